@@ -1,0 +1,127 @@
+//! The inverse Poincaré step: from a wanted motion to a step in latent space, ĝ − g = W⁺ΔP.
+
+use nalgebra::{DMatrix, Matrix6xX, Vector6};
+use ndarray::{Array1, Array2, ArrayView2};
+
+use super::{Error, TargetScale};
+use crate::geometry::Twist;
+
+/// Singular values below this share of the largest count as zero.
+const RANK_TOLERANCE: f64 = 1e-5;
+
+/// How the un-normalisation of the targets enters the inverse.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reading {
+    /// W⁺((ΔP − μ)/σ): inverts the trained predictor exactly; zero motion moves the latent.
+    Affine,
+    /// W⁺(ΔP/σ): zero motion stays put and equal parts add up to the whole. The service's default.
+    Homogeneous,
+    /// W⁺ΔP: as printed in the paper.
+    Literal,
+}
+
+impl Reading {
+    /// Every reading.
+    pub const ALL: [Self; 3] = [Self::Affine, Self::Homogeneous, Self::Literal];
+
+    /// The word for it on the command line and in reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Affine => "affine",
+            Self::Homogeneous => "homogeneous",
+            Self::Literal => "literal",
+        }
+    }
+}
+
+/// W⁺, the pseudo-inverse of W by truncated SVD, with μ and σ to apply it in three readings.
+#[derive(Debug, Clone)]
+pub struct Inverse {
+    /// Shape (k, 6).
+    pseudo_inverse: Array2<f64>,
+    /// Largest first.
+    singular_values: [f64; 6],
+    scale: TargetScale,
+}
+
+impl Inverse {
+    /// Inverts `motion`, W of shape (6, k).
+    ///
+    /// # Errors
+    /// [`Error::RankDeficient`] when fewer than six singular values count.
+    pub fn new(motion: ArrayView2<'_, f64>, scale: &TargetScale) -> Result<Self, Error> {
+        let w = Matrix6xX::from_fn(motion.ncols(), |row, column| motion[(row, column)]);
+        // The tall transpose has the thin SVD with six columns.
+        let svd = DMatrix::from_fn(w.ncols(), 6, |row, column| w[(column, row)]).svd(true, true);
+        let mut sorted: Vec<f64> = svd.singular_values.iter().copied().collect();
+        sorted.sort_by(|a, b| b.total_cmp(a));
+        sorted.resize(6, 0.0);
+        let largest = sorted[0];
+        let counts = |value: f64| value > RANK_TOLERANCE * largest;
+        let rank = sorted.iter().filter(|&&value| counts(value)).count();
+        let (Some(u), Some(v_t), 6) = (svd.u, svd.v_t, rank) else {
+            return Err(Error::RankDeficient { rank, largest, smallest: sorted[5] });
+        };
+        // Wᵀ = U S Vᵀ, so W⁺ = U S⁻¹ Vᵀ.
+        let inverse = u * DMatrix::from_diagonal(&svd.singular_values.map(f64::recip)) * v_t;
+        Ok(Self {
+            pseudo_inverse: Array2::from_shape_fn((w.ncols(), 6), |(row, column)| inverse[(row, column)]),
+            singular_values: std::array::from_fn(|i| sorted[i]),
+            scale: scale.clone(),
+        })
+    }
+
+    /// W⁺, shape (k, 6).
+    pub fn matrix(&self) -> ArrayView2<'_, f64> {
+        self.pseudo_inverse.view()
+    }
+
+    /// Singular values of W, largest first.
+    pub fn singular_values(&self) -> [f64; 6] {
+        self.singular_values
+    }
+
+    /// The latent step of a motion. `mean_share` is the share of μ that an affine step takes off: 1 for a whole
+    /// motion, 1/S for one of S equal parts, so that S parts add up to the whole.
+    ///
+    /// Source: SeeSE3, ĝ = φ(z) + W⁺ΔP.
+    pub fn step(&self, twist: Twist, reading: Reading, mean_share: f64) -> Array1<f64> {
+        let motion = twist.to_vector();
+        let target: Vector6<f64> = match reading {
+            Reading::Affine => (motion - self.scale.mean * mean_share).component_div(&self.scale.deviation),
+            Reading::Homogeneous => motion.component_div(&self.scale.deviation),
+            Reading::Literal => motion,
+        };
+        self.pseudo_inverse.dot(&Array1::from_iter(target.iter().copied()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn unit_scale() -> TargetScale {
+        TargetScale { mean: Vector6::zeros(), deviation: Vector6::repeat(1.0) }
+    }
+
+    /// Oracle: the definition of a right inverse, W W⁺ = I for a W of full row rank, and Moore and Penrose's
+    /// symmetry of W⁺W, which singles out the shortest step.
+    #[test]
+    fn the_pseudo_inverse_is_the_shortest_right_inverse() {
+        let w = Array2::from_shape_fn((6, 20), |(row, column)| (((row * 20 + column) as f64).powi(2) * 0.37).sin());
+        let inverse = Inverse::new(w.view(), &unit_scale()).unwrap();
+        let identity = w.dot(&inverse.matrix());
+        assert!((&identity - &Array2::<f64>::eye(6)).iter().all(|x| x.abs() < 1e-12));
+        let projector = inverse.matrix().dot(&w);
+        assert!((&projector - &projector.t()).iter().all(|x| x.abs() < 1e-12));
+    }
+
+    /// Oracle: a W with two equal rows has rank 5 by definition.
+    #[test]
+    fn a_direction_that_was_never_trained_is_refused() {
+        let mut w = Array2::from_shape_fn((6, 20), |(row, column)| (((row * 20 + column) as f64).powi(2) * 0.37).sin());
+        let copy = w.row(0).to_owned();
+        w.row_mut(5).assign(&copy);
+        assert!(matches!(Inverse::new(w.view(), &unit_scale()), Err(Error::RankDeficient { rank: 5, .. })));
+    }
+}

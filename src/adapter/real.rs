@@ -1,0 +1,35 @@
+//! The two precisions that the network runs in: f32 to train, f64 to answer and to be checked against.
+
+/// f32 or f64.
+pub trait Real: ndarray::NdFloat {
+    /// The error function.
+    fn erf(self) -> Self;
+    /// The nearest value to an f64.
+    fn of(value: f64) -> Self;
+    /// This value as f64.
+    fn f64(self) -> f64;
+}
+
+impl Real for f32 {
+    fn erf(self) -> Self {
+        libm::erff(self)
+    }
+    fn of(value: f64) -> Self {
+        value as f32
+    }
+    fn f64(self) -> f64 {
+        f64::from(self)
+    }
+}
+
+impl Real for f64 {
+    fn erf(self) -> Self {
+        libm::erf(self)
+    }
+    fn of(value: f64) -> Self {
+        value
+    }
+    fn f64(self) -> f64 {
+        self
+    }
+}

@@ -1,0 +1,64 @@
+//! Hit@ε on held-out motions: every navigator beside the baselines that tell what its numbers mean.
+
+mod navigators;
+mod predictions;
+mod retrieval;
+
+pub use navigators::{NavigatorKind, Protocol, Report, Row, evaluate};
+pub use predictions::{Prediction, PredictionScope, score_predictions};
+pub use retrieval::{LatentScores, PoseRecall, RetrievalScores};
+
+use crate::{adapter, cancel, index, navigation, pairs, ridge, room};
+
+/// Why an evaluation cannot be done.
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum Error {
+    #[error(transparent)]
+    Pairs(#[from] pairs::Error),
+    #[error(transparent)]
+    Room(#[from] room::Error),
+    #[error(transparent)]
+    Adapter(#[from] adapter::Error),
+    #[error(transparent)]
+    Ridge(#[from] ridge::Error),
+    #[error(transparent)]
+    Cancelled(#[from] cancel::Cancelled),
+    #[error("threshold {value} must be finite and greater than 0")]
+    Threshold { value: f64 },
+    #[error("{count} thresholds were given; give 1 to {most}")]
+    ThresholdCount { count: usize, most: usize },
+    #[error("no candidate frame is left for source frame {source_frame}")]
+    NoCandidates { source_frame: room::FrameId },
+    #[error("no predictions were given")]
+    NoPredictions,
+    #[error("prediction {position}: {problem}")]
+    Prediction { position: usize, problem: Box<Error> },
+    #[error("the retrieved frame {frame} is not a candidate under the split '{split}'")]
+    NotACandidate { frame: room::FrameId, split: pairs::Split },
+    #[error("predictions must be all latents or all retrieved frames, not a mixture")]
+    MixedPredictions,
+}
+
+/// The most thresholds of one report.
+pub const MAX_THRESHOLDS: usize = 32;
+
+/// Refuses an ε that no error can be under, or that is not a number.
+pub fn check_thresholds(thresholds: &[f64]) -> Result<(), Error> {
+    if thresholds.is_empty() || thresholds.len() > MAX_THRESHOLDS {
+        return Err(Error::ThresholdCount { count: thresholds.len(), most: MAX_THRESHOLDS });
+    }
+    match thresholds.iter().find(|value| !(value.is_finite() && **value > 0.0)) {
+        Some(&value) => Err(Error::Threshold { value }),
+        None => Ok(()),
+    }
+}
+
+/// The exact index over the candidates: evaluations never depend on an approximation.
+fn exact_index(latents: ndarray::ArrayView2<'_, f64>, candidates: &[room::FrameId]) -> index::ExactIndex {
+    index::ExactIndex::new(latents, candidates)
+}
+
+/// The paper's thresholds.
+pub fn default_thresholds() -> Vec<f64> {
+    navigation::HIT_THRESHOLDS.to_vec()
+}

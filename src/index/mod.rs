@@ -1,0 +1,66 @@
+//! Nearest neighbours of a latent among a room's frames: exact by default, HNSW as an option.
+//!
+//! Every index keeps one contract (`tests/index_contract.rs`): answers are ordered by L2 distance, then by frame;
+//! an excluded frame is never returned; fewer than `k` are returned only when fewer are left.
+
+mod exact;
+mod hnsw;
+
+pub use exact::ExactIndex;
+pub use hnsw::{Audit, HnswIndex, HnswParameters};
+
+use crate::room::FrameId;
+
+/// One frame and how far its latent is from the query.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Neighbour {
+    /// The frame.
+    pub frame: FrameId,
+    /// L2 distance in latent units.
+    pub distance: f64,
+}
+
+/// Frames that must not be returned: all within `radius` rows of `centre`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Exclusion {
+    /// The frame in the middle.
+    pub centre: FrameId,
+    /// How many rows to each side are left out with it; 0 leaves out the centre alone.
+    pub radius: u32,
+}
+
+impl Exclusion {
+    /// Whether a frame is left out.
+    pub fn covers(&self, frame: FrameId) -> bool {
+        frame.0.abs_diff(self.centre.0) <= self.radius
+    }
+
+    /// The most frames that are left out.
+    fn most(&self) -> usize {
+        (self.radius as usize).saturating_mul(2).saturating_add(1)
+    }
+}
+
+/// Finds the frames whose latents are nearest to a query.
+pub trait Index: Send + Sync {
+    /// The `k` nearest frames to `query`, by distance and then by frame.
+    fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbour>;
+
+    /// How many frames can be found.
+    fn len(&self) -> usize;
+
+    /// Whether no frame can be found.
+    fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// Orders neighbours as every answer is ordered.
+fn by_distance_then_frame(a: &Neighbour, b: &Neighbour) -> std::cmp::Ordering {
+    a.distance.total_cmp(&b.distance).then(a.frame.cmp(&b.frame))
+}
+
+/// L2 distance, summed in order of the columns.
+fn distance(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(x, y)| (x - y) * (x - y)).sum::<f64>().sqrt()
+}

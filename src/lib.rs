@@ -1,0 +1,19 @@
+//! Latent navigation: Poincaré adapters turn image features into camera motion, and camera motion into the next frame.
+//!
+//! The modules stand bottom to top; each uses only those above its line. `tests/layering.rs` enforces it.
+
+// Core: pure computation. No files, no network, no clock, no async.
+pub mod adapter; // features to latents, latents to twists; training
+pub mod cancel; // a flag that says nobody waits any more
+pub mod eval;
+pub mod features; // one row of encoder output per frame
+pub mod geometry; // SE(3): poses, twists, errors between poses
+pub mod image; // 8-bit RGB pictures
+pub mod index; // nearest neighbours: exact, HNSW
+pub mod localization; // from a feature to a pose, in one room or in all
+pub mod navigation; // from a frame and a motion to the frames that follow
+pub mod odometry; // from two features to the motion between them
+pub mod pairs; // which pairs of frames are learned from, and which are tested
+pub mod ridge; // closed-form ridge regression
+pub mod room; // what was seen, and from where
+pub mod scores; // R² of motions, hit rates and their intervals // Hit@ε on held-out motions

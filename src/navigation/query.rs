@@ -1,0 +1,98 @@
+//! What a navigator is asked.
+
+use super::{Error, Mode, Reading, check_twist};
+use crate::geometry::{Pose, Twist};
+use crate::room::FrameId;
+
+/// Where a question starts from.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Source {
+    /// A frame of the room.
+    Frame(FrameId),
+    /// A raw feature of the adapter's source, shape (d,).
+    Feature(Vec<f32>),
+    /// A latent of the adapter, shape (k,).
+    Latent(Vec<f64>),
+}
+
+/// A source with its pose, `world_from_camera`, where it is known; a frame of the room needs none.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SourceAt {
+    /// What is seen there.
+    pub source: Source,
+    /// Where it is.
+    pub pose: Option<Pose>,
+}
+
+/// Which motion is wanted.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Displacement {
+    /// Motions one after another, each in the body frame where it begins; one is the usual case.
+    Twists(Vec<Twist>),
+    /// The motion to a frame of the room.
+    TargetFrame(FrameId),
+    /// The motion to a pose, `world_from_camera`.
+    TargetPose(Pose),
+}
+
+/// A question to a navigator.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Query {
+    /// Where it starts.
+    pub source: SourceAt,
+    /// Where it wants to go.
+    pub displacement: Displacement,
+    /// Equal parts of each motion.
+    pub steps: u32,
+    /// How the steps hang together.
+    pub mode: Mode,
+    /// How μ and σ enter the inverse.
+    pub reading: Reading,
+    /// Frames for each step.
+    pub hit_count: u32,
+    /// Whether the frame that a step starts from may not be retrieved, and how many rows to each side of it.
+    pub exclude_source: Option<u32>,
+}
+
+/// What one question may ask for at most.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Limits {
+    /// Steps in all.
+    pub steps: u32,
+    /// Frames for each step.
+    pub hits: u32,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self { steps: 1_000, hits: 1_000 }
+    }
+}
+
+impl Query {
+    /// Checks what can be checked without a room.
+    ///
+    /// # Errors
+    /// [`Error::Steps`], [`Error::HitCount`], [`Error::NoTwist`], [`Error::TwistNotFinite`] or
+    /// [`Error::TwistBeyondPi`].
+    pub fn check(&self, limits: Limits) -> Result<(), Error> {
+        let motions = match &self.displacement {
+            Displacement::Twists(twists) => {
+                if twists.is_empty() {
+                    return Err(Error::NoTwist);
+                }
+                twists.iter().enumerate().try_for_each(|(position, &twist)| check_twist(twist, position))?;
+                twists.len() as u64
+            }
+            Displacement::TargetFrame(_) | Displacement::TargetPose(_) => 1,
+        };
+        let actual = u64::from(self.steps).saturating_mul(motions);
+        if actual == 0 || actual > u64::from(limits.steps) {
+            return Err(Error::Steps { actual, most: limits.steps });
+        }
+        if self.hit_count == 0 || self.hit_count > limits.hits {
+            return Err(Error::HitCount { actual: self.hit_count, most: limits.hits });
+        }
+        Ok(())
+    }
+}

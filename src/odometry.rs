@@ -1,0 +1,54 @@
+//! From two views to the motion between them.
+
+use ndarray::Array1;
+
+use crate::adapter::{Adapter, Error};
+use crate::geometry::Twist;
+use crate::navigation::Source;
+
+/// The camera's motion from the first view to the second, in the first camera's body frame.
+///
+/// Views are features or latents; a frame has to be looked up in its room first.
+///
+/// # Errors
+/// [`Error`] when a feature or a latent does not fit the adapter.
+///
+/// Source: SeeSE3, sec. 2.4.
+pub fn motion(adapter: &Adapter, first: &View, second: &View) -> Result<Twist, Error> {
+    let (first, second) = (first.latent(adapter)?, second.latent(adapter)?);
+    Ok(adapter.motion(first.view(), second.view()))
+}
+
+/// What a camera saw, without saying where.
+#[derive(Debug, Clone, PartialEq)]
+pub enum View {
+    /// A raw feature of the adapter's source, shape (d,).
+    Feature(Vec<f32>),
+    /// A latent of the adapter, shape (k,).
+    Latent(Vec<f64>),
+}
+
+impl View {
+    /// The view's latent, shape (k,).
+    ///
+    /// # Errors
+    /// [`Error`] when it does not fit the adapter.
+    pub fn latent(&self, adapter: &Adapter) -> Result<Array1<f64>, Error> {
+        match self {
+            Self::Feature(feature) => adapter.embed_one(feature),
+            Self::Latent(latent) => {
+                adapter.check_latent(latent)?;
+                Ok(Array1::from(latent.clone()))
+            }
+        }
+    }
+}
+
+impl From<View> for Source {
+    fn from(view: View) -> Self {
+        match view {
+            View::Feature(feature) => Self::Feature(feature),
+            View::Latent(latent) => Self::Latent(latent),
+        }
+    }
+}

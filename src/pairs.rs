@@ -1,0 +1,234 @@
+//! Which pairs of frames are learned from, which are tested, and among which frames an answer is looked for.
+//!
+//! A pair (i, j) is two frames of one room, j = i + stride. Frame i is the source, frame j the target.
+
+use rand::{Rng, RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::room::FrameId;
+
+/// Frames in a block of [`Split::Blocks`].
+const BLOCK_FRAMES: usize = 50;
+
+/// Why a room gives no pairs.
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum Error {
+    #[error("stride must be at least 1")]
+    ZeroStride,
+    #[error("{frame_count} frames are too few for stride {stride} under the split '{split}': no {side} pair is left")]
+    NoPairs { frame_count: usize, stride: u32, split: Split, side: &'static str },
+    #[error("strides {low} to {high} are no range")]
+    EmptyRange { low: u32, high: u32 },
+}
+
+/// Two frames of one room.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Pair {
+    /// The frame the motion starts from.
+    pub source: FrameId,
+    /// The frame it ends at.
+    pub target: FrameId,
+}
+
+/// How frames are kept apart for testing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Split {
+    /// The first 80 % of the frames train, the rest test; both ends of a pair on one side. The paper's.
+    Time,
+    /// Blocks of 50 frames; block b tests when b mod 5 = 2; a test pair lies in one block, a training pair
+    /// has both ends outside test blocks.
+    Blocks,
+    /// The pair (i, j) tests when i mod 5 = 2. Frames are shared between the sides: leaky on purpose, a check
+    /// that an implementation is right, no measure of generalisation.
+    Pairs,
+}
+
+impl Split {
+    /// Every split.
+    pub const ALL: [Self; 3] = [Self::Time, Self::Blocks, Self::Pairs];
+
+    /// The word for it on the command line, on the wire and in a manifest.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Time => "time",
+            Self::Blocks => "blocks",
+            Self::Pairs => "pairs",
+        }
+    }
+
+    /// The split with this [`Split::name`].
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|split| split.name() == name)
+    }
+
+    /// Training pairs at one stride, by source frame.
+    ///
+    /// # Errors
+    /// [`Error::ZeroStride`] or [`Error::NoPairs`].
+    pub fn train_pairs(self, frame_count: usize, stride: u32) -> Result<Vec<Pair>, Error> {
+        self.pairs(frame_count, stride, Side::Train)
+    }
+
+    /// Test pairs at one stride, by source frame.
+    ///
+    /// # Errors
+    /// [`Error::ZeroStride`] or [`Error::NoPairs`].
+    pub fn test_pairs(self, frame_count: usize, stride: u32) -> Result<Vec<Pair>, Error> {
+        self.pairs(frame_count, stride, Side::Test)
+    }
+
+    /// The frames among which a test answer is looked for: the test frames; all frames under
+    /// [`Split::Pairs`], which has no test frames.
+    pub fn candidates(self, frame_count: usize) -> Vec<FrameId> {
+        frames(frame_count).filter(|&frame| self == Self::Pairs || self.tests_frame(frame_count, frame)).collect()
+    }
+
+    /// `count` training pairs drawn with replacement from all pairs whose stride lies in `low..=high`
+    /// (the paper's range pairing; A-8, and with replacement because 30,000 exceed the distinct pairs of a room).
+    ///
+    /// # Errors
+    /// [`Error::EmptyRange`], or as [`Split::train_pairs`] when no stride of the range gives a pair.
+    pub fn sampled_range(self, frame_count: usize, range: &StrideRange, seed: u64) -> Result<Vec<Pair>, Error> {
+        let &StrideRange { low, high, count } = range;
+        if low == 0 || low > high {
+            return Err(Error::EmptyRange { low, high });
+        }
+        let pool: Vec<Pair> = (low..=high).filter_map(|s| self.train_pairs(frame_count, s).ok()).flatten().collect();
+        if pool.is_empty() {
+            return Err(Error::NoPairs { frame_count, stride: low, split: self, side: Side::Train.name() });
+        }
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        Ok((0..count).map(|_| pool[random.random_range(0..pool.len())]).collect())
+    }
+
+    fn pairs(self, frame_count: usize, stride: u32, side: Side) -> Result<Vec<Pair>, Error> {
+        if stride == 0 {
+            return Err(Error::ZeroStride);
+        }
+        let last_source = frame_count.saturating_sub(stride as usize);
+        let pairs: Vec<Pair> = frames(last_source)
+            .map(|source| Pair { source, target: FrameId(source.0 + stride) })
+            .filter(|&pair| self.side(frame_count, pair) == Some(side))
+            .collect();
+        if pairs.is_empty() {
+            return Err(Error::NoPairs { frame_count, stride, split: self, side: side.name() });
+        }
+        Ok(pairs)
+    }
+
+    /// The side a pair belongs to, or none when its ends lie on different sides.
+    fn side(self, frame_count: usize, pair: Pair) -> Option<Side> {
+        let tested = |frame| self.tests_frame(frame_count, frame);
+        let block = |frame: FrameId| frame.row() / BLOCK_FRAMES;
+        match self {
+            Self::Pairs => Some(if pair.source.0 % 5 == 2 { Side::Test } else { Side::Train }),
+            Self::Time | Self::Blocks => match (tested(pair.source), tested(pair.target)) {
+                (false, false) => Some(Side::Train),
+                (true, true) if self == Self::Time || block(pair.source) == block(pair.target) => Some(Side::Test),
+                _ => None,
+            },
+        }
+    }
+
+    fn tests_frame(self, frame_count: usize, frame: FrameId) -> bool {
+        match self {
+            Self::Time => frame.row() >= frame_count * 4 / 5,
+            Self::Blocks => (frame.row() / BLOCK_FRAMES) % 5 == 2,
+            Self::Pairs => false,
+        }
+    }
+}
+
+impl std::fmt::Display for Split {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// Strides to draw training pairs from, and how many pairs to draw.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StrideRange {
+    /// The smallest stride.
+    pub low: u32,
+    /// The largest stride.
+    pub high: u32,
+    /// Pairs drawn.
+    pub count: usize,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Side {
+    Train,
+    Test,
+}
+
+impl Side {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Train => "training",
+            Self::Test => "test",
+        }
+    }
+}
+
+/// Puts `items` in an order drawn from `random`: Fisher and Yates' shuffle.
+pub fn shuffle<T>(items: &mut [T], random: &mut impl Rng) {
+    for last in (1..items.len()).rev() {
+        items.swap(last, random.random_range(0..=last));
+    }
+}
+
+fn frames(count: usize) -> impl Iterator<Item = FrameId> {
+    (0..count as u32).map(FrameId)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the pair counts of the published PyTorch reference on 1,000 frames: its column n.
+    #[test]
+    fn test_pair_counts_are_the_reference_ones() {
+        for (split, stride, expected) in [
+            (Split::Pairs, 10, 198),
+            (Split::Pairs, 20, 196),
+            (Split::Pairs, 40, 192),
+            (Split::Time, 10, 190),
+            (Split::Time, 20, 180),
+            (Split::Time, 40, 160),
+        ] {
+            assert_eq!(split.test_pairs(1000, stride).unwrap().len(), expected, "{split} {stride}");
+        }
+        assert_eq!(Split::Time.train_pairs(1000, 40).unwrap().len(), 760);
+    }
+
+    /// Oracle: the definition of a time split, floor(0.8 N) frames train.
+    #[test]
+    fn no_frame_is_on_both_sides_of_the_time_or_block_split() {
+        for split in [Split::Time, Split::Blocks] {
+            let ends = |pairs: Vec<Pair>| pairs.into_iter().flat_map(|pair| [pair.source, pair.target]);
+            let trained: std::collections::HashSet<_> = ends(split.train_pairs(503, 10).unwrap()).collect();
+            assert!(ends(split.test_pairs(503, 10).unwrap()).all(|frame| !trained.contains(&frame)), "{split}");
+            assert!(split.candidates(503).iter().all(|frame| !trained.contains(frame)), "{split}");
+        }
+        assert_eq!(Split::Time.candidates(503)[0], FrameId(402));
+    }
+
+    /// Oracle: paper finding 6, 9,145 distinct pairs with strides 10 to 40 among 320 training frames.
+    #[test]
+    fn range_pairing_draws_from_the_papers_pool() {
+        let distinct: usize = (10..=40).map(|s| Split::Time.train_pairs(400, s).unwrap().len()).sum();
+        assert_eq!(distinct, 9_145);
+        let range = StrideRange { low: 10, high: 40, count: 30_000 };
+        let drawn = Split::Time.sampled_range(400, &range, 7).unwrap();
+        assert_eq!(drawn.len(), 30_000);
+        assert!(drawn.iter().all(|pair| (10..=40).contains(&(pair.target.0 - pair.source.0)) && pair.target.0 < 320));
+        assert_ne!(drawn, Split::Time.sampled_range(400, &range, 8).unwrap());
+    }
+
+    #[test]
+    fn a_room_too_short_for_its_stride_is_refused() {
+        assert!(matches!(Split::Time.test_pairs(100, 40), Err(Error::NoPairs { side: "test", .. })));
+        assert_eq!(Split::Time.test_pairs(100, 0), Err(Error::ZeroStride));
+    }
+}

@@ -1,0 +1,215 @@
+//! A room: what was seen, and from where.
+//!
+//! - Frames are ordered by capture; a [`FrameId`] is the row of a frame in every array of its room.
+//! - Poses are `world_from_camera`, metres. Timestamps are nanoseconds.
+
+use std::fmt;
+
+use crate::geometry::Pose;
+
+/// What is wrong with a room.
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum Error {
+    #[error("name '{name}' must be 1 to 100 letters, digits, '.', '-' or '_', and begin with a letter or digit")]
+    Name { name: String },
+    #[error("room '{room}' has no frames")]
+    Empty { room: RoomId },
+    #[error("room '{room}', frame {frame}: the pose is not finite; drop the frame or repair its pose")]
+    PoseNotFinite { room: RoomId, frame: usize },
+    #[error("room '{room}' has {frame_count} poses but {actual} {what}; every frame needs one")]
+    Count { room: RoomId, frame_count: usize, actual: usize, what: &'static str },
+    #[error("room '{room}' has {frame_count} frames, over the limit of {MAX_FRAMES}")]
+    TooManyFrames { room: RoomId, frame_count: usize },
+    #[error("room '{room}' has no frame {frame}; it has frames 0 to {}", frame_count - 1)]
+    UnknownFrame { room: RoomId, frame: FrameId, frame_count: usize },
+}
+
+/// The most frames a room may have.
+pub const MAX_FRAMES: usize = 10_000_000;
+
+/// The name of a room, also its folder in the store.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct RoomId(String);
+
+impl RoomId {
+    /// Checks a name.
+    ///
+    /// # Errors
+    /// [`Error::Name`] if it could not be a folder's name everywhere.
+    pub fn new(name: &str) -> Result<Self, Error> {
+        if is_plain_name(name) { Ok(Self(name.to_owned())) } else { Err(Error::Name { name: name.to_owned() }) }
+    }
+
+    /// The name.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for RoomId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// Whether `name` can be a folder or file name on every system: no separators, no leading dot, not long.
+pub fn is_plain_name(name: &str) -> bool {
+    name.len() <= 100
+        && name.starts_with(|c: char| c.is_ascii_alphanumeric())
+        && name.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_'))
+}
+
+/// The row of a frame in its room.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct FrameId(pub u32);
+
+impl FrameId {
+    /// The row as an array index.
+    pub fn row(self) -> usize {
+        self.0 as usize
+    }
+}
+
+impl fmt::Display for FrameId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+/// Where a room came from.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Provenance {
+    /// The format it was read from, for instance `7scenes`.
+    pub format: String,
+    /// The terms under which its data may be used, if stated.
+    pub licence: String,
+    /// The largest |RRᵀ − I| entry of its rotations before they were projected to SO(3).
+    pub worst_rotation_deviation: f64,
+}
+
+/// What [`Room::new`] checks.
+#[derive(Debug, Clone, Default)]
+pub struct Frames {
+    /// `world_from_camera`, metres, in order of capture.
+    pub poses: Vec<Pose>,
+    /// Nanoseconds on the recorder's clock, one a frame, or empty if unknown.
+    pub timestamps_ns: Vec<i64>,
+    /// The recording's own frame names, one a frame, or empty if it has none.
+    pub names: Vec<String>,
+}
+
+/// A room that was recorded once. Immutable.
+#[derive(Debug, Clone)]
+pub struct Room {
+    id: RoomId,
+    frames: Frames,
+    provenance: Provenance,
+}
+
+impl Room {
+    /// Checks the frames and makes the room.
+    ///
+    /// # Errors
+    /// The first of [`Error::Empty`], [`Error::TooManyFrames`], [`Error::Count`], [`Error::PoseNotFinite`].
+    pub fn new(id: RoomId, frames: Frames, provenance: Provenance) -> Result<Self, Error> {
+        let frame_count = frames.poses.len();
+        if frame_count == 0 {
+            return Err(Error::Empty { room: id });
+        }
+        if frame_count > MAX_FRAMES {
+            return Err(Error::TooManyFrames { room: id, frame_count });
+        }
+        for (what, actual) in [("timestamps", frames.timestamps_ns.len()), ("frame names", frames.names.len())] {
+            if actual != 0 && actual != frame_count {
+                return Err(Error::Count { room: id, frame_count, actual, what });
+            }
+        }
+        let finite = |pose: &Pose| pose.to_homogeneous().iter().all(|x| x.is_finite());
+        if let Some(frame) = frames.poses.iter().position(|pose| !finite(pose)) {
+            return Err(Error::PoseNotFinite { room: id, frame });
+        }
+        Ok(Self { id, frames, provenance })
+    }
+
+    /// The room's name.
+    pub fn id(&self) -> &RoomId {
+        &self.id
+    }
+
+    /// How many frames it has, at least one.
+    pub fn frame_count(&self) -> usize {
+        self.frames.poses.len()
+    }
+
+    /// All poses, `world_from_camera`, metres, row by frame.
+    pub fn poses(&self) -> &[Pose] {
+        &self.frames.poses
+    }
+
+    /// Nanoseconds by frame; empty if unknown.
+    pub fn timestamps_ns(&self) -> &[i64] {
+        &self.frames.timestamps_ns
+    }
+
+    /// The recording's own frame names; empty if it has none.
+    pub fn frame_names(&self) -> &[String] {
+        &self.frames.names
+    }
+
+    /// Where the room came from.
+    pub fn provenance(&self) -> &Provenance {
+        &self.provenance
+    }
+
+    /// The pose of a frame, `world_from_camera`, metres.
+    ///
+    /// # Errors
+    /// [`Error::UnknownFrame`].
+    pub fn pose(&self, frame: FrameId) -> Result<&Pose, Error> {
+        self.frames.poses.get(frame.row()).ok_or_else(|| Error::UnknownFrame {
+            room: self.id.clone(),
+            frame,
+            frame_count: self.frame_count(),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn room(frames: Frames) -> Result<Room, Error> {
+        Room::new(RoomId::new("r").unwrap(), frames, Provenance::default())
+    }
+
+    /// Oracle: the definition of a frame id, a row.
+    #[test]
+    fn a_frame_past_the_end_is_unknown() {
+        let room = room(Frames { poses: vec![Pose::identity(); 2], ..Frames::default() }).unwrap();
+        assert!(room.pose(FrameId(1)).is_ok());
+        let message = room.pose(FrameId(2)).unwrap_err().to_string();
+        assert_eq!(message, "room 'r' has no frame 2; it has frames 0 to 1");
+    }
+
+    /// Oracle: the list of bad visitors in the issue: empty, not finite, counts that differ.
+    #[test]
+    fn bad_frames_are_refused() {
+        assert!(matches!(room(Frames::default()), Err(Error::Empty { .. })));
+        let nan = Pose::translation(f64::NAN, 0.0, 0.0);
+        assert!(matches!(
+            room(Frames { poses: vec![Pose::identity(), nan], ..Frames::default() }),
+            Err(Error::PoseNotFinite { frame: 1, .. })
+        ));
+        let frames = Frames { poses: vec![Pose::identity()], timestamps_ns: vec![1, 2], ..Frames::default() };
+        assert!(matches!(room(frames), Err(Error::Count { actual: 2, .. })));
+    }
+
+    /// Oracle: what a path traversal or a hidden file looks like.
+    #[test]
+    fn names_that_could_escape_their_folder_are_refused() {
+        for name in ["", "..", ".hidden", "a/b", "a\\b", "a b", "ä", &"x".repeat(101)] {
+            assert!(RoomId::new(name).is_err(), "{name:?}");
+        }
+        assert!(RoomId::new("scene0000_00").is_ok());
+    }
+}

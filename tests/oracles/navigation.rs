@@ -1,0 +1,207 @@
+//! Navigation with the reference adapter against NumPy, SciPy, scikit-learn: retrieved frames identical, figures
+//! within 1e-9.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use seese3::adapter::{Adapter, Samples, Siamese, TENSOR_NAMES};
+use seese3::cancel::Cancellation;
+use seese3::eval::{NavigatorKind, Protocol, RetrievalScores, Row, evaluate};
+use seese3::features::{FeatureSource, Features};
+use seese3::geometry::body_twist;
+use seese3::index::ExactIndex;
+use seese3::navigation::{IndexKind, Mode, Navigator, Plan, Reading, Source, Space, walk};
+use seese3::pairs::{Pair, Split};
+use seese3::room::{Frames, Provenance, Room, RoomId};
+
+use crate::support::{Tensors, features, json, near, number, oracle_rooms, poses, worst};
+
+const STRIDE: u32 = 40;
+
+/// The oracle's trained adapter; μ and σ come from the training pairs.
+fn adapter(folder: &Path, room: &str) -> Arc<Adapter> {
+    let tensors = Tensors::open(&folder.join(format!("m4_adapter/{room}_k1_trained.safetensors")));
+    let network = Siamese::from_tensors(TENSOR_NAMES.map(|name| tensors.rows(name).mapv(|x| x as f32))).unwrap();
+    let (features, poses) = (features(folder, room), poses(&folder.join(format!("rooms/{room}/poses.npy"))));
+    let pairs = Split::Time.train_pairs(poses.len(), STRIDE).unwrap();
+    let twists: Vec<_> = pairs.iter().map(|p| body_twist(&poses[p.source.row()], &poses[p.target.row()])).collect();
+    let rows = pairs.iter().map(|p| [p.source.row(), p.target.row()]).collect();
+    let scale = Samples::<f32>::new(features.view(), rows, &twists).unwrap().scale().clone();
+    Arc::new(Adapter::new(FeatureSource::imported("oracle", features.ncols()), network, scale).unwrap())
+}
+
+fn navigator(folder: &Path, room: &str, adapter: Arc<Adapter>) -> Navigator {
+    let frames = Frames { poses: poses(&folder.join(format!("rooms/{room}/poses.npy"))), ..Frames::default() };
+    let features = Features::new(FeatureSource::imported("oracle", 0), features(folder, room)).unwrap();
+    let room = Room::new(RoomId::new(room).unwrap(), frames, Provenance::default()).unwrap();
+    Navigator::new(Arc::new(room), &features, adapter, IndexKind::Exact).unwrap()
+}
+
+#[track_caller]
+fn compare(what: &str, row: &Row, expected: &serde_json::Value, side: &str) {
+    let latent = row.latent.unwrap();
+    near(&format!("{what} mse"), latent.mse, number(&expected["mse"]), 1e-9);
+    near(&format!("{what} r2"), latent.r2, number(&expected["r2_variance_weighted"]), 1e-8);
+    near(&format!("{what} uniform r2"), latent.r2_uniform, number(&expected["r2_uniform"]), 1e-8);
+    compare_retrieval(&format!("{what} {side}"), &row.retrieval, &expected[side]);
+}
+
+#[track_caller]
+fn compare_retrieval(what: &str, scores: &RetrievalScores, expected: &serde_json::Value) {
+    assert_eq!(scores.top1.n as u64, expected["n"].as_u64().unwrap(), "{what}");
+    near(&format!("{what} top1"), scores.top1.rate, number(&expected["top1"]), 1e-12);
+    for (epsilon, rate) in &scores.hits {
+        let key = epsilon.to_string();
+        near(&format!("{what} hit {key}"), rate.rate, number(&expected["hit"][&key]), 1e-12);
+        near(&format!("{what} low {key}"), rate.low, number(&expected["hit_wilson95"][&key][0]), 1e-9);
+        near(&format!("{what} high {key}"), rate.high, number(&expected["hit_wilson95"][&key][1]), 1e-9);
+    }
+    near(&format!("{what} mean error"), scores.twist_error_mean, number(&expected["twist_error_mean"]), 1e-9);
+    near(&format!("{what} median error"), scores.twist_error_median, number(&expected["twist_error_median"]), 1e-9);
+    near(&format!("{what} metres"), scores.translation_m_median, number(&expected["median_t_m"]), 1e-9);
+    near(&format!("{what} radians"), scores.rotation_rad_median, number(&expected["median_R_rad"]), 1e-9);
+    for recall in &scores.pose_recalls {
+        let key = format!("{}m_{}deg", recall.translation_m, recall.rotation_deg);
+        near(&format!("{what} {key}"), recall.rate.rate, number(&expected["recall_t_R"][&key]), 1e-12);
+    }
+}
+
+fn evaluated(navigator: &Navigator, exclude_source: Option<u32>) -> Vec<Row> {
+    let protocol = Protocol { exclude_source, ..Protocol::paper(STRIDE) };
+    evaluate(navigator, &protocol, &Cancellation::default(), &mut |_, _| ()).unwrap().rows
+}
+
+/// Oracle: NumPy's pinv and brute force, scikit-learn's scores and Ridge, SciPy's Wilson intervals.
+#[test]
+fn the_navigation_table_matches_the_oracle() {
+    for (room, folder) in oracle_rooms("the_navigation_table_matches_the_oracle") {
+        let expected = json(&folder.join(format!("navigation/{room}_expected.json")));
+        let navigator = navigator(&folder, room, adapter(&folder, room));
+        for (side, exclude) in [("source_included", None), ("source_excluded", Some(0))] {
+            let rows = evaluated(&navigator, exclude);
+            for (ours, theirs) in [
+                ("identity", "identity"),
+                ("inverse-poincare-affine", "inverse_affine"),
+                ("inverse-poincare-homogeneous", "inverse_homogeneous"),
+                ("inverse-poincare-literal", "inverse_literal"),
+                ("ridge-refit", "refit_raw_no_intercept_80_20"),
+                ("ridge-refit-in-sample", "refit_raw_no_intercept_in_sample"),
+            ] {
+                let row = rows.iter().find(|row| row.name == ours).unwrap();
+                compare(&format!("{room} {ours}"), row, &expected["navigators"][theirs], side);
+            }
+        }
+    }
+}
+
+/// Oracle: the definition, P(‖ΔP‖ < ε), which the oracle computed from the poses alone.
+#[test]
+fn identity_hits_exactly_when_the_motion_is_short() {
+    for (room, folder) in oracle_rooms("identity_hits_exactly_when_the_motion_is_short") {
+        let expected = json(&folder.join(format!("navigation/{room}_expected.json")));
+        let rows = evaluated(&navigator(&folder, room, adapter(&folder, room)), None);
+        let identity = rows.iter().find(|row| row.name == NavigatorKind::Identity.name()).unwrap();
+        for (epsilon, rate) in &identity.retrieval.hits {
+            let below = number(&expected["pair_displacement"]["fraction_below"][epsilon.to_string()]);
+            near("identity", rate.rate, below, 1e-12);
+        }
+    }
+}
+
+/// Oracle: scipy.linalg.pinv and numpy.linalg.pinv of W.
+#[test]
+fn the_pseudo_inverse_matches_numpy() {
+    for (room, folder) in oracle_rooms("the_pseudo_inverse_matches_numpy") {
+        let tensors = Tensors::open(&folder.join(format!("navigation/{room}_expected.safetensors")));
+        let adapter = adapter(&folder, room);
+        let off = worst(&adapter.inverse().matrix().to_owned(), &tensors.rows("W_dagger"));
+        assert!(off < 1e-12, "{room}: off by {off}");
+        let singular = &json(&folder.join(format!("navigation/{room}_expected.json")))["W_dagger"]["singular_values"];
+        for (position, value) in adapter.inverse().singular_values().into_iter().enumerate() {
+            near("singular value", value, number(&singular[position]), 1e-12);
+        }
+    }
+}
+
+/// Oracle: brute force in NumPy, every retrieved frame of every step of every mode; the open loop's end does not
+/// depend on the number of steps.
+#[test]
+fn every_step_of_every_mode_retrieves_the_oracles_frame() {
+    for (room, folder) in oracle_rooms("every_step_of_every_mode_retrieves_the_oracles_frame") {
+        let tensors = Tensors::open(&folder.join(format!("navigation/{room}_expected.safetensors")));
+        let navigator = navigator(&folder, room, adapter(&folder, room));
+        let count = navigator.room().frame_count();
+        let candidates = ExactIndex::new(navigator.latents(), &Split::Time.candidates(count));
+        let pairs = Split::Time.test_pairs(count, STRIDE).unwrap();
+        let space = Space { index: &candidates, ..navigator.space() };
+        for (name, mode, reading, exclude_source) in [
+            ("open_loop_homogeneous", Mode::OpenLoop, Reading::Homogeneous, None),
+            ("open_loop_affine_spread", Mode::OpenLoop, Reading::Affine, None),
+            ("open_loop_literal", Mode::OpenLoop, Reading::Literal, None),
+            ("snap_homogeneous", Mode::Snap, Reading::Homogeneous, None),
+            ("snap_affine_spread", Mode::Snap, Reading::Affine, None),
+            ("snap_exclude_current_homogeneous", Mode::Snap, Reading::Homogeneous, Some(0)),
+            ("snap_exclude_current_affine_spread", Mode::Snap, Reading::Affine, Some(0)),
+            ("closed_loop_homogeneous", Mode::ClosedLoop, Reading::Homogeneous, None),
+        ] {
+            for steps in [1u32, 2, 4, 8] {
+                let plan = Plan { mode, reading, steps, hit_count: 1, exclude_source };
+                let expected = tensors.rows(&format!("retrieved.{name}.S{steps}.per_step"));
+                assert_eq!(expected.dim(), (pairs.len(), steps as usize));
+                for (pair, expected) in pairs.iter().zip(expected.outer_iter()) {
+                    let found = walk_pair(space, &navigator, *pair, plan);
+                    let frames: Vec<f64> = found.iter().map(|step| f64::from(step.neighbours[0].frame.0)).collect();
+                    assert_eq!(frames, expected.to_vec(), "{room} {name} in {steps}, source {}", pair.source);
+                }
+            }
+        }
+        let predicted = tensors.rows("g_hat.inverse_homogeneous");
+        for steps in [1u32, 7] {
+            let (mode, reading) = (Mode::OpenLoop, Reading::Homogeneous);
+            let plan = Plan { mode, reading, steps, hit_count: 1, exclude_source: None };
+            for (pair, expected) in pairs.iter().zip(predicted.outer_iter()) {
+                let end = &walk_pair(space, &navigator, *pair, plan)[steps as usize - 1].latent;
+                assert!(end.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9), "{room}, {steps} steps");
+            }
+        }
+    }
+}
+
+fn walk_pair(space: Space<'_>, navigator: &Navigator, pair: Pair, plan: Plan) -> Vec<seese3::navigation::Step> {
+    let poses = navigator.room().poses();
+    let start = navigator.start(&Source::Frame(pair.source), None).unwrap();
+    let motion = body_twist(&poses[pair.source.row()], &poses[pair.target.row()]);
+    walk(space, &start, motion, plan, &Cancellation::default()).unwrap()
+}
+
+/// Oracle: as above, with φ and W frozen in a room they never saw.
+#[test]
+fn an_adapter_in_another_room_matches_the_oracle() {
+    let folder = crate::support::golden();
+    let expected =
+        &json(&folder.join("navigation/synthetic_expected.json"))["cross_room_synthetic_b"]["last_20_percent"];
+    let navigator = navigator(&folder, "synthetic_b", adapter(&folder, "synthetic"));
+    let rows = evaluated(&navigator, None);
+    for (ours, theirs) in [
+        ("identity", "identity"),
+        ("inverse-poincare-affine", "zero_shot_affine"),
+        ("inverse-poincare-homogeneous", "zero_shot_homogeneous"),
+        ("ridge-refit", "refit_raw_no_intercept"),
+    ] {
+        compare(ours, rows.iter().find(|row| row.name == ours).unwrap(), &expected[theirs], "source_included");
+    }
+}
+
+/// Oracle: the definitions. Zero motion stays put in the homogeneous reading, and moves by W⁺(−μ/σ) in the affine.
+#[test]
+fn zero_motion_stays_put_only_in_the_homogeneous_reading() {
+    let folder = crate::support::golden();
+    let adapter = adapter(&folder, "synthetic");
+    let still = seese3::geometry::Twist::default();
+    assert!(adapter.inverse().step(still, Reading::Homogeneous, 1.0).iter().all(|&x| x == 0.0));
+    let shift = adapter.inverse().step(still, Reading::Affine, 1.0);
+    let expected = &json(&folder.join("navigation/synthetic_expected.json"))["W_dagger"]["zero_motion_shift_affine"];
+    for (column, &value) in shift.iter().enumerate() {
+        near("shift", value, number(&expected[column]), 1e-12);
+    }
+}
