@@ -16,4 +16,13 @@ pub mod odometry; // from two features to the motion between them
 pub mod pairs; // which pairs of frames are learned from, and which are tested
 pub mod ridge; // closed-form ridge regression
 pub mod room; // what was seen, and from where
-pub mod scores; // R² of motions, hit rates and their intervals // Hit@ε on held-out motions
+pub mod scores;
+pub mod studio; // procedural rooms, ray-cast: images with exact poses
+pub mod training; // from a room to an adapter and its scores // R² of motions, hit rates and their intervals // Hit@ε on held-out motions
+
+// Rim: one module per outside format.
+pub mod cli;
+pub mod datasets; // recordings on disk to rooms
+pub mod encoder; // images to features
+pub mod report;
+pub mod store; // versioned rooms and adapters, in a folder or a bucket // tables, JSON, pictures // the commands

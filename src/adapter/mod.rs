@@ -8,6 +8,7 @@ mod inverse;
 mod loss;
 mod preset;
 mod real;
+mod record;
 mod siamese;
 mod train;
 
@@ -15,6 +16,7 @@ pub use inverse::{Inverse, Reading};
 pub use loss::mean_squared_error;
 pub use preset::{PairPlan, Preset};
 pub use real::Real;
+pub use record::TrainingRecord;
 pub use siamese::{Siamese, TENSOR_NAMES, Widths};
 pub use train::{EpochProgress, Samples, StepReport, TrainConfig, Trainer, train};
 

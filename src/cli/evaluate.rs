@@ -1,0 +1,145 @@
+//! `seese3 evaluate`: the paper's navigation table on a room's held-out motions.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::bail;
+use clap::Args;
+use serde_json::{Map, json};
+
+use super::progress::bar;
+use super::train::SplitName;
+use super::{say, write_json};
+use crate::cancel::Cancellation;
+use crate::eval::{NavigatorKind, Protocol, evaluate};
+use crate::navigation::{IndexKind, Navigator};
+use crate::pairs::Split;
+use crate::report::{evaluation_json, evaluation_table};
+use crate::store::{Store, StoredAdapter};
+
+#[derive(Debug, Args)]
+pub struct Evaluate {
+    /// The store
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// The room
+    #[arg(long)]
+    room: String,
+    /// Which of its features; may be left out when it has one
+    #[arg(long)]
+    features: Option<String>,
+    /// Which adapter; the newest that was trained on the room with this split, if none is named
+    #[arg(long)]
+    adapter: Option<String>,
+    /// Frames from source to target; the adapter's own, if none is given
+    #[arg(long)]
+    stride: Option<u32>,
+    /// How frames are kept apart; the adapter's own, if none is given
+    #[arg(long, value_enum)]
+    split: Option<SplitName>,
+    /// The source frame may not be retrieved
+    #[arg(long)]
+    exclude_source: bool,
+    /// ε of Hit@ε, separated by commas
+    #[arg(long, value_delimiter = ',', default_values_t = crate::navigation::HIT_THRESHOLDS)]
+    thresholds: Vec<f64>,
+    /// Of the random navigator
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Write the table here as JSON
+    #[arg(long)]
+    json: Option<PathBuf>,
+}
+
+impl Evaluate {
+    pub async fn run(self) -> anyhow::Result<()> {
+        let store = Store::open(&self.store)?;
+        let wanted: Option<Split> = self.split.map(Into::into);
+        let chosen = choose(&store, &self, wanted).await?;
+        let features_name = self.features.clone().unwrap_or_else(|| chosen.adapter.source().name.clone());
+        let (stored, features) = store.load_room_with(&self.room, Some(&features_name)).await?;
+        let protocol = Protocol {
+            split: wanted.unwrap_or(chosen.record.split),
+            stride: self.stride.unwrap_or(chosen.record.stride),
+            exclude_source: self.exclude_source.then_some(0),
+            thresholds: self.thresholds.clone(),
+            seed: self.seed,
+            navigators: NavigatorKind::ALL.to_vec(),
+        };
+        let record = chosen.record.clone();
+        let room = Arc::new(stored.room);
+        let navigator = Navigator::new(room, &features, Arc::new(chosen.adapter), IndexKind::Exact)?;
+        let progress = bar(protocol.navigators.len() as u64, "evaluating");
+        let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |done, kind| {
+            progress.set_position(done as u64);
+            progress.set_message(kind.name());
+        })?;
+        progress.finish_and_clear();
+        let in_room = record.rooms.iter().any(|(room, _)| room.as_str() == self.room);
+        let leaks = in_room && record.split != protocol.split;
+        say(format_args!(
+            "room '{}' revision {}, features '{features_name}', adapter '{}' revision {} ({})",
+            self.room,
+            stored.revision,
+            chosen.name,
+            chosen.revision,
+            if in_room { "trained in this room" } else { "never saw this room" },
+        ));
+        let side = if self.exclude_source { "excluded" } else { "included" };
+        say(format_args!(
+            "split {}, stride {}: {} test pairs, {} candidate frames, source {side}",
+            protocol.split, protocol.stride, report.n, report.candidate_count
+        ));
+        if leaks {
+            say(format_args!(
+                "LEAK: the adapter was trained under the split '{}'; test pairs may have been trained on",
+                record.split
+            ));
+        }
+        say(evaluation_table(&report).trim_end());
+        if let Some(path) = &self.json {
+            let mut context = Map::new();
+            context.insert("room".to_owned(), json!({ "name": self.room, "revision": stored.revision }));
+            context.insert("features".to_owned(), json!(features_name));
+            let name = json!({ "name": chosen.name, "revision": chosen.revision, "trained_split": record.split.name(),
+                "trained_stride": record.stride, "preset": record.preset, "seed": record.config.seed });
+            context.insert("adapter".to_owned(), name);
+            context.insert("in_room".to_owned(), json!(in_room));
+            context.insert("leaks".to_owned(), json!(leaks));
+            write_json(path, &evaluation_json(&report, context))?;
+            say(format_args!("wrote {}", path.display()));
+        }
+        Ok(())
+    }
+}
+
+/// The adapter that was named, or the newest that fits the room, its features, the split and, if one does, the stride.
+async fn choose(store: &Store, wanted: &Evaluate, split: Option<Split>) -> anyhow::Result<StoredAdapter> {
+    if let Some(name) = &wanted.adapter {
+        return Ok(store.load_adapter(name, None).await?);
+    }
+    let names = store.adapter_names().await?;
+    let mut fitting = Vec::new();
+    for name in &names {
+        let stored = store.load_adapter(name, None).await?;
+        let fits = wanted.features.as_ref().is_none_or(|name| *name == stored.adapter.source().name)
+            && stored.record.rooms.iter().any(|(room, _)| room.as_str() == wanted.room)
+            && split.is_none_or(|split| split == stored.record.split);
+        if fits {
+            fitting.push(stored);
+        }
+    }
+    let same_stride = |stored: &StoredAdapter| wanted.stride.is_none_or(|stride| stride == stored.record.stride);
+    let best = |a: &StoredAdapter| (same_stride(a), a.created.clone(), a.name.clone());
+    match fitting.into_iter().max_by(|a, b| best(a).cmp(&best(b))) {
+        Some(stored) => Ok(stored),
+        None => bail!(
+            "no adapter was trained on room '{}' with these features and this split; the store has {}; \
+             train one with `seese3 train --store {} --room {}`, or name one with --adapter",
+            wanted.room,
+            if names.is_empty() { "none".to_owned() } else { names.join(", ") },
+            wanted.store,
+            wanted.room,
+        ),
+    }
+}

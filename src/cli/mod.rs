@@ -1,0 +1,59 @@
+//! The command line. One file a command; each reads its arguments, calls the library and prints.
+
+mod evaluate;
+mod import;
+mod progress;
+mod train;
+
+use clap::{Parser, Subcommand};
+
+/// Latent navigation over gRPC: learn a room, serve it, navigate it.
+#[derive(Debug, Parser)]
+#[command(version, about, propagate_version = true)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Read a recording into a store
+    Import(import::Import),
+    /// Learn an adapter from a room's features and publish it
+    Train(train::Train),
+    /// Score navigators on held-out motions: Hit@ε with baselines and intervals
+    Evaluate(evaluate::Evaluate),
+}
+
+/// Runs a command; what it finds goes to standard output, what goes wrong into the error.
+///
+/// # Errors
+/// What went wrong, in one line, with what to change.
+pub async fn run(cli: Cli) -> anyhow::Result<()> {
+    match cli.command {
+        Command::Import(arguments) => arguments.run().await,
+        Command::Train(arguments) => arguments.run().await,
+        Command::Evaluate(arguments) => arguments.run().await,
+    }
+}
+
+/// Prints a line to standard output; a reader that went away is no error of ours.
+fn say(line: impl std::fmt::Display) {
+    use std::io::Write;
+    let _ = writeln!(std::io::stdout(), "{line}");
+}
+
+/// Writes a file whole or not at all.
+fn write_file(path: &std::path::Path, content: &[u8]) -> anyhow::Result<()> {
+    use anyhow::Context;
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".partial");
+    let partial = std::path::PathBuf::from(partial);
+    std::fs::write(&partial, content).with_context(|| format!("{} cannot be written", path.display()))?;
+    std::fs::rename(&partial, path).with_context(|| format!("{} cannot be written", path.display()))
+}
+
+/// Writes JSON, indented, with a line end.
+fn write_json(path: &std::path::Path, value: &serde_json::Value) -> anyhow::Result<()> {
+    write_file(path, format!("{value:#}\n").as_bytes())
+}

@@ -1,0 +1,119 @@
+//! Machine-readable results. Keys are stable; a value that has no meaning is null.
+
+use serde_json::{Map, Value, json};
+
+use super::TrainingRun;
+use crate::adapter::TrainingRecord;
+use crate::eval::{Report, RetrievalScores, Row};
+use crate::scores::{MotionScores, Rate};
+
+/// The record of `seese3 train`: one entry a seed, and the protocol they share.
+pub fn training_json(runs: &[TrainingRun], adapter: &str, revision: u64) -> Value {
+    let protocol = runs.first().map_or(Value::Null, |run| protocol_json(&run.record));
+    let runs: Vec<Value> = runs.iter().map(run_json).collect();
+    json!({ "runs": runs, "adapter": { "name": adapter, "revision": revision }, "protocol": protocol })
+}
+
+fn run_json(run: &TrainingRun) -> Value {
+    json!({
+        "seed": run.record.config.seed,
+        "test": side_json(&run.record.test),
+        "train": side_json(&run.record.train),
+        "train_mean_r2": run.record.train_mean_r2,
+        "inverse_poincare_affine": retrieval_json(&run.navigation),
+        "seconds": run.seconds,
+    })
+}
+
+fn side_json(scores: &MotionScores) -> Value {
+    json!({
+        "n": scores.n,
+        "r2": {
+            "overall": scores.overall,
+            "translation": scores.translation,
+            "rotation": scores.rotation,
+            "direction": scores.direction,
+            "magnitude": scores.magnitude,
+        },
+        "direction_pairs_dropped": scores.direction_pairs_dropped,
+    })
+}
+
+fn protocol_json(record: &TrainingRecord) -> Value {
+    let rooms: Vec<Value> =
+        record.rooms.iter().map(|(room, revision)| json!({ "room": room.as_str(), "revision": revision })).collect();
+    json!({
+        "preset": record.preset,
+        "split": record.split.name(),
+        "stride": record.stride,
+        "rooms": rooms,
+        "training_pairs": record.pair_count,
+        "epochs": record.config.epochs,
+        "batch": record.config.batch,
+        "learning_rate": record.config.learning_rate,
+        "weight_decay": record.config.weight_decay,
+        "clip_norm": record.config.clip_norm,
+        "hidden": record.config.hidden,
+        "latent": record.config.latent,
+        "twist": "body frame, (v, omega), metres and radians",
+        "deviation_ddof": 0,
+    })
+}
+
+/// The record of `seese3 evaluate`; `context` says which room, features and adapter, and joins the protocol.
+pub fn evaluation_json(report: &Report, context: Map<String, Value>) -> Value {
+    let mut protocol = Map::new();
+    protocol.insert("split".to_owned(), json!(report.protocol.split.name()));
+    protocol.insert("stride".to_owned(), json!(report.protocol.stride));
+    protocol.insert("n".to_owned(), json!(report.n));
+    protocol.insert("candidates".to_owned(), json!(report.candidate_count));
+    protocol.insert("source_excluded".to_owned(), json!(report.protocol.exclude_source.is_some()));
+    protocol.insert("thresholds".to_owned(), json!(report.protocol.thresholds));
+    protocol.insert("seed".to_owned(), json!(report.protocol.seed));
+    protocol.insert("index".to_owned(), json!("exact"));
+    protocol.extend(context);
+    let rows: Vec<Value> = report.rows.iter().map(row_json).collect();
+    json!({ "navigators": rows, "protocol": protocol })
+}
+
+fn row_json(row: &Row) -> Value {
+    let mut object = Map::new();
+    object.insert("name".to_owned(), json!(row.name));
+    object.insert("n".to_owned(), json!(row.n));
+    object.insert("mse".to_owned(), json!(row.latent.map(|latent| latent.mse)));
+    object.insert("r2".to_owned(), json!(row.latent.map(|latent| latent.r2)));
+    object.insert("r2_uniform".to_owned(), json!(row.latent.map(|latent| latent.r2_uniform)));
+    if let Value::Object(retrieval) = retrieval_json(&row.retrieval) {
+        object.extend(retrieval);
+    }
+    Value::Object(object)
+}
+
+fn retrieval_json(scores: &RetrievalScores) -> Value {
+    let hits: Map<String, Value> =
+        scores.hits.iter().map(|(epsilon, rate)| (epsilon.to_string(), rate_json(rate))).collect();
+    let recalls: Vec<Value> = scores
+        .pose_recalls
+        .iter()
+        .map(|recall| {
+            json!({
+                "translation_m": recall.translation_m,
+                "rotation_deg": recall.rotation_deg,
+                "rate": recall.rate.rate, "low": recall.rate.low, "high": recall.rate.high,
+            })
+        })
+        .collect();
+    json!({
+        "top1": scores.top1.rate,
+        "top1_interval": rate_json(&scores.top1),
+        "hit": hits,
+        "twist_error": { "mean": scores.twist_error_mean, "median": scores.twist_error_median },
+        "median_translation_m": scores.translation_m_median,
+        "median_rotation_deg": scores.rotation_rad_median.to_degrees(),
+        "recall": recalls,
+    })
+}
+
+fn rate_json(rate: &Rate) -> Value {
+    json!({ "rate": rate.rate, "low": rate.low, "high": rate.high })
+}

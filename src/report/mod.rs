@@ -1,0 +1,23 @@
+//! Results for people and for scripts: tables, JSON, pictures.
+
+mod json;
+mod plot;
+mod table;
+
+pub use json::{evaluation_json, training_json};
+pub use plot::{PathPlot, path_svg};
+pub use table::{evaluation_table, training_table};
+
+use crate::adapter::TrainingRecord;
+use crate::eval::RetrievalScores;
+
+/// One seed of a training command.
+#[derive(Debug, Clone)]
+pub struct TrainingRun {
+    /// The run.
+    pub record: TrainingRecord,
+    /// Inverse Poincaré, affine reading, on the run's test pairs.
+    pub navigation: RetrievalScores,
+    /// Wall time of training, seconds.
+    pub seconds: f64,
+}

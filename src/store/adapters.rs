@@ -1,0 +1,181 @@
+//! Adapters in the store.
+
+use nalgebra::Vector6;
+use ndarray::{Array2, ArrayView2};
+use object_store::path::Path;
+
+use super::format::{AdapterBody, TensorReader, TensorWriter};
+use super::manifest::{self, SCHEMA};
+use super::{ATTEMPTS, Error, Kind, Published, Store, revision_path};
+use crate::adapter::{Adapter, Siamese, TENSOR_NAMES, TargetScale, TrainingRecord};
+use crate::room::is_plain_name;
+
+/// Golden inputs in an adapter's file.
+const GOLDEN_ROWS: usize = 8;
+/// How far a golden output may be off, in units of the larger of 1 and the output itself.
+const GOLDEN_TOLERANCE: f64 = 1e-6;
+
+/// An adapter as it was stored; its golden vectors have been run.
+#[derive(Debug, Clone)]
+pub struct StoredAdapter {
+    /// Its name.
+    pub name: String,
+    /// Counted from 1.
+    pub revision: u64,
+    /// When it was published, RFC 3339.
+    pub created: String,
+    /// The adapter.
+    pub adapter: Adapter,
+    /// How it came to be.
+    pub record: TrainingRecord,
+}
+
+impl Store {
+    /// Publishes an adapter; some of `features` (n, d), the ones it was trained on, become its golden inputs.
+    ///
+    /// # Errors
+    /// [`Error::Name`], [`Error::Damaged`] if the features do not fit, or as the store fails.
+    pub async fn publish_adapter(
+        &self,
+        name: &str,
+        adapter: &Adapter,
+        record: &TrainingRecord,
+        features: ArrayView2<'_, f32>,
+    ) -> Result<Published, Error> {
+        if !is_plain_name(name) {
+            return Err(Error::Name { what: "an adapter", name: name.to_owned() });
+        }
+        let folder = Path::from(Kind::Adapter.folder()).join(name);
+        let bytes = adapter_file(name, adapter, features)?;
+        let weights = self.write_object(&folder, "weights", "safetensors", bytes).await?;
+        for _ in 0..ATTEMPTS {
+            let newest = match self.revisions(&folder).await?.last() {
+                Some(&revision) => Some(self.adapter_body(&folder, revision).await?),
+                None => None,
+            };
+            let body = AdapterBody {
+                schema: SCHEMA,
+                adapter: name.to_owned(),
+                revision: newest.as_ref().map_or(1, |body| body.revision + 1),
+                created: chrono::Utc::now().to_rfc3339(),
+                source: adapter.source().into(),
+                weights: weights.clone(),
+                twist_frame: "body".to_owned(),
+                deviation_ddof: 0,
+                training: record.into(),
+            };
+            if let Some(newest) = newest {
+                let same = AdapterBody { revision: newest.revision, created: newest.created.clone(), ..body.clone() };
+                if same == newest {
+                    let manifest = revision_path(&folder, newest.revision).to_string();
+                    return Ok(Published { revision: newest.revision, is_new: false, manifest });
+                }
+            }
+            let manifest = revision_path(&folder, body.revision).to_string();
+            if self.write_manifest(&folder, body.revision, manifest::encode(&manifest, &body)?).await? {
+                return Ok(Published { revision: body.revision, is_new: true, manifest });
+            }
+        }
+        Err(Error::Contended { name: name.to_owned() })
+    }
+
+    /// Loads an adapter, its newest revision if none is named, and runs its golden vectors.
+    ///
+    /// # Errors
+    /// [`Error::Unknown`], [`Error::UnknownRevision`], [`Error::Damaged`], or as the store fails.
+    pub async fn load_adapter(&self, name: &str, revision: Option<u64>) -> Result<StoredAdapter, Error> {
+        let (folder, revision) = self.resolve(Kind::Adapter, name, revision).await?;
+        let body = self.adapter_body(&folder, revision).await?;
+        let (file, bytes) = self.read_object(&folder, &body.weights).await?;
+        let damaged = |problem: String| Error::Damaged { file: file.clone(), problem };
+        let tensors = TensorReader::new(&file, &bytes)?;
+        let read = TENSOR_NAMES.map(|name| tensors.f32(name));
+        let mut arrays = Vec::with_capacity(read.len());
+        for array in read {
+            arrays.push(array?);
+        }
+        let arrays = <[Array2<f32>; 7]>::try_from(arrays).map_err(|_| damaged("lacks a tensor".to_owned()))?;
+        let network = Siamese::from_tensors(arrays).map_err(|error| damaged(error.to_string()))?;
+        let scale = TargetScale {
+            mean: vector6(&tensors, "target.mean", &file)?,
+            deviation: vector6(&tensors, "target.deviation", &file)?,
+        };
+        let adapter = Adapter::new(body.source.into(), network, scale).map_err(|error| damaged(error.to_string()))?;
+        check_golden(&adapter, &tensors, &file)?;
+        let manifest = self.shown(&revision_path(&folder, revision));
+        let record = body.training.record().map_err(|word| Error::Damaged {
+            file: manifest,
+            problem: format!("{word} means nothing to this program"),
+        })?;
+        Ok(StoredAdapter { name: body.adapter, revision, created: body.created, adapter, record })
+    }
+
+    /// The names of all adapters.
+    ///
+    /// # Errors
+    /// As the store fails.
+    pub async fn adapter_names(&self) -> Result<Vec<String>, Error> {
+        self.names(Kind::Adapter).await
+    }
+
+    async fn adapter_body(&self, folder: &Path, revision: u64) -> Result<AdapterBody, Error> {
+        let path = revision_path(folder, revision);
+        manifest::decode(&self.shown(&path), &self.read(&path).await?)
+    }
+}
+
+fn adapter_file(name: &str, adapter: &Adapter, features: ArrayView2<'_, f32>) -> Result<Vec<u8>, Error> {
+    let damaged = |problem: String| Error::Damaged { file: name.to_owned(), problem };
+    let mut tensors = TensorWriter::default();
+    for (name, array) in TENSOR_NAMES.into_iter().zip(adapter.network().tensors()) {
+        let is_vector = array.nrows() == 1 && name != "W.weight";
+        let shape = if is_vector { vec![array.ncols()] } else { array.shape().to_vec() };
+        tensors.f32(name, &shape, array.iter().copied());
+    }
+    tensors.f64("target.mean", &[6], adapter.scale().mean.iter().copied());
+    tensors.f64("target.deviation", &[6], adapter.scale().deviation.iter().copied());
+    let rows: Vec<usize> = (0..features.nrows()).step_by(features.nrows().div_ceil(GOLDEN_ROWS).max(1)).collect();
+    let golden = features.select(ndarray::Axis(0), &rows);
+    let latents = adapter.embed(golden.view()).map_err(|error| damaged(error.to_string()))?;
+    let twists = golden_twists(adapter, &latents);
+    tensors.f32("golden.features", &[golden.nrows(), golden.ncols()], golden.iter().copied());
+    tensors.f64("golden.latents", &[latents.nrows(), latents.ncols()], latents.iter().copied());
+    tensors.f64("golden.twists", &[twists.nrows(), 6], twists.iter().copied());
+    tensors.finish(name)
+}
+
+/// The motion from the first golden latent to each, shape (n, 6).
+fn golden_twists(adapter: &Adapter, latents: &Array2<f64>) -> Array2<f64> {
+    Array2::from_shape_fn((latents.nrows(), 6), |(row, column)| {
+        adapter.motion(latents.row(0), latents.row(row)).to_vector()[column]
+    })
+}
+
+fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Result<(), Error> {
+    let damaged = |problem: String| Error::Damaged { file: file.to_owned(), problem };
+    let features = tensors.f32("golden.features")?;
+    if features.nrows() == 0 {
+        return Err(damaged("has no golden inputs".to_owned()));
+    }
+    let latents = adapter.embed(features.view()).map_err(|error| damaged(error.to_string()))?;
+    let twists = golden_twists(adapter, &latents);
+    for (what, found, stored) in
+        [("latents", latents, tensors.f64("golden.latents")?), ("twists", twists, tensors.f64("golden.twists")?)]
+    {
+        let off = |(found, stored): (&f64, &f64)| (found - stored).abs() > GOLDEN_TOLERANCE * stored.abs().max(1.0);
+        if found.dim() != stored.dim() || found.iter().zip(&stored).any(off) {
+            return Err(damaged(format!(
+                "its golden inputs do not give its golden {what} on this machine; publish it again"
+            )));
+        }
+    }
+    Ok(())
+}
+
+fn vector6(tensors: &TensorReader<'_>, name: &str, file: &str) -> Result<Vector6<f64>, Error> {
+    let array = tensors.f64(name)?;
+    if array.dim() != (1, 6) {
+        return Err(Error::Damaged { file: file.to_owned(), problem: format!("'{name}' does not have 6 numbers") });
+    }
+    Ok(Vector6::from_fn(|row, _| array[(0, row)]))
+}

@@ -1,0 +1,237 @@
+//! Rooms in the store.
+
+use object_store::path::Path;
+
+use super::format::{FeaturesEntry, RoomBody, TensorReader, TensorWriter};
+use super::manifest::{self, SCHEMA};
+use super::{ATTEMPTS, Error, Kind, Published, Store, revision_path};
+use crate::features::{FeatureSource, Features};
+use crate::geometry::{Pose, nearest_rotation};
+use crate::room::{Frames, Room, RoomId, is_plain_name};
+
+/// A room as it was stored.
+#[derive(Debug, Clone)]
+pub struct StoredRoom {
+    /// The room.
+    pub room: Room,
+    /// Counted from 1.
+    pub revision: u64,
+    /// When it was published, RFC 3339.
+    pub created: String,
+    /// All its features, or those that were asked for.
+    pub features: Vec<Features>,
+}
+
+/// What a manifest says of a room.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RoomSummary {
+    /// Its name.
+    pub room: String,
+    /// The newest revision.
+    pub revision: u64,
+    /// Its frames.
+    pub frame_count: usize,
+    /// What its features were made by.
+    pub features: Vec<FeatureSource>,
+}
+
+impl Store {
+    /// Publishes a room with features. Features of other names that the newest revision has stay with the room as
+    /// long as its frames are the same; publishing the same again makes no revision.
+    ///
+    /// # Errors
+    /// [`Error::FeatureRows`], [`Error::DuplicateFeatures`], [`Error::Name`], or as the store fails.
+    pub async fn publish_room(&self, room: &Room, features: &[Features]) -> Result<Published, Error> {
+        for (position, set) in features.iter().enumerate() {
+            let (name, rows) = (set.source().name.clone(), set.rows().nrows());
+            if !is_plain_name(&name) {
+                return Err(Error::Name { what: "features", name });
+            }
+            if features[..position].iter().any(|other| other.source().name == name) {
+                return Err(Error::DuplicateFeatures { name });
+            }
+            if rows != room.frame_count() {
+                let (room, frame_count) = (room.id().to_string(), room.frame_count());
+                return Err(Error::FeatureRows { name, rows, room, frame_count });
+            }
+        }
+        let folder = Path::from(Kind::Room.folder()).join(room.id().as_str());
+        let frames = self.write_object(&folder, "frames", "safetensors", frames_file(room)?).await?;
+        let frame_names = match room.frame_names() {
+            [] => None,
+            names => Some(self.write_object(&folder, "frame-names", "json", names_file(names)?).await?),
+        };
+        let mut entries = Vec::with_capacity(features.len());
+        for set in features {
+            let stem = format!("features-{}", set.source().name);
+            let object = self.write_object(&folder, &stem, "safetensors", features_file(set)?).await?;
+            entries.push(FeaturesEntry { source: set.source().into(), object });
+        }
+        for _ in 0..ATTEMPTS {
+            let newest = match self.revisions(&folder).await?.last() {
+                Some(&revision) => Some(self.room_body(&folder, revision).await?),
+                None => None,
+            };
+            let mut body = RoomBody {
+                schema: SCHEMA,
+                room: room.id().to_string(),
+                revision: newest.as_ref().map_or(1, |body| body.revision + 1),
+                created: chrono::Utc::now().to_rfc3339(),
+                frame_count: room.frame_count(),
+                frames: frames.clone(),
+                frame_names: frame_names.clone(),
+                features: entries.clone(),
+                provenance: room.provenance().into(),
+            };
+            if let Some(newest) = newest {
+                if newest.frames == body.frames {
+                    let given = |entry: &FeaturesEntry| entries.iter().any(|e| e.source.name() == entry.source.name());
+                    body.features.extend(newest.features.iter().filter(|entry| !given(entry)).cloned());
+                }
+                body.features.sort_by(|a, b| a.source.name().cmp(b.source.name()));
+                let same = RoomBody { revision: newest.revision, created: newest.created.clone(), ..body.clone() };
+                if same == newest {
+                    let manifest = revision_path(&folder, newest.revision).to_string();
+                    return Ok(Published { revision: newest.revision, is_new: false, manifest });
+                }
+            }
+            body.features.sort_by(|a, b| a.source.name().cmp(b.source.name()));
+            let manifest = revision_path(&folder, body.revision).to_string();
+            if self.write_manifest(&folder, body.revision, manifest::encode(&manifest, &body)?).await? {
+                return Ok(Published { revision: body.revision, is_new: true, manifest });
+            }
+        }
+        Err(Error::Contended { name: room.id().to_string() })
+    }
+
+    /// Loads a room, its newest revision if none is named, with all its features.
+    ///
+    /// # Errors
+    /// [`Error::Unknown`], [`Error::UnknownRevision`], [`Error::Damaged`], or as the store fails.
+    pub async fn load_room(&self, name: &str, revision: Option<u64>) -> Result<StoredRoom, Error> {
+        self.load(name, revision, None).await
+    }
+
+    /// Loads a room with one of its features; the only one, if no name is given.
+    ///
+    /// # Errors
+    /// As [`Store::load_room`], and [`Error::UnknownFeatures`].
+    pub async fn load_room_with(&self, name: &str, features: Option<&str>) -> Result<(StoredRoom, Features), Error> {
+        let (folder, revision) = self.resolve(Kind::Room, name, None).await?;
+        let body = self.room_body(&folder, revision).await?;
+        let known: Vec<String> = body.features.iter().map(|entry| entry.source.name().to_owned()).collect();
+        let unknown = |wanted: &str| Error::UnknownFeatures {
+            room: name.to_owned(),
+            name: wanted.to_owned(),
+            known: known.clone(),
+        };
+        let wanted = match (features, known.as_slice()) {
+            (Some(wanted), _) if known.iter().any(|name| name == wanted) => wanted.to_owned(),
+            (Some(wanted), _) => return Err(unknown(wanted)),
+            (None, [only]) => only.clone(),
+            (None, _) => return Err(unknown("(none named)")),
+        };
+        let mut stored = self.load(name, Some(revision), Some(&wanted)).await?;
+        let features = stored.features.pop().ok_or_else(|| unknown(&wanted))?;
+        Ok((stored, features))
+    }
+
+    /// What the newest manifest of every room says, by name.
+    ///
+    /// # Errors
+    /// [`Error::Damaged`], or as the store fails.
+    pub async fn rooms(&self) -> Result<Vec<RoomSummary>, Error> {
+        let mut summaries = Vec::new();
+        for room in self.names(Kind::Room).await? {
+            let (folder, revision) = self.resolve(Kind::Room, &room, None).await?;
+            let body = self.room_body(&folder, revision).await?;
+            let features = body.features.into_iter().map(|entry| entry.source.into()).collect();
+            summaries.push(RoomSummary { room, revision, frame_count: body.frame_count, features });
+        }
+        Ok(summaries)
+    }
+
+    async fn load(&self, name: &str, revision: Option<u64>, only: Option<&str>) -> Result<StoredRoom, Error> {
+        let (folder, revision) = self.resolve(Kind::Room, name, revision).await?;
+        let body = self.room_body(&folder, revision).await?;
+        let (file, bytes) = self.read_object(&folder, &body.frames).await?;
+        let mut frames = read_frames(&file, &bytes)?;
+        if let Some(object) = &body.frame_names {
+            let (file, bytes) = self.read_object(&folder, object).await?;
+            frames.names =
+                serde_json::from_slice(&bytes).map_err(|error| Error::Damaged { file, problem: error.to_string() })?;
+        }
+        let manifest = self.shown(&revision_path(&folder, revision));
+        let damaged = |problem: String| Error::Damaged { file: manifest.clone(), problem };
+        let id = RoomId::new(&body.room).map_err(|error| damaged(error.to_string()))?;
+        let room = Room::new(id, frames, body.provenance.into()).map_err(|error| damaged(error.to_string()))?;
+        let mut features = Vec::new();
+        for entry in body.features.into_iter().filter(|entry| only.is_none_or(|name| name == entry.source.name())) {
+            let (file, bytes) = self.read_object(&folder, &entry.object).await?;
+            let rows = TensorReader::new(&file, &bytes)?.f32("features")?;
+            let set = Features::new(entry.source.into(), rows)
+                .map_err(|error| Error::Damaged { file: file.clone(), problem: error.to_string() })?;
+            if set.rows().nrows() != room.frame_count() {
+                let problem = format!("has {} rows, the room {} frames", set.rows().nrows(), room.frame_count());
+                return Err(Error::Damaged { file, problem });
+            }
+            features.push(set);
+        }
+        Ok(StoredRoom { room, revision, created: body.created, features })
+    }
+
+    async fn room_body(&self, folder: &Path, revision: u64) -> Result<RoomBody, Error> {
+        let path = revision_path(folder, revision);
+        manifest::decode(&self.shown(&path), &self.read(&path).await?)
+    }
+}
+
+fn frames_file(room: &Room) -> Result<Vec<u8>, Error> {
+    let n = room.frame_count();
+    let mut tensors = TensorWriter::default();
+    let rows = room.poses().iter().flat_map(|pose| pose.to_homogeneous().transpose().as_slice().to_vec());
+    tensors.f64("world_from_camera", &[n, 4, 4], rows);
+    if !room.timestamps_ns().is_empty() {
+        tensors.i64("timestamps_ns", &[n], room.timestamps_ns().iter().copied());
+    }
+    tensors.finish("frames")
+}
+
+fn names_file(names: &[String]) -> Result<Vec<u8>, Error> {
+    serde_json::to_vec(names)
+        .map_err(|error| Error::Damaged { file: "frame-names".to_owned(), problem: error.to_string() })
+}
+
+fn features_file(features: &Features) -> Result<Vec<u8>, Error> {
+    let rows = features.rows();
+    let mut tensors = TensorWriter::default();
+    tensors.f32("features", &[rows.nrows(), rows.ncols()], rows.iter().copied());
+    tensors.finish("features")
+}
+
+fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
+    let tensors = TensorReader::new(file, bytes)?;
+    let damaged = |problem: String| Error::Damaged { file: file.to_owned(), problem };
+    let matrices = tensors.f64("world_from_camera")?;
+    if matrices.ncols() != 16 {
+        return Err(damaged("'world_from_camera' is not (n, 4, 4)".to_owned()));
+    }
+    let pose = |(row, matrix): (usize, ndarray::ArrayView1<'_, f64>)| {
+        let m = nalgebra::Matrix4::from_row_iterator(matrix.iter().copied());
+        let rotation = nearest_rotation(&m.fixed_view::<3, 3>(0, 0).into_owned());
+        let rotation = rotation.ok_or_else(|| damaged(format!("frame {row} has no rotation")))?.rotation;
+        let quaternion = nalgebra::UnitQuaternion::from_rotation_matrix(&rotation);
+        Ok(Pose::from_parts(m.fixed_view::<3, 1>(0, 3).into_owned().into(), quaternion))
+    };
+    let poses = matrices.outer_iter().enumerate().map(pose).collect::<Result<_, Error>>()?;
+    let timestamps_ns =
+        if tensors.has("timestamps_ns") { tensors.i64("timestamps_ns")?.iter().copied().collect() } else { Vec::new() };
+    Ok(Frames { poses, timestamps_ns, names: Vec::new() })
+}
+
+impl StoredRoom {
+    /// The features of this name.
+    pub fn features(&self, name: &str) -> Option<&Features> {
+        self.features.iter().find(|features| features.source().name == name)
+    }
+}

@@ -1,0 +1,80 @@
+//! The way a hand-held camera goes: calm, never quite the same twice, and back to where it has been.
+
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::Scene;
+use crate::geometry::Pose;
+
+/// A coordinate that swings slowly, with the hand's tremor on it.
+struct Swing {
+    amplitude: f64,
+    period: f64,
+    phase: f64,
+    tremor: f64,
+    tremor_phase: f64,
+}
+
+impl Swing {
+    fn new(amplitude: f64, period: f64, random: &mut ChaCha8Rng) -> Self {
+        let mut phase = || random.random_range(0.0..std::f64::consts::TAU);
+        Self { amplitude, period, phase: phase(), tremor: 0.03 * amplitude, tremor_phase: phase() }
+    }
+
+    fn at(&self, frame: f64) -> f64 {
+        let turn = std::f64::consts::TAU * frame;
+        self.amplitude * (turn / self.period + self.phase).sin() + self.tremor * (turn / 23.0 + self.tremor_phase).sin()
+    }
+}
+
+/// `frame_count` poses through the middle of a scene, `world_from_camera`, metres, about 30 a second.
+pub fn camera_path(scene: &Scene, frame_count: usize, seed: u64) -> Vec<Pose> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    random.set_stream(1);
+    let size = scene.size();
+    let mut swing = |amplitude: f64, period: f64| {
+        let period = period * random.random_range(0.92..1.08);
+        Swing::new(amplitude, period, &mut random)
+    };
+    let x = swing(size.x * 0.13, 420.0);
+    let y = swing(size.y * 0.13, 310.0);
+    let z = swing(0.09, 190.0);
+    let yaw = swing(0.55, 530.0);
+    let pitch = swing(0.09, 240.0);
+    let roll = swing(0.05, 170.0);
+    let heading = random.random_range(0.0..std::f64::consts::TAU);
+    (0..frame_count)
+        .map(|frame| {
+            let t = frame as f64;
+            let position = Vector3::new(size.x * 0.5 + x.at(t), size.y * 0.5 + y.at(t), 1.5 + z.at(t));
+            let orientation = looking(heading + yaw.at(t), -0.12 + pitch.at(t), roll.at(t));
+            Isometry3::from_parts(Translation3::from(position), UnitQuaternion::from_rotation_matrix(&orientation))
+        })
+        .collect()
+}
+
+/// `world_from_camera` of a camera that looks along `yaw` from the x axis, `pitch` above the horizon, tilted by
+/// `roll` about its own view; radians.
+fn looking(yaw: f64, pitch: f64, roll: f64) -> Rotation3<f64> {
+    let forward = Vector3::new(yaw.cos() * pitch.cos(), yaw.sin() * pitch.cos(), pitch.sin());
+    let right = Vector3::new(yaw.sin(), -yaw.cos(), 0.0);
+    let down = forward.cross(&right);
+    let level = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[right, down, forward]));
+    level * Rotation3::from_axis_angle(&Vector3::z_axis(), roll)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the crate's camera axes. Looking along world x, the image's right is world −y and its down world −z.
+    #[test]
+    fn a_level_camera_has_y_down_and_z_forward() {
+        let rotation = looking(0.0, 0.0, 0.0);
+        assert!((rotation * Vector3::z() - Vector3::x()).norm() < 1e-12);
+        assert!((rotation * Vector3::y() + Vector3::z()).norm() < 1e-12);
+        assert!((rotation * Vector3::x() + Vector3::y()).norm() < 1e-12);
+        assert!((rotation.matrix().determinant() - 1.0).abs() < 1e-12);
+    }
+}
