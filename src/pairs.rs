@@ -2,7 +2,7 @@
 //!
 //! A pair (i, j) is two frames of one room, j = i + stride. Frame i is the source, frame j the target.
 
-use rand::{Rng, RngExt, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::room::FrameId;
@@ -168,13 +168,6 @@ impl Side {
             Self::Train => "training",
             Self::Test => "test",
         }
-    }
-}
-
-/// Puts `items` in an order drawn from `random`: Fisher and Yates' shuffle.
-pub fn shuffle<T>(items: &mut [T], random: &mut impl Rng) {
-    for last in (1..items.len()).rev() {
-        items.swap(last, random.random_range(0..=last));
     }
 }
 

@@ -9,6 +9,7 @@ mod loss;
 mod preset;
 mod real;
 mod record;
+mod seeded;
 mod siamese;
 mod train;
 

@@ -3,11 +3,9 @@
 //! φ = Linear(d, 64) → LayerNorm(64) → GELU (erf) → Linear(64, 20). Rows are samples. Tensors are named and shaped
 //! as PyTorch's state dict names them: `phi.0.weight` (64, d), …, `W.weight` (6, 20); vectors are (1, n) here.
 
-use ndarray::{Array2, ArrayView2, Axis, Zip};
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-
+use super::seeded::Seeded;
 use super::{Error, Real};
+use ndarray::{Array2, ArrayView2, Axis, Zip};
 
 /// Added to a LayerNorm's variance, PyTorch's default.
 const LAYER_NORM_EPS: f64 = 1e-5;
@@ -54,12 +52,11 @@ pub struct Widths {
 
 impl<T: Real> Siamese<T> {
     /// A network drawn as PyTorch draws it: linear weights and biases uniform in ±1/√fan_in, LayerNorm 1 and 0.
-    pub fn random(widths: Widths, seed: u64) -> Self {
+    pub(super) fn random(widths: Widths, random: &mut Seeded) -> Self {
         let Widths { feature, hidden, latent } = widths;
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
         let mut uniform = |rows: usize, columns: usize, fan_in: usize| {
             let bound = (fan_in as f64).sqrt().recip();
-            Array2::from_shape_simple_fn((rows, columns), || T::of(random.random_range(-bound..bound)))
+            Array2::from_shape_simple_fn((rows, columns), || T::of(f64::from(random.symmetric(bound))))
         };
         Self {
             first_weight: uniform(hidden, feature, feature),
@@ -70,6 +67,11 @@ impl<T: Real> Siamese<T> {
             last_bias: uniform(1, latent, hidden),
             motion: uniform(6, latent, latent),
         }
+    }
+
+    /// The initial weights of a seed: those that PyTorch gives the same network after `torch.manual_seed(seed)`.
+    pub fn initial(widths: Widths, seed: u64) -> Self {
+        Self::random(widths, &mut Seeded::new(seed))
     }
 
     /// Takes the seven tensors in the order of [`TENSOR_NAMES`], vectors as (1, n).

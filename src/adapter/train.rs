@@ -1,16 +1,14 @@
 //! Training: AdamW with decoupled decay on every parameter, global-norm clipping, seeded order.
 //!
 //! A frame occurs in many pairs, so φ runs once for each distinct frame of a batch; the gradient of its latent is
-//! the sum over its pairs. On one machine the same seed gives the same bits.
+//! the sum over its pairs. On one machine the same seed gives the same bits; a seed draws the weights and orders that
+//! PyTorch draws from it (`torch.manual_seed`, the module, then `torch.randperm` an epoch).
 
-use ndarray::{Array2, ArrayView2, Axis, Zip};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
-
+use super::seeded::Seeded;
 use super::siamese::Widths;
 use super::{Error, LATENT_DIM, Real, Siamese, TargetScale, mean_squared_error};
 use crate::geometry::Twist;
-use crate::pairs::shuffle;
+use ndarray::{Array2, ArrayView2, Axis, Zip};
 
 const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;
@@ -213,12 +211,10 @@ pub fn train(
     progress: &mut dyn FnMut(EpochProgress),
 ) -> Result<Siamese<f32>, Error> {
     let widths = Widths { feature: samples.features.ncols(), hidden: config.hidden, latent: config.latent };
-    let mut trainer = Trainer::new(samples, Siamese::random(widths, config.seed), config.clone());
-    let mut random = ChaCha8Rng::seed_from_u64(config.seed);
-    random.set_stream(1);
-    let mut order: Vec<usize> = (0..samples.pair_count()).collect();
+    let mut random = Seeded::new(config.seed);
+    let mut trainer = Trainer::new(samples, Siamese::random(widths, &mut random), config.clone());
     for epoch in 1..=config.epochs {
-        shuffle(&mut order, &mut random);
+        let order = random.permutation(samples.pair_count());
         let losses: Vec<f64> = order.chunks(config.batch.max(1)).map(|batch| trainer.step(batch).loss).collect();
         let loss = crate::scores::mean(&losses);
         if !loss.is_finite() {

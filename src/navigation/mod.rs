@@ -24,8 +24,10 @@ pub const MAX_TRANSLATION_M: f64 = 1e6;
 /// Why a question has no answer.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum Error {
-    #[error(transparent)]
-    Room(#[from] room::Error),
+    #[error("source: {0}")]
+    SourceFrame(room::Error),
+    #[error("target: {0}")]
+    TargetFrame(room::Error),
     #[error(transparent)]
     Adapter(#[from] adapter::Error),
     #[error(transparent)]

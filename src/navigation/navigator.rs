@@ -123,11 +123,11 @@ impl Navigator {
     /// The latent, the frame and the pose of a source.
     ///
     /// # Errors
-    /// [`Error::Room`] for an unknown frame, [`Error::Adapter`] for a feature or latent that does not fit.
+    /// [`Error::SourceFrame`] for an unknown frame, [`Error::Adapter`] for a feature or latent that does not fit.
     pub fn start(&self, source: &Source, pose: Option<Pose>) -> Result<Start, Error> {
         match source {
             Source::Frame(frame) => {
-                let pose = *self.room.pose(*frame)?;
+                let pose = *self.room.pose(*frame).map_err(Error::SourceFrame)?;
                 let latent = self.latents.row(frame.row()).to_owned();
                 Ok(Start { latent, frame: Some(*frame), pose: Some(pose) })
             }
@@ -184,7 +184,7 @@ impl Navigator {
     fn twists(&self, displacement: &Displacement, start: &Start) -> Result<Vec<Twist>, Error> {
         let target = match displacement {
             Displacement::Twists(twists) => return Ok(twists.clone()),
-            Displacement::TargetFrame(frame) => *self.room.pose(*frame)?,
+            Displacement::TargetFrame(frame) => *self.room.pose(*frame).map_err(Error::TargetFrame)?,
             Displacement::TargetPose(pose) => *pose,
         };
         let source = start.pose.ok_or(Error::PoseNeeded { what: "a target" })?;

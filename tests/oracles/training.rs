@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use ndarray::Array2;
-use seese3::adapter::{Real, Samples, Siamese, TENSOR_NAMES, TrainConfig, Trainer};
+use seese3::adapter::{Real, Samples, Siamese, TENSOR_NAMES, TrainConfig, Trainer, Widths};
 use seese3::geometry::body_twist;
 use seese3::pairs::{Pair, Split};
 
@@ -81,6 +81,17 @@ fn fifty_steps_in_f64_match_pytorch() {
 fn fifty_steps_in_f32_stay_as_near_as_pytorch_does() {
     for (room, folder) in oracle_rooms("fifty_steps_in_f32_stay_as_near_as_pytorch_does") {
         check::<f32>(room, &folder, |run, name| 10.0 * number(&run["float32_run"]["max_abs_diff_from_float64"][name]));
+    }
+}
+
+/// Oracle: PyTorch 2.15 after `torch.manual_seed(0)`, bit by bit.
+#[test]
+fn a_seed_gives_pytorchs_initial_weights() {
+    for (room, folder) in oracle_rooms("a_seed_gives_pytorchs_initial_weights") {
+        let expected = network::<f32>(&folder.join(format!("m4_adapter/{room}_k1_init.safetensors")), "");
+        let widths = Widths { feature: expected.feature_dim(), hidden: 64, latent: 20 };
+        assert_eq!(Siamese::<f32>::initial(widths, 0), expected, "{room}");
+        assert_ne!(Siamese::<f32>::initial(widths, 1), expected, "{room}");
     }
 }
 

@@ -1,0 +1,46 @@
+//! Random numbers as PyTorch draws them on the CPU, so that a seed here gives the very run that it gives there.
+//!
+//! MT19937 seeded by `torch.manual_seed(seed)`; a float takes the low 24 bits of a draw; `torch.randperm` takes one
+//! draw a place. Initial weights are compared with PyTorch's bit by bit in the tests.
+
+use rand_mt::Mt;
+
+/// The state of `torch.manual_seed`'s generator.
+pub(super) struct Seeded(Mt);
+
+impl Seeded {
+    /// `torch.manual_seed(seed)`, which takes the low 32 bits.
+    pub fn new(seed: u64) -> Self {
+        Self(Mt::new(seed as u32))
+    }
+
+    /// One number of `uniform_(-bound, bound)` on a float tensor.
+    pub fn symmetric(&mut self, bound: f64) -> f32 {
+        let (low, high) = (-bound as f32, bound as f32);
+        let unit = (self.0.next_u32() & 0x00ff_ffff) as f32 * 2f32.powi(-24);
+        unit.mul_add(high - low, low)
+    }
+
+    /// `torch.randperm(count)`.
+    pub fn permutation(&mut self, count: usize) -> Vec<usize> {
+        let mut order: Vec<usize> = (0..count).collect();
+        for place in 0..count.saturating_sub(1) {
+            let ahead = self.0.next_u32() as usize % (count - place);
+            order.swap(place, place + ahead);
+        }
+        order
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: `torch.manual_seed(3); torch.randperm(10)`, then five of `torch.randperm(1000)`, PyTorch 2.15.
+    #[test]
+    fn permutations_are_pytorchs() {
+        let mut random = Seeded::new(3);
+        assert_eq!(random.permutation(10), [6, 0, 3, 7, 8, 5, 1, 9, 2, 4]);
+        assert_eq!(random.permutation(1000)[..5], [739, 917, 459, 849, 525]);
+    }
+}

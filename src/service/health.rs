@@ -1,0 +1,76 @@
+//! The standard health service, `grpc.health.v1`: Check and Watch, for the server, each service and each room.
+//!
+//! Names: `""`, the services' full names, `rooms/NAME`. Watch of a name that is not known says SERVICE_UNKNOWN and
+//! stays open, as the specification wants.
+
+use std::pin::Pin;
+
+use tokio::sync::watch;
+use tokio_stream::{Stream, StreamExt, wrappers::WatchStream};
+use tonic::server::NamedService;
+use tonic::{Request, Response, Status};
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_server::{Health, HealthServer};
+use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
+
+use super::{Handlers, Phase};
+use crate::proto::v1::catalog_service_server::CatalogServiceServer;
+use crate::proto::v1::evaluation_service_server::EvaluationServiceServer;
+use crate::proto::v1::localization_service_server::LocalizationServiceServer;
+use crate::proto::v1::navigation_service_server::NavigationServiceServer;
+use crate::proto::v1::odometry_service_server::OdometryServiceServer;
+
+const SERVICES: [&str; 6] = [
+    "",
+    <NavigationServiceServer<Handlers> as NamedService>::NAME,
+    <LocalizationServiceServer<Handlers> as NamedService>::NAME,
+    <OdometryServiceServer<Handlers> as NamedService>::NAME,
+    <CatalogServiceServer<Handlers> as NamedService>::NAME,
+    <EvaluationServiceServer<Handlers> as NamedService>::NAME,
+];
+
+pub struct HealthOf(watch::Receiver<Phase>);
+
+/// The health of a server in this phase.
+pub fn service(phase: watch::Receiver<Phase>) -> HealthServer<HealthOf> {
+    HealthServer::new(HealthOf(phase))
+}
+
+/// The status of a name, or none if it is not known.
+fn status(phase: &Phase, name: &str) -> Option<ServingStatus> {
+    let has_room = |snapshot: &super::Snapshot| {
+        name.strip_prefix("rooms/").is_some_and(|room| snapshot.rooms().contains_key(room))
+    };
+    let known = SERVICES.contains(&name);
+    match phase {
+        Phase::Serving(snapshot) if known || has_room(snapshot) => Some(ServingStatus::Serving),
+        Phase::Draining(snapshot) if known || has_room(snapshot) => Some(ServingStatus::NotServing),
+        Phase::Loading | Phase::Stopping if known => Some(ServingStatus::NotServing),
+        _ => None,
+    }
+}
+
+#[tonic::async_trait]
+impl Health for HealthOf {
+    type WatchStream = Pin<Box<dyn Stream<Item = Result<HealthCheckResponse, Status>> + Send>>;
+
+    async fn check(&self, request: Request<HealthCheckRequest>) -> Result<Response<HealthCheckResponse>, Status> {
+        let name = request.into_inner().service;
+        match status(&self.0.borrow(), &name) {
+            Some(status) => Ok(Response::new(HealthCheckResponse { status: status.into() })),
+            None => Err(Status::not_found(format!("service '{name}' is not known"))),
+        }
+    }
+
+    async fn watch(&self, request: Request<HealthCheckRequest>) -> Result<Response<Self::WatchStream>, Status> {
+        let name = request.into_inner().service;
+        let mut last = None;
+        let changes = WatchStream::new(self.0.clone()).filter_map(move |phase| {
+            let now = status(&phase, &name).unwrap_or(ServingStatus::ServiceUnknown);
+            let changed = last != Some(now);
+            last = Some(now);
+            changed.then(|| Ok(HealthCheckResponse { status: now.into() }))
+        });
+        Ok(Response::new(Box::pin(changes)))
+    }
+}

@@ -1,0 +1,147 @@
+//! All that a server answers from, loaded and verified. Immutable.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use super::{Error, RunError};
+use crate::features::FeatureSource;
+use crate::navigation::{IndexKind, Navigator};
+use crate::room::Room;
+use crate::store::{Store, StoredAdapter};
+
+/// A room that is served.
+pub struct ServedRoom {
+    /// The room.
+    pub room: Arc<Room>,
+    /// Its revision.
+    pub revision: u64,
+    /// When that was published, RFC 3339.
+    pub created: String,
+    /// What its features were made by.
+    pub sources: Vec<FeatureSource>,
+    /// One for each adapter that fits, the default first.
+    pub navigators: Vec<Arc<ServedNavigator>>,
+}
+
+/// A room under an adapter.
+pub struct ServedNavigator {
+    /// Answers.
+    pub navigator: Navigator,
+    /// With whose numbers.
+    pub adapter: Arc<StoredAdapter>,
+    /// The room's revision.
+    pub room_revision: u64,
+}
+
+/// Rooms and adapters, newest revisions.
+pub struct Snapshot {
+    rooms: BTreeMap<String, ServedRoom>,
+    adapters: BTreeMap<String, Arc<StoredAdapter>>,
+}
+
+impl Snapshot {
+    /// How many rooms it has.
+    pub fn room_count(&self) -> usize {
+        self.rooms.len()
+    }
+
+    /// How many adapters it has.
+    pub fn adapter_count(&self) -> usize {
+        self.adapters.len()
+    }
+
+    /// Rooms by name.
+    pub fn rooms(&self) -> &BTreeMap<String, ServedRoom> {
+        &self.rooms
+    }
+
+    /// Adapters by name.
+    pub fn adapters(&self) -> &BTreeMap<String, Arc<StoredAdapter>> {
+        &self.adapters
+    }
+
+    /// A room by name.
+    pub fn room(&self, name: &str) -> Result<&ServedRoom, Error> {
+        if name.is_empty() {
+            return Err(Error::invalid("room", "is required"));
+        }
+        self.rooms.get(name).ok_or_else(|| Error::NotFound { field: "room".to_owned(), name: name.to_owned() })
+    }
+
+    /// An adapter by name.
+    pub fn adapter(&self, name: &str) -> Result<&Arc<StoredAdapter>, Error> {
+        self.adapters.get(name).ok_or_else(|| Error::NotFound { field: "adapter".to_owned(), name: name.to_owned() })
+    }
+
+    /// A room under the adapter of that name, or under its default if the name is empty.
+    pub fn navigator(&self, room: &str, adapter: &str) -> Result<&Arc<ServedNavigator>, Error> {
+        let served = self.room(room)?;
+        if adapter.is_empty() {
+            return served
+                .navigators
+                .first()
+                .ok_or_else(|| Error::Precondition(format!("no adapter fits room '{room}'; train one")));
+        }
+        let wanted = self.adapter(adapter)?;
+        served.navigators.iter().find(|navigator| navigator.adapter.name == wanted.name).ok_or_else(|| {
+            let source = &wanted.adapter.source().name;
+            Error::Precondition(format!("room '{room}' has no features '{source}', which adapter '{adapter}' needs"))
+        })
+    }
+}
+
+/// Loads every room and adapter of a store and makes their navigators, off the serving threads.
+pub async fn load(store: Store, index: IndexKind) -> Result<Snapshot, RunError> {
+    let runtime = tokio::runtime::Handle::current();
+    let loading = tokio::task::spawn_blocking(move || runtime.block_on(load_all(&store, index)));
+    loading.await.map_err(|error| RunError::Loading(error.to_string()))?
+}
+
+async fn load_all(store: &Store, index: IndexKind) -> Result<Snapshot, RunError> {
+    let mut adapters = BTreeMap::new();
+    for name in store.adapter_names().await? {
+        let stored = store.load_adapter(&name, None).await?;
+        adapters.insert(name, Arc::new(stored));
+    }
+    let mut rooms = BTreeMap::new();
+    for summary in store.rooms().await? {
+        let stored = store.load_room(&summary.room, None).await?;
+        let room = Arc::new(stored.room);
+        let mut fitting: Vec<&Arc<StoredAdapter>> = adapters.values().collect();
+        let rank = |a: &StoredAdapter| {
+            let learned_here = a.record.rooms.iter().any(|(name, _)| name == room.id());
+            (learned_here, a.created.clone(), a.name.clone())
+        };
+        fitting.sort_by_key(|adapter| std::cmp::Reverse(rank(adapter)));
+        let mut navigators = Vec::new();
+        for adapter in fitting {
+            let source = adapter.adapter.source();
+            let Some(features) = stored.features.iter().find(|features| features.source() == source) else {
+                continue;
+            };
+            let navigator = Navigator::new(room.clone(), features, Arc::new(adapter.adapter.clone()), index);
+            let navigator = navigator.map_err(|problem| RunError::Navigator {
+                adapter: adapter.name.clone(),
+                room: room.id().to_string(),
+                problem,
+            })?;
+            if let Some(audit) = navigator.audit() {
+                tracing::info!(
+                    room = %room.id(), adapter = adapter.name, frames = audit.frame_count,
+                    unreachable = audit.unreachable, recall = audit.recall, k = audit.k, queries = audit.queries,
+                    "approximate index audited against the exact scan"
+                );
+            }
+            let adapter = adapter.clone();
+            navigators.push(Arc::new(ServedNavigator { navigator, adapter, room_revision: stored.revision }));
+        }
+        let sources = stored.features.iter().map(|features| features.source().clone()).collect();
+        let served =
+            ServedRoom { room, revision: stored.revision, created: stored.created, sources, navigators };
+        rooms.insert(summary.room, served);
+    }
+    if rooms.is_empty() {
+        return Err(RunError::NoRoom { location: store.location().to_owned() });
+    }
+    Ok(Snapshot { rooms, adapters })
+}

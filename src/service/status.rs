@@ -1,0 +1,156 @@
+//! What went wrong, as gRPC says it. The one place where status codes are chosen.
+
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt};
+
+use crate::{adapter, cancel, eval, navigation, pairs, room};
+
+/// The domain of this service's error reasons.
+const DOMAIN: &str = "seese3.v1";
+
+/// Why a request has no answer.
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum Error {
+    #[error("{field}: {problem}")]
+    Invalid { field: String, problem: String },
+    #[error("{field}: '{name}' is not served")]
+    NotFound { field: String, name: String },
+    #[error("{0}")]
+    Precondition(String),
+    #[error("the server is not ready: it is loading its store or stopping; try again")]
+    Loading,
+    #[error("the server is busy: too many requests wait; try again later")]
+    Busy,
+    #[error("the deadline passed before the answer was ready")]
+    Deadline,
+    #[error("the request was cancelled")]
+    Cancelled,
+    #[error("internal error; the request id is in the server's log")]
+    Internal,
+}
+
+impl Error {
+    /// A field that has to change.
+    pub fn invalid(field: impl Into<String>, problem: impl ToString) -> Self {
+        Self::Invalid { field: field.into(), problem: problem.to_string() }
+    }
+
+    /// The same error with its field inside another.
+    pub fn within(self, parent: &str) -> Self {
+        match self {
+            Self::Invalid { field, problem } => Self::Invalid { field: format!("{parent}.{field}"), problem },
+            Self::NotFound { field, name } => Self::NotFound { field: format!("{parent}.{field}"), name },
+            other => other,
+        }
+    }
+
+    /// The gRPC code.
+    pub fn code(&self) -> Code {
+        match self {
+            Self::Invalid { .. } => Code::InvalidArgument,
+            Self::NotFound { .. } => Code::NotFound,
+            Self::Precondition(_) => Code::FailedPrecondition,
+            Self::Loading => Code::Unavailable,
+            Self::Busy => Code::ResourceExhausted,
+            Self::Deadline => Code::DeadlineExceeded,
+            Self::Cancelled => Code::Cancelled,
+            Self::Internal => Code::Internal,
+        }
+    }
+
+    fn reason(&self) -> &'static str {
+        match self {
+            Self::Invalid { .. } => "INVALID_FIELD",
+            Self::NotFound { .. } => "NOT_SERVED",
+            Self::Precondition(_) => "PRECONDITION",
+            Self::Loading => "NOT_READY",
+            Self::Busy => "BUSY",
+            Self::Deadline => "DEADLINE",
+            Self::Cancelled => "CANCELLED",
+            Self::Internal => "INTERNAL",
+        }
+    }
+}
+
+impl From<Error> for Status {
+    fn from(error: Error) -> Self {
+        let mut details = ErrorDetails::new();
+        details.set_error_info(error.reason(), DOMAIN, std::collections::HashMap::new());
+        match &error {
+            Error::Invalid { field, problem } => {
+                details.add_bad_request_violation(field.clone(), problem.clone());
+            }
+            Error::NotFound { field, name } => {
+                details.set_resource_info(field.clone(), name.clone(), "", "is not served");
+            }
+            Error::Busy => {
+                details.set_retry_info(Some(std::time::Duration::from_millis(500)));
+            }
+            _ => {}
+        }
+        Self::with_error_details(error.code(), error.to_string(), details)
+    }
+}
+
+impl From<cancel::Cancelled> for Error {
+    fn from(_: cancel::Cancelled) -> Self {
+        Self::Cancelled
+    }
+}
+
+impl From<navigation::Error> for Error {
+    fn from(error: navigation::Error) -> Self {
+        use navigation::Error as E;
+        let field = match &error {
+            E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => {
+                return Self::NotFound { field: "source.frame_id".to_owned(), name: frame.to_string() };
+            }
+            E::TargetFrame(room::Error::UnknownFrame { frame, .. }) => {
+                let field = "displacement.target_frame_id".to_owned();
+                return Self::NotFound { field, name: frame.to_string() };
+            }
+            E::Cancelled(_) => return Self::Cancelled,
+            E::FeatureRows { .. } | E::Features(_) => return Self::Internal,
+            E::NoCandidates { .. } => return Self::Precondition(error.to_string()),
+            E::SourceFrame(_) => "source.frame_id",
+            E::TargetFrame(_) => "displacement.target_frame_id",
+            E::Adapter(problem) => return view_error(problem).within("source"),
+            E::Steps { .. } => "steps",
+            E::HitCount { .. } => "hit_count",
+            E::NoTwist | E::TwistNotFinite { .. } | E::TwistBeyondPi { .. } => "displacement",
+            E::PoseNeeded { .. } => "source_pose",
+        };
+        Self::invalid(field, error)
+    }
+}
+
+/// What is wrong with a feature or a latent; the field is relative to the view that holds it.
+pub fn view_error(error: &adapter::Error) -> Error {
+    use adapter::Error as E;
+    let field = match error {
+        E::LatentDim { .. } | E::NotFinite { what: "latent", .. } => "latent.values",
+        E::FeatureSource { .. } => "feature.source_name",
+        _ => "feature.values",
+    };
+    Error::invalid(field, error)
+}
+
+impl From<eval::Error> for Error {
+    fn from(error: eval::Error) -> Self {
+        use eval::Error as E;
+        let field = match &error {
+            E::Cancelled(_) => return Self::Cancelled,
+            E::Ridge(_) | E::Adapter(_) => return Self::Internal,
+            E::Room(_) => "room",
+            E::Pairs(pairs::Error::ZeroStride | pairs::Error::NoPairs { .. } | pairs::Error::EmptyRange { .. }) => {
+                "stride"
+            }
+            E::Threshold { .. } | E::ThresholdCount { .. } => "thresholds",
+            E::NoCandidates { .. } => "exclude_radius",
+            E::NoPredictions | E::MixedPredictions => "predictions",
+            E::NotACandidate { .. } => "retrieved_frame_id",
+            E::Prediction { position, problem } => return Self::invalid(format!("predictions[{position}]"), problem),
+        };
+        Self::invalid(field, error)
+    }
+}

@@ -1,0 +1,163 @@
+//! Where answers are computed: blocking threads, a bounded number at a time, with the caller's deadline.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::Semaphore;
+use tonic::metadata::MetadataMap;
+
+use super::{Config, Error};
+use crate::cancel::Cancellation;
+
+/// Computes requests off the async threads.
+#[derive(Clone)]
+pub struct Workers {
+    threads: Arc<Semaphore>,
+    admitted: Arc<Semaphore>,
+    longest: Duration,
+}
+
+/// Asks the work to stop when nobody waits for it any more.
+pub struct CancelOnDrop(pub Arc<Cancellation>);
+
+impl Drop for CancelOnDrop {
+    fn drop(&mut self) {
+        self.0.cancel();
+    }
+}
+
+impl Workers {
+    pub fn new(config: &Config) -> Self {
+        let threads = config.threads.max(1);
+        Self {
+            threads: Arc::new(Semaphore::new(threads)),
+            admitted: Arc::new(Semaphore::new(threads + config.queue)),
+            longest: config.longest,
+        }
+    }
+
+    /// How long a request may take: its own deadline, at most the server's.
+    pub fn budget(&self, metadata: &MetadataMap) -> Duration {
+        requested(metadata).map_or(self.longest, |deadline| deadline.min(self.longest))
+    }
+
+    /// Runs `work` on a blocking thread. It is told to stop when the budget is spent or the caller goes away; its
+    /// thread is free for others only once it has stopped.
+    ///
+    /// # Errors
+    /// [`Error::Busy`], [`Error::Deadline`], [`Error::Internal`] if it panicked, or its own.
+    pub async fn run<T: Send + 'static>(
+        &self,
+        budget: Duration,
+        work: impl FnOnce(&Cancellation) -> Result<T, Error> + Send + 'static,
+    ) -> Result<T, Error> {
+        let admitted = self.admitted.clone().try_acquire_owned().map_err(|_| Error::Busy)?;
+        let cancel = Arc::new(Cancellation::default());
+        let guard = CancelOnDrop(cancel.clone());
+        let computed = async {
+            let thread = self.threads.clone().acquire_owned().await.map_err(|_| Error::Internal)?;
+            let span = tracing::Span::current();
+            let task = tokio::task::spawn_blocking(move || {
+                let (_thread, _admitted) = (thread, admitted);
+                span.in_scope(|| work(&cancel))
+            });
+            task.await.unwrap_or_else(|error| {
+                tracing::error!(%error, "a request panicked");
+                Err(Error::Internal)
+            })
+        };
+        let result = tokio::time::timeout(budget, computed).await.unwrap_or(Err(Error::Deadline));
+        drop(guard);
+        result
+    }
+}
+
+/// The time a caller gives, from the header `grpc-timeout`, less a little, so that the answer DEADLINE_EXCEEDED comes
+/// before the transport gives the call up.
+fn requested(metadata: &MetadataMap) -> Option<Duration> {
+    let text = metadata.get("grpc-timeout")?.to_str().ok()?;
+    let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
+    let count: u64 = digits.parse().ok().filter(|_| digits.len() <= 8)?;
+    let given = match unit {
+        "H" => Duration::from_secs(count * 3_600),
+        "M" => Duration::from_secs(count * 60),
+        "S" => Duration::from_secs(count),
+        "m" => Duration::from_millis(count),
+        "u" => Duration::from_micros(count),
+        "n" => Duration::from_nanos(count),
+        _ => return None,
+    };
+    Some(given - (given / 10).min(Duration::from_millis(10)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn workers(threads: usize, queue: usize) -> Workers {
+        Workers::new(&Config { threads, queue, ..Config::default() })
+    }
+
+    const LONG: Duration = Duration::from_secs(30);
+
+    /// Oracle: the promise itself: a panic costs one request, and the next is answered.
+    #[tokio::test]
+    async fn a_panic_costs_one_request() {
+        let workers = workers(1, 0);
+        assert_eq!(workers.run::<()>(LONG, |_| panic!("on purpose")).await, Err(Error::Internal));
+        assert_eq!(workers.run(LONG, |_| Ok(7)).await, Ok(7));
+    }
+
+    /// Oracle: the promise itself. The work loops until it is told to stop, and it is told.
+    #[tokio::test]
+    async fn a_deadline_stops_the_work() {
+        let workers = workers(1, 1);
+        let (told, hears) = tokio::sync::oneshot::channel();
+        let work = move |cancel: &Cancellation| {
+            while cancel.check().is_ok() {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            let _ = told.send(());
+            Ok(())
+        };
+        assert_eq!(workers.run(Duration::from_millis(20), work).await, Err(Error::Deadline));
+        hears.await.unwrap();
+    }
+
+    /// Oracle: the definition of a bounded queue: one thread and no place to wait refuse the second request.
+    #[tokio::test]
+    async fn a_full_queue_refuses() {
+        let workers = workers(1, 0);
+        let (release, wait) = std::sync::mpsc::channel::<()>();
+        let busy = workers.clone();
+        let (begun, begins) = tokio::sync::oneshot::channel();
+        let first = tokio::spawn(async move {
+            busy.run(LONG, move |_| {
+                let _ = begun.send(());
+                let _ = wait.recv();
+                Ok(1)
+            })
+            .await
+        });
+        begins.await.unwrap();
+        assert_eq!(workers.run(LONG, |_| Ok(2)).await, Err(Error::Busy));
+        release.send(()).unwrap();
+        assert_eq!(first.await.unwrap(), Ok(1));
+    }
+
+    /// Oracle: the gRPC specification of `grpc-timeout`: up to eight digits and a unit.
+    #[test]
+    fn timeouts_are_read_as_grpc_writes_them() {
+        let read = |text: &str| {
+            let mut metadata = MetadataMap::new();
+            metadata.insert("grpc-timeout", text.parse().unwrap());
+            requested(&metadata)
+        };
+        assert_eq!(read("2S"), Some(Duration::from_millis(1_990)));
+        assert_eq!(read("50m"), Some(Duration::from_millis(45)));
+        assert_eq!(read("1H"), Some(Duration::from_millis(3_599_990)));
+        for nonsense in ["", "S", "5", "123456789S", "-1S", "5x"] {
+            assert_eq!(read(nonsense), None, "{nonsense}");
+        }
+    }
+}
