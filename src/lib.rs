@@ -22,7 +22,10 @@ pub mod training; // from a room to an adapter and its scores // R² of motions,
 
 // Rim: one module per outside format.
 pub mod cli;
+pub mod client; // the other side of it
 pub mod datasets; // recordings on disk to rooms
 pub mod encoder; // images to features
+pub mod proto; // the generated wire types
 pub mod report;
+pub mod service; // gRPC
 pub mod store; // versioned rooms and adapters, in a folder or a bucket // tables, JSON, pictures // the commands

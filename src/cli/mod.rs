@@ -1,8 +1,11 @@
 //! The command line. One file a command; each reads its arguments, calls the library and prints.
 
+mod ask;
+mod demo;
 mod evaluate;
 mod import;
 mod progress;
+mod serve;
 mod train;
 
 use clap::{Parser, Subcommand};
@@ -17,12 +20,24 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// See the whole idea work: a room is drawn, learned, served and navigated
+    Demo(demo::Demo),
     /// Read a recording into a store
     Import(import::Import),
     /// Learn an adapter from a room's features and publish it
     Train(train::Train),
     /// Score navigators on held-out motions: Hit@ε with baselines and intervals
     Evaluate(evaluate::Evaluate),
+    /// Answer over gRPC until told to stop
+    Serve(serve::Serve),
+    /// Ask a server for the frames that a motion leads to
+    Navigate(ask::Navigate),
+    /// Ask a server where a view was seen
+    Localize(ask::Localize),
+    /// Ask a server for the motion between two views
+    Motion(ask::Motion),
+    /// List what a server answers for
+    Catalog(ask::Catalog),
 }
 
 /// Runs a command; what it finds goes to standard output, what goes wrong into the error.
@@ -34,6 +49,12 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Import(arguments) => arguments.run().await,
         Command::Train(arguments) => arguments.run().await,
         Command::Evaluate(arguments) => arguments.run().await,
+        Command::Demo(arguments) => arguments.run().await,
+        Command::Serve(arguments) => arguments.run().await,
+        Command::Navigate(arguments) => arguments.run().await,
+        Command::Localize(arguments) => arguments.run().await,
+        Command::Motion(arguments) => arguments.run().await,
+        Command::Catalog(arguments) => arguments.run().await,
     }
 }
 

@@ -17,6 +17,7 @@ mod status;
 mod telemetry;
 mod work;
 
+pub use convert::pose as pose_from_wire;
 pub use shutdown::shutdown_signal;
 pub use snapshot::Snapshot;
 pub use status::Error;

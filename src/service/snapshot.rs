@@ -136,8 +136,7 @@ async fn load_all(store: &Store, index: IndexKind) -> Result<Snapshot, RunError>
             navigators.push(Arc::new(ServedNavigator { navigator, adapter, room_revision: stored.revision }));
         }
         let sources = stored.features.iter().map(|features| features.source().clone()).collect();
-        let served =
-            ServedRoom { room, revision: stored.revision, created: stored.created, sources, navigators };
+        let served = ServedRoom { room, revision: stored.revision, created: stored.created, sources, navigators };
         rooms.insert(summary.room, served);
     }
     if rooms.is_empty() {

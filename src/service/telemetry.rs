@@ -47,9 +47,7 @@ where
     fn call(&mut self, request: Request<Body>) -> Self::Future {
         let begun = Instant::now();
         let id = request_id(request.headers().get(REQUEST_ID));
-        let span = tracing::info_span!(
-            "request", id = id.to_str().unwrap_or_default(), method = request.uri().path()
-        );
+        let span = tracing::info_span!("request", id = id.to_str().unwrap_or_default(), method = request.uri().path());
         // The service that was polled ready answers; its clone stays for the next request.
         let ready = self.0.clone();
         let mut inner = std::mem::replace(&mut self.0, ready);
@@ -68,9 +66,8 @@ where
 
 /// The caller's id if it is short and printable, else a new one.
 fn request_id(given: Option<&HeaderValue>) -> HeaderValue {
-    let fits = |id: &&HeaderValue| {
-        !id.is_empty() && id.len() <= LONGEST_ID && id.as_bytes().iter().all(u8::is_ascii_graphic)
-    };
+    let fits =
+        |id: &&HeaderValue| !id.is_empty() && id.len() <= LONGEST_ID && id.as_bytes().iter().all(u8::is_ascii_graphic);
     match given.filter(fits) {
         Some(id) => id.clone(),
         None => HeaderValue::from_str(&format!("{:016x}", rand::random::<u64>()))

@@ -1,0 +1,329 @@
+//! `seese3 navigate`, `localize`, `motion` and `catalog`: questions to a running server.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use clap::{Args, ValueEnum};
+
+use super::say;
+use crate::client::Client;
+use crate::datasets::read_features;
+use crate::proto::v1 as pb;
+
+#[derive(Debug, Args)]
+struct Server {
+    /// The server, HOST:PORT
+    #[arg(long, env = "SEESE3_SERVER", default_value = "127.0.0.1:50051")]
+    server: String,
+    /// The deadline of a call, seconds
+    #[arg(long, default_value_t = 30)]
+    deadline: u64,
+}
+
+impl Server {
+    async fn connect(&self) -> anyhow::Result<Client> {
+        Ok(Client::connect(&self.server, Duration::from_secs(self.deadline)).await?)
+    }
+}
+
+/// A row of a NumPy file of features.
+#[derive(Debug, Args)]
+struct FeatureRow {
+    /// A NumPy file of features, (n, d)
+    #[arg(long, value_name = "FILE", requires = "row")]
+    feature: Option<PathBuf>,
+    /// Which row of it
+    #[arg(long)]
+    row: Option<usize>,
+}
+
+impl FeatureRow {
+    fn view(&self) -> anyhow::Result<Option<pb::View>> {
+        match (&self.feature, self.row) {
+            (Some(file), Some(row)) => Ok(Some(feature_view(file, row)?)),
+            (None, Some(_)) => bail!("--row needs --feature FILE"),
+            _ => Ok(None),
+        }
+    }
+}
+
+fn feature_view(file: &Path, row: usize) -> anyhow::Result<pb::View> {
+    let features = read_features(file)?;
+    if row >= features.nrows() {
+        bail!("{} has {} rows, there is no row {row}", file.display(), features.nrows());
+    }
+    let feature = pb::Feature { values: features.row(row).to_vec(), source_name: String::new() };
+    Ok(pb::View { view: Some(pb::view::View::Feature(feature)) })
+}
+
+fn frame_view(frame: u32) -> pb::View {
+    pb::View { view: Some(pb::view::View::FrameId(frame)) }
+}
+
+#[derive(Debug, Args)]
+pub struct Navigate {
+    #[command(flatten)]
+    server: Server,
+    /// The room
+    #[arg(long)]
+    room: String,
+    /// The adapter; the newest that fits the room, if none is named
+    #[arg(long, default_value = "")]
+    adapter: String,
+    /// The frame to start from
+    #[arg(long, conflicts_with = "feature")]
+    from: Option<u32>,
+    #[command(flatten)]
+    feature: FeatureRow,
+    /// The frame to go to
+    #[arg(long, conflicts_with = "twist")]
+    to: Option<u32>,
+    /// The motion: vx,vy,vz,wx,wy,wz in metres and radians, in the camera's frame (x right, y down, z forward)
+    #[arg(long, value_delimiter = ',', allow_hyphen_values = true, num_args = 1..)]
+    twist: Option<Vec<f64>>,
+    /// Equal parts of the motion
+    #[arg(long, default_value_t = 1)]
+    steps: u32,
+    /// How the steps hang together
+    #[arg(long, value_enum, default_value_t = ModeName::OpenLoop)]
+    mode: ModeName,
+    /// How the training motions' mean and deviation enter the inverse
+    #[arg(long, value_enum, default_value_t = ReadingName::Homogeneous)]
+    reading: ReadingName,
+    /// Frames for each step
+    #[arg(long, default_value_t = 1)]
+    hits: u32,
+    /// The frame that a step starts from may not be retrieved
+    #[arg(long)]
+    exclude_source: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum ModeName {
+    /// Steps are added up in latent space
+    OpenLoop,
+    /// Each step starts from the retrieved frame
+    Snap,
+    /// As snap, with the rest of the way planned anew
+    ClosedLoop,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum ReadingName {
+    Affine,
+    Homogeneous,
+    Literal,
+}
+
+impl Navigate {
+    pub async fn run(self) -> anyhow::Result<()> {
+        use pb::displacement::Displacement;
+        let source = match (self.from, self.feature.view()?) {
+            (Some(frame), _) => frame_view(frame),
+            (None, Some(view)) => view,
+            (None, None) => bail!("--from FRAME or --feature FILE --row ROW is required"),
+        };
+        let displacement = match (self.to, &self.twist) {
+            (Some(frame), _) => Displacement::TargetFrameId(frame),
+            (None, Some(numbers)) => Displacement::Twist(twist(numbers)?),
+            (None, None) => bail!("--to FRAME or --twist vx,vy,vz,wx,wy,wz is required"),
+        };
+        let mode = match self.mode {
+            ModeName::OpenLoop => pb::Mode::OpenLoop,
+            ModeName::Snap => pb::Mode::Snap,
+            ModeName::ClosedLoop => pb::Mode::ClosedLoop,
+        };
+        let reading = match self.reading {
+            ReadingName::Affine => pb::Reading::Affine,
+            ReadingName::Homogeneous => pb::Reading::Homogeneous,
+            ReadingName::Literal => pb::Reading::Literal,
+        };
+        let request = pb::NavigateRequest {
+            room: self.room,
+            adapter: self.adapter,
+            source: Some(source),
+            displacement: Some(pb::Displacement { displacement: Some(displacement) }),
+            steps: Some(self.steps),
+            mode: mode.into(),
+            reading: reading.into(),
+            hit_count: Some(self.hits),
+            exclude_source: self.exclude_source,
+            ..pb::NavigateRequest::default()
+        };
+        let answer = self.server.connect().await?.navigate(request).await?;
+        say_navigation(&answer);
+        Ok(())
+    }
+}
+
+fn twist(numbers: &[f64]) -> anyhow::Result<pb::Twist> {
+    let &[vx, vy, vz, wx, wy, wz] = numbers else {
+        bail!("--twist needs six numbers, vx,vy,vz,wx,wy,wz, got {}", numbers.len());
+    };
+    let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
+    Ok(pb::Twist { linear: vector(vx, vy, vz), angular: vector(wx, wy, wz) })
+}
+
+/// Prints the steps of a navigation.
+pub fn say_navigation(answer: &pb::NavigateResponse) {
+    say(format_args!("room {}, adapter {}", revision(answer.room.as_ref()), revision(answer.adapter.as_ref())));
+    if let Some(motion) = &answer.displacement {
+        say(format_args!("motion {}", motion_text(motion)));
+    }
+    for step in &answer.steps {
+        for (rank, hit) in step.hits.iter().enumerate() {
+            let label = if rank == 0 { format!("step {}", step.step) } else { String::new() };
+            let error = step.error.as_ref().filter(|_| rank == 0).map_or(String::new(), error_text);
+            say(format_args!("{label:8}{}{error}", hit_text(hit)));
+        }
+    }
+}
+
+fn error_text(error: &pb::StepError) -> String {
+    let hits: Vec<String> =
+        error.hits.iter().map(|hit| format!("@{} {}", hit.threshold, if hit.hit { "hit" } else { "miss" })).collect();
+    format!(
+        "  error {:.3} m {:.2}°, ‖Δ‖ {:.3} ({})",
+        error.translation_m,
+        error.rotation_rad.to_degrees(),
+        error.twist_norm,
+        hits.join(", ")
+    )
+}
+
+fn hit_text(hit: &pb::Hit) -> String {
+    let pose = hit.pose.clone().unwrap_or_default();
+    let (p, q) = (pose.position.unwrap_or_default(), pose.orientation.unwrap_or_default());
+    format!(
+        "frame {:5}  distance {:.4}  at ({:.3}, {:.3}, {:.3}) m, wxyz ({:.3}, {:.3}, {:.3}, {:.3}) in {}",
+        hit.frame_id, hit.distance, p.x, p.y, p.z, q.w, q.x, q.y, q.z, pose.parent_frame
+    )
+}
+
+fn motion_text(motion: &pb::Twist) -> String {
+    let (v, w) = (motion.linear.unwrap_or_default(), motion.angular.unwrap_or_default());
+    format!("v ({:.4}, {:.4}, {:.4}) m, ω ({:.4}, {:.4}, {:.4}) rad", v.x, v.y, v.z, w.x, w.y, w.z)
+}
+
+fn revision(revision: Option<&pb::Revision>) -> String {
+    revision.map_or(String::new(), |revision| format!("'{}' revision {}", revision.name, revision.revision))
+}
+
+#[derive(Debug, Args)]
+pub struct Localize {
+    #[command(flatten)]
+    server: Server,
+    /// A room to look in; all if none is named; may be given several times
+    #[arg(long = "room")]
+    rooms: Vec<String>,
+    /// The adapter; needed when several fit
+    #[arg(long, default_value = "")]
+    adapter: String,
+    /// A frame of the one room that is named
+    #[arg(long, conflicts_with = "feature")]
+    frame: Option<u32>,
+    #[command(flatten)]
+    feature: FeatureRow,
+    /// Places in all
+    #[arg(long, default_value_t = 5)]
+    hits: u32,
+}
+
+impl Localize {
+    pub async fn run(self) -> anyhow::Result<()> {
+        let view = match (self.frame, self.feature.view()?) {
+            (Some(frame), _) => frame_view(frame),
+            (None, Some(view)) => view,
+            (None, None) => bail!("--feature FILE --row ROW or --frame FRAME is required"),
+        };
+        let request = pb::LocalizeRequest {
+            rooms: self.rooms,
+            adapter: self.adapter,
+            view: Some(view),
+            hit_count: Some(self.hits),
+        };
+        let answer = self.server.connect().await?.localize(request).await?;
+        say(format_args!("adapter {}, {} rooms", revision(answer.adapter.as_ref()), answer.room_count));
+        for place in &answer.places {
+            say(hit_text(place.hit.as_ref().context("the server sent a place without a hit")?));
+        }
+        Ok(())
+    }
+}
+
+#[derive(Debug, Args)]
+pub struct Motion {
+    #[command(flatten)]
+    server: Server,
+    /// The adapter; may be left out when a room is named or the server has only one
+    #[arg(long, default_value = "")]
+    adapter: String,
+    /// The room of the frames
+    #[arg(long, default_value = "")]
+    room: String,
+    /// Two frames of the room, A,B
+    #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with = "features")]
+    frames: Option<Vec<u32>>,
+    /// A NumPy file of features, (n, d)
+    #[arg(long, value_name = "FILE", requires = "rows")]
+    features: Option<PathBuf>,
+    /// Two rows of that file, A,B
+    #[arg(long, value_delimiter = ',', value_name = "A,B")]
+    rows: Option<Vec<usize>>,
+}
+
+impl Motion {
+    pub async fn run(self) -> anyhow::Result<()> {
+        let (first, second) = match (self.frames.as_deref(), &self.features, self.rows.as_deref()) {
+            (Some(&[a, b]), _, _) => (frame_view(a), frame_view(b)),
+            (None, Some(file), Some(&[a, b])) => (feature_view(file, a)?, feature_view(file, b)?),
+            _ => bail!("--frames A,B or --features FILE --rows A,B is required"),
+        };
+        let request = pb::EstimateMotionRequest {
+            adapter: self.adapter,
+            room: self.room,
+            first: Some(first),
+            second: Some(second),
+        };
+        let answer = self.server.connect().await?.estimate_motion(request).await?;
+        let motion = answer.motion.as_ref().context("the server sent no motion")?;
+        say(format_args!("adapter {}", revision(answer.adapter.as_ref())));
+        say(format_args!("motion {} in the body frame of the first camera", motion_text(motion)));
+        Ok(())
+    }
+}
+
+#[derive(Debug, Args)]
+pub struct Catalog {
+    #[command(flatten)]
+    server: Server,
+}
+
+impl Catalog {
+    pub async fn run(self) -> anyhow::Result<()> {
+        let client = self.server.connect().await?;
+        for room in client.rooms().await? {
+            let features: Vec<String> =
+                room.features.iter().map(|source| format!("{} ({})", source.name, source.dim)).collect();
+            say(format_args!(
+                "room {}: {} frames, features {}; adapters {}",
+                revision(room.revision.as_ref()),
+                room.frame_count,
+                features.join(", "),
+                room.adapters.join(", ")
+            ));
+        }
+        for adapter in client.adapters().await? {
+            let r2 = adapter.test.and_then(|test| test.overall).map_or("undefined".to_owned(), |r2| format!("{r2:.3}"));
+            say(format_args!(
+                "adapter {}: preset {}, split {}, stride {}, test R² {r2}",
+                revision(adapter.revision.as_ref()),
+                adapter.preset,
+                adapter.split,
+                adapter.stride
+            ));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,192 @@
+//! `seese3 demo`: the whole idea in one command, on a room that is drawn on the spot.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context;
+use clap::Args;
+use ndarray::Array2;
+use rayon::prelude::*;
+use tokio::net::TcpListener;
+
+use super::ask::say_navigation;
+use super::progress::bar;
+use super::train::{default_name, say_published, train_seeds};
+use super::{say, write_file};
+use crate::adapter::{Adapter, Preset};
+use crate::cancel::Cancellation;
+use crate::client::Client;
+use crate::encoder::{BUILTIN_DIM, builtin_source, encode_builtin};
+use crate::eval::{NavigatorKind, Protocol, evaluate};
+use crate::features::Features;
+use crate::navigation::{IndexKind, Navigator};
+use crate::pairs::Split;
+use crate::proto::v1 as pb;
+use crate::report::{PathPlot, evaluation_table, path_svg, training_table};
+use crate::room::{Frames, Provenance, Room, RoomId};
+use crate::service;
+use crate::store::{Store, StoredRoom};
+use crate::studio::{Camera, Scene, camera_path, render};
+use crate::training::Recipe;
+
+const ROOM: &str = "studio";
+const FEATURES: &str = "builtin";
+const STRIDE: u32 = 40;
+const STEPS: u32 = 4;
+
+#[derive(Debug, Args)]
+pub struct Demo {
+    /// Where the store and the picture are written
+    #[arg(long, default_value = "demo-output")]
+    out: PathBuf,
+    /// Of the room, the camera's path and the training
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Images to draw
+    #[arg(long, default_value_t = 2_000)]
+    frames: usize,
+}
+
+impl Demo {
+    pub async fn run(self) -> anyhow::Result<()> {
+        let store_path = self.out.join("store");
+        let location = store_path.to_str().context("--out is not valid UTF-8")?;
+        let store = Store::create(location)?;
+
+        say(format_args!("1. Drawing a room and walking a camera through it: {} images", self.frames));
+        let (room, features) = draw(self.frames, self.seed)?;
+        let published = store.publish_room(&room, std::slice::from_ref(&features)).await?;
+        say(format_args!("   room '{ROOM}' revision {}: {location}/{}", published.revision, published.manifest));
+
+        say("2. Training a Poincaré adapter on the first 80 % of the path (preset paper-range)");
+        let recipe =
+            Recipe { preset: Preset::PaperRange, split: Split::Time, stride: STRIDE, epochs: None, seed: self.seed };
+        let stored = StoredRoom { room, revision: published.revision, created: String::new(), features: Vec::new() };
+        let (adapter, runs) = train_seeds(&stored, &features, &recipe, 1)?;
+        say(training_table(&runs).trim_end());
+        let name = default_name(ROOM, &features, &recipe);
+        let adapter_published = store.publish_adapter(&name, &adapter, &runs[0].record, features.rows()).await?;
+        say_published(&store, &name, &adapter_published);
+
+        say(format_args!("3. Navigating the last 20 %, which the adapter never saw, {STRIDE} frames ahead"));
+        let room = Arc::new(stored.room);
+        say(score(&room, &features, adapter)?.trim_end());
+
+        say("4. Serving the store and asking it over gRPC");
+        let picture = self.out.join("path.svg");
+        serve_and_ask(&store, &room, &picture).await?;
+
+        say("Go on from here:");
+        say(format_args!("   seese3 serve --store {location}"));
+        say(format_args!("   seese3 navigate --room {ROOM} --from 1700 --to 1740 --steps {STEPS} --mode closed-loop"));
+        say(format_args!("   seese3 evaluate --store {location} --room {ROOM} --exclude-source"));
+        say("(`cargo run --release --` stands for `seese3` in a checkout)");
+        Ok(())
+    }
+}
+
+/// A room of the studio and its features by the built-in encoder.
+fn draw(frame_count: usize, seed: u64) -> anyhow::Result<(Room, Features)> {
+    let scene = Scene::new(seed);
+    let poses = camera_path(&scene, frame_count, seed);
+    let progress = bar(frame_count as u64, "drawing");
+    let rows: Vec<Vec<f32>> = poses
+        .par_iter()
+        .map(|pose| {
+            let feature = encode_builtin(&render(&scene, Camera::small(), pose));
+            progress.inc(1);
+            feature
+        })
+        .collect();
+    progress.finish_and_clear();
+    let rows = Array2::from_shape_vec((frame_count, BUILTIN_DIM), rows.concat())?;
+    let features = Features::new(builtin_source(FEATURES), rows)?;
+    let provenance = Provenance { format: "studio".to_owned(), ..Provenance::default() };
+    let room = Room::new(RoomId::new(ROOM)?, Frames { poses, ..Frames::default() }, provenance)?;
+    Ok((room, features))
+}
+
+fn score(room: &Arc<Room>, features: &Features, adapter: Adapter) -> anyhow::Result<String> {
+    let navigator = Navigator::new(room.clone(), features, Arc::new(adapter), IndexKind::Exact)?;
+    let navigators: Vec<NavigatorKind> =
+        NavigatorKind::ALL.into_iter().filter(|kind| *kind != NavigatorKind::RidgeRefitInSample).collect();
+    let protocol = Protocol { navigators, ..Protocol::paper(STRIDE) };
+    let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |_, _| ())?;
+    Ok(evaluation_table(&report))
+}
+
+/// Starts a server on a free loopback port, asks it for a navigation, draws the answer, and stops it.
+async fn serve_and_ask(store: &Store, room: &Arc<Room>, picture: &Path) -> anyhow::Result<()> {
+    let listener = TcpListener::bind("127.0.0.1:0").await.context("cannot listen on a loopback port")?;
+    let address = listener.local_addr()?.to_string();
+    let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
+    let server = tokio::spawn(service::run(listener, store.clone(), service::Config::default(), async {
+        // An error means the demo has failed: the server is to stop all the same.
+        let _ = stopped.await;
+    }));
+    say(format_args!("   listening on {address}"));
+    let answer = ask(&address, room.frame_count()).await?;
+    say_navigation(&answer);
+    let svg = path_svg(&plot_of(room, &answer)?).map_err(anyhow::Error::msg)?;
+    write_file(picture, svg.as_bytes())?;
+    say(format_args!("   the path from above: {}", picture.display()));
+    // An error means the server has ended already; its own result follows.
+    let _ = stop.send(());
+    server.await??;
+    say("   server stopped");
+    Ok(())
+}
+
+/// A 4-step closed loop from the middle of the held-out part to the frame 40 later.
+async fn ask(address: &str, frame_count: usize) -> anyhow::Result<pb::NavigateResponse> {
+    let client = Client::connect(address, Duration::from_secs(30)).await?;
+    let source = (frame_count * 9 / 10) as u32;
+    let request = pb::NavigateRequest {
+        room: ROOM.to_owned(),
+        source: Some(pb::View { view: Some(pb::view::View::FrameId(source)) }),
+        displacement: Some(pb::Displacement {
+            displacement: Some(pb::displacement::Displacement::TargetFrameId(source + STRIDE)),
+        }),
+        steps: Some(STEPS),
+        mode: pb::Mode::ClosedLoop.into(),
+        ..pb::NavigateRequest::default()
+    };
+    loop {
+        match client.navigate(request.clone()).await {
+            // The server is still loading its store.
+            Err(error) if error.code() == Some(tonic::Code::Unavailable) => {
+                tokio::time::sleep(Duration::from_millis(50)).await;
+            }
+            answer => return Ok(answer?),
+        }
+    }
+}
+
+fn plot_of(room: &Room, answer: &pb::NavigateResponse) -> anyhow::Result<PathPlot> {
+    let place = |pose: &crate::geometry::Pose| {
+        let (at, view) = (pose.translation.vector, pose.rotation * nalgebra::Vector3::z());
+        [at.x, at.y, view.y.atan2(view.x)]
+    };
+    let wire_place = |pose: Option<&pb::Pose>| -> anyhow::Result<[f64; 3]> {
+        let pose = service::pose_from_wire(pose.context("the server sent no pose")?.clone(), ROOM)?;
+        Ok(place(&pose))
+    };
+    let source = room.frame_count() * 9 / 10;
+    Ok(PathPlot {
+        title: format!("{STEPS} steps, closed loop, {STRIDE} frames ahead"),
+        map: room.poses().iter().map(|pose| [pose.translation.x, pose.translation.y]).collect(),
+        source: place(&room.poses()[source]),
+        target: place(&room.poses()[source + STRIDE as usize]),
+        requested: answer
+            .steps
+            .iter()
+            .map(|step| wire_place(step.requested_pose.as_ref()))
+            .collect::<Result<_, _>>()?,
+        retrieved: answer
+            .steps
+            .iter()
+            .map(|step| wire_place(step.hits.first().and_then(|hit| hit.pose.as_ref())))
+            .collect::<Result<_, _>>()?,
+    })
+}

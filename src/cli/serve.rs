@@ -1,0 +1,102 @@
+//! `seese3 serve`: answer over gRPC until told to stop.
+
+use std::time::Duration;
+
+use anyhow::Context;
+use clap::{Args, ValueEnum};
+use tokio::net::TcpListener;
+
+use super::say;
+use crate::index::HnswParameters;
+use crate::navigation::{IndexKind, Limits};
+use crate::service::{Config, run, shutdown_signal};
+use crate::store::Store;
+
+#[derive(Debug, Args)]
+pub struct Serve {
+    /// The store
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// Where to listen; port 0 takes a free one
+    #[arg(long, env = "SEESE3_LISTEN", default_value = "127.0.0.1:50051")]
+    listen: String,
+    /// How frames are searched
+    #[arg(long, env = "SEESE3_INDEX", value_enum, default_value_t = IndexName::Exact)]
+    index: IndexName,
+    /// The most steps of one navigation
+    #[arg(long, env = "SEESE3_MAX_STEPS", default_value_t = Limits::default().steps)]
+    max_steps: u32,
+    /// The most frames of one step or localisation
+    #[arg(long, env = "SEESE3_MAX_HITS", default_value_t = Limits::default().hits)]
+    max_hits: u32,
+    /// The largest message that is read, bytes
+    #[arg(long, env = "SEESE3_MAX_MESSAGE_BYTES", default_value_t = Config::default().message_bytes)]
+    max_message_bytes: usize,
+    /// The longest a request may take, seconds
+    #[arg(long, env = "SEESE3_MAX_REQUEST_SECONDS", default_value_t = 300)]
+    max_request_seconds: u64,
+    /// How long requests in flight may go on after SIGTERM, seconds
+    #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = 10)]
+    drain_seconds: u64,
+    /// Requests computed at a time; the machine's cores if not given
+    #[arg(long, env = "SEESE3_THREADS")]
+    threads: Option<usize>,
+    /// Requests that may wait for a thread
+    #[arg(long, env = "SEESE3_QUEUE", default_value_t = Config::default().queue)]
+    queue: usize,
+    /// How the log is written, to standard error; RUST_LOG chooses what
+    #[arg(long, env = "SEESE3_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
+    log_format: LogFormat,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum IndexName {
+    /// Every frame is looked at
+    Exact,
+    /// The approximate graph of hnsw_rs, for rooms of 100,000 frames and more
+    Hnsw,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum LogFormat {
+    Text,
+    Json,
+}
+
+impl Serve {
+    pub async fn run(self) -> anyhow::Result<()> {
+        start_log(self.log_format);
+        let store = Store::open(&self.store)?;
+        let defaults = Config::default();
+        let config = Config {
+            index: match self.index {
+                IndexName::Exact => IndexKind::Exact,
+                IndexName::Hnsw => IndexKind::Hnsw(HnswParameters::default()),
+            },
+            limits: Limits { steps: self.max_steps, hits: self.max_hits },
+            message_bytes: self.max_message_bytes,
+            threads: self.threads.unwrap_or(defaults.threads).max(1),
+            queue: self.queue,
+            longest: Duration::from_secs(self.max_request_seconds),
+            drain: Duration::from_secs(self.drain_seconds),
+            ..defaults
+        };
+        let listener =
+            TcpListener::bind(&self.listen).await.with_context(|| format!("cannot listen on {}", self.listen))?;
+        let address = listener.local_addr().context("the listener has no address")?;
+        say(format_args!("listening on {address}"));
+        run(listener, store, config, shutdown_signal()).await?;
+        say("stopped");
+        Ok(())
+    }
+}
+
+fn start_log(format: LogFormat) {
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match format {
+        LogFormat::Text => log.init(),
+        LogFormat::Json => log.json().flatten_event(true).init(),
+    }
+}

@@ -1,0 +1,216 @@
+//! A client of the service, in wire types: connects, calls, and says in one line what went wrong.
+
+use std::time::Duration;
+
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Code, Status};
+use tonic_types::StatusExt;
+
+use crate::proto::v1 as pb;
+use crate::proto::v1::catalog_service_client::CatalogServiceClient;
+use crate::proto::v1::evaluation_service_client::EvaluationServiceClient;
+use crate::proto::v1::localization_service_client::LocalizationServiceClient;
+use crate::proto::v1::navigation_service_client::NavigationServiceClient;
+use crate::proto::v1::odometry_service_client::OdometryServiceClient;
+
+/// The largest answer that is read, bytes.
+const MESSAGE_BYTES: usize = 64 << 20;
+
+/// Why a call has no answer.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error("'{address}' is no server address: {problem}; write HOST:PORT")]
+    Address { address: String, problem: String },
+    #[error("cannot connect to {address}: {problem}")]
+    Connect { address: String, problem: String },
+    #[error("the server refused ({:?}): {}", .0.code(), .0.message())]
+    Refused(Box<Status>),
+    #[error("the server ended the evaluation without a report")]
+    NoReport,
+}
+
+impl Error {
+    /// The gRPC code, if the server answered.
+    pub fn code(&self) -> Option<Code> {
+        match self {
+            Self::Refused(status) => Some(status.code()),
+            _ => None,
+        }
+    }
+
+    /// The field that the server wants changed, if it named one.
+    pub fn field(&self) -> Option<String> {
+        let Self::Refused(status) = self else { return None };
+        let details = status.get_error_details();
+        let violation = details.bad_request().and_then(|bad| bad.field_violations.first());
+        let resource = details.resource_info().map(|resource| resource.resource_type.clone());
+        violation.map(|violation| violation.field.clone()).or(resource)
+    }
+}
+
+impl From<Status> for Error {
+    fn from(status: Status) -> Self {
+        Self::Refused(Box::new(status))
+    }
+}
+
+/// A connection to a server. Cloning it is cheap and shares the connection.
+#[derive(Debug, Clone)]
+pub struct Client {
+    channel: Channel,
+    deadline: Duration,
+}
+
+impl Client {
+    /// Connects to `address`, HOST:PORT or a URL; every call gets `deadline`.
+    ///
+    /// # Errors
+    /// [`Error::Address`] or [`Error::Connect`].
+    pub async fn connect(address: &str, deadline: Duration) -> Result<Self, Error> {
+        let url = if address.contains("://") { address.to_owned() } else { format!("http://{address}") };
+        let endpoint = Endpoint::from_shared(url)
+            .map_err(|error| Error::Address { address: address.to_owned(), problem: error.to_string() })?;
+        let endpoint = endpoint.connect_timeout(deadline.min(Duration::from_secs(10))).tcp_nodelay(true);
+        let channel = endpoint.connect().await.map_err(|error| {
+            let cause = std::error::Error::source(&error).map_or(error.to_string(), ToString::to_string);
+            Error::Connect { address: address.to_owned(), problem: cause }
+        })?;
+        Ok(Self { channel, deadline })
+    }
+
+    /// Navigates.
+    ///
+    /// # Errors
+    /// [`Error::Refused`], as for every call.
+    pub async fn navigate(&self, request: pb::NavigateRequest) -> Result<pb::NavigateResponse, Error> {
+        let mut service = NavigationServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service.navigate(self.request(request)).await?.into_inner())
+    }
+
+    /// Navigates several times.
+    ///
+    /// # Errors
+    /// [`Error::Refused`]; a single question that fails is a failure in the answer.
+    pub async fn batch_navigate(
+        &self,
+        requests: Vec<pb::NavigateRequest>,
+    ) -> Result<Vec<pb::BatchNavigateResult>, Error> {
+        let mut service = NavigationServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service.batch_navigate(self.request(pb::BatchNavigateRequest { requests })).await?.into_inner().results)
+    }
+
+    /// Localises a view.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn localize(&self, request: pb::LocalizeRequest) -> Result<pb::LocalizeResponse, Error> {
+        let mut service = LocalizationServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service.localize(self.request(request)).await?.into_inner())
+    }
+
+    /// The motion between two views.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn estimate_motion(
+        &self,
+        request: pb::EstimateMotionRequest,
+    ) -> Result<pb::EstimateMotionResponse, Error> {
+        let mut service = OdometryServiceClient::new(self.channel.clone());
+        Ok(service.estimate_motion(self.request(request)).await?.into_inner())
+    }
+
+    /// All rooms, page by page.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn rooms(&self) -> Result<Vec<pb::Room>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let (mut rooms, mut page_token) = (Vec::new(), String::new());
+        loop {
+            let request = self.request(pb::ListRoomsRequest { page_size: 0, page_token });
+            let page = service.list_rooms(request).await?.into_inner();
+            rooms.extend(page.rooms);
+            page_token = page.next_page_token;
+            if page_token.is_empty() {
+                return Ok(rooms);
+            }
+        }
+    }
+
+    /// A room.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn room(&self, room: &str) -> Result<Option<pb::Room>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        Ok(service.get_room(self.request(pb::GetRoomRequest { room: room.to_owned() })).await?.into_inner().room)
+    }
+
+    /// All adapters, page by page.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn adapters(&self) -> Result<Vec<pb::Adapter>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let (mut adapters, mut page_token) = (Vec::new(), String::new());
+        loop {
+            let request = self.request(pb::ListAdaptersRequest { page_size: 0, page_token });
+            let page = service.list_adapters(request).await?.into_inner();
+            adapters.extend(page.adapters);
+            page_token = page.next_page_token;
+            if page_token.is_empty() {
+                return Ok(adapters);
+            }
+        }
+    }
+
+    /// An adapter.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn adapter(&self, adapter: &str) -> Result<Option<pb::Adapter>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let request = self.request(pb::GetAdapterRequest { adapter: adapter.to_owned() });
+        Ok(service.get_adapter(request).await?.into_inner().adapter)
+    }
+
+    /// Evaluates; `progress` hears of each navigator begun.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] or [`Error::NoReport`].
+    pub async fn evaluate(
+        &self,
+        request: pb::EvaluateRequest,
+        mut progress: impl FnMut(pb::EvaluationProgress),
+    ) -> Result<pb::EvaluationReport, Error> {
+        let mut service = EvaluationServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
+        let mut events = service.evaluate(self.request(request)).await?.into_inner();
+        while let Some(pb::EvaluateResponse { event }) = events.message().await? {
+            match event {
+                Some(pb::evaluate_response::Event::Report(report)) => return Ok(report),
+                Some(pb::evaluate_response::Event::Progress(step)) => progress(step),
+                None => {}
+            }
+        }
+        Err(Error::NoReport)
+    }
+
+    /// Scores a client's own predictions.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn score_predictions(
+        &self,
+        request: pb::ScorePredictionsRequest,
+    ) -> Result<pb::ScorePredictionsResponse, Error> {
+        let mut service = EvaluationServiceClient::new(self.channel.clone());
+        Ok(service.score_predictions(self.request(request)).await?.into_inner())
+    }
+
+    fn request<T>(&self, message: T) -> tonic::Request<T> {
+        let mut request = tonic::Request::new(message);
+        request.set_timeout(self.deadline);
+        request
+    }
+}

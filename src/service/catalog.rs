@@ -1,0 +1,147 @@
+//! CatalogService.
+
+use std::collections::BTreeMap;
+use std::ops::Bound;
+
+use tonic::{Request, Response, Status};
+
+use super::convert;
+use super::snapshot::ServedRoom;
+use super::{Error, Handlers};
+use crate::geometry::Twist;
+use crate::proto::v1 as pb;
+use crate::proto::v1::catalog_service_server::CatalogService;
+use crate::store::StoredAdapter;
+
+/// Entries of a page when the caller leaves it to the server, and at most.
+const PAGE: usize = 100;
+const LARGEST_PAGE: usize = 1_000;
+
+#[tonic::async_trait]
+impl CatalogService for Handlers {
+    async fn list_rooms(
+        &self,
+        request: Request<pb::ListRoomsRequest>,
+    ) -> Result<Response<pb::ListRoomsResponse>, Status> {
+        let pb::ListRoomsRequest { page_size, page_token } = request.into_inner();
+        let snapshot = self.snapshot()?;
+        let (page, next_page_token) = page(snapshot.rooms(), page_size, &page_token)?;
+        let rooms = page.into_iter().map(room).collect();
+        Ok(Response::new(pb::ListRoomsResponse { rooms, next_page_token }))
+    }
+
+    async fn get_room(&self, request: Request<pb::GetRoomRequest>) -> Result<Response<pb::GetRoomResponse>, Status> {
+        let snapshot = self.snapshot()?;
+        let room = room(snapshot.room(&request.into_inner().room)?);
+        Ok(Response::new(pb::GetRoomResponse { room: Some(room) }))
+    }
+
+    async fn list_adapters(
+        &self,
+        request: Request<pb::ListAdaptersRequest>,
+    ) -> Result<Response<pb::ListAdaptersResponse>, Status> {
+        let pb::ListAdaptersRequest { page_size, page_token } = request.into_inner();
+        let snapshot = self.snapshot()?;
+        let (page, next_page_token) = page(snapshot.adapters(), page_size, &page_token)?;
+        let adapters = page.into_iter().map(|stored| adapter(stored)).collect();
+        Ok(Response::new(pb::ListAdaptersResponse { adapters, next_page_token }))
+    }
+
+    async fn get_adapter(
+        &self,
+        request: Request<pb::GetAdapterRequest>,
+    ) -> Result<Response<pb::GetAdapterResponse>, Status> {
+        let snapshot = self.snapshot()?;
+        let adapter = adapter(snapshot.adapter(&request.into_inner().adapter)?);
+        Ok(Response::new(pb::GetAdapterResponse { adapter: Some(adapter) }))
+    }
+}
+
+/// A page of entries by name and the token of the next: the last name of this one.
+fn page<'a, T>(all: &'a BTreeMap<String, T>, size: i32, token: &str) -> Result<(Vec<&'a T>, String), Error> {
+    let size = match usize::try_from(size) {
+        Ok(0) => PAGE,
+        Ok(size) => size.min(LARGEST_PAGE),
+        Err(_) => return Err(Error::invalid("page_size", format!("must not be negative, got {size}"))),
+    };
+    let after = if token.is_empty() {
+        Bound::Unbounded
+    } else if all.contains_key(token) {
+        Bound::Excluded(token)
+    } else {
+        return Err(Error::invalid("page_token", "is not one that this server gave; begin with the first page"));
+    };
+    let mut rest = all.range::<str, _>((after, Bound::Unbounded));
+    let page: Vec<(&String, &T)> = rest.by_ref().take(size).collect();
+    let next = match (rest.next(), page.last()) {
+        (Some(_), Some((name, _))) => (*name).clone(),
+        _ => String::new(),
+    };
+    Ok((page.into_iter().map(|(_, entry)| entry).collect(), next))
+}
+
+fn room(served: &ServedRoom) -> pb::Room {
+    let provenance = served.room.provenance();
+    pb::Room {
+        revision: Some(pb::Revision { name: served.room.id().to_string(), revision: served.revision }),
+        frame_count: served.room.frame_count() as u32,
+        adapters: served.navigators.iter().map(|navigator| navigator.adapter.name.clone()).collect(),
+        features: served.sources.iter().map(convert::source_to_wire).collect(),
+        format: provenance.format.clone(),
+        licence: provenance.licence.clone(),
+        worst_rotation_deviation: provenance.worst_rotation_deviation,
+        created: served.created.clone(),
+    }
+}
+
+fn adapter(stored: &StoredAdapter) -> pb::Adapter {
+    let (adapter, record) = (&stored.adapter, &stored.record);
+    let scale = adapter.scale();
+    pb::Adapter {
+        revision: Some(pb::Revision { name: stored.name.clone(), revision: stored.revision }),
+        source: Some(convert::source_to_wire(adapter.source())),
+        latent_dim: adapter.latent_dim() as u32,
+        training_rooms: record
+            .rooms
+            .iter()
+            .map(|(room, revision)| pb::Revision { name: room.to_string(), revision: *revision })
+            .collect(),
+        preset: record.preset.clone(),
+        split: record.split.name().to_owned(),
+        stride: record.stride,
+        seed: record.config.seed,
+        test: Some(convert::scores_to_wire(&record.test)),
+        train: Some(convert::scores_to_wire(&record.train)),
+        train_mean_r2: record.train_mean_r2,
+        target_mean: Some(convert::twist_to_wire(&Twist::from_vector(&scale.mean))),
+        target_deviation: Some(convert::twist_to_wire(&Twist::from_vector(&scale.deviation))),
+        singular_values: adapter.inverse().singular_values().to_vec(),
+        created: stored.created.clone(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: walking the pages gives every entry once, in order, whatever the size of a page.
+    #[test]
+    fn pages_cover_everything_once() {
+        let all: BTreeMap<String, usize> = (0..25).map(|i| (format!("{i:03}"), i)).collect();
+        for size in [1, 7, 24, 25, 26] {
+            let (mut seen, mut token) = (Vec::new(), String::new());
+            loop {
+                let (entries, next) = page(&all, size, &token).unwrap();
+                assert!(entries.len() <= size as usize);
+                seen.extend(entries.into_iter().copied());
+                if next.is_empty() {
+                    break;
+                }
+                token = next;
+            }
+            assert_eq!(seen, (0..25).collect::<Vec<_>>(), "pages of {size}");
+        }
+        assert!(page(&all, -1, "").is_err());
+        assert!(page(&all, 1, "no such").is_err());
+    }
+}

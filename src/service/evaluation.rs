@@ -1,0 +1,148 @@
+//! EvaluationService.
+
+use std::pin::Pin;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::mpsc;
+use tokio_stream::{Stream, wrappers::ReceiverStream};
+use tonic::{Request, Response, Status};
+use tracing::Instrument;
+
+use super::convert;
+use super::snapshot::ServedNavigator;
+use super::{Error, Handlers, Snapshot};
+use crate::cancel::Cancellation;
+use crate::eval::{PredictionScope, Protocol, evaluate, score_predictions};
+use crate::proto::v1 as pb;
+use crate::proto::v1::evaluation_service_server::EvaluationService;
+
+type Events = mpsc::Sender<Result<pb::EvaluateResponse, Status>>;
+
+#[tonic::async_trait]
+impl EvaluationService for Handlers {
+    type EvaluateStream = Pin<Box<dyn Stream<Item = Result<pb::EvaluateResponse, Status>> + Send>>;
+
+    async fn evaluate(&self, request: Request<pb::EvaluateRequest>) -> Result<Response<Self::EvaluateStream>, Status> {
+        let snapshot = self.snapshot()?;
+        let budget = self.workers.budget(request.metadata());
+        let (served, protocol) = protocol(&snapshot, request.into_inner())?;
+        let (events, stream) = mpsc::channel(16);
+        let run = self.clone().run_evaluation(served, protocol, budget, events);
+        tokio::spawn(run.instrument(tracing::Span::current()));
+        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
+    }
+
+    async fn score_predictions(
+        &self,
+        request: Request<pb::ScorePredictionsRequest>,
+    ) -> Result<Response<pb::ScorePredictionsResponse>, Status> {
+        let (snapshot, most) = (self.snapshot()?, self.config.predictions);
+        let budget = self.workers.budget(request.metadata());
+        let request = request.into_inner();
+        let answer = self.workers.run(budget, move |cancel| score(&snapshot, request, most, cancel)).await?;
+        Ok(Response::new(answer))
+    }
+}
+
+impl Handlers {
+    /// Sends progress and the report, or the error; stops when nobody listens any more.
+    async fn run_evaluation(self, served: Arc<ServedNavigator>, protocol: Protocol, budget: Duration, events: Events) {
+        let heard = events.clone();
+        let total = protocol.navigators.len() as u32;
+        let work = move |cancel: &Cancellation| {
+            let report = evaluate(&served.navigator, &protocol, cancel, &mut |done, kind| {
+                let progress = pb::EvaluationProgress { done: done as u32, total, navigator: kind.name().to_owned() };
+                let event = pb::evaluate_response::Event::Progress(progress);
+                // A listener that went away cancels the work below; there is nothing to do here.
+                let _ = events.blocking_send(Ok(pb::EvaluateResponse { event: Some(event) }));
+            })?;
+            Ok(report_to_wire(&served, &report))
+        };
+        let finished = tokio::select! {
+            finished = self.workers.run(budget, work) => finished,
+            () = heard.closed() => return,
+        };
+        let last = finished
+            .map(|report| pb::EvaluateResponse { event: Some(pb::evaluate_response::Event::Report(report)) })
+            .map_err(Status::from);
+        // As above: without a listener there is nobody to tell.
+        let _ = heard.send(last).await;
+    }
+}
+
+fn protocol(snapshot: &Snapshot, request: pb::EvaluateRequest) -> Result<(Arc<ServedNavigator>, Protocol), Error> {
+    let pb::EvaluateRequest {
+        room,
+        adapter,
+        stride,
+        split,
+        navigators,
+        exclude_source,
+        exclude_radius,
+        thresholds,
+        seed,
+    } = request;
+    let served = snapshot.navigator(&room, &adapter)?.clone();
+    let record = &served.adapter.record;
+    let protocol = Protocol {
+        split: convert::split(&split)?.unwrap_or(record.split),
+        stride: stride.unwrap_or(record.stride),
+        exclude_source: exclude_source.then_some(exclude_radius),
+        thresholds: convert::thresholds(thresholds)?,
+        seed,
+        navigators: convert::navigators(&navigators)?,
+    };
+    Ok((served, protocol))
+}
+
+fn report_to_wire(served: &ServedNavigator, report: &crate::eval::Report) -> pb::EvaluationReport {
+    let record = &served.adapter.record;
+    let in_room = record.rooms.iter().any(|(room, _)| room == served.navigator.room().id());
+    pb::EvaluationReport {
+        room: Some(convert::room_revision(served)),
+        adapter: Some(convert::adapter_revision(served)),
+        split: report.protocol.split.name().to_owned(),
+        stride: report.protocol.stride,
+        n: report.n as u32,
+        candidate_count: report.candidate_count as u32,
+        source_excluded: report.protocol.exclude_source.is_some(),
+        in_room,
+        leaks: in_room && record.split != report.protocol.split,
+        navigators: report.rows.iter().map(convert::row_to_wire).collect(),
+    }
+}
+
+fn score(
+    snapshot: &Snapshot,
+    request: pb::ScorePredictionsRequest,
+    most: usize,
+    cancel: &Cancellation,
+) -> Result<pb::ScorePredictionsResponse, Error> {
+    let pb::ScorePredictionsRequest { room, adapter, predictions, split, exclude_source, exclude_radius, thresholds } =
+        request;
+    let served = snapshot.navigator(&room, &adapter)?;
+    if predictions.len() > most {
+        let problem = format!("needs 1 to {most} in one request, got {}", predictions.len());
+        return Err(Error::invalid("predictions", problem));
+    }
+    let scope = PredictionScope {
+        split: convert::split(&split)?,
+        exclude_source: exclude_source.then_some(exclude_radius),
+        thresholds: convert::thresholds(thresholds)?,
+    };
+    let predictions = predictions
+        .into_iter()
+        .enumerate()
+        .map(|(position, given)| convert::prediction(position, given))
+        .collect::<Result<Vec<_>, _>>()?;
+    let row = score_predictions(&served.navigator, &predictions, &scope, cancel)?;
+    let frame_count = served.navigator.room().frame_count();
+    let candidate_count = scope.split.map_or(frame_count, |split| split.candidates(frame_count).len());
+    Ok(pb::ScorePredictionsResponse {
+        room: Some(convert::room_revision(served)),
+        adapter: Some(convert::adapter_revision(served)),
+        scores: Some(convert::row_to_wire(&row)),
+        candidate_count: candidate_count as u32,
+    })
+}

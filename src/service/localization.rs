@@ -1,0 +1,107 @@
+//! LocalizationService.
+
+use std::sync::Arc;
+
+use tonic::{Request, Response, Status};
+
+use super::convert;
+use super::snapshot::ServedNavigator;
+use super::{Error, Handlers, Snapshot};
+use crate::cancel::Cancellation;
+use crate::localization::localize;
+use crate::navigation::Source;
+use crate::proto::v1 as pb;
+use crate::proto::v1::localization_service_server::LocalizationService;
+
+#[tonic::async_trait]
+impl LocalizationService for Handlers {
+    async fn localize(&self, request: Request<pb::LocalizeRequest>) -> Result<Response<pb::LocalizeResponse>, Status> {
+        let (snapshot, most) = (self.snapshot()?, self.config.limits.hits);
+        let budget = self.workers.budget(request.metadata());
+        let request = request.into_inner();
+        let answer = self.workers.run(budget, move |cancel| answer(&snapshot, request, most, cancel)).await?;
+        Ok(Response::new(answer))
+    }
+}
+
+fn answer(
+    snapshot: &Snapshot,
+    request: pb::LocalizeRequest,
+    most: u32,
+    cancel: &Cancellation,
+) -> Result<pb::LocalizeResponse, Error> {
+    let pb::LocalizeRequest { rooms, adapter, view, hit_count } = request;
+    let k = hit_count.unwrap_or(1);
+    if k == 0 || k > most {
+        return Err(Error::invalid("hit_count", format!("must be 1 to {most}, got {k}")));
+    }
+    let served = rooms_under(snapshot, &rooms, &adapter)?;
+    let first = &served[0];
+    let source = convert::source(view, first.adapter.adapter.source())?;
+    if matches!(source, Source::Frame(_)) && served.len() != 1 {
+        return Err(Error::invalid("view.frame_id", "is a frame of one room; name that room alone in rooms"));
+    }
+    let start = first.navigator.start(&source, None).map_err(|error| match error {
+        crate::navigation::Error::Adapter(problem) => super::status::view_error(&problem).within("view"),
+        other => Error::from(other),
+    })?;
+    let navigators = served.iter().map(|served| &served.navigator);
+    let places = localize(navigators, start.latent.view(), k as usize, cancel)?;
+    let revision = |room: &str| served.iter().find(|served| served.navigator.room().id().as_str() == room);
+    let place = |place: &crate::localization::Place| {
+        let served = revision(place.room.as_str()).ok_or(Error::Internal)?;
+        Ok(pb::Place {
+            room: Some(convert::room_revision(served)),
+            hit: Some(convert::hit_to_wire(&place.hit, served.navigator.room())),
+        })
+    };
+    Ok(pb::LocalizeResponse {
+        adapter: Some(convert::adapter_revision(first)),
+        places: places.iter().map(place).collect::<Result<_, Error>>()?,
+        room_count: served.len() as u32,
+    })
+}
+
+/// The rooms to look in, all under one adapter; at least one.
+fn rooms_under(snapshot: &Snapshot, rooms: &[String], adapter: &str) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+    let adapter = match (adapter, rooms) {
+        ("", [room]) => snapshot.navigator(room, "")?.adapter.name.clone(),
+        ("", _) => only_adapter_of(snapshot, rooms)?,
+        (name, _) => snapshot.adapter(name)?.name.clone(),
+    };
+    if rooms.is_empty() {
+        let all = snapshot.rooms().values().flat_map(|room| &room.navigators);
+        let fitting: Vec<_> = all.filter(|served| served.adapter.name == adapter).cloned().collect();
+        return if fitting.is_empty() {
+            Err(Error::Precondition(format!("no room has the features of adapter '{adapter}'")))
+        } else {
+            Ok(fitting)
+        };
+    }
+    let mut served = Vec::with_capacity(rooms.len());
+    for (position, room) in rooms.iter().enumerate() {
+        if rooms[..position].contains(room) {
+            return Err(Error::invalid("rooms", format!("'{room}' is named twice")));
+        }
+        served.push(snapshot.navigator(room, &adapter)?.clone());
+    }
+    Ok(served)
+}
+
+/// The one adapter that fits all the rooms: distances under two adapters do not compare.
+fn only_adapter_of(snapshot: &Snapshot, rooms: &[String]) -> Result<String, Error> {
+    let asked: Vec<&String> = if rooms.is_empty() { snapshot.rooms().keys().collect() } else { rooms.iter().collect() };
+    let mut fitting: Vec<&String> = snapshot.adapters().keys().collect();
+    for room in asked {
+        let served = snapshot.room(room)?;
+        fitting.retain(|name| served.navigators.iter().any(|navigator| navigator.adapter.name == **name));
+    }
+    match fitting.as_slice() {
+        [only] => Ok((*only).clone()),
+        several => {
+            let names: Vec<&str> = several.iter().map(|name| name.as_str()).collect();
+            let problem = format!("is required: {} adapters fit all these rooms ({})", names.len(), names.join(", "));
+            Err(Error::invalid("adapter", problem))
+        }
+    }
+}

@@ -1,0 +1,75 @@
+//! NavigationService.
+
+use tonic::{Request, Response, Status};
+
+use super::convert;
+use super::{Error, Handlers, Snapshot};
+use crate::cancel::Cancellation;
+use crate::navigation::Limits;
+use crate::proto::v1 as pb;
+use crate::proto::v1::navigation_service_server::NavigationService;
+
+#[tonic::async_trait]
+impl NavigationService for Handlers {
+    async fn navigate(&self, request: Request<pb::NavigateRequest>) -> Result<Response<pb::NavigateResponse>, Status> {
+        let (snapshot, limits) = (self.snapshot()?, self.config.limits);
+        let budget = self.workers.budget(request.metadata());
+        let request = request.into_inner();
+        let answer = self.workers.run(budget, move |cancel| navigate(&snapshot, request, limits, cancel)).await?;
+        Ok(Response::new(answer))
+    }
+
+    async fn batch_navigate(
+        &self,
+        request: Request<pb::BatchNavigateRequest>,
+    ) -> Result<Response<pb::BatchNavigateResponse>, Status> {
+        let (snapshot, limits, most) = (self.snapshot()?, self.config.limits, self.config.batch);
+        let budget = self.workers.budget(request.metadata());
+        let pb::BatchNavigateRequest { requests } = request.into_inner();
+        if requests.is_empty() || requests.len() > most {
+            return Err(Error::invalid("requests", format!("needs 1 to {most}, got {}", requests.len())).into());
+        }
+        let work = move |cancel: &Cancellation| {
+            let mut results = Vec::with_capacity(requests.len());
+            for request in requests {
+                cancel.check()?;
+                results.push(match navigate(&snapshot, request, limits, cancel) {
+                    Ok(response) => pb::batch_navigate_result::Result::Response(response),
+                    Err(Error::Cancelled) => return Err(Error::Cancelled),
+                    Err(error) => pb::batch_navigate_result::Result::Failure(pb::Failure {
+                        code: error.code().into(),
+                        message: error.to_string(),
+                    }),
+                });
+            }
+            Ok(results)
+        };
+        let results = self.workers.run(budget, work).await?;
+        let results = results.into_iter().map(|result| pb::BatchNavigateResult { result: Some(result) }).collect();
+        Ok(Response::new(pb::BatchNavigateResponse { results }))
+    }
+}
+
+fn navigate(
+    snapshot: &Snapshot,
+    request: pb::NavigateRequest,
+    limits: Limits,
+    cancel: &Cancellation,
+) -> Result<pb::NavigateResponse, Error> {
+    let served = snapshot.navigator(&request.room, &request.adapter)?;
+    let (query, thresholds) = convert::query(request, served.adapter.adapter.source())?;
+    let answer = served.navigator.answer(&query, limits, cancel)?;
+    let room = served.navigator.room();
+    Ok(pb::NavigateResponse {
+        room: Some(convert::room_revision(served)),
+        adapter: Some(convert::adapter_revision(served)),
+        steps: (1..)
+            .zip(&answer.steps)
+            .map(|(number, step)| convert::step_to_wire(number, step, room, &thresholds))
+            .collect(),
+        mode: convert::mode_to_wire(query.mode).into(),
+        reading: convert::reading_to_wire(query.reading).into(),
+        displacement: answer.displacement.map(|twist| convert::twist_to_wire(&twist)),
+        exact: served.navigator.audit().is_none(),
+    })
+}
