@@ -88,7 +88,7 @@ pub fn walk(
         _ => None,
     };
     let mut at = start.clone();
-    let mut steps = Vec::with_capacity(plan.steps as usize);
+    let mut steps = Vec::new();
     for done in 0..plan.steps {
         cancel.check()?;
         let (part, parts) = match (goal, at.pose) {

@@ -154,7 +154,7 @@ impl Navigator {
             hit_count: query.hit_count as usize,
             exclude_source: query.exclude_source,
         };
-        let mut steps = Vec::with_capacity(twists.len() * query.steps as usize);
+        let mut steps = Vec::new();
         let mut from = start.clone();
         let mut wanted = start.pose;
         for twist in twists {

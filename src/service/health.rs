@@ -5,8 +5,8 @@
 
 use std::pin::Pin;
 
-use tokio::sync::watch;
-use tokio_stream::{Stream, StreamExt, wrappers::WatchStream};
+use tokio::sync::{mpsc, watch};
+use tokio_stream::{Stream, wrappers::ReceiverStream};
 use tonic::server::NamedService;
 use tonic::{Request, Response, Status};
 use tonic_health::pb::health_check_response::ServingStatus;
@@ -64,13 +64,31 @@ impl Health for HealthOf {
 
     async fn watch(&self, request: Request<HealthCheckRequest>) -> Result<Response<Self::WatchStream>, Status> {
         let name = request.into_inner().service;
-        let mut last = None;
-        let changes = WatchStream::new(self.0.clone()).filter_map(move |phase| {
-            let now = status(&phase, &name).unwrap_or(ServingStatus::ServiceUnknown);
-            let changed = last != Some(now);
-            last = Some(now);
-            changed.then(|| Ok(HealthCheckResponse { status: now.into() }))
+        let mut phase = self.0.clone();
+        let (changes, stream) = mpsc::channel(4);
+        tokio::spawn(async move {
+            let mut last = None;
+            loop {
+                let (now, stopping) = {
+                    let phase = phase.borrow_and_update();
+                    let stopping = matches!(*phase, Phase::Draining(_) | Phase::Stopping);
+                    (status(&phase, &name).unwrap_or(ServingStatus::ServiceUnknown), stopping)
+                };
+                if last.replace(now) != Some(now)
+                    && changes.send(Ok(HealthCheckResponse { status: now.into() })).await.is_err()
+                {
+                    return;
+                }
+                // A watcher must not keep a server that was told to stop.
+                if stopping {
+                    return;
+                }
+                tokio::select! {
+                    changed = phase.changed() => if changed.is_err() { return },
+                    () = changes.closed() => return,
+                }
+            }
         });
-        Ok(Response::new(Box::pin(changes)))
+        Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }
 }

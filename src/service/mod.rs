@@ -41,6 +41,9 @@ use crate::proto::v1::odometry_service_server::OdometryServiceServer;
 use crate::store::{self, Store};
 use work::Workers;
 
+/// How long callers have to hear that their request was given up.
+const LAST_WORDS: Duration = Duration::from_secs(1);
+
 /// What a server allows.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
@@ -136,8 +139,8 @@ pub async fn run(
 ) -> Result<(), RunError> {
     let (phase, watched) = watch::channel(Phase::Loading);
     let (stop, stopped) = oneshot::channel::<()>();
-    let handlers =
-        Handlers { phase: watched.clone(), workers: Workers::new(&config), config: Arc::new(config.clone()) };
+    let workers = Workers::new(&config);
+    let handlers = Handlers { phase: watched.clone(), workers: workers.clone(), config: Arc::new(config.clone()) };
     let server = server(handlers, watched, listener, async {
         // An error means the sender is gone: the server is to stop all the same.
         let _ = stopped.await;
@@ -163,13 +166,13 @@ pub async fn run(
     phase.send_replace(Phase::Draining(loaded));
     // An error means the server has ended already.
     let _ = stop.send(());
-    match tokio::time::timeout(config.drain, server).await {
-        Ok(ended) => ended,
-        Err(_) => {
-            tracing::warn!("the drain bound passed; requests still in flight were dropped");
-            Ok(())
-        }
+    if let Ok(ended) = tokio::time::timeout(config.drain, &mut server).await {
+        return ended;
     }
+    tracing::warn!("the drain bound passed; requests still in flight are given up");
+    workers.halt();
+    // Their callers are answered, unless they do not even read that.
+    tokio::time::timeout(LAST_WORDS, server).await.unwrap_or(Ok(()))
 }
 
 fn server(

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::Semaphore;
+use tokio::sync::{Semaphore, watch};
 use tonic::metadata::MetadataMap;
 
 use super::{Config, Error};
@@ -15,6 +15,7 @@ pub struct Workers {
     threads: Arc<Semaphore>,
     admitted: Arc<Semaphore>,
     longest: Duration,
+    halted: watch::Sender<bool>,
 }
 
 /// Asks the work to stop when nobody waits for it any more.
@@ -33,7 +34,13 @@ impl Workers {
             threads: Arc::new(Semaphore::new(threads)),
             admitted: Arc::new(Semaphore::new(threads + config.queue)),
             longest: config.longest,
+            halted: watch::Sender::new(false),
         }
+    }
+
+    /// Gives up all work, running and waiting; its callers are told that the server is not there.
+    pub fn halt(&self) {
+        self.halted.send_replace(true);
     }
 
     /// How long a request may take: its own deadline, at most the server's.
@@ -45,7 +52,8 @@ impl Workers {
     /// thread is free for others only once it has stopped.
     ///
     /// # Errors
-    /// [`Error::Busy`], [`Error::Deadline`], [`Error::Internal`] if it panicked, or its own.
+    /// [`Error::Busy`], [`Error::Deadline`], [`Error::Loading`] if the server gave it up, [`Error::Internal`] if it
+    /// panicked, or its own.
     pub async fn run<T: Send + 'static>(
         &self,
         budget: Duration,
@@ -66,7 +74,11 @@ impl Workers {
                 Err(Error::Internal)
             })
         };
-        let result = tokio::time::timeout(budget, computed).await.unwrap_or(Err(Error::Deadline));
+        let mut halted = self.halted.subscribe();
+        let result = tokio::select! {
+            result = tokio::time::timeout(budget, computed) => result.unwrap_or(Err(Error::Deadline)),
+            _ = halted.wait_for(|halted| *halted) => Err(Error::Loading),
+        };
         drop(guard);
         result
     }

@@ -1,0 +1,9 @@
+//! The service over a real server on a free port, asked through the real client.
+
+#[path = "../support/mod.rs"]
+mod support;
+
+mod answers;
+mod harness;
+mod lifecycle;
+mod refusals;

@@ -1,0 +1,222 @@
+//! The store: what was published comes back, what was damaged is refused, what was interrupted is not seen.
+
+#[path = "support/mod.rs"]
+mod support;
+
+use std::path::{Path, PathBuf};
+
+use seese3::adapter::{Adapter, Preset};
+use seese3::features::{FeatureSource, Features};
+use seese3::pairs::Split;
+use seese3::room::{Frames, Provenance, Room, RoomId};
+use seese3::store::{Error, Store};
+use seese3::training::{Lesson, Recipe, learn};
+use support::{features, golden, poses};
+
+fn room(name: &str) -> Room {
+    let mut poses = poses(&golden().join("rooms/synthetic/poses.npy"));
+    poses.truncate(300);
+    let names = (0..300).map(|i| format!("seq/frame-{i:06}")).collect();
+    let timestamps_ns = (0..300).map(|i| 1_700_000_000_000_000_000 + i * 33_333_333).collect();
+    let provenance =
+        Provenance { format: "test".to_owned(), licence: "CC0".to_owned(), worst_rotation_deviation: 1e-4 };
+    Room::new(RoomId::new(name).unwrap(), Frames { poses, timestamps_ns, names }, provenance).unwrap()
+}
+
+fn set(name: &str, scale: f32) -> Features {
+    let rows = features(&golden(), "synthetic").slice_move(ndarray::s![..300, ..]) * scale;
+    Features::new(FeatureSource::imported(name, 0), rows).unwrap()
+}
+
+async fn stored() -> (tempfile::TempDir, Store) {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+    (folder, store)
+}
+
+/// The files under a folder whose path contains a word.
+fn files(folder: &Path, word: &str) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.to_string_lossy().contains(word) {
+                found.push(path);
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+fn adapter(room: &Room, features: &Features) -> (Adapter, seese3::adapter::TrainingRecord) {
+    let recipe = Recipe { preset: Preset::PaperBase, split: Split::Time, stride: 20, epochs: Some(2), seed: 4 };
+    learn(Lesson { room, revision: 1, features }, &recipe, &mut |_| ()).unwrap()
+}
+
+/// Oracle: what was published.
+#[tokio::test]
+async fn a_room_comes_back_as_it_was() {
+    let (_folder, store) = stored().await;
+    let (room, features) = (room("a"), [set("f", 1.0), set("g", 2.0)]);
+    let published = store.publish_room(&room, &features).await.unwrap();
+    assert_eq!((published.revision, published.is_new), (1, true));
+    let back = store.load_room("a", None).await.unwrap();
+    assert_eq!(back.room.timestamps_ns(), room.timestamps_ns());
+    assert_eq!(back.room.frame_names(), room.frame_names());
+    assert_eq!(back.room.provenance(), room.provenance());
+    for (found, expected) in back.room.poses().iter().zip(room.poses()) {
+        assert!((found.to_homogeneous() - expected.to_homogeneous()).abs().max() < 1e-15);
+    }
+    for (found, expected) in back.features.iter().zip(&features) {
+        assert_eq!((found.source(), found.rows()), (expected.source(), expected.rows()));
+    }
+}
+
+/// Oracle: the promise itself: the same content makes no revision; more features join, as long as the frames stay.
+#[tokio::test]
+async fn publishing_twice_changes_nothing_and_features_are_added() {
+    let (_folder, store) = stored().await;
+    let room = room("a");
+    store.publish_room(&room, &[set("f", 1.0)]).await.unwrap();
+    let again = store.publish_room(&room, &[set("f", 1.0)]).await.unwrap();
+    assert_eq!((again.revision, again.is_new), (1, false));
+    let more = store.publish_room(&room, &[set("g", 1.0)]).await.unwrap();
+    assert_eq!((more.revision, more.is_new), (2, true));
+    let names = |stored: &seese3::store::StoredRoom| {
+        stored.features.iter().map(|features| features.source().name.clone()).collect::<Vec<_>>()
+    };
+    assert_eq!(names(&store.load_room("a", None).await.unwrap()), ["f", "g"]);
+    assert_eq!(names(&store.load_room("a", Some(1)).await.unwrap()), ["f"], "an old revision stays as it was");
+    assert!(matches!(store.load_room("a", Some(3)).await, Err(Error::UnknownRevision { revision: 3, newest: 2, .. })));
+}
+
+/// Oracle: the adapter that was published answers with the same numbers, bit by bit.
+#[tokio::test]
+async fn an_adapter_comes_back_as_it_was() {
+    let (_folder, store) = stored().await;
+    let (room, features) = (room("a"), set("f", 1.0));
+    let (adapter, record) = adapter(&room, &features);
+    store.publish_adapter("x", &adapter, &record, features.rows()).await.unwrap();
+    let back = store.load_adapter("x", None).await.unwrap();
+    assert_eq!(back.adapter.embed(features.rows()).unwrap(), adapter.embed(features.rows()).unwrap());
+    assert_eq!((back.adapter.scale(), back.adapter.source()), (adapter.scale(), adapter.source()));
+    assert_eq!(back.record, record);
+}
+
+/// Oracle: the list: truncated, altered, or missing files are each named; nothing is answered from them.
+#[tokio::test]
+async fn damage_is_found_and_its_file_named() {
+    let (room, features) = (room("a"), set("f", 1.0));
+    let (trained, record) = adapter(&room, &features);
+    let flip = |bytes: &mut Vec<u8>| {
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+    };
+    let cut = |bytes: &mut Vec<u8>| bytes.truncate(bytes.len() - 1);
+    for word in ["frames-", "frame-names-", "features-", "rooms/a/revisions", "weights-", "adapters/x/revisions"] {
+        for harm in [&flip as &dyn Fn(&mut Vec<u8>), &cut, &|bytes: &mut Vec<u8>| bytes.clear()] {
+            let (folder, store) = stored().await;
+            store.publish_room(&room, std::slice::from_ref(&features)).await.unwrap();
+            store.publish_adapter("x", &trained, &record, features.rows()).await.unwrap();
+            let path = &files(folder.path(), word)[0];
+            let mut bytes = std::fs::read(path).unwrap();
+            harm(&mut bytes);
+            std::fs::write(path, bytes).unwrap();
+            let error = if word.contains("adapters") || word.contains("weights") {
+                store.load_adapter("x", None).await.unwrap_err()
+            } else {
+                store.load_room("a", None).await.unwrap_err()
+            };
+            let name = path.file_name().unwrap().to_string_lossy().into_owned();
+            assert!(matches!(error, Error::Damaged { .. }), "{word}: {error}");
+            assert!(error.to_string().contains(&name), "{error} names {name}");
+        }
+    }
+}
+
+/// Oracle: golden vectors exist to catch a program that computes something else: here, other weights under a valid
+/// checksum.
+#[tokio::test]
+async fn an_adapter_that_computes_something_else_is_refused() {
+    let (folder, store) = stored().await;
+    let (room, features) = (room("a"), set("f", 1.0));
+    let (trained, record) = adapter(&room, &features);
+    store.publish_adapter("x", &trained, &record, features.rows()).await.unwrap();
+    let weights = files(folder.path(), "weights-").remove(0);
+    let bytes = std::fs::read(&weights).unwrap();
+    let header = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    let text = String::from_utf8_lossy(&bytes[8..8 + header]).into_owned();
+    let tensors: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let start = 8 + header + tensors["W.weight"]["data_offsets"][0].as_u64().unwrap() as usize;
+    let mut altered = bytes;
+    altered[start..start + 4].copy_from_slice(&3.5f32.to_le_bytes());
+    let checksum = |bytes: &[u8]| {
+        use sha2::Digest;
+        sha2::Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect::<String>()
+    };
+    std::fs::write(&weights, &altered).unwrap();
+    let manifest = files(folder.path(), "adapters/x/revisions").remove(0);
+    let envelope: serde_json::Value = serde_json::from_slice(&std::fs::read(&manifest).unwrap()).unwrap();
+    let mut body = envelope["body"].clone();
+    body["weights"]["sha256"] = checksum(&altered).into();
+    let body = body.to_string();
+    std::fs::write(&manifest, format!("{{\"sha256\": \"{}\", \"body\": {body}}}", checksum(body.as_bytes()))).unwrap();
+    let error = store.load_adapter("x", None).await.unwrap_err().to_string();
+    assert!(error.contains("golden twists"), "{error}");
+}
+
+/// Oracle: a publish that dies before its manifest leaves the old version whole and shows no new one.
+#[tokio::test]
+async fn a_killed_publish_is_not_seen() {
+    let (folder, store) = stored().await;
+    let room = room("a");
+    store.publish_room(&room, &[set("f", 1.0)]).await.unwrap();
+    // A folder where the next manifest belongs: writing it fails, as it would on a disk that is full.
+    std::fs::create_dir(folder.path().join("rooms/a/revisions/000002.json")).unwrap();
+    assert!(store.publish_room(&room, &[set("f", 3.0)]).await.is_err());
+    let back = store.load_room("a", None).await.unwrap();
+    assert_eq!((back.revision, back.features[0].rows()), (1, set("f", 1.0).rows()));
+    // Tensors without any manifest: the room is not there at all.
+    let objects = folder.path().join("rooms/b/objects");
+    std::fs::create_dir_all(&objects).unwrap();
+    std::fs::write(objects.join("frames-0.safetensors"), b"half").unwrap();
+    assert!(matches!(store.load_room("b", None).await, Err(Error::Unknown { .. })));
+    assert_eq!(store.rooms().await.unwrap().len(), 1);
+}
+
+/// Oracle: the promise itself: two publishers never share a revision, and both versions are whole.
+#[tokio::test]
+async fn publishers_at_the_same_time_get_revisions_of_their_own() {
+    let (_folder, store) = stored().await;
+    let room = room("a");
+    let (f, g) = ([set("f", 1.0)], [set("g", 1.0)]);
+    let (one, two) = tokio::join!(store.publish_room(&room, &f), store.publish_room(&room, &g));
+    let mut revisions = [one.unwrap().revision, two.unwrap().revision];
+    revisions.sort_unstable();
+    assert_eq!(revisions, [1, 2]);
+    assert_eq!(store.load_room("a", Some(2)).await.unwrap().features.len(), 2);
+}
+
+/// Oracle: the list: unknown names, names that are paths, rows that do not fit, places that are not there.
+#[tokio::test]
+async fn bad_visitors_are_told_what_to_change() {
+    let (_folder, store) = stored().await;
+    let room = room("a");
+    store.publish_room(&room, &[set("f", 1.0)]).await.unwrap();
+    for name in ["nope", "../a", "a/b", ""] {
+        let error = store.load_room(name, None).await.unwrap_err().to_string();
+        assert!(error.contains("it has a"), "{error}");
+    }
+    let short = Features::new(FeatureSource::imported("s", 0), ndarray::Array2::ones((5, 3))).unwrap();
+    assert!(matches!(store.publish_room(&room, &[short]).await, Err(Error::FeatureRows { rows: 5, .. })));
+    assert!(matches!(store.publish_room(&room, &[set("a/b", 1.0)]).await, Err(Error::Name { .. })));
+    let twice = [set("f", 1.0), set("f", 2.0)];
+    assert!(matches!(store.publish_room(&room, &twice).await, Err(Error::DuplicateFeatures { .. })));
+    assert!(matches!(store.load_room_with("a", Some("g")).await, Err(Error::UnknownFeatures { .. })));
+    assert!(matches!(Store::open("/no/such/folder"), Err(Error::Missing { .. })));
+    assert!(matches!(Store::open("s3://bucket/prefix"), Err(Error::Open { .. })));
+}
