@@ -80,7 +80,7 @@ pub struct Navigate {
     #[arg(long, conflicts_with = "twist")]
     to: Option<u32>,
     /// The motion: vx,vy,vz,wx,wy,wz in metres and radians, in the camera's frame (x right, y down, z forward)
-    #[arg(long, value_delimiter = ',', allow_hyphen_values = true, num_args = 1..)]
+    #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
     twist: Option<Vec<f64>>,
     /// Equal parts of the motion
     #[arg(long, default_value_t = 1)]

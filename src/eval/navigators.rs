@@ -23,7 +23,8 @@ const REFIT_ALPHA: f64 = 1.0;
 /// One way to choose the next frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NavigatorKind {
-    /// ĝ = g: stay. Its Hit@ε is P(‖ΔP‖ < ε) as long as no other frame looks exactly the same.
+    /// ĝ = g: stay. It retrieves the source itself, also where another frame looks exactly the same, so that its
+    /// Hit@ε is P(‖ΔP‖ < ε), whatever the encoder; with the source excluded, the frame that looks most like it.
     Identity,
     /// A candidate drawn at random.
     Random,
@@ -175,6 +176,9 @@ struct Bench<'a> {
 impl Bench<'_> {
     fn row(&self, kind: NavigatorKind) -> Result<Row, Error> {
         let steps: Vec<Array1<f64>> = match kind {
+            NavigatorKind::Identity if self.protocol.exclude_source.is_none() => {
+                return self.row_of_frames(kind, self.test.iter().map(|pair| pair.source).collect());
+            }
             NavigatorKind::Identity => vec![Array1::zeros(self.latents.ncols()); self.test.len()],
             NavigatorKind::Random => return self.row_of_frames(kind, self.random_frames()?),
             NavigatorKind::Oracle => return self.row_of_frames(kind, self.nearest_poses()?),

@@ -1,0 +1,141 @@
+//! The real room: 1,000 photographs with measured poses, against a PyTorch reference on the same protocol.
+//!
+//! Runs where the folder of large inputs is (`SEESE3_SHARED`, else `../shared`) and says when it does not.
+
+#[path = "support/mod.rs"]
+mod support;
+
+use std::path::Path;
+use std::sync::Arc;
+
+use rayon::prelude::*;
+use seese3::adapter::{Preset, Reading};
+use seese3::cancel::Cancellation;
+use seese3::datasets::{read_features, read_poses, read_seven_scenes};
+use seese3::eval::{NavigatorKind, Protocol, evaluate};
+use seese3::features::{FeatureSource, Features};
+use seese3::geometry::body_twist;
+use seese3::navigation::{IndexKind, Navigator};
+use seese3::pairs::Split;
+use seese3::room::{Provenance, Room, RoomId};
+use seese3::scores::{MotionScores, mean};
+use seese3::training::{Lesson, Recipe, learn};
+use support::{near, shared, skipped};
+
+const EFFNET: &str = "features_effnetlite0_block14_gap.npy";
+const XFEAT: &str = "features_xfeat_block4_p2x2.npy";
+
+fn room(folder: &Path) -> Room {
+    let frames = read_poses(&folder.join("poses.npy")).unwrap().frames;
+    Room::new(RoomId::new("kitchen").unwrap(), frames, Provenance::default()).unwrap()
+}
+
+fn features(folder: &Path, file: &str) -> Features {
+    Features::new(FeatureSource::imported("f", 0), read_features(&folder.join(file)).unwrap()).unwrap()
+}
+
+/// One run: test scores and Hit@0.1 of inverse Poincaré.
+fn run(room: &Room, features: &Features, split: Split, stride: u32, seed: u64) -> (MotionScores, f64) {
+    let recipe = Recipe { preset: Preset::PaperBase, split, stride, epochs: Some(200), seed };
+    let (adapter, record) = learn(Lesson { room, revision: 1, features }, &recipe, &mut |_| ()).unwrap();
+    let navigator = Navigator::new(Arc::new(room.clone()), features, Arc::new(adapter), IndexKind::Exact).unwrap();
+    let navigators = vec![NavigatorKind::InversePoincare(Reading::Affine)];
+    let protocol = Protocol { split, navigators, ..Protocol::paper(stride) };
+    let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |_, _| ()).unwrap();
+    (record.test, report.rows[0].retrieval.hits[0].1.rate)
+}
+
+/// Oracle: PyTorch, 200 epochs, mean over seeds 0 to 4: R² within 0.02, Hit@0.1 within two of its deviations and at
+/// least 0.02.
+#[test]
+fn the_leaky_split_reaches_the_pytorch_reference() {
+    let Some(shared) = shared() else { return skipped("the_leaky_split_reaches_the_pytorch_reference") };
+    let folder = shared.join("rooms/kitchen");
+    let room = room(&folder);
+    for (file, stride, n, r2, hit, deviation) in [
+        (EFFNET, 10, 198, 0.789, 0.996, 0.0),
+        (EFFNET, 20, 196, 0.938, 0.989, 0.0),
+        (EFFNET, 40, 192, 0.981, 0.930, 0.013),
+        (XFEAT, 10, 198, 0.933, 1.0, 0.0),
+        (XFEAT, 20, 196, 0.978, 0.993, 0.0),
+        (XFEAT, 40, 192, 0.991, 0.928, 0.010),
+    ] {
+        let features = features(&folder, file);
+        let runs: Vec<_> =
+            (0..5u64).into_par_iter().map(|seed| run(&room, &features, Split::Pairs, stride, seed)).collect();
+        assert!(runs.iter().all(|(scores, _)| scores.n == n));
+        let found = mean(&runs.iter().map(|(scores, _)| scores.overall).collect::<Vec<_>>());
+        near(&format!("{file} {stride} R²"), found, r2, 0.02);
+        let found = mean(&runs.iter().map(|(_, hit)| *hit).collect::<Vec<_>>());
+        near(&format!("{file} {stride} Hit@0.1"), found, hit, f64::max(0.02, 2.0 * deviation));
+    }
+}
+
+/// Oracle: the definition, P(‖ΔP‖ < ε), counted on the poses; and the reference's own column.
+#[test]
+fn identity_hits_as_often_as_the_camera_hardly_moves() {
+    let Some(shared) = shared() else { return skipped("identity_hits_as_often_as_the_camera_hardly_moves") };
+    let folder = shared.join("rooms/kitchen");
+    let (room, features) = (room(&folder), features(&folder, EFFNET));
+    let recipe = Recipe { preset: Preset::PaperBase, split: Split::Time, stride: 40, epochs: Some(1), seed: 0 };
+    let (adapter, _) = learn(Lesson { room: &room, revision: 1, features: &features }, &recipe, &mut |_| ()).unwrap();
+    let room = Arc::new(room);
+    let navigator = Navigator::new(room.clone(), &features, Arc::new(adapter), IndexKind::Exact).unwrap();
+    for split in Split::ALL {
+        for stride in [10, 20, 40] {
+            let protocol = Protocol { split, navigators: vec![NavigatorKind::Identity], ..Protocol::paper(stride) };
+            let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |_, _| ()).unwrap();
+            let pairs = split.test_pairs(room.frame_count(), stride).unwrap();
+            for (epsilon, rate) in &report.rows[0].retrieval.hits {
+                let moves = |pair: &&seese3::pairs::Pair| {
+                    let poses = room.poses();
+                    body_twist(&poses[pair.source.row()], &poses[pair.target.row()]).norm() < *epsilon
+                };
+                let expected = pairs.iter().filter(moves).count() as f64 / pairs.len() as f64;
+                near(&format!("{split} {stride} ε {epsilon}"), rate.rate, expected, 1e-12);
+            }
+        }
+    }
+}
+
+/// Oracle: the two ways in which the room is published: an array of poses, and a folder of pose files.
+#[test]
+fn the_pose_files_give_the_poses_of_the_array() {
+    let Some(shared) = shared() else { return skipped("the_pose_files_give_the_poses_of_the_array") };
+    let folder = shared.join("rooms/kitchen");
+    let from_array = read_poses(&folder.join("poses.npy")).unwrap();
+    let from_files = read_seven_scenes(&folder, None, true).unwrap();
+    assert_eq!(from_files.frames.names[999], "seq-01/frame-000999");
+    assert_eq!(from_files.frames.poses.len(), 1_000);
+    near("deviation", from_files.worst_rotation_deviation, from_array.worst_rotation_deviation, 1e-12);
+    for (a, b) in from_array.frames.poses.iter().zip(&from_files.frames.poses) {
+        assert!((a.to_homogeneous() - b.to_homogeneous()).abs().max() < 1e-9);
+    }
+}
+
+/// Oracle: poses and reasons as NumPy and SciPy read the same files, traps and all.
+#[test]
+fn seven_scenes_traps_are_dropped_by_name() {
+    let Some(shared) = shared() else { return skipped("seven_scenes_traps_are_dropped_by_name") };
+    let folder = shared.join("oracles/datasets");
+    let expected = &support::json(&folder.join("expected.json"))["sevenscenes"];
+    let scene = folder.join(expected["root"].as_str().unwrap().trim_start_matches("datasets/"));
+    let found = read_seven_scenes(&scene, Some("seq-01"), false).unwrap();
+    let of_sequence = |value: &&serde_json::Value| value["name"].as_str().unwrap().starts_with("seq-01");
+    let frames: Vec<_> = expected["frames"].as_array().unwrap().iter().filter(of_sequence).collect();
+    assert_eq!(found.frames.poses.len(), frames.len());
+    for ((pose, name), frame) in found.frames.poses.iter().zip(&found.frames.names).zip(frames) {
+        assert_eq!(name, frame["name"].as_str().unwrap());
+        for (position, value) in pose.to_homogeneous().transpose().iter().enumerate() {
+            near(name, *value, support::number(&frame["world_from_camera"][position]), 1e-9);
+        }
+    }
+    let dropped: Vec<_> = expected["dropped"].as_array().unwrap().iter().filter(of_sequence).collect();
+    assert_eq!(found.dropped.len(), dropped.len());
+    for (found, expected) in found.dropped.iter().zip(dropped) {
+        assert_eq!(found.name, expected["name"].as_str().unwrap());
+        assert_eq!(found.reason.to_string(), expected["reason"].as_str().unwrap());
+    }
+    assert!(read_seven_scenes(&scene, Some("seq-01"), true).is_err());
+    assert!(read_seven_scenes(&scene, None, false).is_err(), "two sequences, none named");
+}
