@@ -4,6 +4,9 @@ use std::time::Duration;
 
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Status};
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
 use tonic_types::StatusExt;
 
 use crate::proto::v1 as pb;
@@ -206,6 +209,16 @@ impl Client {
     ) -> Result<pb::ScorePredictionsResponse, Error> {
         let mut service = EvaluationServiceClient::new(self.channel.clone());
         Ok(service.score_predictions(self.request(request)).await?.into_inner())
+    }
+
+    /// Whether the server serves: `""` for the whole server, a service's full name, or `rooms/NAME`.
+    ///
+    /// # Errors
+    /// [`Error::Refused`], also for a name that the server does not know.
+    pub async fn serves(&self, name: &str) -> Result<bool, Error> {
+        let mut health = HealthClient::new(self.channel.clone());
+        let request = self.request(HealthCheckRequest { service: name.to_owned() });
+        Ok(health.check(request).await?.into_inner().status() == ServingStatus::Serving)
     }
 
     fn request<T>(&self, message: T) -> tonic::Request<T> {

@@ -160,6 +160,8 @@ fn a_served_room_is_asked_and_the_server_stops_when_told() {
         catalog = seese3(&[&["catalog"][..], &to].concat());
     }
     assert!(String::from_utf8_lossy(&catalog.stdout).contains("room 'r' revision 1: 600 frames"));
+    assert_eq!(succeeds(&[&["health", "--name", "rooms/r"][..], &to].concat()), "serving\n");
+    refuses(&[&["health", "--name", "rooms/x"][..], &to].concat(), &["NotFound"]);
     let still = ["navigate", "--room", "r", "--from", "7", "--twist", "0,0,0,0,0,0", "--steps", "2"];
     let printed = succeeds(&[&still[..], &to].concat());
     assert!(printed.contains("step 2  frame     7  distance 0.0000"), "{printed}");

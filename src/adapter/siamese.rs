@@ -198,7 +198,7 @@ impl<T: Real> Siamese<T> {
         Zip::from(&mut d_scaled)
             .and(&forward.scaled)
             .and(&forward.cumulative)
-            .for_each(|d, &x, &cumulative| *d = *d * (cumulative + x * density_scale * (-half * x * x).exp()));
+            .for_each(|d, &x, &cumulative| *d *= cumulative + x * density_scale * (-half * x * x).exp());
         gradient.norm_weight += &(&d_scaled * &forward.normalised).sum_axis(Axis(0));
         gradient.norm_bias += &d_scaled.sum_axis(Axis(0));
         let mut d_first = d_scaled * &self.norm_weight;

@@ -12,7 +12,7 @@ use crate::datasets::read_features;
 use crate::proto::v1 as pb;
 
 #[derive(Debug, Args)]
-struct Server {
+pub struct Server {
     /// The server, HOST:PORT
     #[arg(long, env = "SEESE3_SERVER", default_value = "127.0.0.1:50051")]
     server: String,
@@ -22,7 +22,8 @@ struct Server {
 }
 
 impl Server {
-    async fn connect(&self) -> anyhow::Result<Client> {
+    /// Connects.
+    pub async fn connect(&self) -> anyhow::Result<Client> {
         Ok(Client::connect(&self.server, Duration::from_secs(self.deadline)).await?)
     }
 }

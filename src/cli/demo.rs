@@ -73,13 +73,23 @@ impl Demo {
         let room = Arc::new(stored.room);
         say(score(&room, &features, adapter)?.trim_end());
 
-        say("4. Serving the store and asking it over gRPC");
+        say(format_args!(
+            "4. Serving the store and asking it over gRPC: one motion of {STRIDE} frames in {STEPS} steps, closed loop"
+        ));
         let picture = self.out.join("path.svg");
         serve_and_ask(&store, &room, &picture).await?;
 
+        say("Files written:");
+        for file in files_under(&self.out)? {
+            say(format_args!("   {}", file.display()));
+        }
+        let from = example_source(room.frame_count());
         say("Go on from here:");
         say(format_args!("   seese3 serve --store {location}"));
-        say(format_args!("   seese3 navigate --room {ROOM} --from 1700 --to 1740 --steps {STEPS} --mode closed-loop"));
+        say(format_args!(
+            "   seese3 navigate --room {ROOM} --from {from} --to {} --steps {STEPS} --mode closed-loop",
+            from + STRIDE
+        ));
         say(format_args!("   seese3 evaluate --store {location} --room {ROOM} --exclude-source"));
         say("(`cargo run --release --` stands for `seese3` in a checkout)");
         Ok(())
@@ -138,10 +148,30 @@ async fn serve_and_ask(store: &Store, room: &Arc<Room>, picture: &Path) -> anyho
     Ok(())
 }
 
-/// A 4-step closed loop from the middle of the held-out part to the frame 40 later.
+/// The frame that the example starts from: in the middle of the second half of the held-out part, whatever is there.
+fn example_source(frame_count: usize) -> u32 {
+    (frame_count * 19 / 20) as u32
+}
+
+/// Every file under a folder, in order.
+fn files_under(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(folder).with_context(|| folder.display().to_string())? {
+        let path = entry?.path();
+        if path.is_dir() {
+            files.extend(files_under(&path)?);
+        } else {
+            files.push(path);
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+/// A 4-step closed loop in the held-out part to the frame 40 later.
 async fn ask(address: &str, frame_count: usize) -> anyhow::Result<pb::NavigateResponse> {
     let client = Client::connect(address, Duration::from_secs(30)).await?;
-    let source = (frame_count * 9 / 10) as u32;
+    let source = example_source(frame_count);
     let request = pb::NavigateRequest {
         room: ROOM.to_owned(),
         source: Some(pb::View { view: Some(pb::view::View::FrameId(source)) }),
@@ -172,7 +202,7 @@ fn plot_of(room: &Room, answer: &pb::NavigateResponse) -> anyhow::Result<PathPlo
         let pose = service::pose_from_wire(pose.context("the server sent no pose")?.clone(), ROOM)?;
         Ok(place(&pose))
     };
-    let source = room.frame_count() * 9 / 10;
+    let source = example_source(room.frame_count()) as usize;
     Ok(PathPlot {
         title: format!("{STEPS} steps, closed loop, {STRIDE} frames ahead"),
         map: room.poses().iter().map(|pose| [pose.translation.x, pose.translation.y]).collect(),

@@ -3,6 +3,7 @@
 mod ask;
 mod demo;
 mod evaluate;
+mod health;
 mod import;
 mod progress;
 mod serve;
@@ -38,6 +39,8 @@ enum Command {
     Motion(ask::Motion),
     /// List what a server answers for
     Catalog(ask::Catalog),
+    /// Succeed if a server serves, for containers and supervisors
+    Health(health::Health),
 }
 
 /// Runs a command; what it finds goes to standard output, what goes wrong into the error.
@@ -55,6 +58,7 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Localize(arguments) => arguments.run().await,
         Command::Motion(arguments) => arguments.run().await,
         Command::Catalog(arguments) => arguments.run().await,
+        Command::Health(arguments) => arguments.run().await,
     }
 }
 

@@ -53,8 +53,7 @@ pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
     let pb::Quaternion { w, x, y, z } = orientation.ok_or_else(|| Error::invalid("orientation", "is required"))?;
     let quaternion = Quaternion::new(w, x, y, z);
     let norm = quaternion.norm();
-    // Written so that a norm that is not a number fails too.
-    if !((norm - 1.0).abs() <= QUATERNION_TOLERANCE) {
+    if norm.is_nan() || (norm - 1.0).abs() > QUATERNION_TOLERANCE {
         return Err(Error::invalid("orientation", format!("has norm {norm}, a rotation has 1")));
     }
     let position = vector("position", position)?;

@@ -9,7 +9,7 @@ use seese3::cancel::Cancellation;
 use seese3::eval::{NavigatorKind, Protocol, RetrievalScores, Row, evaluate};
 use seese3::features::{FeatureSource, Features};
 use seese3::geometry::body_twist;
-use seese3::index::ExactIndex;
+use seese3::index::{ExactIndex, Index};
 use seese3::navigation::{IndexKind, Mode, Navigator, Plan, Reading, Source, Space, walk};
 use seese3::pairs::{Pair, Split};
 use seese3::room::{Frames, Provenance, Room, RoomId};

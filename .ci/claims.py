@@ -1,0 +1,60 @@
+"""Checks what the README and the docs claim against the JSON that the program wrote. No packages needed."""
+
+import json
+import math
+import pathlib
+import sys
+
+# PyTorch, 200 epochs, seeds 0 to 4 (docs/reference.md): R², Hit@0.1 of inverse Poincaré and its deviation.
+REFERENCE = {
+    ("effnet", 10, "pairs"): (0.789, 0.996, 0.0),
+    ("effnet", 20, "pairs"): (0.938, 0.989, 0.0),
+    ("effnet", 40, "pairs"): (0.981, 0.930, 0.013),
+    ("xfeat", 10, "pairs"): (0.933, 1.000, 0.0),
+    ("xfeat", 20, "pairs"): (0.978, 0.993, 0.0),
+    ("xfeat", 40, "pairs"): (0.991, 0.928, 0.010),
+}
+TIME_SPLIT = {
+    ("effnet", 10): -9.30, ("effnet", 20): -7.25, ("effnet", 40): -9.79,
+    ("xfeat", 10): -3.58, ("xfeat", 20): -2.74, ("xfeat", 40): -4.28,
+}
+
+
+def rows(path):
+    table = json.loads(pathlib.Path(path).read_text())
+    return {row["name"]: row for row in table["navigators"]}
+
+
+def demo(path):
+    """Inverse Poincaré above Identity and a random frame at ε 0.1 and 0.2, intervals apart."""
+    table = rows(path)
+    for epsilon in ("0.1", "0.2"):
+        low = min(table[f"inverse-poincare-{r}"]["hit"][epsilon]["low"] for r in ("affine", "homogeneous"))
+        for baseline in ("identity", "random"):
+            high = table[baseline]["hit"][epsilon]["high"]
+            print(f"Hit@{epsilon}: inverse from {low:.3f}, {baseline} up to {high:.3f}")
+            assert low > high, f"the intervals overlap at {epsilon} for {baseline}"
+
+
+def kitchen(folder):
+    """Mean test R² within 0.02 and Hit@0.1 within two deviations (at least 0.02) of the reference."""
+    for (features, stride, split), (r2, hit, deviation) in REFERENCE.items():
+        runs = json.loads((folder / f"{features}-{stride}-{split}.json").read_text())["runs"]
+        found_r2 = sum(run["test"]["r2"]["overall"] for run in runs) / len(runs)
+        found_hit = sum(run["inverse_poincare_affine"]["hit"]["0.1"]["rate"] for run in runs) / len(runs)
+        print(f"{features} {stride} {split}: R² {found_r2:.3f} (reference {r2}), Hit@0.1 {found_hit:.3f} ({hit})")
+        assert abs(found_r2 - r2) <= 0.02
+        assert abs(found_hit - hit) <= max(0.02, 2 * deviation)
+        table = rows(folder / f"table-{features}-{stride}.json")
+        assert math.isclose(table["oracle"]["hit"]["0.1"]["rate"], 1.0)
+    for (features, stride), reference in TIME_SPLIT.items():
+        runs = json.loads((folder / f"{features}-{stride}-time.json").read_text())["runs"]
+        found = sum(run["test"]["r2"]["overall"] for run in runs) / len(runs)
+        print(f"{features} {stride} time: R² {found:.2f} (reference {reference}; out of distribution, not gated)")
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "demo":
+        demo(sys.argv[2])
+    else:
+        kitchen(pathlib.Path(sys.argv[2]))

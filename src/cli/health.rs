@@ -1,0 +1,26 @@
+//! `seese3 health`: whether a server serves.
+
+use anyhow::bail;
+use clap::Args;
+
+use super::ask::Server;
+use super::say;
+
+#[derive(Debug, Args)]
+pub struct Health {
+    #[command(flatten)]
+    server: Server,
+    /// A service's full name or rooms/NAME; the whole server if empty
+    #[arg(long, default_value = "")]
+    name: String,
+}
+
+impl Health {
+    pub async fn run(self) -> anyhow::Result<()> {
+        if !self.server.connect().await?.serves(&self.name).await? {
+            bail!("the server does not serve yet, or no more");
+        }
+        say("serving");
+        Ok(())
+    }
+}
