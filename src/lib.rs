@@ -29,3 +29,8 @@ pub mod proto; // the generated wire types
 pub mod service; // gRPC
 pub mod client; // the other side of it
 pub mod cli; // the commands
+
+/// The README's example, compiled with the tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -51,7 +51,7 @@ fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, plot: &PathPlot) -> Drawn {
         .x_label_area_size(40)
         .y_label_area_size(50)
         .build_cartesian_2d(x_range, y_range)?;
-    chart.configure_mesh().light_line_style(RGBColor(240, 240, 240)).x_desc("x, metres").y_desc("y, metres").draw()?;
+    chart.configure_mesh().light_line_style(WHITE).x_desc("x, metres").y_desc("y, metres").draw()?;
     let entry = |colour: RGBColor| move |(x, y)| Circle::new((x + 10, y), 5, colour.filled());
     chart
         .draw_series(plot.map.iter().map(|at| Circle::new((at[0], at[1]), 2, MAP_COLOUR.filled())))?
