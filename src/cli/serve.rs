@@ -29,6 +29,9 @@ pub struct Serve {
     /// The most frames of one step or localisation
     #[arg(long, env = "SEESE3_MAX_HITS", default_value_t = Limits::default().hits)]
     max_hits: u32,
+    /// The most frames of one answer
+    #[arg(long, env = "SEESE3_MAX_HITS_IN_ALL", default_value_t = Limits::default().hits_in_all)]
+    max_hits_in_all: u64,
     /// The largest message that is read, bytes
     #[arg(long, env = "SEESE3_MAX_MESSAGE_BYTES", default_value_t = Config::default().message_bytes)]
     max_message_bytes: usize,
@@ -73,7 +76,7 @@ impl Serve {
                 IndexName::Exact => IndexKind::Exact,
                 IndexName::Hnsw => IndexKind::Hnsw(HnswParameters::default()),
             },
-            limits: Limits { steps: self.max_steps, hits: self.max_hits },
+            limits: Limits { steps: self.max_steps, hits: self.max_hits, hits_in_all: self.max_hits_in_all },
             message_bytes: self.max_message_bytes,
             threads: self.threads.unwrap_or(defaults.threads).max(1),
             queue: self.queue,

@@ -40,6 +40,8 @@ pub enum Error {
     Steps { actual: u64, most: u32 },
     #[error("hit_count must be 1 to {most}, got {actual}")]
     HitCount { actual: u32, most: u32 },
+    #[error("steps times hit_count is {actual}, over the limit of {most} frames in one answer")]
+    HitsInAll { actual: u64, most: u64 },
     #[error("displacement has no twist; give at least one")]
     NoTwist,
     #[error("displacement {position} has a number that is not finite or a translation over {MAX_TRANSLATION_M:e} m")]

@@ -61,11 +61,13 @@ pub struct Limits {
     pub steps: u32,
     /// Frames for each step.
     pub hits: u32,
+    /// Frames in all: what keeps an answer under the 4 MiB that gRPC clients read unless told otherwise.
+    pub hits_in_all: u64,
 }
 
 impl Default for Limits {
     fn default() -> Self {
-        Self { steps: 1_000, hits: 1_000 }
+        Self { steps: 1_000, hits: 1_000, hits_in_all: 10_000 }
     }
 }
 
@@ -73,7 +75,7 @@ impl Query {
     /// Checks what can be checked without a room.
     ///
     /// # Errors
-    /// [`Error::Steps`], [`Error::HitCount`], [`Error::NoTwist`], [`Error::TwistNotFinite`] or
+    /// [`Error::Steps`], [`Error::HitCount`], [`Error::HitsInAll`], [`Error::NoTwist`], [`Error::TwistNotFinite`] or
     /// [`Error::TwistBeyondPi`].
     pub fn check(&self, limits: Limits) -> Result<(), Error> {
         let motions = match &self.displacement {
@@ -92,6 +94,10 @@ impl Query {
         }
         if self.hit_count == 0 || self.hit_count > limits.hits {
             return Err(Error::HitCount { actual: self.hit_count, most: limits.hits });
+        }
+        let in_all = actual.saturating_mul(u64::from(self.hit_count));
+        if in_all > limits.hits_in_all {
+            return Err(Error::HitsInAll { actual: in_all, most: limits.hits_in_all });
         }
         Ok(())
     }

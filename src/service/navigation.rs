@@ -29,6 +29,11 @@ impl NavigationService for Handlers {
         if requests.is_empty() || requests.len() > most {
             return Err(Error::invalid("requests", format!("needs 1 to {most}, got {}", requests.len())).into());
         }
+        let in_all = requests.iter().map(hits_asked_for).fold(0, u64::saturating_add);
+        if in_all > limits.hits_in_all {
+            let problem = format!("ask for {in_all} frames together, over the limit of {}", limits.hits_in_all);
+            return Err(Error::invalid("requests", problem).into());
+        }
         let work = move |cancel: &Cancellation| {
             let mut results = Vec::with_capacity(requests.len());
             for request in requests {
@@ -48,6 +53,11 @@ impl NavigationService for Handlers {
         let results = results.into_iter().map(|result| pb::BatchNavigateResult { result: Some(result) }).collect();
         Ok(Response::new(pb::BatchNavigateResponse { results }))
     }
+}
+
+/// How many frames a request asks for, at least; each question is checked again when it is answered.
+fn hits_asked_for(request: &pb::NavigateRequest) -> u64 {
+    u64::from(request.steps.unwrap_or(1)).saturating_mul(u64::from(request.hit_count.unwrap_or(1)))
 }
 
 fn navigate(

@@ -116,7 +116,7 @@ impl From<navigation::Error> for Error {
             E::TargetFrame(_) => "displacement.target_frame_id",
             E::Adapter(problem) => return view_error(problem).within("source"),
             E::Steps { .. } => "steps",
-            E::HitCount { .. } => "hit_count",
+            E::HitCount { .. } | E::HitsInAll { .. } => "hit_count",
             E::NoTwist | E::TwistNotFinite { .. } | E::TwistBeyondPi { .. } => "displacement",
             E::PoseNeeded { .. } => "source_pose",
         };

@@ -112,7 +112,7 @@ async fn reflection_lists_the_services_in_both_versions() {
 /// thread is free again at once.
 #[tokio::test]
 async fn a_deadline_ends_the_work() {
-    let limits = seese3::navigation::Limits { steps: 4_000_000_000, hits: 1_000 };
+    let limits = seese3::navigation::Limits { steps: 4_000_000_000, hits: 1_000, hits_in_all: u64::MAX };
     let server = start(Config { threads: 1, queue: 4, limits, ..Config::default() }).await;
     let mut service = NavigationServiceClient::new(channel(&server.address).await);
     let endless = pb::NavigateRequest { steps: Some(400_000_000), ..question() };
@@ -157,7 +157,7 @@ async fn every_answer_carries_a_request_id() {
 /// when it does not end in time, the bound does.
 #[tokio::test]
 async fn stopping_answers_what_is_in_flight_within_a_bound() {
-    let limits = seese3::navigation::Limits { steps: 4_000_000_000, hits: 1_000 };
+    let limits = seese3::navigation::Limits { steps: 4_000_000_000, hits: 1_000, hits_in_all: u64::MAX };
     let server = start(Config { limits, drain: Duration::from_secs(20), ..Config::default() }).await;
     let client = server.client.clone();
     let slow = pb::NavigateRequest { steps: Some(30_000), ..question() };

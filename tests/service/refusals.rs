@@ -139,6 +139,12 @@ async fn navigate_names_the_field() {
         ("2³² − 1 steps", pb::NavigateRequest { steps: Some(u32::MAX), ..q() }, InvalidArgument, "steps"),
         ("0 hits", pb::NavigateRequest { hit_count: Some(0), ..q() }, InvalidArgument, "hit_count"),
         ("10⁹ hits", pb::NavigateRequest { hit_count: Some(1_000_000_000), ..q() }, InvalidArgument, "hit_count"),
+        (
+            "10⁶ frames in one answer",
+            pb::NavigateRequest { steps: Some(1_000), hit_count: Some(1_000), ..q() },
+            InvalidArgument,
+            "hit_count",
+        ),
         ("ε of 0", pb::NavigateRequest { thresholds: vec![0.1, 0.0], ..q() }, InvalidArgument, "thresholds"),
         ("ε NaN", pb::NavigateRequest { thresholds: vec![f64::NAN], ..q() }, InvalidArgument, "thresholds"),
         ("unknown mode", pb::NavigateRequest { mode: 77, ..q() }, InvalidArgument, "mode"),
@@ -323,6 +329,8 @@ async fn the_other_calls_name_the_field() {
 
     refused("empty batch", c.batch_navigate(vec![]).await, InvalidArgument, "requests");
     refused("large batch", c.batch_navigate(vec![question(); 3]).await, InvalidArgument, "requests");
+    let wide = pb::NavigateRequest { steps: Some(10), hit_count: Some(501), ..question() };
+    refused("a batch of many frames", c.batch_navigate(vec![wide; 2]).await, InvalidArgument, "requests");
     refused("unknown adapter", c.adapter("x").await, NotFound, "adapter");
     refused("unknown room", c.room("x").await, NotFound, "room");
 }
