@@ -28,6 +28,8 @@ pub enum Error {
     Connect { address: String, problem: String },
     #[error("the server refused ({:?}): {}", .0.code(), .0.message())]
     Refused(Box<Status>),
+    #[error("no answer came before the deadline")]
+    Deadline,
     #[error("the server ended the evaluation without a report")]
     NoReport,
 }
@@ -53,6 +55,10 @@ impl Error {
 
 impl From<Status> for Error {
     fn from(status: Status) -> Self {
+        // The transport reports its own time-out as a cancellation.
+        if status.code() == Code::Cancelled && status.message() == "Timeout expired" {
+            return Self::Deadline;
+        }
         Self::Refused(Box::new(status))
     }
 }

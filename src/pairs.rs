@@ -77,6 +77,11 @@ impl Split {
         self.pairs(frame_count, stride, Side::Test)
     }
 
+    /// Whether a pair of any stride is a test pair.
+    pub fn tests(self, frame_count: usize, pair: Pair) -> bool {
+        self.side(frame_count, pair) == Some(Side::Test)
+    }
+
     /// The frames among which a test answer is looked for: the test frames; all frames under
     /// [`Split::Pairs`], which has no test frames.
     pub fn candidates(self, frame_count: usize) -> Vec<FrameId> {

@@ -10,11 +10,14 @@ use crate::geometry::Pose;
 /// What is wrong with a room.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum Error {
-    #[error("name '{name}' must be 1 to 100 letters, digits, '.', '-' or '_', and begin with a letter or digit")]
+    #[error("name {name:?} must be 1 to 100 letters, digits, '.', '-' or '_', and begin with a letter or digit")]
     Name { name: String },
     #[error("room '{room}' has no frames")]
     Empty { room: RoomId },
-    #[error("room '{room}', frame {frame}: the pose is not finite; drop the frame or repair its pose")]
+    #[error(
+        "room '{room}', frame {frame}: the pose is not finite or over {MAX_DISTANCE_M:e} m from the origin; \
+         drop the frame or repair its pose"
+    )]
     PoseNotFinite { room: RoomId, frame: usize },
     #[error("room '{room}' has {frame_count} poses but {actual} {what}; every frame needs one")]
     Count { room: RoomId, frame_count: usize, actual: usize, what: &'static str },
@@ -23,6 +26,9 @@ pub enum Error {
     #[error("room '{room}' has no frame {frame}; it has frames 0 to {}", frame_count - 1)]
     UnknownFrame { room: RoomId, frame: FrameId, frame_count: usize },
 }
+
+/// The farthest that a camera may be from its world's origin, metres.
+pub const MAX_DISTANCE_M: f64 = 1e6;
 
 /// The most frames a room may have.
 pub const MAX_FRAMES: usize = 10_000_000;
@@ -124,7 +130,8 @@ impl Room {
                 return Err(Error::Count { room: id, frame_count, actual, what });
             }
         }
-        let finite = |pose: &Pose| pose.to_homogeneous().iter().all(|x| x.is_finite());
+        let near = |pose: &Pose| pose.translation.vector.norm() <= MAX_DISTANCE_M;
+        let finite = |pose: &Pose| near(pose) && pose.to_homogeneous().iter().all(|x| x.is_finite());
         if let Some(frame) = frames.poses.iter().position(|pose| !finite(pose)) {
             return Err(Error::PoseNotFinite { room: id, frame });
         }

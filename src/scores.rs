@@ -61,12 +61,15 @@ pub fn constant_r2(truth: &[Twist], constant: &Vector6<f64>) -> f64 {
     MotionScores::of(truth, &predicted).overall
 }
 
+/// Truths that deviate by less than this, in their own unit, do not vary: it is rounding.
+const STILL: f64 = 1e-9;
+
 /// R² of (truth, prediction) pairs; NaN when the truths do not vary.
 pub fn r2(pairs: Vec<(f64, f64)>) -> f64 {
     let mean = pairs.iter().map(|(truth, _)| truth).sum::<f64>() / pairs.len() as f64;
     let total: f64 = pairs.iter().map(|(truth, _)| (truth - mean).powi(2)).sum();
     let residual: f64 = pairs.iter().map(|(truth, predicted)| (truth - predicted).powi(2)).sum();
-    if total > 0.0 { 1.0 - residual / total } else { f64::NAN }
+    if total > pairs.len() as f64 * STILL * STILL { 1.0 - residual / total } else { f64::NAN }
 }
 
 /// A rate with its count and its 95 % interval.

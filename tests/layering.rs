@@ -12,7 +12,7 @@ const RESERVED: [(&str, &[&str]); 9] = [
     ("tokio", &["service", "client", "cli", "main"]),
     ("std::fs", &["datasets", "store", "cli"]),
     ("std::env", &[]),
-    ("std::time", &["service", "client", "cli"]),
+    ("std::time", &["service", "client", "cli", "main"]),
     ("hnsw_rs", &["index"]),
     ("object_store", &["store"]),
     ("serde", &["store", "report", "cli"]),
@@ -98,8 +98,8 @@ fn formats_and_the_outside_world_have_one_home() {
                 let named = line.match_indices(what).any(|(at, _)| {
                     let before = line[..at].chars().next_back();
                     let after = line[at + what.len()..].chars().next();
-                    let apart = |c: Option<char>| c.is_none_or(|c| !c.is_alphanumeric() && c != '_' && c != '-');
-                    apart(before) && apart(after) && before != Some('"')
+                    let apart = |c: Option<char>| c.is_none_or(|c| !c.is_alphanumeric() && !"_-,\"".contains(c));
+                    apart(before) && apart(after)
                 });
                 let home = homes.contains(&module.as_str()) || (module == "lib");
                 if named && !home {

@@ -1,5 +1,7 @@
 //! The store: what was published comes back, what was damaged is refused, what was interrupted is not seen.
 
+#[path = "support/dying.rs"]
+mod dying;
 #[path = "support/mod.rs"]
 mod support;
 
@@ -169,36 +171,67 @@ async fn an_adapter_that_computes_something_else_is_refused() {
     assert!(error.contains("golden twists"), "{error}");
 }
 
-/// Oracle: a publish that dies before its manifest leaves the old version whole and shows no new one.
+/// Oracle: the promise itself: whichever write of a publish is the last that happens, the old version is whole, and the
+/// new one is there only when all of it is.
 #[tokio::test]
-async fn a_killed_publish_is_not_seen() {
-    let (folder, store) = stored().await;
+async fn a_publish_that_dies_at_any_write_leaves_the_old_version() {
     let room = room("a");
-    store.publish_room(&room, &[set("f", 1.0)]).await.unwrap();
-    // A folder where the next manifest belongs: writing it fails, as it would on a disk that is full.
-    std::fs::create_dir(folder.path().join("rooms/a/revisions/000002.json")).unwrap();
-    assert!(store.publish_room(&room, &[set("f", 3.0)]).await.is_err());
-    let back = store.load_room("a", None).await.unwrap();
-    assert_eq!((back.revision, back.features[0].rows()), (1, set("f", 1.0).rows()));
+    let (old, new) = ([set("f", 1.0)], [set("f", 3.0), set("g", 1.0)]);
+    for survives in 0..=4 {
+        let (folder, store) = stored().await;
+        store.publish_room(&room, &old).await.unwrap();
+        let disk = object_store::local::LocalFileSystem::new_with_prefix(folder.path()).unwrap();
+        let dying = Store::with_objects(std::sync::Arc::new(dying::Dying::new(disk, survives)), "dying");
+        let published = dying.publish_room(&room, &new).await;
+        // Two sets of features, the frames and their names are written before the manifest.
+        assert!(published.is_err(), "write {survives} of 5 failed");
+        let back = store.load_room("a", None).await.unwrap();
+        assert_eq!((back.revision, back.features.len()), (1, 1), "after {survives} writes");
+        assert_eq!(back.features[0].rows(), old[0].rows());
+        let again = store.publish_room(&room, &new).await.unwrap();
+        assert_eq!((again.revision, again.is_new), (2, true), "and publishing again repairs");
+    }
     // Tensors without any manifest: the room is not there at all.
+    let (folder, store) = stored().await;
     let objects = folder.path().join("rooms/b/objects");
     std::fs::create_dir_all(&objects).unwrap();
     std::fs::write(objects.join("frames-0.safetensors"), b"half").unwrap();
     assert!(matches!(store.load_room("b", None).await, Err(Error::Unknown { .. })));
-    assert_eq!(store.rooms().await.unwrap().len(), 1);
+    assert!(store.rooms().await.unwrap().is_empty());
 }
 
-/// Oracle: the promise itself: two publishers never share a revision, and both versions are whole.
+/// Oracle: a manifest says what it is: one that was moved or copied is not what its place says.
 #[tokio::test]
+async fn a_manifest_in_another_place_is_refused() {
+    let (folder, store) = stored().await;
+    store.publish_room(&room("a"), &[set("f", 1.0)]).await.unwrap();
+    let revisions = folder.path().join("rooms/a/revisions");
+    std::fs::copy(revisions.join("000001.json"), revisions.join("000003.json")).unwrap();
+    let error = store.load_room("a", None).await.unwrap_err().to_string();
+    assert!(error.contains("000003.json") && error.contains("moved or copied"), "{error}");
+    std::fs::remove_file(revisions.join("000003.json")).unwrap();
+    std::fs::rename(folder.path().join("rooms/a"), folder.path().join("rooms/b")).unwrap();
+    assert!(matches!(store.load_room("b", None).await, Err(Error::Damaged { .. })));
+}
+
+/// Oracle: the promise itself: publishers never share a revision, and what each brought is there at the end.
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn publishers_at_the_same_time_get_revisions_of_their_own() {
     let (_folder, store) = stored().await;
-    let room = room("a");
-    let (f, g) = ([set("f", 1.0)], [set("g", 1.0)]);
-    let (one, two) = tokio::join!(store.publish_room(&room, &f), store.publish_room(&room, &g));
-    let mut revisions = [one.unwrap().revision, two.unwrap().revision];
+    let publish = |number: usize| {
+        let store = store.clone();
+        tokio::spawn(async move {
+            let features = [set(&format!("f{number}"), 1.0)];
+            store.publish_room(&room("a"), &features).await.unwrap().revision
+        })
+    };
+    let mut revisions = Vec::new();
+    for task in (0..6).map(publish).collect::<Vec<_>>() {
+        revisions.push(task.await.unwrap());
+    }
     revisions.sort_unstable();
-    assert_eq!(revisions, [1, 2]);
-    assert_eq!(store.load_room("a", Some(2)).await.unwrap().features.len(), 2);
+    assert_eq!(revisions, [1, 2, 3, 4, 5, 6]);
+    assert_eq!(store.load_room("a", None).await.unwrap().features.len(), 6);
 }
 
 /// Oracle: the list: unknown names, names that are paths, rows that do not fit, places that are not there.

@@ -22,10 +22,16 @@ pub use siamese::{Siamese, TENSOR_NAMES, Widths};
 pub use train::{EpochProgress, Samples, StepReport, TrainConfig, Trainer, train};
 
 use nalgebra::Vector6;
-use ndarray::{Array1, Array2, ArrayView1, ArrayView2};
+use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis};
 
 use crate::features::FeatureSource;
 use crate::geometry::Twist;
+
+/// The largest number that a latent may hold: far over any that an adapter makes, far under what overflows.
+pub const MAX_LATENT: f64 = 1e6;
+
+/// Rows embedded at a time, so that memory stays flat with the size of a room.
+const EMBED_ROWS: usize = 1_024;
 
 /// Columns of a latent, the paper's geo_dim.
 pub const LATENT_DIM: usize = 20;
@@ -39,6 +45,8 @@ pub enum Error {
     FeatureSource { expected: String, actual: String },
     #[error("latent has {actual} numbers, the adapter's latents have {expected}")]
     LatentDim { expected: usize, actual: usize },
+    #[error("latent, number {position} is {value:e}, over the limit of {MAX_LATENT:e}")]
+    LatentRange { position: usize, value: f64 },
     #[error("{what}, number {position} is {value}; every number must be finite")]
     NotFinite { what: &'static str, position: usize, value: f64 },
     #[error("adapter weights are not finite in '{tensor}'")]
@@ -54,9 +62,14 @@ pub enum Error {
     RankDeficient { rank: usize, largest: f64, smallest: f64 },
     #[error("no training pairs")]
     NoPairs,
+    #[error("the camera moves alike in all training pairs: there is nothing to learn a motion from")]
+    NoMotion,
     #[error("training diverged in epoch {epoch}: the loss is {loss}; lower the learning rate")]
     Diverged { epoch: usize, loss: f64 },
 }
+
+/// A component of the motions that deviates by less, metres or radians, does not move: it is rounding.
+const STILL: f64 = 1e-9;
 
 /// Mean and deviation of the training twists, by component (v, ω): metres and radians.
 #[derive(Debug, Clone, PartialEq)]
@@ -68,13 +81,14 @@ pub struct TargetScale {
 }
 
 impl TargetScale {
-    /// The scale of `twists`; a component that never moves gets deviation 1, so that it stays at zero.
+    /// The scale of `twists`; a component that moves by no more than rounding gets deviation 1, so that it stays at
+    /// zero.
     pub fn of(twists: &[Twist]) -> Self {
         let n = twists.len().max(1) as f64;
         let mean = twists.iter().map(|twist| twist.to_vector()).sum::<Vector6<f64>>() / n;
         let square = |twist: &Twist| (twist.to_vector() - mean).map(|x| x * x);
         let variance = twists.iter().map(square).sum::<Vector6<f64>>() / n;
-        Self { mean, deviation: variance.map(|x| if x > 0.0 { x.sqrt() } else { 1.0 }) }
+        Self { mean, deviation: variance.map(|x| if x.sqrt() > STILL { x.sqrt() } else { 1.0 }) }
     }
 
     /// (ΔP − μ) / σ.
@@ -173,7 +187,12 @@ impl Adapter {
         if let Some(((_, position), &value)) = features.indexed_iter().find(|(_, value)| !value.is_finite()) {
             return Err(Error::NotFinite { what: "feature", position, value: f64::from(value) });
         }
-        Ok(self.network_f64.embed(features.mapv(f64::from)))
+        let mut latents = Array2::zeros((features.nrows(), self.latent_dim()));
+        let chunks = features.axis_chunks_iter(Axis(0), EMBED_ROWS);
+        for (rows, mut out) in chunks.zip(latents.axis_chunks_iter_mut(Axis(0), EMBED_ROWS)) {
+            out.assign(&self.network_f64.embed(rows.mapv(f64::from)));
+        }
+        Ok(latents)
     }
 
     /// The latent φ(z) of one feature.
@@ -182,7 +201,7 @@ impl Adapter {
     /// [`Error::FeatureDim`] or [`Error::NotFinite`].
     pub fn embed_one(&self, feature: &[f32]) -> Result<Array1<f64>, Error> {
         let row = ArrayView1::from(feature);
-        Ok(self.embed(row.insert_axis(ndarray::Axis(0)))?.row(0).to_owned())
+        Ok(self.embed(row.insert_axis(Axis(0)))?.row(0).to_owned())
     }
 
     /// The camera's motion between two latents, ΔP = σ ⊙ W(g₂ − g₁) + μ, in the first camera's body frame.
@@ -196,13 +215,16 @@ impl Adapter {
     /// Refuses a latent of the wrong width or with a number that is not finite.
     ///
     /// # Errors
-    /// [`Error::LatentDim`] or [`Error::NotFinite`].
+    /// [`Error::LatentDim`], [`Error::NotFinite`] or [`Error::LatentRange`].
     pub fn check_latent(&self, latent: &[f64]) -> Result<(), Error> {
         if latent.len() != self.latent_dim() {
             return Err(Error::LatentDim { expected: self.latent_dim(), actual: latent.len() });
         }
-        match latent.iter().position(|x| !x.is_finite()) {
-            Some(position) => Err(Error::NotFinite { what: "latent", position, value: latent[position] }),
+        if let Some(position) = latent.iter().position(|x| !x.is_finite()) {
+            return Err(Error::NotFinite { what: "latent", position, value: latent[position] });
+        }
+        match latent.iter().position(|x| x.abs() > MAX_LATENT) {
+            Some(position) => Err(Error::LatentRange { position, value: latent[position] }),
             None => Ok(()),
         }
     }
@@ -212,4 +234,17 @@ impl Adapter {
 fn describe(source: &FeatureSource) -> String {
     let FeatureSource { name, encoder, layer, pooling, preprocess, dim } = source;
     format!("{name} (encoder {encoder}, layer {layer}, pooling {pooling}, preprocess {preprocess}, {dim} columns)")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand. A wheeled robot moves in x, z and about y; what rounding leaves of the rest is no motion.
+    #[test]
+    fn a_planar_robots_rounding_is_not_blown_up_to_motion() {
+        let step = |i: f64| Twist { linear: [i, 1e-17 * i, -i].into(), angular: [0.0, 2.0 * i, 1e-16].into() };
+        let scale = TargetScale::of(&[step(-1.0), step(1.0)]);
+        assert_eq!(scale.deviation.as_slice(), [1.0, 1.0, 1.0, 1.0, 2.0, 1.0]);
+    }
 }

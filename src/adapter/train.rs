@@ -64,13 +64,16 @@ impl<T: Real> Samples<T> {
     /// `features` (n, d); `pairs` of its rows, source first; the true `twists` of those pairs.
     ///
     /// # Errors
-    /// [`Error::NoPairs`] when there is none, or not one twist for each.
+    /// [`Error::NoPairs`] when there is none, or not one twist for each; [`Error::NoMotion`].
     pub fn new(features: ArrayView2<'_, f32>, pairs: Vec<[usize; 2]>, twists: &[Twist]) -> Result<Self, Error> {
         if pairs.is_empty() || pairs.len() != twists.len() || pairs.iter().flatten().any(|&row| row >= features.nrows())
         {
             return Err(Error::NoPairs);
         }
         let scale = TargetScale::of(twists);
+        if twists.iter().all(|twist| (twist.to_vector() - scale.mean).amax() < super::STILL) {
+            return Err(Error::NoMotion);
+        }
         let normalised: Vec<_> = twists.iter().map(|&twist| scale.normalised(twist)).collect();
         let targets = Array2::from_shape_fn((twists.len(), 6), |(row, column)| T::of(normalised[row][column]));
         Ok(Self { features: features.mapv(|x| T::of(f64::from(x))), pairs, targets, scale })

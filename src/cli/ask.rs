@@ -17,7 +17,7 @@ pub struct Server {
     #[arg(long, env = "SEESE3_SERVER", default_value = "127.0.0.1:50051")]
     server: String,
     /// The deadline of a call, seconds
-    #[arg(long, default_value_t = 30)]
+    #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     deadline: u64,
 }
 
@@ -181,7 +181,7 @@ pub fn say_navigation(answer: &pb::NavigateResponse) {
     }
 }
 
-fn error_text(error: &pb::StepError) -> String {
+fn error_text(error: &pb::PoseError) -> String {
     let hits: Vec<String> =
         error.hits.iter().map(|hit| format!("@{} {}", hit.threshold, if hit.hit { "hit" } else { "miss" })).collect();
     format!(
@@ -243,11 +243,13 @@ impl Localize {
             adapter: self.adapter,
             view: Some(view),
             hit_count: Some(self.hits),
+            ..pb::LocalizeRequest::default()
         };
         let answer = self.server.connect().await?.localize(request).await?;
         say(format_args!("adapter {}, {} rooms", revision(answer.adapter.as_ref()), answer.room_count));
         for place in &answer.places {
-            say(hit_text(place.hit.as_ref().context("the server sent a place without a hit")?));
+            let hit = place.hit.as_ref().context("the server sent a place without a hit")?;
+            say(format_args!("{}{}", hit_text(hit), place.error.as_ref().map_or(String::new(), error_text)));
         }
         Ok(())
     }
@@ -286,11 +288,15 @@ impl Motion {
             room: self.room,
             first: Some(first),
             second: Some(second),
+            ..pb::EstimateMotionRequest::default()
         };
         let answer = self.server.connect().await?.estimate_motion(request).await?;
         let motion = answer.motion.as_ref().context("the server sent no motion")?;
         say(format_args!("adapter {}", revision(answer.adapter.as_ref())));
         say(format_args!("motion {} in the body frame of the first camera", motion_text(motion)));
+        if let (Some(truth), Some(error)) = (&answer.true_motion, &answer.error) {
+            say(format_args!("truth  {}{}", motion_text(truth), error_text(error)));
+        }
         Ok(())
     }
 }

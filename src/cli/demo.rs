@@ -34,6 +34,9 @@ const ROOM: &str = "studio";
 const FEATURES: &str = "builtin";
 const STRIDE: u32 = 40;
 const STEPS: u32 = 4;
+/// How often the server is asked before it is given up, every 50 ms.
+const LOADING_POLLS: u32 = 1_200;
+const MOST_FRAMES: usize = 100_000;
 
 #[derive(Debug, Args)]
 pub struct Demo {
@@ -41,7 +44,7 @@ pub struct Demo {
     #[arg(long, default_value = "demo-output")]
     out: PathBuf,
     /// Of the room, the camera's path and the training
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
     /// Images to draw
     #[arg(long, default_value_t = 2_000)]
@@ -50,6 +53,10 @@ pub struct Demo {
 
 impl Demo {
     pub async fn run(self) -> anyhow::Result<()> {
+        Split::Time.test_pairs(self.frames, STRIDE).context("--frames")?;
+        if self.frames > MOST_FRAMES {
+            anyhow::bail!("--frames must be at most {MOST_FRAMES}, got {}", self.frames);
+        }
         let store_path = self.out.join("store");
         let location = store_path.to_str().context("--out is not valid UTF-8")?;
         let store = Store::create(location)?;
@@ -77,12 +84,15 @@ impl Demo {
             "4. Serving the store and asking it over gRPC: one motion of {STRIDE} frames in {STEPS} steps, closed loop"
         ));
         let picture = self.out.join("path.svg");
-        serve_and_ask(&store, &room, &picture).await?;
+        serve_and_ask(&store, &room, &name, &picture).await?;
 
         say("Files written:");
-        for file in files_under(&self.out)? {
-            say(format_args!("   {}", file.display()));
+        for folder in [store_path.join("rooms").join(ROOM), store_path.join("adapters").join(&name)] {
+            for file in files_under(&folder)? {
+                say(format_args!("   {}", file.display()));
+            }
         }
+        say(format_args!("   {}", picture.display()));
         let from = example_source(room.frame_count());
         say("Go on from here:");
         say(format_args!("   seese3 serve --store {location}"));
@@ -127,16 +137,23 @@ fn score(room: &Arc<Room>, features: &Features, adapter: Adapter) -> anyhow::Res
 }
 
 /// Starts a server on a free loopback port, asks it for a navigation, draws the answer, and stops it.
-async fn serve_and_ask(store: &Store, room: &Arc<Room>, picture: &Path) -> anyhow::Result<()> {
+async fn serve_and_ask(store: &Store, room: &Arc<Room>, adapter: &str, picture: &Path) -> anyhow::Result<()> {
     let listener = TcpListener::bind("127.0.0.1:0").await.context("cannot listen on a loopback port")?;
     let address = listener.local_addr()?.to_string();
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
-    let server = tokio::spawn(service::run(listener, store.clone(), service::Config::default(), async {
+    let mut server = tokio::spawn(service::run(listener, store.clone(), service::Config::default(), async {
         // An error means the demo has failed: the server is to stop all the same.
         let _ = stopped.await;
     }));
     say(format_args!("   listening on {address}"));
-    let answer = ask(&address, room.frame_count()).await?;
+    let answer = tokio::select! {
+        // A server that ends before it answers says why.
+        ended = &mut server => {
+            ended??;
+            anyhow::bail!("the server ended before it answered");
+        }
+        answer = ask(&address, adapter, room.frame_count()) => answer?,
+    };
     say_navigation(&answer);
     let svg = path_svg(&plot_of(room, &answer)?).map_err(anyhow::Error::msg)?;
     write_file(picture, svg.as_bytes())?;
@@ -148,20 +165,21 @@ async fn serve_and_ask(store: &Store, room: &Arc<Room>, picture: &Path) -> anyho
     Ok(())
 }
 
-/// The frame that the example starts from: in the middle of the second half of the held-out part, whatever is there.
+/// The frame that the example starts from: five sixths into the held-out part, whatever is there.
 fn example_source(frame_count: usize) -> u32 {
-    (frame_count * 19 / 20) as u32
+    let (frame_count, held_out) = (frame_count as u32, Split::Time.candidates(frame_count).len() as u32);
+    frame_count - held_out + (held_out - STRIDE) * 5 / 6
 }
 
 /// Every file under a folder, in order.
 fn files_under(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).with_context(|| folder.display().to_string())? {
-        let path = entry?.path();
-        if path.is_dir() {
-            files.extend(files_under(&path)?);
+        let entry = entry?;
+        if entry.file_type()?.is_dir() {
+            files.extend(files_under(&entry.path())?);
         } else {
-            files.push(path);
+            files.push(entry.path());
         }
     }
     files.sort();
@@ -169,11 +187,12 @@ fn files_under(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
 }
 
 /// A 4-step closed loop in the held-out part to the frame 40 later.
-async fn ask(address: &str, frame_count: usize) -> anyhow::Result<pb::NavigateResponse> {
+async fn ask(address: &str, adapter: &str, frame_count: usize) -> anyhow::Result<pb::NavigateResponse> {
     let client = Client::connect(address, Duration::from_secs(30)).await?;
     let source = example_source(frame_count);
     let request = pb::NavigateRequest {
         room: ROOM.to_owned(),
+        adapter: adapter.to_owned(),
         source: Some(pb::View { view: Some(pb::view::View::FrameId(source)) }),
         displacement: Some(pb::Displacement {
             displacement: Some(pb::displacement::Displacement::TargetFrameId(source + STRIDE)),
@@ -182,7 +201,7 @@ async fn ask(address: &str, frame_count: usize) -> anyhow::Result<pb::NavigateRe
         mode: pb::Mode::ClosedLoop.into(),
         ..pb::NavigateRequest::default()
     };
-    loop {
+    for _ in 0..LOADING_POLLS {
         match client.navigate(request.clone()).await {
             // The server is still loading its store.
             Err(error) if error.code() == Some(tonic::Code::Unavailable) => {
@@ -191,6 +210,7 @@ async fn ask(address: &str, frame_count: usize) -> anyhow::Result<pb::NavigateRe
             answer => return Ok(answer?),
         }
     }
+    anyhow::bail!("the server did not finish loading its store")
 }
 
 fn plot_of(room: &Room, answer: &pb::NavigateResponse) -> anyhow::Result<PathPlot> {

@@ -9,7 +9,7 @@ use serde_json::{Map, json};
 
 use super::progress::bar;
 use super::train::SplitName;
-use super::{say, write_json};
+use super::{check_writable, say, write_json};
 use crate::cancel::Cancellation;
 use crate::eval::{NavigatorKind, Protocol, evaluate};
 use crate::navigation::{IndexKind, Navigator};
@@ -53,6 +53,9 @@ pub struct Evaluate {
 
 impl Evaluate {
     pub async fn run(self) -> anyhow::Result<()> {
+        if let Some(path) = &self.json {
+            check_writable(path)?;
+        }
         let store = Store::open(&self.store)?;
         let wanted: Option<Split> = self.split.map(Into::into);
         let chosen = choose(&store, &self, wanted).await?;
@@ -76,7 +79,12 @@ impl Evaluate {
         })?;
         progress.finish_and_clear();
         let in_room = record.rooms.iter().any(|(room, _)| room.as_str() == self.room);
-        let leaks = in_room && record.split != protocol.split;
+        let trained = record.rooms.iter().find(|(room, _)| room.as_str() == self.room).map(|(_, revision)| *revision);
+        let other_frames = match trained {
+            Some(revision) => !store.same_frames(&self.room, revision, stored.revision).await?,
+            None => false,
+        };
+        let leaks = in_room && (record.split != protocol.split || other_frames);
         say(format_args!(
             "room '{}' revision {}, features '{features_name}', adapter '{}' revision {} ({})",
             self.room,
@@ -91,10 +99,12 @@ impl Evaluate {
             protocol.split, protocol.stride, report.n, report.candidate_count
         ));
         if leaks {
-            say(format_args!(
-                "LEAK: the adapter was trained under the split '{}'; test pairs may have been trained on",
-                record.split
-            ));
+            let why = if other_frames {
+                "on other frames of this room".to_owned()
+            } else {
+                format!("under the split '{}'", record.split)
+            };
+            say(format_args!("LEAK: the adapter was trained {why}; test pairs may have been trained on"));
         }
         say(evaluation_table(&report).trim_end());
         if let Some(path) = &self.json {
@@ -121,7 +131,13 @@ async fn choose(store: &Store, wanted: &Evaluate, split: Option<Split>) -> anyho
     let names = store.adapter_names().await?;
     let mut fitting = Vec::new();
     for name in &names {
-        let stored = store.load_adapter(name, None).await?;
+        let stored = match store.load_adapter(name, None).await {
+            Ok(stored) => stored,
+            Err(error) => {
+                say(format_args!("passed over adapter '{name}': {error}"));
+                continue;
+            }
+        };
         let fits = wanted.features.as_ref().is_none_or(|name| *name == stored.adapter.source().name)
             && stored.record.rooms.iter().any(|(room, _)| room.as_str() == wanted.room)
             && split.is_none_or(|split| split == stored.record.split);

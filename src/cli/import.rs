@@ -9,7 +9,7 @@ use super::say;
 use crate::datasets::{self, Recording};
 use crate::features::{FeatureSource, Features};
 use crate::room::{Frames, Provenance, Room, RoomId};
-use crate::store::Store;
+use crate::store::{Store, check_features};
 
 #[derive(Debug, Args)]
 pub struct Import {
@@ -104,6 +104,7 @@ async fn publish(room: &str, format: &str, recording: Recording, to: &Destinatio
             bail!("features '{name}' have {rows} rows, the recording has {frames} usable frames ({unusable} dropped)");
         }
     }
+    check_features(&room, &features)?;
     let store = Store::create(&to.store)?;
     let published = store.publish_room(&room, &features).await?;
     let times = if has_times { "with timestamps" } else { "without timestamps" };

@@ -68,6 +68,15 @@ fn say(line: impl std::fmt::Display) {
     let _ = writeln!(std::io::stdout(), "{line}");
 }
 
+/// Refuses a file whose folder is not there, before long work is done for it.
+fn check_writable(path: &std::path::Path) -> anyhow::Result<()> {
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    match folder {
+        Some(folder) if !folder.is_dir() => anyhow::bail!("{}: the folder does not exist", path.display()),
+        _ => Ok(()),
+    }
+}
+
 /// Writes a file whole or not at all.
 fn write_file(path: &std::path::Path, content: &[u8]) -> anyhow::Result<()> {
     use anyhow::Context;

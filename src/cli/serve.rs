@@ -1,5 +1,6 @@
 //! `seese3 serve`: answer over gRPC until told to stop.
 
+use std::io::IsTerminal;
 use std::time::Duration;
 
 use anyhow::Context;
@@ -36,17 +37,17 @@ pub struct Serve {
     #[arg(long, env = "SEESE3_MAX_MESSAGE_BYTES", default_value_t = Config::default().message_bytes)]
     max_message_bytes: usize,
     /// The longest a request may take, seconds
-    #[arg(long, env = "SEESE3_MAX_REQUEST_SECONDS", default_value_t = 300)]
+    #[arg(long, env = "SEESE3_MAX_REQUEST_SECONDS", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     max_request_seconds: u64,
     /// How long requests in flight may go on after SIGTERM, seconds
-    #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = 10)]
+    #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = 10, value_parser = clap::value_parser!(u64).range(0..=86_400))]
     drain_seconds: u64,
     /// Requests computed at a time; the machine's cores if not given
-    #[arg(long, env = "SEESE3_THREADS")]
-    threads: Option<usize>,
+    #[arg(long, env = "SEESE3_THREADS", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
     /// Requests that may wait for a thread
-    #[arg(long, env = "SEESE3_QUEUE", default_value_t = Config::default().queue)]
-    queue: usize,
+    #[arg(long, env = "SEESE3_QUEUE", default_value_t = 1_024, value_parser = clap::value_parser!(u32).range(0..=1_000_000))]
+    queue: u32,
     /// How the log is written, to standard error; RUST_LOG chooses what
     #[arg(long, env = "SEESE3_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
     log_format: LogFormat,
@@ -78,8 +79,8 @@ impl Serve {
             },
             limits: Limits { steps: self.max_steps, hits: self.max_hits, hits_in_all: self.max_hits_in_all },
             message_bytes: self.max_message_bytes,
-            threads: self.threads.unwrap_or(defaults.threads).max(1),
-            queue: self.queue,
+            threads: self.threads.map_or(defaults.threads, usize::from),
+            queue: self.queue as usize,
             longest: Duration::from_secs(self.max_request_seconds),
             drain: Duration::from_secs(self.drain_seconds),
             ..defaults
@@ -96,8 +97,11 @@ impl Serve {
 
 fn start_log(format: LogFormat) {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,hnsw_rs=warn"));
+    let log = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal());
     match format {
         LogFormat::Text => log.init(),
         LogFormat::Json => log.json().flatten_event(true).init(),

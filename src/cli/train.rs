@@ -3,12 +3,12 @@
 use std::path::PathBuf;
 use std::time::Instant;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 
 use super::progress::bar;
-use super::{say, write_json};
+use super::{check_writable, say, write_json};
 use crate::adapter::{Adapter, Preset, Reading};
 use crate::cancel::Cancellation;
 use crate::eval::{NavigatorKind, Protocol, evaluate};
@@ -45,8 +45,8 @@ pub struct Train {
     /// How frames are kept apart for testing; `pairs` leaks on purpose
     #[arg(long, value_enum, default_value_t = SplitName::Time)]
     split: SplitName,
-    /// Of weights and order
-    #[arg(long, default_value_t = 0)]
+    /// Of weights and order, as PyTorch takes it: 32 bits
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
     /// Train this many, from --seed on, and report mean and deviation; the first is published
     #[arg(long, default_value_t = 1)]
@@ -101,6 +101,9 @@ impl Train {
         if self.seeds == 0 || self.seeds > MAX_SEEDS {
             bail!("--seeds must be 1 to {MAX_SEEDS}, got {}", self.seeds);
         }
+        if let Some(path) = &self.json {
+            check_writable(path)?;
+        }
         let store = Store::open(&self.store)?;
         let (stored, features) = store.load_room_with(&self.room, self.features.as_deref()).await?;
         let recipe = Recipe {
@@ -146,9 +149,13 @@ pub fn train_seeds(
     let epochs = recipe.epochs.unwrap_or(recipe.preset.config(0).epochs) as u64;
     let progress = bar(epochs.saturating_mul(seeds), "training");
     let lesson = Lesson { room: &stored.room, revision: stored.revision, features };
-    let trained: Vec<(Adapter, TrainingRun)> = (recipe.seed..recipe.seed.saturating_add(seeds))
+    let trained: Vec<(Adapter, TrainingRun)> = (0..seeds)
         .into_par_iter()
-        .map(|seed| {
+        .map(|offset| {
+            let seed = recipe.seed + offset;
+            if seed > u64::from(u32::MAX) {
+                bail!("--seed and --seeds reach over 2³²");
+            }
             let begun = Instant::now();
             let recipe = Recipe { seed, ..recipe.clone() };
             let (adapter, record) = learn(lesson, &recipe, &mut |epoch| {
@@ -161,11 +168,9 @@ pub fn train_seeds(
         })
         .collect::<anyhow::Result<_>>()?;
     progress.finish_and_clear();
-    let (mut adapters, runs): (Vec<Adapter>, Vec<TrainingRun>) = trained.into_iter().unzip();
-    if adapters.is_empty() {
-        bail!("no seed was given");
-    }
-    Ok((adapters.swap_remove(0), runs))
+    let (adapters, runs): (Vec<Adapter>, Vec<TrainingRun>) = trained.into_iter().unzip();
+    let first = adapters.into_iter().next().context("no seed was given")?;
+    Ok((first, runs))
 }
 
 fn inverse_poincare(

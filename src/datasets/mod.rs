@@ -21,8 +21,8 @@ pub const MAX_ROTATION_DEVIATION: f64 = 1e-2;
 /// Why a recording cannot be read. Each names the file.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    #[error("{}: {source}", file.display())]
-    Io { file: PathBuf, source: std::io::Error },
+    #[error("{}: {cause}", file.display())]
+    Io { file: PathBuf, cause: std::io::Error },
     #[error("{}: {problem}", file.display())]
     Malformed { file: PathBuf, problem: String },
     #[error("{}, frame {frame}: {problem}", file.display())]
@@ -71,7 +71,7 @@ fn first_reason(dropped: &[Dropped]) -> String {
 }
 
 fn read_bytes(file: &Path) -> Result<Vec<u8>, Error> {
-    std::fs::read(file).map_err(|source| Error::Io { file: file.to_owned(), source })
+    std::fs::read(file).map_err(|cause| Error::Io { file: file.to_owned(), cause })
 }
 
 /// What a 4×4 matrix says.
@@ -80,12 +80,17 @@ enum MatrixPose {
     Pose(Pose, f64),
     NotFinite,
     NotARotation,
+    /// The last row is not (0, 0, 0, 1): transposed, or no pose at all.
+    NotHomogeneous,
 }
 
 /// Reads `world_from_camera` from a homogeneous matrix.
 fn pose_of(matrix: &Matrix4<f64>) -> MatrixPose {
     if !matrix.iter().all(|x| x.is_finite()) {
         return MatrixPose::NotFinite;
+    }
+    if matrix.row(3) != nalgebra::RowVector4::new(0.0, 0.0, 0.0, 1.0) {
+        return MatrixPose::NotHomogeneous;
     }
     let Some(nearest) = nearest_rotation(&matrix.fixed_view::<3, 3>(0, 0).into_owned()) else {
         return MatrixPose::NotARotation;
@@ -94,6 +99,8 @@ fn pose_of(matrix: &Matrix4<f64>) -> MatrixPose {
     let translation = matrix.fixed_view::<3, 1>(0, 3).into_owned();
     MatrixPose::Pose(Pose::from_parts(translation.into(), rotation), nearest.deviation)
 }
+
+const LAST_ROW_PROBLEM: &str = "the last row is not 0 0 0 1; is the matrix transposed?";
 
 fn deviation_problem(deviation: f64) -> String {
     format!(

@@ -6,7 +6,9 @@ use nalgebra::Matrix4;
 use ndarray::{Array2, ArrayD, ArrayViewD, Ix2};
 use ndarray_npy::{ViewElement, ViewNpyError, ViewNpyExt};
 
-use super::{Error, MAX_ROTATION_DEVIATION, MatrixPose, Recording, deviation_problem, pose_of, read_bytes};
+use super::{
+    Error, LAST_ROW_PROBLEM, MAX_ROTATION_DEVIATION, MatrixPose, Recording, deviation_problem, pose_of, read_bytes,
+};
 use crate::room::Frames;
 
 /// NumPy aligns data to 64 bytes; views need no more than this.
@@ -41,9 +43,10 @@ impl NpyFile {
     fn floats(&self, file: &Path) -> Result<ArrayD<f64>, Error> {
         match self.view::<f64>() {
             Ok(view) => Ok(view.to_owned()),
-            Err(ViewNpyError::WrongDescriptor(_)) => {
-                self.view::<f32>().map(|view| view.mapv(f64::from)).map_err(|error| malformed(file, &error.to_string()))
-            }
+            Err(ViewNpyError::WrongDescriptor(_)) => self
+                .view::<f32>()
+                .map(|view| view.mapv(f64::from))
+                .map_err(|error| malformed(file, &format!("{error}; expected float32 or float64"))),
             Err(error) => Err(malformed(file, &error.to_string())),
         }
     }
@@ -69,6 +72,7 @@ pub fn read_poses(file: &Path) -> Result<Recording, Error> {
         let matrix = Matrix4::from_row_iterator(matrix.iter().copied());
         match pose_of(&matrix) {
             MatrixPose::NotFinite => return Err(wrong("the pose has a number that is not finite".to_owned())),
+            MatrixPose::NotHomogeneous => return Err(wrong(LAST_ROW_PROBLEM.to_owned())),
             MatrixPose::NotARotation => {
                 return Err(wrong("the upper left 3×3 block is no rotation (singular or mirrored)".to_owned()));
             }
@@ -76,10 +80,6 @@ pub fn read_poses(file: &Path) -> Result<Recording, Error> {
                 return Err(wrong(deviation_problem(deviation)));
             }
             MatrixPose::Pose(pose, deviation) => {
-                let last = [matrix[(3, 0)], matrix[(3, 1)], matrix[(3, 2)], matrix[(3, 3)]];
-                if last != [0.0, 0.0, 0.0, 1.0] {
-                    return Err(wrong(format!("the last row is {last:?}, expected [0, 0, 0, 1]; is it transposed?")));
-                }
                 worst = worst.max(deviation);
                 frames.poses.push(pose);
             }

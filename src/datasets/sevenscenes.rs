@@ -8,7 +8,8 @@ use std::path::{Path, PathBuf};
 use nalgebra::Matrix4;
 
 use super::{
-    DropReason, Dropped, Error, MAX_ROTATION_DEVIATION, MatrixPose, Recording, deviation_problem, pose_of, read_bytes,
+    DropReason, Dropped, Error, LAST_ROW_PROBLEM, MAX_ROTATION_DEVIATION, MatrixPose, Recording, deviation_problem,
+    pose_of, read_bytes,
 };
 use crate::room::Frames;
 
@@ -33,6 +34,10 @@ pub fn read_seven_scenes(folder: &Path, sequence: Option<&str>, strict: bool) ->
                 recording.worst_rotation_deviation = recording.worst_rotation_deviation.max(deviation);
                 recording.frames.poses.push(pose);
                 recording.frames.names.push(name);
+            }
+            Ok(MatrixPose::NotHomogeneous) => {
+                let file = sequence.join(format!("{stem}{POSE_SUFFIX}"));
+                return Err(Error::Malformed { file, problem: LAST_ROW_PROBLEM.to_owned() });
             }
             Ok(MatrixPose::NotFinite) => recording.dropped.push(Dropped { name, reason: DropReason::NonFinitePose }),
             Ok(MatrixPose::NotARotation) => recording.dropped.push(Dropped { name, reason: DropReason::NotARotation }),
@@ -75,7 +80,7 @@ fn frame_stems(sequence: &Path) -> Result<BTreeSet<String>, Error> {
 }
 
 fn entries(folder: &Path) -> Result<Vec<String>, Error> {
-    let io = |source| Error::Io { file: folder.to_owned(), source };
+    let io = |cause| Error::Io { file: folder.to_owned(), cause };
     let mut names = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(io)? {
         names.push(entry.map_err(io)?.file_name().to_string_lossy().into_owned());

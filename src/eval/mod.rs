@@ -23,7 +23,7 @@ pub enum Error {
     Ridge(#[from] ridge::Error),
     #[error(transparent)]
     Cancelled(#[from] cancel::Cancelled),
-    #[error("threshold {value} must be finite and greater than 0")]
+    #[error("threshold {value:e} must be greater than 0 and at most {MAX_THRESHOLD:e}")]
     Threshold { value: f64 },
     #[error("{count} thresholds were given; give 1 to {most}")]
     ThresholdCount { count: usize, most: usize },
@@ -35,9 +35,16 @@ pub enum Error {
     Prediction { position: usize, problem: Box<Error> },
     #[error("the retrieved frame {frame} is not a candidate under the split '{split}'")]
     NotACandidate { frame: room::FrameId, split: pairs::Split },
+    #[error("the retrieved frame {frame} is excluded with its source")]
+    Excluded { frame: room::FrameId },
+    #[error("({source_frame}, {target_frame}) is no test pair under the split '{split}'")]
+    NotATestPair { source_frame: room::FrameId, target_frame: room::FrameId, split: pairs::Split },
     #[error("predictions must be all latents or all retrieved frames, not a mixture")]
     MixedPredictions,
 }
+
+/// The largest ε.
+pub const MAX_THRESHOLD: f64 = 1e6;
 
 /// The most thresholds of one report.
 pub const MAX_THRESHOLDS: usize = 32;
@@ -47,7 +54,7 @@ pub fn check_thresholds(thresholds: &[f64]) -> Result<(), Error> {
     if thresholds.is_empty() || thresholds.len() > MAX_THRESHOLDS {
         return Err(Error::ThresholdCount { count: thresholds.len(), most: MAX_THRESHOLDS });
     }
-    match thresholds.iter().find(|value| !(value.is_finite() && **value > 0.0)) {
+    match thresholds.iter().find(|value| !(**value > 0.0 && **value <= MAX_THRESHOLD)) {
         Some(&value) => Err(Error::Threshold { value }),
         None => Ok(()),
     }

@@ -155,6 +155,7 @@ pub fn evaluate(
     };
     let mut rows = Vec::with_capacity(protocol.navigators.len());
     for (position, &kind) in protocol.navigators.iter().enumerate() {
+        cancel.check()?;
         progress(position, kind);
         rows.push(bench.row(kind)?);
     }
@@ -219,6 +220,7 @@ impl Bench<'_> {
     fn random_frames(&self) -> Result<Vec<FrameId>, Error> {
         let mut random = ChaCha8Rng::seed_from_u64(self.protocol.seed);
         let draw = |pair: &Pair| {
+            self.cancel.check()?;
             let allowed = self.allowed(pair.source)?;
             Ok(allowed[random.random_range(0..allowed.len())])
         };

@@ -59,10 +59,16 @@ pub fn score_predictions(
         for frame in [pair.source, pair.target] {
             room.pose(frame).map_err(|problem| at(problem.into()))?;
         }
+        if let Some(split) = scope.split.filter(|split| !split.tests(room.frame_count(), *pair)) {
+            return Err(at(Error::NotATestPair { source_frame: pair.source, target_frame: pair.target, split }));
+        }
         let exclusion = scope.exclude_source.map(|radius| Exclusion { centre: pair.source, radius });
         let frame = match prediction {
             Prediction::Frame(frame) => {
                 room.pose(*frame).map_err(|problem| at(problem.into()))?;
+                if exclusion.is_some_and(|exclusion| exclusion.covers(*frame)) {
+                    return Err(at(Error::Excluded { frame: *frame }));
+                }
                 match scope.split {
                     Some(split) if candidates.binary_search(frame).is_err() => {
                         return Err(at(Error::NotACandidate { frame: *frame, split }));

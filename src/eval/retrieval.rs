@@ -101,17 +101,19 @@ pub struct LatentScores {
 impl LatentScores {
     /// Scores predictions (n, k) against targets (n, k).
     pub fn of(targets: ArrayView2<'_, f64>, predicted: ArrayView2<'_, f64>) -> Self {
+        // Latents that deviate by less than 1e-9 do not vary: it is rounding.
+        let still = targets.nrows() as f64 * 1e-18;
         let mut column_r2 = Vec::with_capacity(targets.ncols());
         let (mut residual, mut total) = (0.0, 0.0);
         for (target, predicted) in targets.axis_iter(Axis(1)).zip(predicted.axis_iter(Axis(1))) {
             let mean = target.sum() / target.len() as f64;
             let column_residual: f64 = target.iter().zip(&predicted).map(|(t, p)| (t - p) * (t - p)).sum();
             let column_total: f64 = target.iter().map(|t| (t - mean) * (t - mean)).sum();
-            column_r2.push(if column_total > 0.0 { 1.0 - column_residual / column_total } else { f64::NAN });
+            column_r2.push(if column_total > still { 1.0 - column_residual / column_total } else { f64::NAN });
             residual += column_residual;
             total += column_total;
         }
-        let r2 = if total > 0.0 { 1.0 - residual / total } else { f64::NAN };
+        let r2 = if total > still { 1.0 - residual / total } else { f64::NAN };
         Self { mse: residual / targets.len() as f64, r2, r2_uniform: mean(&column_r2) }
     }
 }

@@ -9,7 +9,7 @@ mod navigator;
 mod query;
 
 pub use crate::adapter::Reading;
-pub use multi_step::{Mode, Plan, Space, Start, Step, walk};
+pub use multi_step::{Leg, Mode, Plan, Space, Start, Step, walk};
 pub use navigator::{Answer, AnswerStep, Hit, IndexKind, Navigator, StepError};
 pub use query::{Displacement, Limits, Query, Source, SourceAt};
 

@@ -5,7 +5,7 @@ use ndarray::{Array1, ArrayView2};
 use super::Error;
 use crate::adapter::{Adapter, Reading};
 use crate::cancel::Cancellation;
-use crate::geometry::{Pose, Twist, body_twist, exp};
+use crate::geometry::{Pose, Twist, body_twist};
 use crate::index::{Exclusion, Index, Neighbour};
 use crate::room::FrameId;
 
@@ -68,23 +68,26 @@ pub struct Step {
     pub neighbours: Vec<Neighbour>,
 }
 
-/// Walks `motion`, a twist in the body frame of the start.
+/// A motion to walk.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Leg {
+    /// In the body frame of the start.
+    pub motion: Twist,
+    /// Where it should end, `world_from_camera`, if known: what a closed loop steers to.
+    pub goal: Option<Pose>,
+}
+
+/// Walks a leg.
 ///
 /// # Errors
 /// [`Error::PoseNeeded`] for a closed loop from a start without a pose, [`Error::NoCandidates`],
 /// [`Error::Cancelled`].
 ///
 /// Source: SeeSE3, sec. 2.7, multi-step navigation.
-pub fn walk(
-    space: Space<'_>,
-    start: &Start,
-    motion: Twist,
-    plan: Plan,
-    cancel: &Cancellation,
-) -> Result<Vec<Step>, Error> {
-    let goal = match (plan.mode, start.pose) {
-        (Mode::ClosedLoop, Some(pose)) => Some(pose * exp(&motion)),
+pub fn walk(space: Space<'_>, start: &Start, leg: Leg, plan: Plan, cancel: &Cancellation) -> Result<Vec<Step>, Error> {
+    let goal = match (plan.mode, leg.goal) {
         (Mode::ClosedLoop, None) => return Err(Error::PoseNeeded { what: "a closed loop" }),
+        (Mode::ClosedLoop, goal) => goal,
         _ => None,
     };
     let mut at = start.clone();
@@ -93,7 +96,7 @@ pub fn walk(
         cancel.check()?;
         let (part, parts) = match (goal, at.pose) {
             (Some(goal), Some(pose)) => (body_twist(&pose, &goal), plan.steps - done),
-            _ => (motion, plan.steps),
+            _ => (leg.motion, plan.steps),
         };
         let step = space.adapter.inverse().step(part.divided(parts), plan.reading, f64::from(parts).recip());
         let latent = &at.latent + &step;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2};
 
-use super::{Displacement, Error, Limits, Plan, Query, Source, Space, Start, check_twist, walk};
+use super::{Displacement, Error, Leg, Limits, Plan, Query, Source, Space, Start, check_twist, walk};
 use crate::adapter::Adapter;
 use crate::cancel::Cancellation;
 use crate::features::Features;
@@ -51,6 +51,15 @@ pub struct StepError {
     pub pose: PoseError,
     /// ‖ΔP_requested − ΔP_retrieved‖₂, both from the source: what Hit@ε compares with ε.
     pub twist: f64,
+}
+
+impl StepError {
+    /// The error of a found pose where another was wanted, for a camera that started at `source`; all
+    /// `world_from_camera`.
+    pub fn of(source: &Pose, found: &Pose, wanted: &Pose) -> Self {
+        let difference = body_twist(source, wanted).to_vector() - body_twist(source, found).to_vector();
+        Self { pose: PoseError::between(found, wanted), twist: difference.norm() }
+    }
 }
 
 /// What a navigator answers.
@@ -158,8 +167,9 @@ impl Navigator {
         let mut from = start.clone();
         let mut wanted = start.pose;
         for twist in twists {
-            let walked = walk(self.space(), &from, twist, plan, cancel)?;
             let begun_at = wanted;
+            let leg = Leg { motion: twist, goal: begun_at.map(|pose| pose * exp(&twist)) };
+            let walked = walk(self.space(), &from, leg, plan, cancel)?;
             for (done, step) in (1..).zip(walked) {
                 let share = Twist { linear: twist.linear * f64::from(done), angular: twist.angular * f64::from(done) };
                 wanted = begun_at.map(|pose| pose * exp(&share.divided(query.steps)));
@@ -208,11 +218,7 @@ impl Navigator {
 
     fn answer_step(&self, step: super::Step, source: Option<Pose>, requested: Option<Pose>) -> AnswerStep {
         let hits = self.hits(&step.neighbours);
-        let error = source.zip(requested).map(|(source, requested)| {
-            let found = hits[0].pose;
-            let difference = body_twist(&source, &requested).to_vector() - body_twist(&source, &found).to_vector();
-            StepError { pose: PoseError::between(&found, &requested), twist: difference.norm() }
-        });
+        let error = source.zip(requested).map(|(source, requested)| StepError::of(&source, &hits[0].pose, &requested));
         AnswerStep { latent: step.latent, hits, requested_pose: requested, error }
     }
 

@@ -81,7 +81,12 @@ fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, plot: &PathPlot) -> Drawn {
             .label(label)
             .legend(entry(colour));
     }
-    chart.configure_series_labels().background_style(WHITE.mix(0.85)).border_style(MAP_COLOUR).draw()?;
+    chart
+        .configure_series_labels()
+        .position(SeriesLabelPosition::LowerLeft)
+        .background_style(WHITE.mix(0.85))
+        .border_style(MAP_COLOUR)
+        .draw()?;
     root.present()?;
     Ok(())
 }

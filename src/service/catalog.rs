@@ -66,7 +66,7 @@ fn page<'a, T>(all: &'a BTreeMap<String, T>, size: i32, token: &str) -> Result<(
     };
     let after = if token.is_empty() {
         Bound::Unbounded
-    } else if all.contains_key(token) {
+    } else if crate::room::is_plain_name(token) {
         Bound::Excluded(token)
     } else {
         return Err(Error::invalid("page_token", "is not one that this server gave; begin with the first page"));
@@ -112,7 +112,7 @@ fn adapter(stored: &StoredAdapter) -> pb::Adapter {
         seed: record.config.seed,
         test: Some(convert::scores_to_wire(&record.test)),
         train: Some(convert::scores_to_wire(&record.train)),
-        train_mean_r2: record.train_mean_r2,
+        train_mean_r2: Some(record.train_mean_r2).filter(|r2| r2.is_finite()),
         target_mean: Some(convert::twist_to_wire(&Twist::from_vector(&scale.mean))),
         target_deviation: Some(convert::twist_to_wire(&Twist::from_vector(&scale.deviation))),
         singular_values: adapter.inverse().singular_values().to_vec(),

@@ -7,7 +7,9 @@ use super::snapshot::ServedNavigator;
 use crate::eval::{NavigatorKind, Prediction, RetrievalScores, Row, check_thresholds, default_thresholds};
 use crate::features::FeatureSource;
 use crate::geometry::{Pose, Twist};
-use crate::navigation::{AnswerStep, Displacement, Hit, Mode, Query, Reading, Source, SourceAt, StepError};
+use crate::navigation::{
+    AnswerStep, Displacement, Hit, MAX_TRANSLATION_M, Mode, Query, Reading, Source, SourceAt, StepError,
+};
 use crate::pairs::{Pair, Split};
 use crate::proto::v1 as pb;
 use crate::room::{FrameId, Room};
@@ -57,23 +59,26 @@ pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
         return Err(Error::invalid("orientation", format!("has norm {norm}, a rotation has 1")));
     }
     let position = vector("position", position)?;
+    if position.norm() > MAX_TRANSLATION_M {
+        return Err(Error::invalid("position", format!("is over {MAX_TRANSLATION_M:e} m from the origin")));
+    }
     Ok(Pose::from_parts(position.into(), UnitQuaternion::from_quaternion(quaternion)))
 }
 
-/// What a camera saw, or a frame.
-pub fn source(view: Option<pb::View>, adapter_source: &FeatureSource) -> Result<Source, Error> {
+/// What a camera saw, or a frame; `field` is the view's name in its request.
+pub fn source(field: &str, view: Option<pb::View>, adapter_source: &FeatureSource) -> Result<Source, Error> {
     match view.and_then(|view| view.view) {
         Some(pb::view::View::FrameId(frame)) => Ok(Source::Frame(FrameId(frame))),
         Some(pb::view::View::Feature(pb::Feature { values, source_name })) => {
             if !source_name.is_empty() && source_name != adapter_source.name {
                 let problem =
                     format!("'{source_name}' is not '{}', which the adapter was trained on", adapter_source.name);
-                return Err(Error::invalid("feature.source_name", problem));
+                return Err(Error::invalid(format!("{field}.feature.source_name"), problem));
             }
             Ok(Source::Feature(values))
         }
         Some(pb::view::View::Latent(pb::Latent { values })) => Ok(Source::Latent(values)),
-        None => Err(Error::invalid("view", "is required: a frame_id, a feature or a latent")),
+        None => Err(Error::invalid(field, "is required: a frame_id, a feature or a latent")),
     }
 }
 
@@ -117,7 +122,7 @@ pub fn query(request: pb::NavigateRequest, adapter_source: &FeatureSource) -> Re
         exclude_radius,
         thresholds: given_thresholds,
     } = request;
-    let source = source(view, adapter_source).map_err(|error| error.within("source"))?;
+    let source = source("source", view, adapter_source)?;
     if source_pose.is_some() && matches!(source, Source::Frame(_)) {
         return Err(Error::invalid("source_pose", "is not to be given with a frame, whose pose the room knows"));
     }
@@ -129,7 +134,7 @@ pub fn query(request: pb::NavigateRequest, adapter_source: &FeatureSource) -> Re
         mode: mode_of(mode)?,
         reading: reading_of(reading)?,
         hit_count: hit_count.unwrap_or(1),
-        exclude_source: exclude_source.then_some(exclude_radius),
+        exclude_source: exclusion(exclude_source, exclude_radius)?,
     };
     Ok((query, thresholds(given_thresholds)?))
 }
@@ -149,6 +154,15 @@ fn reading_of(reading: i32) -> Result<Reading, Error> {
         Ok(pb::Reading::Affine) => Ok(Reading::Affine),
         Ok(pb::Reading::Literal) => Ok(Reading::Literal),
         Err(_) => Err(Error::invalid("reading", format!("{reading} is not known to this server"))),
+    }
+}
+
+/// How many rows to each side of the source are excluded, none if it is not.
+pub fn exclusion(exclude_source: bool, exclude_radius: u32) -> Result<Option<u32>, Error> {
+    match (exclude_source, exclude_radius) {
+        (true, radius) => Ok(Some(radius)),
+        (false, 0) => Ok(None),
+        (false, _) => Err(Error::invalid("exclude_radius", "means nothing without exclude_source")),
     }
 }
 
@@ -172,6 +186,10 @@ pub fn split(name: &str) -> Result<Option<Split>, Error> {
 pub fn navigators(names: &[String]) -> Result<Vec<NavigatorKind>, Error> {
     if names.is_empty() {
         return Ok(NavigatorKind::ALL.to_vec());
+    }
+    let twice = |(position, name): (usize, &String)| names[..position].contains(name);
+    if names.len() > NavigatorKind::ALL.len() || names.iter().enumerate().any(twice) {
+        return Err(Error::invalid("navigators", "names a navigator twice"));
     }
     let kind = |name: &String| {
         NavigatorKind::from_name(name).ok_or_else(|| {
@@ -226,13 +244,13 @@ pub fn step_to_wire(number: usize, step: &AnswerStep, room: &Room, thresholds: &
         step: number as u32,
         hits: step.hits.iter().map(|hit| hit_to_wire(hit, room)).collect(),
         requested_pose: step.requested_pose.map(|pose| pose_to_wire(&pose, room.id().as_str())),
-        error: step.error.map(|error| step_error_to_wire(&error, thresholds)),
+        error: step.error.map(|error| error_to_wire(&error, thresholds)),
         latent: Some(pb::Latent { values: step.latent.to_vec() }),
     }
 }
 
-fn step_error_to_wire(error: &StepError, thresholds: &[f64]) -> pb::StepError {
-    pb::StepError {
+pub fn error_to_wire(error: &StepError, thresholds: &[f64]) -> pb::PoseError {
+    pb::PoseError {
         translation_m: error.pose.translation_m,
         rotation_rad: error.pose.rotation_rad,
         twist_norm: error.twist,

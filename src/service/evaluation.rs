@@ -10,7 +10,7 @@ use tonic::{Request, Response, Status};
 use tracing::Instrument;
 
 use super::convert;
-use super::snapshot::ServedNavigator;
+use super::snapshot::{ServedNavigator, TrainedOn};
 use super::{Error, Handlers, Snapshot};
 use crate::cancel::Cancellation;
 use crate::eval::{PredictionScope, Protocol, evaluate, score_predictions};
@@ -54,8 +54,8 @@ impl Handlers {
             let report = evaluate(&served.navigator, &protocol, cancel, &mut |done, kind| {
                 let progress = pb::EvaluationProgress { done: done as u32, total, navigator: kind.name().to_owned() };
                 let event = pb::evaluate_response::Event::Progress(progress);
-                // A listener that went away cancels the work below; there is nothing to do here.
-                let _ = events.blocking_send(Ok(pb::EvaluateResponse { event: Some(event) }));
+                // A listener that is slow misses progress; it must never hold a thread.
+                let _ = events.try_send(Ok(pb::EvaluateResponse { event: Some(event) }));
             })?;
             Ok(report_to_wire(&served, &report))
         };
@@ -63,6 +63,9 @@ impl Handlers {
             finished = self.workers.run(budget, work) => finished,
             () = heard.closed() => return,
         };
+        if let Err(error) = &finished {
+            tracing::warn!(grpc_status = i32::from(error.code()), %error, "the evaluation ended without a report");
+        }
         let last = finished
             .map(|report| pb::EvaluateResponse { event: Some(pb::evaluate_response::Event::Report(report)) })
             .map_err(Status::from);
@@ -88,7 +91,7 @@ fn protocol(snapshot: &Snapshot, request: pb::EvaluateRequest) -> Result<(Arc<Se
     let protocol = Protocol {
         split: convert::split(&split)?.unwrap_or(record.split),
         stride: stride.unwrap_or(record.stride),
-        exclude_source: exclude_source.then_some(exclude_radius),
+        exclude_source: convert::exclusion(exclude_source, exclude_radius)?,
         thresholds: convert::thresholds(thresholds)?,
         seed,
         navigators: convert::navigators(&navigators)?,
@@ -98,7 +101,7 @@ fn protocol(snapshot: &Snapshot, request: pb::EvaluateRequest) -> Result<(Arc<Se
 
 fn report_to_wire(served: &ServedNavigator, report: &crate::eval::Report) -> pb::EvaluationReport {
     let record = &served.adapter.record;
-    let in_room = record.rooms.iter().any(|(room, _)| room == served.navigator.room().id());
+    let in_room = served.trained_on.is_some();
     pb::EvaluationReport {
         room: Some(convert::room_revision(served)),
         adapter: Some(convert::adapter_revision(served)),
@@ -108,7 +111,7 @@ fn report_to_wire(served: &ServedNavigator, report: &crate::eval::Report) -> pb:
         candidate_count: report.candidate_count as u32,
         source_excluded: report.protocol.exclude_source.is_some(),
         in_room,
-        leaks: in_room && record.split != report.protocol.split,
+        leaks: in_room && (record.split != report.protocol.split || served.trained_on == Some(TrainedOn::OtherFrames)),
         navigators: report.rows.iter().map(convert::row_to_wire).collect(),
     }
 }
@@ -128,7 +131,7 @@ fn score(
     }
     let scope = PredictionScope {
         split: convert::split(&split)?,
-        exclude_source: exclude_source.then_some(exclude_radius),
+        exclude_source: convert::exclusion(exclude_source, exclude_radius)?,
         thresholds: convert::thresholds(thresholds)?,
     };
     let predictions = predictions

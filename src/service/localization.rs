@@ -6,12 +6,14 @@ use tonic::{Request, Response, Status};
 
 use super::convert;
 use super::snapshot::ServedNavigator;
+use super::status::view_error;
 use super::{Error, Handlers, Snapshot};
 use crate::cancel::Cancellation;
 use crate::localization::localize;
-use crate::navigation::Source;
+use crate::navigation::{Error as E, Source, StepError};
 use crate::proto::v1 as pb;
 use crate::proto::v1::localization_service_server::LocalizationService;
+use crate::room;
 
 #[tonic::async_trait]
 impl LocalizationService for Handlers {
@@ -30,19 +32,23 @@ fn answer(
     most: u32,
     cancel: &Cancellation,
 ) -> Result<pb::LocalizeResponse, Error> {
-    let pb::LocalizeRequest { rooms, adapter, view, hit_count } = request;
+    let pb::LocalizeRequest { rooms, adapter, view, hit_count, thresholds } = request;
+    let thresholds = convert::thresholds(thresholds)?;
     let k = hit_count.unwrap_or(1);
     if k == 0 || k > most {
         return Err(Error::invalid("hit_count", format!("must be 1 to {most}, got {k}")));
     }
     let served = rooms_under(snapshot, &rooms, &adapter)?;
     let first = &served[0];
-    let source = convert::source(view, first.adapter.adapter.source())?;
+    let source = convert::source("view", view, first.adapter.adapter.source())?;
     if matches!(source, Source::Frame(_)) && served.len() != 1 {
         return Err(Error::invalid("view.frame_id", "is a frame of one room; name that room alone in rooms"));
     }
     let start = first.navigator.start(&source, None).map_err(|error| match error {
-        crate::navigation::Error::Adapter(problem) => super::status::view_error(&problem).within("view"),
+        E::Adapter(problem) => view_error(&problem).within("view"),
+        E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => {
+            Error::NotFound { field: "view.frame_id".to_owned(), name: frame.to_string() }
+        }
         other => Error::from(other),
     })?;
     let navigators = served.iter().map(|served| &served.navigator);
@@ -53,6 +59,9 @@ fn answer(
         Ok(pb::Place {
             room: Some(convert::room_revision(served)),
             hit: Some(convert::hit_to_wire(&place.hit, served.navigator.room())),
+            error: start
+                .pose
+                .map(|truth| convert::error_to_wire(&StepError::of(&truth, &place.hit.pose, &truth), &thresholds)),
         })
     };
     Ok(pb::LocalizeResponse {
@@ -64,6 +73,12 @@ fn answer(
 
 /// The rooms to look in, all under one adapter; at least one.
 fn rooms_under(snapshot: &Snapshot, rooms: &[String], adapter: &str) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+    for (position, room) in rooms.iter().enumerate() {
+        snapshot.room(room).map_err(|error| error.named(&format!("rooms[{position}]")))?;
+        if rooms[..position].contains(room) {
+            return Err(Error::invalid("rooms", format!("'{room}' is named twice")));
+        }
+    }
     let adapter = match (adapter, rooms) {
         ("", [room]) => snapshot.navigator(room, "")?.adapter.name.clone(),
         ("", _) => only_adapter_of(snapshot, rooms)?,
@@ -78,19 +93,13 @@ fn rooms_under(snapshot: &Snapshot, rooms: &[String], adapter: &str) -> Result<V
             Ok(fitting)
         };
     }
-    let mut served = Vec::with_capacity(rooms.len());
-    for (position, room) in rooms.iter().enumerate() {
-        if rooms[..position].contains(room) {
-            return Err(Error::invalid("rooms", format!("'{room}' is named twice")));
-        }
-        served.push(snapshot.navigator(room, &adapter)?.clone());
-    }
-    Ok(served)
+    rooms.iter().map(|room| Ok(snapshot.navigator(room, &adapter)?.clone())).collect()
 }
 
 /// The one adapter that fits all the rooms: distances under two adapters do not compare.
 fn only_adapter_of(snapshot: &Snapshot, rooms: &[String]) -> Result<String, Error> {
-    let asked: Vec<&String> = if rooms.is_empty() { snapshot.rooms().keys().collect() } else { rooms.iter().collect() };
+    let answered = snapshot.rooms().iter().filter(|(_, room)| !room.navigators.is_empty()).map(|(name, _)| name);
+    let asked: Vec<&String> = if rooms.is_empty() { answered.collect() } else { rooms.iter().collect() };
     let mut fitting: Vec<&String> = snapshot.adapters().keys().collect();
     for room in asked {
         let served = snapshot.room(room)?;

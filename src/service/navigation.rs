@@ -3,6 +3,7 @@
 use tonic::{Request, Response, Status};
 
 use super::convert;
+use super::status::brief;
 use super::{Error, Handlers, Snapshot};
 use crate::cancel::Cancellation;
 use crate::navigation::Limits;
@@ -43,7 +44,7 @@ impl NavigationService for Handlers {
                     Err(Error::Cancelled) => return Err(Error::Cancelled),
                     Err(error) => pb::batch_navigate_result::Result::Failure(pb::Failure {
                         code: error.code().into(),
-                        message: error.to_string(),
+                        message: brief(&error.to_string()),
                     }),
                 });
             }
@@ -55,9 +56,14 @@ impl NavigationService for Handlers {
     }
 }
 
-/// How many frames a request asks for, at least; each question is checked again when it is answered.
+/// How many frames a request asks for; each question is checked again when it is answered.
 fn hits_asked_for(request: &pb::NavigateRequest) -> u64 {
-    u64::from(request.steps.unwrap_or(1)).saturating_mul(u64::from(request.hit_count.unwrap_or(1)))
+    let motions = match request.displacement.as_ref().and_then(|given| given.displacement.as_ref()) {
+        Some(pb::displacement::Displacement::Twists(list)) => list.twists.len() as u64,
+        _ => 1,
+    };
+    let steps = u64::from(request.steps.unwrap_or(1)).saturating_mul(motions);
+    steps.saturating_mul(u64::from(request.hit_count.unwrap_or(1)))
 }
 
 fn navigate(

@@ -5,10 +5,12 @@ use tonic::{Request, Response, Status};
 use super::convert;
 use super::status::view_error;
 use super::{Error, Handlers, Snapshot};
-use crate::navigation::Source;
+use crate::geometry::{body_twist, exp};
+use crate::navigation::{Source, StepError};
 use crate::odometry::{View, motion};
 use crate::proto::v1 as pb;
 use crate::proto::v1::odometry_service_server::OdometryService;
+use crate::room::FrameId;
 
 #[tonic::async_trait]
 impl OdometryService for Handlers {
@@ -25,7 +27,8 @@ impl OdometryService for Handlers {
 }
 
 fn answer(snapshot: &Snapshot, request: pb::EstimateMotionRequest) -> Result<pb::EstimateMotionResponse, Error> {
-    let pb::EstimateMotionRequest { adapter, room, first, second } = request;
+    let pb::EstimateMotionRequest { adapter, room, first, second, thresholds } = request;
+    let thresholds = convert::thresholds(thresholds)?;
     let served = if room.is_empty() { None } else { Some(snapshot.navigator(&room, &adapter)?) };
     let stored = match (served, adapter.as_str()) {
         (Some(served), _) => &served.adapter,
@@ -38,8 +41,13 @@ fn answer(snapshot: &Snapshot, request: pb::EstimateMotionRequest) -> Result<pb:
         },
         (None, name) => snapshot.adapter(name)?,
     };
+    let frame_of = |given: &Option<pb::View>| match given.as_ref().and_then(|view| view.view.as_ref()) {
+        Some(pb::view::View::FrameId(frame)) => Some(FrameId(*frame)),
+        _ => None,
+    };
+    let frames = frame_of(&first).zip(frame_of(&second));
     let view = |field: &str, given| -> Result<View, Error> {
-        let view = match convert::source(given, stored.adapter.source()).map_err(|error| error.within(field))? {
+        let view = match convert::source(field, given, stored.adapter.source())? {
             Source::Feature(feature) => View::Feature(feature),
             Source::Latent(latent) => View::Latent(latent),
             Source::Frame(frame) => {
@@ -56,7 +64,16 @@ fn answer(snapshot: &Snapshot, request: pb::EstimateMotionRequest) -> Result<pb:
     };
     let (first, second) = (view("first", first)?, view("second", second)?);
     let twist = motion(&stored.adapter, &first, &second).map_err(|_| Error::Internal)?;
+    // Both frames have been looked up by now, so that their room and poses are there.
+    let truth = served.zip(frames).and_then(|(served, (first, second))| {
+        let poses = served.navigator.room().poses();
+        Some((poses.get(first.row())?, poses.get(second.row())?))
+    });
     Ok(pb::EstimateMotionResponse {
+        true_motion: truth.map(|(first, second)| convert::twist_to_wire(&body_twist(first, second))),
+        error: truth.map(|(first, second)| {
+            convert::error_to_wire(&StepError::of(first, &(first * exp(&twist)), second), &thresholds)
+        }),
         adapter: Some(pb::Revision { name: stored.name.clone(), revision: stored.revision }),
         motion: Some(convert::twist_to_wire(&twist)),
     })

@@ -31,6 +31,17 @@ pub struct ServedNavigator {
     pub adapter: Arc<StoredAdapter>,
     /// The room's revision.
     pub room_revision: u64,
+    /// Whether the adapter learned from this room, and from which frames of it.
+    pub trained_on: Option<TrainedOn>,
+}
+
+/// What an adapter learned from, of the room that it serves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TrainedOn {
+    /// The frames that are served.
+    TheseFrames,
+    /// Other frames under the room's name: a test frame of today may have been a training frame.
+    OtherFrames,
 }
 
 /// Rooms and adapters, newest revisions.
@@ -70,6 +81,9 @@ impl Snapshot {
 
     /// An adapter by name.
     pub fn adapter(&self, name: &str) -> Result<&Arc<StoredAdapter>, Error> {
+        if name.is_empty() {
+            return Err(Error::invalid("adapter", "is required"));
+        }
         self.adapters.get(name).ok_or_else(|| Error::NotFound { field: "adapter".to_owned(), name: name.to_owned() })
     }
 
@@ -132,8 +146,16 @@ async fn load_all(store: &Store, index: IndexKind) -> Result<Snapshot, RunError>
                     "approximate index audited against the exact scan"
                 );
             }
-            let adapter = adapter.clone();
-            navigators.push(Arc::new(ServedNavigator { navigator, adapter, room_revision: stored.revision }));
+            let trained = adapter.record.rooms.iter().find(|(name, _)| name == room.id());
+            let trained_on = match trained {
+                None => None,
+                Some((name, revision)) if store.same_frames(name.as_str(), *revision, stored.revision).await? => {
+                    Some(TrainedOn::TheseFrames)
+                }
+                Some(_) => Some(TrainedOn::OtherFrames),
+            };
+            let (adapter, room_revision) = (adapter.clone(), stored.revision);
+            navigators.push(Arc::new(ServedNavigator { navigator, adapter, room_revision, trained_on }));
         }
         let sources = stored.features.iter().map(|features| features.source().clone()).collect();
         let served = ServedRoom { room, revision: stored.revision, created: stored.created, sources, navigators };

@@ -44,6 +44,15 @@ impl Error {
         }
     }
 
+    /// The same error about a field of another name.
+    pub fn named(self, name: &str) -> Self {
+        match self {
+            Self::Invalid { problem, .. } => Self::Invalid { field: name.to_owned(), problem },
+            Self::NotFound { name: missing, .. } => Self::NotFound { field: name.to_owned(), name: missing },
+            other => other,
+        }
+    }
+
     /// The gRPC code.
     pub fn code(&self) -> Code {
         match self {
@@ -78,18 +87,28 @@ impl From<Error> for Status {
         details.set_error_info(error.reason(), DOMAIN, std::collections::HashMap::new());
         match &error {
             Error::Invalid { field, problem } => {
-                details.add_bad_request_violation(field.clone(), problem.clone());
+                details.add_bad_request_violation(brief(field), brief(problem));
             }
             Error::NotFound { field, name } => {
-                details.set_resource_info(field.clone(), name.clone(), "", "is not served");
+                details.set_resource_info(brief(field), brief(name), "", "is not served");
             }
             Error::Busy => {
                 details.set_retry_info(Some(std::time::Duration::from_millis(500)));
             }
             _ => {}
         }
-        Self::with_error_details(error.code(), error.to_string(), details)
+        Self::with_error_details(error.code(), brief(&error.to_string()), details)
     }
+}
+
+/// One line of bounded length: what a caller sent may be neither, and metadata must be small.
+pub fn brief(text: &str) -> String {
+    const MOST: usize = 300;
+    let mut line: String = text.chars().take(MOST).map(|c| if c.is_control() { ' ' } else { c }).collect();
+    if text.chars().nth(MOST).is_some() {
+        line.push('…');
+    }
+    line
 }
 
 impl From<cancel::Cancelled> for Error {
@@ -111,7 +130,6 @@ impl From<navigation::Error> for Error {
             }
             E::Cancelled(_) => return Self::Cancelled,
             E::FeatureRows { .. } | E::Features(_) => return Self::Internal,
-            E::NoCandidates { .. } => return Self::Precondition(error.to_string()),
             E::SourceFrame(_) => "source.frame_id",
             E::TargetFrame(_) => "displacement.target_frame_id",
             E::Adapter(problem) => return view_error(problem).within("source"),
@@ -119,6 +137,7 @@ impl From<navigation::Error> for Error {
             E::HitCount { .. } | E::HitsInAll { .. } => "hit_count",
             E::NoTwist | E::TwistNotFinite { .. } | E::TwistBeyondPi { .. } => "displacement",
             E::PoseNeeded { .. } => "source_pose",
+            E::NoCandidates { .. } => "exclude_radius",
         };
         Self::invalid(field, error)
     }
@@ -128,7 +147,7 @@ impl From<navigation::Error> for Error {
 pub fn view_error(error: &adapter::Error) -> Error {
     use adapter::Error as E;
     let field = match error {
-        E::LatentDim { .. } | E::NotFinite { what: "latent", .. } => "latent.values",
+        E::LatentDim { .. } | E::LatentRange { .. } | E::NotFinite { what: "latent", .. } => "latent.values",
         E::FeatureSource { .. } => "feature.source_name",
         _ => "feature.values",
     };
@@ -148,7 +167,7 @@ impl From<eval::Error> for Error {
             E::Threshold { .. } | E::ThresholdCount { .. } => "thresholds",
             E::NoCandidates { .. } => "exclude_radius",
             E::NoPredictions | E::MixedPredictions => "predictions",
-            E::NotACandidate { .. } => "retrieved_frame_id",
+            E::NotACandidate { .. } | E::NotATestPair { .. } | E::Excluded { .. } => "predictions",
             E::Prediction { position, problem } => return Self::invalid(format!("predictions[{position}]"), problem),
         };
         Self::invalid(field, error)

@@ -132,8 +132,10 @@ mod tests {
             let _ = told.send(());
             Ok(())
         };
+        let begun = std::time::Instant::now();
         assert_eq!(workers.run(Duration::from_millis(20), work).await, Err(Error::Deadline));
         hears.await.unwrap();
+        assert!(begun.elapsed() < Duration::from_secs(2), "at the deadline, not later");
     }
 
     /// Oracle: the definition of a bounded queue: one thread and no place to wait refuse the second request.

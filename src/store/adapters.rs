@@ -10,6 +10,8 @@ use super::{ATTEMPTS, Error, Kind, Published, Store, revision_path};
 use crate::adapter::{Adapter, Siamese, TENSOR_NAMES, TargetScale, TrainingRecord};
 use crate::room::is_plain_name;
 
+/// The frame of every twist: the body frame of the source camera.
+const TWIST_FRAME: &str = "body";
 /// Golden inputs in an adapter's file.
 const GOLDEN_ROWS: usize = 8;
 /// How far a golden output may be off, in units of the larger of 1 and the output itself.
@@ -60,7 +62,7 @@ impl Store {
                 created: chrono::Utc::now().to_rfc3339(),
                 source: adapter.source().into(),
                 weights: weights.clone(),
-                twist_frame: "body".to_owned(),
+                twist_frame: TWIST_FRAME.to_owned(),
                 deviation_ddof: 0,
                 training: record.into(),
             };
@@ -86,6 +88,13 @@ impl Store {
     pub async fn load_adapter(&self, name: &str, revision: Option<u64>) -> Result<StoredAdapter, Error> {
         let (folder, revision) = self.resolve(Kind::Adapter, name, revision).await?;
         let body = self.adapter_body(&folder, revision).await?;
+        if body.twist_frame != TWIST_FRAME || body.deviation_ddof != 0 {
+            let problem = format!(
+                "states twists in the frame '{}' and ddof {}; this program answers for '{TWIST_FRAME}' and 0",
+                body.twist_frame, body.deviation_ddof
+            );
+            return Err(Error::Damaged { file: self.shown(&revision_path(&folder, revision)), problem });
+        }
         let (file, bytes) = self.read_object(&folder, &body.weights).await?;
         let damaged = |problem: String| Error::Damaged { file: file.clone(), problem };
         let tensors = TensorReader::new(&file, &bytes)?;
@@ -120,7 +129,10 @@ impl Store {
 
     async fn adapter_body(&self, folder: &Path, revision: u64) -> Result<AdapterBody, Error> {
         let path = revision_path(folder, revision);
-        manifest::decode(&self.shown(&path), &self.read(&path).await?)
+        let file = self.shown(&path);
+        let body: AdapterBody = manifest::decode(&file, &self.read(&path).await?)?;
+        manifest::check_place(&file, folder, (&body.adapter, body.revision), revision)?;
+        Ok(body)
     }
 }
 
@@ -162,8 +174,8 @@ fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Re
     for (what, found, stored) in
         [("latents", latents, tensors.f64("golden.latents")?), ("twists", twists, tensors.f64("golden.twists")?)]
     {
-        let off = |(found, stored): (&f64, &f64)| (found - stored).abs() > GOLDEN_TOLERANCE * stored.abs().max(1.0);
-        if found.dim() != stored.dim() || found.iter().zip(&stored).any(off) {
+        let near = |(found, stored): (&f64, &f64)| (found - stored).abs() <= GOLDEN_TOLERANCE * stored.abs().max(1.0);
+        if found.dim() != stored.dim() || !found.iter().zip(&stored).all(near) {
             return Err(damaged(format!(
                 "its golden inputs do not give its golden {what} on this machine; publish it again"
             )));

@@ -14,7 +14,7 @@ mod manifest;
 mod rooms;
 
 pub use adapters::StoredAdapter;
-pub use rooms::{RoomSummary, StoredRoom};
+pub use rooms::{RoomSummary, StoredRoom, check_features};
 
 use std::sync::Arc;
 
@@ -37,7 +37,9 @@ pub enum Error {
     UnknownRevision { kind: &'static str, name: String, revision: u64, newest: u64 },
     #[error("room '{room}' has no features '{name}'; it has {}", listed(known))]
     UnknownFeatures { room: String, name: String, known: Vec<String> },
-    #[error("'{name}' is no name for {what}: use 1 to 100 letters, digits, '.', '-' or '_'")]
+    #[error("room '{room}' has {}; name one", several(known))]
+    WhichFeatures { room: String, known: Vec<String> },
+    #[error("{name:?} is no name for {what}: use 1 to 100 letters, digits, '.', '-' or '_'")]
     Name { what: &'static str, name: String },
     #[error("{file}: {problem}")]
     Damaged { file: String, problem: String },
@@ -46,14 +48,18 @@ pub enum Error {
         manifest::SCHEMA
     )]
     Schema { file: String, schema: u64 },
-    #[error("{file}: {source}")]
-    Io { file: String, source: object_store::Error },
+    #[error("{file}: {cause}")]
+    Io { file: String, cause: String },
     #[error("could not publish '{name}': another publisher took every revision number that was tried")]
     Contended { name: String },
     #[error("features '{name}' have {rows} rows, room '{room}' has {frame_count} frames")]
     FeatureRows { name: String, rows: usize, room: String, frame_count: usize },
     #[error("features '{name}' were given twice")]
     DuplicateFeatures { name: String },
+}
+
+fn several(names: &[String]) -> String {
+    if names.is_empty() { "no features".to_owned() } else { format!("several features ({})", names.join(", ")) }
 }
 
 fn listed(names: &[String]) -> String {
@@ -133,7 +139,13 @@ impl Store {
             return Err(Error::Missing { location: location.to_owned() });
         }
         let objects = LocalFileSystem::new_with_prefix(location).map_err(|error| failed(error.to_string()))?;
+        let objects = objects.with_fsync(true);
         Ok(Self { objects: Arc::new(objects), location: location.to_owned() })
+    }
+
+    /// A store in any object store; `location` names it in messages.
+    pub fn with_objects(objects: Arc<dyn ObjectStore>, location: &str) -> Self {
+        Self { objects, location: location.to_owned() }
     }
 
     /// Where it is, as it was given.
@@ -146,8 +158,17 @@ impl Store {
         format!("{}/{path}", self.location.trim_end_matches('/'))
     }
 
+    /// What the object store said, without the path that it repeats.
+    fn io(&self, path: &Path, error: &object_store::Error) -> Error {
+        let cause = match error {
+            object_store::Error::NotFound { .. } => "is missing; restore it, or publish again".to_owned(),
+            other => other.to_string(),
+        };
+        Error::Io { file: self.shown(path), cause }
+    }
+
     async fn read(&self, path: &Path) -> Result<Vec<u8>, Error> {
-        let io = |source| Error::Io { file: self.shown(path), source };
+        let io = |error| self.io(path, &error);
         let bytes = self.objects.get(path).await.map_err(io)?.bytes().await.map_err(io)?;
         Ok(bytes.to_vec())
     }
@@ -179,7 +200,7 @@ impl Store {
         let path = folder.clone().join("objects").join(file.as_str());
         let size = bytes.len() as u64;
         let written = self.objects.put(&path, PutPayload::from(bytes)).await;
-        written.map_err(|source| Error::Io { file: self.shown(&path), source })?;
+        written.map_err(|error| self.io(&path, &error))?;
         Ok(manifest::ObjectRef { file, sha256, bytes: size })
     }
 
@@ -190,7 +211,7 @@ impl Store {
         match self.objects.put_opts(&path, PutPayload::from(bytes), options).await {
             Ok(_) => Ok(true),
             Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
-            Err(source) => Err(Error::Io { file: self.shown(&path), source }),
+            Err(error) => Err(self.io(&path, &error)),
         }
     }
 
@@ -198,11 +219,11 @@ impl Store {
     async fn names(&self, kind: Kind) -> Result<Vec<String>, Error> {
         let folder = Path::from(kind.folder());
         let listed = self.objects.list_with_delimiter(Some(&folder)).await;
-        let listed = listed.map_err(|source| Error::Io { file: self.shown(&folder), source })?;
+        let listed = listed.map_err(|error| self.io(&folder, &error))?;
         let mut names = Vec::new();
         for prefix in listed.common_prefixes {
             let Some(name) = prefix.filename().map(str::to_owned) else { continue };
-            if !self.revisions(&prefix).await?.is_empty() {
+            if crate::room::is_plain_name(&name) && !self.revisions(&prefix).await?.is_empty() {
                 names.push(name);
             }
         }
@@ -216,7 +237,7 @@ impl Store {
         let mut listed = self.objects.list(Some(&prefix));
         let mut revisions = Vec::new();
         while let Some(entry) = listed.next().await {
-            let entry = entry.map_err(|source| Error::Io { file: self.shown(&prefix), source })?;
+            let entry = entry.map_err(|error| self.io(&prefix, &error))?;
             let name = entry.location.filename().unwrap_or_default();
             revisions.extend(name.strip_suffix(".json").and_then(|number| number.parse::<u64>().ok()));
         }

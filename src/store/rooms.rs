@@ -42,19 +42,7 @@ impl Store {
     /// # Errors
     /// [`Error::FeatureRows`], [`Error::DuplicateFeatures`], [`Error::Name`], or as the store fails.
     pub async fn publish_room(&self, room: &Room, features: &[Features]) -> Result<Published, Error> {
-        for (position, set) in features.iter().enumerate() {
-            let (name, rows) = (set.source().name.clone(), set.rows().nrows());
-            if !is_plain_name(&name) {
-                return Err(Error::Name { what: "features", name });
-            }
-            if features[..position].iter().any(|other| other.source().name == name) {
-                return Err(Error::DuplicateFeatures { name });
-            }
-            if rows != room.frame_count() {
-                let (room, frame_count) = (room.id().to_string(), room.frame_count());
-                return Err(Error::FeatureRows { name, rows, room, frame_count });
-            }
-        }
+        check_features(room, features)?;
         let folder = Path::from(Kind::Room.folder()).join(room.id().as_str());
         let frames = self.write_object(&folder, "frames", "safetensors", frames_file(room)?).await?;
         let frame_names = match room.frame_names() {
@@ -84,7 +72,7 @@ impl Store {
                 provenance: room.provenance().into(),
             };
             if let Some(newest) = newest {
-                if newest.frames == body.frames {
+                if newest.frames == body.frames || self.has_poses(&folder, &newest, room).await? {
                     let given = |entry: &FeaturesEntry| entries.iter().any(|e| e.source.name() == entry.source.name());
                     body.features.extend(newest.features.iter().filter(|entry| !given(entry)).cloned());
                 }
@@ -129,11 +117,28 @@ impl Store {
             (Some(wanted), _) if known.iter().any(|name| name == wanted) => wanted.to_owned(),
             (Some(wanted), _) => return Err(unknown(wanted)),
             (None, [only]) => only.clone(),
-            (None, _) => return Err(unknown("(none named)")),
+            (None, _) => return Err(Error::WhichFeatures { room: name.to_owned(), known: known.clone() }),
         };
         let mut stored = self.load(name, Some(revision), Some(&wanted)).await?;
         let features = stored.features.pop().ok_or_else(|| unknown(&wanted))?;
         Ok((stored, features))
+    }
+
+    /// Whether two revisions of a room have the same frames; false when one of them is not there any more.
+    ///
+    /// # Errors
+    /// [`Error::Damaged`], or as the store fails.
+    pub async fn same_frames(&self, name: &str, one: u64, other: u64) -> Result<bool, Error> {
+        if one == other {
+            return Ok(true);
+        }
+        let folder = Path::from(Kind::Room.folder()).join(name);
+        let revisions = self.revisions(&folder).await?;
+        if ![one, other].iter().all(|revision| revisions.contains(revision)) {
+            return Ok(false);
+        }
+        let (one, other) = (self.room_body(&folder, one).await?, self.room_body(&folder, other).await?);
+        Ok(one.frames == other.frames)
     }
 
     /// What the newest manifest of every room says, by name.
@@ -149,6 +154,14 @@ impl Store {
             summaries.push(RoomSummary { room, revision, frame_count: body.frame_count, features });
         }
         Ok(summaries)
+    }
+
+    /// Whether a stored revision has a room's poses, whatever else it says of the frames.
+    async fn has_poses(&self, folder: &Path, body: &RoomBody, room: &Room) -> Result<bool, Error> {
+        let (file, bytes) = self.read_object(folder, &body.frames).await?;
+        let stored = read_frames(&file, &bytes)?.poses;
+        let same = |(a, b): (&Pose, &Pose)| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-12;
+        Ok(stored.len() == room.frame_count() && stored.iter().zip(room.poses()).all(same))
     }
 
     async fn load(&self, name: &str, revision: Option<u64>, only: Option<&str>) -> Result<StoredRoom, Error> {
@@ -182,8 +195,32 @@ impl Store {
 
     async fn room_body(&self, folder: &Path, revision: u64) -> Result<RoomBody, Error> {
         let path = revision_path(folder, revision);
-        manifest::decode(&self.shown(&path), &self.read(&path).await?)
+        let file = self.shown(&path);
+        let body: RoomBody = manifest::decode(&file, &self.read(&path).await?)?;
+        manifest::check_place(&file, folder, (&body.room, body.revision), revision)?;
+        Ok(body)
     }
+}
+
+/// Refuses features that could not be published with a room, before anything is written.
+///
+/// # Errors
+/// [`Error::Name`], [`Error::DuplicateFeatures`] or [`Error::FeatureRows`].
+pub fn check_features(room: &Room, features: &[Features]) -> Result<(), Error> {
+    for (position, set) in features.iter().enumerate() {
+        let (name, rows) = (set.source().name.clone(), set.rows().nrows());
+        if !is_plain_name(&name) {
+            return Err(Error::Name { what: "features", name });
+        }
+        if features[..position].iter().any(|other| other.source().name == name) {
+            return Err(Error::DuplicateFeatures { name });
+        }
+        if rows != room.frame_count() {
+            let (room, frame_count) = (room.id().to_string(), room.frame_count());
+            return Err(Error::FeatureRows { name, rows, room, frame_count });
+        }
+    }
+    Ok(())
 }
 
 fn frames_file(room: &Room) -> Result<Vec<u8>, Error> {

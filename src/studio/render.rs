@@ -41,7 +41,7 @@ struct Surface {
     glow: f64,
 }
 
-/// The image that `camera` takes at `world_from_camera`.
+/// The image that `camera` takes at `world_from_camera`, which must lie inside the room.
 pub fn render(scene: &Scene, camera: Camera, world_from_camera: &Pose) -> RgbImage {
     let Camera { width, height, field_of_view_rad } = camera;
     let scale = 2.0 * (field_of_view_rad / 2.0).tan() / width as f64;

@@ -109,7 +109,7 @@ pub(super) fn noise(x: f64, y: f64, seed: u32) -> f64 {
     let (i, j) = (x.floor(), y.floor());
     let smooth = |t: f64| t * t * (3.0 - 2.0 * t);
     let (s, t) = (smooth(x - i), smooth(y - j));
-    let corner = |di: i64, dj: i64| hash2(i as i64 + di, j as i64 + dj, seed);
+    let corner = |di: i64, dj: i64| hash2((i as i64).wrapping_add(di), (j as i64).wrapping_add(dj), seed);
     let low = corner(0, 0) * (1.0 - s) + corner(1, 0) * s;
     let high = corner(0, 1) * (1.0 - s) + corner(1, 1) * s;
     low * (1.0 - t) + high * t

@@ -10,7 +10,7 @@ use seese3::eval::{NavigatorKind, Protocol, RetrievalScores, Row, evaluate};
 use seese3::features::{FeatureSource, Features};
 use seese3::geometry::body_twist;
 use seese3::index::{ExactIndex, Index};
-use seese3::navigation::{IndexKind, Mode, Navigator, Plan, Reading, Source, Space, walk};
+use seese3::navigation::{IndexKind, Leg, Mode, Navigator, Plan, Reading, Source, Space, walk};
 use seese3::pairs::{Pair, Split};
 use seese3::room::{Frames, Provenance, Room, RoomId};
 
@@ -191,7 +191,8 @@ fn walk_pair(space: Space<'_>, navigator: &Navigator, pair: Pair, plan: Plan) ->
     let poses = navigator.room().poses();
     let start = navigator.start(&Source::Frame(pair.source), None).unwrap();
     let motion = body_twist(&poses[pair.source.row()], &poses[pair.target.row()]);
-    walk(space, &start, motion, plan, &Cancellation::default()).unwrap()
+    let goal = start.pose.map(|pose| pose * seese3::geometry::exp(&motion));
+    walk(space, &start, Leg { motion, goal }, plan, &Cancellation::default()).unwrap()
 }
 
 /// Oracle: as above, with φ and W frozen in a room they never saw.

@@ -114,6 +114,64 @@ async fn estimated_motions_have_pytorchs_r2() {
     }
 }
 
+/// Oracle: SciPy's twist of the pair, and the definitions: the truth is log(P₁⁻¹P₂), a frame is its own place.
+#[tokio::test]
+async fn frames_of_a_room_are_answered_with_the_truth() {
+    let server = start(Config::default()).await;
+    let truth = oracle("test_twists");
+    let request = |second| pb::EstimateMotionRequest {
+        room: "synthetic".to_owned(),
+        first: frame(485),
+        second,
+        ..pb::EstimateMotionRequest::default()
+    };
+    let answer = server.client.estimate_motion(request(frame(525))).await.unwrap();
+    let six = |twist: pb::Twist| {
+        let (v, w) = (twist.linear.unwrap(), twist.angular.unwrap());
+        [v.x, v.y, v.z, w.x, w.y, w.z]
+    };
+    let (found, stated) = (six(answer.motion.unwrap()), six(answer.true_motion.unwrap()));
+    let mut squares = 0.0;
+    for component in 0..6 {
+        near("truth", stated[component], truth[(5, component)], 1e-9);
+        squares += (found[component] - truth[(5, component)]).powi(2);
+    }
+    let error = answer.error.unwrap();
+    near("error", error.twist_norm, squares.sqrt(), 1e-9);
+    assert!(error.hits.iter().all(|hit| hit.hit == (error.twist_norm < hit.threshold)) && error.hits.len() == 4);
+    let blind = server.client.estimate_motion(request(feature(feature_row(525)))).await.unwrap();
+    assert!(blind.error.is_none() && blind.true_motion.is_none(), "a feature has no pose");
+
+    let request = pb::LocalizeRequest {
+        rooms: vec!["synthetic".to_owned()],
+        view: frame(123),
+        hit_count: Some(2),
+        ..pb::LocalizeRequest::default()
+    };
+    let places = server.client.localize(request).await.unwrap().places;
+    assert_eq!(places[0].error.as_ref().unwrap().twist_norm, 0.0);
+    assert!(places[1].error.as_ref().unwrap().translation_m > 0.0);
+}
+
+/// Oracle: the definition of a closed loop over motions one after another: the second motion's goal is the composed
+/// one, so going there in a list or at once ends at the same frame when each motion is one step.
+#[tokio::test]
+async fn a_closed_loop_steers_every_motion_to_its_planned_goal() {
+    let server = start(Config::default()).await;
+    let (first, second) = ([0.1, 0.0, 0.2, 0.0, 0.1, 0.0], [0.2, 0.1, 0.0, 0.1, 0.0, 0.1]);
+    let ask = |displacement| pb::NavigateRequest { displacement, mode: pb::Mode::ClosedLoop.into(), ..question() };
+    let list = pb::displacement::Displacement::Twists(pb::TwistList { twists: vec![twist(first), twist(second)] });
+    let list = Some(pb::Displacement { displacement: Some(list) });
+    let both = server.client.navigate(ask(list)).await.unwrap();
+    // From the frame that the first motion retrieved, straight to the pose that the list plans.
+    let goal = both.steps[1].requested_pose.clone().unwrap();
+    let to_goal = Some(pb::Displacement { displacement: Some(pb::displacement::Displacement::TargetPose(goal)) });
+    let reached = both.steps[0].hits[0].frame_id;
+    let direct = server.client.navigate(pb::NavigateRequest { source: frame(reached), ..ask(to_goal) }).await.unwrap();
+    assert_eq!(both.steps[1].hits[0].frame_id, direct.steps[0].hits[0].frame_id);
+    near("distance", both.steps[1].hits[0].distance, direct.steps[0].hits[0].distance, 1e-9);
+}
+
 /// Oracle: the definitions. Zero motion stays put at distance 0; the open loop's end is the same in any number of
 /// steps; a target frame is the same question as its pose and as its twist.
 #[tokio::test]

@@ -94,7 +94,11 @@ pub async fn start(config: Config) -> TestServer {
         let _ = stopped.await;
     }));
     let client = Client::connect(&address, Duration::from_secs(20)).await.unwrap();
-    while client.rooms().await.is_err() {
+    for _ in 0..1_000 {
+        if client.rooms().await.is_ok() {
+            break;
+        }
+        assert!(!ended.is_finished(), "the server ended");
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
     TestServer { address, client, stop, ended, folder }

@@ -130,15 +130,19 @@ async fn a_deadline_ends_the_work() {
 async fn a_caller_that_leaves_an_evaluation_frees_its_thread() {
     let server = start(Config { threads: 1, queue: 4, ..Config::default() }).await;
     let mut service = EvaluationServiceClient::new(channel(&server.address).await);
-    let request = pb::EvaluateRequest {
-        room: "synthetic".to_owned(),
-        navigators: vec!["oracle".to_owned(); 2_000],
-        ..pb::EvaluateRequest::default()
-    };
-    let mut events = service.evaluate(request).await.unwrap().into_inner();
-    assert!(events.message().await.unwrap().is_some());
-    drop(events);
+    let request =
+        pb::EvaluateRequest { room: "synthetic".to_owned(), stride: Some(1), ..pb::EvaluateRequest::default() };
+    // Neither a caller that leaves nor one that never reads keeps the only thread.
+    let mut unread = Vec::new();
+    for _ in 0..3 {
+        let mut left = service.evaluate(request.clone()).await.unwrap().into_inner();
+        assert!(left.message().await.unwrap().is_some());
+        drop(left);
+        unread.push(service.evaluate(request.clone()).await.unwrap());
+    }
+    let begun = Instant::now();
     server.client.navigate(question()).await.unwrap();
+    assert!(begun.elapsed() < Duration::from_secs(10), "the thread was given back");
 }
 
 /// Oracle: the promise itself: the caller's id comes back, and one is made for a caller without.

@@ -5,7 +5,9 @@ use seese3::proto::v1 as pb;
 use seese3::service::Config;
 use tonic::Code;
 
-use crate::harness::{by_twist, feature, feature_row, frame, latent, question, start, to_frame, twist};
+use crate::harness::{
+    by_twist, feature, feature_row, frame, latent, latent as latent_view, question, start, to_frame, twist,
+};
 
 #[track_caller]
 fn refused<T: std::fmt::Debug>(what: &str, answer: Result<T, Error>, code: Code, field: &str) {
@@ -30,7 +32,7 @@ fn level(x: f64) -> pb::Pose {
 /// Oracle: the list of bad input, field by field.
 #[tokio::test]
 async fn navigate_names_the_field() {
-    use Code::{FailedPrecondition, InvalidArgument, NotFound};
+    use Code::{InvalidArgument, NotFound};
     let server = start(Config::default()).await;
     let nan_row = {
         let mut row = feature_row(3);
@@ -52,7 +54,7 @@ async fn navigate_names_the_field() {
         ("no room", pb::NavigateRequest { room: String::new(), ..q() }, InvalidArgument, "room"),
         ("unknown room", pb::NavigateRequest { room: "x".into(), ..q() }, NotFound, "room"),
         ("unknown adapter", pb::NavigateRequest { adapter: "x".into(), ..q() }, NotFound, "adapter"),
-        ("no source", pb::NavigateRequest { source: None, ..q() }, InvalidArgument, "source.view"),
+        ("no source", pb::NavigateRequest { source: None, ..q() }, InvalidArgument, "source"),
         ("unknown frame", pb::NavigateRequest { source: frame(600), ..q() }, NotFound, "source.frame_id"),
         (
             "unknown target",
@@ -164,8 +166,8 @@ async fn navigate_names_the_field() {
         (
             "all excluded",
             pb::NavigateRequest { exclude_source: true, exclude_radius: u32::MAX, ..q() },
-            FailedPrecondition,
-            "",
+            InvalidArgument,
+            "exclude_radius",
         ),
     ];
     for (what, request, code, field) in cases {
@@ -205,7 +207,7 @@ async fn the_other_calls_name_the_field() {
         "unknown room",
         c.localize(pb::LocalizeRequest { rooms: rooms(&["x"]), view: frame(1), ..l() }).await,
         NotFound,
-        "room",
+        "rooms[0]",
     );
     refused(
         "0 hits",
@@ -221,7 +223,7 @@ async fn the_other_calls_name_the_field() {
     );
 
     let m = pb::EstimateMotionRequest::default;
-    refused("no first", c.estimate_motion(m()).await, InvalidArgument, "first.view");
+    refused("no first", c.estimate_motion(m()).await, InvalidArgument, "first");
     refused(
         "frames without a room",
         c.estimate_motion(pb::EstimateMotionRequest { first: frame(1), ..m() }).await,
@@ -331,6 +333,41 @@ async fn the_other_calls_name_the_field() {
     refused("large batch", c.batch_navigate(vec![question(); 3]).await, InvalidArgument, "requests");
     let wide = pb::NavigateRequest { steps: Some(10), hit_count: Some(501), ..question() };
     refused("a batch of many frames", c.batch_navigate(vec![wide; 2]).await, InvalidArgument, "requests");
+    let twists = vec![twist([0.0; 6]); 1_000];
+    let list = pb::displacement::Displacement::Twists(pb::TwistList { twists });
+    let list = Some(pb::Displacement { displacement: Some(list) });
+    let long = pb::NavigateRequest { displacement: list, hit_count: Some(6), ..question() };
+    refused("a batch of long lists", c.batch_navigate(vec![long; 2]).await, InvalidArgument, "requests");
+    let far = vec![0.0; 19].into_iter().chain([1e300]).collect();
+    refused(
+        "far latent",
+        c.localize(pb::LocalizeRequest { view: latent_view(far), ..l() }).await,
+        InvalidArgument,
+        "view.latent.values",
+    );
+    let long_name = "x".repeat(100_000);
+    refused("long name", c.room(&long_name).await, NotFound, "room");
+    refused(
+        "a navigator twice",
+        c.evaluate(pb::EvaluateRequest { navigators: rooms(&["random", "random"]), ..e() }, |_| ()).await,
+        InvalidArgument,
+        "navigators",
+    );
+    refused(
+        "a radius without exclusion",
+        c.evaluate(pb::EvaluateRequest { exclude_radius: 3, ..e() }, |_| ()).await,
+        InvalidArgument,
+        "exclude_radius",
+    );
+    let excluded = |predictions| pb::ScorePredictionsRequest { exclude_source: true, ..s(predictions) };
+    refused(
+        "the source itself",
+        c.score_predictions(excluded(vec![p(540, retrieved(500))])).await,
+        InvalidArgument,
+        "predictions[0]",
+    );
+    let trained = pb::Prediction { source_frame_id: 1, target_frame_id: 41, prediction: retrieved(541) };
+    refused("no test pair", c.score_predictions(s(vec![trained])).await, InvalidArgument, "predictions[0]");
     refused("unknown adapter", c.adapter("x").await, NotFound, "adapter");
     refused("unknown room", c.room("x").await, NotFound, "room");
 }
