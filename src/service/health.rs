@@ -92,3 +92,20 @@ impl Health for HealthOf {
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the promise and the specification: every service that exists is NOT_SERVING until all is
+    /// loaded, and after the server was told to stop; a room is not known before it is loaded.
+    #[test]
+    fn nothing_serves_before_it_is_loaded() {
+        for phase in [Phase::Loading, Phase::Stopping] {
+            for name in SERVICES {
+                assert_eq!(status(&phase, name), Some(ServingStatus::NotServing), "{name:?}");
+            }
+            assert_eq!(status(&phase, "rooms/kitchen"), None);
+        }
+    }
+}
