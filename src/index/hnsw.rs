@@ -132,7 +132,8 @@ impl Index for HnswIndex {
         neighbours.sort_by(by_distance_then_frame);
         neighbours.truncate(k);
         if neighbours.len() < k.min(self.frames.len()) {
-            // The graph ran dry: the contract promises every frame that is left.
+            // The search landed in a part of the graph that is cut off from the rest: the contract promises every
+            // frame that is left.
             return self.exact.nearest(query, k, exclusion);
         }
         neighbours
