@@ -86,7 +86,7 @@ fn the_exact_index_keeps_the_contract() {
     contract(exact, 1.0);
 }
 
-/// Oracle: as above; the published recall of this library at these settings is over 0.99 on such data.
+/// Oracle: as above; an approximate index may miss one nearest frame of a hundred, at every k.
 #[test]
 fn the_hnsw_index_keeps_the_contract() {
     contract(hnsw, 0.99);

@@ -5,11 +5,12 @@ use std::sync::Arc;
 
 use anyhow::bail;
 use clap::Args;
-use serde_json::{Map, json};
+use serde_json::json;
 
 use super::progress::bar;
 use super::train::SplitName;
 use super::{check_writable, say, write_json};
+use crate::adapter::TrainingRecord;
 use crate::cancel::Cancellation;
 use crate::eval::{NavigatorKind, Protocol, evaluate};
 use crate::navigation::{IndexKind, Navigator};
@@ -57,19 +58,11 @@ impl Evaluate {
             check_writable(path)?;
         }
         let store = Store::open(&self.store)?;
-        let wanted: Option<Split> = self.split.map(Into::into);
-        let chosen = choose(&store, &self, wanted).await?;
+        let chosen = choose(&store, &self, self.split.map(Into::into)).await?;
         let features_name = self.features.clone().unwrap_or_else(|| chosen.adapter.source().name.clone());
         let (stored, features) = store.load_room_with(&self.room, Some(&features_name)).await?;
-        let protocol = Protocol {
-            split: wanted.unwrap_or(chosen.record.split),
-            stride: self.stride.unwrap_or(chosen.record.stride),
-            exclude_source: self.exclude_source.then_some(0),
-            thresholds: self.thresholds.clone(),
-            seed: self.seed,
-            navigators: NavigatorKind::ALL.to_vec(),
-        };
         let record = chosen.record.clone();
+        let protocol = self.protocol(&record);
         let room = Arc::new(stored.room);
         let navigator = Navigator::new(room, &features, Arc::new(chosen.adapter), IndexKind::Exact)?;
         let progress = bar(protocol.navigators.len() as u64, "evaluating");
@@ -108,18 +101,32 @@ impl Evaluate {
         }
         say(evaluation_table(&report).trim_end());
         if let Some(path) = &self.json {
-            let mut context = Map::new();
-            context.insert("room".to_owned(), json!({ "name": self.room, "revision": stored.revision }));
-            context.insert("features".to_owned(), json!(features_name));
-            let name = json!({ "name": chosen.name, "revision": chosen.revision, "trained_split": record.split.name(),
-                "trained_stride": record.stride, "preset": record.preset, "seed": record.config.seed });
-            context.insert("adapter".to_owned(), name);
-            context.insert("in_room".to_owned(), json!(in_room));
-            context.insert("leaks".to_owned(), json!(leaks));
+            let adapter = json!({ "name": chosen.name, "revision": chosen.revision, "preset": record.preset,
+                "trained_split": record.split.name(), "trained_stride": record.stride, "seed": record.config.seed });
+            let context = [
+                ("room", json!({ "name": self.room, "revision": stored.revision })),
+                ("features", json!(features_name)),
+                ("adapter", adapter),
+                ("in_room", json!(in_room)),
+                ("leaks", json!(leaks)),
+            ];
+            let context = context.map(|(key, value)| (key.to_owned(), value)).into_iter().collect();
             write_json(path, &evaluation_json(&report, context))?;
             say(format_args!("wrote {}", path.display()));
         }
         Ok(())
+    }
+
+    /// What is asked for, the adapter's own split and stride where nothing is.
+    fn protocol(&self, record: &TrainingRecord) -> Protocol {
+        Protocol {
+            split: self.split.map_or(record.split, Into::into),
+            stride: self.stride.unwrap_or(record.stride),
+            exclude_source: self.exclude_source.then_some(0),
+            thresholds: self.thresholds.clone(),
+            seed: self.seed,
+            navigators: NavigatorKind::ALL.to_vec(),
+        }
     }
 }
 

@@ -86,17 +86,22 @@ pub fn score_predictions(
         pairs.push(*pair);
         retrieved.push(frame);
     }
+    let latent = latent_scores(navigator, &pairs, &latents)?;
+    let retrieval = RetrievalScores::of(&pairs, &retrieved, room.poses(), &scope.thresholds);
+    Ok(Row { name: "predictions".to_owned(), n: pairs.len(), latent, retrieval })
+}
+
+/// Scores of predicted latents, laid end to end; none when only frames were predicted.
+fn latent_scores(navigator: &Navigator, pairs: &[Pair], latents: &[f64]) -> Result<Option<LatentScores>, Error> {
     let targets: Vec<usize> = pairs.iter().map(|pair| pair.target.row()).collect();
     let targets = navigator.latents().select(Axis(0), &targets);
-    let latent = match latents.len() {
-        0 => None,
+    match latents.len() {
+        0 => Ok(None),
         n if n == targets.len() => {
             let predicted =
                 Array2::from_shape_fn(targets.dim(), |(row, column)| latents[row * targets.ncols() + column]);
-            Some(LatentScores::of(targets.view(), predicted.view()))
+            Ok(Some(LatentScores::of(targets.view(), predicted.view())))
         }
-        _ => return Err(Error::MixedPredictions),
-    };
-    let retrieval = RetrievalScores::of(&pairs, &retrieved, room.poses(), &scope.thresholds);
-    Ok(Row { name: "predictions".to_owned(), n: pairs.len(), latent, retrieval })
+        _ => Err(Error::MixedPredictions),
+    }
 }

@@ -23,7 +23,7 @@ pub struct HnswParameters {
     /// Candidates kept while building.
     pub build_effort: usize,
     /// Candidates kept while searching. A wanted latent lies off the path of the frames' latents: there, 64 candidates
-    /// missed one nearest frame of ten that 256 found.
+    /// missed one nearest frame of ten that 256 found (the contract's 900 synthetic latents).
     pub search_effort: usize,
 }
 

@@ -71,19 +71,20 @@ impl Store {
                 features: entries.clone(),
                 provenance: room.provenance().into(),
             };
+            if let Some(newest) = &newest
+                && (newest.frames == body.frames || self.has_poses(&folder, newest, room).await?)
+            {
+                let given = |entry: &FeaturesEntry| entries.iter().any(|e| e.source.name() == entry.source.name());
+                body.features.extend(newest.features.iter().filter(|entry| !given(entry)).cloned());
+            }
+            body.features.sort_by(|a, b| a.source.name().cmp(b.source.name()));
             if let Some(newest) = newest {
-                if newest.frames == body.frames || self.has_poses(&folder, &newest, room).await? {
-                    let given = |entry: &FeaturesEntry| entries.iter().any(|e| e.source.name() == entry.source.name());
-                    body.features.extend(newest.features.iter().filter(|entry| !given(entry)).cloned());
-                }
-                body.features.sort_by(|a, b| a.source.name().cmp(b.source.name()));
                 let same = RoomBody { revision: newest.revision, created: newest.created.clone(), ..body.clone() };
                 if same == newest {
                     let manifest = revision_path(&folder, newest.revision).to_string();
                     return Ok(Published { revision: newest.revision, is_new: false, manifest });
                 }
             }
-            body.features.sort_by(|a, b| a.source.name().cmp(b.source.name()));
             let manifest = revision_path(&folder, body.revision).to_string();
             if self.write_manifest(&folder, body.revision, manifest::encode(&manifest, &body)?).await? {
                 return Ok(Published { revision: body.revision, is_new: true, manifest });
