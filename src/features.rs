@@ -16,6 +16,9 @@ pub enum Error {
 /// The widest feature that is accepted.
 pub const MAX_COLUMNS: usize = 65_536;
 
+/// What is said of an origin that is not known.
+pub const UNSPECIFIED: &str = "unspecified";
+
 /// What made a set of features. Two sources never mix: an adapter answers only for the one it was trained on.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FeatureSource {
@@ -23,11 +26,15 @@ pub struct FeatureSource {
     pub name: String,
     /// The encoder, or `unspecified` when the features were imported without saying.
     pub encoder: String,
-    /// The layer, its base and its norm, for instance `block14`.
+    /// The layer by the model's own name for it, for instance `block14`.
     pub layer: String,
+    /// What the layer's number counts from: `0`, `1`, or `name` when the layer is only named.
+    pub base: String,
+    /// Whether the encoder's last norm was applied to the layer: `none`, `final`, or `unspecified`.
+    pub norm: String,
     /// How a map became one row, for instance `cls`, `mean`, `grid2x2`.
     pub pooling: String,
-    /// SHA-256 of the preprocessing's description, or `unspecified`.
+    /// What was done to an image before the encoder saw it, with its own hash, or `unspecified`.
     pub preprocess: String,
     /// Columns of a feature.
     pub dim: usize,
@@ -36,15 +43,27 @@ pub struct FeatureSource {
 impl FeatureSource {
     /// The source of features that came as numbers alone, so that only their name and width are known.
     pub fn imported(name: &str, dim: usize) -> Self {
-        let unspecified = || "unspecified".to_owned();
+        let unspecified = || UNSPECIFIED.to_owned();
         Self {
             name: name.to_owned(),
             encoder: unspecified(),
             layer: unspecified(),
+            base: unspecified(),
+            norm: unspecified(),
             pooling: unspecified(),
             preprocess: unspecified(),
             dim,
         }
+    }
+
+    /// Whether two sources give comparable numbers: made alike, whatever they are called for short. Where an origin is
+    /// unspecified the name is all there is to go by, so it must be the same.
+    pub fn is_like(&self, other: &Self) -> bool {
+        // Destructured with no `..`, so that a new field breaks the build here.
+        let Self { name, encoder, layer, base, norm, pooling, preprocess, dim } = self;
+        let alike = (encoder, layer, base, norm, pooling, preprocess, dim)
+            == (&other.encoder, &other.layer, &other.base, &other.norm, &other.pooling, &other.preprocess, &other.dim);
+        alike && (encoder != UNSPECIFIED || *name == other.name)
     }
 }
 
@@ -76,6 +95,12 @@ impl Features {
         Ok(Self { source, rows })
     }
 
+    /// The features of these rows, in their order. Every row must be there.
+    #[must_use]
+    pub fn select(&self, rows: &[usize]) -> Self {
+        Self { source: self.source.clone(), rows: self.rows.select(ndarray::Axis(0), rows) }
+    }
+
     /// What made them.
     pub fn source(&self) -> &FeatureSource {
         &self.source
@@ -90,6 +115,21 @@ impl Features {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Oracle: the definition: how features were made counts, what they are called does not, unless nothing else is
+    /// known.
+    #[test]
+    fn sources_are_alike_by_their_making() {
+        let made = |name: &str, layer: &str| FeatureSource {
+            encoder: "e".to_owned(),
+            layer: layer.to_owned(),
+            ..FeatureSource::imported(name, 3)
+        };
+        assert!(made("a", "block1").is_like(&made("b", "block1")));
+        assert!(!made("a", "block1").is_like(&made("a", "block2")));
+        assert!(FeatureSource::imported("a", 3).is_like(&FeatureSource::imported("a", 3)));
+        assert!(!FeatureSource::imported("a", 3).is_like(&FeatureSource::imported("b", 3)));
+    }
 
     /// Oracle: IEEE 754's own list of what is not finite.
     #[test]

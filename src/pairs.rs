@@ -5,7 +5,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::room::FrameId;
+use crate::room::{FrameId, Timeline};
 
 /// Frames in a block of [`Split::Blocks`].
 const BLOCK_FRAMES: usize = 50;
@@ -17,6 +17,8 @@ pub enum Error {
     ZeroStride,
     #[error("{frame_count} frames are too few for stride {stride} under the split '{split}': no {side} pair is left")]
     NoPairs { frame_count: usize, stride: u32, split: Split, side: &'static str },
+    #[error("the split 'dataset' is the recording's own, and this room has none; use time or blocks")]
+    NoDatasetSplit,
     #[error("strides {low} to {high} are no range")]
     EmptyRange { low: u32, high: u32 },
 }
@@ -41,11 +43,13 @@ pub enum Split {
     /// The pair (i, j) tests when i mod 5 = 2. Frames are shared between the sides: leaky on purpose, a check
     /// that an implementation is right, no measure of generalisation.
     Pairs,
+    /// The recording's own: 7-Scenes' TestSplit, 12-Scenes' first sequence. Both ends of a pair on one side.
+    Dataset,
 }
 
 impl Split {
     /// Every split.
-    pub const ALL: [Self; 3] = [Self::Time, Self::Blocks, Self::Pairs];
+    pub const ALL: [Self; 4] = [Self::Time, Self::Blocks, Self::Pairs, Self::Dataset];
 
     /// The word for it on the command line, on the wire and in a manifest.
     pub fn name(self) -> &'static str {
@@ -53,6 +57,7 @@ impl Split {
             Self::Time => "time",
             Self::Blocks => "blocks",
             Self::Pairs => "pairs",
+            Self::Dataset => "dataset",
         }
     }
 
@@ -65,27 +70,28 @@ impl Split {
     ///
     /// # Errors
     /// [`Error::ZeroStride`] or [`Error::NoPairs`].
-    pub fn train_pairs(self, frame_count: usize, stride: u32) -> Result<Vec<Pair>, Error> {
-        self.pairs(frame_count, stride, Side::Train)
+    pub fn train_pairs(self, timeline: &Timeline, stride: u32) -> Result<Vec<Pair>, Error> {
+        self.pairs(timeline, stride, Side::Train)
     }
 
     /// Test pairs at one stride, by source frame.
     ///
     /// # Errors
     /// [`Error::ZeroStride`] or [`Error::NoPairs`].
-    pub fn test_pairs(self, frame_count: usize, stride: u32) -> Result<Vec<Pair>, Error> {
-        self.pairs(frame_count, stride, Side::Test)
+    pub fn test_pairs(self, timeline: &Timeline, stride: u32) -> Result<Vec<Pair>, Error> {
+        self.pairs(timeline, stride, Side::Test)
     }
 
     /// Whether a pair of any stride is a test pair.
-    pub fn tests(self, frame_count: usize, pair: Pair) -> bool {
-        self.side(frame_count, pair) == Some(Side::Test)
+    pub fn tests(self, timeline: &Timeline, pair: Pair) -> bool {
+        self.side(timeline, pair) == Some(Side::Test)
     }
 
     /// The frames among which a test answer is looked for: the test frames; all frames under
     /// [`Split::Pairs`], which has no test frames.
-    pub fn candidates(self, frame_count: usize) -> Vec<FrameId> {
-        frames(frame_count).filter(|&frame| self == Self::Pairs || self.tests_frame(frame_count, frame)).collect()
+    pub fn candidates(self, timeline: &Timeline) -> Vec<FrameId> {
+        let candidate = |&frame: &FrameId| self == Self::Pairs || self.tests_frame(timeline, frame);
+        frames(timeline.frame_count).filter(candidate).collect()
     }
 
     /// `count` training pairs drawn with replacement from all pairs whose stride lies in `low..=high`
@@ -93,27 +99,32 @@ impl Split {
     ///
     /// # Errors
     /// [`Error::EmptyRange`], or as [`Split::train_pairs`] when no stride of the range gives a pair.
-    pub fn sampled_range(self, frame_count: usize, range: &StrideRange, seed: u64) -> Result<Vec<Pair>, Error> {
+    pub fn sampled_range(self, timeline: &Timeline, range: &StrideRange, seed: u64) -> Result<Vec<Pair>, Error> {
         let &StrideRange { low, high, count } = range;
         if low == 0 || low > high {
             return Err(Error::EmptyRange { low, high });
         }
-        let pool: Vec<Pair> = (low..=high).filter_map(|s| self.train_pairs(frame_count, s).ok()).flatten().collect();
+        let pool: Vec<Pair> = (low..=high).filter_map(|s| self.train_pairs(timeline, s).ok()).flatten().collect();
         if pool.is_empty() {
+            let frame_count = timeline.frame_count;
             return Err(Error::NoPairs { frame_count, stride: low, split: self, side: Side::Train.name() });
         }
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         Ok((0..count).map(|_| pool[random.random_range(0..pool.len())]).collect())
     }
 
-    fn pairs(self, frame_count: usize, stride: u32, side: Side) -> Result<Vec<Pair>, Error> {
+    fn pairs(self, timeline: &Timeline, stride: u32, side: Side) -> Result<Vec<Pair>, Error> {
         if stride == 0 {
             return Err(Error::ZeroStride);
         }
+        if self == Self::Dataset && timeline.held_out.is_empty() {
+            return Err(Error::NoDatasetSplit);
+        }
+        let frame_count = timeline.frame_count;
         let last_source = frame_count.saturating_sub(stride as usize);
         let pairs: Vec<Pair> = frames(last_source)
             .map(|source| Pair { source, target: FrameId(source.0 + stride) })
-            .filter(|&pair| self.side(frame_count, pair) == Some(side))
+            .filter(|&pair| self.side(timeline, pair) == Some(side))
             .collect();
         if pairs.is_empty() {
             return Err(Error::NoPairs { frame_count, stride, split: self, side: side.name() });
@@ -121,23 +132,27 @@ impl Split {
         Ok(pairs)
     }
 
-    /// The side a pair belongs to, or none when its ends lie on different sides.
-    fn side(self, frame_count: usize, pair: Pair) -> Option<Side> {
-        let tested = |frame| self.tests_frame(frame_count, frame);
+    /// The side a pair belongs to, or none when its ends lie on different sides or in different sequences.
+    fn side(self, timeline: &Timeline, pair: Pair) -> Option<Side> {
+        if !timeline.joins(pair.source, pair.target) {
+            return None;
+        }
+        let tested = |frame| self.tests_frame(timeline, frame);
         let block = |frame: FrameId| frame.row() / BLOCK_FRAMES;
         match self {
             Self::Pairs => Some(if pair.source.0 % 5 == 2 { Side::Test } else { Side::Train }),
-            Self::Time | Self::Blocks => match (tested(pair.source), tested(pair.target)) {
+            Self::Time | Self::Blocks | Self::Dataset => match (tested(pair.source), tested(pair.target)) {
                 (false, false) => Some(Side::Train),
-                (true, true) if self == Self::Time || block(pair.source) == block(pair.target) => Some(Side::Test),
+                (true, true) if self != Self::Blocks || block(pair.source) == block(pair.target) => Some(Side::Test),
                 _ => None,
             },
         }
     }
 
-    fn tests_frame(self, frame_count: usize, frame: FrameId) -> bool {
+    fn tests_frame(self, timeline: &Timeline, frame: FrameId) -> bool {
         match self {
-            Self::Time => frame.row() >= frame_count * 4 / 5,
+            Self::Time => frame.row() >= timeline.frame_count * 4 / 5,
+            Self::Dataset => timeline.held_out.get(frame.row()).copied().unwrap_or(false),
             Self::Blocks => (frame.row() / BLOCK_FRAMES) % 5 == 2,
             Self::Pairs => false,
         }
@@ -195,9 +210,13 @@ mod tests {
             (Split::Time, 20, 180),
             (Split::Time, 40, 160),
         ] {
-            assert_eq!(split.test_pairs(1000, stride).unwrap().len(), expected, "{split} {stride}");
+            assert_eq!(
+                split.test_pairs(&Timeline::unbroken(1000), stride).unwrap().len(),
+                expected,
+                "{split} {stride}"
+            );
         }
-        assert_eq!(Split::Time.train_pairs(1000, 40).unwrap().len(), 760);
+        assert_eq!(Split::Time.train_pairs(&Timeline::unbroken(1000), 40).unwrap().len(), 760);
     }
 
     /// Oracle: the definition of a time split, floor(0.8 N) frames train.
@@ -205,28 +224,53 @@ mod tests {
     fn no_frame_is_on_both_sides_of_the_time_or_block_split() {
         for split in [Split::Time, Split::Blocks] {
             let ends = |pairs: Vec<Pair>| pairs.into_iter().flat_map(|pair| [pair.source, pair.target]);
-            let trained: std::collections::HashSet<_> = ends(split.train_pairs(503, 10).unwrap()).collect();
-            assert!(ends(split.test_pairs(503, 10).unwrap()).all(|frame| !trained.contains(&frame)), "{split}");
-            assert!(split.candidates(503).iter().all(|frame| !trained.contains(frame)), "{split}");
+            let trained: std::collections::HashSet<_> =
+                ends(split.train_pairs(&Timeline::unbroken(503), 10).unwrap()).collect();
+            assert!(
+                ends(split.test_pairs(&Timeline::unbroken(503), 10).unwrap()).all(|frame| !trained.contains(&frame)),
+                "{split}"
+            );
+            assert!(split.candidates(&Timeline::unbroken(503)).iter().all(|frame| !trained.contains(frame)), "{split}");
         }
-        assert_eq!(Split::Time.candidates(503)[0], FrameId(402));
+        assert_eq!(Split::Time.candidates(&Timeline::unbroken(503))[0], FrameId(402));
     }
 
     /// Oracle: paper finding 6, 9,145 distinct pairs with strides 10 to 40 among 320 training frames.
     #[test]
     fn range_pairing_draws_from_the_papers_pool() {
-        let distinct: usize = (10..=40).map(|s| Split::Time.train_pairs(400, s).unwrap().len()).sum();
+        let distinct: usize =
+            (10..=40).map(|s| Split::Time.train_pairs(&Timeline::unbroken(400), s).unwrap().len()).sum();
         assert_eq!(distinct, 9_145);
         let range = StrideRange { low: 10, high: 40, count: 30_000 };
-        let drawn = Split::Time.sampled_range(400, &range, 7).unwrap();
+        let drawn = Split::Time.sampled_range(&Timeline::unbroken(400), &range, 7).unwrap();
         assert_eq!(drawn.len(), 30_000);
         assert!(drawn.iter().all(|pair| (10..=40).contains(&(pair.target.0 - pair.source.0)) && pair.target.0 < 320));
-        assert_ne!(drawn, Split::Time.sampled_range(400, &range, 8).unwrap());
+        assert_ne!(drawn, Split::Time.sampled_range(&Timeline::unbroken(400), &range, 8).unwrap());
     }
 
     #[test]
     fn a_room_too_short_for_its_stride_is_refused() {
-        assert!(matches!(Split::Time.test_pairs(100, 40), Err(Error::NoPairs { side: "test", .. })));
-        assert_eq!(Split::Time.test_pairs(100, 0), Err(Error::ZeroStride));
+        assert!(matches!(
+            Split::Time.test_pairs(&Timeline::unbroken(100), 40),
+            Err(Error::NoPairs { side: "test", .. })
+        ));
+        assert_eq!(Split::Time.test_pairs(&Timeline::unbroken(100), 0), Err(Error::ZeroStride));
+    }
+
+    /// Oracle: by hand. Two sequences of four frames, the second held out: no pair joins them, and the recording's own
+    /// split tests the second.
+    #[test]
+    fn pairs_stay_in_their_sequence_and_the_datasets_own_split_is_kept() {
+        let timeline = Timeline {
+            frame_count: 8,
+            sequences: vec![0, 0, 0, 0, 1, 1, 1, 1],
+            held_out: vec![false, false, false, false, true, true, true, true],
+        };
+        let rows = |pairs: Vec<Pair>| pairs.iter().map(|p| (p.source.0, p.target.0)).collect::<Vec<_>>();
+        assert_eq!(rows(Split::Dataset.train_pairs(&timeline, 2).unwrap()), [(0, 2), (1, 3)]);
+        assert_eq!(rows(Split::Dataset.test_pairs(&timeline, 2).unwrap()), [(4, 6), (5, 7)]);
+        assert_eq!(rows(Split::Time.train_pairs(&timeline, 2).unwrap()), [(0, 2), (1, 3)]);
+        assert_eq!(Split::Dataset.candidates(&timeline), [4, 5, 6, 7].map(FrameId));
+        assert_eq!(Split::Dataset.test_pairs(&Timeline::unbroken(8), 2), Err(Error::NoDatasetSplit));
     }
 }

@@ -23,6 +23,8 @@ pub enum Error {
     Count { room: RoomId, frame_count: usize, actual: usize, what: &'static str },
     #[error("room '{room}' has {frame_count} frames, over the limit of {MAX_FRAMES}")]
     TooManyFrames { room: RoomId, frame_count: usize },
+    #[error("room '{room}', frame {frame}: image '{image}' must be a path below the recording's folder, without '..'")]
+    ImagePath { room: RoomId, frame: usize, image: String },
     #[error("room '{room}' has no frame {frame}; it has frames 0 to {}", frame_count - 1)]
     UnknownFrame { room: RoomId, frame: FrameId, frame_count: usize },
 }
@@ -89,6 +91,8 @@ pub struct Provenance {
     pub format: String,
     /// The terms under which its data may be used, if stated.
     pub licence: String,
+    /// The folder that its images' paths start from; empty if it has no images.
+    pub images_root: String,
     /// The largest |RRᵀ − I| entry of its rotations before they were projected to SO(3).
     pub worst_rotation_deviation: f64,
 }
@@ -102,6 +106,57 @@ pub struct Frames {
     pub timestamps_ns: Vec<i64>,
     /// The recording's own frame names, one a frame, or empty if it has none.
     pub names: Vec<String>,
+    /// The recording's own frame numbers, one a frame, or empty if it has none. Dropped frames leave gaps.
+    pub numbers: Vec<i64>,
+    /// Where each frame's image is, relative to [`Provenance::images_root`], or empty if there are none.
+    /// `FILE@OFFSET+LENGTH` is an image inside a file, bytes.
+    pub images: Vec<String>,
+    /// Which unbroken sequence each frame belongs to, or empty if all are one.
+    pub sequences: Vec<u32>,
+    /// Whether the recording's own split holds each frame out for testing, or empty if it defines none.
+    pub held_out: Vec<bool>,
+}
+
+impl Frames {
+    /// The frames of these rows, in their order. Every row must be there.
+    #[must_use]
+    pub fn select(&self, rows: &[usize]) -> Self {
+        fn pick<T: Clone>(values: &[T], rows: &[usize]) -> Vec<T> {
+            if values.is_empty() { Vec::new() } else { rows.iter().map(|&row| values[row].clone()).collect() }
+        }
+        Self {
+            poses: pick(&self.poses, rows),
+            timestamps_ns: pick(&self.timestamps_ns, rows),
+            names: pick(&self.names, rows),
+            numbers: pick(&self.numbers, rows),
+            images: pick(&self.images, rows),
+            sequences: pick(&self.sequences, rows),
+            held_out: pick(&self.held_out, rows),
+        }
+    }
+}
+
+/// How a room's frames follow one another: all that a split needs to know of it.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Timeline {
+    /// How many frames there are.
+    pub frame_count: usize,
+    /// Which unbroken sequence each frame belongs to, or empty if all are one.
+    pub sequences: Vec<u32>,
+    /// Whether the recording's own split holds each frame out, or empty if it defines none.
+    pub held_out: Vec<bool>,
+}
+
+impl Timeline {
+    /// One unbroken sequence without a split of its own.
+    pub fn unbroken(frame_count: usize) -> Self {
+        Self { frame_count, ..Self::default() }
+    }
+
+    /// Whether two frames were recorded in one go.
+    pub fn joins(&self, a: FrameId, b: FrameId) -> bool {
+        self.sequences.is_empty() || self.sequences[a.row()] == self.sequences[b.row()]
+    }
 }
 
 /// A room that was recorded once. Immutable.
@@ -109,6 +164,7 @@ pub struct Frames {
 pub struct Room {
     id: RoomId,
     frames: Frames,
+    timeline: Timeline,
     provenance: Provenance,
 }
 
@@ -116,7 +172,8 @@ impl Room {
     /// Checks the frames and makes the room.
     ///
     /// # Errors
-    /// The first of [`Error::Empty`], [`Error::TooManyFrames`], [`Error::Count`], [`Error::PoseNotFinite`].
+    /// The first of [`Error::Empty`], [`Error::TooManyFrames`], [`Error::Count`], [`Error::PoseNotFinite`],
+    /// [`Error::ImagePath`].
     pub fn new(id: RoomId, frames: Frames, provenance: Provenance) -> Result<Self, Error> {
         let frame_count = frames.poses.len();
         if frame_count == 0 {
@@ -125,7 +182,14 @@ impl Room {
         if frame_count > MAX_FRAMES {
             return Err(Error::TooManyFrames { room: id, frame_count });
         }
-        for (what, actual) in [("timestamps", frames.timestamps_ns.len()), ("frame names", frames.names.len())] {
+        for (what, actual) in [
+            ("timestamps", frames.timestamps_ns.len()),
+            ("frame names", frames.names.len()),
+            ("frame numbers", frames.numbers.len()),
+            ("images", frames.images.len()),
+            ("sequence marks", frames.sequences.len()),
+            ("split marks", frames.held_out.len()),
+        ] {
             if actual != 0 && actual != frame_count {
                 return Err(Error::Count { room: id, frame_count, actual, what });
             }
@@ -135,7 +199,12 @@ impl Room {
         if let Some(frame) = frames.poses.iter().position(|pose| !finite(pose)) {
             return Err(Error::PoseNotFinite { room: id, frame });
         }
-        Ok(Self { id, frames, provenance })
+        if let Some(frame) = frames.images.iter().position(|image| !stays_below(image)) {
+            return Err(Error::ImagePath { room: id, frame, image: frames.images[frame].clone() });
+        }
+        let (sequences, held_out) = (frames.sequences.clone(), frames.held_out.clone());
+        let timeline = Timeline { frame_count, sequences, held_out };
+        Ok(Self { id, frames, timeline, provenance })
     }
 
     /// The room's name.
@@ -163,6 +232,26 @@ impl Room {
         &self.frames.names
     }
 
+    /// The recording's own frame numbers; empty if it has none.
+    pub fn frame_numbers(&self) -> &[i64] {
+        &self.frames.numbers
+    }
+
+    /// Where each frame's image is, relative to [`Provenance::images_root`]; empty if there are none.
+    pub fn images(&self) -> &[String] {
+        &self.frames.images
+    }
+
+    /// How the frames follow one another.
+    pub fn timeline(&self) -> &Timeline {
+        &self.timeline
+    }
+
+    /// All that is known of the frames.
+    pub fn frames(&self) -> &Frames {
+        &self.frames
+    }
+
     /// Where the room came from.
     pub fn provenance(&self) -> &Provenance {
         &self.provenance
@@ -179,6 +268,13 @@ impl Room {
             frame_count: self.frame_count(),
         })
     }
+}
+
+/// Whether a relative path cannot leave the folder it starts from.
+fn stays_below(path: &str) -> bool {
+    !path.is_empty()
+        && !path.contains(['\\', ':', '\0'])
+        && path.split('/').all(|part| !matches!(part, "" | "." | ".."))
 }
 
 #[cfg(test)]
@@ -209,6 +305,10 @@ mod tests {
         ));
         let frames = Frames { poses: vec![Pose::identity()], timestamps_ns: vec![1, 2], ..Frames::default() };
         assert!(matches!(room(frames), Err(Error::Count { actual: 2, .. })));
+        for image in ["../secret.png", "/etc/passwd", "a/../../b.png", "", "c:/x.png", "a//b.png"] {
+            let frames = Frames { poses: vec![Pose::identity()], images: vec![image.to_owned()], ..Frames::default() };
+            assert!(matches!(room(frames), Err(Error::ImagePath { .. })), "{image:?}");
+        }
     }
 
     /// Oracle: what a path traversal or a hidden file looks like.

@@ -73,8 +73,8 @@ pub fn learn(
     if config.epochs == 0 || config.epochs > MAX_EPOCHS {
         return Err(Error::Epochs { epochs: config.epochs });
     }
-    let test_pairs = recipe.split.test_pairs(frame_count, recipe.stride)?;
-    let train_pairs = recipe.preset.plan(recipe.stride).pairs(recipe.split, frame_count, recipe.seed)?;
+    let test_pairs = recipe.split.test_pairs(room.timeline(), recipe.stride)?;
+    let train_pairs = recipe.preset.plan(recipe.stride).pairs(recipe.split, room.timeline(), recipe.seed)?;
     let twists = motions(room.poses(), &train_pairs);
     let ends = train_pairs.iter().map(|pair| [pair.source.row(), pair.target.row()]).collect();
     let samples = Samples::new(rows, ends, &twists)?;

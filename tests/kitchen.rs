@@ -11,13 +11,13 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use seese3::adapter::{Preset, Reading};
 use seese3::cancel::Cancellation;
-use seese3::datasets::{read_features, read_poses, read_seven_scenes};
+use seese3::datasets::{Reader, SevenScenes, Unusable, read_features, read_poses, read_seven_scenes};
 use seese3::eval::{NavigatorKind, Protocol, evaluate};
 use seese3::features::{FeatureSource, Features};
 use seese3::geometry::body_twist;
 use seese3::navigation::{IndexKind, Navigator};
 use seese3::pairs::Split;
-use seese3::room::{Provenance, Room, RoomId};
+use seese3::room::{Provenance, Room, RoomId, Timeline};
 use seese3::scores::{MotionScores, mean};
 use seese3::training::{Lesson, Recipe, learn};
 use support::{near, shared, skipped};
@@ -81,11 +81,11 @@ fn identity_hits_as_often_as_the_camera_hardly_moves() {
     let (adapter, _) = learn(Lesson { room: &room, revision: 1, features: &features }, &recipe, &mut |_| ()).unwrap();
     let room = Arc::new(room);
     let navigator = Navigator::new(room.clone(), &features, Arc::new(adapter), IndexKind::Exact).unwrap();
-    for split in Split::ALL {
+    for split in [Split::Time, Split::Blocks, Split::Pairs] {
         for stride in [10, 20, 40] {
             let protocol = Protocol { split, navigators: vec![NavigatorKind::Identity], ..Protocol::paper(stride) };
             let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |_, _| ()).unwrap();
-            let pairs = split.test_pairs(room.frame_count(), stride).unwrap();
+            let pairs = split.test_pairs(&Timeline::unbroken(room.frame_count()), stride).unwrap();
             for (epsilon, rate) in &report.rows[0].retrieval.hits {
                 let moves = |pair: &&seese3::pairs::Pair| {
                     let poses = room.poses();
@@ -104,38 +104,12 @@ fn the_pose_files_give_the_poses_of_the_array() {
     let Some(shared) = shared() else { return skipped("the_pose_files_give_the_poses_of_the_array") };
     let folder = shared.join("rooms/kitchen");
     let from_array = read_poses(&folder.join("poses.npy")).unwrap();
-    let from_files = read_seven_scenes(&folder, None, true).unwrap();
+    let mut reader = Reader { unusable: Unusable::Refuse, progress: &mut |_, _| () };
+    let from_files = read_seven_scenes(&folder, &SevenScenes::default(), &mut reader).unwrap();
     assert_eq!(from_files.frames.names[999], "seq-01/frame-000999");
     assert_eq!(from_files.frames.poses.len(), 1_000);
     near("deviation", from_files.worst_rotation_deviation, from_array.worst_rotation_deviation, 1e-12);
     for (a, b) in from_array.frames.poses.iter().zip(&from_files.frames.poses) {
         assert!((a.to_homogeneous() - b.to_homogeneous()).abs().max() < 1e-9);
     }
-}
-
-/// Oracle: poses and reasons as NumPy and SciPy read the same files, traps and all.
-#[test]
-fn seven_scenes_traps_are_dropped_by_name() {
-    let Some(shared) = shared() else { return skipped("seven_scenes_traps_are_dropped_by_name") };
-    let folder = shared.join("oracles/datasets");
-    let expected = &support::json(&folder.join("expected.json"))["sevenscenes"];
-    let scene = folder.join(expected["root"].as_str().unwrap().trim_start_matches("datasets/"));
-    let found = read_seven_scenes(&scene, Some("seq-01"), false).unwrap();
-    let of_sequence = |value: &&serde_json::Value| value["name"].as_str().unwrap().starts_with("seq-01");
-    let frames: Vec<_> = expected["frames"].as_array().unwrap().iter().filter(of_sequence).collect();
-    assert_eq!(found.frames.poses.len(), frames.len());
-    for ((pose, name), frame) in found.frames.poses.iter().zip(&found.frames.names).zip(frames) {
-        assert_eq!(name, frame["name"].as_str().unwrap());
-        for (position, value) in pose.to_homogeneous().transpose().iter().enumerate() {
-            near(name, *value, support::number(&frame["world_from_camera"][position]), 1e-9);
-        }
-    }
-    let dropped: Vec<_> = expected["dropped"].as_array().unwrap().iter().filter(of_sequence).collect();
-    assert_eq!(found.dropped.len(), dropped.len());
-    for (found, expected) in found.dropped.iter().zip(dropped) {
-        assert_eq!(found.name, expected["name"].as_str().unwrap());
-        assert_eq!(found.reason.to_string(), expected["reason"].as_str().unwrap());
-    }
-    assert!(read_seven_scenes(&scene, Some("seq-01"), true).is_err());
-    assert!(read_seven_scenes(&scene, None, false).is_err(), "two sequences, none named");
 }

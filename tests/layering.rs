@@ -15,7 +15,7 @@ const RESERVED: [(&str, &[&str]); 9] = [
     ("std::time", &["service", "client", "cli", "main"]),
     ("hnsw_rs", &["index"]),
     ("object_store", &["store"]),
-    ("serde", &["store", "report", "cli"]),
+    ("serde", &["datasets", "store", "report", "cli"]),
 ];
 
 fn source() -> PathBuf {

@@ -20,9 +20,26 @@ fn room(name: &str) -> Room {
     poses.truncate(300);
     let names = (0..300).map(|i| format!("seq/frame-{i:06}")).collect();
     let timestamps_ns = (0..300).map(|i| 1_700_000_000_000_000_000 + i * 33_333_333).collect();
-    let provenance =
-        Provenance { format: "test".to_owned(), licence: "CC0".to_owned(), worst_rotation_deviation: 1e-4 };
-    Room::new(RoomId::new(name).unwrap(), Frames { poses, timestamps_ns, names }, provenance).unwrap()
+    let provenance = Provenance {
+        format: "test".to_owned(),
+        licence: "CC0".to_owned(),
+        images_root: "/recordings/a".to_owned(),
+        worst_rotation_deviation: 1e-4,
+    };
+    Room::new(
+        RoomId::new(name).unwrap(),
+        Frames {
+            poses,
+            timestamps_ns,
+            names,
+            numbers: (0..300).map(|row| 3 * row).collect(),
+            images: (0..300).map(|row| format!("color/{row}.jpg")).collect(),
+            sequences: (0..300).map(|row| row / 50).collect(),
+            held_out: (0..300).map(|row| row >= 250).collect(),
+        },
+        provenance,
+    )
+    .unwrap()
 }
 
 fn set(name: &str, scale: f32) -> Features {
@@ -69,6 +86,9 @@ async fn a_room_comes_back_as_it_was() {
     let back = store.load_room("a", None).await.unwrap();
     assert_eq!(back.room.timestamps_ns(), room.timestamps_ns());
     assert_eq!(back.room.frame_names(), room.frame_names());
+    assert_eq!(back.room.frame_numbers(), room.frame_numbers());
+    assert_eq!(back.room.images(), room.images());
+    assert_eq!(back.room.timeline(), room.timeline());
     assert_eq!(back.room.provenance(), room.provenance());
     for (found, expected) in back.room.poses().iter().zip(room.poses()) {
         assert!((found.to_homogeneous() - expected.to_homogeneous()).abs().max() < 1e-15);

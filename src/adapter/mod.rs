@@ -168,7 +168,7 @@ impl Adapter {
         if source.dim != self.source.dim {
             return Err(Error::FeatureDim { expected: self.source.dim, actual: source.dim });
         }
-        if *source != self.source {
+        if !source.is_like(&self.source) {
             return Err(Error::FeatureSource { expected: describe(&self.source), actual: describe(source) });
         }
         Ok(())
@@ -232,8 +232,11 @@ impl Adapter {
 
 /// A source in words, enough to see which of its parts differ.
 fn describe(source: &FeatureSource) -> String {
-    let FeatureSource { name, encoder, layer, pooling, preprocess, dim } = source;
-    format!("{name} (encoder {encoder}, layer {layer}, pooling {pooling}, preprocess {preprocess}, {dim} columns)")
+    let FeatureSource { name, encoder, layer, base, norm, pooling, preprocess, dim } = source;
+    format!(
+        "{name} (encoder {encoder}, layer {layer}, base {base}, norm {norm}, pooling {pooling}, \
+         preprocess {preprocess}, {dim} columns)"
+    )
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 
 use super::TrainConfig;
 use crate::pairs::{Error as PairError, Pair, Split, StrideRange};
+use crate::room::Timeline;
 
 /// A training protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,14 +53,14 @@ impl Preset {
 }
 
 impl PairPlan {
-    /// The training pairs of a room of `frame_count` frames.
+    /// The training pairs of a room.
     ///
     /// # Errors
     /// As [`Split::train_pairs`] and [`Split::sampled_range`].
-    pub fn pairs(&self, split: Split, frame_count: usize, seed: u64) -> Result<Vec<Pair>, PairError> {
+    pub fn pairs(&self, split: Split, timeline: &Timeline, seed: u64) -> Result<Vec<Pair>, PairError> {
         match self {
-            Self::Stride(stride) => split.train_pairs(frame_count, *stride),
-            Self::Range(range) => split.sampled_range(frame_count, range, seed),
+            Self::Stride(stride) => split.train_pairs(timeline, *stride),
+            Self::Range(range) => split.sampled_range(timeline, range, seed),
         }
     }
 }

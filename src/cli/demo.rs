@@ -24,7 +24,7 @@ use crate::navigation::{IndexKind, Navigator};
 use crate::pairs::Split;
 use crate::proto::v1 as pb;
 use crate::report::{PathPlot, evaluation_table, path_svg, training_table};
-use crate::room::{Frames, Provenance, Room, RoomId};
+use crate::room::{Frames, Provenance, Room, RoomId, Timeline};
 use crate::service;
 use crate::store::{Store, StoredRoom};
 use crate::studio::{Camera, Scene, camera_path, render};
@@ -53,7 +53,7 @@ pub struct Demo {
 
 impl Demo {
     pub async fn run(self) -> anyhow::Result<()> {
-        Split::Time.test_pairs(self.frames, STRIDE).context("--frames")?;
+        Split::Time.test_pairs(&Timeline::unbroken(self.frames), STRIDE).context("--frames")?;
         if self.frames > MOST_FRAMES {
             anyhow::bail!("--frames must be at most {MOST_FRAMES}, got {}", self.frames);
         }
@@ -167,7 +167,8 @@ async fn serve_and_ask(store: &Store, room: &Arc<Room>, adapter: &str, picture: 
 
 /// The frame that the example starts from: five sixths into the held-out part, whatever is there.
 fn example_source(frame_count: usize) -> u32 {
-    let (frame_count, held_out) = (frame_count as u32, Split::Time.candidates(frame_count).len() as u32);
+    let (frame_count, held_out) =
+        (frame_count as u32, Split::Time.candidates(&Timeline::unbroken(frame_count)).len() as u32);
     frame_count - held_out + (held_out - STRIDE) * 5 / 6
 }
 

@@ -1,15 +1,20 @@
 //! `seese3 import`: a recording on disk into a store.
 
-use std::path::PathBuf;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
 
+use super::progress::bar;
 use super::say;
-use crate::datasets::{self, Recording};
+use crate::datasets::{self, Dropped, Reader, Recording, SevenScenes, Unusable};
 use crate::features::{FeatureSource, Features};
-use crate::room::{Frames, Provenance, Room, RoomId};
+use crate::room::{Provenance, Room, RoomId};
 use crate::store::{Store, check_features};
+
+/// Dropped frames that are named one by one; the rest are counted.
+const NAMED: usize = 20;
 
 #[derive(Debug, Args)]
 pub struct Import {
@@ -19,34 +24,54 @@ pub struct Import {
 
 #[derive(Debug, Subcommand)]
 enum Format {
+    /// ScanNet: an exported scene's folder (color/, pose/), or a .sens file
+    Scannet(Plain),
+    /// ARKitScenes: a video's folder (lowres_wide/, lowres_wide.traj)
+    Arkitscenes(Plain),
+    /// TUM RGB-D: a sequence's folder (rgb.txt, groundtruth.txt)
+    Tum(Plain),
+    /// 12-Scenes: a room's folder (data/, split.txt)
+    #[command(name = "12scenes")]
+    TwelveScenes(Plain),
+    /// 7-Scenes: a scene's folder (seq-XX/frame-XXXXXX.pose.txt), or one sequence's
+    #[command(name = "7scenes")]
+    SevenScenes(Seven),
     /// NumPy files: poses (n, 4, 4) world_from_camera in metres, features (n, d)
     Numpy(Numpy),
-    /// 7-Scenes: SCENE/seq-XX/frame-XXXXXX.pose.txt
-    #[command(name = "7scenes")]
-    SevenScenes(SevenScenes),
+    /// A folder that `seese3 export numpy` wrote
+    Bundle(Plain),
 }
 
 #[derive(Debug, Args)]
-struct Destination {
-    /// The room's name in the store
+struct Plain {
+    /// What to read
+    path: PathBuf,
+    #[command(flatten)]
+    to: Destination,
+}
+
+#[derive(Debug, Args)]
+struct Seven {
+    /// The scene's folder, or one sequence's
+    path: PathBuf,
+    /// One sequence, for instance seq-01; all of them make one room if none is named
     #[arg(long)]
-    room: Option<String>,
-    /// Features of the frames, NAME=FILE.npy, shape (n, d); may be given several times
-    #[arg(long = "features", value_name = "NAME=FILE")]
-    features: Vec<String>,
-    /// The store: a folder, made if it is not there
-    #[arg(long, env = "SEESE3_STORE")]
-    store: String,
-    /// The terms under which the recording may be used, kept with the room
-    #[arg(long, default_value = "")]
-    licence: String,
+    sequence: Option<String>,
+    /// A file of 4x4 numbers, rgb_from_depth in metres: poses become those of the colour camera
+    #[arg(long, value_name = "FILE")]
+    rgb_from_depth: Option<PathBuf>,
+    #[command(flatten)]
+    to: Destination,
 }
 
 #[derive(Debug, Args)]
 struct Numpy {
+    /// A folder of poses.npy and, where there are, timestamps.npy, frame_ids.npy and features_NAME.npy
+    #[arg(required_unless_present = "poses", conflicts_with_all = ["poses", "timestamps"])]
+    path: Option<PathBuf>,
     /// Poses, world_from_camera, (n, 4, 4) f64 or f32, metres
     #[arg(long)]
-    poses: PathBuf,
+    poses: Option<PathBuf>,
     /// Timestamps (n,), int64 nanoseconds or float seconds
     #[arg(long)]
     timestamps: Option<PathBuf>,
@@ -55,73 +80,196 @@ struct Numpy {
 }
 
 #[derive(Debug, Args)]
-struct SevenScenes {
-    /// The scene's folder, or one sequence's
-    path: PathBuf,
-    /// Which sequence, for instance seq-01; needed when there are several
-    #[arg(long)]
-    sequence: Option<String>,
+struct Destination {
+    /// The store: a folder, made if it is not there
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// The room's name in the store; made from the path if none is given
+    #[arg(long, visible_alias = "room")]
+    name: Option<String>,
+    /// Keep every K-th usable frame of each sequence
+    #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    every: u32,
     /// Refuse the recording if a frame is unusable, instead of dropping that frame
     #[arg(long)]
     strict: bool,
-    #[command(flatten)]
-    to: Destination,
+    /// Features of the usable frames, NAME=FILE.npy, shape (n, d); may be given several times
+    #[arg(long = "features", value_name = "NAME=FILE")]
+    features: Vec<String>,
+    /// The terms under which the recording may be used, kept with the room
+    #[arg(long, default_value = "")]
+    licence: String,
 }
 
 impl Import {
     pub async fn run(self) -> anyhow::Result<()> {
         match self.format {
-            Format::Numpy(numpy) => {
-                let Some(room) = numpy.to.room.clone() else { bail!("--room NAME is required") };
-                let mut recording = datasets::read_poses(&numpy.poses)?;
-                if let Some(file) = &numpy.timestamps {
-                    recording.frames.timestamps_ns = datasets::read_timestamps(file)?;
-                }
-                publish(&room, "numpy", recording, &numpy.to).await
+            Format::Scannet(Plain { path, to }) => {
+                let recording = to.read(|reader| {
+                    if path.is_file() {
+                        datasets::read_sens(&path, reader)
+                    } else {
+                        datasets::read_scannet(&path, reader)
+                    }
+                })?;
+                to.publish("scannet", &path, recording).await
             }
-            Format::SevenScenes(scene) => {
-                let recording = datasets::read_seven_scenes(&scene.path, scene.sequence.as_deref(), scene.strict)?;
-                let folder = scene.path.canonicalize().unwrap_or_else(|_| scene.path.clone());
-                let name = folder.file_name().map(|name| name.to_string_lossy().into_owned());
-                let room = scene.to.room.clone().or(name).context("--room NAME is required")?;
-                publish(&room, "7scenes", recording, &scene.to).await
+            Format::Arkitscenes(Plain { path, to }) => {
+                let recording = to.read(|reader| datasets::read_arkitscenes(&path, reader))?;
+                to.publish("arkitscenes", &path, recording).await
+            }
+            Format::Tum(Plain { path, to }) => {
+                let recording = to.read(|reader| datasets::read_tum(&path, reader))?;
+                to.publish("tum", &path, recording).await
+            }
+            Format::TwelveScenes(Plain { path, to }) => {
+                let recording = to.read(|reader| datasets::read_twelve_scenes(&path, reader))?;
+                to.publish("12scenes", &path, recording).await
+            }
+            Format::SevenScenes(Seven { path, sequence, rgb_from_depth, to }) => {
+                let choice = SevenScenes { sequence, rgb_from_depth };
+                let recording = to.read(|reader| datasets::read_seven_scenes(&path, &choice, reader))?;
+                to.publish("7scenes", &path, recording).await
+            }
+            Format::Numpy(Numpy { path, poses, timestamps, to }) => {
+                let recording = match (&path, &poses) {
+                    (Some(folder), _) => datasets::read_numpy(folder)?,
+                    (None, Some(file)) => {
+                        let mut recording = datasets::read_poses(file)?;
+                        if let Some(file) = &timestamps {
+                            recording.frames.timestamps_ns = datasets::read_timestamps(file)?;
+                        }
+                        recording
+                    }
+                    (None, None) => bail!("a folder or --poses FILE is required"),
+                };
+                if path.is_none() && to.name.is_none() {
+                    bail!("--name NAME is required");
+                }
+                to.publish("numpy", path.as_deref().unwrap_or(Path::new("")), recording).await
+            }
+            Format::Bundle(Plain { path, to }) => {
+                let recording = datasets::read_bundle(&path)?;
+                to.publish("bundle", &path, recording).await
             }
         }
     }
 }
 
-async fn publish(room: &str, format: &str, recording: Recording, to: &Destination) -> anyhow::Result<()> {
-    let Recording { frames, dropped, worst_rotation_deviation } = recording;
-    let provenance = Provenance { format: format.to_owned(), licence: to.licence.clone(), worst_rotation_deviation };
-    let has_times = !frames.timestamps_ns.is_empty();
-    let room = Room::new(RoomId::new(room)?, Frames { ..frames }, provenance)?;
-    let features = to.features.iter().map(|given| read_features(given)).collect::<anyhow::Result<Vec<_>>>()?;
-    for set in &features {
-        let (rows, frames) = (set.rows().nrows(), room.frame_count());
-        if rows != frames {
-            let unusable = dropped.len();
-            let name = &set.source().name;
-            bail!("features '{name}' have {rows} rows, the recording has {frames} usable frames ({unusable} dropped)");
+impl Destination {
+    /// Reads with a progress bar.
+    fn read(
+        &self,
+        read: impl FnOnce(&mut Reader<'_>) -> Result<Recording, datasets::Error>,
+    ) -> anyhow::Result<Recording> {
+        let progress = bar(0, "reading");
+        let unusable = if self.strict { Unusable::Refuse } else { Unusable::Drop };
+        let mut tell = |done: usize, total: usize| {
+            progress.set_length(total as u64);
+            progress.set_position(done as u64);
+        };
+        let recording = read(&mut Reader { unusable, progress: &mut tell })?;
+        progress.finish_and_clear();
+        Ok(recording)
+    }
+
+    async fn publish(&self, format: &str, path: &Path, mut recording: Recording) -> anyhow::Result<()> {
+        let read_count = recording.frames.poses.len();
+        for given in &self.features {
+            recording.features.push(read_features(given)?);
         }
+        for set in &recording.features {
+            let (rows, unusable) = (set.rows().nrows(), recording.dropped.len());
+            if rows != read_count {
+                let name = &set.source().name;
+                bail!(
+                    "features '{name}' have {rows} rows, the recording has {read_count} usable frames \
+                     ({unusable} dropped)"
+                );
+            }
+        }
+        let kept = recording.every(self.every as usize);
+        let features = recording.features.iter().map(|set| set.select(&kept)).collect::<Vec<_>>();
+        let stated = &recording.stated;
+        let either = |given: &str, stated: &str| if given.is_empty() { stated.to_owned() } else { given.to_owned() };
+        let provenance = Provenance {
+            format: either(&stated.format, format),
+            licence: either(&self.licence, &stated.licence),
+            images_root: recording.images_root.clone(),
+            worst_rotation_deviation: recording.worst_rotation_deviation,
+        };
+        let name = match &self.name {
+            Some(name) => name.clone(),
+            None if !stated.name.is_empty() => stated.name.clone(),
+            None => name_from(format, path).context("--name NAME is required")?,
+        };
+        let id = RoomId::new(&name).context("give another name with --name")?;
+        let room = Room::new(id, recording.frames.select(&kept), provenance)?;
+        check_features(&room, &features)?;
+        let store = Store::create(&self.store)?;
+        let published = store.publish_room(&room, &features).await?;
+        let times = if room.timestamps_ns().is_empty() { "without timestamps" } else { "with timestamps" };
+        let thinned = if self.every > 1 { format!(", every {} of {read_count}", self.every) } else { String::new() };
+        say(format_args!("room '{}': {} frames {times}{thinned}", room.id(), room.frame_count()));
+        say_frames(&room);
+        let deviation = recording.worst_rotation_deviation;
+        say(format_args!("rotations: at most {deviation:.1e} off SO(3), projected"));
+        for set in &features {
+            say(format_args!("features '{}': {} columns", set.source().name, set.source().dim));
+        }
+        say_dropped(&recording.dropped);
+        let state = if published.is_new { "published" } else { "already there, unchanged:" };
+        say(format_args!("{state} revision {}: {}/{}", published.revision, store.location(), published.manifest));
+        Ok(())
     }
-    check_features(&room, &features)?;
-    let store = Store::create(&to.store)?;
-    let published = store.publish_room(&room, &features).await?;
-    let times = if has_times { "with timestamps" } else { "without timestamps" };
-    say(format_args!("room '{}': {} frames {times}", room.id(), room.frame_count()));
-    say(format_args!("rotations: at most {worst_rotation_deviation:.1e} off SO(3), projected"));
-    for set in &features {
-        say(format_args!("features '{}': {} columns", set.source().name, set.source().dim));
+}
+
+/// A room's name from where it lies: 12-Scenes and 7-Scenes repeat theirs, so that the folder above belongs to it.
+fn name_from(format: &str, path: &Path) -> Option<String> {
+    let path = path.canonicalize().ok()?;
+    let stem = if path.is_file() { path.file_stem() } else { path.file_name() };
+    let own = stem?.to_string_lossy().into_owned();
+    let above = path.parent().and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned());
+    match (format, above) {
+        ("12scenes", Some(house)) => Some(format!("{house}-{own}")),
+        ("7scenes", Some(scene)) if own.starts_with("seq-") => Some(format!("{scene}-{own}")),
+        _ => Some(own),
     }
-    for frame in dropped.iter().take(20) {
+}
+
+/// Says what the frames bring with them.
+fn say_frames(room: &Room) {
+    let timeline = room.timeline();
+    if let Some(most) = timeline.sequences.iter().max() {
+        say(format_args!("sequences: up to number {most}; no pair of frames joins two of them"));
+    }
+    let held_out = timeline.held_out.iter().filter(|held_out| **held_out).count();
+    if !timeline.held_out.is_empty() {
+        let train = room.frame_count() - held_out;
+        say(format_args!("the recording's own split (--split dataset): {train} training, {held_out} test frames"));
+    }
+    let gaps = room.frame_numbers().windows(2).filter(|pair| pair[1] > pair[0] + 1).count();
+    if gaps > 0 {
+        say(format_args!("frame numbers have {gaps} gaps: a stride counts frames of the room, not of the recording"));
+    }
+    let root = &room.provenance().images_root;
+    if !room.images().is_empty() {
+        say(format_args!("images: {} below {root}", room.images().len()));
+    }
+}
+
+fn say_dropped(dropped: &[Dropped]) {
+    for frame in dropped.iter().take(NAMED) {
         say(format_args!("dropped {}: {}", frame.name, frame.reason));
     }
-    if !dropped.is_empty() {
-        say(format_args!("dropped {} frames in all", dropped.len()));
+    let mut counts = BTreeMap::new();
+    for frame in dropped {
+        *counts.entry(frame.reason).or_insert(0) += 1;
     }
-    let state = if published.is_new { "published" } else { "already there, unchanged:" };
-    say(format_args!("{state} revision {}: {}/{}", published.revision, store.location(), published.manifest));
-    Ok(())
+    if !dropped.is_empty() {
+        let counts: Vec<String> = counts.iter().map(|(reason, count)| format!("{count} {reason}")).collect();
+        say(format_args!("dropped {} frames in all: {}", dropped.len(), counts.join(", ")));
+    }
 }
 
 fn read_features(given: &str) -> anyhow::Result<Features> {

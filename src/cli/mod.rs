@@ -3,6 +3,7 @@
 mod ask;
 mod demo;
 mod evaluate;
+mod export;
 mod health;
 mod import;
 mod progress;
@@ -25,6 +26,8 @@ enum Command {
     Demo(demo::Demo),
     /// Read a recording into a store
     Import(import::Import),
+    /// Give a stored room to other programs
+    Export(export::Export),
     /// Learn an adapter from a room's features and publish it
     Train(train::Train),
     /// Score navigators on held-out motions: Hit@ε with baselines and intervals
@@ -50,6 +53,7 @@ enum Command {
 pub async fn run(cli: Cli) -> anyhow::Result<()> {
     match cli.command {
         Command::Import(arguments) => arguments.run().await,
+        Command::Export(arguments) => arguments.run().await,
         Command::Train(arguments) => arguments.run().await,
         Command::Evaluate(arguments) => arguments.run().await,
         Command::Demo(arguments) => arguments.run().await,

@@ -75,6 +75,8 @@ pub enum SplitName {
     Blocks,
     /// By source frame: leaks on purpose, to check an implementation
     Pairs,
+    /// The recording's own, where it has one
+    Dataset,
 }
 
 impl From<PresetName> for Preset {
@@ -92,6 +94,7 @@ impl From<SplitName> for Split {
             SplitName::Time => Self::Time,
             SplitName::Blocks => Self::Blocks,
             SplitName::Pairs => Self::Pairs,
+            SplitName::Dataset => Self::Dataset,
         }
     }
 }

@@ -6,9 +6,8 @@ use nalgebra::Matrix4;
 use ndarray::{Array2, ArrayD, ArrayViewD, Ix2};
 use ndarray_npy::{ViewElement, ViewNpyError, ViewNpyExt};
 
-use super::{
-    Error, LAST_ROW_PROBLEM, MAX_ROTATION_DEVIATION, MatrixPose, Recording, deviation_problem, pose_of, read_bytes,
-};
+use super::collect::{LAST_ROW_PROBLEM, MatrixPose, deviation_problem, pose_of};
+use super::{Error, MAX_ROTATION_DEVIATION, Recording, read_bytes};
 use crate::room::Frames;
 
 /// NumPy aligns data to 64 bytes; views need no more than this.
@@ -85,7 +84,7 @@ pub fn read_poses(file: &Path) -> Result<Recording, Error> {
             }
         }
     }
-    Ok(Recording { frames, dropped: Vec::new(), worst_rotation_deviation: worst })
+    Ok(Recording { frames, worst_rotation_deviation: worst, ..Recording::default() })
 }
 
 /// Features from an array (n, d) of f32 or f64.
@@ -102,6 +101,26 @@ pub fn read_features(file: &Path) -> Result<Array2<f32>, Error> {
     let shape = array.shape().to_vec();
     let wrong_shape = |_| malformed(file, &format!("has shape {shape:?}, features are (n, d)"));
     array.into_dimensionality::<Ix2>().map_err(wrong_shape)
+}
+
+/// Frame numbers from an array (n,) of int64.
+///
+/// # Errors
+/// [`Error::Malformed`] for another shape or type.
+pub(super) fn read_numbers(file: &Path) -> Result<Vec<i64>, Error> {
+    let npy = NpyFile::read(file)?;
+    let array: ArrayD<i64> = match npy.view::<i64>() {
+        Ok(view) => view.to_owned(),
+        Err(ViewNpyError::WrongDescriptor(_)) => npy
+            .view::<i32>()
+            .map(|view| view.mapv(i64::from))
+            .map_err(|error| malformed(file, &format!("{error}; expected int64 or int32")))?,
+        Err(error) => return Err(malformed(file, &error.to_string())),
+    };
+    if array.ndim() != 1 {
+        return Err(malformed(file, &format!("has shape {:?}, frame ids are (n,)", array.shape())));
+    }
+    Ok(array.iter().copied().collect())
 }
 
 /// Timestamps, nanoseconds, from an array (n,) of int64 nanoseconds or float seconds.

@@ -23,6 +23,8 @@ pub fn builtin_source(name: &str) -> FeatureSource {
         name: name.to_owned(),
         encoder: "builtin-orientations-v1".to_owned(),
         layer: "none".to_owned(),
+        base: "name".to_owned(),
+        norm: "none".to_owned(),
         pooling: format!("grid{COLUMNS}x{ROWS}"),
         preprocess: "none".to_owned(),
         dim: BUILTIN_DIM,

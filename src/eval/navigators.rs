@@ -142,14 +142,14 @@ pub fn evaluate(
     progress: &mut dyn FnMut(usize, NavigatorKind),
 ) -> Result<Report, Error> {
     check_thresholds(&protocol.thresholds)?;
-    let frame_count = navigator.room().frame_count();
+    let timeline = navigator.room().timeline();
     let bench = Bench {
         poses: navigator.room().poses(),
         adapter: navigator.adapter().clone(),
         latents: navigator.latents().to_owned(),
-        test: protocol.split.test_pairs(frame_count, protocol.stride)?,
-        train: protocol.split.train_pairs(frame_count, protocol.stride).unwrap_or_default(),
-        candidates: protocol.split.candidates(frame_count),
+        test: protocol.split.test_pairs(timeline, protocol.stride)?,
+        train: protocol.split.train_pairs(timeline, protocol.stride).unwrap_or_default(),
+        candidates: protocol.split.candidates(timeline),
         protocol,
         cancel,
     };

@@ -46,7 +46,7 @@ pub fn score_predictions(
     }
     let room = navigator.room();
     let candidates = match scope.split {
-        Some(split) => split.candidates(room.frame_count()),
+        Some(split) => split.candidates(room.timeline()),
         None => (0..room.frame_count() as u32).map(FrameId).collect(),
     };
     let index = exact_index(navigator.latents(), &candidates);
@@ -59,7 +59,7 @@ pub fn score_predictions(
         for frame in [pair.source, pair.target] {
             room.pose(frame).map_err(|problem| at(problem.into()))?;
         }
-        if let Some(split) = scope.split.filter(|split| !split.tests(room.frame_count(), *pair)) {
+        if let Some(split) = scope.split.filter(|split| !split.tests(room.timeline(), *pair)) {
             return Err(at(Error::NotATestPair { source_frame: pair.source, target_frame: pair.target, split }));
         }
         let exclusion = scope.exclude_source.map(|radius| Exclusion { centre: pair.source, radius });

@@ -3,10 +3,12 @@
 mod json;
 mod plot;
 mod table;
+mod trajectory;
 
 pub use json::{evaluation_json, training_json};
 pub use plot::{PathPlot, path_svg};
 pub use table::{evaluation_table, training_table};
+pub use trajectory::{kitti_trajectory, tum_trajectory};
 
 use crate::adapter::TrainingRecord;
 use crate::eval::RetrievalScores;

@@ -286,8 +286,8 @@ pub fn adapter_revision(navigator: &ServedNavigator) -> pb::Revision {
 }
 
 pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
-    let FeatureSource { name, encoder, layer, pooling, preprocess, dim } = source.clone();
-    pb::FeatureSource { name, encoder, layer, pooling, preprocess, dim: dim as u32 }
+    let FeatureSource { name, encoder, layer, base, norm, pooling, preprocess, dim } = source.clone();
+    pb::FeatureSource { name, encoder, layer, pooling, preprocess, dim: dim as u32, base, norm }
 }
 
 pub fn scores_to_wire(scores: &MotionScores) -> pb::MotionScores {

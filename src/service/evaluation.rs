@@ -141,7 +141,8 @@ fn score(
         .collect::<Result<Vec<_>, _>>()?;
     let row = score_predictions(&served.navigator, &predictions, &scope, cancel)?;
     let frame_count = served.navigator.room().frame_count();
-    let candidate_count = scope.split.map_or(frame_count, |split| split.candidates(frame_count).len());
+    let candidate_count =
+        scope.split.map_or(frame_count, |split| split.candidates(served.navigator.room().timeline()).len());
     Ok(pb::ScorePredictionsResponse {
         room: Some(convert::room_revision(served)),
         adapter: Some(convert::adapter_revision(served)),

@@ -130,7 +130,7 @@ async fn load_all(store: &Store, index: IndexKind) -> Result<Snapshot, RunError>
         let mut navigators = Vec::new();
         for adapter in fitting {
             let source = adapter.adapter.source();
-            let Some(features) = stored.features.iter().find(|features| features.source() == source) else {
+            let Some(features) = stored.features.iter().find(|features| features.source().is_like(source)) else {
                 continue;
             };
             let navigator = Navigator::new(room.clone(), features, Arc::new(adapter.adapter.clone()), index);

@@ -164,6 +164,7 @@ impl From<eval::Error> for Error {
             E::Pairs(pairs::Error::ZeroStride | pairs::Error::NoPairs { .. } | pairs::Error::EmptyRange { .. }) => {
                 "stride"
             }
+            E::Pairs(pairs::Error::NoDatasetSplit) => "split",
             E::Threshold { .. } | E::ThresholdCount { .. } => "thresholds",
             E::NoCandidates { .. } => "exclude_radius",
             E::NoPredictions | E::MixedPredictions => "predictions",

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::Error;
 use super::manifest::ObjectRef;
 use crate::adapter::{TrainConfig, TrainingRecord};
-use crate::features::FeatureSource;
+use crate::features::{FeatureSource, UNSPECIFIED};
 use crate::pairs::Split;
 use crate::room::{Provenance, RoomId};
 use crate::scores::MotionScores;
@@ -24,10 +24,14 @@ pub struct RoomBody {
     /// RFC 3339.
     pub created: String,
     pub frame_count: usize,
-    /// `world_from_camera` (n, 4, 4) f64, metres; `timestamps_ns` (n,) i64 where known.
+    /// `world_from_camera` (n, 4, 4) f64, metres; where known `timestamps_ns`, `numbers`,
+    /// `sequences` and `held_out` (0 or 1), each (n,) i64.
     pub frames: ObjectRef,
     /// A JSON list of the recording's own frame names.
     pub frame_names: Option<ObjectRef>,
+    /// A JSON list of where the frames' images are.
+    #[serde(default)]
+    pub images: Option<ObjectRef>,
     pub features: Vec<FeaturesEntry>,
     pub provenance: ProvenanceEntry,
 }
@@ -44,6 +48,10 @@ pub struct SourceEntry {
     name: String,
     encoder: String,
     layer: String,
+    #[serde(default = "unspecified")]
+    base: String,
+    #[serde(default = "unspecified")]
+    norm: String,
     pooling: String,
     preprocess: String,
     dim: usize,
@@ -53,6 +61,8 @@ pub struct SourceEntry {
 pub struct ProvenanceEntry {
     format: String,
     licence: String,
+    #[serde(default)]
+    images_root: String,
     worst_rotation_deviation: f64,
 }
 
@@ -109,16 +119,20 @@ pub struct ScoresEntry {
 
 impl From<&FeatureSource> for SourceEntry {
     fn from(source: &FeatureSource) -> Self {
-        let FeatureSource { name, encoder, layer, pooling, preprocess, dim } = source.clone();
-        Self { name, encoder, layer, pooling, preprocess, dim }
+        let FeatureSource { name, encoder, layer, base, norm, pooling, preprocess, dim } = source.clone();
+        Self { name, encoder, layer, base, norm, pooling, preprocess, dim }
     }
 }
 
 impl From<SourceEntry> for FeatureSource {
     fn from(entry: SourceEntry) -> Self {
-        let SourceEntry { name, encoder, layer, pooling, preprocess, dim } = entry;
-        Self { name, encoder, layer, pooling, preprocess, dim }
+        let SourceEntry { name, encoder, layer, base, norm, pooling, preprocess, dim } = entry;
+        Self { name, encoder, layer, base, norm, pooling, preprocess, dim }
     }
+}
+
+fn unspecified() -> String {
+    UNSPECIFIED.to_owned()
 }
 
 impl SourceEntry {
@@ -129,15 +143,15 @@ impl SourceEntry {
 
 impl From<&Provenance> for ProvenanceEntry {
     fn from(provenance: &Provenance) -> Self {
-        let Provenance { format, licence, worst_rotation_deviation } = provenance.clone();
-        Self { format, licence, worst_rotation_deviation }
+        let Provenance { format, licence, images_root, worst_rotation_deviation } = provenance.clone();
+        Self { format, licence, images_root, worst_rotation_deviation }
     }
 }
 
 impl From<ProvenanceEntry> for Provenance {
     fn from(entry: ProvenanceEntry) -> Self {
-        let ProvenanceEntry { format, licence, worst_rotation_deviation } = entry;
-        Self { format, licence, worst_rotation_deviation }
+        let ProvenanceEntry { format, licence, images_root, worst_rotation_deviation } = entry;
+        Self { format, licence, images_root, worst_rotation_deviation }
     }
 }
 

@@ -49,6 +49,10 @@ impl Store {
             [] => None,
             names => Some(self.write_object(&folder, "frame-names", "json", names_file(names)?).await?),
         };
+        let images = match room.images() {
+            [] => None,
+            images => Some(self.write_object(&folder, "images", "json", names_file(images)?).await?),
+        };
         let mut entries = Vec::with_capacity(features.len());
         for set in features {
             let stem = format!("features-{}", set.source().name);
@@ -68,6 +72,7 @@ impl Store {
                 frame_count: room.frame_count(),
                 frames: frames.clone(),
                 frame_names: frame_names.clone(),
+                images: images.clone(),
                 features: entries.clone(),
                 provenance: room.provenance().into(),
             };
@@ -170,11 +175,8 @@ impl Store {
         let body = self.room_body(&folder, revision).await?;
         let (file, bytes) = self.read_object(&folder, &body.frames).await?;
         let mut frames = read_frames(&file, &bytes)?;
-        if let Some(object) = &body.frame_names {
-            let (file, bytes) = self.read_object(&folder, object).await?;
-            frames.names =
-                serde_json::from_slice(&bytes).map_err(|error| Error::Damaged { file, problem: error.to_string() })?;
-        }
+        frames.names = self.read_names(&folder, body.frame_names.as_ref()).await?;
+        frames.images = self.read_names(&folder, body.images.as_ref()).await?;
         let manifest = self.shown(&revision_path(&folder, revision));
         let damaged = |problem: String| Error::Damaged { file: manifest.clone(), problem };
         let id = RoomId::new(&body.room).map_err(|error| damaged(error.to_string()))?;
@@ -192,6 +194,12 @@ impl Store {
             features.push(set);
         }
         Ok(StoredRoom { room, revision, created: body.created, features })
+    }
+
+    async fn read_names(&self, folder: &Path, object: Option<&manifest::ObjectRef>) -> Result<Vec<String>, Error> {
+        let Some(object) = object else { return Ok(Vec::new()) };
+        let (file, bytes) = self.read_object(folder, object).await?;
+        serde_json::from_slice(&bytes).map_err(|error| Error::Damaged { file, problem: error.to_string() })
     }
 
     async fn room_body(&self, folder: &Path, revision: u64) -> Result<RoomBody, Error> {
@@ -232,6 +240,16 @@ fn frames_file(room: &Room) -> Result<Vec<u8>, Error> {
     if !room.timestamps_ns().is_empty() {
         tensors.i64("timestamps_ns", &[n], room.timestamps_ns().iter().copied());
     }
+    let frames = room.frames();
+    for (name, values) in [
+        ("numbers", frames.numbers.clone()),
+        ("sequences", frames.sequences.iter().map(|&sequence| i64::from(sequence)).collect()),
+        ("held_out", frames.held_out.iter().map(|&held_out| i64::from(held_out)).collect()),
+    ] {
+        if !values.is_empty() {
+            tensors.i64(name, &[n], values.into_iter());
+        }
+    }
     tensors.finish("frames")
 }
 
@@ -262,9 +280,19 @@ fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
         Ok(Pose::from_parts(m.fixed_view::<3, 1>(0, 3).into_owned().into(), quaternion))
     };
     let poses = matrices.outer_iter().enumerate().map(pose).collect::<Result<_, Error>>()?;
-    let timestamps_ns =
-        if tensors.has("timestamps_ns") { tensors.i64("timestamps_ns")?.iter().copied().collect() } else { Vec::new() };
-    Ok(Frames { poses, timestamps_ns, names: Vec::new() })
+    let column = |name: &str| -> Result<Vec<i64>, Error> {
+        Ok(if tensors.has(name) { tensors.i64(name)?.iter().copied().collect() } else { Vec::new() })
+    };
+    let sequence = |value: i64| u32::try_from(value).map_err(|_| damaged(format!("{value} numbers no sequence")));
+    Ok(Frames {
+        poses,
+        timestamps_ns: column("timestamps_ns")?,
+        numbers: column("numbers")?,
+        sequences: column("sequences")?.into_iter().map(sequence).collect::<Result<_, _>>()?,
+        held_out: column("held_out")?.into_iter().map(|mark| mark != 0).collect(),
+        names: Vec::new(),
+        images: Vec::new(),
+    })
 }
 
 impl StoredRoom {

@@ -12,7 +12,7 @@ use seese3::geometry::body_twist;
 use seese3::index::{ExactIndex, Index};
 use seese3::navigation::{IndexKind, Leg, Mode, Navigator, Plan, Reading, Source, Space, walk};
 use seese3::pairs::{Pair, Split};
-use seese3::room::{Frames, Provenance, Room, RoomId};
+use seese3::room::{Frames, Provenance, Room, RoomId, Timeline};
 
 use crate::support::{Tensors, features, json, near, number, oracle_rooms, poses, worst};
 
@@ -23,7 +23,7 @@ fn adapter(folder: &Path, room: &str) -> Arc<Adapter> {
     let tensors = Tensors::open(&folder.join(format!("m4_adapter/{room}_k1_trained.safetensors")));
     let network = Siamese::from_tensors(TENSOR_NAMES.map(|name| tensors.rows(name).mapv(|x| x as f32))).unwrap();
     let (features, poses) = (features(folder, room), poses(&folder.join(format!("rooms/{room}/poses.npy"))));
-    let pairs = Split::Time.train_pairs(poses.len(), STRIDE).unwrap();
+    let pairs = Split::Time.train_pairs(&Timeline::unbroken(poses.len()), STRIDE).unwrap();
     let twists: Vec<_> = pairs.iter().map(|p| body_twist(&poses[p.source.row()], &poses[p.target.row()])).collect();
     let rows = pairs.iter().map(|p| [p.source.row(), p.target.row()]).collect();
     let scale = Samples::<f32>::new(features.view(), rows, &twists).unwrap().scale().clone();
@@ -70,8 +70,8 @@ fn compare_retrieval(what: &str, scores: &RetrievalScores, expected: &serde_json
 /// latents' figures and the hits are the same, and the oracle's retrieval is what the index gives.
 fn compare_identity(row: &Row, navigator: &Navigator, expected: &serde_json::Value) {
     let count = navigator.room().frame_count();
-    let pairs = Split::Time.test_pairs(count, STRIDE).unwrap();
-    let index = ExactIndex::new(navigator.latents(), &Split::Time.candidates(count));
+    let pairs = Split::Time.test_pairs(&Timeline::unbroken(count), STRIDE).unwrap();
+    let index = ExactIndex::new(navigator.latents(), &Split::Time.candidates(&Timeline::unbroken(count)));
     let first = |pair: &Pair| index.nearest(&navigator.latents().row(pair.source.row()).to_vec(), 1, None)[0].frame;
     let retrieved: Vec<_> = pairs.iter().map(first).collect();
     let thresholds: Vec<f64> = row.retrieval.hits.iter().map(|(epsilon, _)| *epsilon).collect();
@@ -151,8 +151,8 @@ fn every_step_of_every_mode_retrieves_the_oracles_frame() {
         let tensors = Tensors::open(&folder.join(format!("navigation/{room}_expected.safetensors")));
         let navigator = navigator(&folder, room, adapter(&folder, room));
         let count = navigator.room().frame_count();
-        let candidates = ExactIndex::new(navigator.latents(), &Split::Time.candidates(count));
-        let pairs = Split::Time.test_pairs(count, STRIDE).unwrap();
+        let candidates = ExactIndex::new(navigator.latents(), &Split::Time.candidates(&Timeline::unbroken(count)));
+        let pairs = Split::Time.test_pairs(&Timeline::unbroken(count), STRIDE).unwrap();
         let space = Space { index: &candidates, ..navigator.space() };
         for (name, mode, reading, exclude_source) in [
             ("open_loop_homogeneous", Mode::OpenLoop, Reading::Homogeneous, None),

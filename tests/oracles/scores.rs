@@ -4,6 +4,7 @@ use ndarray::{Array2, ArrayView2};
 use seese3::geometry::{Twist, body_twist};
 use seese3::pairs::Split;
 use seese3::ridge::{Intercept, Ridge};
+use seese3::room::Timeline;
 use seese3::scores::{MotionScores, constant_r2};
 
 use crate::support::{Tensors, features, golden, json, near, number, oracle_rooms, poses, worst};
@@ -41,7 +42,10 @@ fn ridge_and_its_scores_match_scikit_learn() {
         let poses = poses(&folder.join(format!("rooms/{room}/poses.npy")));
         for stride in [10u32, 20, 40] {
             let expected = &expected[room][format!("stride_{stride}")];
-            let sides = [Split::Time.train_pairs(poses.len(), stride), Split::Time.test_pairs(poses.len(), stride)];
+            let sides = [
+                Split::Time.train_pairs(&Timeline::unbroken(poses.len()), stride),
+                Split::Time.test_pairs(&Timeline::unbroken(poses.len()), stride),
+            ];
             let [(train_x, train_y), (test_x, test_y)] = sides.map(|pairs| {
                 let pairs = pairs.unwrap();
                 let twists: Vec<Twist> =

@@ -6,6 +6,7 @@ use ndarray::Array2;
 use seese3::adapter::{Real, Samples, Siamese, TENSOR_NAMES, TrainConfig, Trainer, Widths};
 use seese3::geometry::body_twist;
 use seese3::pairs::{Pair, Split};
+use seese3::room::Timeline;
 
 use crate::support::{Tensors, features, json, near, npy, number, oracle_rooms, poses, worst};
 
@@ -16,7 +17,7 @@ fn network<T: Real>(path: &Path, prefix: &str) -> Siamese<T> {
 
 fn samples<T: Real>(folder: &Path, room: &str) -> Samples<T> {
     let (features, poses) = (features(folder, room), poses(&folder.join(format!("rooms/{room}/poses.npy"))));
-    let pairs: Vec<Pair> = Split::Time.train_pairs(poses.len(), 40).unwrap();
+    let pairs: Vec<Pair> = Split::Time.train_pairs(&Timeline::unbroken(poses.len()), 40).unwrap();
     let twists: Vec<_> = pairs.iter().map(|p| body_twist(&poses[p.source.row()], &poses[p.target.row()])).collect();
     Samples::new(features.view(), pairs.iter().map(|p| [p.source.row(), p.target.row()]).collect(), &twists).unwrap()
 }

@@ -9,7 +9,7 @@ use seese3::features::{FeatureSource, Features};
 use seese3::geometry::body_twist;
 use seese3::pairs::Split;
 use seese3::proto::v1 as pb;
-use seese3::room::{Frames, Provenance, Room, RoomId};
+use seese3::room::{Frames, Provenance, Room, RoomId, Timeline};
 use seese3::scores::MotionScores;
 use seese3::service::{Config, RunError, run};
 use seese3::store::Store;
@@ -42,7 +42,7 @@ pub fn oracle_adapter() -> Adapter {
     let tensors = Tensors::open(&golden().join("m4_adapter/synthetic_k1_trained.safetensors"));
     let network = Siamese::from_tensors(TENSOR_NAMES.map(|name| tensors.rows(name).mapv(|x| x as f32))).unwrap();
     let room = room_of("a", "synthetic");
-    let pairs = Split::Time.train_pairs(room.frame_count(), 40).unwrap();
+    let pairs = Split::Time.train_pairs(&Timeline::unbroken(room.frame_count()), 40).unwrap();
     let twists: Vec<_> =
         pairs.iter().map(|p| body_twist(&room.poses()[p.source.row()], &room.poses()[p.target.row()])).collect();
     let rows = pairs.iter().map(|p| [p.source.row(), p.target.row()]).collect();

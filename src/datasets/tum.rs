@@ -1,0 +1,89 @@
+//! TUM RGB-D: `rgb.txt` ("timestamp file"), `groundtruth.txt` ("timestamp tx ty tz qx qy qz qw"), camera-to-world.
+//!
+//! An image takes the pose nearest in time, at most 10 ms away, as evo associates. Times are decimal text and are kept
+//! to the nanosecond. Lines are read as strictly as evo reads them, and more: numbers must be finite.
+
+use std::path::Path;
+
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+
+use super::collect::{About, Collected};
+use super::text::{data_lines, finite_row, nanoseconds, spaced, wrong};
+use super::{DropReason, Error, Reader, Recording, read_text};
+use crate::geometry::Pose;
+
+/// The farthest that an image's pose may be in time.
+const MAX_DIFFERENCE_NS: u64 = 10_000_000;
+/// How far from 1 a written quaternion's norm may be.
+const NORM_TOLERANCE: f64 = 1e-2;
+
+/// Reads a sequence's folder.
+///
+/// # Errors
+/// [`Error`], naming the file and line.
+pub fn read_tum(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
+    let poses = read_trajectory(&folder.join("groundtruth.txt"))?;
+    let images = read_images(&folder.join("rgb.txt"))?;
+    let mut collected = Collected::default();
+    for (done, (timestamp_ns, image)) in images.iter().enumerate() {
+        (reader.progress)(done, images.len());
+        let Some(pose) = nearest(&poses, *timestamp_ns) else {
+            collected.drop(image.clone(), DropReason::NoPoseWithinTolerance);
+            continue;
+        };
+        if !folder.join(image).is_file() {
+            collected.drop(image.clone(), DropReason::MissingImage);
+            continue;
+        }
+        let (name, image) = (image.clone(), Some(image.clone()));
+        collected.keep(About { name, image, timestamp_ns: Some(*timestamp_ns), ..About::default() }, pose);
+    }
+    collected.finish(folder, reader)
+}
+
+/// The pose nearest in time, the earlier of two as near.
+fn nearest(poses: &[(i64, Pose)], timestamp_ns: i64) -> Option<Pose> {
+    let after = poses.partition_point(|(time, _)| *time < timestamp_ns);
+    let around = poses[after.saturating_sub(1)..].iter().take(2);
+    let (time, pose) = around.min_by_key(|(time, _)| time.abs_diff(timestamp_ns))?;
+    (time.abs_diff(timestamp_ns) <= MAX_DIFFERENCE_NS).then_some(*pose)
+}
+
+/// Poses by time.
+fn read_trajectory(file: &Path) -> Result<Vec<(i64, Pose)>, Error> {
+    let text = read_text(file)?;
+    let mut poses = Vec::new();
+    for (line, row) in data_lines(&text) {
+        let [_, x, y, z, qx, qy, qz, qw] = finite_row(file, line, row)?;
+        let time = time(file, line, row)?;
+        let quaternion = Quaternion::new(qw, qx, qy, qz);
+        let norm = quaternion.norm();
+        if (norm - 1.0).abs() > NORM_TOLERANCE {
+            return Err(wrong(file, line, format!("the quaternion has norm {norm}, a rotation has 1")));
+        }
+        let rotation = UnitQuaternion::from_quaternion(quaternion);
+        poses.push((time, Pose::from_parts(Translation3::new(x, y, z), rotation)));
+    }
+    poses.sort_by_key(|(time, _)| *time);
+    Ok(poses)
+}
+
+/// Images by time.
+fn read_images(file: &Path) -> Result<Vec<(i64, String)>, Error> {
+    let text = read_text(file)?;
+    let mut images = Vec::new();
+    for (line, row) in data_lines(&text) {
+        let words = spaced(file, line, row)?;
+        let &[_, image] = words.as_slice() else {
+            return Err(wrong(file, line, format!("has {} columns, expected timestamp and file", words.len())));
+        };
+        images.push((time(file, line, row)?, image.to_owned()));
+    }
+    images.sort_by_key(|(time, _)| *time);
+    Ok(images)
+}
+
+fn time(file: &Path, line: usize, row: &str) -> Result<i64, Error> {
+    let word = row.split(' ').next().unwrap_or_default();
+    nanoseconds(word).ok_or_else(|| wrong(file, line, format!("'{word}' is no time in decimal seconds")))
+}
