@@ -6,11 +6,14 @@ use std::path::{Path, PathBuf};
 /// The longest source file.
 const LONGEST_FILE: usize = 400;
 /// Crates and modules that only some of ours may name: (what, who).
-const RESERVED: [(&str, &[&str]); 9] = [
+const RESERVED: [(&str, &[&str]); 12] = [
+    ("ort", &["encoder"]),
+    ("tract_onnx", &["encoder"]),
+    ("fast_image_resize", &["encoder"]),
     ("tonic", &["proto", "service", "client", "cli"]),
-    ("prost", &["proto", "service"]),
+    ("prost", &["proto", "service", "encoder"]),
     ("tokio", &["service", "client", "cli", "main"]),
-    ("std::fs", &["datasets", "store", "cli"]),
+    ("std::fs", &["datasets", "encoder", "store", "cli"]),
     ("std::env", &[]),
     ("std::time", &["service", "client", "cli", "main"]),
     ("hnsw_rs", &["index"]),

@@ -2,6 +2,9 @@
 
 mod ask;
 mod demo;
+mod encode;
+mod encoder;
+mod encoders;
 mod evaluate;
 mod export;
 mod health;
@@ -28,6 +31,10 @@ enum Command {
     Import(import::Import),
     /// Give a stored room to other programs
     Export(export::Export),
+    /// Turn a room's images into features
+    Encode(encode::Encode),
+    /// List the encoders that are known, with their preprocessing
+    Encoders(encoders::Encoders),
     /// Learn an adapter from a room's features and publish it
     Train(train::Train),
     /// Score navigators on held-out motions: Hit@ε with baselines and intervals
@@ -54,6 +61,8 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
     match cli.command {
         Command::Import(arguments) => arguments.run().await,
         Command::Export(arguments) => arguments.run().await,
+        Command::Encode(arguments) => arguments.run().await,
+        Command::Encoders(arguments) => arguments.run(),
         Command::Train(arguments) => arguments.run().await,
         Command::Evaluate(arguments) => arguments.run().await,
         Command::Demo(arguments) => arguments.run().await,

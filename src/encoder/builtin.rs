@@ -6,6 +6,7 @@
 
 use std::f32::consts::TAU;
 
+use super::{Pooling, Preparation, Resize};
 use crate::features::FeatureSource;
 use crate::image::RgbImage;
 
@@ -17,7 +18,14 @@ const CELL_DIM: usize = ORIENTATIONS + 3;
 /// Columns of a feature.
 pub const BUILTIN_DIM: usize = COLUMNS * ROWS * CELL_DIM;
 
-/// What [`encode_builtin`] makes.
+pub(super) const POOLING: Pooling = Pooling::Grid { columns: COLUMNS, rows: ROWS, skip: 0 };
+
+/// The images that the encoder is meant for are small.
+pub(super) fn preparation() -> Preparation {
+    Preparation { resize: Resize::Whole { width: 64, height: 48 }, ..Preparation::default() }
+}
+
+/// What [`encode_builtin`] makes of images of 64×48 pixels.
 pub fn builtin_source(name: &str) -> FeatureSource {
     FeatureSource {
         name: name.to_owned(),
@@ -25,8 +33,8 @@ pub fn builtin_source(name: &str) -> FeatureSource {
         layer: "none".to_owned(),
         base: "name".to_owned(),
         norm: "none".to_owned(),
-        pooling: format!("grid{COLUMNS}x{ROWS}"),
-        preprocess: "none".to_owned(),
+        pooling: POOLING.to_string(),
+        preprocess: preparation().describe(1),
         dim: BUILTIN_DIM,
     }
 }

@@ -1,5 +1,337 @@
-//! Encoders: images to features.
+//! Encoders: images to features, several layers in one pass.
+//!
+//! - An image is decoded, resized and cropped in 8 bit, normalised, run, and each layer pooled to one row.
+//! - What an [`Encoder`] does is written into the [`FeatureSource`] of what it makes, word for word, so that an encoder
+//!   can be built again from a source and its model alone.
 
 mod builtin;
+mod decode;
+mod journal;
+mod model_file;
+mod network;
+#[cfg(feature = "onnxruntime")]
+mod onnxruntime;
+mod pooling;
+mod preparation;
+mod recipes;
+mod run;
+#[cfg(feature = "onnx")]
+mod tract;
 
 pub use builtin::{BUILTIN_DIM, builtin_source, encode_builtin};
+pub use decode::{Bounds, decode, read_image};
+pub use journal::Journal;
+pub use network::{Runtime, RuntimeKind};
+pub use pooling::Pooling;
+pub use preparation::{Filter, Preparation, Resize, normalised};
+pub use recipes::{RECIPES, Recipe, recipe};
+pub use run::{Encoded, OnBadImage, Task, encode_room};
+
+use std::path::{Path, PathBuf};
+
+use ndarray::{Array2, ArrayD, Axis, IxDyn};
+
+use crate::features::FeatureSource;
+use crate::image::RgbImage;
+use crate::room::is_plain_name;
+use network::Network;
+
+/// What can go wrong between an image file and a feature.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error("{}: {cause}", file.display())]
+    Io { file: PathBuf, cause: std::io::Error },
+    #[error("{image}: {problem}")]
+    BadImage { image: String, problem: String },
+    #[error("{what} '{given}': {problem}")]
+    Option { what: &'static str, given: String, problem: String },
+    #[error("{}: {problem}", file.display())]
+    Model { file: PathBuf, problem: String },
+    #[error("the runtime '{runtime}' failed: {problem}")]
+    Runtime { runtime: &'static str, problem: String },
+    #[error(
+        "this program was built without the runtime '{runtime}'; build it with \
+         `cargo install --path . --features full` (or `cargo build --release --features full`)"
+    )]
+    NotBuilt { runtime: &'static str },
+    #[error("layer '{layer}' gave {value} in column {column}; a feature must be finite")]
+    NotFinite { layer: String, column: usize, value: f32 },
+    #[error("room '{room}' has no images; import it from a recording with images")]
+    NoImages { room: String },
+    #[error("every image of room '{room}' is bad")]
+    AllBad { room: String },
+    #[error(transparent)]
+    Cancelled(#[from] crate::cancel::Cancelled),
+}
+
+/// Which layer of a model is kept, and how it is written down (A-13).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Layer {
+    /// The output's name in the model.
+    pub name: String,
+    /// What the number in the name counts from: `0`, `1`, or `name` when it is only a name.
+    pub base: String,
+    /// Whether the encoder's last norm is in it: `none`, `final` or `unspecified`.
+    pub norm: String,
+    /// How it becomes one row.
+    pub pooling: Pooling,
+}
+
+/// What a model is asked for.
+#[derive(Debug, Clone)]
+pub struct ModelTask {
+    /// The ONNX file.
+    pub file: PathBuf,
+    /// How images are prepared for it.
+    pub preparation: Preparation,
+    /// What is kept.
+    pub layers: Vec<Layer>,
+    /// Images a clip, 1 for an image model.
+    pub window: usize,
+}
+
+/// The identity of the encoder [`Encoder::pixels`].
+pub const PIXELS: &str = "pixels";
+
+/// Turns clips of images into features.
+pub struct Encoder {
+    id: String,
+    preparation: Preparation,
+    network: Network,
+    layers: Vec<Layer>,
+    dims: Vec<usize>,
+    window: usize,
+}
+
+impl Encoder {
+    /// The built-in, weight-free encoder.
+    pub fn builtin() -> Self {
+        let source = builtin_source("");
+        Self {
+            id: source.encoder,
+            preparation: builtin::preparation(),
+            network: Network::Builtin,
+            layers: vec![Layer { name: source.layer, base: source.base, norm: source.norm, pooling: builtin::POOLING }],
+            dims: vec![BUILTIN_DIM],
+            window: 1,
+        }
+    }
+
+    /// Raw pixels, the paper's baseline: the image at 320×240, in means over 16×12 patches, 0 to 1, by channel.
+    pub fn pixels() -> Self {
+        let pooling = Pooling::Grid { columns: 16, rows: 12, skip: 0 };
+        Self {
+            id: PIXELS.to_owned(),
+            preparation: Preparation {
+                resize: Resize::Whole { width: 320, height: 240 },
+                divisor: 255.0,
+                ..Preparation::default()
+            },
+            network: Network::Pixels,
+            layers: vec![Layer { name: PIXELS.to_owned(), base: "name".to_owned(), norm: "none".to_owned(), pooling }],
+            dims: vec![3 * 16 * 12],
+            window: 1,
+        }
+    }
+
+    /// An ONNX model. It is run once on a grey image, so that wrong names and shapes are found at once.
+    ///
+    /// # Errors
+    /// [`Error::Model`], [`Error::NotBuilt`], [`Error::Runtime`].
+    pub fn model(task: ModelTask, runtime: &Runtime) -> Result<Self, Error> {
+        let ModelTask { file, preparation, layers, window } = task;
+        let (network, id) = network::open(&file, &preparation, &layers, window, runtime)?;
+        let mut encoder = Self { id, preparation, network, layers, dims: Vec::new(), window };
+        let (width, height) = encoder.preparation.size().unwrap_or((64, 64));
+        let grey = RgbImage { width, height, bytes: vec![127; width * height * 3] };
+        let outputs = encoder.outputs(&[vec![&grey; window]])?;
+        for (layer, output) in encoder.layers.iter_mut().zip(&outputs) {
+            let problem = |problem: String| Error::Model { file: file.clone(), problem };
+            let one = output.index_axis(Axis(0), 0);
+            layer.pooling = layer.pooling.for_rank(one.ndim());
+            let row = layer.pooling.pool(one).map_err(|error| problem(format!("layer '{}': {error}", layer.name)))?;
+            encoder.dims.push(row.len());
+        }
+        Ok(encoder)
+    }
+
+    /// Builds the encoder that made a source again: the built-in ones, or the model in a file of that identity.
+    /// None if none of `models` has it.
+    ///
+    /// # Errors
+    /// As [`Encoder::model`], and [`Error::Option`] for a source that does not say how images were prepared.
+    pub fn of_source(source: &FeatureSource, models: &[PathBuf], runtime: &Runtime) -> Result<Option<Self>, Error> {
+        for encoder in [Self::builtin(), Self::pixels()] {
+            if encoder.sources("")[0].encoder == source.encoder {
+                return Ok(Some(encoder));
+            }
+        }
+        for file in models {
+            if model_file::identity(file)? != source.encoder {
+                continue;
+            }
+            let (preparation, window) = Preparation::parse(&source.preprocess)?;
+            let layer = Layer {
+                name: source.layer.clone(),
+                base: source.base.clone(),
+                norm: source.norm.clone(),
+                pooling: source.pooling.parse()?,
+            };
+            let task = ModelTask { file: file.clone(), preparation, layers: vec![layer], window };
+            return Self::model(task, runtime).map(Some);
+        }
+        Ok(None)
+    }
+
+    /// What its layers make, in order; each is called `PREFIX-LAYER-POOLING`, or just the prefix if there is one layer
+    /// and it has no name of its own.
+    pub fn sources(&self, prefix: &str) -> Vec<FeatureSource> {
+        let made = |(layer, &dim): (&Layer, &usize)| FeatureSource {
+            name: feature_name(prefix, layer, &self.network),
+            encoder: self.id.clone(),
+            layer: layer.name.clone(),
+            base: layer.base.clone(),
+            norm: layer.norm.clone(),
+            pooling: layer.pooling.to_string(),
+            preprocess: self.preparation.describe(self.window),
+            dim,
+        };
+        self.layers.iter().zip(&self.dims).map(made).collect()
+    }
+
+    /// Which runtime runs it; none for the built-in ones.
+    pub fn runtime(&self) -> &'static str {
+        self.network.runtime()
+    }
+
+    /// The model's identity: its file's name and the beginning of its SHA-256.
+    pub fn id(&self) -> &str {
+        &self.id
+    }
+
+    /// Images a clip.
+    pub fn window(&self) -> usize {
+        self.window
+    }
+
+    /// Columns of each layer's feature.
+    pub fn dims(&self) -> &[usize] {
+        &self.dims
+    }
+
+    /// The size that images have once they are prepared, where the encoder fixes it: render at this to lose nothing.
+    pub fn size(&self) -> Option<(usize, usize)> {
+        self.preparation.size()
+    }
+
+    /// Resizes and crops an image as the encoder wants it, 8 bit.
+    ///
+    /// # Errors
+    /// [`Error::BadImage`] if it is too small for the crop.
+    pub fn prepare(&self, image: RgbImage) -> Result<RgbImage, Error> {
+        self.preparation.pixels(image)
+    }
+
+    /// Features of prepared clips: a row a clip, the layers' columns side by side.
+    ///
+    /// # Errors
+    /// [`Error::Runtime`] or [`Error::NotFinite`].
+    pub fn encode(&self, clips: &[Vec<&RgbImage>]) -> Result<Array2<f32>, Error> {
+        let width = self.dims.iter().sum();
+        let mut rows = Array2::zeros((clips.len(), width));
+        if clips.is_empty() {
+            return Ok(rows);
+        }
+        if matches!(self.network, Network::Builtin) {
+            for (mut row, clip) in rows.outer_iter_mut().zip(clips) {
+                row.assign(&ndarray::aview1(&encode_builtin(clip[0])));
+            }
+            return Ok(rows);
+        }
+        let outputs = self.outputs(clips)?;
+        let runtime = self.network.runtime();
+        let mut from = 0;
+        for ((layer, &dim), output) in self.layers.iter().zip(&self.dims).zip(&outputs) {
+            for (mut row, one) in rows.outer_iter_mut().zip(output.outer_iter()) {
+                let pooled =
+                    layer.pooling.pool(one).map_err(|error| Error::Runtime { runtime, problem: error.to_string() })?;
+                if pooled.len() != dim {
+                    let problem = format!("layer '{}' gave {} columns, expected {dim}", layer.name, pooled.len());
+                    return Err(Error::Runtime { runtime, problem });
+                }
+                if let Some(column) = pooled.iter().position(|value| !value.is_finite()) {
+                    return Err(Error::NotFinite { layer: layer.name.clone(), column, value: pooled[column] });
+                }
+                row.slice_mut(ndarray::s![from..from + dim]).assign(&ndarray::aview1(&pooled));
+            }
+            from += dim;
+        }
+        Ok(rows)
+    }
+
+    /// What the network gives for clips, by layer, clips along the first axis.
+    fn outputs(&self, clips: &[Vec<&RgbImage>]) -> Result<Vec<ArrayD<f32>>, Error> {
+        let (width, height) = (clips[0][0].width, clips[0][0].height);
+        if clips.iter().flatten().any(|image| (image.width, image.height) != (width, height)) {
+            let problem = "images of several sizes in one batch; give a --resize that fixes the size".to_owned();
+            return Err(Error::BadImage { image: "batch".to_owned(), problem });
+        }
+        let mut numbers = Vec::with_capacity(clips.len() * self.window * 3 * width * height);
+        for clip in clips {
+            for image in clip {
+                normalised(&self.preparation, image, &mut numbers);
+            }
+        }
+        let shape = IxDyn(&[clips.len(), self.window, 3, height, width]);
+        let frames = ArrayD::from_shape_vec(shape, numbers)
+            .map_err(|error| Error::Runtime { runtime: self.runtime(), problem: error.to_string() })?;
+        match &self.network {
+            Network::Builtin => Ok(Vec::new()),
+            Network::Pixels => Ok(vec![frames.index_axis_move(Axis(1), 0)]),
+            Network::Model { runner, clip_axis, .. } => runner.run(network::laid_out(frames, *clip_axis)),
+        }
+    }
+}
+
+/// The name of a model's features; characters that names may not have become dashes.
+fn feature_name(prefix: &str, layer: &Layer, network: &Network) -> String {
+    let name = match network {
+        Network::Builtin | Network::Pixels => prefix.to_owned(),
+        Network::Model { .. } if layer.pooling == Pooling::Vector => format!("{prefix}-{}", layer.name),
+        Network::Model { .. } => format!("{prefix}-{}-{}", layer.name, layer.pooling.short()),
+    };
+    let plain: String = name.chars().map(|c| if is_plain_name(&format!("a{c}")) { c } else { '-' }).collect();
+    plain.trim_start_matches(|c: char| !c.is_ascii_alphanumeric()).to_owned()
+}
+
+/// The layers that a model declares as its outputs, in its order.
+///
+/// # Errors
+/// [`Error::Io`] or [`Error::Model`].
+pub fn declared_outputs(file: &Path) -> Result<Vec<String>, Error> {
+    Ok(model_file::ModelFile::read(file)?.outputs)
+}
+
+/// The size (width, height) of a model's images, where its file fixes it.
+///
+/// # Errors
+/// [`Error::Io`] or [`Error::Model`].
+pub fn declared_size(file: &Path) -> Result<Option<(usize, usize)>, Error> {
+    Ok(model_file::ModelFile::read(file)?.image_size())
+}
+
+/// Reads `WIDTHxHEIGHT` or `none`.
+///
+/// # Errors
+/// [`Error::Option`].
+pub fn parse_crop(text: &str) -> Result<Option<(usize, usize)>, Error> {
+    if text == "none" { Ok(None) } else { preparation::size("crop", text).map(Some) }
+}
+
+/// Reads `R,G,B`, or one number for all three.
+///
+/// # Errors
+/// [`Error::Option`].
+pub fn parse_channels(what: &'static str, text: &str) -> Result<[f32; 3], Error> {
+    preparation::three(what, text)
+}

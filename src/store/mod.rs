@@ -267,6 +267,11 @@ fn revision_path(folder: &Path, revision: u64) -> Path {
     folder.clone().join("revisions").join(format!("{revision:06}.json"))
 }
 
+/// The beginning of a text's SHA-256, for names of files.
+pub fn short_digest(text: &str) -> String {
+    sha256(text.as_bytes())[..16].to_owned()
+}
+
 fn sha256(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }

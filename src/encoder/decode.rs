@@ -1,0 +1,130 @@
+//! Image files to pixels: JPEG and PNG, within bounds, as 8-bit RGB.
+
+use std::fs::File;
+use std::io::{Cursor, Read, Seek, SeekFrom};
+use std::path::Path;
+
+use image::{ImageFormat, ImageReader, Limits};
+
+use super::Error;
+use crate::image::RgbImage;
+
+/// How large an image may be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Bounds {
+    /// Encoded.
+    pub bytes: u64,
+    /// Decoded.
+    pub pixels: u64,
+}
+
+impl Bounds {
+    /// For files of one's own.
+    pub const LOCAL: Self = Self { bytes: 256 << 20, pixels: 100_000_000 };
+}
+
+/// Decodes a JPEG or PNG; `name` is for messages. Alpha is dropped, grey becomes RGB, 16 bits become 8.
+///
+/// # Errors
+/// [`Error::BadImage`], for another format, a file that is not whole, or one out of bounds.
+pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Error> {
+    let bad = |problem: String| Error::BadImage { image: name.to_owned(), problem };
+    if bytes.len() as u64 > bounds.bytes {
+        return Err(bad(format!("is {} bytes, over the limit of {}", bytes.len(), bounds.bytes)));
+    }
+    let format = image::guess_format(bytes).ok();
+    if !matches!(format, Some(ImageFormat::Jpeg | ImageFormat::Png)) {
+        return Err(bad("is neither JPEG nor PNG".to_owned()));
+    }
+    let read = |limits: Option<Limits>| {
+        let mut reader = ImageReader::new(Cursor::new(bytes));
+        reader.set_format(format.unwrap_or(ImageFormat::Png));
+        match limits {
+            Some(limits) => reader.limits(limits),
+            None => reader.no_limits(),
+        }
+        reader
+    };
+    let (width, height) = read(None).into_dimensions().map_err(|error| bad(error.to_string()))?;
+    if u64::from(width) * u64::from(height) > bounds.pixels {
+        return Err(bad(format!("has {width}×{height} pixels, over the limit of {}", bounds.pixels)));
+    }
+    let mut limits = Limits::default();
+    // Sixteen bits, four channels, and as much again for the decoder.
+    limits.max_alloc = Some(bounds.pixels.saturating_mul(16).saturating_add(1 << 20));
+    let decoded = read(Some(limits)).decode().map_err(|error| bad(error.to_string()))?;
+    let bytes = decoded.into_rgb8().into_raw();
+    Ok(RgbImage { width: width as usize, height: height as usize, bytes })
+}
+
+/// Reads and decodes a room's image: a file below `root`, or the part `FILE@OFFSET+LENGTH` of one.
+///
+/// # Errors
+/// [`Error::Io`] or [`Error::BadImage`].
+pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
+    let bad = |problem: String| Error::BadImage { image: root.join(image).display().to_string(), problem };
+    let part = image.rsplit_once('@').and_then(|(file, part)| {
+        let (offset, length) = part.split_once('+')?;
+        Some((file, offset.parse::<u64>().ok()?, length.parse::<u64>().ok()?))
+    });
+    let path = root.join(part.map_or(image, |(file, _, _)| file));
+    let io = |cause| Error::Io { file: path.clone(), cause };
+    let mut file = File::open(&path).map_err(io)?;
+    let mut length = file.metadata().map_err(io)?.len();
+    if let Some((_, offset, part_length)) = part {
+        if offset.saturating_add(part_length) > length {
+            return Err(bad(format!("reaches past the end of the file, which has {length} bytes")));
+        }
+        file.seek(SeekFrom::Start(offset)).map_err(io)?;
+        length = part_length;
+    }
+    if length > Bounds::LOCAL.bytes {
+        return Err(bad(format!("is {length} bytes, over the limit of {}", Bounds::LOCAL.bytes)));
+    }
+    let mut bytes = Vec::with_capacity(length as usize);
+    file.take(length).read_to_end(&mut bytes).map_err(io)?;
+    decode(&path.display().to_string(), &bytes, Bounds::LOCAL)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn png(width: u32, height: u32) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        let image = image::GrayImage::from_fn(width, height, |x, y| image::Luma([(x * 16 + y) as u8]));
+        image.write_to(&mut Cursor::new(&mut bytes), ImageFormat::Png).unwrap();
+        bytes
+    }
+
+    /// Oracle: PNG is lossless, so pixels come back as they were written, grey in all three channels.
+    #[test]
+    fn a_png_comes_back_and_a_part_of_a_file_is_found() {
+        let bytes = png(4, 3);
+        let found = decode("a.png", &bytes, Bounds::LOCAL).unwrap();
+        assert_eq!((found.width, found.height, found.pixel(3, 2)), (4, 3, [50, 50, 50]));
+        let folder = tempfile::tempdir().unwrap();
+        let packed = [b"head".as_slice(), &bytes, b"tail"].concat();
+        std::fs::write(folder.path().join("p.bin"), packed).unwrap();
+        let image = format!("p.bin@4+{}", bytes.len());
+        assert_eq!(read_image(folder.path(), &image).unwrap(), found);
+        assert!(read_image(folder.path(), "p.bin@4+99999").is_err());
+    }
+
+    /// Oracle: the list of bad visitors: cut, too large, too many pixels, another format, nothing.
+    #[test]
+    fn bad_images_are_named() {
+        let bytes = png(64, 64);
+        let small = Bounds { bytes: 10_000, pixels: 100 };
+        for (bytes, bounds) in [
+            (&bytes[..bytes.len() / 2], Bounds::LOCAL),
+            (&bytes[..], small),
+            (&bytes[..], Bounds { bytes: 10, pixels: 10_000 }),
+            (b"GIF89a".as_slice(), Bounds::LOCAL),
+            (&[], Bounds::LOCAL),
+        ] {
+            let error = decode("frame 7", bytes, bounds).unwrap_err().to_string();
+            assert!(error.starts_with("frame 7: "), "{error}");
+        }
+    }
+}

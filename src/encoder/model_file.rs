@@ -1,0 +1,142 @@
+//! What an ONNX file says of itself: its input, its outputs, the names inside, and its identity.
+//!
+//! Only the few fields of ONNX's protobuf that are needed are read.
+
+use std::collections::HashSet;
+use std::path::Path;
+
+use prost::Message;
+use sha2::{Digest, Sha256};
+
+use super::Error;
+
+#[derive(Clone, PartialEq, Message)]
+struct ModelProto {
+    #[prost(message, optional, tag = "7")]
+    graph: Option<GraphProto>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct GraphProto {
+    #[prost(message, repeated, tag = "1")]
+    node: Vec<NodeProto>,
+    #[prost(message, repeated, tag = "5")]
+    initializer: Vec<TensorProto>,
+    #[prost(message, repeated, tag = "11")]
+    input: Vec<ValueInfoProto>,
+    #[prost(message, repeated, tag = "12")]
+    output: Vec<ValueInfoProto>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct NodeProto {
+    #[prost(string, repeated, tag = "2")]
+    output: Vec<String>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct TensorProto {
+    #[prost(string, tag = "8")]
+    name: String,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct ValueInfoProto {
+    #[prost(string, tag = "1")]
+    name: String,
+    #[prost(message, optional, tag = "2")]
+    kind: Option<TypeProto>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct TypeProto {
+    #[prost(message, optional, tag = "1")]
+    tensor: Option<TensorType>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct TensorType {
+    #[prost(message, optional, tag = "2")]
+    shape: Option<ShapeProto>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct ShapeProto {
+    #[prost(message, repeated, tag = "1")]
+    dim: Vec<DimProto>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct DimProto {
+    #[prost(int64, tag = "1")]
+    value: i64,
+}
+
+/// An ONNX file that was read.
+pub(super) struct ModelFile {
+    /// The file's name and the beginning of its SHA-256.
+    pub id: String,
+    /// The whole file.
+    pub bytes: Vec<u8>,
+    /// The sizes of its one input, none where they are open.
+    pub input: Vec<Option<usize>>,
+    /// The names of its declared outputs.
+    pub outputs: Vec<String>,
+    /// The names of everything its nodes compute.
+    pub inner: HashSet<String>,
+}
+
+impl ModelFile {
+    pub fn read(file: &Path) -> Result<Self, Error> {
+        let wrong = |problem: String| Error::Model { file: file.to_owned(), problem };
+        let bytes = std::fs::read(file).map_err(|cause| Error::Io { file: file.to_owned(), cause })?;
+        let model = ModelProto::decode(bytes.as_slice());
+        let graph = model.ok().and_then(|model| model.graph);
+        let graph = graph.ok_or_else(|| wrong("is no ONNX model; was it truncated?".to_owned()))?;
+        let weights: HashSet<&str> = graph.initializer.iter().map(|tensor| tensor.name.as_str()).collect();
+        let inputs: Vec<&ValueInfoProto> =
+            graph.input.iter().filter(|input| !weights.contains(input.name.as_str())).collect();
+        let [input] = inputs.as_slice() else {
+            let names: Vec<&str> = inputs.iter().map(|input| input.name.as_str()).collect();
+            return Err(wrong(format!("has {} inputs ({}), expected one image", names.len(), names.join(", "))));
+        };
+        let shape = input.kind.as_ref().and_then(|kind| kind.tensor.as_ref()?.shape.as_ref());
+        let input = shape.map_or_else(Vec::new, |shape| {
+            shape.dim.iter().map(|dim| usize::try_from(dim.value).ok().filter(|&size| size > 0)).collect()
+        });
+        let outputs = graph.output.into_iter().map(|output| output.name).collect();
+        let inner = graph.node.into_iter().flat_map(|node| node.output).collect();
+        Ok(Self { id: id_of(file, &bytes), bytes, input, outputs, inner })
+    }
+
+    /// The size (width, height) of its images, where the file fixes it.
+    pub fn image_size(&self) -> Option<(usize, usize)> {
+        match self.input.as_slice() {
+            [.., Some(height), Some(width)] if self.input.len() >= 4 => Some((*width, *height)),
+            _ => None,
+        }
+    }
+
+    /// The file with more of its inner values declared as outputs, for a runtime that gives only those.
+    ///
+    /// In protobuf a message that is written in several parts is their sum, so that outputs can be appended.
+    #[cfg_attr(not(feature = "onnxruntime"), allow(dead_code, reason = "only that runtime needs it"))]
+    pub fn with_outputs(&self, names: &[String]) -> Vec<u8> {
+        let named = |name: &String| ValueInfoProto { name: name.clone(), kind: None };
+        let output = names.iter().filter(|name| !self.outputs.contains(name)).map(named).collect();
+        let more = ModelProto { graph: Some(GraphProto { output, ..GraphProto::default() }) };
+        [self.bytes.as_slice(), &more.encode_to_vec()].concat()
+    }
+}
+
+/// The identity of a model's file.
+pub(super) fn identity(file: &Path) -> Result<String, Error> {
+    let bytes = std::fs::read(file).map_err(|cause| Error::Io { file: file.to_owned(), cause })?;
+    Ok(id_of(file, &bytes))
+}
+
+fn id_of(file: &Path, bytes: &[u8]) -> String {
+    let stem = file.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+    let digest: String = Sha256::digest(bytes).iter().take(8).map(|byte| format!("{byte:02x}")).collect();
+    format!("{stem}@{digest}")
+}

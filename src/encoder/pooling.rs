@@ -1,0 +1,215 @@
+//! How a layer's output becomes one row (A-14).
+//!
+//! An output is a vector (C), tokens (N, C) or a map (C, H, W). Grids are means over cells as PyTorch's
+//! `adaptive_avg_pool2d` cuts them, laid out channel by channel, rows of cells within: (C, rows, columns).
+
+use std::fmt;
+use std::str::FromStr;
+
+use ndarray::{Array3, ArrayView3, ArrayViewD, Axis, Ix1, Ix2, Ix3};
+
+use super::Error;
+
+/// How a layer's output becomes one row.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Pooling {
+    /// A vector, as it is.
+    Vector,
+    /// The first token.
+    Cls,
+    /// The mean over the map, or over the tokens after the first `skip`.
+    Mean {
+        /// Tokens that are no patches: the class token and registers.
+        skip: usize,
+    },
+    /// Means over cells of the map, or of the square of tokens after the first `skip`.
+    Grid {
+        /// Cells across.
+        columns: usize,
+        /// Cells down.
+        rows: usize,
+        /// Tokens that are no patches.
+        skip: usize,
+    },
+}
+
+/// The most cells a side.
+const MOST_CELLS: usize = 64;
+
+impl Pooling {
+    /// This pooling for an output of so many axes: a vector is never pooled.
+    pub(super) fn for_rank(self, rank: usize) -> Self {
+        if rank == 1 { Self::Vector } else { self }
+    }
+
+    /// With this many tokens that are no patches.
+    #[must_use]
+    pub fn after(self, skip: usize) -> Self {
+        match self {
+            Self::Vector | Self::Cls => self,
+            Self::Mean { .. } => Self::Mean { skip },
+            Self::Grid { columns, rows, .. } => Self::Grid { columns, rows, skip },
+        }
+    }
+
+    /// The word for it without the skipped tokens, for names.
+    pub(super) fn short(self) -> String {
+        self.after(0).to_string()
+    }
+
+    /// The row of one image's output.
+    pub(super) fn pool(self, output: ArrayViewD<'_, f32>) -> Result<Vec<f32>, Problem> {
+        let shape = output.shape().to_vec();
+        let wrong = || Problem { pooling: self, shape: shape.clone() };
+        match (self, output.ndim()) {
+            (Self::Vector, 1) => Ok(output.into_dimensionality::<Ix1>().map_err(|_| wrong())?.to_vec()),
+            (Self::Cls, 2) if shape[0] > 0 => {
+                Ok(output.into_dimensionality::<Ix2>().map_err(|_| wrong())?.row(0).to_vec())
+            }
+            (Self::Mean { skip }, 2) if skip < shape[0] => {
+                let tokens = output.into_dimensionality::<Ix2>().map_err(|_| wrong())?;
+                let patches = tokens.slice_move(ndarray::s![skip.., ..]).reversed_axes();
+                Ok(grid(patches.insert_axis(Axis(1)), 1, 1))
+            }
+            (Self::Grid { columns, rows, skip }, 2) if skip < shape[0] => {
+                let side = (shape[0] - skip).isqrt();
+                if side * side != shape[0] - skip {
+                    return Err(wrong());
+                }
+                let tokens = output.into_dimensionality::<Ix2>().map_err(|_| wrong())?;
+                let patches = tokens.slice_move(ndarray::s![skip.., ..]);
+                let map = Array3::from_shape_fn((shape[1], side, side), |(c, y, x)| patches[(y * side + x, c)]);
+                Ok(grid(map.view(), columns, rows))
+            }
+            (Self::Mean { .. }, 3) if shape[1] * shape[2] > 0 => {
+                Ok(grid(output.into_dimensionality::<Ix3>().map_err(|_| wrong())?, 1, 1))
+            }
+            (Self::Grid { columns, rows, .. }, 3) if shape[1] * shape[2] > 0 => {
+                Ok(grid(output.into_dimensionality::<Ix3>().map_err(|_| wrong())?, columns, rows))
+            }
+            _ => Err(wrong()),
+        }
+    }
+}
+
+/// Means over cells of a map (C, H, W); a cell reaches from ⌊iH/n⌋ to ⌈(i+1)H/n⌉.
+fn grid(map: ArrayView3<'_, f32>, columns: usize, rows: usize) -> Vec<f32> {
+    let (channels, height, width) = map.dim();
+    let cell = |i: usize, n: usize, length: usize| i * length / n..((i + 1) * length).div_ceil(n);
+    let mut row = Vec::with_capacity(channels * columns * rows);
+    for channel in map.outer_iter() {
+        for down in 0..rows {
+            for across in 0..columns {
+                let (ys, xs) = (cell(down, rows, height), cell(across, columns, width));
+                let part = channel.slice(ndarray::s![ys, xs]);
+                let sum: f64 = part.iter().map(|&value| f64::from(value)).sum();
+                row.push((sum / part.len() as f64) as f32);
+            }
+        }
+    }
+    row
+}
+
+/// An output that cannot be pooled so.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "its output of shape {shape:?} cannot be pooled by '{pooling}': cls wants tokens (n, c); grids want a map (c, h, w) \
+     or a square number of patch tokens, after the prefix tokens"
+)]
+pub(super) struct Problem {
+    pooling: Pooling,
+    shape: Vec<usize>,
+}
+
+impl fmt::Display for Pooling {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let skip = match self {
+            Self::Vector => return f.write_str("vector"),
+            Self::Cls => return f.write_str("cls"),
+            Self::Mean { skip } => {
+                f.write_str("mean")?;
+                *skip
+            }
+            Self::Grid { columns, rows, skip } => {
+                write!(f, "grid{columns}x{rows}")?;
+                *skip
+            }
+        };
+        if skip > 0 { write!(f, "@{skip}") } else { Ok(()) }
+    }
+}
+
+impl FromStr for Pooling {
+    type Err = Error;
+
+    /// `vector`, `cls`, `mean` or `gridCxR` (columns × rows); `@N` after it leaves out the first N tokens.
+    fn from_str(text: &str) -> Result<Self, Error> {
+        let wrong = || Error::Option {
+            what: "pooling",
+            given: text.to_owned(),
+            problem: format!("is not cls, mean, or gridCxR with 1 to {MOST_CELLS} columns and rows"),
+        };
+        let (word, skip) = match text.split_once('@') {
+            Some((word, skip)) => (word, skip.parse().map_err(|_| wrong())?),
+            None => (text, 0),
+        };
+        let pooling = match word {
+            "vector" => Self::Vector,
+            "cls" => Self::Cls,
+            "mean" => Self::Mean { skip },
+            _ => {
+                let cells = |text: &str| text.parse().ok().filter(|n| (1..=MOST_CELLS).contains(n));
+                let grid = word.strip_prefix("grid").and_then(|grid| grid.split_once('x'));
+                let (columns, rows) =
+                    grid.and_then(|(columns, rows)| Some((cells(columns)?, cells(rows)?))).ok_or_else(wrong)?;
+                Self::Grid { columns, rows, skip }
+            }
+        };
+        Ok(pooling)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::{Array2, ArrayD};
+
+    fn map(channels: usize, height: usize, width: usize) -> ArrayD<f32> {
+        Array3::from_shape_fn((channels, height, width), |(c, y, x)| (100 * c + 10 * y + x) as f32).into_dyn()
+    }
+
+    /// Oracle: PyTorch's definition by hand. Three rows in two cells overlap in the middle one: rows 0–1 and 1–2.
+    #[test]
+    fn cells_overlap_where_the_map_does_not_divide() {
+        let pool = |text: &str, output: ArrayD<f32>| text.parse::<Pooling>().unwrap().pool(output.view());
+        assert_eq!(pool("grid1x2", map(2, 3, 1)).unwrap(), [5.0, 15.0, 105.0, 115.0]);
+        assert_eq!(pool("grid2x1", map(1, 2, 2)).unwrap(), [5.0, 6.0]);
+        assert_eq!(pool("mean", map(2, 2, 2)).unwrap(), [5.5, 105.5]);
+    }
+
+    /// Oracle: by hand. Five tokens of two columns: a class token and a 2×2 square of patches.
+    #[test]
+    fn tokens_after_the_prefix_are_a_square() {
+        let tokens = || Array2::from_shape_fn((5, 2), |(n, c)| (10 * c + n) as f32).into_dyn();
+        let pool = |text: &str| text.parse::<Pooling>().unwrap().pool(tokens().view());
+        assert_eq!(pool("cls").unwrap(), [0.0, 10.0]);
+        assert_eq!(pool("mean@1").unwrap(), [2.5, 12.5]);
+        assert_eq!(pool("mean").unwrap(), [2.0, 12.0]);
+        assert_eq!(pool("grid2x2@1").unwrap(), [1.0, 2.0, 3.0, 4.0, 11.0, 12.0, 13.0, 14.0]);
+        assert_eq!(pool("grid2x1@1").unwrap(), [2.0, 3.0, 12.0, 13.0]);
+        assert!(pool("grid2x2").is_err(), "five tokens are no square");
+        assert!(pool("mean@5").is_err(), "no token is left");
+        assert!("cls".parse::<Pooling>().unwrap().pool(map(1, 2, 2).view()).is_err());
+    }
+
+    /// Oracle: the words of the documentation.
+    #[test]
+    fn words_are_read_and_written() {
+        for word in ["vector", "cls", "mean", "mean@5", "grid2x2", "grid16x12@1"] {
+            assert_eq!(word.parse::<Pooling>().unwrap().to_string(), word);
+        }
+        for wrong in ["", "max", "grid", "grid0x2", "grid2", "mean@", "grid65x1", "mean@x"] {
+            assert!(wrong.parse::<Pooling>().is_err(), "{wrong}");
+        }
+    }
+}

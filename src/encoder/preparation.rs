@@ -1,0 +1,364 @@
+//! What is done to an image before a network sees it: resize, crop, normalise.
+//!
+//! Resizing is an antialiased convolution in 8 bit, as Pillow does it; cropping is central. Then, in f32,
+//! (v / divisor − mean) / deviation for each channel, v in 0 to 255.
+
+use fast_image_resize::images::{Image, ImageRef};
+use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
+use sha2::{Digest, Sha256};
+
+use super::Error;
+use crate::image::RgbImage;
+
+/// The size that an image is brought to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Resize {
+    /// Its own.
+    None,
+    /// The whole image to this size, whatever its shape.
+    Whole {
+        /// Pixels.
+        width: usize,
+        /// Pixels.
+        height: usize,
+    },
+    /// The shorter edge to this many pixels, the longer one in proportion, cut to whole pixels.
+    Shortest(usize),
+}
+
+/// The filter of the convolution.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Filter {
+    /// A triangle.
+    Bilinear,
+    /// Cubic, a = −0.5.
+    Bicubic,
+    /// Sinc over three lobes.
+    Lanczos3,
+}
+
+/// How images are prepared for a network.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Preparation {
+    /// First.
+    pub resize: Resize,
+    /// Of the resize.
+    pub filter: Filter,
+    /// Width and height of the central crop, if there is one.
+    pub crop: Option<(usize, usize)>,
+    /// Values are divided by this.
+    pub divisor: f32,
+    /// Subtracted, by channel: red, green, blue.
+    pub mean: [f32; 3],
+    /// Divided by, by channel.
+    pub deviation: [f32; 3],
+}
+
+impl Default for Preparation {
+    /// No resize, values as they are.
+    fn default() -> Self {
+        Self {
+            resize: Resize::None,
+            filter: Filter::Bilinear,
+            crop: None,
+            divisor: 1.0,
+            mean: [0.0; 3],
+            deviation: [1.0; 3],
+        }
+    }
+}
+
+/// The largest edge that is asked for, pixels.
+const LARGEST: usize = 8_192;
+
+impl Preparation {
+    /// The size (width, height) of every prepared image, where it does not depend on the image.
+    pub fn size(&self) -> Option<(usize, usize)> {
+        match (self.crop, self.resize) {
+            (Some(size), _) => Some(size),
+            (None, Resize::Whole { width, height }) => Some((width, height)),
+            (None, Resize::None | Resize::Shortest(_)) => None,
+        }
+    }
+
+    /// The 8-bit part: resize, then crop.
+    ///
+    /// # Errors
+    /// [`Error::BadImage`] if the image is empty or smaller than the crop.
+    pub fn pixels(&self, image: RgbImage) -> Result<RgbImage, Error> {
+        let (width, height) = match self.resize {
+            Resize::None => (image.width, image.height),
+            Resize::Whole { width, height } => (width, height),
+            Resize::Shortest(edge) if image.width <= image.height => (edge, edge * image.height / image.width.max(1)),
+            Resize::Shortest(edge) => (edge * image.width / image.height.max(1), edge),
+        };
+        let resized = if (width, height) == (image.width, image.height) {
+            image
+        } else {
+            resized(&image, width, height, self.filter)?
+        };
+        match self.crop {
+            Some((width, height)) if (width, height) != (resized.width, resized.height) => {
+                cropped(&resized, width, height)
+            }
+            _ => Ok(resized),
+        }
+    }
+
+    /// In words, with their own hash: what [`Preparation::parse`] reads. `window` is the number of images a clip.
+    pub fn describe(&self, window: usize) -> String {
+        let text = self.text(window);
+        format!("{text} sha256={}", digest(&text))
+    }
+
+    fn text(&self, window: usize) -> String {
+        let resize = match self.resize {
+            Resize::None => "none".to_owned(),
+            Resize::Whole { width, height } => format!("{width}x{height}"),
+            Resize::Shortest(edge) => format!("shortest:{edge}"),
+        };
+        let crop = self.crop.map_or("none".to_owned(), |(width, height)| format!("{width}x{height}"));
+        let three = |[r, g, b]: [f32; 3]| format!("{r},{g},{b}");
+        format!(
+            "resize={resize} filter={} crop={crop} divisor={} mean={} std={} window={window}",
+            self.filter.name(),
+            self.divisor,
+            three(self.mean),
+            three(self.deviation)
+        )
+    }
+
+    /// Reads what [`Preparation::describe`] wrote: the preparation, and the number of images a clip.
+    ///
+    /// # Errors
+    /// [`Error::Option`] if it was not written so, or was altered.
+    pub fn parse(text: &str) -> Result<(Self, usize), Error> {
+        let wrong =
+            |problem: &str| Error::Option { what: "preprocess", given: text.to_owned(), problem: problem.to_owned() };
+        let mut preparation = Self::default();
+        let mut window = None;
+        for word in text.split(' ') {
+            let (key, value) = word.split_once('=').ok_or_else(|| wrong("does not say how images were prepared"))?;
+            match key {
+                "resize" => preparation.resize = value.parse()?,
+                "filter" => preparation.filter = value.parse()?,
+                "crop" if value == "none" => preparation.crop = None,
+                "crop" => preparation.crop = Some(size("crop", value)?),
+                "divisor" => {
+                    preparation.divisor = value.parse().map_err(|_| wrong("has a divisor that is no number"))?
+                }
+                "mean" => preparation.mean = three("mean", value)?,
+                "std" => preparation.deviation = three("std", value)?,
+                "window" => window = value.parse().ok(),
+                "sha256" => {}
+                _ => return Err(wrong("has a word that means nothing to this program")),
+            }
+        }
+        let window = window.ok_or_else(|| wrong("does not say how many images a clip has"))?;
+        if preparation.describe(window) != text {
+            return Err(wrong("does not have its own hash; it was altered"));
+        }
+        Ok((preparation, window))
+    }
+
+    /// Refuses numbers that no image can be prepared with.
+    ///
+    /// # Errors
+    /// [`Error::Option`].
+    pub fn check(&self) -> Result<(), Error> {
+        let usable = |value: f32| value.is_finite() && value != 0.0;
+        let wrong = |what: &'static str, problem: &str| {
+            Err(Error::Option { what, given: self.text(1), problem: problem.to_owned() })
+        };
+        if !usable(self.divisor) {
+            return wrong("divisor", "must be finite and not 0");
+        }
+        if !self.deviation.iter().all(|&value| usable(value)) || !self.mean.iter().all(|value| value.is_finite()) {
+            return wrong("mean, std", "must be finite, std not 0");
+        }
+        Ok(())
+    }
+}
+
+fn digest(text: &str) -> String {
+    Sha256::digest(text).iter().take(8).map(|byte| format!("{byte:02x}")).collect()
+}
+
+impl Filter {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Bilinear => "bilinear",
+            Self::Bicubic => "bicubic",
+            Self::Lanczos3 => "lanczos3",
+        }
+    }
+}
+
+impl std::str::FromStr for Filter {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self, Error> {
+        [Self::Bilinear, Self::Bicubic, Self::Lanczos3].into_iter().find(|filter| filter.name() == text).ok_or_else(
+            || Error::Option {
+                what: "filter",
+                given: text.to_owned(),
+                problem: "is not bilinear, bicubic or lanczos3".to_owned(),
+            },
+        )
+    }
+}
+
+impl std::str::FromStr for Resize {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self, Error> {
+        if text == "none" {
+            return Ok(Self::None);
+        }
+        if let Some(edge) = text.strip_prefix("shortest:") {
+            return match edge.parse() {
+                Ok(edge) if (1..=LARGEST).contains(&edge) => Ok(Self::Shortest(edge)),
+                _ => Err(Error::Option {
+                    what: "resize",
+                    given: text.to_owned(),
+                    problem: format!("the edge must be 1 to {LARGEST} pixels"),
+                }),
+            };
+        }
+        let (width, height) = size("resize", text)?;
+        Ok(Self::Whole { width, height })
+    }
+}
+
+/// `WIDTHxHEIGHT`, pixels.
+pub(super) fn size(what: &'static str, text: &str) -> Result<(usize, usize), Error> {
+    let number = |text: &str| text.parse::<usize>().ok().filter(|edge| (1..=LARGEST).contains(edge));
+    let both = text.split_once('x').and_then(|(width, height)| Some((number(width)?, number(height)?)));
+    both.ok_or_else(|| Error::Option {
+        what,
+        given: text.to_owned(),
+        problem: format!("is not WIDTHxHEIGHT, each 1 to {LARGEST} pixels"),
+    })
+}
+
+/// Three numbers divided by commas; one stands for all three.
+pub(super) fn three(what: &'static str, text: &str) -> Result<[f32; 3], Error> {
+    let numbers: Option<Vec<f32>> = text.split(',').map(|word| word.parse().ok()).collect();
+    match numbers.as_deref() {
+        Some(&[all]) => Ok([all; 3]),
+        Some(&[r, g, b]) => Ok([r, g, b]),
+        _ => Err(Error::Option { what, given: text.to_owned(), problem: "is not three numbers R,G,B".to_owned() }),
+    }
+}
+
+fn resized(image: &RgbImage, width: usize, height: usize, filter: Filter) -> Result<RgbImage, Error> {
+    let bad = |problem: String| Error::BadImage {
+        image: format!("image of {}×{} pixels", image.width, image.height),
+        problem: format!("cannot be resized to {width}×{height}: {problem}"),
+    };
+    if width == 0 || height == 0 {
+        return Err(bad("nothing is left of it".to_owned()));
+    }
+    let from = ImageRef::new(image.width as u32, image.height as u32, &image.bytes, PixelType::U8x3)
+        .map_err(|error| bad(error.to_string()))?;
+    let mut to = Image::new(width as u32, height as u32, PixelType::U8x3);
+    let filter = match filter {
+        Filter::Bilinear => FilterType::Bilinear,
+        Filter::Bicubic => FilterType::CatmullRom,
+        Filter::Lanczos3 => FilterType::Lanczos3,
+    };
+    let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(filter));
+    Resizer::new().resize(&from, &mut to, &options).map_err(|error| bad(error.to_string()))?;
+    Ok(RgbImage { width, height, bytes: to.into_vec() })
+}
+
+fn cropped(image: &RgbImage, width: usize, height: usize) -> Result<RgbImage, Error> {
+    if image.width < width || image.height < height {
+        return Err(Error::BadImage {
+            image: format!("image of {}×{} pixels", image.width, image.height),
+            problem: format!("is smaller than the crop of {width}×{height}"),
+        });
+    }
+    let (left, top) = ((image.width - width) / 2, (image.height - height) / 2);
+    let line = |row: usize| {
+        let from = ((top + row) * image.width + left) * 3;
+        &image.bytes[from..from + width * 3]
+    };
+    Ok(RgbImage { width, height, bytes: (0..height).flat_map(line).copied().collect() })
+}
+
+/// Appends an image's numbers, normalised, channel by channel: red plane, green plane, blue plane.
+pub fn normalised(preparation: &Preparation, image: &RgbImage, numbers: &mut Vec<f32>) {
+    let Preparation { divisor, mean, deviation, .. } = preparation;
+    for channel in 0..3 {
+        let (mean, deviation) = (mean[channel], deviation[channel]);
+        let table: [f32; 256] = std::array::from_fn(|value| (value as f32 / divisor - mean) / deviation);
+        numbers.extend(image.bytes[channel..].iter().step_by(3).map(|&value| table[usize::from(value)]));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ramp(width: usize, height: usize) -> RgbImage {
+        let bytes = (0..width * height).flat_map(|i| [(i % width) as u8, (i / width) as u8, 7]).collect();
+        RgbImage { width, height, bytes }
+    }
+
+    /// Oracle: by hand. 641×480 with its shorter edge at 240 is 320×240 (cut, not rounded); a centre crop of 100×50
+    /// begins at ((320 − 100) / 2, (240 − 50) / 2).
+    #[test]
+    fn sizes_are_cut_and_crops_are_central() {
+        let preparation =
+            Preparation { resize: Resize::Shortest(240), crop: Some((100, 50)), ..Preparation::default() };
+        let found = preparation.pixels(ramp(641, 480)).unwrap();
+        assert_eq!((found.width, found.height), (100, 50));
+        let uncropped = Preparation { crop: None, ..preparation }.pixels(ramp(641, 480)).unwrap();
+        assert_eq!((uncropped.width, uncropped.height), (320, 240));
+        assert_eq!(found.pixel(0, 0), uncropped.pixel(110, 95));
+        let tall = Preparation { resize: Resize::Shortest(10), ..Preparation::default() }.pixels(ramp(20, 45)).unwrap();
+        assert_eq!((tall.width, tall.height), (10, 22));
+    }
+
+    /// Oracle: an image that has the size already is not touched, and one too small for its crop is refused.
+    #[test]
+    fn nothing_is_done_that_need_not_be() {
+        let preparation = Preparation { resize: "30x20".parse().unwrap(), ..Preparation::default() };
+        assert_eq!(preparation.pixels(ramp(30, 20)).unwrap(), ramp(30, 20));
+        let crop = Preparation { crop: Some((31, 20)), ..Preparation::default() };
+        assert!(crop.pixels(ramp(30, 20)).is_err());
+        let empty = RgbImage { width: 0, height: 0, bytes: Vec::new() };
+        assert!(preparation.pixels(empty).is_err());
+    }
+
+    /// Oracle: the formula by hand, and planes in the order red, green, blue.
+    #[test]
+    fn channels_are_normalised_each_by_its_own_numbers() {
+        let preparation =
+            Preparation { divisor: 2.0, mean: [1.0, 2.0, 3.0], deviation: [1.0, 2.0, 4.0], ..Preparation::default() };
+        let image = RgbImage { width: 2, height: 1, bytes: vec![2, 4, 6, 10, 20, 30] };
+        let mut numbers = Vec::new();
+        normalised(&preparation, &image, &mut numbers);
+        assert_eq!(numbers, [0.0, 4.0, 0.0, 4.0, 0.0, 3.0]);
+    }
+
+    /// Oracle: what is described can be read again, and a changed word is noticed by the hash.
+    #[test]
+    fn a_description_says_everything_and_cannot_be_altered_unseen() {
+        let preparation = Preparation {
+            resize: Resize::Shortest(256),
+            filter: Filter::Bicubic,
+            crop: Some((224, 224)),
+            divisor: 255.0,
+            mean: [0.485, 0.456, 0.406],
+            deviation: [0.229, 0.224, 0.225],
+        };
+        let text = preparation.describe(16);
+        assert_eq!(Preparation::parse(&text).unwrap(), (preparation, 16));
+        assert!(Preparation::parse(&text.replace("bicubic", "bilinear")).is_err());
+        for wrong in ["unspecified", "resize=0x5", "filter=box", "mean=1,2", "resize=shortest:99999"] {
+            assert!(Preparation::parse(wrong).is_err(), "{wrong}");
+        }
+    }
+}

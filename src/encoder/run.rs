@@ -1,0 +1,239 @@
+//! A whole room through an encoder: images are decoded while others are run, rows are journalled as they come, and
+//! memory does not grow with the number of images but by their rows.
+
+use std::collections::BTreeMap;
+
+use ndarray::Array2;
+use rayon::prelude::*;
+
+use super::{Encoder, Error, Journal};
+use crate::cancel::Cancellation;
+use crate::image::RgbImage;
+use crate::room::{FrameId, Timeline};
+
+/// What becomes of a frame whose image cannot be read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OnBadImage {
+    /// The run ends, naming it.
+    Stop,
+    /// It is left out, and named.
+    Skip,
+}
+
+/// A room to encode.
+pub struct Task<'a> {
+    /// How its frames follow one another: clips stay inside a sequence.
+    pub timeline: &'a Timeline,
+    /// Images by row; called from several threads.
+    pub image: &'a (dyn Fn(usize) -> Result<RgbImage, Error> + Sync),
+    /// Frames a run.
+    pub batch: usize,
+    /// What becomes of a frame whose image cannot be read.
+    pub on_bad: OnBadImage,
+    /// Tells the run to stop; what was journalled stays.
+    pub cancel: &'a Cancellation,
+}
+
+/// What came of it.
+#[derive(Debug)]
+pub struct Encoded {
+    /// Features of the good frames, the layers' columns side by side.
+    pub rows: Array2<f32>,
+    /// The rows of the good frames in the room.
+    pub good: Vec<usize>,
+    /// The other frames, and why.
+    pub bad: Vec<(usize, String)>,
+    /// Frames that an earlier run had done.
+    pub resumed: usize,
+}
+
+/// Encodes every frame on the threads of the pool that calls; `done` hears how many are done.
+///
+/// # Errors
+/// [`Error::BadImage`] or [`Error::Io`] for the first image that cannot be read, unless those are skipped;
+/// [`Error::Runtime`]; [`Error::Cancelled`].
+pub fn encode_room(
+    task: &Task<'_>,
+    encoder: &Encoder,
+    journal: &mut Journal,
+    before: Vec<(usize, Vec<f32>)>,
+    done: &(dyn Fn(usize) + Sync),
+) -> Result<Encoded, Error> {
+    let frame_count = task.timeline.frame_count;
+    let mut rows: BTreeMap<usize, Vec<f32>> = before.into_iter().filter(|(row, _)| *row < frame_count).collect();
+    let resumed = rows.len();
+    done(resumed);
+    let open: Vec<usize> = (0..frame_count).filter(|row| !rows.contains_key(row)).collect();
+    let mut chunks = open.chunks(task.batch.max(1));
+    let mut bad = Vec::new();
+    let mut ready = chunks.next().map(|chunk| prepare(task, encoder, chunk)).transpose()?;
+    while let Some(clips) = ready.take() {
+        task.cancel.check()?;
+        let next = chunks.next();
+        let (encoded, prepared) =
+            rayon::join(|| clips.encode(encoder), || next.map(|chunk| prepare(task, encoder, chunk)).transpose());
+        let encoded = encoded?;
+        journal.append(clips.good.iter().copied().zip(encoded.outer_iter().map(row_of)))?;
+        rows.extend(clips.good.iter().copied().zip(encoded.outer_iter().map(|row| row.to_vec())));
+        bad.extend(clips.bad);
+        done(rows.len() + bad.len());
+        ready = prepared?;
+    }
+    let good: Vec<usize> = rows.keys().copied().collect();
+    let width = encoder.dims().iter().sum();
+    let numbers = rows.into_values().flatten().collect();
+    let rows = Array2::from_shape_vec((good.len(), width), numbers)
+        .map_err(|error| Error::Runtime { runtime: encoder.runtime(), problem: error.to_string() })?;
+    Ok(Encoded { rows, good, bad, resumed })
+}
+
+/// A row of a matrix in standard layout.
+fn row_of(row: ndarray::ArrayView1<'_, f32>) -> &[f32] {
+    row.to_slice().unwrap_or_default()
+}
+
+/// Clips of one run.
+struct Clips {
+    images: BTreeMap<usize, RgbImage>,
+    /// The frames around each good anchor.
+    frames: Vec<Vec<usize>>,
+    good: Vec<usize>,
+    bad: Vec<(usize, String)>,
+}
+
+impl Clips {
+    fn encode(&self, encoder: &Encoder) -> Result<Array2<f32>, Error> {
+        let clips: Vec<Vec<&RgbImage>> =
+            self.frames.iter().map(|frames| frames.iter().map(|frame| &self.images[frame]).collect()).collect();
+        encoder.encode(&clips)
+    }
+}
+
+fn prepare(task: &Task<'_>, encoder: &Encoder, anchors: &[usize]) -> Result<Clips, Error> {
+    let frames: Vec<Vec<usize>> = anchors.iter().map(|&row| clip(task.timeline, row, encoder.window())).collect();
+    let mut wanted: Vec<usize> = frames.iter().flatten().copied().collect();
+    wanted.sort_unstable();
+    wanted.dedup();
+    let read = |row: usize| (row, (task.image)(row).and_then(|image| encoder.prepare(image)));
+    let read: Vec<(usize, Result<RgbImage, Error>)> = wanted.into_par_iter().map(read).collect();
+    let mut clips = Clips { images: BTreeMap::new(), frames: Vec::new(), good: Vec::new(), bad: Vec::new() };
+    let mut problems = BTreeMap::new();
+    for (row, image) in read {
+        match image {
+            Ok(image) => drop(clips.images.insert(row, image)),
+            Err(error) if task.on_bad == OnBadImage::Stop => return Err(error),
+            Err(error @ (Error::BadImage { .. } | Error::Io { .. })) => {
+                problems.insert(row, error.to_string());
+            }
+            Err(error) => return Err(error),
+        }
+    }
+    for (&anchor, frames) in anchors.iter().zip(frames) {
+        match frames.iter().find_map(|frame| problems.get(frame)) {
+            Some(problem) => clips.bad.push((anchor, problem.clone())),
+            None => {
+                clips.good.push(anchor);
+                clips.frames.push(frames);
+            }
+        }
+    }
+    Ok(clips)
+}
+
+/// The frames of the clip around an anchor: the anchor is in the middle (of an even number, after it); at the ends of
+/// a sequence its first or last frame stands in for those that are missing.
+fn clip(timeline: &Timeline, anchor: usize, window: usize) -> Vec<usize> {
+    let joined = |row: usize| timeline.joins(FrameId(anchor as u32), FrameId(row as u32));
+    let mut frames = Vec::with_capacity(window);
+    for place in 0..window {
+        let (before, after) = ((window / 2).saturating_sub(place), place.saturating_sub(window / 2));
+        let mut frame = anchor;
+        for _ in 0..before.max(after) {
+            let next = if before > 0 { frame.checked_sub(1) } else { Some(frame + 1) };
+            match next.filter(|&row| row < timeline.frame_count && joined(row)) {
+                Some(next) => frame = next,
+                None => break,
+            }
+        }
+        frames.push(frame);
+    }
+    frames
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand, on two sequences of three frames.
+    #[test]
+    fn clips_stay_in_their_sequence() {
+        let timeline = Timeline { frame_count: 6, sequences: vec![0, 0, 0, 1, 1, 1], held_out: Vec::new() };
+        assert_eq!(clip(&timeline, 1, 1), [1]);
+        assert_eq!(clip(&timeline, 1, 3), [0, 1, 2]);
+        assert_eq!(clip(&timeline, 2, 3), [1, 2, 2]);
+        assert_eq!(clip(&timeline, 3, 4), [3, 3, 3, 4]);
+        assert_eq!(clip(&timeline, 5, 5), [3, 4, 5, 5, 5]);
+    }
+
+    fn image(row: usize) -> Result<RgbImage, Error> {
+        if row == 3 {
+            return Err(Error::BadImage { image: "frame 3".to_owned(), problem: "is cut".to_owned() });
+        }
+        let bytes = (0..64 * 48 * 3).map(|i| ((i * (row + 1)) % 251) as u8).collect();
+        Ok(RgbImage { width: 64, height: 48, bytes })
+    }
+
+    /// Oracle: the encoder called on each image alone; and that a second run asks only for what the first had not done.
+    #[test]
+    fn an_interrupted_run_goes_on_and_gives_the_same_rows() {
+        let (timeline, encoder) = (Timeline::unbroken(8), Encoder::builtin());
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rows");
+        let width = encoder.dims()[0];
+        let cancel = Cancellation::default();
+        let asked = std::sync::Mutex::new(Vec::new());
+        let counting = |row: usize| {
+            asked.lock().unwrap().push(row);
+            if row >= 5 {
+                cancel.cancel()
+            }
+            image(row)
+        };
+        let task = |image, on_bad| Task { timeline: &timeline, image, batch: 2, on_bad, cancel: &cancel };
+        let (mut journal, before) = Journal::open(&path, "k", width).unwrap();
+        let first = encode_room(&task(&counting, OnBadImage::Skip), &encoder, &mut journal, before, &|_| ());
+        assert!(matches!(first, Err(Error::Cancelled(_))));
+        drop(journal);
+        asked.lock().unwrap().clear();
+        let (mut journal, before) = Journal::open(&path, "k", width).unwrap();
+        let kept = before.len();
+        assert!(kept >= 2, "something was journalled");
+        let go_on = Cancellation::default();
+        let again = |row: usize| {
+            asked.lock().unwrap().push(row);
+            image(row)
+        };
+        let task = Task { timeline: &timeline, image: &again, batch: 2, on_bad: OnBadImage::Skip, cancel: &go_on };
+        let found = encode_room(&task, &encoder, &mut journal, before, &|_| ()).unwrap();
+        assert_eq!(found.resumed, kept);
+        assert_eq!(asked.lock().unwrap().len(), 8 - kept);
+        assert_eq!(found.good, [0, 1, 2, 4, 5, 6, 7]);
+        assert_eq!(found.bad.len(), 1);
+        assert!(found.bad[0].1.contains("frame 3: is cut"));
+        for (row, &frame) in found.rows.outer_iter().zip(&found.good) {
+            assert_eq!(row.to_vec(), super::super::encode_builtin(&image(frame).unwrap()));
+        }
+    }
+
+    /// Oracle: the definition of stopping at a bad image: it is named, and nothing is given.
+    #[test]
+    fn a_bad_image_stops_the_run_by_name() {
+        let (timeline, encoder) = (Timeline::unbroken(8), Encoder::builtin());
+        let folder = tempfile::tempdir().unwrap();
+        let (mut journal, before) = Journal::open(&folder.path().join("rows"), "k", encoder.dims()[0]).unwrap();
+        let cancel = Cancellation::default();
+        let task = Task { timeline: &timeline, image: &image, batch: 3, on_bad: OnBadImage::Stop, cancel: &cancel };
+        let error = encode_room(&task, &encoder, &mut journal, before, &|_| ()).unwrap_err();
+        assert_eq!(error.to_string(), "frame 3: is cut");
+    }
+}
