@@ -10,7 +10,7 @@ use super::encoder::{EncoderOptions, RuntimeOptions};
 use super::progress::bar;
 use super::say;
 use crate::cancel::Cancellation;
-use crate::encoder::{Encoded, Encoder, Journal, OnBadImage, Task, encode_room, read_image};
+use crate::encoder::{Encoded, Encoder, Journal, Kept, OnBadImage, Task, encode_room, read_image};
 use crate::features::{FeatureSource, Features};
 use crate::room::Room;
 use crate::store::{Store, StoredRoom};
@@ -71,7 +71,7 @@ impl Encode {
         let key = key(&stored, &encoder, &root);
         let (mut journal, before) = Journal::open(&self.journal_path(&key)?, &key, encoder.dims().iter().sum())?;
         let begun = Instant::now();
-        let encoded = self.encode(&stored.room, &root, &encoder, &mut journal, before)?;
+        let encoded = self.encode(&stored.room, &root, &encoder, Kept { journal: &mut journal, before })?;
         let seconds = begun.elapsed().as_secs_f64();
         say_bad(&stored.room, &encoded);
         if encoded.good.is_empty() {
@@ -108,14 +108,7 @@ impl Encode {
         Ok(folder.join(format!("{}-{}.rows", self.room, crate::store::short_digest(key))))
     }
 
-    fn encode(
-        &self,
-        room: &Room,
-        root: &Path,
-        encoder: &Encoder,
-        journal: &mut Journal,
-        before: Vec<(usize, Vec<f32>)>,
-    ) -> anyhow::Result<Encoded> {
+    fn encode(&self, room: &Room, root: &Path, encoder: &Encoder, kept: Kept<'_>) -> anyhow::Result<Encoded> {
         let images = room.images();
         let image = |row: usize| read_image(root, &images[row]);
         let cancel = Cancellation::default();
@@ -125,7 +118,7 @@ impl Encode {
         let progress = bar(room.frame_count() as u64, "encoding");
         let pool = rayon::ThreadPoolBuilder::new().num_threads(self.runtime.threads()).build()?;
         let told = |done: usize| progress.set_position(done as u64);
-        let encoded = pool.install(|| encode_room(&task, encoder, journal, before, &told));
+        let encoded = pool.install(|| encode_room(&task, encoder, Some(kept), &told));
         progress.finish_and_clear();
         encoded.context("what was encoded is kept; the same command goes on from there")
     }
@@ -144,7 +137,7 @@ fn images_root(room: &Room, given: Option<&Path>) -> anyhow::Result<PathBuf> {
 }
 
 /// Whether a room has features of that name, made like that.
-fn has(stored: &StoredRoom, source: &FeatureSource) -> bool {
+pub fn has(stored: &StoredRoom, source: &FeatureSource) -> bool {
     stored.features(&source.name).is_some_and(|set| set.source() == source)
 }
 
@@ -172,15 +165,21 @@ fn say_bad(room: &Room, encoded: &Encoded) {
     }
 }
 
-/// The room with its new features; without the bad frames, if there were any.
-fn whole(stored: StoredRoom, sources: &[FeatureSource], encoded: &Encoded) -> anyhow::Result<(Room, Vec<Features>)> {
-    let mut features = Vec::new();
+/// The columns of each layer.
+pub fn by_layer(sources: &[FeatureSource], rows: &ndarray::Array2<f32>) -> anyhow::Result<Vec<Features>> {
     let mut from = 0;
+    let mut features = Vec::with_capacity(sources.len());
     for source in sources {
-        let columns = encoded.rows.slice(ndarray::s![.., from..from + source.dim]).to_owned();
+        let columns = rows.slice(ndarray::s![.., from..from + source.dim]).to_owned();
         features.push(Features::new(source.clone(), columns)?);
         from += source.dim;
     }
+    Ok(features)
+}
+
+/// The room with its new features; without the bad frames, if there were any.
+fn whole(stored: StoredRoom, sources: &[FeatureSource], encoded: &Encoded) -> anyhow::Result<(Room, Vec<Features>)> {
+    let mut features = by_layer(sources, &encoded.rows)?;
     if encoded.bad.is_empty() {
         return Ok((stored.room, features));
     }

@@ -11,6 +11,7 @@ mod health;
 mod import;
 mod progress;
 mod serve;
+mod studio;
 mod train;
 
 use clap::{Parser, Subcommand};
@@ -35,6 +36,8 @@ enum Command {
     Encode(encode::Encode),
     /// List the encoders that are known, with their preprocessing
     Encoders(encoders::Encoders),
+    /// Draw a suite of rooms and encode it
+    Studio(studio::Studio),
     /// Learn an adapter from a room's features and publish it
     Train(train::Train),
     /// Score navigators on held-out motions: Hit@ε with baselines and intervals
@@ -63,6 +66,7 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Export(arguments) => arguments.run().await,
         Command::Encode(arguments) => arguments.run().await,
         Command::Encoders(arguments) => arguments.run(),
+        Command::Studio(arguments) => arguments.run().await,
         Command::Train(arguments) => arguments.run().await,
         Command::Evaluate(arguments) => arguments.run().await,
         Command::Demo(arguments) => arguments.run().await,

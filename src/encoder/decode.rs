@@ -4,7 +4,8 @@ use std::fs::File;
 use std::io::{Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
-use image::{ImageFormat, ImageReader, Limits};
+use image::codecs::png::PngEncoder;
+use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits};
 
 use super::Error;
 use crate::image::RgbImage;
@@ -84,6 +85,21 @@ pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
     let mut bytes = Vec::with_capacity(length as usize);
     file.take(length).read_to_end(&mut bytes).map_err(io)?;
     decode(&path.display().to_string(), &bytes, Bounds::LOCAL)
+}
+
+/// An image as PNG.
+///
+/// # Errors
+/// [`Error::BadImage`] if its bytes do not fit its size.
+pub fn encode_png(picture: &RgbImage) -> Result<Vec<u8>, Error> {
+    let mut bytes = Vec::new();
+    let encoder = PngEncoder::new(&mut bytes);
+    let (width, height) = (picture.width as u32, picture.height as u32);
+    encoder.write_image(&picture.bytes, width, height, ExtendedColorType::Rgb8).map_err(|error| Error::BadImage {
+        image: format!("picture of {width}×{height} pixels"),
+        problem: error.to_string(),
+    })?;
+    Ok(bytes)
 }
 
 #[cfg(test)]

@@ -16,6 +16,9 @@ const CHECK_BYTES: usize = 8;
 /// Magic, and the hash of the key.
 const HEADER_BYTES: usize = 16 + 32;
 
+/// Rows of features with the frames that they belong to.
+pub type NumberedRows = Vec<(usize, Vec<f32>)>;
+
 /// See the module.
 pub struct Journal {
     path: PathBuf,
@@ -29,7 +32,7 @@ impl Journal {
     ///
     /// # Errors
     /// [`Error::Io`], also when another process is at the same task.
-    pub fn open(path: &Path, key: &str, width: usize) -> Result<(Self, Vec<(usize, Vec<f32>)>), Error> {
+    pub fn open(path: &Path, key: &str, width: usize) -> Result<(Self, NumberedRows), Error> {
         let io = |cause| Error::Io { file: path.to_owned(), cause };
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder).map_err(io)?;
@@ -87,7 +90,7 @@ impl Journal {
         4 + 4 * self.width + CHECK_BYTES
     }
 
-    fn rows(&mut self) -> std::io::Result<Vec<(usize, Vec<f32>)>> {
+    fn rows(&mut self) -> std::io::Result<NumberedRows> {
         let mut reader = std::io::BufReader::new(&self.file);
         let mut record = vec![0; self.record_bytes()];
         let mut rows = Vec::new();

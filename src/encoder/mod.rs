@@ -19,13 +19,13 @@ mod run;
 mod tract;
 
 pub use builtin::{BUILTIN_DIM, builtin_source, encode_builtin};
-pub use decode::{Bounds, decode, read_image};
-pub use journal::Journal;
+pub use decode::{Bounds, decode, encode_png, read_image};
+pub use journal::{Journal, NumberedRows};
 pub use network::{Runtime, RuntimeKind};
 pub use pooling::Pooling;
 pub use preparation::{Filter, Preparation, Resize, normalised};
 pub use recipes::{RECIPES, Recipe, recipe};
-pub use run::{Encoded, OnBadImage, Task, encode_room};
+pub use run::{Encoded, Kept, OnBadImage, Task, encode_room};
 
 use std::path::{Path, PathBuf};
 
@@ -219,9 +219,13 @@ impl Encoder {
         &self.dims
     }
 
-    /// The size that images have once they are prepared, where the encoder fixes it: render at this to lose nothing.
-    pub fn size(&self) -> Option<(usize, usize)> {
-        self.preparation.size()
+    /// The size (width, height) of an image of 4:3 that is prepared without being resized: render at this.
+    pub fn render_size(&self) -> (usize, usize) {
+        match self.preparation.resize {
+            Resize::Whole { width, height } => (width, height),
+            Resize::Shortest(edge) => (edge * 4 / 3, edge),
+            Resize::None => self.preparation.crop.unwrap_or((320, 240)),
+        }
     }
 
     /// Resizes and crops an image as the encoder wants it, 8 bit.

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use ndarray::Array2;
 use rayon::prelude::*;
 
+use super::journal::NumberedRows;
 use super::{Encoder, Error, Journal};
 use crate::cancel::Cancellation;
 use crate::image::RgbImage;
@@ -47,6 +48,14 @@ pub struct Encoded {
     pub resumed: usize,
 }
 
+/// A journal, and the rows that were in it when it was opened.
+pub struct Kept<'a> {
+    /// Where rows go as they come.
+    pub journal: &'a mut Journal,
+    /// See [`Journal::open`].
+    pub before: NumberedRows,
+}
+
 /// Encodes every frame on the threads of the pool that calls; `done` hears how many are done.
 ///
 /// # Errors
@@ -55,11 +64,11 @@ pub struct Encoded {
 pub fn encode_room(
     task: &Task<'_>,
     encoder: &Encoder,
-    journal: &mut Journal,
-    before: Vec<(usize, Vec<f32>)>,
+    mut kept: Option<Kept<'_>>,
     done: &(dyn Fn(usize) + Sync),
 ) -> Result<Encoded, Error> {
     let frame_count = task.timeline.frame_count;
+    let before = kept.as_mut().map(|kept| std::mem::take(&mut kept.before)).unwrap_or_default();
     let mut rows: BTreeMap<usize, Vec<f32>> = before.into_iter().filter(|(row, _)| *row < frame_count).collect();
     let resumed = rows.len();
     done(resumed);
@@ -73,7 +82,9 @@ pub fn encode_room(
         let (encoded, prepared) =
             rayon::join(|| clips.encode(encoder), || next.map(|chunk| prepare(task, encoder, chunk)).transpose());
         let encoded = encoded?;
-        journal.append(clips.good.iter().copied().zip(encoded.outer_iter().map(row_of)))?;
+        if let Some(kept) = &mut kept {
+            kept.journal.append(clips.good.iter().copied().zip(encoded.outer_iter().map(row_of)))?;
+        }
         rows.extend(clips.good.iter().copied().zip(encoded.outer_iter().map(|row| row.to_vec())));
         bad.extend(clips.bad);
         done(rows.len() + bad.len());
@@ -175,6 +186,10 @@ mod tests {
         assert_eq!(clip(&timeline, 5, 5), [3, 4, 5, 5, 5]);
     }
 
+    fn kept(journal: &mut Journal, before: NumberedRows) -> Option<Kept<'_>> {
+        Some(Kept { journal, before })
+    }
+
     fn image(row: usize) -> Result<RgbImage, Error> {
         if row == 3 {
             return Err(Error::BadImage { image: "frame 3".to_owned(), problem: "is cut".to_owned() });
@@ -201,22 +216,22 @@ mod tests {
         };
         let task = |image, on_bad| Task { timeline: &timeline, image, batch: 2, on_bad, cancel: &cancel };
         let (mut journal, before) = Journal::open(&path, "k", width).unwrap();
-        let first = encode_room(&task(&counting, OnBadImage::Skip), &encoder, &mut journal, before, &|_| ());
+        let first = encode_room(&task(&counting, OnBadImage::Skip), &encoder, kept(&mut journal, before), &|_| ());
         assert!(matches!(first, Err(Error::Cancelled(_))));
         drop(journal);
         asked.lock().unwrap().clear();
         let (mut journal, before) = Journal::open(&path, "k", width).unwrap();
-        let kept = before.len();
-        assert!(kept >= 2, "something was journalled");
+        let done = before.len();
+        assert!(done >= 2, "something was journalled");
         let go_on = Cancellation::default();
         let again = |row: usize| {
             asked.lock().unwrap().push(row);
             image(row)
         };
         let task = Task { timeline: &timeline, image: &again, batch: 2, on_bad: OnBadImage::Skip, cancel: &go_on };
-        let found = encode_room(&task, &encoder, &mut journal, before, &|_| ()).unwrap();
-        assert_eq!(found.resumed, kept);
-        assert_eq!(asked.lock().unwrap().len(), 8 - kept);
+        let found = encode_room(&task, &encoder, kept(&mut journal, before), &|_| ()).unwrap();
+        assert_eq!(found.resumed, done);
+        assert_eq!(asked.lock().unwrap().len(), 8 - done);
         assert_eq!(found.good, [0, 1, 2, 4, 5, 6, 7]);
         assert_eq!(found.bad.len(), 1);
         assert!(found.bad[0].1.contains("frame 3: is cut"));
@@ -233,7 +248,7 @@ mod tests {
         let (mut journal, before) = Journal::open(&folder.path().join("rows"), "k", encoder.dims()[0]).unwrap();
         let cancel = Cancellation::default();
         let task = Task { timeline: &timeline, image: &image, batch: 3, on_bad: OnBadImage::Stop, cancel: &cancel };
-        let error = encode_room(&task, &encoder, &mut journal, before, &|_| ()).unwrap_err();
+        let error = encode_room(&task, &encoder, kept(&mut journal, before), &|_| ()).unwrap_err();
         assert_eq!(error.to_string(), "frame 3: is cut");
     }
 }

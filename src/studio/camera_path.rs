@@ -49,9 +49,67 @@ pub fn camera_path(scene: &Scene, frame_count: usize, seed: u64) -> Vec<Pose> {
             let t = frame as f64;
             let position = Vector3::new(size.x * 0.5 + x.at(t), size.y * 0.5 + y.at(t), 1.5 + z.at(t));
             let orientation = looking(heading + yaw.at(t), -0.12 + pitch.at(t), roll.at(t));
-            Isometry3::from_parts(Translation3::from(position), UnitQuaternion::from_rotation_matrix(&orientation))
+            posed(position, orientation)
         })
         .collect()
+}
+
+/// Round and round in the middle of a room of `size`, looking about, each place several times.
+pub(super) fn around(size: Vector3<f64>, frame_count: usize, random: &mut ChaCha8Rng) -> Vec<Pose> {
+    let mut swing = |amplitude: f64, period: f64| {
+        let period = period * random.random_range(0.92..1.08);
+        Swing::new(amplitude, period, random)
+    };
+    let x = swing(size.x * 0.09, 150.0);
+    let y = swing(size.y * 0.09, 115.0);
+    let z = swing(0.08, 130.0);
+    let yaw = swing(0.45, 190.0);
+    let (pitch, roll) = (swing(0.08, 140.0), swing(0.04, 120.0));
+    let heading = random.random_range(0.0..std::f64::consts::TAU);
+    let height = random.random_range(1.4..1.65);
+    let pose = |frame: usize| {
+        let t = frame as f64;
+        let at = Vector3::new(size.x * 0.5 + x.at(t), size.y * 0.5 + y.at(t), height + z.at(t));
+        posed(at, looking(heading + yaw.at(t), -0.12 + pitch.at(t), roll.at(t)))
+    };
+    (0..frame_count).map(pose).collect()
+}
+
+/// A way that is gone once, on the floor, metres.
+pub(super) struct Way {
+    pub from: Vector3<f64>,
+    pub to: Vector3<f64>,
+    /// To the sides.
+    pub sway: f64,
+    /// By how much the view turns from the first frame to the last, radians.
+    pub sweep: f64,
+}
+
+/// Along a way once, looking ahead.
+pub(super) fn along(way: &Way, frame_count: usize, random: &mut ChaCha8Rng) -> Vec<Pose> {
+    let mut swing = |amplitude: f64, period: f64| {
+        let period = period * random.random_range(0.85..1.15);
+        Swing::new(amplitude, period, random)
+    };
+    let (side, height, yaw) = (swing(way.sway, 210.0), swing(0.06, 140.0), swing(0.2, 230.0));
+    let (pitch, roll) = (swing(0.07, 160.0), swing(0.04, 130.0));
+    let level = random.random_range(1.4..1.65);
+    let ahead = way.to - way.from;
+    let heading = ahead.y.atan2(ahead.x);
+    let aside = Vector3::new(-ahead.y, ahead.x, 0.0) / ahead.norm().max(1e-9);
+    let last = frame_count.saturating_sub(1).max(1) as f64;
+    let pose = |frame: usize| {
+        let (t, part) = (frame as f64, frame as f64 / last);
+        let mut at = way.from + ahead * part + aside * side.at(t);
+        at.z = level + height.at(t);
+        let turned = heading + way.sweep * (part - 0.5) + yaw.at(t);
+        posed(at, looking(turned, -0.1 + pitch.at(t), roll.at(t)))
+    };
+    (0..frame_count).map(pose).collect()
+}
+
+fn posed(at: Vector3<f64>, orientation: Rotation3<f64>) -> Pose {
+    Isometry3::from_parts(Translation3::from(at), UnitQuaternion::from_rotation_matrix(&orientation))
 }
 
 /// `world_from_camera` of a camera that looks along `yaw` from the x axis, `pitch` above the horizon, tilted by

@@ -41,6 +41,60 @@ pub(super) fn furnish(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Piece>
     pieces
 }
 
+/// Furnishes a room of `size` with more or less along each wall, and perhaps a table.
+pub(super) fn furnish_loosely(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Piece> {
+    let mut pieces = Vec::new();
+    let quarter = std::f64::consts::FRAC_PI_2;
+    for wall in 0..4u8 {
+        let (length, turn) = (if wall % 2 == 0 { size.x } else { size.y }, f64::from(wall) * quarter);
+        let slots = random.random_range(1..=(length / 1.9) as u32);
+        for slot in 0..slots {
+            let along = length * (f64::from(slot) + 0.5) / f64::from(slots) + random.random_range(-0.12..0.12);
+            let blocks = wall_piece(random);
+            if random.random_bool(0.2) {
+                continue;
+            }
+            let at = match wall {
+                0 => [along, 0.02],
+                1 => [size.x - 0.02, along],
+                2 => [size.x - along, size.y - 0.02],
+                _ => [0.02, size.y - along],
+            };
+            pieces.push(Piece::new(&blocks, at, turn, random));
+        }
+    }
+    if random.random_bool(0.7) {
+        let centre = [size.x * random.random_range(0.42..0.58), size.y * random.random_range(0.42..0.58)];
+        let turn = random.random_range(-0.6..0.6);
+        pieces.push(Piece::new(&table(random), centre, turn, random));
+        for side in 0..random.random_range(1..5) {
+            let angle = turn + f64::from(side) * 1.6 + random.random_range(-0.3..0.3);
+            let at = [centre[0] + 0.85 * angle.cos(), centre[1] + 0.75 * angle.sin()];
+            pieces.push(Piece::new(&chair(random), at, angle + quarter, random));
+        }
+    }
+    pieces
+}
+
+/// Furnishes a corridor along x: shallow pieces on its long sides.
+pub(super) fn furnish_corridor(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Piece> {
+    let mut pieces = Vec::new();
+    let mut along = random.random_range(0.9..1.8);
+    while along < size.x - 0.9 {
+        let blocks = match random.random_range(0..5) {
+            0 => bookshelf(random),
+            1 => wardrobe(random),
+            2 => plant(random),
+            _ => sideboard(random),
+        };
+        let far = random.random_bool(0.5);
+        let (at, turn) = if far { ([along, size.y - 0.02], std::f64::consts::PI) } else { ([along, 0.02], 0.0) };
+        pieces.push(Piece::new(&blocks, at, turn, random));
+        along += random.random_range(1.5..2.8);
+    }
+    pieces
+}
+
 fn wall_piece(random: &mut ChaCha8Rng) -> Vec<Block> {
     match random.random_range(0..7) {
         0 => bookshelf(random),

@@ -6,10 +6,13 @@
 mod camera_path;
 mod furniture;
 mod render;
+mod suite;
+mod surfaces;
 mod texture;
 
 pub use camera_path::camera_path;
-pub use render::{Camera, render};
+pub use render::{Camera, Sampling, render};
+pub use suite::{SuiteRoom, Walk};
 
 use nalgebra::{Point3, Vector3};
 use rand::{RngExt, SeedableRng};
@@ -25,6 +28,22 @@ pub struct Scene {
     shell: Shell,
     pieces: Vec<Piece>,
     lamp: Point3<f64>,
+    light: Light,
+}
+
+/// How a room is lit.
+#[derive(Debug, Clone, Copy)]
+struct Light {
+    /// Of the lamp, at about a metre.
+    lamp: f64,
+    /// Of the lamp's colour.
+    lamp_tint: [f64; 3],
+    /// What comes from everywhere.
+    sky: f64,
+}
+
+impl Light {
+    const PLAIN: Self = Self { lamp: 1.9, lamp_tint: [1.0; 3], sky: 0.30 };
 }
 
 /// How floor, walls and ceiling look.
@@ -32,6 +51,7 @@ pub struct Scene {
 struct Shell {
     seed: u32,
     wall_colours: [Colour; 4],
+    wallpaper: Wallpaper,
     floor: Floor,
     /// Things on each wall, in wall coordinates (along, up), metres.
     panels: [Vec<Panel>; 4],
@@ -42,6 +62,18 @@ struct Shell {
 enum Floor {
     Planks(Colour),
     Tiles(Colour),
+    Carpet(Colour),
+}
+
+/// What is on the walls' paint; lengths in metres.
+#[derive(Debug, Clone, Copy)]
+enum Wallpaper {
+    None,
+    /// Vertical, this far apart.
+    Stripes(f64),
+    /// Boards up to this height.
+    Boards(f64),
+    Bricks,
 }
 
 /// A rectangle on a wall.
@@ -97,7 +129,7 @@ impl Scene {
         let pieces = furniture::furnish(size, &mut random);
         let lamp =
             Point3::new(size.x * random.random_range(0.4..0.6), size.y * random.random_range(0.4..0.6), size.z - 0.25);
-        Self { size, shell, pieces, lamp }
+        Self { size, shell, pieces, lamp, light: Light::PLAIN }
     }
 
     /// Width (x), depth (y) and height (z), metres.
@@ -138,7 +170,7 @@ impl Shell {
                 Colour::of_hue(random.random_range(0.0..1.0), 0.3, 0.75),
             ],
         };
-        Self { seed: random.random(), wall_colours, floor, panels, rug }
+        Self { seed: random.random(), wall_colours, wallpaper: Wallpaper::None, floor, panels, rug }
     }
 }
 
