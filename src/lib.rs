@@ -18,6 +18,7 @@ pub mod training; // from a room to an adapter and its scores
 pub mod navigation; // from a frame and a motion to the frames that follow
 pub mod localization; // from a feature to a pose, in one room or in all
 pub mod odometry; // from two features to the motion between them
+pub mod metrics; // M1 to M3: how much of SE(3) the features hold; M4 is training
 pub mod eval; // Hit@ε on held-out motions
 
 // Rim: one module per outside format.

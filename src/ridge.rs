@@ -58,12 +58,12 @@ impl Ridge {
         };
         let (input_mean, target_mean) = (centre(inputs), centre(targets));
         let (x, y) = (&inputs - &input_mean, &targets - &target_mean);
-        let mut gram = x.t().dot(&x);
-        gram.diag_mut().mapv_inplace(|value| value + alpha);
-        let right = x.t().dot(&y);
-        let cholesky = Cholesky::new(matrix(gram.view())).ok_or(Error::NotPositiveDefinite)?;
-        let solution = cholesky.solve(&matrix(right.view()));
-        let coefficients = Array2::from_shape_fn((targets.ncols(), inputs.ncols()), |(t, d)| solution[(d, t)]);
+        // (XᵀX + α)⁻¹XᵀY = Xᵀ(XXᵀ + α)⁻¹Y: whichever of the two systems is smaller.
+        let coefficients = if x.nrows() < x.ncols() {
+            solved(x.dot(&x.t()), alpha, &y)?.reversed_axes().dot(&x)
+        } else {
+            solved(x.t().dot(&x), alpha, &x.t().dot(&y))?.reversed_axes()
+        };
         let intercept = target_mean - coefficients.dot(&input_mean);
         Ok(Self { coefficients, intercept })
     }
@@ -72,6 +72,14 @@ impl Ridge {
     pub fn predict(&self, input: ArrayView1<'_, f64>) -> Array1<f64> {
         self.coefficients.dot(&input) + &self.intercept
     }
+}
+
+/// (G + α)⁻¹R for a symmetric G.
+fn solved(mut gram: Array2<f64>, alpha: f64, right: &Array2<f64>) -> Result<Array2<f64>, Error> {
+    gram.diag_mut().mapv_inplace(|value| value + alpha);
+    let cholesky = Cholesky::new(matrix(gram.view())).ok_or(Error::NotPositiveDefinite)?;
+    let solution = cholesky.solve(&matrix(right.view()));
+    Ok(Array2::from_shape_fn(right.dim(), |(row, column)| solution[(row, column)]))
 }
 
 fn matrix(array: ArrayView2<'_, f64>) -> DMatrix<f64> {
@@ -97,6 +105,21 @@ mod tests {
         let inputs = array![[1.0], [2.0], [4.0]];
         let fit = Ridge::fit(inputs.view(), array![[7.0], [7.0], [7.0]].view(), 1.0, Intercept::Fitted).unwrap();
         assert!((fit.predict(array![3.0].view())[0] - 7.0).abs() < 1e-12);
+    }
+
+    /// Oracle: the definition. At the minimum of ‖Y − XB − b‖² + α‖B‖² the gradient Xᵀ(Y − XB − b) − αB is zero, with
+    /// more inputs than rows as with fewer.
+    #[test]
+    fn the_gradient_is_zero_however_wide_the_inputs() {
+        for (rows, columns) in [(7, 30), (30, 7), (8, 8)] {
+            let wave = |i: usize, j: usize| ((3 * i + 7 * j) as f64 * 0.37).sin() + 0.1 * (i * j) as f64;
+            let x = Array2::from_shape_fn((rows, columns), |(i, j)| wave(i, j));
+            let y = Array2::from_shape_fn((rows, 2), |(i, t)| wave(t + 5, i));
+            let fit = Ridge::fit(x.view(), y.view(), 0.5, Intercept::Fitted).unwrap();
+            let predicted = x.dot(&fit.coefficients.t()) + &fit.intercept;
+            let gradient = x.t().dot(&(&y - &predicted)) - 0.5 * &fit.coefficients.t();
+            assert!(gradient.iter().all(|g| g.abs() < 1e-9), "{rows} rows, {columns} columns");
+        }
     }
 
     #[test]

@@ -115,6 +115,13 @@ pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
+/// Sample standard deviation (n − 1).
+pub fn deviation(values: &[f64]) -> f64 {
+    let centre = mean(values);
+    let squares: f64 = values.iter().map(|value| (value - centre).powi(2)).sum();
+    (squares / (values.len() as f64 - 1.0)).sqrt()
+}
+
 fn pairs_of(truth: &[Twist], predicted: &[Twist], value: impl Fn(&Twist) -> f64) -> Vec<(f64, f64)> {
     truth.iter().zip(predicted).map(|(truth, predicted)| (value(truth), value(predicted))).collect()
 }

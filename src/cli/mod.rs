@@ -12,6 +12,7 @@ mod import;
 mod progress;
 mod serve;
 mod studio;
+mod sweep;
 mod train;
 
 use clap::{Parser, Subcommand};
@@ -42,6 +43,8 @@ enum Command {
     Train(train::Train),
     /// Score navigators on held-out motions: Hit@ε with baselines and intervals
     Evaluate(evaluate::Evaluate),
+    /// Score many features at once
+    Sweep(sweep::Sweep),
     /// Answer over gRPC until told to stop
     Serve(serve::Serve),
     /// Ask a server for the frames that a motion leads to
@@ -70,6 +73,7 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Train(arguments) => arguments.run().await,
         Command::Evaluate(arguments) => arguments.run().await,
         Command::Demo(arguments) => arguments.run().await,
+        Command::Sweep(arguments) => arguments.run().await,
         Command::Serve(arguments) => arguments.run().await,
         Command::Navigate(arguments) => arguments.run().await,
         Command::Localize(arguments) => arguments.run().await,

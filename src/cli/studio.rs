@@ -28,8 +28,8 @@ const SHEET_SIZE: (usize, usize) = (160, 120);
 #[derive(Debug, Args)]
 pub struct Studio {
     /// Where the rooms go; made if it is not there
-    #[arg(long, env = "SEESE3_STORE", visible_alias = "store")]
-    out: String,
+    #[arg(long, env = "SEESE3_STORE", visible_alias = "store", required_unless_present = "sheet")]
+    out: Option<String>,
     /// How many rooms
     #[arg(long, default_value_t = 231, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     rooms: u32,
@@ -72,14 +72,15 @@ impl Studio {
         if let Some(file) = &self.sheet {
             return self.sheet(file);
         }
-        if self.keep_images && self.out.contains("://") {
+        let out = self.out()?;
+        if self.keep_images && out.contains("://") {
             bail!("--keep-images needs a store that is a folder");
         }
         let encoder = self.encoder.open(&self.encode, &self.runtime.runtime())?;
         if encoder.window() > 1 && self.keep_images {
             bail!("--keep-images draws single images; leave it out for an encoder of clips");
         }
-        let store = Store::create(&self.out)?;
+        let store = Store::create(out)?;
         let sources = encoder.sources(&self.prefix());
         let (width, height) = encoder.render_size();
         say(format_args!(
@@ -137,6 +138,10 @@ impl Studio {
         Ok(())
     }
 
+    fn out(&self) -> anyhow::Result<&str> {
+        self.out.as_deref().context("--out DIR is required")
+    }
+
     fn prefix(&self) -> String {
         let stem = || Path::new(&self.encode).file_stem().map(|stem| stem.to_string_lossy().into_owned());
         self.prefix.clone().or_else(stem).unwrap_or_default()
@@ -156,7 +161,8 @@ impl Studio {
         };
         let mut frames = Frames { poses, ..Frames::default() };
         if self.keep_images {
-            let root = Path::new(&self.out).canonicalize().with_context(|| self.out.clone())?.join("images");
+            let out = self.out()?;
+            let root = Path::new(out).canonicalize().with_context(|| out.to_owned())?.join("images");
             provenance.images_root = root.to_str().context("the store's path is not UTF-8")?.to_owned();
             frames.images = (0..self.frames).map(|frame| format!("{name}/frame-{frame:06}.png")).collect();
         }

@@ -256,8 +256,8 @@ fn resized(image: &RgbImage, width: usize, height: usize, filter: Filter) -> Res
         image: format!("image of {}×{} pixels", image.width, image.height),
         problem: format!("cannot be resized to {width}×{height}: {problem}"),
     };
-    if width == 0 || height == 0 {
-        return Err(bad("nothing is left of it".to_owned()));
+    if width * height == 0 || image.width * image.height == 0 {
+        return Err(bad("there is nothing in it".to_owned()));
     }
     let from = ImageRef::new(image.width as u32, image.height as u32, &image.bytes, PixelType::U8x3)
         .map_err(|error| bad(error.to_string()))?;

@@ -1,11 +1,13 @@
 //! Results for people and for scripts: tables, JSON, pictures.
 
 mod json;
+mod layers;
 mod plot;
 mod table;
 mod trajectory;
 
 pub use json::{evaluation_json, training_json};
+pub use layers::{LayerScores, layers_json, layers_table};
 pub use plot::{PathPlot, path_svg};
 pub use table::{evaluation_table, training_table};
 pub use trajectory::{kitti_trajectory, tum_trajectory};

@@ -2,7 +2,7 @@
 
 use super::TrainingRun;
 use crate::eval::{Report, Row};
-use crate::scores::{Rate, mean};
+use crate::scores::{Rate, deviation, mean};
 
 /// Hit@ε by navigator with 95 % intervals, then medians and joint recalls.
 pub fn evaluation_table(report: &Report) -> String {
@@ -85,15 +85,8 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
     aligned(&lines)
 }
 
-/// Sample standard deviation (n − 1).
-fn deviation(values: &[f64]) -> f64 {
-    let centre = mean(values);
-    let squares: f64 = values.iter().map(|value| (value - centre).powi(2)).sum();
-    (squares / (values.len() as f64 - 1.0)).sqrt()
-}
-
 /// Columns as wide as their widest cell; the first to the left, the others to the right.
-fn aligned(lines: &[Vec<String>]) -> String {
+pub(super) fn aligned(lines: &[Vec<String>]) -> String {
     let columns = lines.iter().map(Vec::len).max().unwrap_or(0);
     let width = |column: usize| {
         lines.iter().filter_map(|line| line.get(column)).map(|cell| cell.chars().count()).max().unwrap_or(0)

@@ -60,8 +60,8 @@ pub(super) fn around(size: Vector3<f64>, frame_count: usize, random: &mut ChaCha
         let period = period * random.random_range(0.92..1.08);
         Swing::new(amplitude, period, random)
     };
-    let x = swing(size.x * 0.09, 150.0);
-    let y = swing(size.y * 0.09, 115.0);
+    let x = swing((size.x * 0.09).min(0.45), 150.0);
+    let y = swing((size.y * 0.09).min(0.4), 115.0);
     let z = swing(0.08, 130.0);
     let yaw = swing(0.45, 190.0);
     let (pitch, roll) = (swing(0.08, 140.0), swing(0.04, 120.0));

@@ -7,6 +7,7 @@
 mod support;
 
 mod geometry;
+mod metrics;
 mod navigation;
 mod scores;
 mod training;

@@ -1,0 +1,204 @@
+//! `seese3 sweep layers`: M1 to M4 over the layers of a features set.
+
+use std::path::PathBuf;
+
+use anyhow::bail;
+use clap::{Args, Subcommand};
+use rayon::prelude::*;
+
+use super::progress::bar;
+use super::train::{PresetName, SplitName};
+use super::{check_writable, say, write_json};
+use crate::adapter::Preset;
+use crate::features::Features;
+use crate::metrics::{Duplicates, IntrinsicDimension, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
+use crate::pairs::Split;
+use crate::report::{LayerScores, layers_json, layers_table};
+use crate::room::Room;
+use crate::scores::{MotionScores, deviation, mean};
+use crate::store::{Store, StoredRoom};
+use crate::training::{Lesson, Recipe, learn};
+
+#[derive(Debug, Args)]
+pub struct Sweep {
+    #[command(subcommand)]
+    over: Over,
+}
+
+#[derive(Debug, Subcommand)]
+enum Over {
+    /// M1 to M4 over the layers of a features set, the best by each
+    Layers(Layers),
+}
+
+#[derive(Debug, Args)]
+struct Layers {
+    /// The store
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// The room; may be given several times, then means over rooms are shown
+    #[arg(long = "room", required = true)]
+    rooms: Vec<String>,
+    /// Features by name, or what their names begin with; all of the room's if none is given
+    #[arg(long, value_delimiter = ',')]
+    features: Vec<String>,
+    /// Frames from source to target, of M3 and M4
+    #[arg(long, default_value_t = 40)]
+    stride: u32,
+    /// How frames are kept apart, in M3 and M4
+    #[arg(long, value_enum, default_value_t = SplitName::Time)]
+    split: SplitName,
+    /// The protocol of M4
+    #[arg(long, value_enum, default_value_t = PresetName::PaperBase)]
+    preset: PresetName,
+    /// Passes of M4 over the pairs, instead of the preset's
+    #[arg(long)]
+    epochs: Option<usize>,
+    /// Adapters of M4, from seed 0 on
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1_000))]
+    seeds: u64,
+    /// Frames that M1 compares
+    #[arg(long, default_value_t = 256)]
+    m1_frames: usize,
+    /// Stride of M1
+    #[arg(long, default_value_t = 1)]
+    m1_stride: usize,
+    /// Neighbours of M1
+    #[arg(long, default_value_t = 10)]
+    m1_k: usize,
+    /// Frames to each side that are no neighbours, in M1
+    #[arg(long, default_value_t = 10)]
+    m1_exclusion: usize,
+    /// Frames to each side that are no neighbours, in M2; 0 is the paper's, which measures the path rather than the room
+    #[arg(long, default_value_t = 10)]
+    m2_gap: usize,
+    /// Write all of it here as JSON
+    #[arg(long)]
+    json: Option<PathBuf>,
+}
+
+impl Sweep {
+    pub async fn run(self) -> anyhow::Result<()> {
+        let Over::Layers(layers) = self.over;
+        layers.run().await
+    }
+}
+
+impl Layers {
+    async fn run(self) -> anyhow::Result<()> {
+        if let Some(file) = &self.json {
+            check_writable(file)?;
+        }
+        let store = Store::open(&self.store)?;
+        let mut rooms = Vec::new();
+        for room in &self.rooms {
+            rooms.push(store.load_room(room, None).await?);
+        }
+        let names = self.names(&rooms)?;
+        let tasks: Vec<(usize, &StoredRoom, &Features)> = (0..names.len())
+            .flat_map(|layer| rooms.iter().map(move |room| (layer, room)))
+            .filter_map(|(layer, room)| Some((layer, room, room.features(&names[layer])?)))
+            .collect();
+        let progress = bar(tasks.len() as u64, "layers");
+        let scored: Vec<(usize, LayerScores)> = tasks
+            .into_par_iter()
+            .map(|(layer, stored, features)| {
+                let scores = self.scores(stored, features)?;
+                progress.inc(1);
+                Ok((layer, scores))
+            })
+            .collect::<anyhow::Result<_>>()?;
+        progress.finish_and_clear();
+        let scores: Vec<LayerScores> = scored.into_iter().map(|(_, scores)| scores).collect();
+        let split: Split = self.split.into();
+        let preset: Preset = self.preset.into();
+        say(format_args!(
+            "{} rooms; M1: {} frames at stride {}, k {}, exclusion {}; M2: gap {}; M3, M4: stride {}, split {split}; \
+             M4: {}, {} seeds",
+            rooms.len(),
+            self.m1_frames,
+            self.m1_stride,
+            self.m1_k,
+            self.m1_exclusion,
+            self.m2_gap,
+            self.stride,
+            preset.name(),
+            self.seeds
+        ));
+        say(layers_table(&scores).trim_end());
+        say("* the best: M1 highest, M2 nearest to 6 (SE(3)), M3 and M4 highest; means over rooms");
+        if let Some(file) = &self.json {
+            write_json(file, &layers_json(&scores))?;
+            say(format_args!("wrote {}", file.display()));
+        }
+        Ok(())
+    }
+
+    /// The features that every room has, of those that were asked for.
+    fn names(&self, rooms: &[StoredRoom]) -> anyhow::Result<Vec<String>> {
+        let wanted = |name: &str| {
+            self.features.is_empty()
+                || self.features.iter().any(|given| {
+                    name == given || name.strip_prefix(given.as_str()).is_some_and(|rest| rest.starts_with('-'))
+                })
+        };
+        let all: Vec<&str> = rooms[0].features.iter().map(|set| set.source().name.as_str()).collect();
+        let names: Vec<String> = all.iter().filter(|name| wanted(name)).map(|&name| name.to_owned()).collect();
+        if names.is_empty() {
+            bail!("room '{}' has no such features; it has {}", rooms[0].room.id(), all.join(", "));
+        }
+        for name in &names {
+            for stored in rooms {
+                if stored.features(name).is_none() {
+                    bail!(
+                        "room '{}' has no features '{name}', which room '{}' has",
+                        stored.room.id(),
+                        rooms[0].room.id()
+                    );
+                }
+            }
+        }
+        Ok(names)
+    }
+
+    fn scores(&self, stored: &StoredRoom, features: &Features) -> anyhow::Result<LayerScores> {
+        let (room, rows) = (&stored.room, features.rows());
+        let knn =
+            MutualKnn { frames: self.m1_frames, stride: self.m1_stride, k: self.m1_k, exclusion: self.m1_exclusion };
+        let m2: IntrinsicDimension = intrinsic_dimension(rows, self.m2_gap, Duplicates::DropRows)?;
+        let m3: MotionScores = ridge_probe(rows, room, self.split.into(), self.stride)?;
+        let runs: Vec<f64> = (0..self.seeds)
+            .into_par_iter()
+            .map(|seed| self.adapter_r2(stored, features, seed))
+            .collect::<anyhow::Result<_>>()?;
+        Ok(LayerScores {
+            features: features.source().name.clone(),
+            room: room_name(room),
+            dim: features.source().dim,
+            m1: mutual_knn(rows, room.poses(), &knn)?,
+            m2_two_nn: m2.two_nn.linear,
+            m2_mle: m2.mle_unbiased.harmonic,
+            m2_dropped: m2.dropped,
+            m3_r2: m3.overall,
+            m4_r2: mean(&runs),
+            m4_deviation: deviation(&runs),
+            m4_runs: runs,
+        })
+    }
+
+    fn adapter_r2(&self, stored: &StoredRoom, features: &Features, seed: u64) -> anyhow::Result<f64> {
+        let recipe = Recipe {
+            preset: self.preset.into(),
+            split: self.split.into(),
+            stride: self.stride,
+            epochs: self.epochs,
+            seed,
+        };
+        let lesson = Lesson { room: &stored.room, revision: stored.revision, features };
+        Ok(learn(lesson, &recipe, &mut |_| ())?.1.test.overall)
+    }
+}
+
+fn room_name(room: &Room) -> String {
+    room.id().to_string()
+}
