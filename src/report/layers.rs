@@ -47,7 +47,8 @@ pub fn layers_table(scores: &[LayerScores]) -> String {
     };
     let highest = |value: f64| value;
     let near_six = |value: f64| -(value - 6.0).abs();
-    let columns: [(Vec<f64>, fn(f64) -> f64); 5] = [
+    type Merit = fn(f64) -> f64;
+    let columns: [(Vec<f64>, Merit); 5] = [
         (column(|score| score.m1), highest),
         (column(|score| score.m2_two_nn), near_six),
         (column(|score| score.m2_mle), near_six),
