@@ -28,9 +28,12 @@ impl Server {
     }
 }
 
-/// A row of a NumPy file of features.
+/// A row of a NumPy file of features, or an image.
 #[derive(Debug, Args)]
 struct FeatureRow {
+    /// A JPEG or PNG file, for a server that was started with --encoder
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["feature", "row"])]
+    image: Option<PathBuf>,
     /// A NumPy file of features, (n, d)
     #[arg(long, value_name = "FILE", requires = "row")]
     feature: Option<PathBuf>,
@@ -41,6 +44,9 @@ struct FeatureRow {
 
 impl FeatureRow {
     fn view(&self) -> anyhow::Result<Option<pb::View>> {
+        if let Some(file) = &self.image {
+            return Ok(Some(image_view(file)?));
+        }
         match (&self.feature, self.row) {
             (Some(file), Some(row)) => Ok(Some(feature_view(file, row)?)),
             (None, Some(_)) => bail!("--row needs --feature FILE"),
@@ -58,6 +64,11 @@ fn feature_view(file: &Path, row: usize) -> anyhow::Result<pb::View> {
     Ok(pb::View { view: Some(pb::view::View::Feature(feature)) })
 }
 
+fn image_view(file: &Path) -> anyhow::Result<pb::View> {
+    let bytes = std::fs::read(file).with_context(|| file.display().to_string())?;
+    Ok(pb::View { view: Some(pb::view::View::Image(bytes)) })
+}
+
 fn frame_view(frame: u32) -> pb::View {
     pb::View { view: Some(pb::view::View::FrameId(frame)) }
 }
@@ -73,7 +84,7 @@ pub struct Navigate {
     #[arg(long, default_value = "")]
     adapter: String,
     /// The frame to start from
-    #[arg(long, conflicts_with = "feature")]
+    #[arg(long, conflicts_with_all = ["feature", "image"])]
     from: Option<u32>,
     #[command(flatten)]
     feature: FeatureRow,
@@ -123,7 +134,7 @@ impl Navigate {
         let source = match (self.from, self.feature.view()?) {
             (Some(frame), _) => frame_view(frame),
             (None, Some(view)) => view,
-            (None, None) => bail!("--from FRAME or --feature FILE --row ROW is required"),
+            (None, None) => bail!("--from FRAME, --feature FILE --row ROW or --image FILE is required"),
         };
         let displacement = match (self.to, &self.twist) {
             (Some(frame), _) => Displacement::TargetFrameId(frame),
@@ -222,7 +233,7 @@ pub struct Localize {
     #[arg(long, default_value = "")]
     adapter: String,
     /// A frame of the one room that is named
-    #[arg(long, conflicts_with = "feature")]
+    #[arg(long, conflicts_with_all = ["feature", "image"])]
     frame: Option<u32>,
     #[command(flatten)]
     feature: FeatureRow,
@@ -236,7 +247,7 @@ impl Localize {
         let view = match (self.frame, self.feature.view()?) {
             (Some(frame), _) => frame_view(frame),
             (None, Some(view)) => view,
-            (None, None) => bail!("--feature FILE --row ROW or --frame FRAME is required"),
+            (None, None) => bail!("--feature FILE --row ROW, --image FILE or --frame FRAME is required"),
         };
         let request = pb::LocalizeRequest {
             rooms: self.rooms,
@@ -268,6 +279,9 @@ pub struct Motion {
     /// Two frames of the room, A,B
     #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with = "features")]
     frames: Option<Vec<u32>>,
+    /// Two JPEG or PNG files, A,B, for a server that was started with --encoder
+    #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "features"])]
+    images: Option<Vec<PathBuf>>,
     /// A NumPy file of features, (n, d)
     #[arg(long, value_name = "FILE", requires = "rows")]
     features: Option<PathBuf>,
@@ -281,7 +295,10 @@ impl Motion {
         let (first, second) = match (self.frames.as_deref(), &self.features, self.rows.as_deref()) {
             (Some(&[a, b]), _, _) => (frame_view(a), frame_view(b)),
             (None, Some(file), Some(&[a, b])) => (feature_view(file, a)?, feature_view(file, b)?),
-            _ => bail!("--frames A,B or --features FILE --rows A,B is required"),
+            _ => match self.images.as_deref() {
+                Some([a, b]) => (image_view(a)?, image_view(b)?),
+                _ => bail!("--frames A,B, --features FILE --rows A,B or --images A,B is required"),
+            },
         };
         let request = pb::EstimateMotionRequest {
             adapter: self.adapter,

@@ -24,19 +24,26 @@ pub struct RuntimeOptions {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum RuntimeName {
+pub enum RuntimeName {
+    /// Pure Rust
     Tract,
+    /// The library, loaded when a model is opened
     Onnxruntime,
+}
+
+impl From<RuntimeName> for RuntimeKind {
+    fn from(name: RuntimeName) -> Self {
+        match name {
+            RuntimeName::Tract => Self::Tract,
+            RuntimeName::Onnxruntime => Self::OnnxRuntime,
+        }
+    }
 }
 
 impl RuntimeOptions {
     /// As the library wants it.
     pub fn runtime(&self) -> Runtime {
-        let kind = match self.runtime {
-            RuntimeName::Tract => RuntimeKind::Tract,
-            RuntimeName::Onnxruntime => RuntimeKind::OnnxRuntime,
-        };
-        Runtime { kind, threads: self.threads(), library: self.library.clone() }
+        Runtime { kind: self.runtime.into(), threads: self.threads(), library: self.library.clone() }
     }
 
     /// How many threads are meant.

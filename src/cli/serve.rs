@@ -7,10 +7,12 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 use tokio::net::TcpListener;
 
+use super::encoder::RuntimeName;
 use super::say;
+use crate::encoder::{Bounds, Runtime};
 use crate::index::HnswParameters;
 use crate::navigation::{IndexKind, Limits};
-use crate::service::{Config, run, shutdown_signal};
+use crate::service::{Config, ImageEncoders, run, shutdown_signal};
 use crate::store::Store;
 
 #[derive(Debug, Args)]
@@ -24,6 +26,19 @@ pub struct Serve {
     /// How frames are searched
     #[arg(long, env = "SEESE3_INDEX", value_enum, default_value_t = IndexName::Exact)]
     index: IndexName,
+    /// Take images instead of features: `builtin`, `pixels`, or the ONNX file that an adapter's features were made by;
+    /// may be given several times
+    #[arg(long = "encoder", value_name = "MODEL")]
+    encoders: Vec<String>,
+    /// What runs ONNX models: tract needs nothing, onnxruntime is faster
+    #[arg(long, env = "SEESE3_RUNTIME", value_enum, default_value_t = RuntimeName::Tract)]
+    runtime: RuntimeName,
+    /// The shared library of onnxruntime
+    #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
+    library: Option<std::path::PathBuf>,
+    /// The most pixels of an image that is sent
+    #[arg(long, env = "SEESE3_MAX_IMAGE_PIXELS", default_value_t = 16_000_000)]
+    max_image_pixels: u64,
     /// The most steps of one navigation
     #[arg(long, env = "SEESE3_MAX_STEPS", default_value_t = Limits::default().steps)]
     max_steps: u32,
@@ -72,14 +87,20 @@ impl Serve {
         start_log(self.log_format);
         let store = Store::open(&self.store)?;
         let defaults = Config::default();
+        let threads = self.threads.map_or(defaults.threads, usize::from);
         let config = Config {
             index: match self.index {
                 IndexName::Exact => IndexKind::Exact,
                 IndexName::Hnsw => IndexKind::Hnsw(HnswParameters::default()),
             },
+            encoders: (!self.encoders.is_empty()).then(|| ImageEncoders {
+                models: self.encoders.clone(),
+                runtime: Runtime { kind: self.runtime.into(), threads, library: self.library.clone() },
+                bounds: Bounds { bytes: self.max_message_bytes as u64, pixels: self.max_image_pixels },
+            }),
             limits: Limits { steps: self.max_steps, hits: self.max_hits, hits_in_all: self.max_hits_in_all },
             message_bytes: self.max_message_bytes,
-            threads: self.threads.map_or(defaults.threads, usize::from),
+            threads,
             queue: self.queue as usize,
             longest: Duration::from_secs(self.max_request_seconds),
             drain: Duration::from_secs(self.drain_seconds),

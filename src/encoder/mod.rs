@@ -155,18 +155,25 @@ impl Encoder {
         Ok(encoder)
     }
 
-    /// Builds the encoder that made a source again: the built-in ones, or the model in a file of that identity.
-    /// None if none of `models` has it.
+    /// Builds the encoder that made a source again. `models` are those at hand: `builtin`, `pixels`, or ONNX files; none
+    /// of them may be the one.
     ///
     /// # Errors
     /// As [`Encoder::model`], and [`Error::Option`] for a source that does not say how images were prepared.
-    pub fn of_source(source: &FeatureSource, models: &[PathBuf], runtime: &Runtime) -> Result<Option<Self>, Error> {
-        for encoder in [Self::builtin(), Self::pixels()] {
-            if encoder.sources("")[0].encoder == source.encoder {
-                return Ok(Some(encoder));
+    pub fn of_source(source: &FeatureSource, models: &[String], runtime: &Runtime) -> Result<Option<Self>, Error> {
+        for model in models {
+            let plain = match model.as_str() {
+                "builtin" => Some(Self::builtin()),
+                PIXELS => Some(Self::pixels()),
+                _ => None,
+            };
+            if let Some(encoder) = plain {
+                if encoder.sources("")[0].is_like(source) {
+                    return Ok(Some(encoder));
+                }
+                continue;
             }
-        }
-        for file in models {
+            let file = Path::new(model);
             if model_file::identity(file)? != source.encoder {
                 continue;
             }
@@ -177,7 +184,7 @@ impl Encoder {
                 norm: source.norm.clone(),
                 pooling: source.pooling.parse()?,
             };
-            let task = ModelTask { file: file.clone(), preparation, layers: vec![layer], window };
+            let task = ModelTask { file: file.to_owned(), preparation, layers: vec![layer], window };
             return Self::model(task, runtime).map(Some);
         }
         Ok(None)

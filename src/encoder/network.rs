@@ -35,7 +35,7 @@ impl RuntimeKind {
 }
 
 /// How a model is run.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Runtime {
     /// By which program.
     pub kind: RuntimeKind,

@@ -3,7 +3,7 @@
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 use super::Error;
-use super::snapshot::ServedNavigator;
+use super::snapshot::{ServedNavigator, Snapshot};
 use crate::eval::{NavigatorKind, Prediction, RetrievalScores, Row, check_thresholds, default_thresholds};
 use crate::features::FeatureSource;
 use crate::geometry::{Pose, Twist};
@@ -14,6 +14,7 @@ use crate::pairs::{Pair, Split};
 use crate::proto::v1 as pb;
 use crate::room::{FrameId, Room};
 use crate::scores::{MotionScores, Rate};
+use crate::store::StoredAdapter;
 
 /// How far from 1 a quaternion's norm may be.
 const QUATERNION_TOLERANCE: f64 = 1e-3;
@@ -65,20 +66,28 @@ pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
     Ok(Pose::from_parts(position.into(), UnitQuaternion::from_quaternion(quaternion)))
 }
 
-/// What a camera saw, or a frame; `field` is the view's name in its request.
-pub fn source(field: &str, view: Option<pb::View>, adapter_source: &FeatureSource) -> Result<Source, Error> {
+/// What a camera saw, or a frame, for an adapter; `field` is the view's name in its request.
+pub fn source(
+    field: &str,
+    view: Option<pb::View>,
+    adapter: &StoredAdapter,
+    snapshot: &Snapshot,
+) -> Result<Source, Error> {
     match view.and_then(|view| view.view) {
         Some(pb::view::View::FrameId(frame)) => Ok(Source::Frame(FrameId(frame))),
         Some(pb::view::View::Feature(pb::Feature { values, source_name })) => {
-            if !source_name.is_empty() && source_name != adapter_source.name {
-                let problem =
-                    format!("'{source_name}' is not '{}', which the adapter was trained on", adapter_source.name);
+            let own = &adapter.adapter.source().name;
+            if !source_name.is_empty() && source_name != *own {
+                let problem = format!("'{source_name}' is not '{own}', which the adapter was trained on");
                 return Err(Error::invalid(format!("{field}.feature.source_name"), problem));
             }
             Ok(Source::Feature(values))
         }
         Some(pb::view::View::Latent(pb::Latent { values })) => Ok(Source::Latent(values)),
-        None => Err(Error::invalid(field, "is required: a frame_id, a feature or a latent")),
+        Some(pb::view::View::Image(image)) => {
+            Ok(Source::Feature(snapshot.eye(adapter)?.feature(&format!("{field}.image"), &image)?))
+        }
+        None => Err(Error::invalid(field, "is required: a frame_id, a feature, a latent or an image")),
     }
 }
 
@@ -106,7 +115,11 @@ fn displacement(displacement: Option<pb::Displacement>, room: &str) -> Result<Di
 }
 
 /// A question and the thresholds it is to be judged by.
-pub fn query(request: pb::NavigateRequest, adapter_source: &FeatureSource) -> Result<(Query, Vec<f64>), Error> {
+pub fn query(
+    request: pb::NavigateRequest,
+    adapter: &StoredAdapter,
+    snapshot: &Snapshot,
+) -> Result<(Query, Vec<f64>), Error> {
     // Destructured with no `..`, so that a new field breaks the build here.
     let pb::NavigateRequest {
         room,
@@ -122,7 +135,7 @@ pub fn query(request: pb::NavigateRequest, adapter_source: &FeatureSource) -> Re
         exclude_radius,
         thresholds: given_thresholds,
     } = request;
-    let source = source("source", view, adapter_source)?;
+    let source = source("source", view, adapter, snapshot)?;
     if source_pose.is_some() && matches!(source, Source::Frame(_)) {
         return Err(Error::invalid("source_pose", "is not to be given with a frame, whose pose the room knows"));
     }

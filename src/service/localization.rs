@@ -40,7 +40,7 @@ fn answer(
     }
     let served = rooms_under(snapshot, &rooms, &adapter)?;
     let first = &served[0];
-    let source = convert::source("view", view, first.adapter.adapter.source())?;
+    let source = convert::source("view", view, &first.adapter, snapshot)?;
     if matches!(source, Source::Frame(_)) && served.len() != 1 {
         return Err(Error::invalid("view.frame_id", "is a frame of one room; name that room alone in rooms"));
     }

@@ -6,6 +6,7 @@
 
 mod catalog;
 mod convert;
+mod eye;
 mod evaluation;
 mod health;
 mod localization;
@@ -18,6 +19,7 @@ mod telemetry;
 mod work;
 
 pub use convert::pose as pose_from_wire;
+pub use eye::ImageEncoders;
 pub use shutdown::shutdown_signal;
 pub use snapshot::Snapshot;
 pub use status::Error;
@@ -51,6 +53,8 @@ pub struct Config {
     pub index: IndexKind,
     /// Of one question.
     pub limits: Limits,
+    /// What images are encoded with, if callers may send them.
+    pub encoders: Option<ImageEncoders>,
     /// Of one batch, requests.
     pub batch: usize,
     /// Of one ScorePredictions, pairs.
@@ -72,6 +76,7 @@ impl Default for Config {
         Self {
             index: IndexKind::Exact,
             limits: Limits::default(),
+            encoders: None,
             batch: 256,
             predictions: 100_000,
             message_bytes: 4 << 20,
@@ -92,6 +97,8 @@ pub enum RunError {
     NoRoom { location: String },
     #[error("adapter '{adapter}' does not serve room '{room}': {problem}")]
     Navigator { adapter: String, room: String, problem: crate::navigation::Error },
+    #[error("adapter '{adapter}' cannot be given images: {problem}")]
+    Encoder { adapter: String, problem: crate::encoder::Error },
     #[error("the server failed: {0}")]
     Transport(#[from] tonic::transport::Error),
     #[error("the reflection service cannot be made: {0}")]
@@ -146,7 +153,7 @@ pub async fn run(
         let _ = stopped.await;
     })?;
     tokio::pin!(server, shutdown);
-    let loading = snapshot::load(store, config.index);
+    let loading = snapshot::load(store, config.index, config.encoders);
     let loaded = tokio::select! {
         loaded = loading => loaded?,
         ended = &mut server => return ended,

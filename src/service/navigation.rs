@@ -73,7 +73,7 @@ fn navigate(
     cancel: &Cancellation,
 ) -> Result<pb::NavigateResponse, Error> {
     let served = snapshot.navigator(&request.room, &request.adapter)?;
-    let (query, thresholds) = convert::query(request, served.adapter.adapter.source())?;
+    let (query, thresholds) = convert::query(request, &served.adapter, snapshot)?;
     let answer = served.navigator.answer(&query, limits, cancel)?;
     let room = served.navigator.room();
     Ok(pb::NavigateResponse {

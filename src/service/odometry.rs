@@ -47,7 +47,7 @@ fn answer(snapshot: &Snapshot, request: pb::EstimateMotionRequest) -> Result<pb:
     };
     let frames = frame_of(&first).zip(frame_of(&second));
     let view = |field: &str, given| -> Result<View, Error> {
-        let view = match convert::source(field, given, stored.adapter.source())? {
+        let view = match convert::source(field, given, stored, snapshot)? {
             Source::Feature(feature) => View::Feature(feature),
             Source::Latent(latent) => View::Latent(latent),
             Source::Frame(frame) => {

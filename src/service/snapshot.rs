@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use super::eye::{self, Eye, ImageEncoders};
 use super::{Error, RunError};
 use crate::features::FeatureSource;
 use crate::navigation::{IndexKind, Navigator};
@@ -48,9 +49,22 @@ pub enum TrainedOn {
 pub struct Snapshot {
     rooms: BTreeMap<String, ServedRoom>,
     adapters: BTreeMap<String, Arc<StoredAdapter>>,
+    eyes: BTreeMap<String, Arc<Eye>>,
 }
 
 impl Snapshot {
+    /// What encodes images for an adapter.
+    pub fn eye(&self, adapter: &StoredAdapter) -> Result<&Eye, Error> {
+        self.eyes.get(&adapter.name).map(AsRef::as_ref).ok_or_else(|| {
+            let encoder = &adapter.adapter.source().encoder;
+            Error::Precondition(format!(
+                "images cannot be sent for adapter '{}': this server has no encoder '{encoder}'; start it with \
+                 --encoder, or send the feature",
+                adapter.name
+            ))
+        })
+    }
+
     /// How many rooms it has.
     pub fn room_count(&self) -> usize {
         self.rooms.len()
@@ -105,18 +119,19 @@ impl Snapshot {
 }
 
 /// Loads every room and adapter of a store and makes their navigators, off the serving threads.
-pub async fn load(store: Store, index: IndexKind) -> Result<Snapshot, RunError> {
+pub async fn load(store: Store, index: IndexKind, encoders: Option<ImageEncoders>) -> Result<Snapshot, RunError> {
     let runtime = tokio::runtime::Handle::current();
-    let loading = tokio::task::spawn_blocking(move || runtime.block_on(load_all(&store, index)));
+    let loading = tokio::task::spawn_blocking(move || runtime.block_on(load_all(&store, index, encoders.as_ref())));
     loading.await.map_err(|error| RunError::Loading(error.to_string()))?
 }
 
-async fn load_all(store: &Store, index: IndexKind) -> Result<Snapshot, RunError> {
+async fn load_all(store: &Store, index: IndexKind, encoders: Option<&ImageEncoders>) -> Result<Snapshot, RunError> {
     let mut adapters = BTreeMap::new();
     for name in store.adapter_names().await? {
         let stored = store.load_adapter(&name, None).await?;
         adapters.insert(name, Arc::new(stored));
     }
+    let eyes = eye::open(encoders, &adapters)?;
     let mut rooms = BTreeMap::new();
     for summary in store.rooms().await? {
         let stored = store.load_room(&summary.room, None).await?;
@@ -164,5 +179,5 @@ async fn load_all(store: &Store, index: IndexKind) -> Result<Snapshot, RunError>
     if rooms.is_empty() {
         return Err(RunError::NoRoom { location: store.location().to_owned() });
     }
-    Ok(Snapshot { rooms, adapters })
+    Ok(Snapshot { rooms, adapters, eyes })
 }

@@ -87,6 +87,11 @@ pub async fn filled_store() -> (tempfile::TempDir, Store) {
 /// Starts a server on a free port and waits until it serves.
 pub async fn start(config: Config) -> TestServer {
     let (folder, store) = filled_store().await;
+    start_on(folder, store, config).await
+}
+
+/// Starts a server of a store on a free port and waits until it serves.
+pub async fn start_on(folder: tempfile::TempDir, store: Store, config: Config) -> TestServer {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();
     let (stop, stopped) = oneshot::channel();

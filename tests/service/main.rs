@@ -5,5 +5,6 @@ mod support;
 
 mod answers;
 mod harness;
+mod images;
 mod lifecycle;
 mod refusals;
