@@ -165,6 +165,7 @@ impl Layers {
         let (room, rows) = (&stored.room, features.rows());
         let knn =
             MutualKnn { frames: self.m1_frames, stride: self.m1_stride, k: self.m1_k, exclusion: self.m1_exclusion };
+        let m1 = mutual_knn(rows, room.poses(), &knn)?;
         let m2: IntrinsicDimension = intrinsic_dimension(rows, self.m2_gap, Duplicates::DropRows)?;
         let m3: MotionScores = ridge_probe(rows, room, self.split.into(), self.stride)?;
         let runs: Vec<f64> = (0..self.seeds)
@@ -175,7 +176,7 @@ impl Layers {
             features: features.source().name.clone(),
             room: room_name(room),
             dim: features.source().dim,
-            m1: mutual_knn(rows, room.poses(), &knn)?,
+            m1,
             m2_two_nn: m2.two_nn.linear,
             m2_mle: m2.mle_unbiased.harmonic,
             m2_dropped: m2.dropped,
