@@ -1,5 +1,7 @@
 """Checks what the README and the docs claim against the JSON that the program wrote. No packages needed."""
 
+import array
+import ast
 import json
 import pathlib
 import sys
@@ -50,8 +52,42 @@ def kitchen(folder):
         print(f"{features} {stride} time: R² {found:.2f} (reference {reference}; out of distribution, not gated)")
 
 
+def npy(path):
+    """Rows of a float32 NumPy file (n, d) in C order."""
+    content = path.read_bytes()
+    size = int.from_bytes(content[8:10], "little")
+    header = ast.literal_eval(content[10:10 + size].decode())
+    assert header["descr"] == "<f4" and not header["fortran_order"], header
+    (count, columns), numbers = header["shape"], array.array("f", content[10 + size:])
+    return [numbers[row * columns:(row + 1) * columns] for row in range(count)]
+
+
+# Our features of the kitchen, its published ones, and how far a row may be from its own, of its length.
+FEATURES = [
+    ("effnetlite0-block14-mean", "effnetlite0_block14_gap", 0.025),
+    ("xfeat-block4-grid2x2", "xfeat_block4_p2x2", 0.01),
+    ("xfeat-block5-grid4x4", "xfeat_block5_p4x4", 0.01),
+    ("pixels", "pixels_rgb16x12", 0.003),
+]
+
+
+def features(ours, published):
+    """Every photograph's features are the published ones, but for the JPEG decoder and the resize filter's rounding."""
+    for name, reference, bound in FEATURES:
+        found, expected = npy(ours / f"features_{name}.npy"), npy(published / f"features_{reference}.npy")
+        assert len(found) == len(expected) == 1000
+        off = []
+        for a, b in zip(found, expected):
+            off.append((sum((x - y) ** 2 for x, y in zip(a, b)) / sum(y * y for y in b)) ** 0.5)
+        off.sort()
+        print(f"{name}: median {100 * off[500]:.2f} %, at most {100 * off[-1]:.2f} % of a feature's length off")
+        assert off[-1] <= bound
+
+
 if __name__ == "__main__":
     if sys.argv[1] == "demo":
         demo(sys.argv[2])
+    elif sys.argv[1] == "features":
+        features(pathlib.Path(sys.argv[2]), pathlib.Path(sys.argv[3]))
     else:
         kitchen(pathlib.Path(sys.argv[2]))

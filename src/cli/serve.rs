@@ -27,8 +27,8 @@ pub struct Serve {
     #[arg(long, env = "SEESE3_INDEX", value_enum, default_value_t = IndexName::Exact)]
     index: IndexName,
     /// Take images instead of features: `builtin`, `pixels`, or the ONNX file that an adapter's features were made by;
-    /// may be given several times
-    #[arg(long = "encoder", value_name = "MODEL")]
+    /// several are divided by commas
+    #[arg(long = "encoder", value_name = "MODEL", env = "SEESE3_ENCODER", value_delimiter = ',')]
     encoders: Vec<String>,
     /// What runs ONNX models: tract needs nothing, onnxruntime is faster
     #[arg(long, env = "SEESE3_RUNTIME", value_enum, default_value_t = RuntimeName::Tract)]

@@ -178,7 +178,7 @@ impl Layers {
             dim: features.source().dim,
             m1,
             m2_two_nn: m2.two_nn.linear,
-            m2_mle: m2.mle_unbiased.harmonic,
+            m2_mle: m2.mle_biased.harmonic,
             m2_dropped: m2.dropped,
             m3_r2: m3.overall,
             m4_r2: mean(&runs),

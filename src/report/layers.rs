@@ -18,7 +18,7 @@ pub struct LayerScores {
     pub m1: f64,
     /// TwoNN, linear.
     pub m2_two_nn: f64,
-    /// MLE, harmonic, unbiased.
+    /// MLE over 20 neighbours, harmonic, divided by K − 1.
     pub m2_mle: f64,
     /// Duplicate rows that M2 dropped.
     pub m2_dropped: usize,

@@ -45,9 +45,13 @@ impl Camera {
         Self { width, height, field_of_view_rad: 75f64.to_radians(), sampling: Sampling::Adaptive }
     }
 
-    /// The ray through a point of the image, pixels from the top left corner.
-    fn ray(&self, world_from_camera: &Pose, column: f64, row: f64) -> Ray {
-        let scale = 2.0 * (self.field_of_view_rad / 2.0).tan() / self.width as f64;
+    /// The side of a pixel at distance 1.
+    fn pixel(&self) -> f64 {
+        2.0 * (self.field_of_view_rad / 2.0).tan() / self.width as f64
+    }
+
+    /// The ray through a point of the image, pixels from the top left corner; `scale` is [`Camera::pixel`].
+    fn ray(&self, scale: f64, world_from_camera: &Pose, column: f64, row: f64) -> Ray {
         let x = (column - self.width as f64 / 2.0) * scale;
         let y = (row - self.height as f64 / 2.0) * scale;
         let direction = world_from_camera * Vector3::new(x, y, 1.0).normalize();
@@ -71,7 +75,8 @@ struct Surface {
 /// The image that `camera` takes at `world_from_camera`, which must lie inside the room.
 pub fn render(scene: &Scene, camera: Camera, world_from_camera: &Pose) -> RgbImage {
     let Camera { width, height, .. } = camera;
-    let seen = |column: f64, row: f64| scene.seen(&camera.ray(world_from_camera, column, row)).0;
+    let scale = camera.pixel();
+    let seen = |column: f64, row: f64| scene.seen(&camera.ray(scale, world_from_camera, column, row)).0;
     let inner = |column: usize, row: usize| {
         let mut light = [0.0; 3];
         for sample in 0..SUPERSAMPLING * SUPERSAMPLING {
@@ -121,12 +126,18 @@ fn to_srgb(light: f64) -> u8 {
 
 impl Scene {
     fn seen(&self, ray: &Ray) -> Colour {
-        let mut surface = self.shell_surface(ray);
+        let (mut limit, axis) = self.shell_reach(ray);
+        let mut nearest = None;
         for piece in &self.pieces {
-            if let Some(nearer) = piece.surface(ray, surface.distance) {
-                surface = nearer;
+            if let Some(nearer) = piece.touch(ray, limit) {
+                limit = nearer.distance;
+                nearest = Some(nearer);
             }
         }
+        let surface = match nearest {
+            Some(touch) => touch.surface(),
+            None => self.shell_surface(ray, limit, axis),
+        };
         self.lit(&surface, ray)
     }
 
@@ -150,11 +161,11 @@ impl Scene {
 
     fn blocked(&self, origin: Point3<f64>, direction: Vector3<f64>, distance: f64) -> bool {
         let ray = Ray { origin, direction };
-        self.pieces.iter().any(|piece| piece.surface(&ray, distance).is_some())
+        self.pieces.iter().any(|piece| piece.is_met(&ray, distance))
     }
 
-    /// Floor, ceiling or wall: the first plane that a ray from inside leaves through.
-    fn shell_surface(&self, ray: &Ray) -> Surface {
+    /// How far it is to floor, ceiling or wall, the first plane that a ray from inside leaves through, and its axis.
+    fn shell_reach(&self, ray: &Ray) -> (f64, usize) {
         let (mut distance, mut axis) = (f64::INFINITY, 0);
         for candidate in 0..3 {
             let speed = ray.direction[candidate];
@@ -165,6 +176,10 @@ impl Scene {
                 (distance, axis) = (reach, candidate);
             }
         }
+        (distance, axis)
+    }
+
+    fn shell_surface(&self, ray: &Ray, distance: f64, axis: usize) -> Surface {
         let at = ray.origin + ray.direction * distance;
         let mut normal = Vector3::zeros();
         normal[axis] = -ray.direction[axis].signum();
@@ -181,18 +196,28 @@ impl Scene {
 }
 
 impl Piece {
-    /// The nearest box of the piece that a ray meets within `limit`, metres.
-    fn surface(&self, ray: &Ray, limit: f64) -> Option<Surface> {
+    /// Whether a ray comes near the piece within `limit`, metres.
+    fn is_near(&self, ray: &Ray, limit: f64) -> bool {
         let to_centre = self.centre - ray.origin;
         let along = to_centre.dot(&ray.direction);
         let off = to_centre.norm_squared() - along * along;
-        if off > self.radius * self.radius || along < -self.radius || along - self.radius > limit {
+        !(off > self.radius * self.radius || along < -self.radius || along - self.radius > limit)
+    }
+
+    /// Whether a ray meets any box of the piece within `limit`, metres.
+    fn is_met(&self, ray: &Ray, limit: f64) -> bool {
+        self.is_near(ray, limit) && self.solids.iter().any(|solid| solid.touch(ray, limit).is_some())
+    }
+
+    /// The nearest box of the piece that a ray meets within `limit`, metres.
+    fn touch(&self, ray: &Ray, limit: f64) -> Option<Touch<'_>> {
+        if !self.is_near(ray, limit) {
             return None;
         }
-        let mut nearest: Option<Surface> = None;
+        let mut nearest: Option<Touch<'_>> = None;
         for solid in &self.solids {
-            let limit = nearest.as_ref().map_or(limit, |surface| surface.distance);
-            nearest = solid.surface(ray, limit).or(nearest);
+            let limit = nearest.as_ref().map_or(limit, |touch| touch.distance);
+            nearest = solid.touch(ray, limit).or(nearest);
         }
         nearest
     }
@@ -200,7 +225,7 @@ impl Piece {
 
 impl Solid {
     /// Where a ray enters the box, if within `limit`, metres.
-    fn surface(&self, ray: &Ray, limit: f64) -> Option<Surface> {
+    fn touch(&self, ray: &Ray, limit: f64) -> Option<Touch<'_>> {
         let turn_back =
             |v: Vector3<f64>| Vector3::new(self.cos * v.x + self.sin * v.y, self.cos * v.y - self.sin * v.x, v.z);
         let (origin, direction) = (turn_back(ray.origin - self.centre), turn_back(ray.direction));
@@ -219,7 +244,23 @@ impl Solid {
         if !(enter > 1e-6 && enter < leave && enter < limit) {
             return None;
         }
-        let at = origin + direction * enter;
+        Some(Touch { solid: self, distance: enter, axis, origin, direction })
+    }
+}
+
+/// Where a ray, in a box's own coordinates, enters it.
+struct Touch<'a> {
+    solid: &'a Solid,
+    distance: f64,
+    axis: usize,
+    origin: Vector3<f64>,
+    direction: Vector3<f64>,
+}
+
+impl Touch<'_> {
+    fn surface(&self) -> Surface {
+        let &Touch { solid, distance, axis, origin, direction } = self;
+        let at = origin + direction * distance;
         let mut normal = Vector3::zeros();
         normal[axis] = -direction[axis].signum();
         let front = axis == 1 && normal.y > 0.0;
@@ -229,14 +270,14 @@ impl Solid {
             _ => (at.x, at.y),
         };
         // Heights are counted from the floor of the piece, so that shelves and boards line up.
-        let v = if axis == 2 { v } else { v + self.half.z };
-        let colour = self.material.colour(u, v, front, self.seed);
+        let v = if axis == 2 { v } else { v + solid.half.z };
+        let colour = solid.material.colour(u, v, front, solid.seed);
         let normal = Vector3::new(
-            self.cos * normal.x - self.sin * normal.y,
-            self.sin * normal.x + self.cos * normal.y,
+            solid.cos * normal.x - solid.sin * normal.y,
+            solid.sin * normal.x + solid.cos * normal.y,
             normal.z,
         );
-        Some(Surface { distance: enter, normal, colour, glow: 0.0 })
+        Surface { distance, normal, colour, glow: 0.0 }
     }
 }
 
@@ -250,7 +291,9 @@ mod tests {
         let mut scene = Scene::new(3);
         scene.pieces.clear();
         let origin = Point3::from(scene.size() / 2.0);
-        let surface = scene.shell_surface(&Ray { origin, direction: Vector3::x() });
+        let ray = Ray { origin, direction: Vector3::x() };
+        let (reach, axis) = scene.shell_reach(&ray);
+        let surface = scene.shell_surface(&ray, reach, axis);
         assert!((surface.distance - scene.size().x / 2.0).abs() < 1e-12);
         assert_eq!(surface.normal, -Vector3::x());
     }
