@@ -67,6 +67,9 @@ impl Encode {
             say(format_args!("already there in room '{room}' revision {revision}: {}", names.join(", ")));
             return Ok(());
         }
+        for source in sources.iter().filter(|source| stored.features(&source.name).is_some() && !has(&stored, source)) {
+            say(format_args!("replaces features '{}', which were made otherwise", source.name));
+        }
         say(format_args!("encoder {} by {}, {}", encoder.id(), encoder.runtime(), sources[0].preprocess));
         let key = key(&stored, &encoder, &root);
         let (mut journal, before) = Journal::open(&self.journal_path(&key)?, &key, encoder.dims().iter().sum())?;

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
 use rayon::prelude::*;
 
@@ -103,7 +103,8 @@ impl Layers {
         let scored: Vec<(usize, LayerScores)> = tasks
             .into_par_iter()
             .map(|(layer, stored, features)| {
-                let scores = self.scores(stored, features)?;
+                let what = || format!("room '{}', features '{}'", stored.room.id(), features.source().name);
+                let scores = self.scores(stored, features).with_context(what)?;
                 progress.inc(1);
                 Ok((layer, scores))
             })

@@ -19,6 +19,9 @@ pub struct Bounds {
     pub pixels: u64,
 }
 
+/// What may be allocated to read a header: colour profiles are compressed, and may be bombs.
+const HEADER_ALLOC: u64 = 16 << 20;
+
 impl Bounds {
     /// For files of one's own.
     pub const LOCAL: Self = Self { bytes: 256 << 20, pixels: 100_000_000 };
@@ -37,23 +40,21 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
     if !matches!(format, Some(ImageFormat::Jpeg | ImageFormat::Png)) {
         return Err(bad("is neither JPEG nor PNG".to_owned()));
     }
-    let read = |limits: Option<Limits>| {
+    let read = |most: u64| {
         let mut reader = ImageReader::new(Cursor::new(bytes));
         reader.set_format(format.unwrap_or(ImageFormat::Png));
-        match limits {
-            Some(limits) => reader.limits(limits),
-            None => reader.no_limits(),
-        }
+        let mut limits = Limits::default();
+        limits.max_alloc = Some(most);
+        reader.limits(limits);
         reader
     };
-    let (width, height) = read(None).into_dimensions().map_err(|error| bad(error.to_string()))?;
+    let (width, height) = read(HEADER_ALLOC).into_dimensions().map_err(|error| bad(error.to_string()))?;
     if u64::from(width) * u64::from(height) > bounds.pixels {
         return Err(bad(format!("has {width}×{height} pixels, over the limit of {}", bounds.pixels)));
     }
-    let mut limits = Limits::default();
     // Sixteen bits, four channels, and as much again for the decoder.
-    limits.max_alloc = Some(bounds.pixels.saturating_mul(16).saturating_add(1 << 20));
-    let decoded = read(Some(limits)).decode().map_err(|error| bad(error.to_string()))?;
+    let most = (u64::from(width) * u64::from(height)).saturating_mul(16).saturating_add(HEADER_ALLOC);
+    let decoded = read(most).decode().map_err(|error| bad(error.to_string()))?;
     let bytes = decoded.into_rgb8().into_raw();
     Ok(RgbImage { width: width as usize, height: height as usize, bytes })
 }
