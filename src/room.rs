@@ -118,6 +118,19 @@ pub struct Frames {
 }
 
 impl Frames {
+    /// The first column that is neither empty nor as long as the poses, and its length.
+    pub fn unequal(&self) -> Option<(&'static str, usize)> {
+        let columns = [
+            ("timestamps", self.timestamps_ns.len()),
+            ("frame names", self.names.len()),
+            ("frame numbers", self.numbers.len()),
+            ("images", self.images.len()),
+            ("sequence marks", self.sequences.len()),
+            ("split marks", self.held_out.len()),
+        ];
+        columns.into_iter().find(|(_, length)| *length != 0 && *length != self.poses.len())
+    }
+
     /// The frames of these rows, in their order. Every row must be there.
     #[must_use]
     pub fn select(&self, rows: &[usize]) -> Self {
@@ -182,17 +195,8 @@ impl Room {
         if frame_count > MAX_FRAMES {
             return Err(Error::TooManyFrames { room: id, frame_count });
         }
-        for (what, actual) in [
-            ("timestamps", frames.timestamps_ns.len()),
-            ("frame names", frames.names.len()),
-            ("frame numbers", frames.numbers.len()),
-            ("images", frames.images.len()),
-            ("sequence marks", frames.sequences.len()),
-            ("split marks", frames.held_out.len()),
-        ] {
-            if actual != 0 && actual != frame_count {
-                return Err(Error::Count { room: id, frame_count, actual, what });
-            }
+        if let Some((what, actual)) = frames.unequal() {
+            return Err(Error::Count { room: id, frame_count, actual, what });
         }
         let near = |pose: &Pose| pose.translation.vector.norm() <= MAX_DISTANCE_M;
         let finite = |pose: &Pose| near(pose) && pose.to_homogeneous().iter().all(|x| x.is_finite());

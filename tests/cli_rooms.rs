@@ -87,6 +87,17 @@ fn recordings_are_imported_once_and_given_back() {
     succeeds(&["export", "kitti", "--store", &store, "--room", "chess", "--out", &trajectory]);
     assert_eq!(std::fs::read_to_string(&trajectory).unwrap().lines().count(), 8);
     refuses(&["import", "tum", "nowhere", "--store", &store], &["nowhere"]);
+    let short = path(folder.path(), "short");
+    std::fs::create_dir(&short).unwrap();
+    for file in ["poses.npy", "timestamps.npy"] {
+        let from = if file == "poses.npy" {
+            golden().join("m1_mutual_knn/tiny_poses.npy")
+        } else {
+            Path::new(&out).join(file)
+        };
+        std::fs::copy(from, Path::new(&short).join(file)).unwrap();
+    }
+    refuses(&["import", "numpy", &short, "--store", &store, "--every", "2"], &["6 poses but 2 timestamps", "short"]);
 }
 
 fn features(store: &str, room: &str, name: &str) -> Array2<f32> {
@@ -146,6 +157,27 @@ fn a_corrupt_image_is_named_or_left_out() {
     assert!(std::fs::read_dir(Path::new(&store).join("unfinished")).unwrap().next().is_none(), "no journal is left");
     std::fs::remove_dir_all(Path::new(&store).join("images")).unwrap();
     refuses(&[&encode[..], &["--again"]].concat(), &["--images DIR"]);
+    refuses(&[&encode[..], &["--resize", "64x48"]].concat(), &["'pixels' is one fixed encoder"]);
+    refuses(&[&encode[..], &["--as", &"x".repeat(101)]].concat(), &["--as PREFIX"]);
+}
+
+/// Oracle: what was encoded before an image was written anew is not taken for it.
+#[test]
+fn a_run_does_not_go_on_from_rows_of_other_images() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = path(folder.path(), "store");
+    succeeds(&["studio", "--out", &store, "--rooms", "1", "--frames", "40", "--seed", "4", "--keep-images"]);
+    let images = Path::new(&store).join("images/studio4-0000");
+    let last = images.join("frame-000039.png");
+    let whole = std::fs::read(&last).unwrap();
+    std::fs::write(&last, &whole[..100]).unwrap();
+    let encode = ["encode", "--store", &store, "--room", "studio4-0000", "--model", "pixels"];
+    refuses(&encode, &["frame-000039.png"]);
+    std::fs::write(&last, &whole).unwrap();
+    std::fs::copy(images.join("frame-000020.png"), images.join("frame-000000.png")).unwrap();
+    assert!(succeeds(&encode).contains(", 0 were done before"));
+    let rows = features(&store, "studio4-0000", "pixels");
+    assert_eq!(rows.row(0), rows.row(20), "frame 0 was encoded anew");
 }
 
 /// Oracle: the keys that scripts read, and that every layer of the room is scored.

@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array2, ArrayD};
 use safetensors::SafeTensors;
 use seese3::encoder::{
-    Encoder, Error, Filter, Layer, ModelTask, Preparation, Resize, Runtime, RuntimeKind, normalised, read_image, recipe,
+    Bounds, Encoder, Error, Filter, Layer, ModelTask, Preparation, Resize, Runtime, RuntimeKind, decode, normalised,
+    read_image, recipe,
 };
 use seese3::image::RgbImage;
 use support::{Tensors, golden, npy, shared, skipped};
@@ -66,6 +67,7 @@ fn layers_of_a_tiny_model_are_what_numpy_says() {
             ("map", "mean", "map_mean"),
             ("map", "grid2x2", "map_grid2x2"),
             ("tokens", "cls", "tokens_cls"),
+            ("tokens", "grid2x2", "map_grid2x2"),
             ("tokens", "mean@1", "tokens_mean_after_1"),
             ("vector", "mean", "vector"),
             ("hidden", "mean", "hidden_mean"),
@@ -115,7 +117,7 @@ fn models_that_cannot_be_used_are_refused_by_name() {
         let task = |name: &str, pooling: &str| tiny("image.onnx", vec![layer(name, pooling)], 1);
         refused(task("block9", "mean"), "map, tokens, vector");
         refused(task("map", "cls"), "cannot be pooled");
-        refused(task("tokens", "grid2x2"), "square");
+        refused(task("tokens", "grid2x2@1"), "image's shape");
         refused(tiny("image.onnx", vec![layer("map", "mean"), layer("map", "mean")], 1), "twice");
         refused(tiny("image.onnx", Vec::new(), 1), "no layer");
         refused(tiny("image.onnx", vec![layer("map", "mean")], 4), "single images");
@@ -158,6 +160,21 @@ fn an_encoder_is_built_again_from_what_its_features_say() {
             Err(error) => assert!(kind.is_built() && error.to_string().contains("pip install onnxruntime"), "{error}"),
             Ok(_) => assert!(kind == RuntimeKind::Tract && kind.is_built()),
         }
+    }
+}
+
+/// Oracle: by hand: a layer whose first axis is not the batch, and one without axes, are no features of single images.
+#[test]
+fn a_layer_that_does_not_count_images_is_refused() {
+    for runtime in runtimes("a_layer_that_does_not_count_images_is_refused") {
+        for name in ["turned", "scalar"] {
+            let refused = Encoder::model(tiny("turned.onnx", vec![layer(name, "mean")], 1), &runtime);
+            let message = refused.map(|_| ()).unwrap_err().to_string();
+            assert!(message.contains(name), "{message}");
+        }
+        let outside = Encoder::model(tiny("outside.onnx", vec![layer("map", "mean")], 1), &runtime);
+        let message = outside.map(|_| ()).unwrap_err().to_string();
+        assert!(message.contains("weights in another file"), "{message}");
     }
 }
 
@@ -369,4 +386,16 @@ fn decoded_photographs_are_pillows() {
     assert_eq!((found.width, found.height), (640, 480));
     let worst = found.bytes.iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
     assert!(worst <= 5, "{worst} levels");
+}
+
+/// Oracle: a photograph that is cut is no photograph; a lenient decoder would fill it up with grey.
+#[test]
+fn cut_photographs_are_refused() {
+    let Some(folder) = models("cut_photographs_are_refused") else { return };
+    let whole = std::fs::read(folder.join("inputs/frame-000000.color.jpg")).unwrap();
+    let refused = |bytes: &[u8]| decode("photo", bytes, Bounds::LOCAL).is_err();
+    assert!(!refused(&whole));
+    for part in [10, 50, 90, 99] {
+        assert!(refused(&whole[..whole.len() * part / 100]), "cut to {part} %");
+    }
 }

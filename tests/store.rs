@@ -98,6 +98,29 @@ async fn a_room_comes_back_as_it_was() {
     }
 }
 
+/// Oracle: what a recording said once is not lost because the same poses are published again with less.
+#[tokio::test]
+async fn publishing_the_same_poses_with_less_loses_nothing() {
+    let (_folder, store) = stored().await;
+    let whole = room("a");
+    store.publish_room(&whole, &[set("f", 1.0)]).await.unwrap();
+    let poses = Frames { poses: whole.poses().to_vec(), ..Frames::default() };
+    let bare = Room::new(RoomId::new("a").unwrap(), poses, Provenance::default()).unwrap();
+    store.publish_room(&bare, &[set("g", 2.0)]).await.unwrap();
+    let back = store.load_room("a", None).await.unwrap();
+    assert_eq!(back.room.timestamps_ns(), whole.timestamps_ns());
+    assert_eq!((back.room.images(), back.room.frame_names()), (whole.images(), whole.frame_names()));
+    assert_eq!((back.room.frame_numbers(), back.room.timeline()), (whole.frame_numbers(), whole.timeline()));
+    assert_eq!(back.room.provenance().licence, "CC0");
+    assert_eq!(back.room.provenance().images_root, whole.provenance().images_root);
+    assert_eq!(back.features.len(), 2);
+    let moved = Frames { poses: whole.poses()[1..].to_vec(), ..Frames::default() };
+    let moved = Room::new(RoomId::new("a").unwrap(), moved, Provenance::default()).unwrap();
+    store.publish_room(&moved, &[]).await.unwrap();
+    let back = store.load_room("a", None).await.unwrap();
+    assert!(back.room.images().is_empty() && back.features.is_empty(), "other frames are another room");
+}
+
 /// Oracle: the promise itself: the same content makes no revision; more features join, as long as the frames stay.
 #[tokio::test]
 async fn publishing_twice_changes_nothing_and_features_are_added() {

@@ -12,7 +12,8 @@ use super::say;
 use crate::cancel::Cancellation;
 use crate::encoder::{Encoded, Encoder, Journal, Kept, OnBadImage, Task, encode_room, read_image};
 use crate::features::{FeatureSource, Features};
-use crate::room::Room;
+use crate::geometry::Pose;
+use crate::room::{Room, is_plain_name};
 use crate::store::{Store, StoredRoom};
 
 /// Bad images that are named one by one; the rest are counted.
@@ -59,8 +60,9 @@ impl Encode {
         let encoder = self.encoder.open(&self.model, &runtime)?;
         let store = Store::open(&self.store)?;
         let stored = store.load_room(&self.room, None).await?;
-        let root = images_root(&stored.room, self.images.as_deref())?;
         let sources = encoder.sources(&self.prefix());
+        check_names(&sources)?;
+        let root = images_root(&stored.room, self.images.as_deref())?;
         if !self.again && sources.iter().all(|source| has(&stored, source)) {
             let names: Vec<&str> = sources.iter().map(|source| source.name.as_str()).collect();
             let (room, revision) = (&self.room, stored.revision);
@@ -72,7 +74,11 @@ impl Encode {
         }
         say(format_args!("encoder {} by {}, {}", encoder.id(), encoder.runtime(), sources[0].preprocess));
         let key = key(&stored, &encoder, &root);
-        let (mut journal, before) = Journal::open(&self.journal_path(&key)?, &key, encoder.dims().iter().sum())?;
+        let path = self.journal_path(&key)?;
+        if self.again && path.exists() {
+            std::fs::remove_file(&path).with_context(|| path.display().to_string())?;
+        }
+        let (mut journal, before) = Journal::open(&path, &key, encoder.dims().iter().sum())?;
         let begun = Instant::now();
         let encoded = self.encode(&stored.room, &root, &encoder, Kept { journal: &mut journal, before })?;
         let seconds = begun.elapsed().as_secs_f64();
@@ -80,7 +86,16 @@ impl Encode {
         if encoded.good.is_empty() {
             bail!(crate::encoder::Error::AllBad { room: self.room.clone() });
         }
-        let (room, features) = whole(stored, &sources, &encoded)?;
+        let newest = store.load_room(&self.room, None).await?;
+        if !same_poses(&newest.room, &stored.room) {
+            bail!(
+                "room '{}' got other frames while it was encoded (revision {}, was {}); run the command again",
+                self.room,
+                newest.revision,
+                stored.revision
+            );
+        }
+        let (room, features) = whole(newest, &sources, &encoded)?;
         let published = store.publish_room(&room, &features).await?;
         journal.finish()?;
         let fresh = encoded.good.len() - encoded.resumed.min(encoded.good.len());
@@ -147,16 +162,45 @@ pub fn has(stored: &StoredRoom, source: &FeatureSource) -> bool {
 /// All that decides the rows of a run.
 fn key(stored: &StoredRoom, encoder: &Encoder, root: &Path) -> String {
     let (room, sources) = (&stored.room, encoder.sources(""));
+    // A file that was written anew has another time or size.
+    let state = |image: &String| {
+        let file = image.rsplit_once('@').map_or(image.as_str(), |(file, _)| file);
+        let metadata = std::fs::metadata(root.join(file)).ok()?;
+        Some((metadata.len(), metadata.modified().ok()))
+    };
+    let states: Vec<_> = room.images().iter().map(state).collect();
     format!(
-        "{}\n{}\n{}\n{}\n{:?}\n{:?}\n{:?}",
+        "{}\n{}\n{}\n{}\n{:?}\n{:?}\n{:?}\n{:?}",
         room.id(),
         stored.revision,
         root.display(),
         encoder.runtime(),
         room.images(),
+        states,
         room.timeline().sequences,
         sources
     )
+}
+
+/// Refuses names that features cannot have, before anything is encoded.
+pub fn check_names(sources: &[FeatureSource]) -> anyhow::Result<()> {
+    for (position, FeatureSource { name, layer, .. }) in sources.iter().enumerate() {
+        if !is_plain_name(name) {
+            bail!(
+                "layer '{layer}' would give features of the name '{name}', which is over 100 characters or empty; give --as PREFIX"
+            );
+        }
+        if sources[..position].iter().any(|other| other.name == *name) {
+            bail!("two layers would give features of the name '{name}'; encode them apart, with --as PREFIX");
+        }
+    }
+    Ok(())
+}
+
+/// Whether two rooms have the same frames.
+pub fn same_poses(a: &Room, b: &Room) -> bool {
+    let near = |(a, b): (&Pose, &Pose)| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-9;
+    a.frame_count() == b.frame_count() && a.poses().iter().zip(b.poses()).all(near)
 }
 
 fn say_bad(room: &Room, encoded: &Encoded) {

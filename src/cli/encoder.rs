@@ -99,10 +99,9 @@ pub struct EncoderOptions {
 impl EncoderOptions {
     /// Opens `builtin`, `pixels` or the model in a file.
     pub fn open(&self, model: &str, runtime: &Runtime) -> anyhow::Result<Encoder> {
-        let is_plain = self.layers == ["all"] && self.pool.is_none() && self.recipe.is_none() && self.window.is_none();
         match model {
-            "builtin" | "pixels" if !is_plain => {
-                bail!("'{model}' has one layer and needs no recipe; leave out --layers, --pool, --recipe and --window")
+            "builtin" | "pixels" if !self.is_plain() => {
+                bail!("'{model}' is one fixed encoder; leave out --layers, --pool, --recipe, --resize and their like")
             }
             "builtin" => return Ok(Encoder::builtin()),
             "pixels" => return Ok(Encoder::pixels()),
@@ -133,6 +132,16 @@ impl EncoderOptions {
         let window = self.window.map_or(recipe.map_or(1, |recipe| recipe.window), |window| window as usize);
         let layers = names.iter().map(layer).collect();
         Ok(Encoder::model(ModelTask { file: file.to_owned(), preparation, layers, window }, runtime)?)
+    }
+
+    /// Whether nothing was asked for.
+    fn is_plain(&self) -> bool {
+        // Destructured with no `..`, so that a new option breaks the build here.
+        let Self { recipe, layers, pool, prefix_tokens, base, norm, window, resize, filter, crop, divisor, mean, std } =
+            self;
+        let words = [recipe, pool, base, norm, resize, filter, crop, mean, std];
+        let numbers = [prefix_tokens.is_some(), window.is_some(), divisor.is_some()];
+        layers == &["all"] && words.iter().all(|word| word.is_none()) && numbers == [false; 3]
     }
 
     fn recipe(&self) -> anyhow::Result<Option<&'static Recipe>> {

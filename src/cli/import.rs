@@ -135,11 +135,11 @@ impl Import {
                 let recording = match (&path, &poses) {
                     (Some(folder), _) => datasets::read_numpy(folder)?,
                     (None, Some(file)) => {
-                        let mut recording = datasets::read_poses(file)?;
-                        if let Some(file) = &timestamps {
-                            recording.frames.timestamps_ns = datasets::read_timestamps(file)?;
+                        let recording = datasets::read_poses(file)?;
+                        match &timestamps {
+                            Some(file) => recording.with_timestamps(file)?,
+                            None => recording,
                         }
-                        recording
                     }
                     (None, None) => bail!("a folder or --poses FILE is required"),
                 };

@@ -8,13 +8,12 @@ use anyhow::{Context, bail};
 use clap::Args;
 use rayon::prelude::*;
 
-use super::encode::{by_layer, has};
+use super::encode::{by_layer, check_names, has, same_poses};
 use super::encoder::{EncoderOptions, RuntimeOptions};
 use super::progress::bar;
 use super::{check_writable, say, write_file};
 use crate::cancel::Cancellation;
 use crate::encoder::{Encoder, Error, OnBadImage, Task, encode_png, encode_room, read_image};
-use crate::geometry::Pose;
 use crate::image::RgbImage;
 use crate::room::{Frames, Provenance, Room, RoomId, Timeline};
 use crate::store::{Store, StoredRoom};
@@ -82,6 +81,7 @@ impl Studio {
         }
         let store = Store::create(out)?;
         let sources = encoder.sources(&self.prefix());
+        check_names(&sources)?;
         let (width, height) = encoder.render_size();
         say(format_args!(
             "{} rooms of {} frames at {width}x{height}, encoder {} by {}",
@@ -181,9 +181,10 @@ impl Studio {
         let camera = Camera::sized(width, height);
         let image = |row: usize| -> Result<RgbImage, Error> {
             let begun = Instant::now();
-            let drawn = self
-                .drawn_before(room, row, camera)
-                .unwrap_or_else(|| render(&suite.scene, camera, &room.poses()[row]));
+            let drawn = match drawn_before(room, row, camera)? {
+                Some(kept) => kept,
+                None => render(&suite.scene, camera, &room.poses()[row]),
+            };
             spent.drawing_us.fetch_add(begun.elapsed().as_micros() as u64, Ordering::Relaxed);
             self.keep(room, row, &drawn)?;
             Ok(drawn)
@@ -194,15 +195,8 @@ impl Studio {
         Ok(encode_room(&task, encoder, None, told)?.rows)
     }
 
-    /// The kept image of an earlier run, if it is whole and of the right size.
-    fn drawn_before(&self, room: &Room, row: usize, camera: Camera) -> Option<RgbImage> {
-        let image = room.images().get(row)?;
-        let kept = read_image(Path::new(&room.provenance().images_root), image).ok()?;
-        ((kept.width, kept.height) == (camera.width, camera.height)).then_some(kept)
-    }
-
     fn keep(&self, room: &Room, row: usize, drawn: &RgbImage) -> Result<(), Error> {
-        let Some(image) = room.images().get(row) else { return Ok(()) };
+        let Some(image) = room.images().get(row).filter(|_| self.keep_images) else { return Ok(()) };
         let file = Path::new(&room.provenance().images_root).join(image);
         if file.is_file() {
             return Ok(());
@@ -238,6 +232,22 @@ impl Studio {
     }
 }
 
+/// The kept image of an earlier run, if it is whole. One of another size would not give the same features again.
+fn drawn_before(room: &Room, row: usize, camera: Camera) -> Result<Option<RgbImage>, Error> {
+    let Some(image) = room.images().get(row) else { return Ok(None) };
+    match read_image(Path::new(&room.provenance().images_root), image) {
+        Ok(kept) if (kept.width, kept.height) == (camera.width, camera.height) => Ok(Some(kept)),
+        Ok(kept) => Err(Error::BadImage {
+            image: image.clone(),
+            problem: format!(
+                "was kept at {}×{}, this encoder sees {}×{}; draw into another store",
+                kept.width, kept.height, camera.width, camera.height
+            ),
+        }),
+        Err(_) => Ok(None),
+    }
+}
+
 /// The room as it is in the store, if it is; refused if it has other frames there.
 async fn stored(store: &Store, room: &Room) -> anyhow::Result<Option<StoredRoom>> {
     let name = room.id().as_str();
@@ -246,13 +256,11 @@ async fn stored(store: &Store, room: &Room) -> anyhow::Result<Option<StoredRoom>
         Err(crate::store::Error::Unknown { .. }) => return Ok(None),
         Err(error) => return Err(error.into()),
     };
-    let near = |(a, b): (&Pose, &Pose)| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-9;
-    let (poses, wanted) = (stored.room.poses(), room.poses());
-    if poses.len() != wanted.len() || !poses.iter().zip(wanted).all(near) {
+    if !same_poses(&stored.room, room) {
         bail!(
             "room '{name}' is in the store with other frames ({}, this suite has {}); name another store",
-            poses.len(),
-            wanted.len()
+            stored.room.frame_count(),
+            room.frame_count()
         );
     }
     Ok(Some(stored))

@@ -150,6 +150,13 @@ impl Layers {
         }
         for name in &names {
             for stored in rooms {
+                let first = rooms[0].features(name).map(Features::source);
+                if stored.features(name).zip(first).is_some_and(|(set, first)| !set.source().is_like(first)) {
+                    let (a, b) = (rooms[0].room.id(), stored.room.id());
+                    bail!(
+                        "features '{name}' of rooms '{a}' and '{b}' were not made alike; name others with --features"
+                    );
+                }
                 if stored.features(name).is_none() {
                     bail!(
                         "room '{}' has no features '{name}', which room '{}' has",

@@ -14,6 +14,7 @@ use ndarray::{Array1, Array3, ArrayBase, Data, Dimension};
 use ndarray_npy::{WritableElement, WriteNpyExt};
 use serde::{Deserialize, Serialize};
 
+use super::collect::check_lengths;
 use super::numpy::read_numbers;
 use super::{Error, Recording, Stated, entries, read_bytes, read_features, read_poses, read_timestamps};
 use crate::features::{FeatureSource, Features};
@@ -33,6 +34,8 @@ struct Bundle {
     licence: String,
     /// Where images' paths start from; relative to the bundle's folder if relative.
     images_root: String,
+    /// Whether `frame_ids.npy` are the recording's own numbers, or only rows.
+    numbered: bool,
     names: Vec<String>,
     images: Vec<String>,
     sequences: Vec<u32>,
@@ -66,6 +69,7 @@ pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
     if let Some(file) = there("frame_ids.npy") {
         recording.frames.numbers = read_numbers(&file)?;
     }
+    check_lengths(&folder.join("poses.npy"), &recording)?;
     for file_name in entries(folder)? {
         let name = file_name.strip_prefix("features_").and_then(|name| name.strip_suffix(".npy"));
         let Some(name) = name else { continue };
@@ -91,6 +95,7 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
         recorded_as,
         licence,
         images_root,
+        numbered,
         names,
         images,
         sequences,
@@ -103,9 +108,13 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     }
     let mut recording = read_numpy(folder)?;
     let frames = &mut recording.frames;
+    if !numbered {
+        frames.numbers.clear();
+    }
     (frames.names, frames.images, frames.sequences, frames.held_out) = (names, images, sequences, held_out);
     recording.worst_rotation_deviation = recording.worst_rotation_deviation.max(worst_rotation_deviation);
     recording.images_root = if images_root.is_empty() { images_root } else { resolved(folder, &images_root)? };
+    check_lengths(&file, &recording)?;
     recording.stated = Stated { name, format: recorded_as, licence };
     let read = std::mem::take(&mut recording.features);
     for set in read {
@@ -165,6 +174,7 @@ pub fn write_numpy(folder: &Path, room: &Room, features: &[Features]) -> Result<
         recorded_as: provenance.format.clone(),
         licence: provenance.licence.clone(),
         images_root: provenance.images_root.clone(),
+        numbered: !frames.numbers.is_empty(),
         names: frames.names.clone(),
         images: frames.images.clone(),
         sequences: frames.sequences.clone(),
@@ -200,7 +210,9 @@ where
 }
 
 fn resolved(folder: &Path, root: &str) -> Result<String, Error> {
+    // Where the images are not there any more the path stays as it is said.
     let path = folder.join(root);
+    let path = path.canonicalize().unwrap_or(path);
     let malformed = |problem: &str| Error::Malformed { file: folder.join(SAYS), problem: problem.to_owned() };
     path.to_str().map(str::to_owned).ok_or_else(|| malformed("images_root is not UTF-8"))
 }

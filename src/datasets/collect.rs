@@ -42,6 +42,17 @@ pub(super) fn pose_of(matrix: &Matrix4<f64>) -> MatrixPose {
     MatrixPose::Pose(Pose::from_parts(translation.into(), rotation), nearest.deviation)
 }
 
+/// Refuses columns that are not as long as the poses, before anything is done by rows.
+pub(super) fn check_lengths(file: &Path, recording: &Recording) -> Result<(), Error> {
+    match recording.frames.unequal() {
+        None => Ok(()),
+        Some((what, actual)) => {
+            let problem = format!("there are {} poses but {actual} {what}", recording.frames.poses.len());
+            Err(Error::Malformed { file: file.to_owned(), problem })
+        }
+    }
+}
+
 /// What a format says of a frame besides its pose; `None` where it says nothing of any frame.
 #[derive(Debug, Clone, Default)]
 pub(super) struct About {

@@ -106,6 +106,16 @@ pub struct Stated {
 }
 
 impl Recording {
+    /// With these times.
+    ///
+    /// # Errors
+    /// [`Error::Malformed`] if they are not as many as the poses.
+    pub fn with_timestamps(mut self, file: &Path) -> Result<Self, Error> {
+        self.frames.timestamps_ns = read_timestamps(file)?;
+        collect::check_lengths(file, &self)?;
+        Ok(self)
+    }
+
     /// Which rows stay when only every `step`-th frame of each sequence is kept.
     pub fn every(&self, step: usize) -> Vec<usize> {
         let frame_count = self.frames.poses.len();

@@ -34,27 +34,24 @@ pub fn read_sens(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, Erro
     let frame_count = file.header()?;
     let file_name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let mut collected = Collected::default();
-    let mut times = Vec::new();
     for number in 0..frame_count {
         (reader.progress)(number as usize, frame_count as usize);
         let frame = file.frame(number)?;
         let name = number.to_string();
         let image = Some(format!("{file_name}@{}+{}", frame.offset, frame.bytes));
-        let about = About { name, image, number: i64::try_from(number).ok(), ..About::default() };
+        // A time so large that this cuts it is no time, and does not grow.
+        let timestamp_ns = Some(i64::try_from(frame.time_us).unwrap_or(i64::MAX).saturating_mul(1_000));
+        let about = About { name, image, number: i64::try_from(number).ok(), timestamp_ns, ..About::default() };
         if is_suspect(&frame.pose, number == 0) {
             collected.drop(about.name, DropReason::SuspectIdentityPose);
         } else {
-            let finite = frame.pose.iter().all(|x| x.is_finite());
             collected.take(about, &frame.pose, path)?;
-            times.extend(finite.then_some(frame.time_us));
         }
     }
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut recording = collected.finish(folder, reader)?;
-    let grows = times.len() == recording.frames.poses.len() && times.is_sorted_by(|a, b| a < b);
-    let in_ns = |time: &u64| i64::try_from(*time).ok()?.checked_mul(1_000);
-    if let (true, Some(times)) = (grows, times.iter().map(in_ns).collect()) {
-        recording.frames.timestamps_ns = times;
+    if !recording.frames.timestamps_ns.is_sorted_by(|a, b| a < b) {
+        recording.frames.timestamps_ns.clear();
     }
     Ok(recording)
 }

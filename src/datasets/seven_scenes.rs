@@ -102,7 +102,7 @@ fn sequences_of(folder: &Path, wanted: Option<&str>) -> Result<(PathBuf, Vec<Str
     Ok((folder.to_owned(), sequences))
 }
 
-/// The sequences that the scene holds out for testing; none if it has no split files, or they leave a sequence out.
+/// The sequences that the scene holds out for testing; none if it has no split files.
 fn dataset_split(scene: &Path, sequences: &[String]) -> Result<Option<BTreeSet<String>>, Error> {
     let files = ["TrainSplit.txt", "TestSplit.txt"].map(|name| scene.join(name));
     if !files.iter().all(|file| file.is_file()) {
@@ -115,7 +115,11 @@ fn dataset_split(scene: &Path, sequences: &[String]) -> Result<Option<BTreeSet<S
             problem: format!("names {both}, as TrainSplit.txt does"),
         });
     }
-    Ok(sequences.iter().all(|name| train.contains(name) || test.contains(name)).then_some(test))
+    if let Some(unlisted) = sequences.iter().find(|name| !train.contains(*name) && !test.contains(*name)) {
+        let problem = format!("does not name {unlisted}, nor does TrainSplit.txt; add it, or move the sequence away");
+        return Err(Error::Malformed { file: files[1].clone(), problem });
+    }
+    Ok(Some(test))
 }
 
 fn split_file(file: &Path) -> Result<BTreeSet<String>, Error> {

@@ -4,6 +4,11 @@ use std::fs::File;
 use std::io::{Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
+use zune_core::bytestream::ZCursor;
+use zune_core::colorspace::ColorSpace;
+use zune_core::options::DecoderOptions;
+use zune_jpeg::JpegDecoder;
+
 use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits};
 
@@ -19,6 +24,8 @@ pub struct Bounds {
     pub pixels: u64,
 }
 
+/// The last two bytes of a JPEG; anything may follow them.
+const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];
 /// What may be allocated to read a header: colour profiles are compressed, and may be bombs.
 const HEADER_ALLOC: u64 = 16 << 20;
 
@@ -40,9 +47,12 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
     if !matches!(format, Some(ImageFormat::Jpeg | ImageFormat::Png)) {
         return Err(bad("is neither JPEG nor PNG".to_owned()));
     }
+    if format == Some(ImageFormat::Jpeg) {
+        return decode_jpeg(bytes, bounds).map_err(bad);
+    }
     let read = |most: u64| {
         let mut reader = ImageReader::new(Cursor::new(bytes));
-        reader.set_format(format.unwrap_or(ImageFormat::Png));
+        reader.set_format(ImageFormat::Png);
         let mut limits = Limits::default();
         limits.max_alloc = Some(most);
         reader.limits(limits);
@@ -57,6 +67,29 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
     let decoded = read(most).decode().map_err(|error| bad(error.to_string()))?;
     let bytes = decoded.into_rgb8().into_raw();
     Ok(RgbImage { width: width as usize, height: height as usize, bytes })
+}
+
+/// JPEG, strictly: an image that ends early is not filled up with grey.
+fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
+    if !bytes.windows(2).rev().any(|marker| marker == END_OF_IMAGE) {
+        return Err("ends before its end marker: it was cut".to_owned());
+    }
+    let options = DecoderOptions::default()
+        .set_strict_mode(true)
+        .set_max_width(usize::from(u16::MAX))
+        .set_max_height(usize::from(u16::MAX))
+        .jpeg_set_out_colorspace(ColorSpace::RGB);
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
+    decoder.decode_headers().map_err(|error| error.to_string())?;
+    let (width, height) = decoder.dimensions().ok_or("says no size")?;
+    if width as u64 * height as u64 > bounds.pixels {
+        return Err(format!("has {width}×{height} pixels, over the limit of {}", bounds.pixels));
+    }
+    let bytes = decoder.decode().map_err(|error| error.to_string())?;
+    if bytes.len() != width * height * 3 {
+        return Err("has colours that are no RGB".to_owned());
+    }
+    Ok(RgbImage { width, height, bytes })
 }
 
 /// Reads and decodes a room's image: a file below `root`, or the part `FILE@OFFSET+LENGTH` of one.
@@ -126,6 +159,19 @@ mod tests {
         let image = format!("p.bin@4+{}", bytes.len());
         assert_eq!(read_image(folder.path(), &image).unwrap(), found);
         assert!(read_image(folder.path(), "p.bin@4+99999").is_err());
+    }
+
+    /// Oracle: the photographs of a tiny recording, whole and under every cut: a JPEG that ends early is no image, whatever
+    /// a lenient decoder would make of it.
+    #[test]
+    fn a_jpeg_that_ends_early_is_refused() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/datasets/scannet/scene0000_00/color");
+        let whole = std::fs::read(folder.join("9.jpg")).unwrap();
+        let image = decode("9.jpg", &whole, Bounds::LOCAL).unwrap();
+        assert_eq!((image.width, image.height), (8, 6));
+        for cut in 0..whole.len() - 1 {
+            assert!(decode("9.jpg", &whole[..cut], Bounds::LOCAL).is_err(), "cut at {cut} of {}", whole.len());
+        }
     }
 
     /// Oracle: the list of bad visitors: cut, too large, too many pixels, another format, nothing.

@@ -101,6 +101,8 @@ pub struct Encoder {
     layers: Vec<Layer>,
     dims: Vec<usize>,
     window: usize,
+    /// Of every prepared image (width, height), where the preparation or the model fixes it.
+    size: Option<(usize, usize)>,
 }
 
 impl Encoder {
@@ -114,6 +116,7 @@ impl Encoder {
             layers: vec![Layer { name: source.layer, base: source.base, norm: source.norm, pooling: builtin::POOLING }],
             dims: vec![BUILTIN_DIM],
             window: 1,
+            size: Some((64, 48)),
         }
     }
 
@@ -131,6 +134,7 @@ impl Encoder {
             layers: vec![Layer { name: PIXELS.to_owned(), base: "name".to_owned(), norm: "none".to_owned(), pooling }],
             dims: vec![3 * 16 * 12],
             window: 1,
+            size: Some((320, 240)),
         }
     }
 
@@ -140,16 +144,19 @@ impl Encoder {
     /// [`Error::Model`], [`Error::NotBuilt`], [`Error::Runtime`].
     pub fn model(task: ModelTask, runtime: &Runtime) -> Result<Self, Error> {
         let ModelTask { file, preparation, layers, window } = task;
-        let (network, id) = network::open(&file, &preparation, &layers, window, runtime)?;
-        let mut encoder = Self { id, preparation, network, layers, dims: Vec::new(), window };
-        let (width, height) = encoder.preparation.size().unwrap_or((64, 64));
+        let (network, id, size) = network::open(&file, &preparation, &layers, window, runtime)?;
+        let mut encoder = Self { id, preparation, network, layers, dims: Vec::new(), window, size };
+        let (width, height) = size.unwrap_or((64, 64));
         let grey = RgbImage { width, height, bytes: vec![127; width * height * 3] };
-        let outputs = encoder.outputs(&[vec![&grey; window]])?;
+        // Two clips, so that a layer whose first axis is not the batch is found.
+        let outputs = encoder.outputs(&[vec![&grey; window], vec![&grey; window]])?;
+        let seen = pooling::Seen { width, height, window };
         for (layer, output) in encoder.layers.iter_mut().zip(&outputs) {
             let problem = |problem: String| Error::Model { file: file.clone(), problem };
             let one = output.index_axis(Axis(0), 0);
             layer.pooling = layer.pooling.for_rank(one.ndim());
-            let row = layer.pooling.pool(one).map_err(|error| problem(format!("layer '{}': {error}", layer.name)))?;
+            let row = layer.pooling.pool(one, seen);
+            let row = row.map_err(|error| problem(format!("layer '{}': {error}", layer.name)))?;
             encoder.dims.push(row.len());
         }
         Ok(encoder)
@@ -261,11 +268,12 @@ impl Encoder {
         }
         let outputs = self.outputs(clips)?;
         let runtime = self.network.runtime();
+        let seen = pooling::Seen { width: clips[0][0].width, height: clips[0][0].height, window: self.window };
         let mut from = 0;
         for ((layer, &dim), output) in self.layers.iter().zip(&self.dims).zip(&outputs) {
             for (mut row, one) in rows.outer_iter_mut().zip(output.outer_iter()) {
-                let pooled =
-                    layer.pooling.pool(one).map_err(|error| Error::Runtime { runtime, problem: error.to_string() })?;
+                let pooled = layer.pooling.pool(one, seen);
+                let pooled = pooled.map_err(|error| Error::Runtime { runtime, problem: error.to_string() })?;
                 if pooled.len() != dim {
                     let problem = format!("layer '{}' gave {} columns, expected {dim}", layer.name, pooled.len());
                     return Err(Error::Runtime { runtime, problem });
@@ -287,6 +295,12 @@ impl Encoder {
             let problem = "images of several sizes in one batch; give a --resize that fixes the size".to_owned();
             return Err(Error::BadImage { image: "batch".to_owned(), problem });
         }
+        if let Some((wanted_width, wanted_height)) = self.size.filter(|&size| size != (width, height)) {
+            return Err(Error::BadImage {
+                image: format!("image of {width}×{height} pixels"),
+                problem: format!("the encoder takes {wanted_width}x{wanted_height}; give a --resize or --crop to that"),
+            });
+        }
         let mut numbers = Vec::with_capacity(clips.len() * self.window * 3 * width * height);
         for clip in clips {
             for image in clip {
@@ -296,11 +310,24 @@ impl Encoder {
         let shape = IxDyn(&[clips.len(), self.window, 3, height, width]);
         let frames = ArrayD::from_shape_vec(shape, numbers)
             .map_err(|error| Error::Runtime { runtime: self.runtime(), problem: error.to_string() })?;
-        match &self.network {
-            Network::Builtin => Ok(Vec::new()),
-            Network::Pixels => Ok(vec![frames.index_axis_move(Axis(1), 0)]),
-            Network::Model { runner, clip_axis, .. } => runner.run(network::laid_out(frames, *clip_axis)),
+        let outputs = match &self.network {
+            Network::Builtin => Vec::new(),
+            Network::Pixels => vec![frames.index_axis_move(Axis(1), 0)],
+            Network::Model { runner, clip_axis, .. } => runner.run(network::laid_out(frames, *clip_axis))?,
+        };
+        for (layer, output) in self.layers.iter().zip(&outputs) {
+            if output.shape().first() != Some(&clips.len()) {
+                let problem = format!(
+                    "layer '{}' gave an output of shape {:?} for {} images: its first axis does not count them; name \
+                     another layer, or transpose it in the export",
+                    layer.name,
+                    output.shape(),
+                    clips.len()
+                );
+                return Err(Error::Runtime { runtime: self.runtime(), problem });
+            }
         }
+        Ok(outputs)
     }
 }
 

@@ -38,6 +38,9 @@ struct NodeProto {
 struct TensorProto {
     #[prost(string, tag = "8")]
     name: String,
+    /// 1 for weights in another file.
+    #[prost(int32, tag = "14")]
+    location: i32,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -93,6 +96,10 @@ impl ModelFile {
         let model = ModelProto::decode(bytes.as_slice());
         let graph = model.ok().and_then(|model| model.graph);
         let graph = graph.ok_or_else(|| wrong("is no ONNX model; was it truncated?".to_owned()))?;
+        if graph.initializer.iter().any(|tensor| tensor.location != 0) {
+            let inline = "onnx.save(onnx.load(\"FILE.onnx\"), \"WHOLE.onnx\")";
+            return Err(wrong(format!("keeps weights in another file; put them into this one, in Python: {inline}")));
+        }
         let weights: HashSet<&str> = graph.initializer.iter().map(|tensor| tensor.name.as_str()).collect();
         let inputs: Vec<&ValueInfoProto> =
             graph.input.iter().filter(|input| !weights.contains(input.name.as_str())).collect();

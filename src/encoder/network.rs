@@ -74,14 +74,17 @@ impl Network {
     }
 }
 
-/// Opens a model and checks what it is asked for against what its file says. Returns it and its identity.
+/// A model, its identity, and the size (width, height) of its images where that is fixed.
+pub(super) type Opened = (Network, String, Option<(usize, usize)>);
+
+/// Opens a model and checks what it is asked for against what its file says.
 pub(super) fn open(
     file: &Path,
     preparation: &Preparation,
     layers: &[Layer],
     window: usize,
     runtime: &Runtime,
-) -> Result<(Network, String), Error> {
+) -> Result<Opened, Error> {
     preparation.check()?;
     let model = ModelFile::read(file)?;
     let wrong = |problem: String| Error::Model { file: file.to_owned(), problem };
@@ -106,7 +109,8 @@ pub(super) fn open(
         let ((width, height), (w, h)) = (wanted, given);
         return Err(wrong(format!("wants images of {width}x{height}, --resize and --crop give {w}x{h}")));
     }
-    if let Some((width, height)) = preparation.size().or(model.image_size()) {
+    let size = preparation.size().or(model.image_size());
+    if let Some((width, height)) = size {
         let rank = shape.len();
         (shape[rank - 2], shape[rank - 1]) = (Some(height), Some(width));
     }
@@ -119,7 +123,7 @@ pub(super) fn open(
     }
     let id = model.id.clone();
     let runner = runner(file, model, &names, &shape, runtime)?;
-    Ok((Network::Model { runner, kind, clip_axis }, id))
+    Ok((Network::Model { runner, kind, clip_axis }, id, size))
 }
 
 #[cfg_attr(not(feature = "onnxruntime"), allow(unused_variables, reason = "each runtime takes a part"))]

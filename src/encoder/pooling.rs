@@ -22,7 +22,7 @@ pub enum Pooling {
         /// Tokens that are no patches: the class token and registers.
         skip: usize,
     },
-    /// Means over cells of the map, or of the square of tokens after the first `skip`.
+    /// Means over cells of the map, or of the patch tokens after the first `skip`, laid out in the image's shape.
     Grid {
         /// Cells across.
         columns: usize,
@@ -58,7 +58,7 @@ impl Pooling {
     }
 
     /// The row of one image's output.
-    pub(super) fn pool(self, output: ArrayViewD<'_, f32>) -> Result<Vec<f32>, Problem> {
+    pub(super) fn pool(self, output: ArrayViewD<'_, f32>, seen: Seen) -> Result<Vec<f32>, Problem> {
         let shape = output.shape().to_vec();
         let wrong = || Problem { pooling: self, shape: shape.clone() };
         match (self, output.ndim()) {
@@ -72,13 +72,14 @@ impl Pooling {
                 Ok(grid(patches.insert_axis(Axis(1)), 1, 1))
             }
             (Self::Grid { columns, rows, skip }, 2) if skip < shape[0] => {
-                let side = (shape[0] - skip).isqrt();
-                if side * side != shape[0] - skip {
-                    return Err(wrong());
-                }
+                let (times, height, width) = seen.patches(shape[0] - skip).ok_or_else(wrong)?;
                 let tokens = output.into_dimensionality::<Ix2>().map_err(|_| wrong())?;
                 let patches = tokens.slice_move(ndarray::s![skip.., ..]);
-                let map = Array3::from_shape_fn((shape[1], side, side), |(c, y, x)| patches[(y * side + x, c)]);
+                let mean = |c: usize, place: usize| {
+                    let sum: f64 = (0..times).map(|t| f64::from(patches[(t * height * width + place, c)])).sum();
+                    (sum / times as f64) as f32
+                };
+                let map = Array3::from_shape_fn((shape[1], height, width), |(c, y, x)| mean(c, y * width + x));
                 Ok(grid(map.view(), columns, rows))
             }
             (Self::Mean { .. }, 3) if shape[1] * shape[2] > 0 => {
@@ -89,6 +90,29 @@ impl Pooling {
             }
             _ => Err(wrong()),
         }
+    }
+}
+
+/// What the network saw: the size of its images in pixels, and how many a clip has.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Seen {
+    pub width: usize,
+    pub height: usize,
+    pub window: usize,
+}
+
+impl Seen {
+    /// How many times, rows and columns a number of patch tokens has: square patches, time first. A clip's tokens stand
+    /// for two images each, for one, or for all of them.
+    fn patches(self, tokens: usize) -> Option<(usize, usize, usize)> {
+        let times = if self.window > 1 { vec![self.window / 2, self.window, 1] } else { vec![1] };
+        times.into_iter().find_map(|times| {
+            let area = tokens.is_multiple_of(times).then(|| tokens / times)?;
+            let columns = (area * self.width / self.height).isqrt();
+            let rows = area.checked_div(columns)?;
+            let fits = columns * rows == area && columns * self.height == rows * self.width;
+            fits.then_some((times, rows, columns))
+        })
     }
 }
 
@@ -113,8 +137,8 @@ fn grid(map: ArrayView3<'_, f32>, columns: usize, rows: usize) -> Vec<f32> {
 /// An output that cannot be pooled so.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "its output of shape {shape:?} cannot be pooled by '{pooling}': cls wants tokens (n, c); grids want a map (c, h, w) \
-     or a square number of patch tokens, after the prefix tokens"
+    "its output of shape {shape:?} cannot be pooled by '{pooling}': cls wants tokens (n, c); grids want a map (c, h, w), \
+     or patch tokens as many across and down as the image's shape says, after the prefix tokens"
 )]
 pub(super) struct Problem {
     pooling: Pooling,
@@ -174,6 +198,8 @@ mod tests {
     use super::*;
     use ndarray::{Array2, ArrayD};
 
+    const SQUARE: Seen = Seen { width: 14, height: 14, window: 1 };
+
     fn map(channels: usize, height: usize, width: usize) -> ArrayD<f32> {
         Array3::from_shape_fn((channels, height, width), |(c, y, x)| (100 * c + 10 * y + x) as f32).into_dyn()
     }
@@ -181,7 +207,7 @@ mod tests {
     /// Oracle: PyTorch's definition by hand. Three rows in two cells overlap in the middle one: rows 0–1 and 1–2.
     #[test]
     fn cells_overlap_where_the_map_does_not_divide() {
-        let pool = |text: &str, output: ArrayD<f32>| text.parse::<Pooling>().unwrap().pool(output.view());
+        let pool = |text: &str, output: ArrayD<f32>| text.parse::<Pooling>().unwrap().pool(output.view(), SQUARE);
         assert_eq!(pool("grid1x2", map(2, 3, 1)).unwrap(), [5.0, 15.0, 105.0, 115.0]);
         assert_eq!(pool("grid2x1", map(1, 2, 2)).unwrap(), [5.0, 6.0]);
         assert_eq!(pool("mean", map(2, 2, 2)).unwrap(), [5.5, 105.5]);
@@ -191,7 +217,7 @@ mod tests {
     #[test]
     fn tokens_after_the_prefix_are_a_square() {
         let tokens = || Array2::from_shape_fn((5, 2), |(n, c)| (10 * c + n) as f32).into_dyn();
-        let pool = |text: &str| text.parse::<Pooling>().unwrap().pool(tokens().view());
+        let pool = |text: &str| text.parse::<Pooling>().unwrap().pool(tokens().view(), SQUARE);
         assert_eq!(pool("cls").unwrap(), [0.0, 10.0]);
         assert_eq!(pool("mean@1").unwrap(), [2.5, 12.5]);
         assert_eq!(pool("mean").unwrap(), [2.0, 12.0]);
@@ -199,7 +225,22 @@ mod tests {
         assert_eq!(pool("grid2x1@1").unwrap(), [2.0, 3.0, 12.0, 13.0]);
         assert!(pool("grid2x2").is_err(), "five tokens are no square");
         assert!(pool("mean@5").is_err(), "no token is left");
-        assert!("cls".parse::<Pooling>().unwrap().pool(map(1, 2, 2).view()).is_err());
+        assert!("cls".parse::<Pooling>().unwrap().pool(map(1, 2, 2).view(), SQUARE).is_err());
+    }
+
+    /// Oracle: by hand. 576 tokens are 32×18 of a wide image and 24×24 of a square one; a clip's come in times.
+    #[test]
+    fn tokens_lie_in_the_images_shape() {
+        let seen = |width, height, window| Seen { width, height, window };
+        assert_eq!(seen(512, 288, 1).patches(576), Some((1, 18, 32)));
+        assert_eq!(seen(384, 384, 1).patches(576), Some((1, 24, 24)));
+        assert_eq!(seen(512, 384, 1).patches(768), Some((1, 24, 32)));
+        assert_eq!(seen(384, 384, 16).patches(8 * 576), Some((8, 24, 24)));
+        assert_eq!(seen(224, 224, 1).patches(257), None);
+        assert_eq!(seen(512, 384, 1).patches(576), None);
+        let wide = Array2::from_shape_fn((8, 1), |(n, _)| n as f32).into_dyn();
+        let halves: Pooling = "grid2x1".parse().unwrap();
+        assert_eq!(halves.pool(wide.view(), seen(32, 16, 1)).unwrap(), [2.5, 4.5], "four across, two down");
     }
 
     /// Oracle: the words of the documentation.

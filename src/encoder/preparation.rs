@@ -89,9 +89,17 @@ impl Preparation {
         let (width, height) = match self.resize {
             Resize::None => (image.width, image.height),
             Resize::Whole { width, height } => (width, height),
-            Resize::Shortest(edge) if image.width <= image.height => (edge, edge * image.height / image.width.max(1)),
-            Resize::Shortest(edge) => (edge * image.width / image.height.max(1), edge),
+            Resize::Shortest(edge) if image.width <= image.height => {
+                (edge, edge.saturating_mul(image.height) / image.width.max(1))
+            }
+            Resize::Shortest(edge) => (edge.saturating_mul(image.width) / image.height.max(1), edge),
         };
+        if width.max(height) > LARGEST && self.resize != Resize::None {
+            return Err(Error::BadImage {
+                image: format!("image of {}×{} pixels", image.width, image.height),
+                problem: format!("would be resized to {width}×{height}, over the limit of {LARGEST} a side"),
+            });
+        }
         let resized = if (width, height) == (image.width, image.height) {
             image
         } else {
@@ -328,6 +336,9 @@ mod tests {
         assert_eq!(preparation.pixels(ramp(30, 20)).unwrap(), ramp(30, 20));
         let crop = Preparation { crop: Some((31, 20)), ..Preparation::default() };
         assert!(crop.pixels(ramp(30, 20)).is_err());
+        let strip = RgbImage { width: 1, height: 100_000, bytes: vec![0; 300_000] };
+        let shortest = Preparation { resize: Resize::Shortest(256), crop: Some((224, 224)), ..Preparation::default() };
+        assert!(shortest.pixels(strip).unwrap_err().to_string().contains("over the limit"), "a bomb");
         let empty = RgbImage { width: 0, height: 0, bytes: Vec::new() };
         assert!(preparation.pixels(empty).is_err());
     }

@@ -133,22 +133,34 @@ fn prepare(task: &Task<'_>, encoder: &Encoder, anchors: &[usize]) -> Result<Clip
         match image {
             Ok(image) => drop(clips.images.insert(row, image)),
             Err(error) if task.on_bad == OnBadImage::Stop => return Err(error),
-            Err(error @ (Error::BadImage { .. } | Error::Io { .. })) => {
-                problems.insert(row, error.to_string());
-            }
+            Err(error) if is_of_the_image(&error) => drop(problems.insert(row, error.to_string())),
             Err(error) => return Err(error),
         }
     }
     for (&anchor, frames) in anchors.iter().zip(frames) {
-        match frames.iter().find_map(|frame| problems.get(frame)) {
+        match problems.get(&anchor) {
             Some(problem) => clips.bad.push((anchor, problem.clone())),
             None => {
+                let good = |frame: &usize| clips.images.contains_key(frame);
+                // Where another frame of the clip is bad, the nearest good one stands in for it.
+                let stand_in = |frame: usize| {
+                    frames.iter().copied().filter(good).min_by_key(|other| other.abs_diff(frame)).unwrap_or(anchor)
+                };
+                clips.frames.push(frames.iter().map(|&frame| stand_in(frame)).collect());
                 clips.good.push(anchor);
-                clips.frames.push(frames);
             }
         }
     }
     Ok(clips)
+}
+
+/// Whether it is the image that is bad or gone, and not the disk or the runtime.
+fn is_of_the_image(error: &Error) -> bool {
+    match error {
+        Error::BadImage { .. } => true,
+        Error::Io { cause, .. } => cause.kind() == std::io::ErrorKind::NotFound,
+        _ => false,
+    }
 }
 
 /// The frames of the clip around an anchor: the anchor is in the middle (of an even number, after it); at the ends of
@@ -238,6 +250,19 @@ mod tests {
         for (row, &frame) in found.rows.outer_iter().zip(&found.good) {
             assert_eq!(row.to_vec(), super::super::encode_builtin(&image(frame).unwrap()));
         }
+    }
+
+    /// Oracle: by hand. Of clips of three around frames 2, 3 and 4, with frame 3 bad, only frame 3 is left out.
+    #[test]
+    fn a_bad_image_costs_its_own_frame_alone() {
+        let timeline = Timeline::unbroken(8);
+        let mut encoder = Encoder::builtin();
+        encoder.window = 3;
+        let cancel = Cancellation::default();
+        let task = Task { timeline: &timeline, image: &image, batch: 8, on_bad: OnBadImage::Skip, cancel: &cancel };
+        let clips = prepare(&task, &encoder, &[2, 3, 4]).unwrap();
+        assert_eq!((clips.good, clips.bad.len()), (vec![2, 4], 1));
+        assert_eq!(clips.frames, [[1, 2, 2], [4, 4, 5]]);
     }
 
     /// Oracle: the definition of stopping at a bad image: it is named, and nothing is given.

@@ -13,7 +13,11 @@ use tract_onnx::prelude::{
 use super::Error;
 use super::network::Runner;
 
-pub(super) struct Tract(Arc<TypedRunnableModel>);
+pub(super) struct Tract {
+    model: Arc<TypedRunnableModel>,
+    /// The outputs that were asked for, in that order.
+    names: Vec<String>,
+}
 
 impl Tract {
     pub fn open(file: &Path, names: &[String], shape: &[Option<usize>]) -> Result<Self, Error> {
@@ -27,14 +31,15 @@ impl Tract {
             model.set_input_fact(0, InferenceFact::dt_shape(f32::datum_type(), shape.as_slice()))?;
             model.into_optimized()?.into_runnable()
         });
-        model.map(Self).map_err(|error| wrong(format!("cannot be run by tract: {error:#}")))
+        let model = model.map_err(|error| wrong(format!("cannot be run by tract: {error:#}")))?;
+        Ok(Self { model, names: names.to_vec() })
     }
 
     fn one(&self, clip: ArrayViewD<'_, f32>) -> Result<Vec<ArrayD<f32>>, Error> {
         let failed = |problem: String| Error::Runtime { runtime: "tract", problem };
         let numbers: Vec<f32> = clip.iter().copied().collect();
         let input = Tensor::from_shape(clip.shape(), &numbers).map_err(|error| failed(format!("{error:#}")))?;
-        let outputs = self.0.run(tvec!(input.into())).map_err(|error| failed(format!("{error:#}")))?;
+        let outputs = self.model.run(tvec!(input.into())).map_err(|error| failed(format!("{error:#}")))?;
         let array = |output: &tract_onnx::prelude::TValue| {
             let numbers = output.to_plain_array_view::<f32>();
             let numbers = numbers.map_err(|error| failed(format!("{error:#}")))?;
@@ -52,11 +57,13 @@ impl Runner for Tract {
             .into_par_iter()
             .map(|clip| self.one(input.slice_axis(Axis(0), ndarray::Slice::from(clip..clip + 1))))
             .collect::<Result<_, _>>()?;
-        let count = each.first().map_or(0, Vec::len);
+        let count = self.names.len();
         let joined = |output: usize| {
             let parts: Vec<_> = each.iter().map(|outputs| outputs[output].view()).collect();
-            ndarray::concatenate(Axis(0), &parts)
-                .map_err(|error| Error::Runtime { runtime: "tract", problem: error.to_string() })
+            ndarray::concatenate(Axis(0), &parts).map_err(|_| {
+                let problem = format!("layer '{}' has no axis that counts images", self.names[output]);
+                Error::Runtime { runtime: "tract", problem }
+            })
         };
         (0..count).map(joined).collect()
     }

@@ -135,6 +135,9 @@ pub fn query(
         exclude_radius,
         thresholds: given_thresholds,
     } = request;
+    let displacement = displacement(wanted, &room)?;
+    let thresholds = thresholds(given_thresholds)?;
+    // Last, since an image is costly.
     let source = source("source", view, adapter, snapshot)?;
     if source_pose.is_some() && matches!(source, Source::Frame(_)) {
         return Err(Error::invalid("source_pose", "is not to be given with a frame, whose pose the room knows"));
@@ -142,14 +145,14 @@ pub fn query(
     let known = source_pose.map(|given| pose(given, &room).map_err(|error| error.within("source_pose"))).transpose()?;
     let query = Query {
         source: SourceAt { source, pose: known },
-        displacement: displacement(wanted, &room)?,
+        displacement,
         steps: steps.unwrap_or(1),
         mode: mode_of(mode)?,
         reading: reading_of(reading)?,
         hit_count: hit_count.unwrap_or(1),
         exclude_source: exclusion(exclude_source, exclude_radius)?,
     };
-    Ok((query, thresholds(given_thresholds)?))
+    Ok((query, thresholds))
 }
 
 fn mode_of(mode: i32) -> Result<Mode, Error> {
@@ -191,7 +194,10 @@ pub fn split(name: &str) -> Result<Option<Split>, Error> {
     match Split::from_name(name) {
         Some(split) => Ok(Some(split)),
         None if name.is_empty() => Ok(None),
-        None => Err(Error::invalid("split", format!("'{name}' is not time, blocks or pairs"))),
+        None => {
+            let known = Split::ALL.map(Split::name).join(", ");
+            Err(Error::invalid("split", format!("'{name}' is none of {known}")))
+        }
     }
 }
 

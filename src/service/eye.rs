@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use super::{Error, RunError};
 use crate::encoder::{self, Bounds, Encoder, Runtime, decode};
+use crate::features::FeatureSource;
 use crate::store::StoredAdapter;
 
 /// What a server may encode images with.
@@ -49,8 +50,14 @@ pub fn open(
 ) -> Result<BTreeMap<String, Arc<Eye>>, RunError> {
     let mut eyes = BTreeMap::new();
     let Some(ImageEncoders { models, runtime, bounds }) = encoders else { return Ok(eyes) };
+    // Adapters of one source share an encoder.
+    let mut opened: Vec<(&FeatureSource, Arc<Eye>)> = Vec::new();
     for (name, adapter) in adapters {
         let source = adapter.adapter.source();
+        if let Some((_, eye)) = opened.iter().find(|(other, _)| other.is_like(source)) {
+            eyes.insert(name.clone(), eye.clone());
+            continue;
+        }
         let encoder = Encoder::of_source(source, models, runtime)
             .map_err(|problem| RunError::Encoder { adapter: name.clone(), problem })?;
         match encoder {
@@ -59,7 +66,9 @@ pub fn open(
             }
             Some(encoder) if encoder.dims() == [source.dim] => {
                 tracing::info!(adapter = name, encoder = encoder.id(), runtime = encoder.runtime(), "takes images");
-                eyes.insert(name.clone(), Arc::new(Eye { encoder, bounds: *bounds }));
+                let eye = Arc::new(Eye { encoder, bounds: *bounds });
+                opened.push((source, eye.clone()));
+                eyes.insert(name.clone(), eye);
             }
             Some(encoder) => {
                 let problem = encoder::Error::Option {

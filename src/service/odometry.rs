@@ -5,6 +5,7 @@ use tonic::{Request, Response, Status};
 use super::convert;
 use super::status::view_error;
 use super::{Error, Handlers, Snapshot};
+use crate::cancel::Cancellation;
 use crate::geometry::{body_twist, exp};
 use crate::navigation::{Source, StepError};
 use crate::odometry::{View, motion};
@@ -21,12 +22,16 @@ impl OdometryService for Handlers {
         let snapshot = self.snapshot()?;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
-        let answer = self.workers.run(budget, move |_| answer(&snapshot, request)).await?;
+        let answer = self.workers.run(budget, move |cancel| answer(&snapshot, request, cancel)).await?;
         Ok(Response::new(answer))
     }
 }
 
-fn answer(snapshot: &Snapshot, request: pb::EstimateMotionRequest) -> Result<pb::EstimateMotionResponse, Error> {
+fn answer(
+    snapshot: &Snapshot,
+    request: pb::EstimateMotionRequest,
+    cancel: &Cancellation,
+) -> Result<pb::EstimateMotionResponse, Error> {
     let pb::EstimateMotionRequest { adapter, room, first, second, thresholds } = request;
     let thresholds = convert::thresholds(thresholds)?;
     let served = if room.is_empty() { None } else { Some(snapshot.navigator(&room, &adapter)?) };
@@ -47,6 +52,7 @@ fn answer(snapshot: &Snapshot, request: pb::EstimateMotionRequest) -> Result<pb:
     };
     let frames = frame_of(&first).zip(frame_of(&second));
     let view = |field: &str, given| -> Result<View, Error> {
+        cancel.check()?;
         let view = match convert::source(field, given, stored, snapshot)? {
             Source::Feature(feature) => View::Feature(feature),
             Source::Latent(latent) => View::Latent(latent),

@@ -36,14 +36,15 @@ pub struct RoomSummary {
 }
 
 impl Store {
-    /// Publishes a room with features. Features of other names that the newest revision has stay with the room as
-    /// long as its frames are the same; publishing the same again makes no revision.
+    /// Publishes a room with features. What the newest revision has besides, features of other names, timestamps, images
+    /// and the like, stays with the room as long as its poses are the same; publishing the same again makes no revision.
     ///
     /// # Errors
     /// [`Error::FeatureRows`], [`Error::DuplicateFeatures`], [`Error::Name`], or as the store fails.
     pub async fn publish_room(&self, room: &Room, features: &[Features]) -> Result<Published, Error> {
         check_features(room, features)?;
         let folder = Path::from(Kind::Room.folder()).join(room.id().as_str());
+        let room = &self.with_what_is_known(&folder, room).await?;
         let frames = self.write_object(&folder, "frames", "safetensors", frames_file(room)?).await?;
         let frame_names = match room.frame_names() {
             [] => None,
@@ -160,6 +161,39 @@ impl Store {
             summaries.push(RoomSummary { room, revision, frame_count: body.frame_count, features });
         }
         Ok(summaries)
+    }
+
+    /// A room with what the newest revision knows of the same frames and it does not say itself.
+    async fn with_what_is_known(&self, folder: &Path, room: &Room) -> Result<Room, Error> {
+        let Some(&newest) = self.revisions(folder).await?.last() else { return Ok(room.clone()) };
+        let body = self.room_body(folder, newest).await?;
+        if !self.has_poses(folder, &body, room).await? {
+            return Ok(room.clone());
+        }
+        let known = self.load(room.id().as_str(), Some(newest), Some("")).await?.room;
+        fn either<T: Clone>(given: &[T], known: &[T]) -> Vec<T> {
+            if given.is_empty() { known.to_vec() } else { given.to_vec() }
+        }
+        let (given, before) = (room.frames(), known.frames());
+        let frames = Frames {
+            poses: given.poses.clone(),
+            timestamps_ns: either(&given.timestamps_ns, &before.timestamps_ns),
+            names: either(&given.names, &before.names),
+            numbers: either(&given.numbers, &before.numbers),
+            images: either(&given.images, &before.images),
+            sequences: either(&given.sequences, &before.sequences),
+            held_out: either(&given.held_out, &before.held_out),
+        };
+        let mut provenance = room.provenance().clone();
+        if provenance.licence.is_empty() {
+            provenance.licence.clone_from(&known.provenance().licence);
+        }
+        if given.images.is_empty() {
+            provenance.images_root.clone_from(&known.provenance().images_root);
+        }
+        let damaged =
+            |error: crate::room::Error| Error::Damaged { file: self.shown(folder), problem: error.to_string() };
+        Room::new(room.id().clone(), frames, provenance).map_err(damaged)
     }
 
     /// Whether a stored revision has a room's poses, whatever else it says of the frames.

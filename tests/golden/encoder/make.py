@@ -46,6 +46,20 @@ by_colour = save("clip_colour_first", [helper.make_node("ReduceMean", ["clip"], 
                                        helper.make_node("Transpose", ["means"], ["colours"], perm=[0, 2, 1])], {},
                  [tensor("clip", ["batch", 3, T, H, W])], [tensor("colours", ["batch", T, 3])])
 
+# outputs whose first axis is not the batch, and one without axes
+save("turned", [helper.make_node("ReduceMean", ["image"], ["means"], axes=[3], keepdims=0),
+                helper.make_node("Transpose", ["means"], ["turned"], perm=[2, 0, 1]),
+                helper.make_node("ReduceMean", ["image"], ["scalar"], keepdims=0)], {},
+     [tensor("image", ["batch", 3, H, W])], [tensor("turned", [H, "batch", 3]), tensor("scalar", [])])
+# weights in another file (which is not there: the model is refused before it is looked for)
+outside = onnx.load(HERE / "image.onnx")
+for weight in outside.graph.initializer:
+    if weight.name == "K":
+        weight.ClearField("raw_data")
+        weight.data_location = TensorProto.EXTERNAL
+        weight.external_data.add(key="location", value="outside.bin")
+(HERE / "outside.onnx").write_bytes(outside.SerializeToString())
+
 
 def conv(x):
     x = np.pad(x.astype(np.float64), ((0, 0), (0, 0), (1, 1), (1, 1)))
