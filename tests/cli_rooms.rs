@@ -60,6 +60,11 @@ fn recordings_are_imported_once_and_given_back() {
         let again = succeeds(&["import", format, &place, "--store", &store]);
         assert!(again.contains("already there, unchanged: revision 1"), "{again}");
     }
+    refuses(&["import", "tum", &path(&datasets, "tum"), "--store", &store, "--name", "chess"], &["--replace"]);
+    succeeds(&["encode", "--store", &store, "--room", "tiny", "--model", "pixels"]);
+    let tiny = path(&datasets, "scannet_sens/tiny.sens");
+    let again = succeeds(&["import", "scannet", &tiny, "--store", &store]);
+    assert!(again.contains("already there, unchanged: revision 2"), "an encoded room is the same room: {again}");
     let thinned = succeeds(&[
         "import",
         "tum",
@@ -122,6 +127,8 @@ fn a_suite_is_drawn_once_and_encodes_as_its_images_do() {
     assert!(succeeds(&encode).contains("encoded 24 frames"));
     assert_eq!(features(&store, "studio3-0001", "kept"), streamed);
     assert!(succeeds(&encode).contains("already there"));
+    let pixels = ["studio", "--out", &store, "--rooms", "2", "--frames", "24", "--seed", "3", "--encode", "pixels"];
+    refuses(&pixels, &["was kept at 64×48", "another store"]);
     let other = path(folder.path(), "other");
     succeeds(&["studio", "--out", &other, "--rooms", "2", "--frames", "24", "--seed", "3", "--threads", "1"]);
     assert_eq!(features(&other, "studio3-0001", "builtin"), streamed, "the same rooms on one thread");
@@ -215,6 +222,7 @@ fn layers_are_swept() {
         }
     }
     refuses(&[&sweep[..5], &["nowhere"]].concat(), &["nowhere"]);
+    refuses(&[&sweep[..6], &["--room", "studio4-0000"]].concat(), &["given twice"]);
     refuses(&[&sweep[..6], &["--features", "dino"]].concat(), &["no such features", "builtin, pixels"]);
     refuses(&[&sweep[..6], &["--m1-frames", "300"]].concat(), &["300 frames"]);
 }

@@ -66,9 +66,11 @@ fn layers_of_a_tiny_model_are_what_numpy_says() {
         let cases = [
             ("map", "mean", "map_mean"),
             ("map", "grid2x2", "map_grid2x2"),
-            ("tokens", "cls", "tokens_cls"),
+            ("tokens", "mean", "map_mean"),
             ("tokens", "grid2x2", "map_grid2x2"),
-            ("tokens", "mean@1", "tokens_mean_after_1"),
+            ("classed", "cls", "vector"),
+            ("classed", "mean@1", "map_mean"),
+            ("classed", "grid2x2@1", "map_grid2x2"),
             ("vector", "mean", "vector"),
             ("hidden", "mean", "hidden_mean"),
         ];
@@ -117,7 +119,8 @@ fn models_that_cannot_be_used_are_refused_by_name() {
         let task = |name: &str, pooling: &str| tiny("image.onnx", vec![layer(name, pooling)], 1);
         refused(task("block9", "mean"), "map, tokens, vector");
         refused(task("map", "cls"), "cannot be pooled");
-        refused(task("tokens", "grid2x2@1"), "image's shape");
+        refused(task("classed", "grid2x2"), "image's shape");
+        refused(task("tokens", "cls"), "--prefix-tokens 0");
         refused(tiny("image.onnx", vec![layer("map", "mean"), layer("map", "mean")], 1), "twice");
         refused(tiny("image.onnx", Vec::new(), 1), "no layer");
         refused(tiny("image.onnx", vec![layer("map", "mean")], 4), "single images");

@@ -64,10 +64,10 @@ impl Export {
             Format::Tum(Timed { from, rate }) => {
                 let stored = from.load().await?;
                 let times = match (stored.room.timestamps_ns(), rate) {
-                    ([], Some(rate)) if rate > 0.0 && rate.is_finite() => {
+                    ([], Some(rate)) if (1e-3..=1e6).contains(&rate) => {
                         (0..stored.room.frame_count()).map(|row| (row as f64 / rate * 1e9).round() as i64).collect()
                     }
-                    ([], Some(rate)) => bail!("--rate must be frames a second, greater than 0, got {rate}"),
+                    ([], Some(rate)) => bail!("--rate must be 0.001 to 1,000,000 frames a second, got {rate}"),
                     ([], None) => bail!(
                         "room '{}' has no timestamps, which the format needs; give --rate FRAMES_A_SECOND, \
                          or export kitti",

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
 
+use super::encode::same_poses;
 use super::progress::bar;
 use super::say;
 use crate::datasets::{self, Dropped, Reader, Recording, SevenScenes, Unusable};
@@ -93,6 +94,9 @@ struct Destination {
     /// Refuse the recording if a frame is unusable, instead of dropping that frame
     #[arg(long)]
     strict: bool,
+    /// Publish a new revision of a room that has other frames in the store; its features do not carry over
+    #[arg(long)]
+    replace: bool,
     /// Features of the usable frames, NAME=FILE.npy, shape (n, d); may be given several times
     #[arg(long = "features", value_name = "NAME=FILE")]
     features: Vec<String>,
@@ -157,6 +161,26 @@ impl Import {
 }
 
 impl Destination {
+    /// Refuses to put other frames in the place of a room's, unless that is asked for.
+    async fn check_same(&self, store: &Store, room: &Room) -> anyhow::Result<()> {
+        let before = match store.load_room(room.id().as_str(), None).await {
+            Ok(before) => before.room,
+            Err(crate::store::Error::Unknown { .. }) => return Ok(()),
+            Err(error) => return Err(error.into()),
+        };
+        if self.replace || same_poses(&before, room) {
+            return Ok(());
+        }
+        bail!(
+            "room '{}' is in the store with other frames ({} from {}, these are {}); give another --name, or --replace, \
+             which leaves its features behind",
+            room.id(),
+            before.frame_count(),
+            before.provenance().format,
+            room.frame_count()
+        );
+    }
+
     /// Reads with a progress bar.
     fn read(
         &self,
@@ -207,6 +231,7 @@ impl Destination {
         let room = Room::new(id, recording.frames.select(&kept), provenance)?;
         check_features(&room, &features)?;
         let store = Store::create(&self.store)?;
+        self.check_same(&store, &room).await?;
         let published = store.publish_room(&room, &features).await?;
         let times = if room.timestamps_ns().is_empty() { "without timestamps" } else { "with timestamps" };
         let thinned = if self.every > 1 { format!(", every {} of {read_count}", self.every) } else { String::new() };

@@ -94,6 +94,9 @@ impl Layers {
         for room in &self.rooms {
             rooms.push(store.load_room(room, None).await?);
         }
+        if let Some(twice) = self.rooms.iter().enumerate().find(|(i, room)| self.rooms[..*i].contains(room)) {
+            bail!("room '{}' was given twice", twice.1);
+        }
         let names = self.names(&rooms)?;
         let tasks: Vec<(usize, &StoredRoom, &Features)> = (0..names.len())
             .flat_map(|layer| rooms.iter().map(move |room| (layer, room)))
@@ -137,16 +140,15 @@ impl Layers {
 
     /// The features that every room has, of those that were asked for.
     fn names(&self, rooms: &[StoredRoom]) -> anyhow::Result<Vec<String>> {
-        let wanted = |name: &str| {
-            self.features.is_empty()
-                || self.features.iter().any(|given| {
-                    name == given || name.strip_prefix(given.as_str()).is_some_and(|rest| rest.starts_with('-'))
-                })
+        let calls_for = |given: &str, name: &str| {
+            name == given || name.strip_prefix(given).is_some_and(|rest| rest.starts_with('-'))
         };
+        let wanted = |name: &str| self.features.is_empty() || self.features.iter().any(|given| calls_for(given, name));
         let all: Vec<&str> = rooms[0].features.iter().map(|set| set.source().name.as_str()).collect();
         let names: Vec<String> = all.iter().filter(|name| wanted(name)).map(|&name| name.to_owned()).collect();
-        if names.is_empty() {
-            bail!("room '{}' has no such features; it has {}", rooms[0].room.id(), all.join(", "));
+        let missing = self.features.iter().find(|given| !all.iter().any(|name| calls_for(given, name)));
+        if let Some(missing) = missing.map(String::as_str).or(names.is_empty().then_some("any")) {
+            bail!("room '{}' has no such features: '{missing}'; it has {}", rooms[0].room.id(), all.join(", "));
         }
         for name in &names {
             for stored in rooms {

@@ -105,7 +105,7 @@ fn sequences_of(folder: &Path, wanted: Option<&str>) -> Result<(PathBuf, Vec<Str
 /// The sequences that the scene holds out for testing; none if it has no split files.
 fn dataset_split(scene: &Path, sequences: &[String]) -> Result<Option<BTreeSet<String>>, Error> {
     let files = ["TrainSplit.txt", "TestSplit.txt"].map(|name| scene.join(name));
-    if !files.iter().all(|file| file.is_file()) {
+    if files.iter().all(|file| !file.is_file()) {
         return Ok(None);
     }
     let [train, test] = [split_file(&files[0])?, split_file(&files[1])?];

@@ -24,6 +24,9 @@ pub struct Bounds {
     pub pixels: u64,
 }
 
+/// The longest side of an image, pixels: a longer one would be resized by way of something much larger.
+const LONGEST_SIDE: usize = 16_384;
+
 /// The last two bytes of a JPEG; anything may follow them.
 const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];
 /// What may be allocated to read a header: colour profiles are compressed, and may be bombs.
@@ -39,7 +42,9 @@ impl Bounds {
 /// # Errors
 /// [`Error::BadImage`], for another format, a file that is not whole, or one out of bounds.
 pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Error> {
-    let bad = |problem: String| Error::BadImage { image: name.to_owned(), problem };
+    // Decoders' messages may go over several lines.
+    let one_line = |problem: String| problem.split_whitespace().collect::<Vec<_>>().join(" ");
+    let bad = |problem: String| Error::BadImage { image: name.to_owned(), problem: one_line(problem) };
     if bytes.len() as u64 > bounds.bytes {
         return Err(bad(format!("is {} bytes, over the limit of {}", bytes.len(), bounds.bytes)));
     }
@@ -59,14 +64,22 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
         reader
     };
     let (width, height) = read(HEADER_ALLOC).into_dimensions().map_err(|error| bad(error.to_string()))?;
-    if u64::from(width) * u64::from(height) > bounds.pixels {
-        return Err(bad(format!("has {width}×{height} pixels, over the limit of {}", bounds.pixels)));
-    }
+    check_size(width as usize, height as usize, bounds).map_err(bad)?;
     // Sixteen bits, four channels, and as much again for the decoder.
     let most = (u64::from(width) * u64::from(height)).saturating_mul(16).saturating_add(HEADER_ALLOC);
     let decoded = read(most).decode().map_err(|error| bad(error.to_string()))?;
     let bytes = decoded.into_rgb8().into_raw();
     Ok(RgbImage { width: width as usize, height: height as usize, bytes })
+}
+
+fn check_size(width: usize, height: usize, bounds: Bounds) -> Result<(), String> {
+    if width.max(height) > LONGEST_SIDE {
+        return Err(format!("has {width}×{height} pixels, over the limit of {LONGEST_SIDE} a side"));
+    }
+    if width as u64 * height as u64 > bounds.pixels {
+        return Err(format!("has {width}×{height} pixels, over the limit of {}", bounds.pixels));
+    }
+    Ok(())
 }
 
 /// JPEG, strictly: an image that ends early is not filled up with grey.
@@ -82,9 +95,7 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
     decoder.decode_headers().map_err(|error| error.to_string())?;
     let (width, height) = decoder.dimensions().ok_or("says no size")?;
-    if width as u64 * height as u64 > bounds.pixels {
-        return Err(format!("has {width}×{height} pixels, over the limit of {}", bounds.pixels));
-    }
+    check_size(width, height, bounds)?;
     let bytes = decoder.decode().map_err(|error| error.to_string())?;
     if bytes.len() != width * height * 3 {
         return Err("has colours that are no RGB".to_owned());
@@ -183,6 +194,7 @@ mod tests {
             (&bytes[..bytes.len() / 2], Bounds::LOCAL),
             (&bytes[..], small),
             (&bytes[..], Bounds { bytes: 10, pixels: 10_000 }),
+            (&png(16_385, 1), Bounds::LOCAL),
             (b"GIF89a".as_slice(), Bounds::LOCAL),
             (&[], Bounds::LOCAL),
         ] {

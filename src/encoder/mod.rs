@@ -342,6 +342,18 @@ fn feature_name(prefix: &str, layer: &Layer, network: &Network) -> String {
     plain.trim_start_matches(|c: char| !c.is_ascii_alphanumeric()).to_owned()
 }
 
+/// The identity of an encoder: `builtin`, `pixels`, or an ONNX file that can be read.
+///
+/// # Errors
+/// [`Error::Io`] or [`Error::Model`].
+pub fn identity(model: &str) -> Result<String, Error> {
+    match model {
+        "builtin" => Ok(Encoder::builtin().id),
+        PIXELS => Ok(Encoder::pixels().id),
+        file => Ok(model_file::ModelFile::read(Path::new(file))?.id),
+    }
+}
+
 /// The layers that a model declares as its outputs, in its order.
 ///
 /// # Errors

@@ -59,6 +59,9 @@ struct TypeProto {
 
 #[derive(Clone, PartialEq, Message)]
 struct TensorType {
+    /// 1 for f32.
+    #[prost(int32, tag = "1")]
+    element: i32,
     #[prost(message, optional, tag = "2")]
     shape: Option<ShapeProto>,
 }
@@ -74,6 +77,9 @@ struct DimProto {
     #[prost(int64, tag = "1")]
     value: i64,
 }
+
+/// ONNX's number for f32.
+const FLOAT: i32 = 1;
 
 /// An ONNX file that was read.
 pub(super) struct ModelFile {
@@ -107,7 +113,11 @@ impl ModelFile {
             let names: Vec<&str> = inputs.iter().map(|input| input.name.as_str()).collect();
             return Err(wrong(format!("has {} inputs ({}), expected one image", names.len(), names.join(", "))));
         };
-        let shape = input.kind.as_ref().and_then(|kind| kind.tensor.as_ref()?.shape.as_ref());
+        let tensor = input.kind.as_ref().and_then(|kind| kind.tensor.as_ref());
+        if tensor.is_some_and(|tensor| tensor.element != FLOAT) {
+            return Err(wrong("takes numbers that are not float32; export it so that its input is float32".to_owned()));
+        }
+        let shape = tensor.and_then(|tensor| tensor.shape.as_ref());
         let input = shape.map_or_else(Vec::new, |shape| {
             shape.dim.iter().map(|dim| usize::try_from(dim.value).ok().filter(|&size| size > 0)).collect()
         });

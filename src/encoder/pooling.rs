@@ -60,7 +60,14 @@ impl Pooling {
     /// The row of one image's output.
     pub(super) fn pool(self, output: ArrayViewD<'_, f32>, seen: Seen) -> Result<Vec<f32>, Problem> {
         let shape = output.shape().to_vec();
-        let wrong = || Problem { pooling: self, shape: shape.clone() };
+        let wrong = || Problem::Shape { pooling: self, shape: shape.clone() };
+        if let (2, Self::Cls | Self::Mean { skip: 1.. } | Self::Grid { skip: 1.., .. }) = (output.ndim(), self) {
+            let skip = if let Self::Mean { skip } | Self::Grid { skip, .. } = self { skip } else { 1 };
+            let after = shape[0].checked_sub(skip).and_then(|patches| seen.patches(patches));
+            if seen.patches(shape[0]).is_some() && after.is_none() {
+                return Err(Problem::NoPrefix { tokens: shape[0] });
+            }
+        }
         match (self, output.ndim()) {
             (Self::Vector, 1) => Ok(output.into_dimensionality::<Ix1>().map_err(|_| wrong())?.to_vec()),
             (Self::Cls, 2) if shape[0] > 0 => {
@@ -136,13 +143,17 @@ fn grid(map: ArrayView3<'_, f32>, columns: usize, rows: usize) -> Vec<f32> {
 
 /// An output that cannot be pooled so.
 #[derive(Debug, thiserror::Error)]
-#[error(
-    "its output of shape {shape:?} cannot be pooled by '{pooling}': cls wants tokens (n, c); grids want a map (c, h, w), \
-     or patch tokens as many across and down as the image's shape says, after the prefix tokens"
-)]
-pub(super) struct Problem {
-    pooling: Pooling,
-    shape: Vec<usize>,
+pub(super) enum Problem {
+    #[error(
+        "its output of shape {shape:?} cannot be pooled by '{pooling}': cls wants tokens (n, c); grids want a map (c, h, w), \
+         or patch tokens as many across and down as the image's shape says, after the prefix tokens"
+    )]
+    Shape { pooling: Pooling, shape: Vec<usize> },
+    #[error(
+        "its {tokens} tokens are all patches of the image, there is no class token before them; give --prefix-tokens 0 and \
+         --pool mean or a grid"
+    )]
+    NoPrefix { tokens: usize },
 }
 
 impl fmt::Display for Pooling {
@@ -225,6 +236,11 @@ mod tests {
         assert_eq!(pool("grid2x1@1").unwrap(), [2.0, 3.0, 12.0, 13.0]);
         assert!(pool("grid2x2").is_err(), "five tokens are no square");
         assert!(pool("mean@5").is_err(), "no token is left");
+        let patches = Array2::<f32>::zeros((16, 2)).into_dyn();
+        for word in ["cls", "mean@1", "grid2x2@1"] {
+            let problem = word.parse::<Pooling>().unwrap().pool(patches.view(), SQUARE).unwrap_err().to_string();
+            assert!(problem.contains("--prefix-tokens 0"), "{word}: {problem}");
+        }
         assert!("cls".parse::<Pooling>().unwrap().pool(map(1, 2, 2).view(), SQUARE).is_err());
     }
 

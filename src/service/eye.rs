@@ -50,6 +50,12 @@ pub fn open(
 ) -> Result<BTreeMap<String, Arc<Eye>>, RunError> {
     let mut eyes = BTreeMap::new();
     let Some(ImageEncoders { models, runtime, bounds }) = encoders else { return Ok(eyes) };
+    for model in models {
+        let id = encoder::identity(model).map_err(|problem| RunError::Model { model: model.clone(), problem })?;
+        if adapters.values().all(|adapter| adapter.adapter.source().encoder != id) {
+            tracing::warn!(model, id, "no adapter's features were made by this encoder");
+        }
+    }
     // Adapters of one source share an encoder.
     let mut opened: Vec<(&FeatureSource, Arc<Eye>)> = Vec::new();
     for (name, adapter) in adapters {

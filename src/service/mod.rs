@@ -99,6 +99,8 @@ pub enum RunError {
     Navigator { adapter: String, room: String, problem: crate::navigation::Error },
     #[error("adapter '{adapter}' cannot be given images: {problem}")]
     Encoder { adapter: String, problem: crate::encoder::Error },
+    #[error("--encoder {model}: {problem}")]
+    Model { model: String, problem: crate::encoder::Error },
     #[error("the server failed: {0}")]
     Transport(#[from] tonic::transport::Error),
     #[error("the reflection service cannot be made: {0}")]

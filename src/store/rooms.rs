@@ -3,7 +3,7 @@
 use object_store::path::Path;
 
 use super::format::{FeaturesEntry, RoomBody, TensorReader, TensorWriter};
-use super::manifest::{self, SCHEMA};
+use super::manifest::{self, ObjectRef, SCHEMA};
 use super::{ATTEMPTS, Error, Kind, Published, Store, revision_path};
 use crate::features::{FeatureSource, Features};
 use crate::geometry::{Pose, nearest_rotation};
@@ -44,8 +44,12 @@ impl Store {
     pub async fn publish_room(&self, room: &Room, features: &[Features]) -> Result<Published, Error> {
         check_features(room, features)?;
         let folder = Path::from(Kind::Room.folder()).join(room.id().as_str());
-        let room = &self.with_what_is_known(&folder, room).await?;
-        let frames = self.write_object(&folder, "frames", "safetensors", frames_file(room)?).await?;
+        let (room, known) = self.with_what_is_known(&folder, room).await?;
+        let room = &room;
+        let frames = match known {
+            Some(frames) => frames,
+            None => self.write_object(&folder, "frames", "safetensors", frames_file(room)?).await?,
+        };
         let frame_names = match room.frame_names() {
             [] => None,
             names => Some(self.write_object(&folder, "frame-names", "json", names_file(names)?).await?),
@@ -163,12 +167,13 @@ impl Store {
         Ok(summaries)
     }
 
-    /// A room with what the newest revision knows of the same frames and it does not say itself.
-    async fn with_what_is_known(&self, folder: &Path, room: &Room) -> Result<Room, Error> {
-        let Some(&newest) = self.revisions(folder).await?.last() else { return Ok(room.clone()) };
+    /// A room with what the newest revision knows of the same frames and it does not say itself; and that revision's
+    /// object of frames, where it says all of it: poses that are the same but for rounding are not written again.
+    async fn with_what_is_known(&self, folder: &Path, room: &Room) -> Result<(Room, Option<ObjectRef>), Error> {
+        let Some(&newest) = self.revisions(folder).await?.last() else { return Ok((room.clone(), None)) };
         let body = self.room_body(folder, newest).await?;
         if !self.has_poses(folder, &body, room).await? {
-            return Ok(room.clone());
+            return Ok((room.clone(), None));
         }
         let known = self.load(room.id().as_str(), Some(newest), Some("")).await?.room;
         fn either<T: Clone>(given: &[T], known: &[T]) -> Vec<T> {
@@ -184,6 +189,11 @@ impl Store {
             sequences: either(&given.sequences, &before.sequences),
             held_out: either(&given.held_out, &before.held_out),
         };
+        let columns = |frames: &Frames| {
+            let Frames { timestamps_ns, numbers, sequences, held_out, .. } = frames.clone();
+            (timestamps_ns, numbers, sequences, held_out)
+        };
+        let object = (columns(&frames) == columns(before)).then_some(body.frames);
         let mut provenance = room.provenance().clone();
         if provenance.licence.is_empty() {
             provenance.licence.clone_from(&known.provenance().licence);
@@ -193,7 +203,7 @@ impl Store {
         }
         let damaged =
             |error: crate::room::Error| Error::Damaged { file: self.shown(folder), problem: error.to_string() };
-        Room::new(room.id().clone(), frames, provenance).map_err(damaged)
+        Ok((Room::new(room.id().clone(), frames, provenance).map_err(damaged)?, object))
     }
 
     /// Whether a stored revision has a room's poses, whatever else it says of the frames.
@@ -230,7 +240,7 @@ impl Store {
         Ok(StoredRoom { room, revision, created: body.created, features })
     }
 
-    async fn read_names(&self, folder: &Path, object: Option<&manifest::ObjectRef>) -> Result<Vec<String>, Error> {
+    async fn read_names(&self, folder: &Path, object: Option<&ObjectRef>) -> Result<Vec<String>, Error> {
         let Some(object) = object else { return Ok(Vec::new()) };
         let (file, bytes) = self.read_object(folder, object).await?;
         serde_json::from_slice(&bytes).map_err(|error| Error::Damaged { file, problem: error.to_string() })

@@ -167,5 +167,5 @@ async fn an_encoder_that_is_not_there_ends_the_server() {
     let config = with_encoders(&[missing.to_str().unwrap()]);
     let ended = seese3::service::run(listener, store, config, std::future::pending()).await;
     let message = ended.unwrap_err().to_string();
-    assert!(message.contains("eyes") && message.contains("model.onnx"), "{message}");
+    assert!(message.contains("--encoder") && message.contains("model.onnx"), "{message}");
 }

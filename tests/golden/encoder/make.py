@@ -35,10 +35,13 @@ nodes = [
     helper.make_node("Reshape", ["map", "flat"], ["flattened"]),
     helper.make_node("Transpose", ["flattened"], ["tokens"], perm=[0, 2, 1]),
     helper.make_node("ReduceMean", ["map"], ["vector"], axes=[2, 3], keepdims=0),
+    helper.make_node("Unsqueeze", ["vector", "second"], ["class"]),
+    helper.make_node("Concat", ["class", "tokens"], ["classed"], axis=1),
 ]
-weights = {"K": K, "B": B, "flat": np.array([0, C, -1], np.int64)}
+weights = {"K": K, "B": B, "flat": np.array([0, C, -1], np.int64), "second": np.array([1], np.int64)}
 image_model = save("image", nodes, weights, [tensor("image", ["batch", 3, H, W])],
-                   [tensor("map", ["batch", C, H // 2, W // 2]), tensor("tokens", ["batch", H * W // 4, C]), tensor("vector", ["batch", C])])
+                   [tensor("map", ["batch", C, H // 2, W // 2]), tensor("tokens", ["batch", H * W // 4, C]), tensor("vector", ["batch", C]),
+                    tensor("classed", ["batch", H * W // 4 + 1, C])])
 # clips: one wants [batch, T, 3, H, W], the other [batch, 3, T, H, W]; both give the mean colour of each image, (batch, T, 3)
 by_time = save("clip_time_first", [helper.make_node("ReduceMean", ["clip"], ["colours"], axes=[3, 4], keepdims=0)], {},
                [tensor("clip", ["batch", T, 3, H, W])], [tensor("colours", ["batch", T, 3])])
@@ -80,10 +83,11 @@ grid = np.stack([relu[:, :, 0:2, 0:2].mean((2, 3)), relu[:, :, 0:2, 2:4].mean((2
 clip = np.stack([x[[0, 0, 0, 1]], x[[0, 0, 1, 2]], x[[0, 1, 2, 3]], x[[1, 2, 3, 4]], x[[2, 3, 4, 4]]])  # around each frame
 colours = clip.mean((3, 4), dtype=np.float64)
 out = {"pixels": pixels, "hidden_mean": hidden.mean((2, 3)), "map_mean": relu.mean((2, 3)), "map_grid2x2": grid.reshape(5, -1),
-       "tokens_cls": tokens[:, 0], "tokens_mean_after_1": tokens[:, 1:].mean(1), "vector": relu.mean((2, 3)),
+       "vector": relu.mean((2, 3)),
        "clip_colours_mean": colours.mean(1)}
-ref = dict(zip(["map", "tokens", "vector"], image_model.run(None, {"image": x})))
+ref = dict(zip(["map", "tokens", "vector", "classed"], image_model.run(None, {"image": x})))
 assert np.abs(ref["map"] - relu).max() < 1e-5 and np.abs(ref["tokens"] - tokens).max() < 1e-5
+assert np.abs(ref["classed"] - np.concatenate([relu.mean((2, 3))[:, None], tokens], 1)).max() < 1e-5
 assert np.abs(by_time.run(None, {"clip": clip})[0] - colours).max() < 1e-6
 assert np.abs(by_colour.run(None, {"clip": np.ascontiguousarray(clip.transpose(0, 2, 1, 3, 4))})[0] - colours).max() < 1e-6
 save_file({k: np.ascontiguousarray(v if v.dtype == np.uint8 else v.astype(np.float32)) for k, v in out.items()}, HERE / "expected.safetensors")
