@@ -14,6 +14,7 @@ use super::progress::bar;
 use super::{check_writable, say, write_file};
 use crate::cancel::Cancellation;
 use crate::encoder::{Encoder, Error, OnBadImage, Task, encode_png, encode_room, read_image};
+use crate::features::FeatureSource;
 use crate::image::RgbImage;
 use crate::room::{Frames, Provenance, Room, RoomId, Timeline};
 use crate::store::{Store, StoredRoom};
@@ -90,38 +91,7 @@ impl Studio {
             encoder.id(),
             encoder.runtime()
         ));
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(self.runtime.threads()).build()?;
-        let progress = bar(u64::from(self.rooms) * u64::from(self.frames), "drawing");
-        let mut spent = Spent::default();
-        let (mut drawn, mut there) = (0u32, 0u32);
-        for number in 0..self.rooms {
-            let name = self.room_name(number);
-            progress.set_message(name.clone());
-            let begun = Instant::now();
-            let suite = SuiteRoom::new(self.seed, number);
-            let mut room = self.room(&name, &suite)?;
-            let before = stored(&store, &room).await?;
-            let images_kept = before.as_ref().is_some_and(|before| before.room.images() == room.images());
-            if before.as_ref().is_some_and(|before| sources.iter().all(|source| has(before, source)))
-                && (images_kept || !self.keep_images)
-            {
-                there += 1;
-            } else {
-                // What an earlier run kept stays with the room.
-                if let Some(before) = before.filter(|_| !self.keep_images) {
-                    room = before.room;
-                }
-                let told = |done: usize| {
-                    progress.set_position(u64::from(number) * u64::from(self.frames) + done as u64);
-                };
-                let rows = pool.install(|| self.encode_room(&room, &suite, &encoder, &spent, &told))?;
-                store.publish_room(&room, &by_layer(&sources, &rows)?).await?;
-                drawn += 1;
-                spent.wall += begun.elapsed();
-            }
-            progress.set_position(u64::from(number + 1) * u64::from(self.frames));
-        }
-        progress.finish_and_clear();
+        let (drawn, there, spent) = self.draw(&store, &encoder, &sources).await?;
         say(format_args!("{drawn} rooms drawn, {there} were there already"));
         if drawn > 0 {
             let threads = self.runtime.threads();
@@ -136,6 +106,48 @@ impl Studio {
             say(format_args!("features '{}': {} columns", source.name, source.dim));
         }
         Ok(())
+    }
+
+    /// Draws and publishes the rooms that are missing: how many were, how many were there, and what it took.
+    async fn draw(
+        &self,
+        store: &Store,
+        encoder: &Encoder,
+        sources: &[FeatureSource],
+    ) -> anyhow::Result<(u32, u32, Spent)> {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(self.runtime.threads()).build()?;
+        let progress = bar(u64::from(self.rooms) * u64::from(self.frames), "drawing");
+        let mut spent = Spent::default();
+        let (mut drawn, mut there) = (0, 0);
+        for number in 0..self.rooms {
+            let name = self.room_name(number);
+            progress.set_message(name.clone());
+            let begun = Instant::now();
+            let suite = SuiteRoom::new(self.seed, number);
+            let mut room = self.room(&name, &suite)?;
+            let before = stored(store, &room).await?;
+            let images_kept = before.as_ref().is_some_and(|before| before.room.images() == room.images());
+            if before.as_ref().is_some_and(|before| sources.iter().all(|source| has(before, source)))
+                && (images_kept || !self.keep_images)
+            {
+                there += 1;
+            } else {
+                // What an earlier run kept stays with the room.
+                if let Some(before) = before.filter(|_| !self.keep_images) {
+                    room = before.room;
+                }
+                let told = |done: usize| {
+                    progress.set_position(u64::from(number) * u64::from(self.frames) + done as u64);
+                };
+                let rows = pool.install(|| self.encode_room(&room, &suite, encoder, &spent, &told))?;
+                store.publish_room(&room, &by_layer(sources, &rows)?).await?;
+                drawn += 1;
+                spent.wall += begun.elapsed();
+            }
+            progress.set_position(u64::from(number + 1) * u64::from(self.frames));
+        }
+        progress.finish_and_clear();
+        Ok((drawn, there, spent))
     }
 
     fn out(&self) -> anyhow::Result<&str> {

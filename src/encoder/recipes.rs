@@ -54,7 +54,7 @@ pub static RECIPES: [Recipe; 9] = [
         prefix_tokens: 1,
         pooling: "cls",
         paper: "navigation and sweeps: layer 7, class token; M3 best: layer 9. Norm and numbering are not stated (A-13)",
-        checked: "preprocessing read in facebookresearch/dinov2 and the Hugging Face processor; the model was not run here, the export is untested",
+        checked: "preprocessing read in facebookresearch/dinov2 and the Hugging Face processor; the export is that of dinov2-s, which was run with random weights; the published weights were not at hand",
         export: r#"import torch
 from transformers import AutoModel
 class Layers(torch.nn.Module):
@@ -85,7 +85,7 @@ torch.onnx.export(Layers(model), (torch.randn(1, 3, 224, 224),), "dinov2-b.onnx"
         prefix_tokens: 1,
         pooling: "cls",
         paper: "not used alone; as dinov2-b",
-        checked: "preprocessing read in facebookresearch/dinov2; the model was not run here, the export is untested. Its architecture was run with random weights",
+        checked: "preprocessing read in facebookresearch/dinov2; the export was run with random weights and encoded here: layer 7 agrees with PyTorch and Pillow within 0.1 % of its length; the published weights were not at hand",
         export: r#"import torch
 from transformers import AutoModel
 class Layers(torch.nn.Module):
@@ -116,7 +116,7 @@ torch.onnx.export(Layers(model), (torch.randn(1, 3, 224, 224),), "dinov2-s.onnx"
         prefix_tokens: 5,
         pooling: "cls",
         paper: "M3 best: layer 9",
-        checked: "preprocessing read in the Hugging Face processor, which squashes the image and rescales before it resizes; here it is resized in 8 bit; the model was not run here, the export is untested",
+        checked: "preprocessing read in the Hugging Face processor, which squashes the image and rescales before it resizes; here it is resized in 8 bit; the export was run with random weights and encoded here: layer 7 agrees with PyTorch and Pillow within 0.1 % of its length; the published weights were not at hand",
         export: r#"import torch
 from transformers import AutoModel
 class Layers(torch.nn.Module):
@@ -147,7 +147,7 @@ torch.onnx.export(Layers(model), (torch.randn(1, 3, 224, 224),), "dinov3-b.onnx"
         prefix_tokens: 1,
         pooling: "cls",
         paper: "M3 best: layer 9; which CLIP is not stated",
-        checked: "preprocessing read in openai/CLIP clip.py; the model was not run here, the export is untested",
+        checked: "preprocessing read in openai/CLIP clip.py; the export was run with random weights and encoded here: layer 7 agrees with PyTorch and Pillow within 0.1 % of its length; the published weights were not at hand",
         export: r#"import torch
 from transformers import CLIPVisionModel
 class Layers(torch.nn.Module):
