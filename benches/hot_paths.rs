@@ -9,13 +9,15 @@ use std::time::Duration;
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
-use seese3::adapter::{Adapter, Samples, Siamese, TrainConfig, Trainer, Widths};
+use seese3::adapter::{Adapter, Mixture, Samples, Siamese, TrainConfig, Trainer, Widths};
 use seese3::cancel::Cancellation;
 use seese3::client::Client;
 use seese3::features::{FeatureSource, Features};
 use seese3::geometry::{Twist, exp};
 use seese3::index::{ExactIndex, HnswIndex, HnswParameters, Index};
-use seese3::navigation::{Displacement, IndexKind, Limits, Mode, Navigator, Query, Reading, Source, SourceAt};
+use seese3::navigation::{
+    Displacement, FitOn, IndexKind, Limits, Metric, Mode, Navigator, Query, Reading, Source, SourceAt, StepKind,
+};
 use seese3::proto::v1 as pb;
 use seese3::room::{FrameId, Frames, Provenance, Room, RoomId};
 
@@ -51,7 +53,9 @@ fn twists(count: usize) -> Vec<Twist> {
 
 fn adapter() -> Arc<Adapter> {
     let widths = Widths { feature: DIM, hidden: 64, latent: 20 };
-    let samples = Samples::<f32>::new(Array2::zeros((2, DIM)).view(), vec![[0, 1]; 100], &twists(100)).unwrap();
+    let (room, features) = room(200);
+    let samples =
+        Samples::<f32>::new(features.rows(), room.poses().to_vec(), (0..100).map(|i| [i, i + 40]).collect()).unwrap();
     let scale = samples.scale().clone();
     Arc::new(Adapter::new(FeatureSource::imported("bench", DIM), Siamese::initial(widths, 0), scale).unwrap())
 }
@@ -63,7 +67,9 @@ fn query(steps: u32) -> Query {
         displacement: Displacement::Twists(vec![twist]),
         steps,
         mode: Mode::OpenLoop,
-        reading: Reading::Homogeneous,
+        step: StepKind::InversePoincare(Reading::Homogeneous),
+        metric: Metric::Full,
+        fit_on: FitOn { split: seese3::pairs::Split::Time, stride: 40 },
         hit_count: 10,
         exclude_source: None,
     }
@@ -111,7 +117,7 @@ fn scan(criterion: &mut Criterion) {
 /// implementation can do without: one forward and one backward product for each distinct frame of each batch.
 fn epoch(criterion: &mut Criterion) {
     const PAIRS: usize = 30_000;
-    let (_, features) = room(1_000);
+    let (room, features) = room(1_000);
     let mut random_rows = rand_chacha::ChaCha8Rng::seed_from_u64(4);
     let pairs: Vec<[usize; 2]> = (0..PAIRS)
         .map(|_| {
@@ -119,13 +125,13 @@ fn epoch(criterion: &mut Criterion) {
             [source, source + random_rows.random_range(10..=40usize)]
         })
         .collect();
-    let samples = Samples::<f32>::new(features.rows(), pairs.clone(), &twists(PAIRS)).unwrap();
+    let samples = Samples::<f32>::new(features.rows(), room.poses().to_vec(), pairs.clone()).unwrap();
     let widths = Widths { feature: DIM, hidden: 64, latent: 20 };
     let batches: Vec<Vec<usize>> = (0..PAIRS).collect::<Vec<_>>().chunks(512).map(<[usize]>::to_vec).collect();
     let mut group = criterion.benchmark_group("epoch");
     group.sample_size(10);
     group.bench_function("train", |bencher| {
-        let mut trainer = Trainer::new(&samples, Siamese::initial(widths, 0), TrainConfig::default());
+        let mut trainer = Trainer::new(&samples, Mixture::initial(widths, 1, 0), TrainConfig::default());
         bencher.iter(|| batches.iter().map(|batch| trainer.step(batch).loss).sum::<f64>());
     });
     let weight = random(64, DIM, 5).mapv(|x| x as f32);
@@ -181,9 +187,12 @@ async fn serve(folder: &str) -> (Client, tonic::transport::Channel) {
         preset: "bench".to_owned(),
         split: seese3::pairs::Split::Time,
         stride: 40,
+        pairs: seese3::adapter::PairPlan::Stride(40),
         rooms: vec![(room.id().clone(), 1)],
+        calibrated_on: Vec::new(),
         config: TrainConfig::default(),
         pair_count: 100,
+        room_tests: Vec::new(),
         test: seese3::scores::MotionScores::of(&twists(9), &twists(9)),
         train: seese3::scores::MotionScores::of(&twists(9), &twists(9)),
         train_mean_r2: 0.0,

@@ -14,7 +14,8 @@ pub mod ridge; // closed-form ridge regression
 pub mod pairs; // which pairs of frames are learned from, and which are tested
 pub mod scores; // R² of motions, hit rates and their intervals
 pub mod adapter; // features to latents, latents to twists and back
-pub mod training; // from a room to an adapter and its scores
+pub mod training; // from rooms to an adapter and its scores
+pub mod formulations; // the alternatives A to D, to compare with
 pub mod navigation; // from a frame and a motion to the frames that follow
 pub mod localization; // from a feature to a pose, in one room or in all
 pub mod odometry; // from two features to the motion between them

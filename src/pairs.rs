@@ -45,11 +45,13 @@ pub enum Split {
     Pairs,
     /// The recording's own: 7-Scenes' TestSplit, 12-Scenes' first sequence. Both ends of a pair on one side.
     Dataset,
+    /// Every pair trains, and every pair tests: for rooms that are learned from, or held out, as a whole.
+    Whole,
 }
 
 impl Split {
     /// Every split.
-    pub const ALL: [Self; 4] = [Self::Time, Self::Blocks, Self::Pairs, Self::Dataset];
+    pub const ALL: [Self; 5] = [Self::Time, Self::Blocks, Self::Pairs, Self::Dataset, Self::Whole];
 
     /// The word for it on the command line, on the wire and in a manifest.
     pub fn name(self) -> &'static str {
@@ -58,6 +60,7 @@ impl Split {
             Self::Blocks => "blocks",
             Self::Pairs => "pairs",
             Self::Dataset => "dataset",
+            Self::Whole => "whole",
         }
     }
 
@@ -84,30 +87,42 @@ impl Split {
 
     /// Whether a pair of any stride is a test pair.
     pub fn tests(self, timeline: &Timeline, pair: Pair) -> bool {
-        self.side(timeline, pair) == Some(Side::Test)
+        self.is_on(timeline, pair, Side::Test)
     }
 
     /// The frames among which a test answer is looked for: the test frames; all frames under
-    /// [`Split::Pairs`], which has no test frames.
+    /// [`Split::Pairs`] and [`Split::Whole`], which set no frames apart.
     pub fn candidates(self, timeline: &Timeline) -> Vec<FrameId> {
-        let candidate = |&frame: &FrameId| self == Self::Pairs || self.tests_frame(timeline, frame);
+        let all = matches!(self, Self::Pairs | Self::Whole);
+        let candidate = |&frame: &FrameId| all || self.tests_frame(timeline, frame);
         frames(timeline.frame_count).filter(candidate).collect()
     }
 
-    /// `count` training pairs drawn with replacement from all pairs whose stride lies in `low..=high`
-    /// (the paper's range pairing; A-8, and with replacement because 30,000 exceed the distinct pairs of a room).
+    /// `count` training pairs drawn with replacement from all pairs of all rooms whose stride lies in `low..=high`, each
+    /// with the position of its room (the paper's range pairing; A-8, and with replacement because 30,000 exceed the
+    /// distinct pairs of a room).
     ///
     /// # Errors
-    /// [`Error::EmptyRange`], or as [`Split::train_pairs`] when no stride of the range gives a pair.
-    pub fn sampled_range(self, timeline: &Timeline, range: &StrideRange, seed: u64) -> Result<Vec<Pair>, Error> {
+    /// [`Error::EmptyRange`], or as [`Split::train_pairs`] when no stride of the range gives a pair of some room.
+    pub fn sampled_range(
+        self,
+        timelines: &[&Timeline],
+        range: &StrideRange,
+        seed: u64,
+    ) -> Result<Vec<(usize, Pair)>, Error> {
         let &StrideRange { low, high, count } = range;
         if low == 0 || low > high {
             return Err(Error::EmptyRange { low, high });
         }
-        let pool: Vec<Pair> = (low..=high).filter_map(|s| self.train_pairs(timeline, s).ok()).flatten().collect();
-        if pool.is_empty() {
-            let frame_count = timeline.frame_count;
-            return Err(Error::NoPairs { frame_count, stride: low, split: self, side: Side::Train.name() });
+        let mut pool: Vec<(usize, Pair)> = Vec::new();
+        for (room, timeline) in timelines.iter().enumerate() {
+            let before = pool.len();
+            let pairs = (low..=high).filter_map(|stride| self.train_pairs(timeline, stride).ok()).flatten();
+            pool.extend(pairs.map(|pair| (room, pair)));
+            if pool.len() == before {
+                let frame_count = timeline.frame_count;
+                return Err(Error::NoPairs { frame_count, stride: low, split: self, side: Side::Train.name() });
+            }
         }
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         Ok((0..count).map(|_| pool[random.random_range(0..pool.len())]).collect())
@@ -124,12 +139,19 @@ impl Split {
         let last_source = frame_count.saturating_sub(stride as usize);
         let pairs: Vec<Pair> = frames(last_source)
             .map(|source| Pair { source, target: FrameId(source.0 + stride) })
-            .filter(|&pair| self.side(timeline, pair) == Some(side))
+            .filter(|&pair| self.is_on(timeline, pair, side))
             .collect();
         if pairs.is_empty() {
             return Err(Error::NoPairs { frame_count, stride, split: self, side: side.name() });
         }
         Ok(pairs)
+    }
+
+    fn is_on(self, timeline: &Timeline, pair: Pair, side: Side) -> bool {
+        match self {
+            Self::Whole => timeline.joins(pair.source, pair.target),
+            _ => self.side(timeline, pair) == Some(side),
+        }
     }
 
     /// The side a pair belongs to, or none when its ends lie on different sides or in different sequences.
@@ -141,7 +163,8 @@ impl Split {
         let block = |frame: FrameId| frame.row() / BLOCK_FRAMES;
         match self {
             Self::Pairs => Some(if pair.source.0 % 5 == 2 { Side::Test } else { Side::Train }),
-            Self::Time | Self::Blocks | Self::Dataset => match (tested(pair.source), tested(pair.target)) {
+            Self::Time | Self::Blocks | Self::Dataset | Self::Whole => match (tested(pair.source), tested(pair.target))
+            {
                 (false, false) => Some(Side::Train),
                 (true, true) if self != Self::Blocks || block(pair.source) == block(pair.target) => Some(Side::Test),
                 _ => None,
@@ -154,7 +177,7 @@ impl Split {
             Self::Time => frame.row() >= timeline.frame_count * 4 / 5,
             Self::Dataset => timeline.held_out.get(frame.row()).copied().unwrap_or(false),
             Self::Blocks => (frame.row() / BLOCK_FRAMES) % 5 == 2,
-            Self::Pairs => false,
+            Self::Pairs | Self::Whole => false,
         }
     }
 }
@@ -242,10 +265,25 @@ mod tests {
             (10..=40).map(|s| Split::Time.train_pairs(&Timeline::unbroken(400), s).unwrap().len()).sum();
         assert_eq!(distinct, 9_145);
         let range = StrideRange { low: 10, high: 40, count: 30_000 };
-        let drawn = Split::Time.sampled_range(&Timeline::unbroken(400), &range, 7).unwrap();
+        let room = Timeline::unbroken(400);
+        let drawn = Split::Time.sampled_range(&[&room], &range, 7).unwrap();
         assert_eq!(drawn.len(), 30_000);
-        assert!(drawn.iter().all(|pair| (10..=40).contains(&(pair.target.0 - pair.source.0)) && pair.target.0 < 320));
-        assert_ne!(drawn, Split::Time.sampled_range(&Timeline::unbroken(400), &range, 8).unwrap());
+        let fits = |pair: &Pair| (10..=40).contains(&(pair.target.0 - pair.source.0)) && pair.target.0 < 320;
+        assert!(drawn.iter().all(|(room, pair)| *room == 0 && fits(pair)));
+        assert_ne!(drawn, Split::Time.sampled_range(&[&room], &range, 8).unwrap());
+        let pooled = Split::Time.sampled_range(&[&room, &room, &room], &range, 7).unwrap();
+        let share = |of: usize| pooled.iter().filter(|(room, pair)| *room == of && fits(pair)).count();
+        assert!((0..3).all(|of| share(of).abs_diff(10_000) < 500), "rooms are drawn from alike");
+    }
+
+    /// Oracle: by hand.
+    #[test]
+    fn a_whole_room_trains_and_tests() {
+        let room = Timeline::unbroken(10);
+        let train = Split::Whole.train_pairs(&room, 4).unwrap();
+        assert_eq!(train.len(), 6);
+        assert_eq!(train, Split::Whole.test_pairs(&room, 4).unwrap());
+        assert_eq!(Split::Whole.candidates(&room).len(), 10);
     }
 
     #[test]

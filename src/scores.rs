@@ -7,14 +7,17 @@ use crate::geometry::Twist;
 /// Motions whose true translation |v| is shorter, metres, have no direction to score.
 pub const LEAST_DIRECTED_M: f64 = 1e-3;
 
-/// R² of predicted twists. A value is NaN when its targets do not vary, for then R² has no meaning.
+/// R² of predicted twists. A component whose targets do not vary has no R²; it is left out of the means, and a mean of
+/// none is NaN.
 ///
 /// R² = 1 − Σ(y − ŷ)² / Σ(y − ȳ)², ȳ the mean of the evaluated targets (scikit-learn's `r2_score`).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionScores {
     /// Pairs scored.
     pub n: usize,
-    /// Mean of the six components' R².
+    /// R² of each component, (v, ω); NaN when it does not vary.
+    pub components: [f64; 6],
+    /// Mean of the components' R².
     pub overall: f64,
     /// Mean over the components of v.
     pub translation: f64,
@@ -31,8 +34,8 @@ pub struct MotionScores {
 impl MotionScores {
     /// Scores predictions against truths, pair by pair; both must be equally long.
     pub fn of(truth: &[Twist], predicted: &[Twist]) -> Self {
-        let components: Vec<f64> =
-            (0..6).map(|c| r2(pairs_of(truth, predicted, |twist| twist.to_vector()[c]))).collect();
+        let components: [f64; 6] =
+            std::array::from_fn(|c| r2(pairs_of(truth, predicted, |twist| twist.to_vector()[c])));
         let moving: Vec<(Vector3<f64>, Vector3<f64>)> = truth
             .iter()
             .zip(predicted)
@@ -45,17 +48,41 @@ impl MotionScores {
         let direction: Vec<f64> = (0..3).map(|c| r2(moving.iter().map(|(t, p)| (t[c], p[c])).collect())).collect();
         Self {
             n: truth.len(),
-            overall: mean(&components),
-            translation: mean(&components[..3]),
-            rotation: mean(&components[3..]),
-            direction: mean(&direction),
+            components,
+            overall: mean_of_known(&components),
+            translation: mean_of_known(&components[..3]),
+            rotation: mean_of_known(&components[3..]),
+            direction: mean_of_known(&direction),
             magnitude: r2(pairs_of(truth, predicted, |twist| twist.linear.norm())),
             direction_pairs_dropped: truth.len() - moving.len(),
         }
     }
 }
 
-/// Mean of R² over the six components when `constant` is predicted for every pair.
+impl MotionScores {
+    /// The mean of several scores, figure by figure, over those that have it; counts are added up.
+    pub fn mean(scores: &[Self]) -> Self {
+        let of = |figure: fn(&Self) -> f64| mean_of_known(&scores.iter().map(figure).collect::<Vec<_>>());
+        let component = |c: usize| mean_of_known(&scores.iter().map(|score| score.components[c]).collect::<Vec<_>>());
+        Self {
+            n: scores.iter().map(|score| score.n).sum(),
+            components: std::array::from_fn(component),
+            overall: of(|score| score.overall),
+            translation: of(|score| score.translation),
+            rotation: of(|score| score.rotation),
+            direction: of(|score| score.direction),
+            magnitude: of(|score| score.magnitude),
+            direction_pairs_dropped: scores.iter().map(|score| score.direction_pairs_dropped).sum(),
+        }
+    }
+
+    /// How many components do not vary, and so have no R².
+    pub fn still_components(&self) -> usize {
+        self.components.iter().filter(|r2| r2.is_nan()).count()
+    }
+}
+
+/// Mean of R² over the components when `constant` is predicted for every pair.
 pub fn constant_r2(truth: &[Twist], constant: &Vector6<f64>) -> f64 {
     let predicted = vec![Twist::from_vector(constant); truth.len()];
     MotionScores::of(truth, &predicted).overall
@@ -97,6 +124,11 @@ impl Rate {
         let high = if successes == n { 1.0 } else { (centre + spread) / scale };
         Self { rate, low, high, n }
     }
+
+    /// How many trials succeeded.
+    pub fn successes(&self) -> usize {
+        (self.rate * self.n as f64).round() as usize
+    }
 }
 
 /// The middle of the values, the mean of the two middle ones when there are two; NaN of none.
@@ -113,6 +145,11 @@ pub fn median(values: &[f64]) -> f64 {
 /// The arithmetic mean; NaN of none.
 pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
+}
+
+/// The arithmetic mean of the values that are numbers; NaN of none.
+pub fn mean_of_known(values: &[f64]) -> f64 {
+    mean(&values.iter().copied().filter(|value| !value.is_nan()).collect::<Vec<_>>())
 }
 
 /// Sample standard deviation (n − 1).

@@ -15,7 +15,7 @@ use seese3::datasets::{Reader, SevenScenes, Unusable, read_features, read_poses,
 use seese3::eval::{NavigatorKind, Protocol, evaluate};
 use seese3::features::{FeatureSource, Features};
 use seese3::geometry::body_twist;
-use seese3::navigation::{IndexKind, Navigator};
+use seese3::navigation::{IndexKind, Metric, Navigator, StepKind};
 use seese3::pairs::Split;
 use seese3::room::{Provenance, Room, RoomId, Timeline};
 use seese3::scores::{MotionScores, mean};
@@ -36,10 +36,11 @@ fn features(folder: &Path, file: &str) -> Features {
 
 /// One run: test scores and Hit@0.1 of inverse Poincaré.
 fn run(room: &Room, features: &Features, split: Split, stride: u32, seed: u64) -> (MotionScores, f64) {
-    let recipe = Recipe { preset: Preset::PaperBase, split, stride, epochs: Some(200), seed };
-    let (adapter, record) = learn(Lesson { room, revision: 1, features }, &recipe, &mut |_| ()).unwrap();
+    let mut recipe = Recipe::of(Preset::PaperBase, split, stride, seed);
+    recipe.config.epochs = 200;
+    let (adapter, record) = learn(&[Lesson { room, revision: 1, features }], &recipe, &mut |_| ()).unwrap();
     let navigator = Navigator::new(Arc::new(room.clone()), features, Arc::new(adapter), IndexKind::Exact).unwrap();
-    let navigators = vec![NavigatorKind::InversePoincare(Reading::Affine)];
+    let navigators = vec![NavigatorKind::Step(StepKind::InversePoincare(Reading::Affine), Metric::Full)];
     let protocol = Protocol { split, navigators, ..Protocol::paper(stride) };
     let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |_, _| ()).unwrap();
     (record.test, report.rows[0].retrieval.hits[0].1.rate)
@@ -77,8 +78,10 @@ fn identity_hits_as_often_as_the_camera_hardly_moves() {
     let Some(shared) = shared() else { return skipped("identity_hits_as_often_as_the_camera_hardly_moves") };
     let folder = shared.join("rooms/kitchen");
     let (room, features) = (room(&folder), features(&folder, EFFNET));
-    let recipe = Recipe { preset: Preset::PaperBase, split: Split::Time, stride: 40, epochs: Some(1), seed: 0 };
-    let (adapter, _) = learn(Lesson { room: &room, revision: 1, features: &features }, &recipe, &mut |_| ()).unwrap();
+    let mut recipe = Recipe::of(Preset::PaperBase, Split::Time, 40, 0);
+    recipe.config.epochs = 1;
+    let (adapter, _) =
+        learn(&[Lesson { room: &room, revision: 1, features: &features }], &recipe, &mut |_| ()).unwrap();
     let room = Arc::new(room);
     let navigator = Navigator::new(room.clone(), &features, Arc::new(adapter), IndexKind::Exact).unwrap();
     for split in [Split::Time, Split::Blocks, Split::Pairs] {

@@ -7,9 +7,10 @@ mod support;
 
 use std::path::{Path, PathBuf};
 
-use seese3::adapter::{Adapter, Preset};
+use nalgebra::{Matrix6, Vector6};
+use seese3::adapter::{Adapter, CorrectorKind, Loss, Mixing, PairPlan, Preset, TrainConfig};
 use seese3::features::{FeatureSource, Features};
-use seese3::pairs::Split;
+use seese3::pairs::{Split, StrideRange};
 use seese3::room::{Frames, Provenance, Room, RoomId};
 use seese3::store::{Error, Store};
 use seese3::training::{Lesson, Recipe, learn};
@@ -72,8 +73,9 @@ fn files(folder: &Path, word: &str) -> Vec<PathBuf> {
 }
 
 fn adapter(room: &Room, features: &Features) -> (Adapter, seese3::adapter::TrainingRecord) {
-    let recipe = Recipe { preset: Preset::PaperBase, split: Split::Time, stride: 20, epochs: Some(2), seed: 4 };
-    learn(Lesson { room, revision: 1, features }, &recipe, &mut |_| ()).unwrap()
+    let mut recipe = Recipe::of(Preset::PaperBase, Split::Time, 20, 4);
+    recipe.config.epochs = 2;
+    learn(&[Lesson { room, revision: 1, features }], &recipe, &mut |_| ()).unwrap()
 }
 
 /// Oracle: what was published.
@@ -95,6 +97,37 @@ async fn a_room_comes_back_as_it_was() {
     }
     for (found, expected) in back.features.iter().zip(&features) {
         assert_eq!((found.source(), found.rows()), (expected.source(), expected.rows()));
+    }
+}
+
+/// Oracle: what was published, bit by bit: charts and their gate, an ensemble, correctors, the errors' covariance, the
+/// record of a recipe of our own.
+#[tokio::test]
+async fn every_kind_of_adapter_comes_back_as_it_was() {
+    let (_folder, store) = stored().await;
+    let (room, features) = (room("a"), set("f", 1.0));
+    for (name, charts, mixing, correctors) in [
+        ("gated", 2, Mixing::Gate, vec![CorrectorKind::Linear]),
+        ("ensemble", 3, Mixing::Even, vec![]),
+        ("corrected", 1, Mixing::Gate, CorrectorKind::ALL.to_vec()),
+    ] {
+        let mut recipe = Recipe::of(Preset::Steady, Split::Time, 20, 4);
+        recipe.config = TrainConfig { epochs: 1, charts, mixing, loss: Loss::Cosine, ..recipe.config };
+        recipe.pairs = PairPlan::Range(StrideRange { low: 5, high: 9, count: 100 });
+        recipe.correctors = correctors;
+        let (adapter, mut record) =
+            learn(&[Lesson { room: &room, revision: 1, features: &features }], &recipe, &mut |_| ()).unwrap();
+        let covariance = Matrix6::from_diagonal(&Vector6::new(1.0, 2.0, 3.0, 0.1, 0.2, 0.3));
+        let adapter = adapter.with_error_covariance(covariance).unwrap();
+        record.calibrated_on = vec![(RoomId::new("b").unwrap(), 3)];
+        store.publish_adapter(name, &adapter, &record, features.rows()).await.unwrap();
+        let back = store.load_adapter(name, None).await.unwrap();
+        assert_eq!(back.adapter.network(), adapter.network(), "{name}");
+        assert_eq!(back.adapter.network().mixing(), mixing, "{name}");
+        assert!(back.adapter.correctors().eq(adapter.correctors()), "{name}");
+        assert_eq!(back.adapter.error_covariance(), Some(covariance), "{name}");
+        assert_eq!(back.record.config, record.config, "{name}");
+        assert_eq!((back.record.pairs, back.record.calibrated_on), (record.pairs, record.calibrated_on), "{name}");
     }
 }
 

@@ -1,6 +1,6 @@
 //! The inverse Poincaré step: from a wanted motion to a step in latent space, ĝ − g = W⁺ΔP.
 
-use nalgebra::{DMatrix, Matrix6xX, Vector6};
+use nalgebra::{DMatrix, Vector6};
 use ndarray::{Array1, Array2, ArrayView2};
 
 use super::{Error, TargetScale};
@@ -50,25 +50,12 @@ impl Inverse {
     /// # Errors
     /// [`Error::RankDeficient`] when fewer than six singular values count.
     pub fn new(motion: ArrayView2<'_, f64>, scale: &TargetScale) -> Result<Self, Error> {
-        let w = Matrix6xX::from_fn(motion.ncols(), |row, column| motion[(row, column)]);
-        // The tall transpose has the thin SVD with six columns.
-        let svd = DMatrix::from_fn(w.ncols(), 6, |row, column| w[(column, row)]).svd(true, true);
-        let mut sorted: Vec<f64> = svd.singular_values.iter().copied().collect();
-        sorted.sort_by(|a, b| b.total_cmp(a));
-        sorted.resize(6, 0.0);
-        let largest = sorted[0];
-        let counts = |value: f64| value > RANK_TOLERANCE * largest;
-        let rank = sorted.iter().filter(|&&value| counts(value)).count();
-        let (Some(u), Some(v_t), 6) = (svd.u, svd.v_t, rank) else {
-            return Err(Error::RankDeficient { rank, largest, smallest: sorted[5] });
-        };
-        // Wᵀ = U S Vᵀ, so W⁺ = U S⁻¹ Vᵀ.
-        let inverse = u * DMatrix::from_diagonal(&svd.singular_values.map(f64::recip)) * v_t;
-        Ok(Self {
-            pseudo_inverse: Array2::from_shape_fn((w.ncols(), 6), |(row, column)| inverse[(row, column)]),
-            singular_values: std::array::from_fn(|i| sorted[i]),
-            scale: scale.clone(),
-        })
+        let (pseudo_inverse, singular_values, rank) = pseudo_inverse(motion);
+        let [largest, .., smallest] = singular_values;
+        if rank < 6 {
+            return Err(Error::RankDeficient { rank, largest, smallest });
+        }
+        Ok(Self { pseudo_inverse, singular_values, scale: scale.clone() })
     }
 
     /// W⁺, shape (k, 6).
@@ -86,14 +73,39 @@ impl Inverse {
     ///
     /// Source: SeeSE3, ĝ = φ(z) + W⁺ΔP.
     pub fn step(&self, twist: Twist, reading: Reading, mean_share: f64) -> Array1<f64> {
-        let motion = twist.to_vector();
-        let target: Vector6<f64> = match reading {
-            Reading::Affine => (motion - self.scale.mean * mean_share).component_div(&self.scale.deviation),
-            Reading::Homogeneous => motion.component_div(&self.scale.deviation),
-            Reading::Literal => motion,
-        };
-        self.pseudo_inverse.dot(&Array1::from_iter(target.iter().copied()))
+        self.pseudo_inverse.dot(&target(&self.scale, twist, reading, mean_share))
     }
+}
+
+/// What W should map a latent step to, for a motion in a reading.
+pub(super) fn target(scale: &TargetScale, twist: Twist, reading: Reading, mean_share: f64) -> Array1<f64> {
+    let motion = twist.to_vector();
+    let target: Vector6<f64> = match reading {
+        Reading::Affine => (motion - scale.mean * mean_share).component_div(&scale.deviation),
+        Reading::Homogeneous => motion.component_div(&scale.deviation),
+        Reading::Literal => motion,
+    };
+    Array1::from_iter(target.iter().copied())
+}
+
+/// The pseudo-inverse (k, 6) of a matrix (6, k), its singular values, the largest first, and how many of them count;
+/// those that do not are left out of the inverse.
+pub(super) fn pseudo_inverse(motion: ArrayView2<'_, f64>) -> (Array2<f64>, [f64; 6], usize) {
+    // The tall transpose has the thin SVD with six columns: Wᵀ = U S Vᵀ, so W⁺ = U S⁻¹ Vᵀ.
+    let columns = motion.ncols();
+    let svd = DMatrix::from_fn(columns, 6, |row, column| motion[(column, row)]).svd(true, true);
+    let mut sorted: Vec<f64> = svd.singular_values.iter().copied().collect();
+    sorted.sort_by(|a, b| b.total_cmp(a));
+    sorted.resize(6, 0.0);
+    let least = RANK_TOLERANCE * sorted[0];
+    let rank = sorted.iter().filter(|&&value| value > least).count();
+    let reciprocal = svd.singular_values.map(|value| if value > least { value.recip() } else { 0.0 });
+    let inverse = match (svd.u, svd.v_t) {
+        (Some(u), Some(v_t)) => u * DMatrix::from_diagonal(&reciprocal) * v_t,
+        // Both were asked for.
+        _ => DMatrix::zeros(columns, 6),
+    };
+    (Array2::from_shape_fn((columns, 6), |at| inverse[at]), std::array::from_fn(|i| sorted[i]), rank)
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! The two precisions that the network runs in: f32 to train, f64 to answer and to be checked against.
 
 /// f32 or f64.
-pub trait Real: ndarray::NdFloat {
+pub trait Real: ndarray::NdFloat + Default {
     /// The error function.
     fn erf(self) -> Self;
     /// The nearest value to an f64.

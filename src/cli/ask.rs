@@ -9,6 +9,7 @@ use clap::{Args, ValueEnum};
 use super::say;
 use crate::client::Client;
 use crate::datasets::read_features;
+use crate::navigation::Mode;
 use crate::proto::v1 as pb;
 
 #[derive(Debug, Args)]
@@ -100,9 +101,12 @@ pub struct Navigate {
     /// How the steps hang together
     #[arg(long, value_enum, default_value_t = ModeName::OpenLoop)]
     mode: ModeName,
-    /// How the training motions' mean and deviation enter the inverse
-    #[arg(long, value_enum, default_value_t = ReadingName::Homogeneous)]
-    reading: ReadingName,
+    /// How the training motions' mean and deviation enter the inverse; homogeneous if nothing is given
+    #[arg(long, value_enum, conflicts_with = "navigator")]
+    reading: Option<ReadingName>,
+    /// How to step, by name, instead of inverse Poincaré: corrector-mlp-3, ridge-refit, inverse-poincare-affine+motion, …
+    #[arg(long, default_value = "")]
+    navigator: String,
     /// Frames for each step
     #[arg(long, default_value_t = 1)]
     hits: u32,
@@ -112,13 +116,23 @@ pub struct Navigate {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum ModeName {
+pub enum ModeName {
     /// Steps are added up in latent space
     OpenLoop,
     /// Each step starts from the retrieved frame
     Snap,
     /// As snap, with the rest of the way planned anew
     ClosedLoop,
+}
+
+impl From<ModeName> for Mode {
+    fn from(name: ModeName) -> Self {
+        match name {
+            ModeName::OpenLoop => Self::OpenLoop,
+            ModeName::Snap => Self::Snap,
+            ModeName::ClosedLoop => Self::ClosedLoop,
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -147,9 +161,10 @@ impl Navigate {
             ModeName::ClosedLoop => pb::Mode::ClosedLoop,
         };
         let reading = match self.reading {
-            ReadingName::Affine => pb::Reading::Affine,
-            ReadingName::Homogeneous => pb::Reading::Homogeneous,
-            ReadingName::Literal => pb::Reading::Literal,
+            None => pb::Reading::Unspecified,
+            Some(ReadingName::Affine) => pb::Reading::Affine,
+            Some(ReadingName::Homogeneous) => pb::Reading::Homogeneous,
+            Some(ReadingName::Literal) => pb::Reading::Literal,
         };
         let request = pb::NavigateRequest {
             room: self.room,
@@ -159,6 +174,7 @@ impl Navigate {
             steps: Some(self.steps),
             mode: mode.into(),
             reading: reading.into(),
+            navigator: self.navigator,
             hit_count: Some(self.hits),
             exclude_source: self.exclude_source,
             ..pb::NavigateRequest::default()

@@ -20,7 +20,7 @@ use crate::client::Client;
 use crate::encoder::{BUILTIN_DIM, builtin_source, encode_builtin};
 use crate::eval::{NavigatorKind, Protocol, evaluate};
 use crate::features::Features;
-use crate::navigation::{IndexKind, Navigator};
+use crate::navigation::{IndexKind, Navigator, StepKind};
 use crate::pairs::Split;
 use crate::proto::v1 as pb;
 use crate::report::{PathPlot, evaluation_table, path_svg, training_table};
@@ -67,16 +67,17 @@ impl Demo {
         say(format_args!("   room '{ROOM}' revision {}: {location}/{}", published.revision, published.manifest));
 
         say("2. Training a Poincaré adapter on the first 80 % of the path (preset paper-range)");
-        let recipe =
-            Recipe { preset: Preset::PaperRange, split: Split::Time, stride: STRIDE, epochs: None, seed: self.seed };
+        let recipe = Recipe::of(Preset::PaperRange, Split::Time, STRIDE, self.seed);
         let stored = StoredRoom { room, revision: published.revision, created: String::new(), features: Vec::new() };
-        let (adapter, runs) = train_seeds(&stored, &features, &recipe, 1)?;
+        let rooms = [(stored, features)];
+        let (adapter, runs) = train_seeds(&rooms, &recipe, 1)?;
         say(training_table(&runs).trim_end());
-        let name = default_name(ROOM, &features, &recipe);
-        let adapter_published = store.publish_adapter(&name, &adapter, &runs[0].record, features.rows()).await?;
+        let name = default_name(&rooms, &recipe);
+        let adapter_published = store.publish_adapter(&name, &adapter, &runs[0].record, rooms[0].1.rows()).await?;
         say_published(&store, &name, &adapter_published);
 
         say(format_args!("3. Navigating the last 20 %, which the adapter never saw, {STRIDE} frames ahead"));
+        let [(stored, features)] = rooms;
         let room = Arc::new(stored.room);
         say(score(&room, &features, adapter)?.trim_end());
 
@@ -129,8 +130,9 @@ fn draw(frame_count: usize, seed: u64) -> anyhow::Result<(Room, Features)> {
 
 fn score(room: &Arc<Room>, features: &Features, adapter: Adapter) -> anyhow::Result<String> {
     let navigator = Navigator::new(room.clone(), features, Arc::new(adapter), IndexKind::Exact)?;
-    let navigators: Vec<NavigatorKind> =
-        NavigatorKind::ALL.into_iter().filter(|kind| *kind != NavigatorKind::RidgeRefitInSample).collect();
+    let leaks =
+        |kind: &NavigatorKind| matches!(kind, NavigatorKind::Step(StepKind::Refit(refit), _) if refit.in_sample);
+    let navigators = NavigatorKind::table(navigator.adapter()).into_iter().filter(|kind| !leaks(kind)).collect();
     let protocol = Protocol { navigators, ..Protocol::paper(STRIDE) };
     let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |_, _| ())?;
     Ok(evaluation_table(&report))

@@ -3,12 +3,13 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use clap::Args;
 use serde_json::json;
 
+use super::ask::ModeName;
 use super::progress::bar;
-use super::train::SplitName;
+use super::protocol::SplitName;
 use super::{check_writable, say, write_json};
 use crate::adapter::TrainingRecord;
 use crate::cancel::Cancellation;
@@ -44,6 +45,15 @@ pub struct Evaluate {
     /// ε of Hit@ε, separated by commas
     #[arg(long, value_delimiter = ',', default_values_t = crate::navigation::HIT_THRESHOLDS)]
     thresholds: Vec<f64>,
+    /// Rows of the table by name, separated by commas; a way to step may have +row-space, +whitened or +motion
+    #[arg(long, value_delimiter = ',')]
+    navigators: Vec<String>,
+    /// Equal parts of each motion
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1_000))]
+    steps: u32,
+    /// How the parts hang together
+    #[arg(long, value_enum, default_value_t = ModeName::OpenLoop)]
+    mode: ModeName,
     /// Of the random navigator
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -62,10 +72,14 @@ impl Evaluate {
         let features_name = self.features.clone().unwrap_or_else(|| chosen.adapter.source().name.clone());
         let (stored, features) = store.load_room_with(&self.room, Some(&features_name)).await?;
         let record = chosen.record.clone();
-        let protocol = self.protocol(&record);
+        let protocol = self.protocol(&record)?;
         let room = Arc::new(stored.room);
         let navigator = Navigator::new(room, &features, Arc::new(chosen.adapter), IndexKind::Exact)?;
-        let progress = bar(protocol.navigators.len() as u64, "evaluating");
+        let rows = match protocol.navigators.len() {
+            0 => NavigatorKind::table(navigator.adapter()).len(),
+            given => given,
+        };
+        let progress = bar(rows as u64, "evaluating");
         let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |done, kind| {
             progress.set_position(done as u64);
             progress.set_message(kind.name());
@@ -77,7 +91,7 @@ impl Evaluate {
             Some(revision) => !store.same_frames(&self.room, revision, stored.revision).await?,
             None => false,
         };
-        let leaks = in_room && (record.split != protocol.split || other_frames);
+        let leaks = in_room && (record.split != protocol.split || record.split == Split::Whole || other_frames);
         say(format_args!(
             "room '{}' revision {}, features '{features_name}', adapter '{}' revision {} ({})",
             self.room,
@@ -118,15 +132,21 @@ impl Evaluate {
     }
 
     /// What is asked for, the adapter's own split and stride where nothing is.
-    fn protocol(&self, record: &TrainingRecord) -> Protocol {
-        Protocol {
+    fn protocol(&self, record: &TrainingRecord) -> anyhow::Result<Protocol> {
+        let named = |name: &String| {
+            let unknown = || format!("--navigators: '{name}' is not one of {}", NavigatorKind::known_names());
+            NavigatorKind::from_name(name).with_context(unknown)
+        };
+        Ok(Protocol {
             split: self.split.map_or(record.split, Into::into),
             stride: self.stride.unwrap_or(record.stride),
             exclude_source: self.exclude_source.then_some(0),
             thresholds: self.thresholds.clone(),
             seed: self.seed,
-            navigators: NavigatorKind::ALL.to_vec(),
-        }
+            steps: self.steps,
+            mode: self.mode.into(),
+            navigators: self.navigators.iter().map(named).collect::<Result<_, _>>()?,
+        })
     }
 }
 

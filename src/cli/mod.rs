@@ -9,7 +9,10 @@ mod evaluate;
 mod export;
 mod health;
 mod import;
+mod probe;
 mod progress;
+mod protocol;
+mod rooms;
 mod serve;
 mod studio;
 mod sweep;
@@ -43,6 +46,8 @@ enum Command {
     Train(train::Train),
     /// Score navigators on held-out motions: Hit@ε with baselines and intervals
     Evaluate(evaluate::Evaluate),
+    /// Measure how much of SE(3) features hold: M1 to M4
+    Probe(probe::Probe),
     /// Score many features at once
     Sweep(sweep::Sweep),
     /// Answer over gRPC until told to stop
@@ -73,6 +78,7 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Train(arguments) => arguments.run().await,
         Command::Evaluate(arguments) => arguments.run().await,
         Command::Demo(arguments) => arguments.run().await,
+        Command::Probe(arguments) => arguments.run().await,
         Command::Sweep(arguments) => arguments.run().await,
         Command::Serve(arguments) => arguments.run().await,
         Command::Navigate(arguments) => arguments.run().await,

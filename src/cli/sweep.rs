@@ -7,7 +7,7 @@ use clap::{Args, Subcommand};
 use rayon::prelude::*;
 
 use super::progress::bar;
-use super::train::{PresetName, SplitName};
+use super::protocol::{PresetName, SplitName};
 use super::{check_writable, say, write_json};
 use crate::adapter::Preset;
 use crate::features::Features;
@@ -173,8 +173,13 @@ impl Layers {
 
     fn scores(&self, stored: &StoredRoom, features: &Features) -> anyhow::Result<LayerScores> {
         let (room, rows) = (&stored.room, features.rows());
-        let knn =
-            MutualKnn { frames: self.m1_frames, stride: self.m1_stride, k: self.m1_k, exclusion: self.m1_exclusion };
+        let knn = MutualKnn {
+            frames: self.m1_frames,
+            stride: self.m1_stride,
+            k: self.m1_k,
+            exclusion: self.m1_exclusion,
+            ..MutualKnn::default()
+        };
         let m1 = mutual_knn(rows, room.poses(), &knn)?;
         let m2: IntrinsicDimension = intrinsic_dimension(rows, self.m2_gap, Duplicates::DropRows)?;
         let m3: MotionScores = ridge_probe(rows, room, self.split.into(), self.stride)?;
@@ -198,15 +203,10 @@ impl Layers {
     }
 
     fn adapter_r2(&self, stored: &StoredRoom, features: &Features, seed: u64) -> anyhow::Result<f64> {
-        let recipe = Recipe {
-            preset: self.preset.into(),
-            split: self.split.into(),
-            stride: self.stride,
-            epochs: self.epochs,
-            seed,
-        };
+        let mut recipe = Recipe::of(self.preset.into(), self.split.into(), self.stride, seed);
+        recipe.config.epochs = self.epochs.unwrap_or(recipe.config.epochs);
         let lesson = Lesson { room: &stored.room, revision: stored.revision, features };
-        Ok(learn(lesson, &recipe, &mut |_| ())?.1.test.overall)
+        Ok(learn(&[lesson], &recipe, &mut |_| ())?.1.test.overall)
     }
 }
 

@@ -1,23 +1,27 @@
 //! `seese3 train`: learn an adapter and publish it.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Context, bail};
-use clap::{Args, ValueEnum};
+use clap::Args;
 use rayon::prelude::*;
 
 use super::progress::bar;
+use super::protocol::ProtocolOptions;
+use super::rooms::{lesson, load_rooms, room_words};
 use super::{check_writable, say, write_json};
-use crate::adapter::{Adapter, Preset, Reading};
+use crate::adapter::{Adapter, CorrectorKind, Reading, TrainConfig};
 use crate::cancel::Cancellation;
 use crate::eval::{NavigatorKind, Protocol, evaluate};
 use crate::features::Features;
-use crate::navigation::{IndexKind, Navigator};
+use crate::navigation::{IndexKind, Metric, Navigator, StepKind};
 use crate::pairs::Split;
 use crate::report::{TrainingRun, training_json, training_table};
+use crate::scores::Rate;
 use crate::store::{Published, Store, StoredRoom};
-use crate::training::{Lesson, Recipe, learn};
+use crate::training::{Lesson, Recipe, error_covariance, learn};
 
 /// The most seeds of one command.
 const MAX_SEEDS: u64 = 1_000;
@@ -27,24 +31,21 @@ pub struct Train {
     /// The store
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// The room to learn from
-    #[arg(long)]
-    room: String,
-    /// Which of its features; may be left out when it has one
+    /// The rooms to learn from together: names, or patterns with *; may be given several times
+    #[arg(long = "room", required = true)]
+    rooms: Vec<String>,
+    /// Which of their features; may be left out when the first room has one
     #[arg(long)]
     features: Option<String>,
-    /// The protocol of the paper
-    #[arg(long, value_enum, default_value_t = PresetName::PaperBase)]
-    preset: PresetName,
-    /// Frames from source to target
-    #[arg(long, default_value_t = 40)]
-    stride: u32,
-    /// Passes over the pairs, instead of the preset's
+    #[command(flatten)]
+    protocol: ProtocolOptions,
+    /// Train these after the adapter, as further navigators: linear, mlp-2, mlp-3, attention, or all
+    #[arg(long, value_delimiter = ',')]
+    correctors: Vec<String>,
+    /// Rooms in which the adapter's errors are measured, for navigators with +calibrated: names or patterns, none of them
+    /// learned from
     #[arg(long)]
-    epochs: Option<usize>,
-    /// How frames are kept apart for testing; `pairs` leaks on purpose
-    #[arg(long, value_enum, default_value_t = SplitName::Time)]
-    split: SplitName,
+    calibrate_on: Vec<String>,
     /// Of weights and order, as PyTorch takes it: 32 bits
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
@@ -59,46 +60,6 @@ pub struct Train {
     json: Option<PathBuf>,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum PresetName {
-    /// All pairs at one stride, 10 epochs
-    PaperBase,
-    /// 30,000 pairs with strides 10 to 40, 200 epochs
-    PaperRange,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum SplitName {
-    /// The first 80 % of the frames train
-    Time,
-    /// Blocks of 50 frames
-    Blocks,
-    /// By source frame: leaks on purpose, to check an implementation
-    Pairs,
-    /// The recording's own, where it has one
-    Dataset,
-}
-
-impl From<PresetName> for Preset {
-    fn from(name: PresetName) -> Self {
-        match name {
-            PresetName::PaperBase => Self::PaperBase,
-            PresetName::PaperRange => Self::PaperRange,
-        }
-    }
-}
-
-impl From<SplitName> for Split {
-    fn from(name: SplitName) -> Self {
-        match name {
-            SplitName::Time => Self::Time,
-            SplitName::Blocks => Self::Blocks,
-            SplitName::Pairs => Self::Pairs,
-            SplitName::Dataset => Self::Dataset,
-        }
-    }
-}
-
 impl Train {
     pub async fn run(self) -> anyhow::Result<()> {
         if self.seeds == 0 || self.seeds > MAX_SEEDS {
@@ -108,31 +69,45 @@ impl Train {
             check_writable(path)?;
         }
         let store = Store::open(&self.store)?;
-        let (stored, features) = store.load_room_with(&self.room, self.features.as_deref()).await?;
-        let recipe = Recipe {
-            preset: self.preset.into(),
-            split: self.split.into(),
-            stride: self.stride,
-            epochs: self.epochs,
-            seed: self.seed,
+        let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
+        let recipe = Recipe { correctors: correctors(&self.correctors)?, ..self.protocol.recipe(self.seed)? };
+        let source = rooms[0].1.source().name.clone();
+        let calibration = match self.calibrate_on.is_empty() {
+            true => Vec::new(),
+            false => load_rooms(&store, &self.calibrate_on, Some(&source)).await?,
         };
-        let (adapter, runs) = train_seeds(&stored, &features, &recipe, self.seeds)?;
-        let name = self.name.unwrap_or_else(|| default_name(&self.room, &features, &recipe));
+        let (mut adapter, mut runs) = train_seeds(&rooms, &recipe, self.seeds)?;
+        if !calibration.is_empty() {
+            let lessons: Vec<Lesson<'_>> = calibration.iter().map(lesson).collect();
+            let covariance = error_covariance(&adapter, &runs[0].record, &lessons)?;
+            adapter = adapter.with_error_covariance(covariance)?;
+            let room = |(stored, _): &(StoredRoom, Features)| (stored.room.id().clone(), stored.revision);
+            runs[0].record.calibrated_on = calibration.iter().map(room).collect();
+        }
+        let features = &rooms[0].1;
+        let name = self.name.unwrap_or_else(|| default_name(&rooms, &recipe));
         let record = &runs[0].record;
         let published = store.publish_adapter(&name, &adapter, record, features.rows()).await?;
         let (split, stride, preset) = (recipe.split, recipe.stride, recipe.preset.name());
         say(format_args!(
-            "room '{}' revision {}, features '{}' ({} columns), preset {preset}, stride {stride}, split {split}",
-            self.room,
-            stored.revision,
+            "{}, features '{}' ({} columns), preset {preset}, stride {stride}, split {split}",
+            room_words(&rooms),
             features.source().name,
             features.source().dim,
         ));
+        let judged = match split {
+            Split::Whole => "R² and Hit@0.1 on the training pairs, for none are set apart".to_owned(),
+            _ => format!("{} test pairs", record.test.n),
+        };
         say(format_args!(
-            "{} training pairs, {} test pairs, {} epochs; test R², and Hit@0.1 of inverse Poincaré (affine):",
-            record.pair_count, record.test.n, record.config.epochs
+            "{} training pairs, {judged}, {} epochs; test R², and Hit@0.1 of inverse Poincaré (affine):",
+            record.pair_count, record.config.epochs
         ));
         say(training_table(&runs).trim_end());
+        let still = record.test.still_components();
+        if record.test.n > 0 && still > 0 {
+            say(format_args!("{still} of the 6 components of the motion never vary and are left out of the means"));
+        }
         say_published(&store, &name, &published);
         if let Some(path) = &self.json {
             write_json(path, &training_json(&runs, &name, published.revision))?;
@@ -142,32 +117,41 @@ impl Train {
     }
 }
 
+fn correctors(names: &[String]) -> anyhow::Result<Vec<CorrectorKind>> {
+    if names == ["all"] {
+        return Ok(CorrectorKind::ALL.to_vec());
+    }
+    let kind = |name: &String| {
+        let known = CorrectorKind::ALL.map(CorrectorKind::name).join(", ");
+        CorrectorKind::from_name(name).with_context(|| format!("--correctors: '{name}' is not one of {known}"))
+    };
+    names.iter().map(kind).collect()
+}
+
 /// Trains one adapter a seed, on all cores; the first seed's adapter and every seed's scores.
 pub fn train_seeds(
-    stored: &StoredRoom,
-    features: &Features,
+    rooms: &[(StoredRoom, Features)],
     recipe: &Recipe,
     seeds: u64,
 ) -> anyhow::Result<(Adapter, Vec<TrainingRun>)> {
-    let epochs = recipe.epochs.unwrap_or(recipe.preset.config(0).epochs) as u64;
-    let progress = bar(epochs.saturating_mul(seeds), "training");
-    let lesson = Lesson { room: &stored.room, revision: stored.revision, features };
+    let progress = bar((recipe.config.epochs as u64).saturating_mul(seeds), "training");
+    let lessons: Vec<Lesson<'_>> = rooms.iter().map(lesson).collect();
     let trained: Vec<(Adapter, TrainingRun)> = (0..seeds)
         .into_par_iter()
         .map(|offset| {
-            let seed = recipe.seed + offset;
+            let seed = recipe.config.seed + offset;
             if seed > u64::from(u32::MAX) {
                 bail!("--seed and --seeds reach over 2³²");
             }
             let begun = Instant::now();
-            let recipe = Recipe { seed, ..recipe.clone() };
-            let (adapter, record) = learn(lesson, &recipe, &mut |epoch| {
+            let recipe = Recipe { config: TrainConfig { seed, ..recipe.config.clone() }, ..recipe.clone() };
+            let (adapter, record) = learn(&lessons, &recipe, &mut |epoch| {
                 progress.set_message(format!("loss {:.4}", epoch.loss));
                 progress.inc(1);
             })?;
             let seconds = begun.elapsed().as_secs_f64();
-            let navigation = inverse_poincare(stored, features, &adapter, &recipe)?;
-            Ok((adapter, TrainingRun { record, navigation, seconds }))
+            let hit_rate = hit_rate(rooms, &adapter, &recipe)?;
+            Ok((adapter, TrainingRun { record, hit_rate, seconds }))
         })
         .collect::<anyhow::Result<_>>()?;
     progress.finish_and_clear();
@@ -176,24 +160,28 @@ pub fn train_seeds(
     Ok((first, runs))
 }
 
-fn inverse_poincare(
-    stored: &StoredRoom,
-    features: &Features,
-    adapter: &Adapter,
-    recipe: &Recipe,
-) -> anyhow::Result<crate::eval::RetrievalScores> {
-    let room = std::sync::Arc::new(stored.room.clone());
-    let navigator = Navigator::new(room, features, std::sync::Arc::new(adapter.clone()), IndexKind::Exact)?;
-    let navigators = vec![NavigatorKind::InversePoincare(Reading::Affine)];
-    let protocol = Protocol { split: recipe.split, navigators, ..Protocol::paper(recipe.stride) };
-    let mut report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |_, _| ())?;
-    Ok(report.rows.swap_remove(0).retrieval)
+/// Hit@0.1 of inverse Poincaré in the affine reading on the rooms' test pairs together.
+fn hit_rate(rooms: &[(StoredRoom, Features)], adapter: &Adapter, recipe: &Recipe) -> anyhow::Result<Rate> {
+    let adapter = Arc::new(adapter.clone());
+    let kind = NavigatorKind::Step(StepKind::InversePoincare(Reading::Affine), Metric::Full);
+    let protocol = Protocol { split: recipe.split, navigators: vec![kind], ..Protocol::paper(recipe.stride) };
+    let (mut hits, mut n) = (0, 0);
+    for (stored, features) in rooms {
+        let navigator = Navigator::new(Arc::new(stored.room.clone()), features, adapter.clone(), IndexKind::Exact)?;
+        let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |_, _| ())?;
+        let rate = report.rows[0].retrieval.hits[0].1;
+        (hits, n) = (hits + rate.successes(), n + rate.n);
+    }
+    Ok(Rate::of(hits, n))
 }
 
 /// The name of an adapter that was given none.
-pub fn default_name(room: &str, features: &Features, recipe: &Recipe) -> String {
-    let Recipe { preset, split, stride, .. } = recipe;
-    format!("{room}.{}.{}.s{stride}.{split}", features.source().name, preset.name())
+pub fn default_name(rooms: &[(StoredRoom, Features)], recipe: &Recipe) -> String {
+    let Recipe { preset, split, stride, config, .. } = recipe;
+    let (first, features) = (rooms[0].0.room.id(), &rooms[0].1.source().name);
+    let others = if rooms.len() > 1 { format!("-and-{}-more", rooms.len() - 1) } else { String::new() };
+    let charts = if config.charts > 1 { format!(".k{}", config.charts) } else { String::new() };
+    format!("{first}{others}.{features}.{}.s{stride}.{split}{charts}", preset.name())
 }
 
 /// Says where an adapter lies.

@@ -8,7 +8,7 @@ pub use navigators::{NavigatorKind, Protocol, Report, Row, evaluate};
 pub use predictions::{Prediction, PredictionScope, score_predictions};
 pub use retrieval::{LatentScores, PoseRecall, RetrievalScores};
 
-use crate::{adapter, cancel, index, navigation, pairs, ridge, room};
+use crate::{adapter, cancel, navigation, pairs, room};
 
 /// Why an evaluation cannot be done.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -20,7 +20,7 @@ pub enum Error {
     #[error(transparent)]
     Adapter(#[from] adapter::Error),
     #[error(transparent)]
-    Ridge(#[from] ridge::Error),
+    Navigation(#[from] navigation::Error),
     #[error(transparent)]
     Cancelled(#[from] cancel::Cancelled),
     #[error("threshold {value:e} must be greater than 0 and at most {MAX_THRESHOLD:e}")]
@@ -58,11 +58,6 @@ pub fn check_thresholds(thresholds: &[f64]) -> Result<(), Error> {
         Some(&value) => Err(Error::Threshold { value }),
         None => Ok(()),
     }
-}
-
-/// The exact index over the candidates: evaluations never depend on an approximation.
-fn exact_index(latents: ndarray::ArrayView2<'_, f64>, candidates: &[room::FrameId]) -> index::ExactIndex {
-    index::ExactIndex::new(latents, candidates)
 }
 
 /// The paper's thresholds.

@@ -1,24 +1,20 @@
 //! The paper's navigation table: one row a navigator, all on the same pairs and candidates.
 
-use std::sync::Arc;
-
-use ndarray::{Array1, Array2, Axis};
+use ndarray::{Array2, ArrayView2, Axis, s};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::retrieval::twist_error;
-use super::{Error, LatentScores, RetrievalScores, check_thresholds, default_thresholds, exact_index};
-use crate::adapter::{Adapter, Reading};
+use super::{Error, LatentScores, RetrievalScores, check_thresholds, default_thresholds};
+use crate::adapter::{Adapter, CorrectorKind, Reading};
 use crate::cancel::Cancellation;
-use crate::geometry::{Pose, Twist, body_twist};
-use crate::index::{Exclusion, Index};
-use crate::navigation::Navigator;
+use crate::geometry::{Pose, body_twist};
+use crate::index::Exclusion;
+use crate::navigation::{
+    Ground, Leg, Metric, Mode, Navigator, Plan, Refit, Search, Space, Start, StepKind, Stepper, walk,
+};
 use crate::pairs::{Pair, Split};
-use crate::ridge::{Intercept, Ridge};
 use crate::room::FrameId;
-
-/// Penalty of the refit, scikit-learn's default.
-const REFIT_ALPHA: f64 = 1.0;
 
 /// One way to choose the next frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -30,45 +26,60 @@ pub enum NavigatorKind {
     Random,
     /// The candidate whose pose is nearest to the target: what retrieval could reach at best.
     Oracle,
-    /// ĝ = g + W⁺ΔP.
-    InversePoincare(Reading),
-    /// ĝ = g + B ΔP with B fitted by ridge on the room's training pairs, φ frozen (A-24: raw twists, no intercept).
-    RidgeRefit,
-    /// As [`NavigatorKind::RidgeRefit`], fitted on the very pairs it is scored on: the likely protocol of the paper,
-    /// and a leak.
-    RidgeRefitInSample,
+    /// Imagines where the motion leads and takes the frame that is nearest under a metric.
+    Step(StepKind, Metric),
 }
 
-impl NavigatorKind {
-    /// Every navigator, in the order of the table.
-    pub const ALL: [Self; 8] = [
-        Self::Identity,
-        Self::Random,
-        Self::Oracle,
-        Self::InversePoincare(Reading::Affine),
-        Self::InversePoincare(Reading::Homogeneous),
-        Self::InversePoincare(Reading::Literal),
-        Self::RidgeRefit,
-        Self::RidgeRefitInSample,
-    ];
+/// Between a way to step and a metric that is not the paper's, in a navigator's name.
+const UNDER: char = '+';
 
-    /// Its name in tables, JSON and on the wire.
-    pub fn name(self) -> &'static str {
+impl NavigatorKind {
+    /// Every navigator.
+    pub fn all() -> Vec<Self> {
+        let steps = StepKind::all().into_iter();
+        let steps = steps.flat_map(|step| Metric::ALL.map(|metric| Self::Step(step, metric)));
+        [Self::Identity, Self::Random, Self::Oracle].into_iter().chain(steps).collect()
+    }
+
+    /// The rows of the table for an adapter: the baselines, the three readings, its correctors, the refits on raw
+    /// motions, and inverse Poincaré under the other metrics.
+    pub fn table(adapter: &Adapter) -> Vec<Self> {
+        let full = |step: StepKind| Self::Step(step, Metric::Full);
+        let corrector = |kind: CorrectorKind| full(StepKind::Corrector(kind));
+        let refit = |in_sample: bool| full(StepKind::Refit(Refit { z_scored: false, intercept: false, in_sample }));
+        let affine = StepKind::InversePoincare(Reading::Affine);
+        let others = [Metric::RowSpace, Metric::Whitened, Metric::Motion];
+        let mut rows = vec![Self::Identity, Self::Random, Self::Oracle];
+        rows.extend(Reading::ALL.map(|reading| full(StepKind::InversePoincare(reading))));
+        rows.extend(adapter.correctors().map(|known| corrector(known.kind())));
+        rows.extend([refit(false), refit(true)]);
+        rows.extend(others.map(|metric| Self::Step(affine, metric)));
+        let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
+        rows.extend(adapter.error_covariance().map(|_| Self::Step(homogeneous, Metric::Calibrated)));
+        rows
+    }
+
+    /// Its name in tables, JSON and on the wire: the way to step, and `+METRIC` unless that is the paper's.
+    pub fn name(self) -> String {
         match self {
-            Self::Identity => "identity",
-            Self::Random => "random",
-            Self::Oracle => "oracle",
-            Self::InversePoincare(Reading::Affine) => "inverse-poincare-affine",
-            Self::InversePoincare(Reading::Homogeneous) => "inverse-poincare-homogeneous",
-            Self::InversePoincare(Reading::Literal) => "inverse-poincare-literal",
-            Self::RidgeRefit => "ridge-refit",
-            Self::RidgeRefitInSample => "ridge-refit-in-sample",
+            Self::Identity => "identity".to_owned(),
+            Self::Random => "random".to_owned(),
+            Self::Oracle => "oracle".to_owned(),
+            Self::Step(step, Metric::Full) => step.name().to_owned(),
+            Self::Step(step, metric) => format!("{}{UNDER}{}", step.name(), metric.name()),
         }
     }
 
     /// The navigator with this [`NavigatorKind::name`].
     pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|kind| kind.name() == name)
+        Self::all().into_iter().find(|kind| kind.name() == name)
+    }
+
+    /// The names in words, for those who gave another.
+    pub fn known_names() -> String {
+        let steps: Vec<&str> = StepKind::all().into_iter().map(StepKind::name).collect();
+        let metrics: Vec<&str> = Metric::ALL.into_iter().skip(1).map(Metric::name).collect();
+        format!("identity, random, oracle, {}; the last ones also with +{}", steps.join(", "), metrics.join(", +"))
     }
 }
 
@@ -85,12 +96,16 @@ pub struct Protocol {
     pub thresholds: Vec<f64>,
     /// Of the random navigator.
     pub seed: u64,
-    /// Rows of the table.
+    /// Equal parts of each motion.
+    pub steps: u32,
+    /// How the parts hang together.
+    pub mode: Mode,
+    /// Rows of the table; those of [`NavigatorKind::table`] if empty.
     pub navigators: Vec<NavigatorKind>,
 }
 
 impl Protocol {
-    /// The paper's protocol at a stride: time split, source included, ε of 0.1, 0.2, 0.3 and 0.5.
+    /// The paper's protocol at a stride: time split, source included, one step, ε of 0.1, 0.2, 0.3 and 0.5.
     pub fn paper(stride: u32) -> Self {
         Self {
             split: Split::Time,
@@ -98,7 +113,9 @@ impl Protocol {
             exclude_source: None,
             thresholds: default_thresholds(),
             seed: 0,
-            navigators: NavigatorKind::ALL.to_vec(),
+            steps: 1,
+            mode: Mode::OpenLoop,
+            navigators: Vec::new(),
         }
     }
 }
@@ -143,30 +160,35 @@ pub fn evaluate(
 ) -> Result<Report, Error> {
     check_thresholds(&protocol.thresholds)?;
     let timeline = navigator.room().timeline();
+    let navigators = match protocol.navigators.as_slice() {
+        [] => NavigatorKind::table(navigator.adapter()),
+        given => given.to_vec(),
+    };
     let bench = Bench {
         poses: navigator.room().poses(),
-        adapter: navigator.adapter().clone(),
-        latents: navigator.latents().to_owned(),
+        adapter: navigator.adapter(),
+        latents: navigator.latents(),
         test: protocol.split.test_pairs(timeline, protocol.stride)?,
         train: protocol.split.train_pairs(timeline, protocol.stride).unwrap_or_default(),
         candidates: protocol.split.candidates(timeline),
         protocol,
         cancel,
     };
-    let mut rows = Vec::with_capacity(protocol.navigators.len());
-    for (position, &kind) in protocol.navigators.iter().enumerate() {
+    let mut rows = Vec::with_capacity(navigators.len());
+    for (position, &kind) in navigators.iter().enumerate() {
         cancel.check()?;
         progress(position, kind);
         rows.push(bench.row(kind)?);
     }
-    Ok(Report { rows, n: bench.test.len(), candidate_count: bench.candidates.len(), protocol: protocol.clone() })
+    let protocol = Protocol { navigators, ..protocol.clone() };
+    Ok(Report { rows, n: bench.test.len(), candidate_count: bench.candidates.len(), protocol })
 }
 
 /// What every row is computed from.
 struct Bench<'a> {
     poses: &'a [Pose],
-    adapter: Arc<Adapter>,
-    latents: Array2<f64>,
+    adapter: &'a Adapter,
+    latents: ArrayView2<'a, f64>,
     test: Vec<Pair>,
     train: Vec<Pair>,
     candidates: Vec<FrameId>,
@@ -176,41 +198,71 @@ struct Bench<'a> {
 
 impl Bench<'_> {
     fn row(&self, kind: NavigatorKind) -> Result<Row, Error> {
-        let steps: Vec<Array1<f64>> = match kind {
-            NavigatorKind::Identity if self.protocol.exclude_source.is_none() => {
-                return self.row_of_frames(kind, self.test.iter().map(|pair| pair.source).collect());
+        match kind {
+            NavigatorKind::Identity => self.identity(),
+            NavigatorKind::Random => Ok(self.row_of_frames(kind, &self.random_frames()?)),
+            NavigatorKind::Oracle => Ok(self.row_of_frames(kind, &self.nearest_poses()?)),
+            NavigatorKind::Step(step, metric) => {
+                let ground = Ground { latents: self.latents, poses: self.poses, train: &self.train, test: &self.test };
+                let stepper = Stepper::new(step, self.adapter, ground)?;
+                let search = Search::exact(metric, self.adapter, self.latents, &self.candidates)?;
+                let space = Space {
+                    adapter: self.adapter,
+                    stepper: &stepper,
+                    latents: self.latents,
+                    poses: self.poses,
+                    search: &search,
+                };
+                let mut predicted = Array2::zeros((self.test.len(), self.adapter.coordinate_count()));
+                let mut retrieved = Vec::with_capacity(self.test.len());
+                for (&pair, mut row) in self.test.iter().zip(predicted.outer_iter_mut()) {
+                    let Some(end) = self.walked(space, pair)?.pop() else { continue };
+                    row.assign(&end.latent.slice(s![..self.adapter.coordinate_count()]));
+                    retrieved.push(end.neighbours[0].frame);
+                }
+                Ok(self.scored(kind, &predicted, &retrieved))
             }
-            NavigatorKind::Identity => vec![Array1::zeros(self.latents.ncols()); self.test.len()],
-            NavigatorKind::Random => return self.row_of_frames(kind, self.random_frames()?),
-            NavigatorKind::Oracle => return self.row_of_frames(kind, self.nearest_poses()?),
-            NavigatorKind::InversePoincare(reading) => {
-                self.twists(&self.test).map(|twist| self.adapter.inverse().step(twist, reading, 1.0)).collect()
-            }
-            NavigatorKind::RidgeRefit => self.refit(&self.train)?,
-            NavigatorKind::RidgeRefitInSample => self.refit(&self.test)?,
-        };
-        let mut predicted = self.latents_of(self.test.iter().map(|pair| pair.source));
-        predicted.outer_iter_mut().zip(&steps).for_each(|(mut row, step)| row += step);
-        let index = exact_index(self.latents.view(), &self.candidates);
-        let mut retrieved = Vec::with_capacity(self.test.len());
-        for (latent, pair) in predicted.outer_iter().zip(&self.test) {
-            self.cancel.check()?;
-            let nearest = index.nearest(&latent.to_vec(), 1, self.exclusion(pair.source));
-            let first = nearest.first().ok_or(Error::NoCandidates { source_frame: pair.source })?;
-            retrieved.push(first.frame);
         }
-        Ok(self.scored(kind, &predicted, &retrieved))
     }
 
-    fn row_of_frames(&self, kind: NavigatorKind, retrieved: Vec<FrameId>) -> Result<Row, Error> {
-        let predicted = self.latents_of(retrieved.iter().copied());
-        Ok(self.scored(kind, &predicted, &retrieved))
+    fn walked(&self, space: Space<'_>, pair: Pair) -> Result<Vec<crate::navigation::Step>, Error> {
+        let Protocol { steps, mode, exclude_source, .. } = *self.protocol;
+        let [source, target] = [pair.source, pair.target].map(|frame| self.poses[frame.row()]);
+        let latent = self.latents.row(pair.source.row()).to_owned();
+        let start = Start { latent, frame: Some(pair.source), pose: Some(source) };
+        let leg = Leg { motion: body_twist(&source, &target), goal: Some(target) };
+        let plan = Plan { mode, steps, hit_count: 1, exclude_source };
+        walk(space, &start, leg, plan, self.cancel).map_err(|error| match error {
+            crate::navigation::Error::NoCandidates { .. } => Error::NoCandidates { source_frame: pair.source },
+            other => other.into(),
+        })
+    }
+
+    fn identity(&self) -> Result<Row, Error> {
+        if self.protocol.exclude_source.is_none() {
+            let sources: Vec<FrameId> = self.test.iter().map(|pair| pair.source).collect();
+            return Ok(self.row_of_frames(NavigatorKind::Identity, &sources));
+        }
+        let search = Search::exact(Metric::Full, self.adapter, self.latents, &self.candidates)?;
+        let mut retrieved = Vec::with_capacity(self.test.len());
+        for pair in &self.test {
+            self.cancel.check()?;
+            let nearest = search.nearest(self.latents.row(pair.source.row()), 1, self.exclusion(pair.source));
+            let found = nearest.first().ok_or(Error::NoCandidates { source_frame: pair.source })?;
+            retrieved.push(found.frame);
+        }
+        let here = self.coordinates_of(self.test.iter().map(|pair| pair.source));
+        Ok(self.scored(NavigatorKind::Identity, &here, &retrieved))
+    }
+
+    fn row_of_frames(&self, kind: NavigatorKind, retrieved: &[FrameId]) -> Row {
+        self.scored(kind, &self.coordinates_of(retrieved.iter().copied()), retrieved)
     }
 
     fn scored(&self, kind: NavigatorKind, predicted: &Array2<f64>, retrieved: &[FrameId]) -> Row {
-        let targets = self.latents_of(self.test.iter().map(|pair| pair.target));
+        let targets = self.coordinates_of(self.test.iter().map(|pair| pair.target));
         Row {
-            name: kind.name().to_owned(),
+            name: kind.name(),
             n: self.test.len(),
             latent: Some(LatentScores::of(targets.view(), predicted.view())),
             retrieval: RetrievalScores::of(&self.test, retrieved, self.poses, &self.protocol.thresholds),
@@ -250,22 +302,8 @@ impl Bench<'_> {
         self.protocol.exclude_source.map(|radius| Exclusion { centre, radius })
     }
 
-    /// Latent steps of the test pairs from a linear map fitted on `fit_on`.
-    fn refit(&self, fit_on: &[Pair]) -> Result<Vec<Array1<f64>>, Error> {
-        let rows: Vec<Twist> = self.twists(fit_on).collect();
-        let inputs = Array2::from_shape_fn((rows.len(), 6), |(row, column)| rows[row].to_vector()[column]);
-        let steps = self.latents_of(fit_on.iter().map(|pair| pair.target))
-            - self.latents_of(fit_on.iter().map(|pair| pair.source));
-        let fit = Ridge::fit(inputs.view(), steps.view(), REFIT_ALPHA, Intercept::None)?;
-        let predict = |twist: Twist| fit.predict(Array1::from_iter(twist.to_vector().iter().copied()).view());
-        Ok(self.twists(&self.test).map(predict).collect())
-    }
-
-    fn twists<'b>(&'b self, pairs: &'b [Pair]) -> impl Iterator<Item = Twist> + 'b {
-        pairs.iter().map(|pair| body_twist(&self.poses[pair.source.row()], &self.poses[pair.target.row()]))
-    }
-
-    fn latents_of(&self, frames: impl Iterator<Item = FrameId>) -> Array2<f64> {
-        self.latents.select(Axis(0), &frames.map(FrameId::row).collect::<Vec<_>>())
+    fn coordinates_of(&self, frames: impl Iterator<Item = FrameId>) -> Array2<f64> {
+        let coordinates = self.latents.slice(s![.., ..self.adapter.coordinate_count()]);
+        coordinates.select(Axis(0), &frames.map(FrameId::row).collect::<Vec<_>>())
     }
 }

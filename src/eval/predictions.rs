@@ -1,11 +1,11 @@
 //! Scores of predictions that were made elsewhere: a remote client brings its own navigator.
 
-use ndarray::{Array2, Axis};
+use ndarray::{Array2, Axis, s};
 
-use super::{Error, LatentScores, RetrievalScores, Row, check_thresholds, exact_index};
+use super::{Error, LatentScores, RetrievalScores, Row, check_thresholds};
 use crate::cancel::Cancellation;
-use crate::index::{Exclusion, Index};
-use crate::navigation::Navigator;
+use crate::index::Exclusion;
+use crate::navigation::{Metric, Navigator, Search};
 use crate::pairs::{Pair, Split};
 use crate::room::FrameId;
 
@@ -49,7 +49,8 @@ pub fn score_predictions(
         Some(split) => split.candidates(room.timeline()),
         None => (0..room.frame_count() as u32).map(FrameId).collect(),
     };
-    let index = exact_index(navigator.latents(), &candidates);
+    // Exact, since evaluations never depend on an approximation.
+    let search = Search::exact(Metric::Full, navigator.adapter(), navigator.latents(), &candidates)?;
     let mut pairs = Vec::with_capacity(predictions.len());
     let mut retrieved = Vec::with_capacity(predictions.len());
     let mut latents: Vec<f64> = Vec::new();
@@ -79,7 +80,7 @@ pub fn score_predictions(
             Prediction::Latent(latent) => {
                 navigator.adapter().check_latent(latent).map_err(|problem| at(problem.into()))?;
                 latents.extend(latent);
-                let nearest = index.nearest(latent, 1, exclusion);
+                let nearest = search.nearest(ndarray::ArrayView1::from(latent), 1, exclusion);
                 nearest.first().ok_or_else(|| at(Error::NoCandidates { source_frame: pair.source }))?.frame
             }
         };
@@ -95,12 +96,13 @@ pub fn score_predictions(
 fn latent_scores(navigator: &Navigator, pairs: &[Pair], latents: &[f64]) -> Result<Option<LatentScores>, Error> {
     let targets: Vec<usize> = pairs.iter().map(|pair| pair.target.row()).collect();
     let targets = navigator.latents().select(Axis(0), &targets);
+    let coordinates = s![.., ..navigator.adapter().coordinate_count()];
     match latents.len() {
         0 => Ok(None),
         n if n == targets.len() => {
             let predicted =
                 Array2::from_shape_fn(targets.dim(), |(row, column)| latents[row * targets.ncols() + column]);
-            Ok(Some(LatentScores::of(targets.view(), predicted.view())))
+            Ok(Some(LatentScores::of(targets.slice(coordinates), predicted.slice(coordinates))))
         }
         _ => Err(Error::MixedPredictions),
     }

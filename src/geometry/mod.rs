@@ -14,7 +14,7 @@ mod se3;
 
 pub use pose_error::PoseError;
 pub use rotation::{NearestRotation, nearest_rotation};
-pub use se3::{Twist, adjoint, body_twist, exp, log};
+pub use se3::{Twist, adjoint, body_twist, exp, left_jacobian_inverse, log};
 
 /// A camera's position and orientation, `world_from_camera`, metres.
 pub type Pose = nalgebra::Isometry3<f64>;

@@ -110,6 +110,45 @@ pub fn adjoint(b_from_a: &Pose) -> Matrix6<f64> {
     ad
 }
 
+/// The inverse left Jacobian of SE(3) at a twist, on (v, ω): log(exp(δ) exp(ξ)) = ξ + J_l⁻¹(ξ) δ to first order in δ.
+///
+/// The inverse right Jacobian, J_r⁻¹(ξ) with log(exp(ξ) exp(δ)) = ξ + J_r⁻¹(ξ) δ, is J_l⁻¹(−ξ). |ω| < π.
+///
+/// Source: T. Barfoot, State Estimation for Robotics, the closed form of Q.
+pub fn left_jacobian_inverse(twist: &Twist) -> Matrix6<f64> {
+    let (rho, phi) = (twist.linear.cross_matrix(), twist.angular.cross_matrix());
+    let angle = twist.angular.norm();
+    let x = angle * angle;
+    let (first, second, third, inverse) = if angle < SERIES_ANGLE_RAD {
+        (
+            series(x, &[1.0 / 6.0, -1.0 / 120.0, 1.0 / 5_040.0, -1.0 / 362_880.0]),
+            series(x, &[1.0 / 24.0, -1.0 / 720.0, 1.0 / 40_320.0, -1.0 / 3_628_800.0]),
+            series(x, &[1.0 / 120.0, -1.0 / 2_520.0, 1.0 / 120_960.0, -1.0 / 9_979_200.0]),
+            series(x, &[1.0 / 12.0, 1.0 / 720.0, 1.0 / 30_240.0, 1.0 / 1_209_600.0, 1.0 / 47_900_160.0]),
+        )
+    } else {
+        let (sine, cosine) = angle.sin_cos();
+        let half = 0.5 * angle;
+        (
+            (angle - sine) / (x * angle),
+            (x + 2.0 * cosine - 2.0) / (2.0 * x * x),
+            (2.0 * angle - 3.0 * sine + angle * cosine) / (2.0 * x * x * angle),
+            (1.0 - half * half.cos() / half.sin()) / x,
+        )
+    };
+    let (both, turned) = (phi * rho, rho * phi);
+    let q = rho * 0.5
+        + (both + turned + phi * turned) * first
+        + (phi * both + turned * phi - phi * turned * 3.0) * second
+        + (phi * turned * phi + phi * phi * turned) * third;
+    let rotation = Matrix3::identity() - phi * 0.5 + phi * phi * inverse;
+    let mut jacobian = Matrix6::zeros();
+    jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);
+    jacobian.fixed_view_mut::<3, 3>(3, 3).copy_from(&rotation);
+    jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&(-rotation * q * rotation));
+    jacobian
+}
+
 /// Axis times angle, radians, |ω| ≤ π. Accurate at every angle because atan2 never cancels.
 fn rotation_vector(rotation: &UnitQuaternion<f64>) -> Vector3<f64> {
     let (w, v) = (rotation.w, rotation.imag());

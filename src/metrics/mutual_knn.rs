@@ -15,14 +15,51 @@ pub struct MutualKnn {
     pub stride: usize,
     /// Neighbours of each.
     pub k: usize,
-    /// Frames at most this far away among those compared are no neighbours; a frame itself never is.
+    /// Frames this near are no neighbours; a frame itself never is.
     pub exclusion: usize,
+    /// What `exclusion` counts.
+    pub counted: Counted,
+    /// Whether a frame that is just `exclusion` away is left out too.
+    pub bound: Bound,
+}
+
+/// What a temporal distance is counted in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Counted {
+    /// The frames that are compared.
+    Sampled,
+    /// The frames of the room.
+    Native,
+}
+
+/// Whether a limit belongs to what it limits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Bound {
+    /// It does.
+    Inclusive,
+    /// It does not.
+    Exclusive,
+}
+
+impl MutualKnn {
+    /// Whether two of the compared frames may be neighbours.
+    fn apart(&self, frame: usize, other: usize) -> bool {
+        let distance = match self.counted {
+            Counted::Sampled => frame.abs_diff(other),
+            Counted::Native => frame.abs_diff(other).saturating_mul(self.stride),
+        };
+        let near = match self.bound {
+            Bound::Inclusive => distance <= self.exclusion,
+            Bound::Exclusive => distance < self.exclusion,
+        };
+        frame != other && !near
+    }
 }
 
 impl Default for MutualKnn {
     /// The paper's: 256 frames, k = 10, 10 frames to each side left out.
     fn default() -> Self {
-        Self { frames: 256, stride: 1, k: 10, exclusion: 10 }
+        Self { frames: 256, stride: 1, k: 10, exclusion: 10, counted: Counted::Sampled, bound: Bound::Inclusive }
     }
 }
 
@@ -93,7 +130,7 @@ fn sampled(have: usize, options: &MutualKnn) -> Result<Vec<usize>, Error> {
 fn neighbours(options: &MutualKnn, distance: impl Fn(usize, usize) -> f64 + Sync) -> Result<Vec<Vec<usize>>, Error> {
     let &MutualKnn { frames, k, exclusion, .. } = options;
     let of = |frame: usize| {
-        let apart = |other: &usize| *other != frame && other.abs_diff(frame) > exclusion;
+        let apart = |other: &usize| options.apart(frame, *other);
         let mut others: Vec<(f64, usize)> =
             (0..frames).filter(apart).map(|other| (distance(frame, other), other)).collect();
         if others.len() < k {
@@ -103,4 +140,22 @@ fn neighbours(options: &MutualKnn, distance: impl Fn(usize, usize) -> f64 + Sync
         Ok(others.into_iter().take(k).map(|(_, other)| other).collect())
     };
     (0..frames).into_par_iter().map(of).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand, of a frame and the one three samples on, six frames of the room.
+    #[test]
+    fn distances_are_counted_as_asked() {
+        let apart = |counted, bound, exclusion| {
+            MutualKnn { stride: 2, exclusion, counted, bound, ..MutualKnn::default() }.apart(4, 7)
+        };
+        assert!(apart(Counted::Sampled, Bound::Inclusive, 2) && !apart(Counted::Sampled, Bound::Inclusive, 3));
+        assert!(apart(Counted::Sampled, Bound::Exclusive, 3) && !apart(Counted::Sampled, Bound::Exclusive, 4));
+        assert!(apart(Counted::Native, Bound::Inclusive, 5) && !apart(Counted::Native, Bound::Inclusive, 6));
+        assert!(apart(Counted::Native, Bound::Exclusive, 6) && !apart(Counted::Native, Bound::Exclusive, 7));
+        assert!(!MutualKnn { exclusion: 0, bound: Bound::Exclusive, ..MutualKnn::default() }.apart(3, 3));
+    }
 }

@@ -1,19 +1,24 @@
 //! From a frame and a motion to the frames that follow: inverse Poincaré navigation in any number of steps.
 //!
-//! - A step in latent space is ĝ = g + W⁺ΔP in one of three readings ([`Reading`], A-16).
+//! - A step in latent space is ĝ = g + W⁺ΔP in one of three readings ([`Reading`], A-16), or what another [`Stepper`]
+//!   says; the frame nearest to ĝ is looked for under a [`Metric`].
 //! - Open loop takes all steps from the source; snap goes on from each retrieved frame; closed loop does so too and
 //!   plans the rest of the way anew.
 
 mod multi_step;
 mod navigator;
 mod query;
+mod search;
+mod stepper;
 
 pub use crate::adapter::Reading;
 pub use multi_step::{Leg, Mode, Plan, Space, Start, Step, walk};
-pub use navigator::{Answer, AnswerStep, Hit, IndexKind, Navigator, StepError};
-pub use query::{Displacement, Limits, Query, Source, SourceAt};
+pub use navigator::{Answer, AnswerStep, Hit, Navigator, StepError};
+pub use query::{Displacement, FitOn, Limits, Query, Source, SourceAt};
+pub use search::{IndexKind, Metric, Search};
+pub use stepper::{Ground, Refit, StepKind, Stepper};
 
-use crate::{adapter, cancel, features, geometry, room};
+use crate::{adapter, cancel, features, geometry, pairs, ridge, room};
 
 /// Hit thresholds of the paper, on ‖ΔP_target − ΔP_retrieved‖₂, metres and radians mixed.
 pub const HIT_THRESHOLDS: [f64; 4] = [0.1, 0.2, 0.3, 0.5];
@@ -32,6 +37,10 @@ pub enum Error {
     Adapter(#[from] adapter::Error),
     #[error(transparent)]
     Features(#[from] features::Error),
+    #[error("no linear map from motions to steps can be fitted in this room: {0}")]
+    Refit(#[from] ridge::Error),
+    #[error("no linear map from motions to steps can be fitted in this room: {0}")]
+    Pairs(#[from] pairs::Error),
     #[error(transparent)]
     Cancelled(#[from] cancel::Cancelled),
     #[error("room '{room}' has {frame_count} frames, its features have {rows} rows; every frame needs one")]

@@ -2,11 +2,11 @@
 
 use ndarray::{Array1, ArrayView2};
 
-use super::Error;
-use crate::adapter::{Adapter, Reading};
+use super::{Error, Search, Stepper};
+use crate::adapter::Adapter;
 use crate::cancel::Cancellation;
 use crate::geometry::{Pose, Twist, body_twist};
-use crate::index::{Exclusion, Index, Neighbour};
+use crate::index::{Exclusion, Neighbour};
 use crate::room::FrameId;
 
 /// How the steps of a motion hang together.
@@ -20,13 +20,22 @@ pub enum Mode {
     ClosedLoop,
 }
 
+impl Mode {
+    /// Its name on the command line and in reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::OpenLoop => "open-loop",
+            Self::Snap => "snap",
+            Self::ClosedLoop => "closed-loop",
+        }
+    }
+}
+
 /// How a motion is walked.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Plan {
     /// How the steps hang together.
     pub mode: Mode,
-    /// How μ and σ enter the inverse.
-    pub reading: Reading,
     /// Equal parts of the motion, at least 1.
     pub steps: u32,
     /// Frames retrieved for each step, at least 1.
@@ -35,17 +44,19 @@ pub struct Plan {
     pub exclude_source: Option<u32>,
 }
 
-/// Where frames are looked for: latents (n, k) of a room's frames, their poses, and an index over the candidates.
+/// Where frames are looked for: latents (n, k) of a room's frames, their poses, and the candidates.
 #[derive(Clone, Copy)]
 pub struct Space<'a> {
-    /// Turns motions into latent steps.
+    /// Whose latents they are.
     pub adapter: &'a Adapter,
+    /// Turns motions into latent steps.
+    pub stepper: &'a Stepper,
     /// Row by frame.
     pub latents: ArrayView2<'a, f64>,
     /// `world_from_camera`, by frame.
     pub poses: &'a [Pose],
-    /// Over the candidates.
-    pub index: &'a dyn Index,
+    /// Among the candidates.
+    pub search: &'a Search,
 }
 
 /// Where a walk begins.
@@ -80,7 +91,7 @@ pub struct Leg {
 /// Walks a leg.
 ///
 /// # Errors
-/// [`Error::PoseNeeded`] for a closed loop from a start without a pose, [`Error::NoCandidates`],
+/// [`Error::PoseNeeded`] for a closed loop from a start without a pose, [`Error::NoCandidates`], [`Error::Adapter`],
 /// [`Error::Cancelled`].
 ///
 /// Source: SeeSE3, sec. 2.7, multi-step navigation.
@@ -98,10 +109,11 @@ pub fn walk(space: Space<'_>, start: &Start, leg: Leg, plan: Plan, cancel: &Canc
             (Some(goal), Some(pose)) => (body_twist(&pose, &goal), plan.steps - done),
             _ => (leg.motion, plan.steps),
         };
-        let step = space.adapter.inverse().step(part.divided(parts), plan.reading, f64::from(parts).recip());
+        let share = f64::from(parts).recip();
+        let step = space.stepper.step(space.adapter, at.latent.view(), part.divided(parts), share)?;
         let latent = &at.latent + &step;
         let exclusion = plan.exclude_source.zip(at.frame).map(|(radius, centre)| Exclusion { centre, radius });
-        let neighbours = space.index.nearest(&latent.to_vec(), plan.hit_count, exclusion);
+        let neighbours = space.search.nearest(latent.view(), plan.hit_count, exclusion);
         let Some(first) = neighbours.first() else {
             return Err(Error::NoCandidates { frame_count: space.poses.len() });
         };

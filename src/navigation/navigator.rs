@@ -1,26 +1,19 @@
 //! One room, ready to answer.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2};
 
-use super::{Displacement, Error, Leg, Limits, Plan, Query, Source, Space, Start, check_twist, walk};
+use super::{
+    Displacement, Error, FitOn, Ground, IndexKind, Leg, Limits, Metric, Plan, Query, Search, Source, Space, Start,
+    StepKind, Stepper, check_twist, walk,
+};
 use crate::adapter::Adapter;
 use crate::cancel::Cancellation;
 use crate::features::Features;
 use crate::geometry::{Pose, PoseError, Twist, body_twist, exp};
-use crate::index::{Audit, ExactIndex, HnswIndex, HnswParameters, Index, Neighbour};
-use crate::room::{FrameId, Room};
-
-/// Which index a navigator searches.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum IndexKind {
-    /// Every frame is looked at.
-    #[default]
-    Exact,
-    /// The graph of `hnsw_rs`.
-    Hnsw(HnswParameters),
-}
+use crate::index::{Audit, Neighbour};
+use crate::room::Room;
 
 /// A retrieved frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -76,8 +69,10 @@ pub struct Navigator {
     room: Arc<Room>,
     adapter: Arc<Adapter>,
     latents: Array2<f64>,
-    index: Box<dyn Index>,
-    audit: Option<Audit>,
+    kind: IndexKind,
+    search: Search,
+    /// Of the metrics but the first, made when they are first asked for.
+    other_searches: [OnceLock<Search>; 4],
 }
 
 impl Navigator {
@@ -92,16 +87,8 @@ impl Navigator {
             return Err(Error::FeatureRows { room: room.id().clone(), frame_count, rows });
         }
         let latents = adapter.embed(features.rows())?;
-        let frames: Vec<FrameId> = (0..frame_count as u32).map(FrameId).collect();
-        let (index, audit): (Box<dyn Index>, _) = match kind {
-            IndexKind::Exact => (Box::new(ExactIndex::new(latents.view(), &frames)), None),
-            IndexKind::Hnsw(parameters) => {
-                let index = HnswIndex::new(latents.view(), &frames, parameters);
-                let audit = index.audit(10, frame_count.div_ceil(200));
-                (Box::new(index), Some(audit))
-            }
-        };
-        Ok(Self { room, adapter, latents, index, audit })
+        let search = Search::new(kind, Metric::Full, &adapter, latents.view())?;
+        Ok(Self { room, adapter, latents, kind, search, other_searches: Default::default() })
     }
 
     /// The room.
@@ -121,12 +108,49 @@ impl Navigator {
 
     /// What was measured of an approximate index; none for the exact scan.
     pub fn audit(&self) -> Option<Audit> {
-        self.audit
+        self.search.audit()
     }
 
-    /// The `k` frames nearest to a latent.
+    /// The `k` frames nearest to a latent, by all its coordinates.
     pub fn nearest(&self, latent: ArrayView1<'_, f64>, k: usize) -> Vec<Hit> {
-        self.hits(&self.index.nearest(&latent.to_vec(), k, None))
+        self.hits(&self.search.nearest(latent, k, None))
+    }
+
+    /// All frames under a metric.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] when the metric needs what the adapter lacks.
+    pub fn search(&self, metric: Metric) -> Result<&Search, Error> {
+        let other = match metric {
+            Metric::Full => return Ok(&self.search),
+            Metric::RowSpace => 0,
+            Metric::Whitened => 1,
+            Metric::Motion => 2,
+            Metric::Calibrated => 3,
+        };
+        let place = &self.other_searches[other];
+        if let Some(made) = place.get() {
+            return Ok(made);
+        }
+        let made = Search::new(self.kind, metric, &self.adapter, self.latents.view())?;
+        Ok(place.get_or_init(|| made))
+    }
+
+    /// A way to step in this room.
+    ///
+    /// # Errors
+    /// As [`Stepper::new`]; [`Error::Pairs`] when the room has no pair to fit a refit on.
+    pub fn stepper(&self, kind: StepKind, fit_on: FitOn) -> Result<Stepper, Error> {
+        let FitOn { split, stride } = fit_on;
+        let timeline = self.room.timeline();
+        let (mut train, mut test) = (Vec::new(), Vec::new());
+        match kind {
+            StepKind::Refit(refit) if refit.in_sample => test = split.test_pairs(timeline, stride)?,
+            StepKind::Refit(_) => train = split.train_pairs(timeline, stride)?,
+            _ => {}
+        }
+        let ground = Ground { latents: self.latents.view(), poses: self.room.poses(), train: &train, test: &test };
+        Stepper::new(kind, &self.adapter, ground)
     }
 
     /// The latent, the frame and the pose of a source.
@@ -156,9 +180,10 @@ impl Navigator {
         query.check(limits)?;
         let start = self.start(&query.source.source, query.source.pose)?;
         let twists = self.twists(&query.displacement, &start)?;
+        let stepper = self.stepper(query.step, query.fit_on)?;
+        let space = Space { stepper: &stepper, search: self.search(query.metric)?, ..self.space(&stepper) };
         let plan = Plan {
             mode: query.mode,
-            reading: query.reading,
             steps: query.steps,
             hit_count: query.hit_count as usize,
             exclude_source: query.exclude_source,
@@ -169,7 +194,7 @@ impl Navigator {
         for twist in twists {
             let begun_at = wanted;
             let leg = Leg { motion: twist, goal: begun_at.map(|pose| pose * exp(&twist)) };
-            let walked = walk(self.space(), &from, leg, plan, cancel)?;
+            let walked = walk(space, &from, leg, plan, cancel)?;
             for (done, step) in (1..).zip(walked) {
                 let share = Twist { linear: twist.linear * f64::from(done), angular: twist.angular * f64::from(done) };
                 wanted = begun_at.map(|pose| pose * exp(&share.divided(query.steps)));
@@ -181,13 +206,14 @@ impl Navigator {
         Ok(Answer { steps, displacement: displacement.filter(|twist| twist.is_unique_logarithm()) })
     }
 
-    /// Where frames are looked for.
-    pub fn space(&self) -> Space<'_> {
+    /// Where frames are looked for: among all, by all coordinates.
+    pub fn space<'a>(&'a self, stepper: &'a Stepper) -> Space<'a> {
         Space {
             adapter: &self.adapter,
+            stepper,
             latents: self.latents.view(),
             poses: self.room.poses(),
-            index: self.index.as_ref(),
+            search: &self.search,
         }
     }
 

@@ -1,7 +1,8 @@
 //! What a navigator is asked.
 
-use super::{Error, Mode, Reading, check_twist};
+use super::{Error, Metric, Mode, StepKind, check_twist};
 use crate::geometry::{Pose, Twist};
+use crate::pairs::Split;
 use crate::room::FrameId;
 
 /// Where a question starts from.
@@ -35,6 +36,15 @@ pub enum Displacement {
     TargetPose(Pose),
 }
 
+/// Which pairs of the room a refit is fitted on: the training pairs, or the test pairs for an in-sample refit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FitOn {
+    /// How frames are kept apart.
+    pub split: Split,
+    /// Frames from source to target.
+    pub stride: u32,
+}
+
 /// A question to a navigator.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Query {
@@ -46,8 +56,12 @@ pub struct Query {
     pub steps: u32,
     /// How the steps hang together.
     pub mode: Mode,
-    /// How μ and σ enter the inverse.
-    pub reading: Reading,
+    /// How a motion becomes a latent step.
+    pub step: StepKind,
+    /// By which distance frames are near.
+    pub metric: Metric,
+    /// What a refit is fitted on.
+    pub fit_on: FitOn,
     /// Frames for each step.
     pub hit_count: u32,
     /// Whether the frame that a step starts from may not be retrieved, and how many rows to each side of it.

@@ -3,9 +3,9 @@
 use serde_json::{Map, Value, json};
 
 use super::TrainingRun;
-use crate::adapter::TrainingRecord;
+use crate::adapter::{PairPlan, TrainingRecord};
 use crate::eval::{Report, RetrievalScores, Row};
-use crate::scores::{MotionScores, Rate};
+use crate::scores::{MotionScores, Rate, deviation, mean};
 
 /// The record of `seese3 train`: one entry a seed, and the protocol they share.
 pub fn training_json(runs: &[TrainingRun], adapter: &str, revision: u64) -> Value {
@@ -17,18 +17,36 @@ pub fn training_json(runs: &[TrainingRun], adapter: &str, revision: u64) -> Valu
 fn run_json(run: &TrainingRun) -> Value {
     json!({
         "seed": run.record.config.seed,
-        "test": side_json(&run.record.test),
-        "train": side_json(&run.record.train),
+        "test": motion_json(&run.record.test),
+        "train": motion_json(&run.record.train),
         "train_mean_r2": run.record.train_mean_r2,
-        "inverse_poincare_affine": retrieval_json(&run.navigation),
+        "rooms": run.record.room_tests.iter().map(motion_json).collect::<Vec<_>>(),
+        "inverse_poincare_affine": { "hit": { "0.1": rate_json(&run.hit_rate) } },
         "seconds": run.seconds,
     })
 }
 
-fn side_json(scores: &MotionScores) -> Value {
+/// R² by part: mean and sample deviation over runs.
+pub(super) fn parts_json(runs: &[MotionScores]) -> Value {
+    let part = |figure: fn(&MotionScores) -> f64| {
+        let values: Vec<f64> = runs.iter().map(figure).filter(|value| !value.is_nan()).collect();
+        json!({ "mean": mean(&values), "sd": deviation(&values) })
+    };
+    json!({
+        "overall": part(|run| run.overall),
+        "translation": part(|run| run.translation),
+        "rotation": part(|run| run.rotation),
+        "direction": part(|run| run.direction),
+        "magnitude": part(|run| run.magnitude),
+    })
+}
+
+/// R² by component and part.
+pub(super) fn motion_json(scores: &MotionScores) -> Value {
     json!({
         "n": scores.n,
         "r2": {
+            "components": scores.components,
             "overall": scores.overall,
             "translation": scores.translation,
             "rotation": scores.rotation,
@@ -42,12 +60,18 @@ fn side_json(scores: &MotionScores) -> Value {
 fn protocol_json(record: &TrainingRecord) -> Value {
     let rooms: Vec<Value> =
         record.rooms.iter().map(|(room, revision)| json!({ "room": room.as_str(), "revision": revision })).collect();
+    let calibrated_on: Vec<&str> = record.calibrated_on.iter().map(|(room, _)| room.as_str()).collect();
+    let range = match &record.pairs {
+        PairPlan::Stride(_) => Value::Null,
+        PairPlan::Range(range) => json!([range.low, range.high]),
+    };
     json!({
         "preset": record.preset,
         "split": record.split.name(),
         "stride": record.stride,
         "rooms": rooms,
         "training_pairs": record.pair_count,
+        "drawn_from_strides": range,
         "epochs": record.config.epochs,
         "batch": record.config.batch,
         "learning_rate": record.config.learning_rate,
@@ -55,6 +79,14 @@ fn protocol_json(record: &TrainingRecord) -> Value {
         "clip_norm": record.config.clip_norm,
         "hidden": record.config.hidden,
         "latent": record.config.latent,
+        "charts": record.config.charts,
+        "mixing": record.config.mixing.name(),
+        "loss": record.config.loss.name(),
+        "standardised_features": record.config.standardise,
+        "noise": record.config.noise,
+        "weight_average": record.config.average,
+        "through_zero": record.config.through_zero,
+        "calibrated_on": calibrated_on,
         "twist": "body frame, (v, omega), metres and radians",
         "deviation_ddof": 0,
     })
@@ -70,6 +102,8 @@ pub fn evaluation_json(report: &Report, context: Map<String, Value>) -> Value {
     protocol.insert("source_excluded".to_owned(), json!(report.protocol.exclude_source.is_some()));
     protocol.insert("thresholds".to_owned(), json!(report.protocol.thresholds));
     protocol.insert("seed".to_owned(), json!(report.protocol.seed));
+    protocol.insert("steps".to_owned(), json!(report.protocol.steps));
+    protocol.insert("mode".to_owned(), json!(report.protocol.mode.name()));
     protocol.insert("index".to_owned(), json!("exact"));
     protocol.extend(context);
     let rows: Vec<Value> = report.rows.iter().map(row_json).collect();

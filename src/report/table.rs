@@ -54,7 +54,7 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
     let mut lines = vec![head.map(str::to_owned).to_vec()];
     let numbers = |run: &TrainingRun| {
         let test = &run.record.test;
-        let hit = run.navigation.hits.first().map_or(f64::NAN, |(_, rate)| rate.rate);
+        let hit = run.hit_rate.rate;
         [
             test.overall,
             test.translation,

@@ -117,6 +117,9 @@ fn adapter(stored: &StoredAdapter) -> pb::Adapter {
         target_deviation: Some(convert::twist_to_wire(&Twist::from_vector(&scale.deviation))),
         singular_values: adapter.inverse().singular_values().to_vec(),
         created: stored.created.clone(),
+        charts: adapter.network().chart_count() as u32,
+        loss: record.config.loss.name().to_owned(),
+        navigators: convert::navigator_names(adapter),
     }
 }
 

@@ -13,7 +13,8 @@ use super::convert;
 use super::snapshot::{ServedNavigator, TrainedOn};
 use super::{Error, Handlers, Snapshot};
 use crate::cancel::Cancellation;
-use crate::eval::{PredictionScope, Protocol, evaluate, score_predictions};
+use crate::eval::{NavigatorKind, PredictionScope, Protocol, evaluate, score_predictions};
+use crate::pairs::Split;
 use crate::proto::v1 as pb;
 use crate::proto::v1::evaluation_service_server::EvaluationService;
 
@@ -26,7 +27,7 @@ impl EvaluationService for Handlers {
     async fn evaluate(&self, request: Request<pb::EvaluateRequest>) -> Result<Response<Self::EvaluateStream>, Status> {
         let snapshot = self.snapshot()?;
         let budget = self.workers.budget(request.metadata());
-        let (served, protocol) = protocol(&snapshot, request.into_inner())?;
+        let (served, protocol) = protocol(&snapshot, request.into_inner(), self.config.limits.steps)?;
         let (events, stream) = mpsc::channel(16);
         let run = self.clone().run_evaluation(served, protocol, budget, events);
         tokio::spawn(run.instrument(tracing::Span::current()));
@@ -52,7 +53,7 @@ impl Handlers {
         let total = protocol.navigators.len() as u32;
         let work = move |cancel: &Cancellation| {
             let report = evaluate(&served.navigator, &protocol, cancel, &mut |done, kind| {
-                let progress = pb::EvaluationProgress { done: done as u32, total, navigator: kind.name().to_owned() };
+                let progress = pb::EvaluationProgress { done: done as u32, total, navigator: kind.name() };
                 let event = pb::evaluate_response::Event::Progress(progress);
                 // A listener that is slow misses progress; it must never hold a thread.
                 let _ = events.try_send(Ok(pb::EvaluateResponse { event: Some(event) }));
@@ -74,7 +75,11 @@ impl Handlers {
     }
 }
 
-fn protocol(snapshot: &Snapshot, request: pb::EvaluateRequest) -> Result<(Arc<ServedNavigator>, Protocol), Error> {
+fn protocol(
+    snapshot: &Snapshot,
+    request: pb::EvaluateRequest,
+    most_steps: u32,
+) -> Result<(Arc<ServedNavigator>, Protocol), Error> {
     let pb::EvaluateRequest {
         room,
         adapter,
@@ -85,17 +90,28 @@ fn protocol(snapshot: &Snapshot, request: pb::EvaluateRequest) -> Result<(Arc<Se
         exclude_radius,
         thresholds,
         seed,
+        steps,
+        mode,
     } = request;
     let served = snapshot.navigator(&room, &adapter)?.clone();
     let record = &served.adapter.record;
+    let navigators = match convert::navigators(&navigators)? {
+        none if none.is_empty() => NavigatorKind::table(&served.adapter.adapter),
+        given => given,
+    };
     let protocol = Protocol {
         split: convert::split(&split)?.unwrap_or(record.split),
         stride: stride.unwrap_or(record.stride),
         exclude_source: convert::exclusion(exclude_source, exclude_radius)?,
         thresholds: convert::thresholds(thresholds)?,
         seed,
-        navigators: convert::navigators(&navigators)?,
+        steps: steps.unwrap_or(1),
+        mode: convert::mode_of(mode)?,
+        navigators,
     };
+    if protocol.steps == 0 || protocol.steps > most_steps {
+        return Err(Error::invalid("steps", format!("must be 1 to {most_steps}, got {}", protocol.steps)));
+    }
     Ok((served, protocol))
 }
 
@@ -110,8 +126,13 @@ fn report_to_wire(served: &ServedNavigator, report: &crate::eval::Report) -> pb:
         n: report.n as u32,
         candidate_count: report.candidate_count as u32,
         source_excluded: report.protocol.exclude_source.is_some(),
+        steps: report.protocol.steps,
+        mode: convert::mode_to_wire(report.protocol.mode).into(),
         in_room,
-        leaks: in_room && (record.split != report.protocol.split || served.trained_on == Some(TrainedOn::OtherFrames)),
+        leaks: in_room
+            && (record.split != report.protocol.split
+                || record.split == Split::Whole
+                || served.trained_on == Some(TrainedOn::OtherFrames)),
         navigators: report.rows.iter().map(convert::row_to_wire).collect(),
     }
 }

@@ -84,7 +84,8 @@ fn navigate(
             .map(|(number, step)| convert::step_to_wire(number, step, room, &thresholds))
             .collect(),
         mode: convert::mode_to_wire(query.mode).into(),
-        reading: convert::reading_to_wire(query.reading).into(),
+        reading: convert::reading_to_wire(query.step).into(),
+        navigator: convert::navigator_to_wire(&query),
         displacement: answer.displacement.map(|twist| convert::twist_to_wire(&twist)),
         exact: served.navigator.audit().is_none(),
     })

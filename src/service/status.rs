@@ -132,7 +132,9 @@ impl From<navigation::Error> for Error {
             E::FeatureRows { .. } | E::Features(_) => return Self::Internal,
             E::SourceFrame(_) => "source.frame_id",
             E::TargetFrame(_) => "displacement.target_frame_id",
+            E::Adapter(adapter::Error::NoCorrector { .. } | adapter::Error::NotCalibrated) => "navigator",
             E::Adapter(problem) => return view_error(problem).within("source"),
+            E::Refit(_) | E::Pairs(_) => return Self::Precondition(error.to_string()),
             E::Steps { .. } => "steps",
             E::HitCount { .. } | E::HitsInAll { .. } => "hit_count",
             E::NoTwist | E::TwistNotFinite { .. } | E::TwistBeyondPi { .. } => "displacement",
@@ -147,7 +149,9 @@ impl From<navigation::Error> for Error {
 pub fn view_error(error: &adapter::Error) -> Error {
     use adapter::Error as E;
     let field = match error {
-        E::LatentDim { .. } | E::LatentRange { .. } | E::NotFinite { what: "latent", .. } => "latent.values",
+        E::LatentDim { .. } | E::LatentRange { .. } | E::Gate { .. } | E::NotFinite { what: "latent", .. } => {
+            "latent.values"
+        }
         E::FeatureSource { .. } => "feature.source_name",
         _ => "feature.values",
     };
@@ -158,8 +162,13 @@ impl From<eval::Error> for Error {
     fn from(error: eval::Error) -> Self {
         use eval::Error as E;
         let field = match &error {
-            E::Cancelled(_) => return Self::Cancelled,
-            E::Ridge(_) | E::Adapter(_) => return Self::Internal,
+            E::Cancelled(_) | E::Navigation(navigation::Error::Cancelled(_)) => return Self::Cancelled,
+            E::Navigation(navigation::Error::Adapter(
+                adapter::Error::NoCorrector { .. } | adapter::Error::NotCalibrated,
+            ))
+            | E::Adapter(adapter::Error::NotCalibrated) => "navigators",
+            E::Navigation(navigation::Error::Refit(_)) => return Self::Precondition(error.to_string()),
+            E::Navigation(_) | E::Adapter(_) => return Self::Internal,
             E::Room(_) => "room",
             E::Pairs(pairs::Error::ZeroStride | pairs::Error::NoPairs { .. } | pairs::Error::EmptyRange { .. }) => {
                 "stride"

@@ -1,17 +1,20 @@
 //! Adapters in the store.
 
-use nalgebra::Vector6;
+use nalgebra::{Matrix6, Vector6};
 use ndarray::{Array2, ArrayView2};
 use object_store::path::Path;
 
-use super::format::{AdapterBody, TensorReader, TensorWriter};
+use super::format::{AdapterBody, TrainingEntry};
 use super::manifest::{self, SCHEMA};
+use super::tensors::{TensorReader, TensorWriter};
 use super::{ATTEMPTS, Error, Kind, Published, Store, revision_path};
-use crate::adapter::{Adapter, Siamese, TENSOR_NAMES, TargetScale, TrainingRecord};
+use crate::adapter::{self, Adapter, Corrector, CorrectorKind, Mixture, Network, TargetScale, TrainingRecord};
 use crate::room::is_plain_name;
 
 /// The frame of every twist: the body frame of the source camera.
 const TWIST_FRAME: &str = "body";
+/// The tensor of Σ, (6, 6) f64 on (v, ω).
+const ERROR_COVARIANCE: &str = "error.covariance";
 /// Golden inputs in an adapter's file.
 const GOLDEN_ROWS: usize = 8;
 /// How far a golden output may be off, in units of the larger of 1 and the output itself.
@@ -64,7 +67,7 @@ impl Store {
                 weights: weights.clone(),
                 twist_frame: TWIST_FRAME.to_owned(),
                 deviation_ddof: 0,
-                training: record.into(),
+                training: TrainingEntry::new(record, adapter),
             };
             if let Some(newest) = newest {
                 let same = AdapterBody { revision: newest.revision, created: newest.created.clone(), ..body.clone() };
@@ -98,18 +101,32 @@ impl Store {
         let (file, bytes) = self.read_object(&folder, &body.weights).await?;
         let damaged = |problem: String| Error::Damaged { file: file.clone(), problem };
         let tensors = TensorReader::new(&file, &bytes)?;
-        let read = TENSOR_NAMES.map(|name| tensors.f32(name));
-        let mut arrays = Vec::with_capacity(read.len());
-        for array in read {
-            arrays.push(array?);
-        }
-        let arrays = <[Array2<f32>; 7]>::try_from(arrays).map_err(|_| damaged("lacks a tensor".to_owned()))?;
-        let network = Siamese::from_tensors(arrays).map_err(|error| damaged(error.to_string()))?;
+        let mixing = body.training.mixing().map_err(&damaged)?;
+        let network = Mixture::from_tensors(body.training.charts, mixing, |name| read_weights(&tensors, name));
+        let network = network.map_err(|error| error.within(&file))?;
         let scale = TargetScale {
             mean: vector6(&tensors, "target.mean", &file)?,
             deviation: vector6(&tensors, "target.deviation", &file)?,
         };
-        let adapter = Adapter::new(body.source.into(), network, scale).map_err(|error| damaged(error.to_string()))?;
+        let error_covariance = match tensors.has(ERROR_COVARIANCE) {
+            true => Some(matrix6(&tensors, ERROR_COVARIANCE, &file)?),
+            false => None,
+        };
+        let mut correctors = Vec::with_capacity(body.training.correctors.len());
+        for name in &body.training.correctors {
+            let kind = CorrectorKind::from_name(name)
+                .ok_or_else(|| damaged(format!("has a corrector '{name}', which means nothing to this program")))?;
+            let read = |tensor: &str| read_weights(&tensors, &corrector_tensor(kind, tensor));
+            let corrector = Corrector::from_tensors(kind, network.coordinate_count(), read);
+            correctors.push(corrector.map_err(|error| error.within(&file))?);
+        }
+        let adapter = Adapter::new(body.source.into(), network, scale)
+            .and_then(|adapter| adapter.with_correctors(correctors))
+            .and_then(|adapter| match error_covariance {
+                Some(covariance) => adapter.with_error_covariance(covariance),
+                None => Ok(adapter),
+            })
+            .map_err(|error| damaged(error.to_string()))?;
         check_golden(&adapter, &tensors, &file)?;
         let manifest = self.shown(&revision_path(&folder, revision));
         let record = body.training.record().map_err(|word| Error::Damaged {
@@ -136,16 +153,67 @@ impl Store {
     }
 }
 
+/// Why weights could not be taken from a file.
+enum WeightError {
+    File(Error),
+    Shape(adapter::Error),
+}
+
+impl From<adapter::Error> for WeightError {
+    fn from(error: adapter::Error) -> Self {
+        Self::Shape(error)
+    }
+}
+
+impl WeightError {
+    fn within(self, file: &str) -> Error {
+        match self {
+            Self::File(error) => error,
+            Self::Shape(error) => Error::Damaged { file: file.to_owned(), problem: error.to_string() },
+        }
+    }
+}
+
+fn read_weights(tensors: &TensorReader<'_>, name: &str) -> Result<Array2<f32>, WeightError> {
+    tensors.f32(name).map_err(WeightError::File)
+}
+
+fn corrector_tensor(kind: CorrectorKind, tensor: &str) -> String {
+    format!("corrector.{}.{tensor}", kind.name())
+}
+
+/// The shape that PyTorch gives a tensor which is two-dimensional here.
+fn torch_shape(name: &str, array: &Array2<f32>) -> Vec<usize> {
+    let last = name.rsplit('.').next().unwrap_or(name);
+    match array.dim() {
+        (1, 1) if last == "log_tau" => Vec::new(),
+        (1, columns) if last.contains("bias") || is_norm(name) => vec![columns],
+        (rows, columns) => vec![rows, columns],
+    }
+}
+
+/// Whether a tensor is a LayerNorm's weight, which is a vector.
+fn is_norm(name: &str) -> bool {
+    name.ends_with("phi.1.weight") || name.contains(".norm") || name.starts_with("norm")
+}
+
 fn adapter_file(name: &str, adapter: &Adapter, features: ArrayView2<'_, f32>) -> Result<Vec<u8>, Error> {
     let damaged = |problem: String| Error::Damaged { file: name.to_owned(), problem };
     let mut tensors = TensorWriter::default();
-    for (name, array) in TENSOR_NAMES.into_iter().zip(adapter.network().tensors()) {
-        let is_vector = array.nrows() == 1 && name != "W.weight";
-        let shape = if is_vector { vec![array.ncols()] } else { array.shape().to_vec() };
-        tensors.f32(name, &shape, array.iter().copied());
+    for (name, array) in adapter.network().names().iter().zip(adapter.network().parameters()) {
+        tensors.f32(name, &torch_shape(name, array), array.iter().copied());
+    }
+    for corrector in adapter.correctors() {
+        for (name, array) in corrector.names().iter().zip(corrector.parameters()) {
+            let (name, shape) = (corrector_tensor(corrector.kind(), name), torch_shape(name, array));
+            tensors.f32(&name, &shape, array.iter().copied());
+        }
     }
     tensors.f64("target.mean", &[6], adapter.scale().mean.iter().copied());
     tensors.f64("target.deviation", &[6], adapter.scale().deviation.iter().copied());
+    if let Some(covariance) = adapter.error_covariance() {
+        tensors.f64(ERROR_COVARIANCE, &[6, 6], covariance.transpose().iter().copied());
+    }
     let rows: Vec<usize> = (0..features.nrows()).step_by(features.nrows().div_ceil(GOLDEN_ROWS).max(1)).collect();
     let golden = features.select(ndarray::Axis(0), &rows);
     let latents = adapter.embed(golden.view()).map_err(|error| damaged(error.to_string()))?;
@@ -153,6 +221,11 @@ fn adapter_file(name: &str, adapter: &Adapter, features: ArrayView2<'_, f32>) ->
     tensors.f32("golden.features", &[golden.nrows(), golden.ncols()], golden.iter().copied());
     tensors.f64("golden.latents", &[latents.nrows(), latents.ncols()], latents.iter().copied());
     tensors.f64("golden.twists", &[twists.nrows(), 6], twists.iter().copied());
+    for corrector in adapter.correctors() {
+        let steps = golden_steps(adapter, corrector.kind(), &latents).map_err(|error| damaged(error.to_string()))?;
+        let name = golden_corrector(corrector.kind());
+        tensors.f64(&name, &[steps.nrows(), steps.ncols()], steps.iter().copied());
+    }
     tensors.finish(name)
 }
 
@@ -163,6 +236,20 @@ fn golden_twists(adapter: &Adapter, latents: &Array2<f64>) -> Array2<f64> {
     })
 }
 
+fn golden_corrector(kind: CorrectorKind) -> String {
+    format!("golden.corrector.{}", kind.name())
+}
+
+/// The corrected steps from each golden latent by the motion that it sees from the first.
+fn golden_steps(adapter: &Adapter, kind: CorrectorKind, latents: &Array2<f64>) -> Result<Array2<f64>, adapter::Error> {
+    let mut steps = Array2::zeros(latents.dim());
+    for (latent, mut into) in latents.outer_iter().zip(steps.outer_iter_mut()) {
+        let twist = adapter.motion(latents.row(0), latent);
+        into.assign(&adapter.corrected_step(kind, latent, twist, 1.0)?);
+    }
+    Ok(steps)
+}
+
 fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Result<(), Error> {
     let damaged = |problem: String| Error::Damaged { file: file.to_owned(), problem };
     let features = tensors.f32("golden.features")?;
@@ -171,9 +258,15 @@ fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Re
     }
     let latents = adapter.embed(features.view()).map_err(|error| damaged(error.to_string()))?;
     let twists = golden_twists(adapter, &latents);
-    for (what, found, stored) in
-        [("latents", latents, tensors.f64("golden.latents")?), ("twists", twists, tensors.f64("golden.twists")?)]
-    {
+    let mut checked = Vec::new();
+    for corrector in adapter.correctors() {
+        let kind = corrector.kind();
+        let steps = golden_steps(adapter, kind, &latents).map_err(|error| damaged(error.to_string()))?;
+        checked.push((kind.name(), steps, tensors.f64(&golden_corrector(kind))?));
+    }
+    checked.push(("latents", latents, tensors.f64("golden.latents")?));
+    checked.push(("twists", twists, tensors.f64("golden.twists")?));
+    for (what, found, stored) in checked {
         let near = |(found, stored): (&f64, &f64)| (found - stored).abs() <= GOLDEN_TOLERANCE * stored.abs().max(1.0);
         if found.dim() != stored.dim() || !found.iter().zip(&stored).all(near) {
             return Err(damaged(format!(
@@ -182,6 +275,17 @@ fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Re
         }
     }
     Ok(())
+}
+
+fn matrix6(tensors: &TensorReader<'_>, name: &str, file: &str) -> Result<Matrix6<f64>, Error> {
+    let array = tensors.f64(name)?;
+    if array.dim() != (6, 6) {
+        return Err(Error::Damaged {
+            file: file.to_owned(),
+            problem: format!("'{name}' does not have 6 by 6 numbers"),
+        });
+    }
+    Ok(Matrix6::from_fn(|row, column| array[(row, column)]))
 }
 
 fn vector6(tensors: &TensorReader<'_>, name: &str, file: &str) -> Result<Vector6<f64>, Error> {

@@ -1,17 +1,11 @@
-//! Shapes on disk: the bodies of manifests, and safetensors.
+//! Shapes on disk: the bodies of manifests.
 
-use std::collections::BTreeMap;
-
-use ndarray::{Array2, ArrayD};
-use safetensors::SafeTensors;
-use safetensors::tensor::{Dtype, TensorView};
 use serde::{Deserialize, Serialize};
 
-use super::Error;
 use super::manifest::ObjectRef;
-use crate::adapter::{TrainConfig, TrainingRecord};
+use crate::adapter::{Adapter, Loss, Mixing, PairPlan, TrainConfig, TrainingRecord};
 use crate::features::{FeatureSource, UNSPECIFIED};
-use crate::pairs::Split;
+use crate::pairs::{Split, StrideRange};
 use crate::room::{Provenance, RoomId};
 use crate::scores::MotionScores;
 
@@ -98,8 +92,36 @@ pub struct TrainingEntry {
     clip_norm: f64,
     hidden: usize,
     latent: usize,
+    /// Charts, the paper's K.
+    #[serde(default = "one_chart")]
+    pub charts: usize,
+    /// How they are mixed: by a learned `gate`, or `even`.
+    #[serde(default = "by_gate")]
+    mixing: String,
+    #[serde(default = "squared_error")]
+    loss: String,
+    #[serde(default)]
+    standardise: bool,
+    #[serde(default)]
+    noise: f64,
+    #[serde(default)]
+    average: f64,
+    #[serde(default)]
+    through_zero: bool,
+    /// Rooms in which its errors were measured; then the weights hold `error.covariance`.
+    #[serde(default)]
+    calibrated_on: Vec<(String, u64)>,
+    /// Correctors by name, under `corrector.NAME.` in the weights.
+    #[serde(default)]
+    pub correctors: Vec<String>,
+    /// Smallest and largest stride, and how many pairs were drawn; absent when all pairs at one stride were taken.
+    #[serde(default)]
+    range: Option<(u32, u32, usize)>,
     seed: u64,
     pair_count: usize,
+    /// By room, in the order of `rooms`.
+    #[serde(default)]
+    room_tests: Vec<ScoresEntry>,
     test: ScoresEntry,
     train: ScoresEntry,
     train_mean_r2: Option<f64>,
@@ -109,6 +131,8 @@ pub struct TrainingEntry {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ScoresEntry {
     n: usize,
+    #[serde(default)]
+    components: [Option<f64>; 6],
     overall: Option<f64>,
     translation: Option<f64>,
     rotation: Option<f64>,
@@ -129,6 +153,18 @@ impl From<SourceEntry> for FeatureSource {
         let SourceEntry { name, encoder, layer, base, norm, pooling, preprocess, dim } = entry;
         Self { name, encoder, layer, base, norm, pooling, preprocess, dim }
     }
+}
+
+fn one_chart() -> usize {
+    1
+}
+
+fn by_gate() -> String {
+    Mixing::Gate.name().to_owned()
+}
+
+fn squared_error() -> String {
+    Loss::MeanSquaredError.name().to_owned()
 }
 
 fn unspecified() -> String {
@@ -160,6 +196,7 @@ impl From<&MotionScores> for ScoresEntry {
         let known = |value: f64| value.is_finite().then_some(value);
         Self {
             n: scores.n,
+            components: scores.components.map(known),
             overall: known(scores.overall),
             translation: known(scores.translation),
             rotation: known(scores.rotation),
@@ -175,6 +212,7 @@ impl From<ScoresEntry> for MotionScores {
         let value = |value: Option<f64>| value.unwrap_or(f64::NAN);
         Self {
             n: entry.n,
+            components: entry.components.map(value),
             overall: value(entry.overall),
             translation: value(entry.translation),
             rotation: value(entry.rotation),
@@ -185,10 +223,26 @@ impl From<ScoresEntry> for MotionScores {
     }
 }
 
-impl From<&TrainingRecord> for TrainingEntry {
-    fn from(record: &TrainingRecord) -> Self {
-        let TrainConfig { epochs, batch, learning_rate, weight_decay, clip_norm, hidden, latent, seed } =
-            record.config.clone();
+impl TrainingEntry {
+    /// What is written of an adapter and its record.
+    pub fn new(record: &TrainingRecord, adapter: &Adapter) -> Self {
+        let TrainConfig {
+            epochs,
+            batch,
+            learning_rate,
+            weight_decay,
+            clip_norm,
+            hidden,
+            latent,
+            charts: _,
+            mixing: _,
+            loss,
+            standardise,
+            noise,
+            average,
+            through_zero,
+            seed,
+        } = record.config.clone();
         Self {
             preset: record.preset.clone(),
             split: record.split.name().to_owned(),
@@ -201,19 +255,38 @@ impl From<&TrainingRecord> for TrainingEntry {
             clip_norm,
             hidden,
             latent,
+            charts: adapter.network().chart_count(),
+            mixing: adapter.network().mixing().name().to_owned(),
+            loss: loss.name().to_owned(),
+            standardise,
+            noise,
+            average,
+            through_zero,
+            calibrated_on: record.calibrated_on.iter().map(|(room, revision)| (room.to_string(), *revision)).collect(),
+            correctors: adapter.correctors().map(|corrector| corrector.kind().name().to_owned()).collect(),
+            range: match &record.pairs {
+                PairPlan::Stride(_) => None,
+                PairPlan::Range(StrideRange { low, high, count }) => Some((*low, *high, *count)),
+            },
             seed,
             pair_count: record.pair_count,
+            room_tests: record.room_tests.iter().map(Into::into).collect(),
             test: (&record.test).into(),
             train: (&record.train).into(),
             train_mean_r2: record.train_mean_r2.is_finite().then_some(record.train_mean_r2),
         }
     }
-}
 
-impl TrainingEntry {
+    /// How the charts are mixed, or the word that means nothing.
+    pub fn mixing(&self) -> Result<Mixing, String> {
+        Mixing::from_name(&self.mixing).ok_or_else(|| format!("mixing '{}'", self.mixing))
+    }
+
     /// The record, or the word in it that means nothing.
     pub fn record(self) -> Result<TrainingRecord, String> {
         let split = Split::from_name(&self.split).ok_or_else(|| format!("split '{}'", self.split))?;
+        let mixing = self.mixing()?;
+        let loss = Loss::from_name(&self.loss).ok_or_else(|| format!("loss '{}'", self.loss))?;
         let room = |(name, revision): (String, u64)| match RoomId::new(&name) {
             Ok(room) => Ok((room, revision)),
             Err(_) => Err(format!("room '{name}'")),
@@ -222,7 +295,12 @@ impl TrainingEntry {
             preset: self.preset,
             split,
             stride: self.stride,
+            pairs: match self.range {
+                None => PairPlan::Stride(self.stride),
+                Some((low, high, count)) => PairPlan::Range(StrideRange { low, high, count }),
+            },
             rooms: self.rooms.into_iter().map(room).collect::<Result<_, _>>()?,
+            calibrated_on: self.calibrated_on.into_iter().map(room).collect::<Result<_, _>>()?,
             config: TrainConfig {
                 epochs: self.epochs,
                 batch: self.batch,
@@ -231,88 +309,20 @@ impl TrainingEntry {
                 clip_norm: self.clip_norm,
                 hidden: self.hidden,
                 latent: self.latent,
+                charts: self.charts,
+                mixing,
+                loss,
+                standardise: self.standardise,
+                noise: self.noise,
+                average: self.average,
+                through_zero: self.through_zero,
                 seed: self.seed,
             },
             pair_count: self.pair_count,
             test: self.test.into(),
+            room_tests: self.room_tests.into_iter().map(Into::into).collect(),
             train: self.train.into(),
             train_mean_r2: self.train_mean_r2.unwrap_or(f64::NAN),
         })
-    }
-}
-
-/// Tensors by name, to be written.
-#[derive(Default)]
-pub struct TensorWriter(BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>);
-
-impl TensorWriter {
-    pub fn f32(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = f32>) {
-        self.0.insert(name.to_owned(), (Dtype::F32, shape.to_vec(), values.flat_map(f32::to_le_bytes).collect()));
-    }
-
-    pub fn f64(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = f64>) {
-        self.0.insert(name.to_owned(), (Dtype::F64, shape.to_vec(), values.flat_map(f64::to_le_bytes).collect()));
-    }
-
-    pub fn i64(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = i64>) {
-        self.0.insert(name.to_owned(), (Dtype::I64, shape.to_vec(), values.flat_map(i64::to_le_bytes).collect()));
-    }
-
-    /// The file's bytes.
-    pub fn finish(self, file: &str) -> Result<Vec<u8>, Error> {
-        let damaged = |problem: String| Error::Damaged { file: file.to_owned(), problem };
-        let mut views = Vec::with_capacity(self.0.len());
-        for (name, (dtype, shape, bytes)) in &self.0 {
-            let view = TensorView::new(*dtype, shape.clone(), bytes).map_err(|error| damaged(error.to_string()))?;
-            views.push((name.clone(), view));
-        }
-        safetensors::serialize(views, None).map_err(|error| damaged(error.to_string()))
-    }
-}
-
-/// A safetensors file that was read.
-pub struct TensorReader<'a> {
-    file: &'a str,
-    tensors: SafeTensors<'a>,
-}
-
-impl<'a> TensorReader<'a> {
-    pub fn new(file: &'a str, bytes: &'a [u8]) -> Result<Self, Error> {
-        let tensors = SafeTensors::deserialize(bytes)
-            .map_err(|error| Error::Damaged { file: file.to_owned(), problem: error.to_string() })?;
-        Ok(Self { file, tensors })
-    }
-
-    pub fn has(&self, name: &str) -> bool {
-        self.tensors.tensor(name).is_ok()
-    }
-
-    pub fn f32(&self, name: &str) -> Result<Array2<f32>, Error> {
-        self.rows(name, Dtype::F32, f32::from_le_bytes)
-    }
-
-    pub fn f64(&self, name: &str) -> Result<Array2<f64>, Error> {
-        self.rows(name, Dtype::F64, f64::from_le_bytes)
-    }
-
-    pub fn i64(&self, name: &str) -> Result<Array2<i64>, Error> {
-        self.rows(name, Dtype::I64, i64::from_le_bytes)
-    }
-
-    /// A tensor as rows: a vector is one row, the last axes of a stack are laid end to end.
-    fn rows<T, const N: usize>(&self, name: &str, dtype: Dtype, read: fn([u8; N]) -> T) -> Result<Array2<T>, Error> {
-        let damaged = |problem: String| Error::Damaged { file: self.file.to_owned(), problem };
-        let tensor = self.tensors.tensor(name).map_err(|_| damaged(format!("has no tensor '{name}'")))?;
-        if tensor.dtype() != dtype {
-            return Err(damaged(format!("tensor '{name}' is {:?}, expected {dtype:?}", tensor.dtype())));
-        }
-        let values = tensor.data().as_chunks::<N>().0.iter().map(|bytes| read(*bytes)).collect();
-        let array = ArrayD::from_shape_vec(tensor.shape().to_vec(), values).map_err(|e| damaged(e.to_string()))?;
-        let shape = match tensor.shape() {
-            [] => (1, 1),
-            [columns] => (1, *columns),
-            [rows, rest @ ..] => (*rows, rest.iter().product()),
-        };
-        array.into_shape_with_order(shape).map_err(|error| damaged(error.to_string()))
     }
 }

@@ -12,6 +12,7 @@ mod adapters;
 mod format;
 mod manifest;
 mod rooms;
+mod tensors;
 
 pub use adapters::StoredAdapter;
 pub use rooms::{RoomSummary, StoredRoom, check_features};

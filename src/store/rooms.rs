@@ -2,8 +2,9 @@
 
 use object_store::path::Path;
 
-use super::format::{FeaturesEntry, RoomBody, TensorReader, TensorWriter};
+use super::format::{FeaturesEntry, RoomBody};
 use super::manifest::{self, ObjectRef, SCHEMA};
+use super::tensors::{TensorReader, TensorWriter};
 use super::{ATTEMPTS, Error, Kind, Published, Store, revision_path};
 use crate::features::{FeatureSource, Features};
 use crate::geometry::{Pose, nearest_rotation};

@@ -1,7 +1,7 @@
 //! SE(3) against mpmath at 60 digits. Tolerance 1e-12 · max(1, |v|), as the oracle's README gives it.
 
 use nalgebra::{Matrix3, Matrix4};
-use seese3::geometry::{Pose, Twist, adjoint, body_twist, exp, log, nearest_rotation};
+use seese3::geometry::{Pose, Twist, adjoint, body_twist, exp, left_jacobian_inverse, log, nearest_rotation};
 
 use crate::support::{Tensors, golden, json, near, npy, oracle_rooms, pose};
 
@@ -52,6 +52,27 @@ fn exp_log_and_adjoint_match_mpmath() {
             same(&format!("log of {what}"), found.to_vector().as_slice(), &expected_log.row(row).to_vec(), scale);
         }
     }
+}
+
+/// Oracle: ad / (1 − e^(−ad)) of matrices at 60 digits, mpmath; J_r⁻¹(ξ) = J_l⁻¹(−ξ).
+#[test]
+fn the_inverse_jacobian_matches_mpmath() {
+    let folder = golden().join("se3");
+    let twists = npy::<f64>(&folder.join("twists.npy")).into_dimensionality::<ndarray::Ix2>().unwrap();
+    let expected: Vec<f64> =
+        Tensors::open(&folder.join("expected.safetensors")).rows("jr_inv").iter().copied().collect();
+    let mut compared = 0;
+    for (row, xi) in twists.outer_iter().enumerate() {
+        let xi = twist(&xi.to_vec());
+        if xi.angular.norm() > std::f64::consts::PI {
+            continue;
+        }
+        compared += 1;
+        let backwards = Twist { linear: -xi.linear, angular: -xi.angular };
+        let found = left_jacobian_inverse(&backwards).transpose();
+        same(&format!("row {row}"), found.as_slice(), &expected[row * 36..][..36], 10.0 * xi.linear.norm());
+    }
+    assert!(compared > 100);
 }
 
 /// Oracle: mpmath, log(P₁⁻¹P₂) of sixty pairs.

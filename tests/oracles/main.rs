@@ -6,6 +6,8 @@
 #[path = "../support/mod.rs"]
 mod support;
 
+mod correctors;
+mod formulations;
 mod geometry;
 mod metrics;
 mod navigation;

@@ -13,7 +13,13 @@ use crate::support::{Tensors, features, golden, json, near, npy, number, oracle_
 
 fn options(row: &Value) -> MutualKnn {
     let integer = |key: &str| row[key].as_u64().unwrap() as usize;
-    MutualKnn { frames: 256, stride: integer("stride"), k: integer("k"), exclusion: integer("exclusion") }
+    MutualKnn {
+        frames: 256,
+        stride: integer("stride"),
+        k: integer("k"),
+        exclusion: integer("exclusion"),
+        ..MutualKnn::default()
+    }
 }
 
 /// Oracle: brute force in NumPy, the same as scikit-learn's in all settings.
@@ -49,13 +55,19 @@ fn six_frames_by_hand() {
     let poses = poses(&folder.join("tiny_poses.npy"));
     for row in expected["tiny"].as_array().unwrap() {
         let integer = |key: &str| row[key].as_u64().unwrap() as usize;
-        let options = MutualKnn { frames: 6, stride: 1, k: integer("k"), exclusion: integer("exclusion") };
+        let options = MutualKnn {
+            frames: 6,
+            stride: 1,
+            k: integer("k"),
+            exclusion: integer("exclusion"),
+            ..MutualKnn::default()
+        };
         let found = mutual_knn(z.view(), &poses, &options).unwrap();
         near(&format!("{options:?}"), found, number(&row["score"]), 1e-12);
         let neighbours = feature_neighbours(z.view(), &options).unwrap();
         assert_eq!(serde_json::json!(neighbours), row["feature_neighbours"]);
     }
-    let too_few = MutualKnn { frames: 6, stride: 1, k: 2, exclusion: 3 };
+    let too_few = MutualKnn { frames: 6, stride: 1, k: 2, exclusion: 3, ..MutualKnn::default() };
     assert!(matches!(mutual_knn(z.view(), &poses, &too_few), Err(Error::TooFewCandidates { .. })));
     let too_long = MutualKnn { frames: 7, ..too_few };
     assert!(matches!(mutual_knn(z.view(), &poses, &too_long), Err(Error::TooFewFrames { needed: 7, have: 6, .. })));

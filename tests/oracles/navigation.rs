@@ -4,30 +4,46 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use seese3::adapter::{Adapter, Samples, Siamese, TENSOR_NAMES};
+use seese3::adapter::{Adapter, Corrector, CorrectorKind, Error, Mixing, Mixture};
 use seese3::cancel::Cancellation;
 use seese3::eval::{NavigatorKind, Protocol, RetrievalScores, Row, evaluate};
 use seese3::features::{FeatureSource, Features};
 use seese3::geometry::body_twist;
 use seese3::index::{ExactIndex, Index};
-use seese3::navigation::{IndexKind, Leg, Mode, Navigator, Plan, Reading, Source, Space, walk};
+use seese3::navigation::{
+    IndexKind, Leg, Metric, Mode, Navigator, Plan, Reading, Search, Source, Space, StepKind, Stepper, walk,
+};
 use seese3::pairs::{Pair, Split};
 use seese3::room::{Frames, Provenance, Room, RoomId, Timeline};
 
 use crate::support::{Tensors, features, json, near, number, oracle_rooms, poses, worst};
+use crate::training::samples;
 
 const STRIDE: u32 = 40;
 
-/// The oracle's trained adapter; μ and σ come from the training pairs.
+/// The oracle's trained adapter of so many charts; μ and σ come from the training pairs.
+fn adapter_of(folder: &Path, room: &str, charts: usize) -> Adapter {
+    let tensors = Tensors::open(&folder.join(format!("m4_adapter/{room}_k{charts}_trained.safetensors")));
+    let network =
+        Mixture::from_tensors(charts, Mixing::Gate, |name| Ok::<_, Error>(tensors.rows(name).mapv(|x| x as f32)))
+            .unwrap();
+    let scale = samples::<f32>(folder, room).scale().clone();
+    Adapter::new(FeatureSource::imported("oracle", network.feature_dim()), network, scale).unwrap()
+}
+
 fn adapter(folder: &Path, room: &str) -> Arc<Adapter> {
-    let tensors = Tensors::open(&folder.join(format!("m4_adapter/{room}_k1_trained.safetensors")));
-    let network = Siamese::from_tensors(TENSOR_NAMES.map(|name| tensors.rows(name).mapv(|x| x as f32))).unwrap();
-    let (features, poses) = (features(folder, room), poses(&folder.join(format!("rooms/{room}/poses.npy"))));
-    let pairs = Split::Time.train_pairs(&Timeline::unbroken(poses.len()), STRIDE).unwrap();
-    let twists: Vec<_> = pairs.iter().map(|p| body_twist(&poses[p.source.row()], &poses[p.target.row()])).collect();
-    let rows = pairs.iter().map(|p| [p.source.row(), p.target.row()]).collect();
-    let scale = Samples::<f32>::new(features.view(), rows, &twists).unwrap().scale().clone();
-    Arc::new(Adapter::new(FeatureSource::imported("oracle", features.ncols()), network, scale).unwrap())
+    Arc::new(adapter_of(folder, room, 1))
+}
+
+/// The adapter with the oracle's four correctors.
+fn corrected_adapter(folder: &Path, room: &str) -> Arc<Adapter> {
+    let corrector = |kind: CorrectorKind| {
+        let name = kind.name().replace('-', "");
+        let tensors = Tensors::open(&folder.join(format!("navigation/{room}_corrector_{name}.safetensors")));
+        Corrector::from_tensors(kind, 20, |name| Ok::<_, Error>(tensors.rows(name).mapv(|x| x as f32))).unwrap()
+    };
+    let correctors = CorrectorKind::ALL.map(corrector).to_vec();
+    Arc::new(adapter_of(folder, room, 1).with_correctors(correctors).unwrap())
 }
 
 fn navigator(folder: &Path, room: &str, adapter: Arc<Adapter>) -> Navigator {
@@ -83,7 +99,16 @@ fn compare_identity(row: &Row, navigator: &Navigator, expected: &serde_json::Val
 }
 
 fn evaluated(navigator: &Navigator, exclude_source: Option<u32>) -> Vec<Row> {
-    let protocol = Protocol { exclude_source, ..Protocol::paper(STRIDE) };
+    let can = |kind: &NavigatorKind| {
+        let corrected = navigator.adapter().correctors().next().is_some();
+        match kind {
+            NavigatorKind::Step(_, Metric::Calibrated) => false,
+            NavigatorKind::Step(StepKind::Corrector(_), _) => corrected,
+            _ => true,
+        }
+    };
+    let navigators = NavigatorKind::all().into_iter().filter(can).collect();
+    let protocol = Protocol { exclude_source, navigators, ..Protocol::paper(STRIDE) };
     evaluate(navigator, &protocol, &Cancellation::default(), &mut |_, _| ()).unwrap().rows
 }
 
@@ -92,7 +117,7 @@ fn evaluated(navigator: &Navigator, exclude_source: Option<u32>) -> Vec<Row> {
 fn the_navigation_table_matches_the_oracle() {
     for (room, folder) in oracle_rooms("the_navigation_table_matches_the_oracle") {
         let expected = json(&folder.join(format!("navigation/{room}_expected.json")));
-        let navigator = navigator(&folder, room, adapter(&folder, room));
+        let navigator = navigator(&folder, room, corrected_adapter(&folder, room));
         for (side, exclude) in [("source_included", None), ("source_excluded", Some(0))] {
             let rows = evaluated(&navigator, exclude);
             for (ours, theirs) in [
@@ -102,6 +127,16 @@ fn the_navigation_table_matches_the_oracle() {
                 ("inverse-poincare-literal", "inverse_literal"),
                 ("ridge-refit", "refit_raw_no_intercept_80_20"),
                 ("ridge-refit-in-sample", "refit_raw_no_intercept_in_sample"),
+                ("ridge-refit-intercept", "refit_raw_intercept_80_20"),
+                ("ridge-refit-intercept-in-sample", "refit_raw_intercept_in_sample"),
+                ("ridge-refit-z-scored", "refit_zscored_no_intercept_80_20"),
+                ("ridge-refit-z-scored-in-sample", "refit_zscored_no_intercept_in_sample"),
+                ("ridge-refit-z-scored-intercept", "refit_zscored_intercept_80_20"),
+                ("ridge-refit-z-scored-intercept-in-sample", "refit_zscored_intercept_in_sample"),
+                ("corrector-linear", "linear"),
+                ("corrector-mlp-2", "mlp2"),
+                ("corrector-mlp-3", "mlp3"),
+                ("corrector-attention", "attention"),
             ] {
                 let row = rows.iter().find(|row| row.name == ours).unwrap();
                 if (ours, side) == ("identity", "source_included") {
@@ -110,6 +145,79 @@ fn the_navigation_table_matches_the_oracle() {
                 }
                 compare(&format!("{room} {ours}"), row, &expected["navigators"][theirs], side);
             }
+        }
+    }
+}
+
+/// Oracle: NumPy, distances after the projector W⁺W on both sides.
+#[test]
+fn retrieval_in_the_row_space_matches_the_oracle() {
+    for (room, folder) in oracle_rooms("retrieval_in_the_row_space_matches_the_oracle") {
+        let expected = &json(&folder.join(format!("navigation/{room}_expected.json")))["row_space_l2"];
+        let navigator = navigator(&folder, room, adapter(&folder, room));
+        for (side, exclude_source) in [("source_included", None), ("source_excluded", Some(0))] {
+            for (reading, theirs) in
+                [(Reading::Affine, "inverse_affine"), (Reading::Homogeneous, "inverse_homogeneous")]
+            {
+                let kind = NavigatorKind::Step(StepKind::InversePoincare(reading), Metric::RowSpace);
+                let protocol = Protocol { exclude_source, navigators: vec![kind], ..Protocol::paper(STRIDE) };
+                let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |_, _| ()).unwrap();
+                compare_retrieval(&kind.name(), &report.rows[0].retrieval, &expected[theirs][side]);
+            }
+        }
+    }
+}
+
+/// Oracle: the definition, candidate by candidate: the least rᵀ Σ⁻¹ r, r what is left of the wanted motion when the
+/// motion that the adapter sees to the candidate, without μ, is taken off.
+#[test]
+fn calibrated_retrieval_is_the_least_surprising_candidate() {
+    let folder = crate::support::golden();
+    let wave = nalgebra::Matrix6::from_fn(|i, j| ((3 * i + 5 * j) as f64).sin());
+    let covariance = wave * wave.transpose() + nalgebra::Matrix6::identity() * 0.3;
+    let inverse = covariance.try_inverse().unwrap();
+    let adapter = adapter_of(&folder, "synthetic", 1).with_error_covariance(covariance).unwrap();
+    let navigator = navigator(&folder, "synthetic", Arc::new(adapter));
+    let (adapter, latents, poses) = (navigator.adapter(), navigator.latents(), navigator.room().poses());
+    let timeline = navigator.room().timeline();
+    let candidates = Split::Time.candidates(timeline);
+    let search = Search::exact(Metric::Calibrated, adapter, latents, &candidates).unwrap();
+    let stepper = Stepper::InversePoincare(Reading::Homogeneous);
+    for pair in Split::Time.test_pairs(timeline, STRIDE).unwrap() {
+        let wanted = body_twist(&poses[pair.source.row()], &poses[pair.target.row()]);
+        let here = latents.row(pair.source.row());
+        let surprise = |frame: &seese3::room::FrameId| {
+            let seen = adapter.motion(here, latents.row(frame.row())).to_vector() - adapter.scale().mean;
+            let left = wanted.to_vector() - seen;
+            (left.transpose() * inverse * left)[(0, 0)]
+        };
+        let best = candidates.iter().min_by(|a, b| surprise(a).total_cmp(&surprise(b))).unwrap();
+        let imagined = &here + &stepper.step(adapter, here, wanted, 1.0).unwrap();
+        assert_eq!(search.nearest(imagined.view(), 1, None)[0].frame, *best, "source {}", pair.source);
+    }
+    let uncalibrated = adapter_of(&folder, "synthetic", 1);
+    assert!(Search::exact(Metric::Calibrated, &uncalibrated, latents, &candidates).is_err());
+    assert!(uncalibrated.with_error_covariance(-covariance).is_err());
+}
+
+/// Oracle: NumPy, a pseudo-inverse for every source with the gate that PyTorch gives it, distances over both charts.
+#[test]
+fn a_mixture_navigates_as_the_oracle() {
+    for (room, folder) in oracle_rooms("a_mixture_navigates_as_the_oracle") {
+        let expected = &json(&folder.join(format!("navigation/{room}_expected.json")))["mixture_k2_inverse_affine"];
+        let tensors = Tensors::open(&folder.join(format!("navigation/{room}_expected.safetensors")));
+        let navigator = navigator(&folder, room, Arc::new(adapter_of(&folder, room, 2)));
+        let pairs = Split::Time.test_pairs(navigator.room().timeline(), STRIDE).unwrap();
+        let gates = tensors.rows("mixture_k2.alpha_source");
+        for (pair, gate) in pairs.iter().zip(gates.outer_iter()) {
+            let found = navigator.latents().row(pair.source.row()).slice(ndarray::s![40..]).to_owned();
+            assert!(found.iter().zip(gate).all(|(a, b)| (a - b).abs() < 1e-9), "{room}, source {}", pair.source);
+        }
+        let kind = NavigatorKind::Step(StepKind::InversePoincare(Reading::Affine), Metric::Full);
+        for (side, exclude_source) in [("source_included", None), ("source_excluded", Some(0))] {
+            let protocol = Protocol { exclude_source, navigators: vec![kind], ..Protocol::paper(STRIDE) };
+            let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |_, _| ()).unwrap();
+            compare("mixture", &report.rows[0], expected, side);
         }
     }
 }
@@ -151,9 +259,9 @@ fn every_step_of_every_mode_retrieves_the_oracles_frame() {
         let tensors = Tensors::open(&folder.join(format!("navigation/{room}_expected.safetensors")));
         let navigator = navigator(&folder, room, adapter(&folder, room));
         let count = navigator.room().frame_count();
-        let candidates = ExactIndex::new(navigator.latents(), &Split::Time.candidates(&Timeline::unbroken(count)));
+        let candidates = Split::Time.candidates(&Timeline::unbroken(count));
+        let search = Search::exact(Metric::Full, navigator.adapter(), navigator.latents(), &candidates).unwrap();
         let pairs = Split::Time.test_pairs(&Timeline::unbroken(count), STRIDE).unwrap();
-        let space = Space { index: &candidates, ..navigator.space() };
         for (name, mode, reading, exclude_source) in [
             ("open_loop_homogeneous", Mode::OpenLoop, Reading::Homogeneous, None),
             ("open_loop_affine_spread", Mode::OpenLoop, Reading::Affine, None),
@@ -164,8 +272,10 @@ fn every_step_of_every_mode_retrieves_the_oracles_frame() {
             ("snap_exclude_current_affine_spread", Mode::Snap, Reading::Affine, Some(0)),
             ("closed_loop_homogeneous", Mode::ClosedLoop, Reading::Homogeneous, None),
         ] {
+            let stepper = Stepper::InversePoincare(reading);
+            let space = Space { search: &search, ..navigator.space(&stepper) };
             for steps in [1u32, 2, 4, 8] {
-                let plan = Plan { mode, reading, steps, hit_count: 1, exclude_source };
+                let plan = Plan { mode, steps, hit_count: 1, exclude_source };
                 let expected = tensors.rows(&format!("retrieved.{name}.S{steps}.per_step"));
                 assert_eq!(expected.dim(), (pairs.len(), steps as usize));
                 for (pair, expected) in pairs.iter().zip(expected.outer_iter()) {
@@ -176,9 +286,10 @@ fn every_step_of_every_mode_retrieves_the_oracles_frame() {
             }
         }
         let predicted = tensors.rows("g_hat.inverse_homogeneous");
+        let stepper = Stepper::InversePoincare(Reading::Homogeneous);
+        let space = Space { search: &search, ..navigator.space(&stepper) };
         for steps in [1u32, 7] {
-            let (mode, reading) = (Mode::OpenLoop, Reading::Homogeneous);
-            let plan = Plan { mode, reading, steps, hit_count: 1, exclude_source: None };
+            let plan = Plan { mode: Mode::OpenLoop, steps, hit_count: 1, exclude_source: None };
             for (pair, expected) in pairs.iter().zip(predicted.outer_iter()) {
                 let end = &walk_pair(space, &navigator, *pair, plan)[steps as usize - 1].latent;
                 assert!(end.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9), "{room}, {steps} steps");

@@ -3,23 +3,25 @@
 use std::path::Path;
 
 use ndarray::Array2;
-use seese3::adapter::{Real, Samples, Siamese, TENSOR_NAMES, TrainConfig, Trainer, Widths};
-use seese3::geometry::body_twist;
+use seese3::adapter::{
+    Adapter, Error, Loss, Mixing, Mixture, Network, Real, Samples, Siamese, TENSOR_NAMES, TrainConfig, Trainer, Widths,
+};
+use seese3::features::FeatureSource;
 use seese3::pairs::{Pair, Split};
 use seese3::room::Timeline;
 
 use crate::support::{Tensors, features, json, near, npy, number, oracle_rooms, poses, worst};
 
-fn network<T: Real>(path: &Path, prefix: &str) -> Siamese<T> {
+fn network<T: Real>(path: &Path, prefix: &str, charts: usize) -> Mixture<T> {
     let tensors = Tensors::open(path);
-    Siamese::from_tensors(TENSOR_NAMES.map(|name| tensors.rows(&format!("{prefix}{name}")).mapv(T::of))).unwrap()
+    let read = |name: &str| Ok::<_, Error>(tensors.rows(&format!("{prefix}{name}")).mapv(T::of));
+    Mixture::from_tensors(charts, Mixing::Gate, read).unwrap()
 }
 
-fn samples<T: Real>(folder: &Path, room: &str) -> Samples<T> {
+pub fn samples<T: Real>(folder: &Path, room: &str) -> Samples<T> {
     let (features, poses) = (features(folder, room), poses(&folder.join(format!("rooms/{room}/poses.npy"))));
     let pairs: Vec<Pair> = Split::Time.train_pairs(&Timeline::unbroken(poses.len()), 40).unwrap();
-    let twists: Vec<_> = pairs.iter().map(|p| body_twist(&poses[p.source.row()], &poses[p.target.row()])).collect();
-    Samples::new(features.view(), pairs.iter().map(|p| [p.source.row(), p.target.row()]).collect(), &twists).unwrap()
+    Samples::new(features.view(), poses, pairs.iter().map(|p| [p.source.row(), p.target.row()]).collect()).unwrap()
 }
 
 /// Batches as the oracle cut them: an epoch's order in pieces, the short last piece kept.
@@ -30,41 +32,53 @@ fn batches(folder: &Path, room: &str, batch: usize) -> Vec<Vec<usize>> {
 }
 
 /// The worst difference of any tensor; the last bias has no gradient in mathematics and only noise in f32.
-fn difference<T: Real>(found: &Siamese<T>, expected: &Siamese<f64>, with_last_bias: bool) -> f64 {
-    let tensors = TENSOR_NAMES.into_iter().zip(found.tensors().into_iter().zip(expected.tensors()));
-    let compared = tensors.filter(|(name, _)| with_last_bias || *name != "phi.3.bias");
+fn difference<T: Real>(found: &Mixture<T>, expected: &Mixture<f64>, with_last_bias: bool) -> f64 {
+    let tensors = found.names().into_iter().zip(found.parameters().into_iter().zip(expected.parameters()));
+    let compared = tensors.filter(|(name, _)| with_last_bias || !name.ends_with("phi.3.bias"));
     compared.map(|(_, (a, b))| worst(&a.mapv(Real::f64), b)).fold(0.0, f64::max)
 }
 
-fn check<T: Real>(room: &str, folder: &Path, tolerance: impl Fn(&serde_json::Value, &str) -> f64) {
+/// A run of the oracle.
+struct Run {
+    charts: usize,
+    loss: Loss,
+    /// What of the weights it keeps.
+    kept: &'static [usize],
+}
+
+const PLAIN: Run = Run { charts: 1, loss: Loss::MeanSquaredError, kept: &[1, 50] };
+
+fn check<T: Real>(run: &Run, room: &str, folder: &Path, tolerance: impl Fn(&serde_json::Value, &str) -> f64) {
     let expected = json(&folder.join(format!("m4_adapter/{room}_expected.json")));
-    let run = &expected["k1_mse"];
-    let reference = folder.join(format!("m4_adapter/{room}_k1_mse.safetensors"));
+    let name = format!("k{}_{}", run.charts, run.loss.name());
+    let reference = folder.join(format!("m4_adapter/{room}_{name}.safetensors"));
     let samples = samples::<T>(folder, room);
     for component in 0..6 {
         near("mu", samples.scale().mean[component], number(&expected["mu"][component]), 1e-12);
         near("sd", samples.scale().deviation[component], number(&expected["sd"][component]), 1e-12);
     }
+    let expected_run = &expected[&name];
     let batch = expected["batch_size"].as_u64().unwrap() as usize;
-    let config = TrainConfig { batch, ..TrainConfig::default() };
-    let start = network::<T>(&folder.join(format!("m4_adapter/{room}_k1_init.safetensors")), "");
+    let config = TrainConfig { batch, loss: run.loss, charts: run.charts, ..TrainConfig::default() };
+    let start =
+        network::<T>(&folder.join(format!("m4_adapter/{room}_k{}_init.safetensors", run.charts)), "", run.charts);
     let mut trainer = Trainer::new(&samples, start, config);
     let is_f64 = std::mem::size_of::<T>() == 8;
     for (step, batch) in (1..=50).zip(batches(folder, room, batch)) {
         if step == 1 {
             let (_, gradient) = trainer.gradient(&batch);
-            let off = difference(&gradient, &network(&reference, "grad1."), true);
-            assert!(off <= tolerance(run, "grad1"), "{room}: first gradient off by {off}");
+            let off = difference(&gradient, &network(&reference, "grad1.", run.charts), true);
+            assert!(off <= tolerance(expected_run, "grad1"), "{room} {name}: first gradient off by {off}");
         }
         let report = trainer.step(&batch);
         if is_f64 {
-            near("loss", report.loss, number(&run["loss"][step - 1]), 1e-10);
-            near("gradient norm", report.gradient_norm, number(&run["grad_norm"][step - 1]), 1e-10);
+            near("loss", report.loss, number(&expected_run["loss"][step - 1]), 1e-10);
+            near("gradient norm", report.gradient_norm, number(&expected_run["grad_norm"][step - 1]), 1e-10);
         }
-        if step == 1 || step == 50 {
-            let name = format!("after{step}");
-            let off = difference(trainer.weights(), &network(&reference, &format!("{name}.")), is_f64);
-            assert!(off <= tolerance(run, &name), "{room}: weights {name} off by {off}");
+        if run.kept.contains(&step) {
+            let kept = format!("after{step}");
+            let off = difference(trainer.weights(), &network(&reference, &format!("{kept}."), run.charts), is_f64);
+            assert!(off <= tolerance(expected_run, &kept), "{room} {name}: weights {kept} off by {off}");
         }
     }
 }
@@ -73,7 +87,7 @@ fn check<T: Real>(room: &str, folder: &Path, tolerance: impl Fn(&serde_json::Val
 #[test]
 fn fifty_steps_in_f64_match_pytorch() {
     for (room, folder) in oracle_rooms("fifty_steps_in_f64_match_pytorch") {
-        check::<f64>(room, &folder, |_, _| 1e-10);
+        check::<f64>(&PLAIN, room, &folder, |_, _| 1e-10);
     }
 }
 
@@ -81,38 +95,130 @@ fn fifty_steps_in_f64_match_pytorch() {
 #[test]
 fn fifty_steps_in_f32_stay_as_near_as_pytorch_does() {
     for (room, folder) in oracle_rooms("fifty_steps_in_f32_stay_as_near_as_pytorch_does") {
-        check::<f32>(room, &folder, |run, name| 10.0 * number(&run["float32_run"]["max_abs_diff_from_float64"][name]));
+        check::<f32>(&PLAIN, room, &folder, |run, name| {
+            10.0 * number(&run["float32_run"]["max_abs_diff_from_float64"][name])
+        });
     }
 }
 
-/// Oracle: PyTorch 2.15 after `torch.manual_seed(0)`, bit by bit.
+/// Oracle: as above, for the other losses.
+#[test]
+fn fifty_steps_of_the_other_losses_match_pytorch() {
+    for (room, folder) in oracle_rooms("fifty_steps_of_the_other_losses_match_pytorch") {
+        for loss in [Loss::Cosine, Loss::Rotation] {
+            check::<f64>(&Run { charts: 1, loss, kept: &[50] }, room, &folder, |_, _| 1e-10);
+        }
+    }
+}
+
+/// Oracle: as above, for mixtures of two and four charts.
+#[test]
+fn fifty_steps_of_a_mixture_match_pytorch() {
+    for (room, folder) in oracle_rooms("fifty_steps_of_a_mixture_match_pytorch") {
+        for charts in [2, 4] {
+            check::<f64>(&Run { charts, ..PLAIN }, room, &folder, |_, _| 1e-10);
+        }
+    }
+}
+
+/// Oracle: PyTorch's first batch through a mixture of two: the gate, both charts, and what they say together.
+#[test]
+fn a_mixtures_gate_and_charts_match_pytorch() {
+    for (room, folder) in oracle_rooms("a_mixtures_gate_and_charts_match_pytorch") {
+        let mixture = network::<f64>(&folder.join(format!("m4_adapter/{room}_k2_init.safetensors")), "", 2);
+        let expected = Tensors::open(&folder.join(format!("m4_adapter/{room}_k2_mse.safetensors")));
+        let samples = samples::<f64>(&folder, room);
+        let first: Vec<usize> = batches(&folder, room, 8)[0].clone();
+        let rows = features(&folder, room).mapv(f64::from);
+        let pairs: Vec<Pair> = Split::Time.train_pairs(&Timeline::unbroken(rows.nrows()), 40).unwrap();
+        let latents = |end: fn(&Pair) -> usize| {
+            let rows = rows.select(ndarray::Axis(0), &first.iter().map(|&p| end(&pairs[p])).collect::<Vec<_>>());
+            mixture.embed(rows)
+        };
+        let (from, to) = (latents(|p| p.source.row()), latents(|p| p.target.row()));
+        for (chart, columns) in [(0, 0..20), (1, 20..40)] {
+            let g = |latents: &Array2<f64>| latents.slice(ndarray::s![.., columns.clone()]).to_owned();
+            assert!(worst(&g(&from), &expected.rows(&format!("first.g_i.{chart}"))) < 1e-12);
+            assert!(worst(&g(&to), &expected.rows(&format!("first.g_j.{chart}"))) < 1e-12);
+        }
+        assert!(worst(&from.slice(ndarray::s![.., 40..]).to_owned(), &expected.rows("first.alpha")) < 1e-12);
+        let adapter = Adapter::new(
+            FeatureSource::imported("oracle", rows.ncols()),
+            mixture.cast::<f32>(),
+            samples.scale().clone(),
+        );
+        let adapter = adapter.unwrap();
+        for (row, y) in expected.rows("first.y").outer_iter().enumerate() {
+            let seen = samples.scale().normalised(adapter.motion(from.row(row), to.row(row)));
+            assert!(seen.iter().zip(y).all(|(a, b)| (a - b).abs() < 1e-12), "{room}, pair {row}");
+        }
+    }
+}
+
+/// Oracle: PyTorch 2.15 after `torch.manual_seed(0)`, bit by bit; the prototypes to the last bits of the sine.
 #[test]
 fn a_seed_gives_pytorchs_initial_weights() {
     for (room, folder) in oracle_rooms("a_seed_gives_pytorchs_initial_weights") {
-        let expected = network::<f32>(&folder.join(format!("m4_adapter/{room}_k1_init.safetensors")), "");
-        let widths = Widths { feature: expected.feature_dim(), hidden: 64, latent: 20 };
-        assert_eq!(Siamese::<f32>::initial(widths, 0), expected, "{room}");
-        assert_ne!(Siamese::<f32>::initial(widths, 1), expected, "{room}");
+        for charts in [1, 2, 4] {
+            let file = folder.join(format!("m4_adapter/{room}_k{charts}_init.safetensors"));
+            let expected = network::<f32>(&file, "", charts);
+            let widths = Widths { feature: expected.feature_dim(), hidden: 64, latent: 20 };
+            let found = Mixture::<f32>::initial(widths, charts, 0);
+            for ((name, a), b) in expected.names().iter().zip(expected.parameters()).zip(found.parameters()) {
+                let off = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+                assert!(off <= if name == "prototypes" { 1e-6 } else { 0.0 }, "{room} {name} off by {off}");
+            }
+            assert_ne!(Mixture::<f32>::initial(widths, charts, 1), expected, "{room}");
+        }
     }
 }
 
-/// Oracle: central differences of the loss itself, along one direction in each tensor.
+/// Oracle: the plain chart itself, bit by bit, after training (K = 1 has no gate).
+#[test]
+fn a_mixture_of_one_is_the_plain_adapter() {
+    let folder = crate::support::golden();
+    let samples = samples::<f32>(&folder, "synthetic");
+    let widths = Widths { feature: samples.feature_dim(), hidden: 64, latent: 20 };
+    let chart = Siamese::<f32>::initial(widths, 7);
+    let mixture = Mixture::<f32>::initial(widths, 1, 7);
+    assert_eq!(mixture.names(), TENSOR_NAMES);
+    assert_eq!(mixture.charts(), std::slice::from_ref(&chart));
+    let rows = features(&folder, "synthetic");
+    assert_eq!(mixture.embed(rows.clone()), chart.embed(rows));
+}
+
+/// Oracle: central differences of the loss itself, along one direction in each tensor, of every loss and two gates.
 #[test]
 fn the_gradient_is_the_slope_of_the_loss() {
     let folder = crate::support::golden();
     let samples = samples::<f64>(&folder, "synthetic");
-    let start = network::<f64>(&folder.join("m4_adapter/synthetic_k1_init.safetensors"), "");
     let batch: Vec<usize> = (0..60).collect();
-    let loss = |weights: Siamese<f64>| Trainer::new(&samples, weights, TrainConfig::default()).gradient(&batch).0;
-    let (_, gradient) = Trainer::new(&samples, start.clone(), TrainConfig::default()).gradient(&batch);
-    for tensor in 0..TENSOR_NAMES.len() {
+    for (charts, loss) in [
+        (1, Loss::MeanSquaredError),
+        (1, Loss::Cosine),
+        (1, Loss::Rotation),
+        (2, Loss::Cosine),
+        (4, Loss::MeanSquaredError),
+    ] {
+        let start =
+            network::<f64>(&folder.join(format!("m4_adapter/synthetic_k{charts}_init.safetensors")), "", charts);
+        let config = TrainConfig { loss, charts, ..TrainConfig::default() };
+        slopes(&start, |weights| Trainer::new(&samples, weights, config.clone()).gradient(&batch));
+    }
+}
+
+/// Compares every tensor's gradient with central differences of the loss.
+pub fn slopes<N: Network<f64>>(start: &N, gradient: impl Fn(N) -> (f64, N)) {
+    let (_, stated) = gradient(start.clone());
+    for (tensor, name) in start.names().iter().enumerate() {
         let moved = |by: f64| {
-            let mut tensors = start.tensors().map(Array2::clone);
-            tensors[tensor].iter_mut().enumerate().for_each(|(k, x)| *x += by * ((k + 1) as f64).sin());
-            loss(Siamese::from_tensors(tensors).unwrap())
+            let mut weights = start.clone();
+            let mut parameters = weights.parameters_mut();
+            parameters[tensor].iter_mut().enumerate().for_each(|(k, x)| *x += by * ((k + 1) as f64).sin());
+            gradient(weights).0
         };
         let slope = (moved(1e-5) - moved(-1e-5)) / 2e-5;
-        let stated: f64 = gradient.tensors()[tensor].iter().enumerate().map(|(k, g)| g * ((k + 1) as f64).sin()).sum();
-        near(TENSOR_NAMES[tensor], stated, slope, 1e-6 * slope.abs().max(1e-3));
+        let stated: f64 = stated.parameters()[tensor].iter().enumerate().map(|(k, g)| g * ((k + 1) as f64).sin()).sum();
+        near(name, stated, slope, 1e-6 * slope.abs().max(1e-3));
     }
 }

@@ -3,10 +3,9 @@
 use std::time::Duration;
 
 use ndarray::Array2;
-use seese3::adapter::{Adapter, Samples, Siamese, TENSOR_NAMES, TrainConfig, TrainingRecord};
+use seese3::adapter::{Adapter, PairPlan, Samples, Siamese, TENSOR_NAMES, TrainConfig, TrainingRecord};
 use seese3::client::Client;
 use seese3::features::{FeatureSource, Features};
-use seese3::geometry::body_twist;
 use seese3::pairs::Split;
 use seese3::proto::v1 as pb;
 use seese3::room::{Frames, Provenance, Room, RoomId, Timeline};
@@ -43,16 +42,15 @@ pub fn oracle_adapter() -> Adapter {
     let network = Siamese::from_tensors(TENSOR_NAMES.map(|name| tensors.rows(name).mapv(|x| x as f32))).unwrap();
     let room = room_of("a", "synthetic");
     let pairs = Split::Time.train_pairs(&Timeline::unbroken(room.frame_count()), 40).unwrap();
-    let twists: Vec<_> =
-        pairs.iter().map(|p| body_twist(&room.poses()[p.source.row()], &room.poses()[p.target.row()])).collect();
     let rows = pairs.iter().map(|p| [p.source.row(), p.target.row()]).collect();
-    let samples = Samples::<f32>::new(features_of("synthetic").rows(), rows, &twists).unwrap();
+    let samples = Samples::<f32>::new(features_of("synthetic").rows(), room.poses().to_vec(), rows).unwrap();
     Adapter::new(features_of("synthetic").source().clone(), network, samples.scale().clone()).unwrap()
 }
 
 pub fn record() -> TrainingRecord {
     let scores = MotionScores {
         n: 1,
+        components: [0.5; 6],
         overall: 0.5,
         translation: 0.5,
         rotation: 0.5,
@@ -64,10 +62,13 @@ pub fn record() -> TrainingRecord {
         preset: "paper-base".to_owned(),
         split: Split::Time,
         stride: 40,
+        pairs: PairPlan::Stride(40),
         rooms: vec![(RoomId::new("synthetic").unwrap(), 1)],
+        calibrated_on: Vec::new(),
         config: TrainConfig::default(),
         pair_count: 440,
         test: scores,
+        room_tests: vec![scores],
         train: scores,
         train_mean_r2: -0.1,
     }

@@ -42,9 +42,10 @@ async fn drawn_store() -> (tempfile::TempDir, Store, Vec<RgbImage>) {
     let features = Features::new(encoder.sources("builtin").remove(0), rows).unwrap();
     let room = Room::new(RoomId::new(ROOM).unwrap(), frames, Provenance::default()).unwrap();
     store.publish_room(&room, std::slice::from_ref(&features)).await.unwrap();
-    let recipe = Recipe { preset: Preset::PaperBase, split: Split::Time, stride: 10, epochs: Some(2), seed: 0 };
+    let mut recipe = Recipe::of(Preset::PaperBase, Split::Time, 10, 0);
+    recipe.config.epochs = 2;
     let lesson = Lesson { room: &room, revision: 1, features: &features };
-    let (adapter, record) = learn(lesson, &recipe, &mut |_| ()).unwrap();
+    let (adapter, record) = learn(&[lesson], &recipe, &mut |_| ()).unwrap();
     store.publish_adapter("eyes", &adapter, &record, features.rows()).await.unwrap();
     (folder, store, pictures)
 }

@@ -7,4 +7,5 @@ mod answers;
 mod harness;
 mod images;
 mod lifecycle;
+mod navigators;
 mod refusals;

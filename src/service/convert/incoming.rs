@@ -1,30 +1,24 @@
-//! Wire types to domain types and back. Everything that enters is checked here, and named by its field.
+//! What enters: requests to questions. Every field is checked here, and named in what is wrong with it.
 
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
-use super::Error;
-use super::snapshot::{ServedNavigator, Snapshot};
-use crate::eval::{NavigatorKind, Prediction, RetrievalScores, Row, check_thresholds, default_thresholds};
-use crate::features::FeatureSource;
+use super::super::Error;
+use super::super::snapshot::Snapshot;
+use super::{CAMERA, world_frame};
+use crate::eval::{NavigatorKind, Prediction, check_thresholds, default_thresholds};
 use crate::geometry::{Pose, Twist};
 use crate::navigation::{
-    AnswerStep, Displacement, Hit, MAX_TRANSLATION_M, Mode, Query, Reading, Source, SourceAt, StepError,
+    Displacement, FitOn, MAX_TRANSLATION_M, Metric, Mode, Query, Reading, Source, SourceAt, StepKind,
 };
 use crate::pairs::{Pair, Split};
 use crate::proto::v1 as pb;
-use crate::room::{FrameId, Room};
-use crate::scores::{MotionScores, Rate};
+use crate::room::FrameId;
 use crate::store::StoredAdapter;
 
 /// How far from 1 a quaternion's norm may be.
 const QUATERNION_TOLERANCE: f64 = 1e-3;
-/// The child frame of every pose.
-const CAMERA: &str = "camera";
-
-/// The world frame of a room.
-pub fn world_frame(room: &str) -> String {
-    format!("rooms/{room}")
-}
+/// The most rows of one evaluation.
+const MAX_NAVIGATORS: usize = 100;
 
 fn vector(field: &str, vector: Option<pb::Vector3>) -> Result<Vector3<f64>, Error> {
     let pb::Vector3 { x, y, z } = vector.ok_or_else(|| Error::invalid(field, "is required"))?;
@@ -134,9 +128,11 @@ pub fn query(
         exclude_source,
         exclude_radius,
         thresholds: given_thresholds,
+        navigator,
     } = request;
     let displacement = displacement(wanted, &room)?;
     let thresholds = thresholds(given_thresholds)?;
+    let (step, metric) = step_of(&navigator, reading)?;
     // Last, since an image is costly.
     let source = source("source", view, adapter, snapshot)?;
     if source_pose.is_some() && matches!(source, Source::Frame(_)) {
@@ -148,14 +144,49 @@ pub fn query(
         displacement,
         steps: steps.unwrap_or(1),
         mode: mode_of(mode)?,
-        reading: reading_of(reading)?,
+        step,
+        metric,
+        fit_on: fit_on(adapter),
         hit_count: hit_count.unwrap_or(1),
         exclude_source: exclusion(exclude_source, exclude_radius)?,
     };
     Ok((query, thresholds))
 }
 
-fn mode_of(mode: i32) -> Result<Mode, Error> {
+/// How to step, and under which metric, by name, or inverse Poincaré in a reading.
+fn step_of(name: &str, reading: i32) -> Result<(StepKind, Metric), Error> {
+    let given = reading_of(reading)?;
+    if name.is_empty() {
+        return Ok((StepKind::InversePoincare(given), Metric::Full));
+    }
+    if reading != pb::Reading::Unspecified as i32 {
+        return Err(Error::invalid("reading", "is not to be given with a navigator, whose name says it"));
+    }
+    match navigator_named("navigator", name)? {
+        NavigatorKind::Step(step, metric) => Ok((step, metric)),
+        _ => Err(Error::invalid("navigator", format!("'{name}' is a row of Evaluate; it makes no latent step"))),
+    }
+}
+
+/// Pairs of a room that a refit is fitted on: under the adapter's own split and stride, or the time split where the
+/// adapter set nothing apart.
+fn fit_on(adapter: &StoredAdapter) -> FitOn {
+    let split = match adapter.record.split {
+        Split::Whole => Split::Time,
+        split => split,
+    };
+    FitOn { split, stride: adapter.record.stride }
+}
+
+fn navigator_named(field: &str, name: &str) -> Result<NavigatorKind, Error> {
+    NavigatorKind::from_name(name).ok_or_else(|| {
+        let problem =
+            "is no navigator; adapters list theirs, and +row-space, +whitened, +motion or +calibrated may be added";
+        Error::invalid(field, format!("'{name}' {problem}"))
+    })
+}
+
+pub fn mode_of(mode: i32) -> Result<Mode, Error> {
     match pb::Mode::try_from(mode) {
         Ok(pb::Mode::Unspecified | pb::Mode::OpenLoop) => Ok(Mode::OpenLoop),
         Ok(pb::Mode::Snap) => Ok(Mode::Snap),
@@ -201,22 +232,16 @@ pub fn split(name: &str) -> Result<Option<Split>, Error> {
     }
 }
 
-/// Rows of the table by name, all if there is none.
+/// Rows of the table by name; none means the adapter's own table.
 pub fn navigators(names: &[String]) -> Result<Vec<NavigatorKind>, Error> {
-    if names.is_empty() {
-        return Ok(NavigatorKind::ALL.to_vec());
-    }
     let twice = |(position, name): (usize, &String)| names[..position].contains(name);
-    if names.len() > NavigatorKind::ALL.len() || names.iter().enumerate().any(twice) {
+    if names.len() > MAX_NAVIGATORS {
+        return Err(Error::invalid("navigators", format!("names more than {MAX_NAVIGATORS}")));
+    }
+    if names.iter().enumerate().any(twice) {
         return Err(Error::invalid("navigators", "names a navigator twice"));
     }
-    let kind = |name: &String| {
-        NavigatorKind::from_name(name).ok_or_else(|| {
-            let known: Vec<&str> = NavigatorKind::ALL.iter().map(|kind| kind.name()).collect();
-            Error::invalid("navigators", format!("'{name}' is not one of {}", known.join(", ")))
-        })
-    };
-    names.iter().map(kind).collect()
+    names.iter().map(|name| navigator_named("navigators", name)).collect()
 }
 
 pub fn prediction(position: usize, given: pb::Prediction) -> Result<(Pair, Prediction), Error> {
@@ -227,125 +252,4 @@ pub fn prediction(position: usize, given: pb::Prediction) -> Result<(Pair, Predi
         Some(pb::prediction::Prediction::RetrievedFrameId(frame)) => Ok((pair, Prediction::Frame(FrameId(frame)))),
         None => Err(Error::invalid(format!("predictions[{position}]"), "needs a latent or a retrieved_frame_id")),
     }
-}
-
-pub fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
-    pb::Vector3 { x: vector.x, y: vector.y, z: vector.z }
-}
-
-pub fn twist_to_wire(twist: &Twist) -> pb::Twist {
-    pb::Twist { linear: Some(vector_to_wire(&twist.linear)), angular: Some(vector_to_wire(&twist.angular)) }
-}
-
-pub fn pose_to_wire(pose: &Pose, room: &str) -> pb::Pose {
-    let q = pose.rotation.quaternion();
-    pb::Pose {
-        parent_frame: world_frame(room),
-        child_frame: CAMERA.to_owned(),
-        position: Some(vector_to_wire(&pose.translation.vector)),
-        orientation: Some(pb::Quaternion { w: q.w, x: q.i, y: q.j, z: q.k }),
-    }
-}
-
-pub fn hit_to_wire(hit: &Hit, room: &Room) -> pb::Hit {
-    let frame = hit.neighbour.frame;
-    pb::Hit {
-        frame_id: frame.0,
-        distance: hit.neighbour.distance,
-        pose: Some(pose_to_wire(&hit.pose, room.id().as_str())),
-        frame_name: room.frame_names().get(frame.row()).cloned().unwrap_or_default(),
-        timestamp_ns: room.timestamps_ns().get(frame.row()).copied(),
-    }
-}
-
-pub fn step_to_wire(number: usize, step: &AnswerStep, room: &Room, thresholds: &[f64]) -> pb::NavigationStep {
-    pb::NavigationStep {
-        step: number as u32,
-        hits: step.hits.iter().map(|hit| hit_to_wire(hit, room)).collect(),
-        requested_pose: step.requested_pose.map(|pose| pose_to_wire(&pose, room.id().as_str())),
-        error: step.error.map(|error| error_to_wire(&error, thresholds)),
-        latent: Some(pb::Latent { values: step.latent.to_vec() }),
-    }
-}
-
-pub fn error_to_wire(error: &StepError, thresholds: &[f64]) -> pb::PoseError {
-    pb::PoseError {
-        translation_m: error.pose.translation_m,
-        rotation_rad: error.pose.rotation_rad,
-        twist_norm: error.twist,
-        hits: thresholds
-            .iter()
-            .map(|&threshold| pb::ThresholdHit { threshold, hit: error.twist < threshold })
-            .collect(),
-    }
-}
-
-pub fn mode_to_wire(mode: Mode) -> pb::Mode {
-    match mode {
-        Mode::OpenLoop => pb::Mode::OpenLoop,
-        Mode::Snap => pb::Mode::Snap,
-        Mode::ClosedLoop => pb::Mode::ClosedLoop,
-    }
-}
-
-pub fn reading_to_wire(reading: Reading) -> pb::Reading {
-    match reading {
-        Reading::Affine => pb::Reading::Affine,
-        Reading::Homogeneous => pb::Reading::Homogeneous,
-        Reading::Literal => pb::Reading::Literal,
-    }
-}
-
-pub fn room_revision(navigator: &ServedNavigator) -> pb::Revision {
-    pb::Revision { name: navigator.navigator.room().id().to_string(), revision: navigator.room_revision }
-}
-
-pub fn adapter_revision(navigator: &ServedNavigator) -> pb::Revision {
-    pb::Revision { name: navigator.adapter.name.clone(), revision: navigator.adapter.revision }
-}
-
-pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
-    let FeatureSource { name, encoder, layer, base, norm, pooling, preprocess, dim } = source.clone();
-    pb::FeatureSource { name, encoder, layer, pooling, preprocess, dim: dim as u32, base, norm }
-}
-
-pub fn scores_to_wire(scores: &MotionScores) -> pb::MotionScores {
-    let known = |value: f64| value.is_finite().then_some(value);
-    pb::MotionScores {
-        n: scores.n as u32,
-        overall: known(scores.overall),
-        translation: known(scores.translation),
-        rotation: known(scores.rotation),
-        direction: known(scores.direction),
-        magnitude: known(scores.magnitude),
-    }
-}
-
-pub fn row_to_wire(row: &Row) -> pb::NavigatorScores {
-    let RetrievalScores { top1, hits, translation_m_median, rotation_rad_median, pose_recalls, .. } = &row.retrieval;
-    pb::NavigatorScores {
-        name: row.name.clone(),
-        n: row.n as u32,
-        mse: row.latent.map(|latent| latent.mse),
-        r2: row.latent.map(|latent| latent.r2).filter(|r2| r2.is_finite()),
-        top1: Some(rate_to_wire(top1)),
-        hits: hits
-            .iter()
-            .map(|(threshold, rate)| pb::HitRate { threshold: *threshold, rate: Some(rate_to_wire(rate)) })
-            .collect(),
-        translation_m_median: *translation_m_median,
-        rotation_rad_median: *rotation_rad_median,
-        recalls: pose_recalls
-            .iter()
-            .map(|recall| pb::PoseRecall {
-                translation_m: recall.translation_m,
-                rotation_deg: recall.rotation_deg,
-                rate: Some(rate_to_wire(&recall.rate)),
-            })
-            .collect(),
-    }
-}
-
-fn rate_to_wire(rate: &Rate) -> pb::Rate {
-    pb::Rate { rate: rate.rate, low: rate.low, high: rate.high }
 }

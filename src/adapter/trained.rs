@@ -1,0 +1,293 @@
+//! A trained adapter: what answers are computed with.
+
+use nalgebra::{Matrix6, Vector6};
+use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis, s};
+
+use super::inverse::{pseudo_inverse, target};
+use super::{Corrector, CorrectorKind, Error, Inverse, MAX_LATENT, Mixture, Network, Reading, TargetScale};
+use crate::features::FeatureSource;
+use crate::geometry::Twist;
+
+/// Rows embedded at a time, so that memory stays flat with the size of a room.
+const EMBED_ROWS: usize = 1_024;
+/// How far the shares of a gate may be from adding up to 1.
+const GATE_TOLERANCE: f64 = 1e-6;
+
+/// A trained adapter. Immutable; refuses features of another source.
+#[derive(Debug, Clone)]
+pub struct Adapter {
+    source: FeatureSource,
+    network: Mixture<f32>,
+    network_f64: Mixture<f64>,
+    scale: TargetScale,
+    inverse: Inverse,
+    correctors: Vec<(Corrector<f32>, Corrector<f64>)>,
+    error_covariance: Option<Matrix6<f64>>,
+}
+
+impl Adapter {
+    /// Checks trained weights and prepares W⁺.
+    ///
+    /// # Errors
+    /// [`Error::FeatureDim`], [`Error::WeightsNotFinite`], [`Error::Deviation`] or [`Error::RankDeficient`].
+    pub fn new(source: FeatureSource, network: impl Into<Mixture<f32>>, scale: TargetScale) -> Result<Self, Error> {
+        let network = network.into();
+        if network.feature_dim() != source.dim {
+            return Err(Error::FeatureDim { expected: network.feature_dim(), actual: source.dim });
+        }
+        if let Some(tensor) = network.not_finite() {
+            return Err(Error::WeightsNotFinite { tensor });
+        }
+        for (component, &value) in scale.deviation.iter().enumerate() {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(Error::Deviation { component, value });
+            }
+        }
+        if let Some(position) = scale.mean.iter().position(|x| !x.is_finite()) {
+            return Err(Error::NotFinite { what: "target mean", position, value: scale.mean[position] });
+        }
+        let network_f64 = network.cast::<f64>();
+        for chart in network_f64.charts() {
+            Inverse::new(chart.motion_matrix(), &scale)?;
+        }
+        let inverse = Inverse::new(network_f64.motion_matrix(network_f64.even_gate().view()).view(), &scale)?;
+        Ok(Self { source, network, network_f64, scale, inverse, correctors: Vec::new(), error_covariance: None })
+    }
+
+    /// The same adapter with correctors, one a kind.
+    ///
+    /// # Errors
+    /// [`Error::CorrectorTwice`], [`Error::WeightsNotFinite`], or [`Error::WeightShape`] when one does not fit the
+    /// adapter's latents.
+    pub fn with_correctors(mut self, correctors: Vec<Corrector<f32>>) -> Result<Self, Error> {
+        for corrector in correctors {
+            let name = corrector.kind().name();
+            if self.corrector(corrector.kind()).is_ok() {
+                return Err(Error::CorrectorTwice { name });
+            }
+            corrector.check(self.network.coordinate_count())?;
+            let precise = corrector.cast::<f64>();
+            self.correctors.push((corrector, precise));
+        }
+        Ok(self)
+    }
+
+    /// The same adapter with the covariance of its errors, Σ = mean (ΔP − σ⊙W(g₂ − g₁))(…)ᵀ, on (v, ω), measured in rooms
+    /// that it did not learn from.
+    ///
+    /// # Errors
+    /// [`Error::ErrorCovariance`].
+    pub fn with_error_covariance(mut self, covariance: Matrix6<f64>) -> Result<Self, Error> {
+        let symmetric = (covariance - covariance.transpose()).amax() <= 1e-9 * covariance.amax();
+        if !symmetric || covariance.cholesky().is_none() {
+            return Err(Error::ErrorCovariance);
+        }
+        self.error_covariance = Some(covariance);
+        Ok(self)
+    }
+
+    /// The covariance of its errors, metres and radians, if it was measured.
+    pub fn error_covariance(&self) -> Option<Matrix6<f64>> {
+        self.error_covariance
+    }
+
+    /// The features it was trained on.
+    pub fn source(&self) -> &FeatureSource {
+        &self.source
+    }
+
+    /// The trained weights.
+    pub fn network(&self) -> &Mixture<f32> {
+        &self.network
+    }
+
+    /// The trained correctors.
+    pub fn correctors(&self) -> impl Iterator<Item = &Corrector<f32>> {
+        self.correctors.iter().map(|(corrector, _)| corrector)
+    }
+
+    /// μ and σ of the training twists.
+    pub fn scale(&self) -> &TargetScale {
+        &self.scale
+    }
+
+    /// W⁺ in its three readings; of a mixture, with all charts' shares equal.
+    pub fn inverse(&self) -> &Inverse {
+        &self.inverse
+    }
+
+    /// Columns of its latents: the coordinates, and with several charts the gate.
+    pub fn latent_dim(&self) -> usize {
+        self.network.latent_dim()
+    }
+
+    /// Columns of its latents that distances are taken of.
+    pub fn coordinate_count(&self) -> usize {
+        self.network.coordinate_count()
+    }
+
+    /// W of each chart, shape (6, k).
+    pub fn motion_matrices(&self) -> Vec<ArrayView2<'_, f64>> {
+        self.network_f64.charts().iter().map(super::Siamese::motion_matrix).collect()
+    }
+
+    /// σ ⊙ W̄, shape (6, [`Adapter::coordinate_count`]): a difference of latents to the motion without μ. Of a mixture,
+    /// with all charts' shares equal.
+    pub fn motion_of_coordinates(&self) -> Array2<f64> {
+        let mut matrix = self.network_f64.motion_matrix(self.network_f64.even_gate().view());
+        for (mut row, &deviation) in matrix.outer_iter_mut().zip(self.scale.deviation.iter()) {
+            row *= deviation;
+        }
+        matrix
+    }
+
+    /// Refuses features of another source.
+    ///
+    /// # Errors
+    /// [`Error::FeatureDim`] or [`Error::FeatureSource`].
+    pub fn check_source(&self, source: &FeatureSource) -> Result<(), Error> {
+        if source.dim != self.source.dim {
+            return Err(Error::FeatureDim { expected: self.source.dim, actual: source.dim });
+        }
+        if !source.is_like(&self.source) {
+            return Err(Error::FeatureSource { expected: describe(&self.source), actual: describe(source) });
+        }
+        Ok(())
+    }
+
+    /// Latents φ(z) of feature rows: shape (n, d) in, (n, [`Adapter::latent_dim`]) out.
+    ///
+    /// # Errors
+    /// [`Error::FeatureDim`] or [`Error::NotFinite`].
+    ///
+    /// Source: SeeSE3, sec. 2.4.
+    pub fn embed(&self, features: ArrayView2<'_, f32>) -> Result<Array2<f64>, Error> {
+        if features.ncols() != self.source.dim {
+            return Err(Error::FeatureDim { expected: self.source.dim, actual: features.ncols() });
+        }
+        if let Some(((_, position), &value)) = features.indexed_iter().find(|(_, value)| !value.is_finite()) {
+            return Err(Error::NotFinite { what: "feature", position, value: f64::from(value) });
+        }
+        let mut latents = Array2::zeros((features.nrows(), self.latent_dim()));
+        let chunks = features.axis_chunks_iter(Axis(0), EMBED_ROWS);
+        for (rows, mut out) in chunks.zip(latents.axis_chunks_iter_mut(Axis(0), EMBED_ROWS)) {
+            out.assign(&self.network_f64.embed(rows.mapv(f64::from)));
+        }
+        Ok(latents)
+    }
+
+    /// The latent φ(z) of one feature.
+    ///
+    /// # Errors
+    /// [`Error::FeatureDim`] or [`Error::NotFinite`].
+    pub fn embed_one(&self, feature: &[f32]) -> Result<Array1<f64>, Error> {
+        let row = ArrayView1::from(feature);
+        Ok(self.embed(row.insert_axis(Axis(0)))?.row(0).to_owned())
+    }
+
+    /// The camera's motion between two latents, ΔP = σ ⊙ W(g₂ − g₁) + μ, in the first camera's body frame; W is mixed
+    /// by the gate of the first.
+    ///
+    /// Source: SeeSE3, sec. 2.4; targets un-normalised.
+    pub fn motion(&self, from: ArrayView1<'_, f64>, to: ArrayView1<'_, f64>) -> Twist {
+        let normalised = match self.network_f64.charts() {
+            [chart] => chart.motion_matrix().dot(&(&to - &from)),
+            _ => {
+                let coordinates = s![..self.coordinate_count()];
+                let step = &to.slice(coordinates) - &from.slice(coordinates);
+                self.network_f64.motion_matrix(self.network_f64.gate_of(from).view()).dot(&step)
+            }
+        };
+        self.scale.twist(&Vector6::from_fn(|row, _| normalised[row]))
+    }
+
+    /// The latent step of a motion from `latent`, ĝ − g = W⁺ΔP; what a mixture's gate says stays as it is at the
+    /// source (A-36). `mean_share` as in [`Inverse::step`].
+    ///
+    /// Source: SeeSE3, ĝ = φ(z) + W⁺ΔP.
+    pub fn step(&self, latent: ArrayView1<'_, f64>, twist: Twist, reading: Reading, mean_share: f64) -> Array1<f64> {
+        if self.network_f64.chart_count() == 1 {
+            return self.inverse.step(twist, reading, mean_share);
+        }
+        let mixed = self.network_f64.motion_matrix(self.network_f64.gate_of(latent).view());
+        let (inverse, ..) = pseudo_inverse(mixed.view());
+        self.widened(inverse.dot(&target(&self.scale, twist, reading, mean_share)))
+    }
+
+    /// The latent step of a motion from `latent` by a corrector: with a residual W⁺ΔP in the affine reading and what
+    /// the corrector adds, else the latent that it predicts.
+    ///
+    /// # Errors
+    /// [`Error::NoCorrector`].
+    ///
+    /// Source: SeeSE3, sec. 2.6; widths and heads are ours (A-17).
+    pub fn corrected_step(
+        &self,
+        kind: CorrectorKind,
+        latent: ArrayView1<'_, f64>,
+        twist: Twist,
+        mean_share: f64,
+    ) -> Result<Array1<f64>, Error> {
+        let corrector = self.corrector(kind)?;
+        let wanted = target(&self.scale, twist, Reading::Affine, mean_share);
+        let here = latent.slice(s![..self.coordinate_count()]);
+        let added = corrector.added(here, wanted.view());
+        if kind.has_residual() {
+            Ok(self.step(latent, twist, Reading::Affine, mean_share) + self.widened(added))
+        } else {
+            Ok(self.widened(added - here))
+        }
+    }
+
+    /// Refuses a latent of the wrong width, with a number that is not finite, or with a gate that is none.
+    ///
+    /// # Errors
+    /// [`Error::LatentDim`], [`Error::NotFinite`], [`Error::LatentRange`] or [`Error::Gate`].
+    pub fn check_latent(&self, latent: &[f64]) -> Result<(), Error> {
+        if latent.len() != self.latent_dim() {
+            return Err(Error::LatentDim { expected: self.latent_dim(), actual: latent.len() });
+        }
+        if let Some(position) = latent.iter().position(|x| !x.is_finite()) {
+            return Err(Error::NotFinite { what: "latent", position, value: latent[position] });
+        }
+        if let Some(position) = latent.iter().position(|x| x.abs() > MAX_LATENT) {
+            return Err(Error::LatentRange { position, value: latent[position] });
+        }
+        let gate = &latent[self.coordinate_count()..];
+        let sum: f64 = gate.iter().sum();
+        let off = gate.iter().position(|share| !(0.0..=1.0).contains(share));
+        let off = off.or((!gate.is_empty() && (sum - 1.0).abs() > GATE_TOLERANCE).then_some(0));
+        match off {
+            Some(chart) => Err(Error::Gate { chart, value: gate[chart] }),
+            None => Ok(()),
+        }
+    }
+
+    /// A step of the coordinates as a step of the latent, whose gate stays.
+    fn widened(&self, coordinates: Array1<f64>) -> Array1<f64> {
+        if coordinates.len() == self.latent_dim() {
+            return coordinates;
+        }
+        let mut step = Array1::zeros(self.latent_dim());
+        step.slice_mut(s![..coordinates.len()]).assign(&coordinates);
+        step
+    }
+
+    fn corrector(&self, kind: CorrectorKind) -> Result<&Corrector<f64>, Error> {
+        let found = self.correctors.iter().map(|(_, precise)| precise).find(|corrector| corrector.kind() == kind);
+        found.ok_or_else(|| {
+            let names: Vec<&str> = self.correctors.iter().map(|(corrector, _)| corrector.kind().name()).collect();
+            let known = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+            Error::NoCorrector { name: kind.name(), known }
+        })
+    }
+}
+
+/// A source in words, enough to see which of its parts differ.
+fn describe(source: &FeatureSource) -> String {
+    let FeatureSource { name, encoder, layer, base, norm, pooling, preprocess, dim } = source;
+    format!(
+        "{name} (encoder {encoder}, layer {layer}, base {base}, norm {norm}, pooling {pooling}, \
+         preprocess {preprocess}, {dim} columns)"
+    )
+}

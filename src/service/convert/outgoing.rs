@@ -1,0 +1,152 @@
+//! What leaves: answers to the wire.
+
+use nalgebra::Vector3;
+
+use super::super::snapshot::ServedNavigator;
+use super::{CAMERA, world_frame};
+use crate::adapter::Adapter;
+use crate::eval::{NavigatorKind, RetrievalScores, Row};
+use crate::features::FeatureSource;
+use crate::geometry::{Pose, Twist};
+use crate::navigation::{AnswerStep, Hit, Mode, Query, Reading, StepError, StepKind};
+use crate::proto::v1 as pb;
+use crate::room::Room;
+use crate::scores::{MotionScores, Rate};
+
+pub fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
+    pb::Vector3 { x: vector.x, y: vector.y, z: vector.z }
+}
+
+pub fn twist_to_wire(twist: &Twist) -> pb::Twist {
+    pb::Twist { linear: Some(vector_to_wire(&twist.linear)), angular: Some(vector_to_wire(&twist.angular)) }
+}
+
+pub fn pose_to_wire(pose: &Pose, room: &str) -> pb::Pose {
+    let q = pose.rotation.quaternion();
+    pb::Pose {
+        parent_frame: world_frame(room),
+        child_frame: CAMERA.to_owned(),
+        position: Some(vector_to_wire(&pose.translation.vector)),
+        orientation: Some(pb::Quaternion { w: q.w, x: q.i, y: q.j, z: q.k }),
+    }
+}
+
+pub fn hit_to_wire(hit: &Hit, room: &Room) -> pb::Hit {
+    let frame = hit.neighbour.frame;
+    pb::Hit {
+        frame_id: frame.0,
+        distance: hit.neighbour.distance,
+        pose: Some(pose_to_wire(&hit.pose, room.id().as_str())),
+        frame_name: room.frame_names().get(frame.row()).cloned().unwrap_or_default(),
+        timestamp_ns: room.timestamps_ns().get(frame.row()).copied(),
+    }
+}
+
+pub fn step_to_wire(number: usize, step: &AnswerStep, room: &Room, thresholds: &[f64]) -> pb::NavigationStep {
+    pb::NavigationStep {
+        step: number as u32,
+        hits: step.hits.iter().map(|hit| hit_to_wire(hit, room)).collect(),
+        requested_pose: step.requested_pose.map(|pose| pose_to_wire(&pose, room.id().as_str())),
+        error: step.error.map(|error| error_to_wire(&error, thresholds)),
+        latent: Some(pb::Latent { values: step.latent.to_vec() }),
+    }
+}
+
+pub fn error_to_wire(error: &StepError, thresholds: &[f64]) -> pb::PoseError {
+    pb::PoseError {
+        translation_m: error.pose.translation_m,
+        rotation_rad: error.pose.rotation_rad,
+        twist_norm: error.twist,
+        hits: thresholds
+            .iter()
+            .map(|&threshold| pb::ThresholdHit { threshold, hit: error.twist < threshold })
+            .collect(),
+    }
+}
+
+/// The ways to step that an adapter has, by name.
+pub fn navigator_names(adapter: &Adapter) -> Vec<String> {
+    let has = |step: &StepKind| match step {
+        StepKind::Corrector(kind) => adapter.correctors().any(|corrector| corrector.kind() == *kind),
+        StepKind::InversePoincare(_) | StepKind::Refit(_) => true,
+    };
+    StepKind::all().into_iter().filter(has).map(|step| step.name().to_owned()).collect()
+}
+
+/// The navigator of a question, by name.
+pub fn navigator_to_wire(query: &Query) -> String {
+    NavigatorKind::Step(query.step, query.metric).name()
+}
+
+/// The reading of a question; unspecified for a way to step that has none.
+pub fn reading_to_wire(step: StepKind) -> pb::Reading {
+    match step {
+        StepKind::InversePoincare(Reading::Affine) => pb::Reading::Affine,
+        StepKind::InversePoincare(Reading::Homogeneous) => pb::Reading::Homogeneous,
+        StepKind::InversePoincare(Reading::Literal) => pb::Reading::Literal,
+        StepKind::Corrector(_) | StepKind::Refit(_) => pb::Reading::Unspecified,
+    }
+}
+
+pub fn mode_to_wire(mode: Mode) -> pb::Mode {
+    match mode {
+        Mode::OpenLoop => pb::Mode::OpenLoop,
+        Mode::Snap => pb::Mode::Snap,
+        Mode::ClosedLoop => pb::Mode::ClosedLoop,
+    }
+}
+
+pub fn room_revision(navigator: &ServedNavigator) -> pb::Revision {
+    pb::Revision { name: navigator.navigator.room().id().to_string(), revision: navigator.room_revision }
+}
+
+pub fn adapter_revision(navigator: &ServedNavigator) -> pb::Revision {
+    pb::Revision { name: navigator.adapter.name.clone(), revision: navigator.adapter.revision }
+}
+
+pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
+    let FeatureSource { name, encoder, layer, base, norm, pooling, preprocess, dim } = source.clone();
+    pb::FeatureSource { name, encoder, layer, pooling, preprocess, dim: dim as u32, base, norm }
+}
+
+pub fn scores_to_wire(scores: &MotionScores) -> pb::MotionScores {
+    let known = |value: f64| value.is_finite().then_some(value);
+    pb::MotionScores {
+        n: scores.n as u32,
+        overall: known(scores.overall),
+        translation: known(scores.translation),
+        rotation: known(scores.rotation),
+        direction: known(scores.direction),
+        magnitude: known(scores.magnitude),
+        still_components: if scores.n == 0 { 0 } else { scores.still_components() as u32 },
+    }
+}
+
+pub fn row_to_wire(row: &Row) -> pb::NavigatorScores {
+    let RetrievalScores { top1, hits, translation_m_median, rotation_rad_median, pose_recalls, .. } = &row.retrieval;
+    pb::NavigatorScores {
+        name: row.name.clone(),
+        n: row.n as u32,
+        mse: row.latent.map(|latent| latent.mse),
+        r2: row.latent.map(|latent| latent.r2).filter(|r2| r2.is_finite()),
+        top1: Some(rate_to_wire(top1)),
+        hits: hits
+            .iter()
+            .map(|(threshold, rate)| pb::HitRate { threshold: *threshold, rate: Some(rate_to_wire(rate)) })
+            .collect(),
+        translation_m_median: *translation_m_median,
+        rotation_rad_median: *rotation_rad_median,
+        recalls: pose_recalls
+            .iter()
+            .map(|recall| pb::PoseRecall {
+                translation_m: recall.translation_m,
+                rotation_deg: recall.rotation_deg,
+                rate: Some(rate_to_wire(&recall.rate)),
+            })
+            .collect(),
+    }
+}
+
+fn rate_to_wire(rate: &Rate) -> pb::Rate {
+    pb::Rate { rate: rate.rate, low: rate.low, high: rate.high }
+}

@@ -1,0 +1,85 @@
+//! Arrays on disk: safetensors.
+
+use std::collections::BTreeMap;
+
+use ndarray::{Array2, ArrayD};
+use safetensors::SafeTensors;
+use safetensors::tensor::{Dtype, TensorView};
+
+use super::Error;
+
+/// Tensors by name, to be written.
+#[derive(Default)]
+pub struct TensorWriter(BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>);
+
+impl TensorWriter {
+    pub fn f32(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = f32>) {
+        self.0.insert(name.to_owned(), (Dtype::F32, shape.to_vec(), values.flat_map(f32::to_le_bytes).collect()));
+    }
+
+    pub fn f64(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = f64>) {
+        self.0.insert(name.to_owned(), (Dtype::F64, shape.to_vec(), values.flat_map(f64::to_le_bytes).collect()));
+    }
+
+    pub fn i64(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = i64>) {
+        self.0.insert(name.to_owned(), (Dtype::I64, shape.to_vec(), values.flat_map(i64::to_le_bytes).collect()));
+    }
+
+    /// The file's bytes.
+    pub fn finish(self, file: &str) -> Result<Vec<u8>, Error> {
+        let damaged = |problem: String| Error::Damaged { file: file.to_owned(), problem };
+        let mut views = Vec::with_capacity(self.0.len());
+        for (name, (dtype, shape, bytes)) in &self.0 {
+            let view = TensorView::new(*dtype, shape.clone(), bytes).map_err(|error| damaged(error.to_string()))?;
+            views.push((name.clone(), view));
+        }
+        safetensors::serialize(views, None).map_err(|error| damaged(error.to_string()))
+    }
+}
+
+/// A safetensors file that was read.
+pub struct TensorReader<'a> {
+    file: &'a str,
+    tensors: SafeTensors<'a>,
+}
+
+impl<'a> TensorReader<'a> {
+    pub fn new(file: &'a str, bytes: &'a [u8]) -> Result<Self, Error> {
+        let tensors = SafeTensors::deserialize(bytes)
+            .map_err(|error| Error::Damaged { file: file.to_owned(), problem: error.to_string() })?;
+        Ok(Self { file, tensors })
+    }
+
+    pub fn has(&self, name: &str) -> bool {
+        self.tensors.tensor(name).is_ok()
+    }
+
+    pub fn f32(&self, name: &str) -> Result<Array2<f32>, Error> {
+        self.rows(name, Dtype::F32, f32::from_le_bytes)
+    }
+
+    pub fn f64(&self, name: &str) -> Result<Array2<f64>, Error> {
+        self.rows(name, Dtype::F64, f64::from_le_bytes)
+    }
+
+    pub fn i64(&self, name: &str) -> Result<Array2<i64>, Error> {
+        self.rows(name, Dtype::I64, i64::from_le_bytes)
+    }
+
+    /// A tensor as rows: a vector is one row, the last axes of a stack are laid end to end.
+    fn rows<T, const N: usize>(&self, name: &str, dtype: Dtype, read: fn([u8; N]) -> T) -> Result<Array2<T>, Error> {
+        let damaged = |problem: String| Error::Damaged { file: self.file.to_owned(), problem };
+        let tensor = self.tensors.tensor(name).map_err(|_| damaged(format!("has no tensor '{name}'")))?;
+        if tensor.dtype() != dtype {
+            return Err(damaged(format!("tensor '{name}' is {:?}, expected {dtype:?}", tensor.dtype())));
+        }
+        let values = tensor.data().as_chunks::<N>().0.iter().map(|bytes| read(*bytes)).collect();
+        let array = ArrayD::from_shape_vec(tensor.shape().to_vec(), values).map_err(|e| damaged(e.to_string()))?;
+        let shape = match tensor.shape() {
+            [] => (1, 1),
+            [columns] => (1, *columns),
+            [rows, rest @ ..] => (*rows, rest.iter().product()),
+        };
+        array.into_shape_with_order(shape).map_err(|error| damaged(error.to_string()))
+    }
+}
