@@ -21,6 +21,8 @@ pub mod localization; // from a feature to a pose, in one room or in all
 pub mod odometry; // from two features to the motion between them
 pub mod metrics; // M1 to M3: how much of SE(3) the features hold; M4 is training
 pub mod eval; // Hit@ε on held-out motions
+pub mod generalisation; // in rooms that were never seen
+pub mod theory; // the paper's theorems as numeric checks
 
 // Rim: one module per outside format.
 pub mod datasets; // recordings on disk to rooms

@@ -4,8 +4,8 @@ use nalgebra::Matrix6;
 use ndarray::{Array2, ArrayView2, s};
 
 use crate::adapter::{
-    self, Adapter, CorrectorKind, EpochProgress, MAX_CHARTS, PairPlan, Preset, Samples, TrainConfig, TrainingRecord,
-    train, train_corrector,
+    self, Adapter, CorrectorKind, EpochProgress, MAX_CHARTS, Mixing, PairPlan, Preset, Samples, TrainConfig,
+    TrainingRecord, train, train_corrector,
 };
 use crate::features::Features;
 use crate::geometry::{Pose, Twist, body_twist};
@@ -28,6 +28,8 @@ pub enum Error {
     UnlikeFeatures { features: String, first: RoomId, room: RoomId },
     #[error("room '{room}' was learned from: errors there are not those in rooms never seen; name others")]
     LearnedFrom { room: RoomId },
+    #[error("features cannot be z-scored for charts under a gate; mix them evenly, or take another preset")]
+    GatedStandardised,
     #[error("no room was given to learn from")]
     NoRoom,
     #[error("{what} must be {least} to {most}, got {given}")]
@@ -67,7 +69,11 @@ impl Recipe {
         Self { preset, split, stride, pairs, config, correctors: Vec::new() }
     }
 
-    fn check(&self) -> Result<(), Error> {
+    /// Refuses settings that are out of range.
+    ///
+    /// # Errors
+    /// [`Error::Setting`] or [`Error::Rate`].
+    pub fn check(&self) -> Result<(), Error> {
         let TrainConfig { epochs, batch, learning_rate, weight_decay, clip_norm, hidden, latent, charts, .. } =
             self.config;
         for (what, given, least, most) in [
@@ -82,6 +88,9 @@ impl Recipe {
             }
         }
         let (noise, average) = (self.config.noise, self.config.average);
+        if self.config.standardise && charts > 1 && self.config.mixing == Mixing::Gate {
+            return Err(Error::GatedStandardised);
+        }
         let positive = |value: f64| value.is_finite() && value > 0.0;
         for (what, bound, given, fits) in [
             ("the learning rate", "positive", learning_rate, positive(learning_rate)),

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 /// The longest source file.
 const LONGEST_FILE: usize = 400;
 /// Crates and modules that only some of ours may name: (what, who).
-const RESERVED: [(&str, &[&str]); 12] = [
+const RESERVED: [(&str, &[&str]); 13] = [
+    ("parquet", &["report"]),
     ("ort", &["encoder"]),
     ("tract_onnx", &["encoder"]),
     ("fast_image_resize", &["encoder"]),

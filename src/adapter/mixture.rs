@@ -170,8 +170,8 @@ impl<T: Real> Mixture<T> {
         Ok(())
     }
 
-    /// Makes weights that were learned on (z − mean)/deviation, each (1, d), weights for z. A gate's scores lose a term
-    /// that is the same for all features, so only charts without one are standardised exactly.
+    /// Makes charts that were learned on (z − mean)/deviation, each (1, d), charts for z. A gate has no bias that could
+    /// take the mean up: [`crate::training::Recipe::check`] refuses it.
     pub(super) fn fold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
         for chart in &mut self.charts {
             chart.phi.fold_standardisation(mean, deviation);

@@ -133,10 +133,6 @@ impl Evaluate {
 
     /// What is asked for, the adapter's own split and stride where nothing is.
     fn protocol(&self, record: &TrainingRecord) -> anyhow::Result<Protocol> {
-        let named = |name: &String| {
-            let unknown = || format!("--navigators: '{name}' is not one of {}", NavigatorKind::known_names());
-            NavigatorKind::from_name(name).with_context(unknown)
-        };
         Ok(Protocol {
             split: self.split.map_or(record.split, Into::into),
             stride: self.stride.unwrap_or(record.stride),
@@ -145,9 +141,18 @@ impl Evaluate {
             seed: self.seed,
             steps: self.steps,
             mode: self.mode.into(),
-            navigators: self.navigators.iter().map(named).collect::<Result<_, _>>()?,
+            navigators: navigators_named(&self.navigators)?,
         })
     }
+}
+
+/// Navigators by name.
+pub fn navigators_named(names: &[String]) -> anyhow::Result<Vec<NavigatorKind>> {
+    let named = |name: &String| {
+        let unknown = || format!("--navigators: '{name}' is not one of {}", NavigatorKind::known_names());
+        NavigatorKind::from_name(name).with_context(unknown)
+    };
+    names.iter().map(named).collect()
 }
 
 /// The adapter that was named, or the newest that fits the room, its features, the split and, if one does, the stride.

@@ -1,6 +1,7 @@
 //! The command line. One file a command; each reads its arguments, calls the library and prints.
 
 mod ask;
+mod cross_room;
 mod demo;
 mod encode;
 mod encoder;
@@ -16,6 +17,7 @@ mod rooms;
 mod serve;
 mod studio;
 mod sweep;
+mod theory;
 mod train;
 
 use clap::{Parser, Subcommand};
@@ -48,8 +50,12 @@ enum Command {
     Evaluate(evaluate::Evaluate),
     /// Measure how much of SE(3) features hold: M1 to M4
     Probe(probe::Probe),
+    /// Learn from some rooms, navigate in others: zero-shot, against Identity, by how many rooms were learned from
+    CrossRoom(cross_room::CrossRoom),
     /// Score many features at once
     Sweep(sweep::Sweep),
+    /// Check the paper's theorems numerically: measured against bound
+    Theory(theory::Theory),
     /// Answer over gRPC until told to stop
     Serve(serve::Serve),
     /// Ask a server for the frames that a motion leads to
@@ -79,7 +85,9 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Evaluate(arguments) => arguments.run().await,
         Command::Demo(arguments) => arguments.run().await,
         Command::Probe(arguments) => arguments.run().await,
+        Command::CrossRoom(arguments) => arguments.run().await,
         Command::Sweep(arguments) => arguments.run().await,
+        Command::Theory(arguments) => arguments.run(),
         Command::Serve(arguments) => arguments.run().await,
         Command::Navigate(arguments) => arguments.run().await,
         Command::Localize(arguments) => arguments.run().await,

@@ -35,6 +35,11 @@ impl Twist {
         self.to_vector().norm()
     }
 
+    /// This motion done `count` times: exp(ξ)ⁿ = exp(nξ).
+    pub fn times(self, count: usize) -> Self {
+        Self { linear: self.linear * count as f64, angular: self.angular * count as f64 }
+    }
+
     /// This motion cut into `parts` equal ones: exp(ξ/n)ⁿ = exp(ξ).
     pub fn divided(self, parts: u32) -> Self {
         let share = f64::from(parts).recip();

@@ -148,6 +148,6 @@ fn retrieval_json(scores: &RetrievalScores) -> Value {
     })
 }
 
-fn rate_json(rate: &Rate) -> Value {
+pub(super) fn rate_json(rate: &Rate) -> Value {
     json!({ "rate": rate.rate, "low": rate.low, "high": rate.high })
 }

@@ -1,17 +1,25 @@
 //! Results for people and for scripts: tables, JSON, pictures.
 
+mod adapter_sweep;
+mod columns;
+mod cross_room;
 mod json;
 mod layers;
 mod plot;
 mod probe;
 mod table;
+mod theory;
 mod trajectory;
 
+pub use adapter_sweep::{SweepRow, configurations_table, parts_table, success_table, sweep_parquet};
+pub use columns::{Column, parquet_file};
+pub use cross_room::{CrossRoomRun, cross_room_json, cross_room_table, rooms_table, scaling_table};
 pub use json::{evaluation_json, training_json};
 pub use layers::{LayerScores, layers_json, layers_table};
 pub use plot::{PathPlot, path_svg};
 pub use probe::{AtStride, ProbeScores, probe_table};
 pub use table::{evaluation_table, training_table};
+pub use theory::{theory_json, theory_table};
 pub use trajectory::{kitti_trajectory, tum_trajectory};
 
 use crate::adapter::TrainingRecord;

@@ -3,12 +3,12 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, bail};
-use clap::{Args, Subcommand};
+use clap::Args;
 use rayon::prelude::*;
 
-use super::progress::bar;
-use super::protocol::{PresetName, SplitName};
-use super::{check_writable, say, write_json};
+use super::super::progress::bar;
+use super::super::protocol::{PresetName, SplitName};
+use super::super::{check_writable, say, write_json};
 use crate::adapter::Preset;
 use crate::features::Features;
 use crate::metrics::{Duplicates, IntrinsicDimension, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
@@ -20,19 +20,7 @@ use crate::store::{Store, StoredRoom};
 use crate::training::{Lesson, Recipe, learn};
 
 #[derive(Debug, Args)]
-pub struct Sweep {
-    #[command(subcommand)]
-    over: Over,
-}
-
-#[derive(Debug, Subcommand)]
-enum Over {
-    /// M1 to M4 over the layers of a features set, the best by each
-    Layers(Layers),
-}
-
-#[derive(Debug, Args)]
-struct Layers {
+pub struct Layers {
     /// The store
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
@@ -77,15 +65,8 @@ struct Layers {
     json: Option<PathBuf>,
 }
 
-impl Sweep {
-    pub async fn run(self) -> anyhow::Result<()> {
-        let Over::Layers(layers) = self.over;
-        layers.run().await
-    }
-}
-
 impl Layers {
-    async fn run(self) -> anyhow::Result<()> {
+    pub async fn run(self) -> anyhow::Result<()> {
         if let Some(file) = &self.json {
             check_writable(file)?;
         }

@@ -1,0 +1,242 @@
+//! A sweep over adapters: a row a run, and what the paper's tables say of it.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::columns::{Column, parquet_file};
+use super::table::aligned;
+use crate::scores::{MotionScores, deviation, mean, mean_of_known};
+
+/// One run: what decided it, and what it reached. R² is null where it has no meaning or the run failed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SweepRow {
+    /// Names everything that decides the run's numbers.
+    pub key: String,
+    pub room: String,
+    pub room_revision: u64,
+    /// How the room was recorded, for instance `7scenes` or `studio corridor`.
+    pub format: String,
+    pub features: String,
+    pub preset: String,
+    pub split: String,
+    pub stride: u32,
+    pub geo_dim: usize,
+    pub charts: usize,
+    pub lr: f64,
+    pub loss: String,
+    pub epochs: usize,
+    pub batch: usize,
+    pub weight_decay: f64,
+    pub hidden: usize,
+    pub seed: u64,
+    /// Test pairs.
+    pub n: usize,
+    pub overall: Option<f64>,
+    pub translation: Option<f64>,
+    pub rotation: Option<f64>,
+    pub direction: Option<f64>,
+    pub magnitude: Option<f64>,
+    pub train_overall: Option<f64>,
+    pub seconds: f64,
+    /// Why the run has no scores; empty if it has.
+    pub failure: String,
+}
+
+impl SweepRow {
+    /// Takes scores over.
+    pub fn score(&mut self, test: &MotionScores, train: &MotionScores) {
+        let known = |value: f64| value.is_finite().then_some(value);
+        self.n = test.n;
+        self.overall = known(test.overall);
+        self.translation = known(test.translation);
+        self.rotation = known(test.rotation);
+        self.direction = known(test.direction);
+        self.magnitude = known(test.magnitude);
+        self.train_overall = known(train.overall);
+    }
+
+    /// All but room and seed: runs of one configuration.
+    fn configuration(&self) -> (usize, usize, String, String, String) {
+        (self.geo_dim, self.charts, self.lr.to_string(), self.loss.clone(), self.features.clone())
+    }
+}
+
+/// The rows as a Parquet file.
+///
+/// # Errors
+/// What the library says, in words.
+pub fn sweep_parquet(rows: &[SweepRow]) -> Result<Vec<u8>, String> {
+    let text = |of: fn(&SweepRow) -> &str| Column::Text(rows.iter().map(|row| of(row).to_owned()).collect());
+    let whole = |of: fn(&SweepRow) -> u64| Column::Whole(rows.iter().map(|row| of(row) as i64).collect());
+    let real = |of: fn(&SweepRow) -> f64| Column::Real(rows.iter().map(of).collect());
+    let known =
+        |of: fn(&SweepRow) -> Option<f64>| Column::Real(rows.iter().map(|row| of(row).unwrap_or(f64::NAN)).collect());
+    parquet_file(&[
+        ("key", text(|row| &row.key)),
+        ("room", text(|row| &row.room)),
+        ("room_revision", whole(|row| row.room_revision)),
+        ("format", text(|row| &row.format)),
+        ("features", text(|row| &row.features)),
+        ("preset", text(|row| &row.preset)),
+        ("split", text(|row| &row.split)),
+        ("stride", whole(|row| u64::from(row.stride))),
+        ("geo_dim", whole(|row| row.geo_dim as u64)),
+        ("charts", whole(|row| row.charts as u64)),
+        ("lr", real(|row| row.lr)),
+        ("loss", text(|row| &row.loss)),
+        ("epochs", whole(|row| row.epochs as u64)),
+        ("batch", whole(|row| row.batch as u64)),
+        ("weight_decay", real(|row| row.weight_decay)),
+        ("hidden", whole(|row| row.hidden as u64)),
+        ("seed", whole(|row| row.seed)),
+        ("n", whole(|row| row.n as u64)),
+        ("r2_overall", known(|row| row.overall)),
+        ("r2_translation", known(|row| row.translation)),
+        ("r2_rotation", known(|row| row.rotation)),
+        ("r2_direction", known(|row| row.direction)),
+        ("r2_magnitude", known(|row| row.magnitude)),
+        ("r2_train", known(|row| row.train_overall)),
+        ("seconds", real(|row| row.seconds)),
+        ("failure", text(|row| &row.failure)),
+    ])
+}
+
+/// Best R², and the share of runs above 0 and 0.3, by recording format and features: the paper's success table (sec. 2.7);
+/// of each room its best run, as "Max R²" and "% > 0" there are over rooms.
+pub fn success_table(rows: &[SweepRow]) -> String {
+    let mut groups: BTreeMap<(String, String), BTreeMap<String, f64>> = BTreeMap::new();
+    for row in rows {
+        let best = groups.entry((row.format.clone(), row.features.clone())).or_default();
+        let of_room = best.entry(row.room.clone()).or_insert(f64::NEG_INFINITY);
+        *of_room = of_room.max(row.overall.unwrap_or(f64::NEG_INFINITY));
+    }
+    let head = ["recorded as", "features", "rooms", "max R²", "% > 0", "% > 0.3"];
+    let mut lines = vec![head.map(str::to_owned).to_vec()];
+    for ((format, features), rooms) in groups {
+        let best: Vec<f64> = rooms.into_values().collect();
+        lines.push(vec![
+            format,
+            features,
+            best.len().to_string(),
+            format!("{:.3}", best.iter().copied().fold(f64::NEG_INFINITY, f64::max)),
+            percent(&best, 0.0),
+            percent(&best, 0.3),
+        ]);
+    }
+    aligned(&lines)
+}
+
+/// By part of the motion: best R², the share of runs above 0 and 0.5, and the deviation over seeds, averaged over
+/// configurations and rooms that have several: the paper's sweep table.
+pub fn parts_table(rows: &[SweepRow]) -> String {
+    type Part = fn(&SweepRow) -> Option<f64>;
+    let parts: [(&str, Part); 5] = [
+        ("overall", |row| row.overall),
+        ("rotation", |row| row.rotation),
+        ("translation", |row| row.translation),
+        ("direction", |row| row.direction),
+        ("magnitude", |row| row.magnitude),
+    ];
+    let head = ["part", "runs", "best R²", "% > 0", "% > 0.5", "sd over seeds", "mean R²"];
+    let mut lines = vec![head.map(str::to_owned).to_vec()];
+    for (name, part) in parts {
+        let values: Vec<f64> = rows.iter().filter_map(part).collect();
+        let mut by_configuration: BTreeMap<_, Vec<f64>> = BTreeMap::new();
+        for row in rows {
+            let seeds = by_configuration.entry((row.room.clone(), row.configuration())).or_default();
+            seeds.extend(part(row));
+        }
+        let spreads: Vec<f64> =
+            by_configuration.values().filter(|seeds| seeds.len() > 1).map(|seeds| deviation(seeds)).collect();
+        lines.push(vec![
+            name.to_owned(),
+            values.len().to_string(),
+            format!("{:.3}", values.iter().copied().fold(f64::NEG_INFINITY, f64::max)),
+            percent(&values, 0.0),
+            percent(&values, 0.5),
+            format!("{:.3}", mean_of_known(&spreads)),
+            format!("{:.3}", mean(&values)),
+        ]);
+    }
+    aligned(&lines)
+}
+
+/// The configurations by mean R² over rooms and seeds, the best first.
+pub fn configurations_table(rows: &[SweepRow], most: usize) -> String {
+    let mut by_configuration: BTreeMap<_, Vec<f64>> = BTreeMap::new();
+    for row in rows {
+        by_configuration.entry(row.configuration()).or_default().push(row.overall.unwrap_or(f64::NAN));
+    }
+    let mut ranked: Vec<_> = by_configuration.into_iter().collect();
+    ranked.sort_by(|a, b| mean_of_known(&b.1).total_cmp(&mean_of_known(&a.1)));
+    let head = ["features", "geo_dim", "K", "lr", "loss", "runs", "mean R²", "sd"];
+    let mut lines = vec![head.map(str::to_owned).to_vec()];
+    for ((geo_dim, charts, lr, loss, features), values) in ranked.into_iter().take(most) {
+        let (runs, middle) = (values.len().to_string(), format!("{:.3}", mean_of_known(&values)));
+        let spread = if values.len() > 1 { format!("{:.3}", deviation(&values)) } else { String::new() };
+        lines.push(vec![features, geo_dim.to_string(), charts.to_string(), lr, loss, runs, middle, spread]);
+    }
+    aligned(&lines)
+}
+
+fn percent(values: &[f64], above: f64) -> String {
+    let count = values.iter().filter(|&&value| value > above).count();
+    format!("{:.0}", 100.0 * count as f64 / values.len().max(1) as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(room: &str, seed: u64, overall: Option<f64>) -> SweepRow {
+        SweepRow {
+            key: format!("{room}{seed}"),
+            room: room.to_owned(),
+            room_revision: 1,
+            format: "tum".to_owned(),
+            features: "f".to_owned(),
+            preset: "paper-base".to_owned(),
+            split: "time".to_owned(),
+            stride: 40,
+            geo_dim: 20,
+            charts: 1,
+            lr: 1e-3,
+            loss: "mse".to_owned(),
+            epochs: 10,
+            batch: 512,
+            weight_decay: 1e-2,
+            hidden: 64,
+            seed,
+            n: 40,
+            overall,
+            translation: overall,
+            rotation: overall,
+            direction: None,
+            magnitude: overall,
+            train_overall: overall,
+            seconds: 0.1,
+            failure: String::new(),
+        }
+    }
+
+    /// Oracle: by hand. A room counts by its best run, a failed run by nothing.
+    #[test]
+    fn rooms_count_by_their_best_run() {
+        let rows = [row("a", 0, Some(-1.0)), row("a", 1, Some(0.4)), row("b", 0, Some(-0.5)), row("b", 1, None)];
+        let table = success_table(&rows);
+        let cells: Vec<&str> = table.lines().nth(1).unwrap().split_whitespace().collect();
+        assert_eq!(cells, ["tum", "f", "2", "0.400", "50", "50"]);
+        let parts = parts_table(&rows);
+        let cells: Vec<&str> = parts.lines().nth(1).unwrap().split_whitespace().collect();
+        // The seeds of room a deviate by 1.4/√2; room b has one that counts.
+        assert_eq!(cells, ["overall", "3", "0.400", "33", "0", "0.990", "-0.367"]);
+    }
+
+    /// Oracle: the format's magic at both ends; tests/cli.rs has another program read a file.
+    #[test]
+    fn rows_become_a_parquet_file() {
+        let file = sweep_parquet(&[row("a", 0, Some(0.5)), row("b", 0, None)]).unwrap();
+        assert!(file.starts_with(b"PAR1") && file.ends_with(b"PAR1"));
+    }
+}

@@ -1,0 +1,126 @@
+//! Maps from poses to features, f: SE(3) → R^d.
+
+use nalgebra::{DMatrix, DVector, Vector6};
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+
+use crate::geometry::{Pose, Twist, exp};
+use crate::studio::{Camera, Scene, SuiteRoom, render};
+
+/// Step of the differences that derivatives of constructed maps are taken by.
+const STEP: f64 = 1e-4;
+/// Step for drawn maps: far over what a pixel's rounding can do, metres and radians.
+const DRAWN_STEP: f64 = 0.02;
+
+/// A map from a pose, `world_from_camera`, to a feature of shape (d,).
+pub trait FeatureMap: Sync {
+    /// f(g).
+    fn feature(&self, pose: &Pose) -> DVector<f64>;
+
+    /// The step that derivatives are taken by.
+    fn step(&self) -> f64;
+
+    /// J(g), shape (d, 6): the derivative of f(g exp(ξ)) by ξ = (v, ω) at 0, by central differences.
+    fn jacobian(&self, pose: &Pose) -> DMatrix<f64> {
+        let h = self.step();
+        let columns: Vec<DVector<f64>> = (0..6)
+            .map(|component| {
+                let mut xi = Vector6::zeros();
+                xi[component] = h;
+                let moved = |xi: Vector6<f64>| self.feature(&(pose * exp(&Twist::from_vector(&xi))));
+                (moved(xi) - moved(-xi)) / (2.0 * h)
+            })
+            .collect();
+        DMatrix::from_columns(&columns)
+    }
+}
+
+/// Sines of random mixtures of position and rotation: smooth, of rank 6 everywhere that was looked at.
+#[derive(Debug, Clone)]
+pub struct ConstructedMap {
+    weights: DMatrix<f64>,
+    phases: DVector<f64>,
+}
+
+impl ConstructedMap {
+    /// A map to `dim` numbers that depends on the first `coordinates` of x, y, z and the nine entries of R.
+    pub fn new(dim: usize, coordinates: usize, random: &mut ChaCha8Rng) -> Self {
+        let weights = DMatrix::from_fn(dim, 12, |_, column| match column < coordinates {
+            true => random.random_range(-0.8..0.8),
+            false => 0.0,
+        });
+        Self { weights, phases: DVector::from_fn(dim, |_, _| random.random_range(0.0..std::f64::consts::TAU)) }
+    }
+}
+
+impl FeatureMap for ConstructedMap {
+    fn feature(&self, pose: &Pose) -> DVector<f64> {
+        let rotation = pose.rotation.to_rotation_matrix();
+        let numbers = DVector::from_iterator(
+            12,
+            pose.translation.vector.iter().copied().chain(rotation.matrix().iter().copied()),
+        );
+        (&self.weights * numbers + &self.phases).map(f64::sin)
+    }
+
+    fn step(&self) -> f64 {
+        STEP
+    }
+}
+
+/// A studio room, seen: the mean colour of each of 8×6 patches, 144 numbers from 0 to 1.
+pub struct DrawnMap {
+    scene: Scene,
+    camera: Camera,
+}
+
+impl DrawnMap {
+    /// A room of a suite, and a pose in its middle that looks along it.
+    pub fn new(seed: u64, number: u32) -> (Self, Pose) {
+        let room = SuiteRoom::new(seed, number);
+        let path = room.path(101);
+        (Self { scene: room.scene, camera: Camera::sized(160, 120) }, path[50])
+    }
+}
+
+/// Patches across and down.
+const PATCHES: (usize, usize) = (8, 6);
+
+impl FeatureMap for DrawnMap {
+    fn feature(&self, pose: &Pose) -> DVector<f64> {
+        let image = render(&self.scene, self.camera, pose);
+        let (across, down) = (image.width / PATCHES.0, image.height / PATCHES.1);
+        let mut feature = DVector::zeros(PATCHES.0 * PATCHES.1 * 3);
+        for y in 0..image.height {
+            for x in 0..image.width {
+                let patch = (y / down) * PATCHES.0 + x / across;
+                for (channel, &value) in image.pixel(x, y).iter().enumerate() {
+                    feature[patch * 3 + channel] += f64::from(value);
+                }
+            }
+        }
+        feature / (255.0 * (across * down) as f64)
+    }
+
+    fn step(&self) -> f64 {
+        DRAWN_STEP
+    }
+}
+
+/// A twist of a length, in a direction drawn evenly.
+pub(super) fn twist_of_length(length: f64, random: &mut ChaCha8Rng) -> Twist {
+    loop {
+        let direction = Vector6::from_fn(|_, _| random.random_range(-1.0..1.0));
+        let norm: f64 = direction.norm();
+        if (1e-3..=1.0).contains(&norm) {
+            return Twist::from_vector(&(direction * (length / norm)));
+        }
+    }
+}
+
+/// A pose at most `radius` away from another, in the length of a twist.
+pub(super) fn pose_near(centre: &Pose, radius: f64, random: &mut ChaCha8Rng) -> Pose {
+    // The sixth root makes the ball evenly full.
+    let length = radius * random.random_range(0.0f64..1.0).powf(1.0 / 6.0);
+    centre * exp(&twist_of_length(length, random))
+}
