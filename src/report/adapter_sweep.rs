@@ -17,6 +17,7 @@ pub struct SweepRow {
     pub room_revision: u64,
     /// How the room was recorded, for instance `7scenes` or `studio corridor`.
     pub format: String,
+    pub frames: usize,
     pub features: String,
     pub preset: String,
     pub split: String,
@@ -77,6 +78,7 @@ pub fn sweep_parquet(rows: &[SweepRow]) -> Result<Vec<u8>, String> {
         ("room", text(|row| &row.room)),
         ("room_revision", whole(|row| row.room_revision)),
         ("format", text(|row| &row.format)),
+        ("frames", whole(|row| row.frames as u64)),
         ("features", text(|row| &row.features)),
         ("preset", text(|row| &row.preset)),
         ("split", text(|row| &row.split)),
@@ -122,6 +124,33 @@ pub fn success_table(rows: &[SweepRow]) -> String {
             format!("{:.3}", best.iter().copied().fold(f64::NEG_INFINITY, f64::max)),
             percent(&best, 0.0),
             percent(&best, 0.3),
+        ]);
+    }
+    aligned(&lines)
+}
+
+/// By recording format, over all features: frames and test pairs a room, the share of rooms whose best run is above 0,
+/// the best run: the paper's difficulty table (sec. 2.7).
+pub fn difficulty_table(rows: &[SweepRow]) -> String {
+    let mut groups: BTreeMap<&str, BTreeMap<&str, (usize, usize, f64)>> = BTreeMap::new();
+    for row in rows {
+        let rooms = groups.entry(&row.format).or_default();
+        let (_, pairs, best) = rooms.entry(&row.room).or_insert((row.frames, 0, f64::NEG_INFINITY));
+        *pairs = row.n.max(*pairs);
+        *best = best.max(row.overall.unwrap_or(f64::NEG_INFINITY));
+    }
+    let head = ["recorded as", "rooms", "frames", "test pairs", "% > 0", "best R²"];
+    let mut lines = vec![head.map(str::to_owned).to_vec()];
+    for (format, rooms) in groups {
+        let column = |of: fn(&(usize, usize, f64)) -> f64| rooms.values().map(of).collect::<Vec<_>>();
+        let best = column(|room| room.2);
+        lines.push(vec![
+            format.to_owned(),
+            rooms.len().to_string(),
+            format!("{:.0}", mean(&column(|room| room.0 as f64))),
+            format!("{:.0}", mean(&column(|room| room.1 as f64))),
+            percent(&best, 0.0),
+            format!("{:.3}", best.iter().copied().fold(f64::NEG_INFINITY, f64::max)),
         ]);
     }
     aligned(&lines)
@@ -195,6 +224,7 @@ mod tests {
             room: room.to_owned(),
             room_revision: 1,
             format: "tum".to_owned(),
+            frames: 200,
             features: "f".to_owned(),
             preset: "paper-base".to_owned(),
             split: "time".to_owned(),
@@ -227,6 +257,9 @@ mod tests {
         let table = success_table(&rows);
         let cells: Vec<&str> = table.lines().nth(1).unwrap().split_whitespace().collect();
         assert_eq!(cells, ["tum", "f", "2", "0.400", "50", "50"]);
+        let difficulty = difficulty_table(&rows);
+        let cells: Vec<&str> = difficulty.lines().nth(1).unwrap().split_whitespace().collect();
+        assert_eq!(cells, ["tum", "2", "200", "40", "50", "0.400"]);
         let parts = parts_table(&rows);
         let cells: Vec<&str> = parts.lines().nth(1).unwrap().split_whitespace().collect();
         // The seeds of room a deviate by 1.4/√2; room b has one that counts.

@@ -24,8 +24,14 @@ pub struct LayerScores {
     pub m2_dropped: usize,
     /// Test R² of the ridge.
     pub m3_r2: f64,
+    /// What made the features, for instance `dinov2@SHA`.
+    pub encoder: String,
     /// Mean test R² of the adapters.
     pub m4_r2: f64,
+    /// The same over the components of v.
+    pub m4_translation: f64,
+    /// The same over the components of ω.
+    pub m4_rotation: f64,
     /// Its sample deviation over seeds; NaN for one seed.
     pub m4_deviation: f64,
     /// Test R² by seed.
@@ -74,6 +80,41 @@ pub fn layers_table(scores: &[LayerScores]) -> String {
     aligned(&lines)
 }
 
+/// A line an encoder, by its layer of the highest mean test R² of the adapters: what becomes of checkpoints of one encoder.
+/// The shape of the paper's ablation table (sec. 2.7).
+pub fn encoders_table(scores: &[LayerScores]) -> String {
+    type Layer<'a> = (&'a str, Vec<&'a LayerScores>);
+    let mut by_encoder: Vec<(&str, Vec<Layer<'_>>)> = Vec::new();
+    for score in scores {
+        let at = match by_encoder.iter().position(|(encoder, _)| *encoder == score.encoder) {
+            Some(at) => at,
+            None => {
+                by_encoder.push((&score.encoder, Vec::new()));
+                by_encoder.len() - 1
+            }
+        };
+        let layers = &mut by_encoder[at].1;
+        match layers.iter_mut().find(|(features, _)| *features == score.features) {
+            Some((_, rooms)) => rooms.push(score),
+            None => layers.push((&score.features, vec![score])),
+        }
+    }
+    let over = |rooms: &[&LayerScores], of: fn(&LayerScores) -> f64| {
+        mean(&rooms.iter().map(|score| of(score)).collect::<Vec<_>>())
+    };
+    let head = ["encoder", "best layer", "M1", "overall", "transl.", "rotation", "sd"];
+    let mut lines = vec![head.map(str::to_owned).to_vec()];
+    for (encoder, layers) in &by_encoder {
+        let best = layers.iter().max_by(|a, b| over(&a.1, |s| s.m4_r2).total_cmp(&over(&b.1, |s| s.m4_r2)));
+        let Some((features, rooms)) = best else { continue };
+        let figures: [fn(&LayerScores) -> f64; 5] =
+            [|s| s.m1, |s| s.m4_r2, |s| s.m4_translation, |s| s.m4_rotation, |s| s.m4_deviation];
+        let cells = figures.map(|of| format!("{:.3}", over(rooms, of)));
+        lines.push([(*encoder).to_owned(), (*features).to_owned()].into_iter().chain(cells).collect());
+    }
+    aligned(&lines)
+}
+
 /// One entry a layer and room.
 pub fn layers_json(scores: &[LayerScores]) -> Value {
     let entry = |score: &LayerScores| {
@@ -84,7 +125,8 @@ pub fn layers_json(scores: &[LayerScores]) -> Value {
             "m1": { "value": score.m1 },
             "m2": { "twonn": score.m2_two_nn, "mle": score.m2_mle, "dropped_rows": score.m2_dropped },
             "m3": { "r2": score.m3_r2 },
-            "m4": { "r2": score.m4_r2, "deviation": score.m4_deviation, "runs": score.m4_runs },
+            "encoder": score.encoder,
+            "m4": { "r2": score.m4_r2, "translation": score.m4_translation, "rotation": score.m4_rotation, "deviation": score.m4_deviation, "runs": score.m4_runs },
         })
     };
     json!({ "layers": scores.iter().map(entry).collect::<Vec<_>>() })
@@ -106,7 +148,10 @@ mod tests {
             m2_mle: dimension,
             m2_dropped: 0,
             m3_r2: r2,
+            encoder: "e".to_owned(),
             m4_r2: r2,
+            m4_translation: r2,
+            m4_rotation: r2,
             m4_deviation: 0.1,
             m4_runs: vec![r2],
         };

@@ -3,6 +3,7 @@
 mod adapter_sweep;
 mod columns;
 mod cross_room;
+mod formulations;
 mod json;
 mod layers;
 mod plot;
@@ -11,11 +12,12 @@ mod table;
 mod theory;
 mod trajectory;
 
-pub use adapter_sweep::{SweepRow, configurations_table, parts_table, success_table, sweep_parquet};
+pub use adapter_sweep::{SweepRow, configurations_table, difficulty_table, parts_table, success_table, sweep_parquet};
 pub use columns::{Column, parquet_file};
 pub use cross_room::{CrossRoomRun, cross_room_json, cross_room_table, rooms_table, scaling_table};
+pub use formulations::{FormulationScores, formulations_json, formulations_table};
 pub use json::{evaluation_json, training_json};
-pub use layers::{LayerScores, layers_json, layers_table};
+pub use layers::{LayerScores, encoders_table, layers_json, layers_table};
 pub use plot::{PathPlot, path_svg};
 pub use probe::{AtStride, ProbeScores, probe_table};
 pub use table::{evaluation_table, training_table};

@@ -16,7 +16,7 @@ use super::journal::{self, Journal};
 use crate::adapter::{Loss, TrainConfig};
 use crate::features::Features;
 use crate::generalisation::nested_choice;
-use crate::report::{SweepRow, configurations_table, parts_table, success_table, sweep_parquet};
+use crate::report::{SweepRow, configurations_table, difficulty_table, parts_table, success_table, sweep_parquet};
 use crate::store::{Store, StoredRoom};
 use crate::training::{Recipe, learn};
 
@@ -107,6 +107,8 @@ impl Adapters {
         let file = self.out.join("runs.parquet");
         write_file(&file, &sweep_parquet(&rows).map_err(anyhow::Error::msg)?)?;
         say(success_table(&rows).trim_end());
+        say("\nhow hard the rooms are:");
+        say(difficulty_table(&rows).trim_end());
         say(format_args!("\nby part of the motion, over {} runs:", rows.len()));
         say(parts_table(&rows).trim_end());
         say("\nthe best configurations by mean R²:");
@@ -182,6 +184,7 @@ fn row((stored, features): &(StoredRoom, Features), recipe: &Recipe) -> SweepRow
         room: stored.room.id().to_string(),
         room_revision: stored.revision,
         format: stored.room.provenance().format.clone(),
+        frames: stored.room.frame_count(),
         features: features.source().name.clone(),
         preset: recipe.preset.name().to_owned(),
         split: recipe.split.name().to_owned(),

@@ -13,7 +13,7 @@ use crate::adapter::Preset;
 use crate::features::Features;
 use crate::metrics::{Duplicates, IntrinsicDimension, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
 use crate::pairs::Split;
-use crate::report::{LayerScores, layers_json, layers_table};
+use crate::report::{LayerScores, encoders_table, layers_json, layers_table};
 use crate::room::Room;
 use crate::scores::{MotionScores, deviation, mean};
 use crate::store::{Store, StoredRoom};
@@ -60,6 +60,9 @@ pub struct Layers {
     /// Frames to each side that are no neighbours, in M2; 0 is the paper's, which measures the path rather than the room
     #[arg(long, default_value_t = 10)]
     m2_gap: usize,
+    /// Also a line an encoder, by its best layer: for checkpoints of one encoder
+    #[arg(long)]
+    by_encoder: bool,
     /// Write all of it here as JSON
     #[arg(long)]
     json: Option<PathBuf>,
@@ -111,6 +114,9 @@ impl Layers {
             self.seeds
         ));
         say(layers_table(&scores).trim_end());
+        if self.by_encoder {
+            say(encoders_table(&scores).trim_end());
+        }
         say("* the best: M1 highest, M2 nearest to 6 (SE(3)), M3 and M4 highest; means over rooms");
         if let Some(file) = &self.json {
             write_json(file, &layers_json(&scores))?;
@@ -164,10 +170,12 @@ impl Layers {
         let m1 = mutual_knn(rows, room.poses(), &knn)?;
         let m2: IntrinsicDimension = intrinsic_dimension(rows, self.m2_gap, Duplicates::DropRows)?;
         let m3: MotionScores = ridge_probe(rows, room, self.split.into(), self.stride)?;
-        let runs: Vec<f64> = (0..self.seeds)
+        let adapters: Vec<MotionScores> = (0..self.seeds)
             .into_par_iter()
-            .map(|seed| self.adapter_r2(stored, features, seed))
+            .map(|seed| self.adapter(stored, features, seed))
             .collect::<anyhow::Result<_>>()?;
+        let runs: Vec<f64> = adapters.iter().map(|scores| scores.overall).collect();
+        let adapters = MotionScores::mean(&adapters);
         Ok(LayerScores {
             features: features.source().name.clone(),
             room: room_name(room),
@@ -177,17 +185,20 @@ impl Layers {
             m2_mle: m2.mle_biased.harmonic,
             m2_dropped: m2.dropped,
             m3_r2: m3.overall,
+            encoder: features.source().encoder.clone(),
             m4_r2: mean(&runs),
+            m4_translation: adapters.translation,
+            m4_rotation: adapters.rotation,
             m4_deviation: deviation(&runs),
             m4_runs: runs,
         })
     }
 
-    fn adapter_r2(&self, stored: &StoredRoom, features: &Features, seed: u64) -> anyhow::Result<f64> {
+    fn adapter(&self, stored: &StoredRoom, features: &Features, seed: u64) -> anyhow::Result<MotionScores> {
         let mut recipe = Recipe::of(self.preset.into(), self.split.into(), self.stride, seed);
         recipe.config.epochs = self.epochs.unwrap_or(recipe.config.epochs);
         let lesson = Lesson { room: &stored.room, revision: stored.revision, features };
-        Ok(learn(&[lesson], &recipe, &mut |_| ())?.1.test.overall)
+        Ok(learn(&[lesson], &recipe, &mut |_| ())?.1.test)
     }
 }
 

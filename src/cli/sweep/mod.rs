@@ -1,6 +1,7 @@
 //! `seese3 sweep`: many at once, over layers or over adapters.
 
 mod adapters;
+mod formulations;
 mod journal;
 mod layers;
 
@@ -18,6 +19,8 @@ enum Over {
     Layers(layers::Layers),
     /// Adapters over latent sizes, charts, learning rates, losses and seeds: resumable, in shards, a row a run
     Adapters(adapters::Adapters),
+    /// The adapter beside the paper's alternatives A to D
+    Formulations(formulations::Formulations),
 }
 
 impl Sweep {
@@ -25,6 +28,7 @@ impl Sweep {
         match self.over {
             Over::Layers(layers) => layers.run().await,
             Over::Adapters(adapters) => adapters.run().await,
+            Over::Formulations(formulations) => formulations.run().await,
         }
     }
 }
