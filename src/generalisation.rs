@@ -185,6 +185,30 @@ mod tests {
         assert!((found.mean - 0.1).abs() < 1e-12 && (found.high - found.low).abs() < 1e-12, "{found:?}");
     }
 
+    /// Oracle: by hand: of three rooms one is won, one lost, one tied, and a tie is no win.
+    #[test]
+    fn a_win_is_strictly_more_hits_than_identity() {
+        let retrieval = |hits: usize| crate::eval::RetrievalScores {
+            top1: Rate::of(0, 10),
+            hits: vec![(0.1, Rate::of(hits, 10))],
+            twist_error_mean: 0.0,
+            twist_error_median: 0.0,
+            translation_m_median: 0.0,
+            rotation_rad_median: 0.0,
+            pose_recalls: Vec::new(),
+        };
+        let row = |name: &str, hits| Row { name: name.to_owned(), n: 10, latent: None, retrieval: retrieval(hits) };
+        let outcome = |ours, identity| RoomOutcome {
+            room: RoomId::new("r").unwrap(),
+            motion: MotionScores::of(&[], &[]),
+            rows: vec![row("identity", identity), row("ours", ours)],
+            candidate_count: 10,
+        };
+        let won = wins(&[outcome(5, 4), outcome(3, 4), outcome(4, 4)], "ours").unwrap();
+        assert_eq!((won.successes(), won.n), (1, 3));
+        assert!(wins(&[outcome(5, 4)], "theirs").is_none());
+    }
+
     /// Oracle: by hand.
     #[test]
     fn r2_of_rooms_is_clipped_and_counted() {

@@ -117,7 +117,9 @@ impl Split {
         let mut pool: Vec<(usize, Pair)> = Vec::new();
         for (room, timeline) in timelines.iter().enumerate() {
             let before = pool.len();
-            let pairs = (low..=high).filter_map(|stride| self.train_pairs(timeline, stride).ok()).flatten();
+            let longest = u32::try_from(timeline.frame_count).unwrap_or(u32::MAX);
+            let pairs =
+                (low..=high.min(longest)).filter_map(|stride| self.train_pairs(timeline, stride).ok()).flatten();
             pool.extend(pairs.map(|pair| (room, pair)));
             if pool.len() == before {
                 let frame_count = timeline.frame_count;

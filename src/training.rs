@@ -28,8 +28,10 @@ pub enum Error {
     UnlikeFeatures { features: String, first: RoomId, room: RoomId },
     #[error("room '{room}' was learned from: errors there are not those in rooms never seen; name others")]
     LearnedFrom { room: RoomId },
-    #[error("features cannot be z-scored for charts under a gate; mix them evenly, or take another preset")]
-    GatedStandardised,
+    #[error(
+        "alternatives are compared with one chart, mean squared error and features as they are; take a paper preset"
+    )]
+    NotPlain,
     #[error("no room was given to learn from")]
     NoRoom,
     #[error("{what} must be {least} to {most}, got {given}")]
@@ -58,7 +60,8 @@ pub struct Recipe {
     pub pairs: PairPlan,
     /// The optimiser's settings and the seed of weights, order and drawn pairs.
     pub config: TrainConfig,
-    /// Trained after the adapter, for [`CORRECTOR_EPOCHS`] epochs and otherwise by the same settings.
+    /// Trained after the adapter for [`CORRECTOR_EPOCHS`] epochs, by mean squared error on its latents, with the same rate,
+    /// decay, batch and seed.
     pub correctors: Vec<CorrectorKind>,
 }
 
@@ -72,7 +75,7 @@ impl Recipe {
     /// Refuses settings that are out of range.
     ///
     /// # Errors
-    /// [`Error::Setting`] or [`Error::Rate`].
+    /// [`Error::Setting`], [`Error::Rate`] or [`Error::Adapter`].
     pub fn check(&self) -> Result<(), Error> {
         let TrainConfig { epochs, batch, learning_rate, weight_decay, clip_norm, hidden, latent, charts, .. } =
             self.config;
@@ -87,9 +90,13 @@ impl Recipe {
                 return Err(Error::Setting { what, least, most, given });
             }
         }
+        let twice = |(at, kind): (usize, &CorrectorKind)| self.correctors[..at].contains(kind);
+        if let Some((_, kind)) = self.correctors.iter().enumerate().find(|&given| twice(given)) {
+            return Err(Error::Adapter(adapter::Error::CorrectorTwice { name: kind.name() }));
+        }
         let (noise, average) = (self.config.noise, self.config.average);
         if self.config.standardise && charts > 1 && self.config.mixing == Mixing::Gate {
-            return Err(Error::GatedStandardised);
+            return Err(Error::Adapter(adapter::Error::GatedStandardised));
         }
         let positive = |value: f64| value.is_finite() && value > 0.0;
         for (what, bound, given, fits) in [
@@ -190,11 +197,12 @@ pub fn samples(lessons: &[Lesson<'_>], recipe: &Recipe) -> Result<Samples<f32>, 
     Ok(if recipe.config.through_zero { samples.through_zero()? } else { samples })
 }
 
-/// The covariance of an adapter's errors, Σ = mean r rᵀ with r = ΔP − σ⊙W(g₂ − g₁), on (v, ω), over all pairs of rooms that
-/// it did not learn from, at the strides of a recipe: the one it was trained on, or every fifth of a range.
+/// The second moment of an adapter's errors, Σ = mean r rᵀ with r = ΔP − σ⊙W(g₂ − g₁), on (v, ω), over all pairs of rooms
+/// that it did not learn from, at the strides it was trained on: the one, or of a range every fifth from the lowest on
+/// and the highest.
 ///
 /// # Errors
-/// [`Error`], when a room was learned from, or no pair is left.
+/// [`Error`], when a room was learned from, or has no pair.
 pub fn error_covariance(
     adapter: &Adapter,
     record: &TrainingRecord,
@@ -203,17 +211,29 @@ pub fn error_covariance(
     check_lessons(lessons)?;
     let strides: Vec<u32> = match &record.pairs {
         PairPlan::Stride(stride) => vec![*stride],
-        PairPlan::Range(range) => (range.low..=range.high).filter(|stride| stride % 5 == 0).collect(),
+        PairPlan::Range(range) => {
+            let mut strides: Vec<u32> = (range.low..=range.high).step_by(5).collect();
+            strides.extend((strides.last() != Some(&range.high)).then_some(range.high));
+            strides
+        }
     };
     let (mut sum, mut count) = (Matrix6::zeros(), 0usize);
     for lesson in lessons {
-        if record.rooms.iter().any(|(room, _)| room == lesson.room.id()) {
-            return Err(Error::LearnedFrom { room: lesson.room.id().clone() });
-        }
+        check_unseen(lesson, record.rooms.iter().map(|(room, _)| room))?;
         adapter.check_source(lesson.features.source())?;
         let latents = adapter.embed(lesson.features.rows())?;
         let mean = adapter.scale().mean;
-        for pair in strides.iter().filter_map(|&s| Split::Whole.train_pairs(lesson.room.timeline(), s).ok()).flatten() {
+        let pairs: Vec<Pair> = strides
+            .iter()
+            .filter_map(|&s| Split::Whole.train_pairs(lesson.room.timeline(), s).ok())
+            .flatten()
+            .collect();
+        if pairs.is_empty() {
+            let (frame_count, stride, split) = (lesson.room.frame_count(), strides[0], Split::Whole);
+            let problem = pairs::Error::NoPairs { frame_count, stride, split, side: "calibration" };
+            return Err(Error::RoomPairs { room: lesson.room.id().clone(), problem });
+        }
+        for pair in pairs {
             let [from, to] = [pair.source.row(), pair.target.row()];
             let seen = adapter.motion(latents.row(from), latents.row(to)).to_vector() - mean;
             let truth = body_twist(&lesson.room.poses()[from], &lesson.room.poses()[to]).to_vector();
@@ -226,6 +246,14 @@ pub fn error_covariance(
         return Err(Error::Adapter(adapter::Error::NoPairs));
     }
     Ok(sum / count as f64)
+}
+
+/// Refuses a room that was learned from.
+pub fn check_unseen<'a>(lesson: &Lesson<'_>, learned: impl IntoIterator<Item = &'a RoomId>) -> Result<(), Error> {
+    match learned.into_iter().any(|room| room == lesson.room.id()) {
+        true => Err(Error::LearnedFrom { room: lesson.room.id().clone() }),
+        false => Ok(()),
+    }
 }
 
 /// The test pairs of each room; none under [`Split::Whole`], which sets none apart.

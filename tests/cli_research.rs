@@ -87,8 +87,8 @@ fn probe_writes_the_oracles_figures() {
     refuses(&["probe", "--store", &store, "--room", "nothing*"], &["nothing*"]);
 }
 
-/// Oracle: the definitions. What is held out is not learned from, Identity is no better than itself, the calibrated
-/// navigator is there when rooms are kept aside, and the table tells rooms by name.
+/// Oracle: the definitions. What is held out is not learned from, the calibrated navigator is there when rooms are kept
+/// aside, and what cannot be answered is refused before anything is trained.
 #[test]
 fn cross_room_compares_with_identity_room_by_room() {
     let folder = tempfile::tempdir().unwrap();
@@ -103,7 +103,21 @@ fn cross_room_compares_with_identity_room_by_room() {
     assert_eq!(run["rooms"][0]["motion"]["n"], 360);
     assert_eq!(run["rooms"][0]["candidates"], 400);
     refuses(&["cross-room", "--store", &store, "--train", "a", "--test", "*"], &["both learned from and held out"]);
-    refuses(&[&fixed[..], &["--aside", "1"]].concat(), &["--sizes"]);
+    refuses(&[&fixed[..], &["--aside", "1"]].concat(), &["--aside"]);
+    for navigator in ["corrector-linear", "inverse-poincare-homogeneous+calibrated", "ridge-refit"] {
+        refuses(&[&fixed[..], &["--navigators", navigator]].concat(), &["--navigators"]);
+    }
+    refuses(&[&fixed[..], &["--threshold", "nan"]].concat(), &["threshold"]);
+    let poses = golden().join("rooms/synthetic/poses.npy");
+    let features = format!("fourier={}", text(&golden().join("rooms/synthetic/features.npy")));
+    succeeds(&["import", "numpy", "--room", "c", "--poses", text(&poses), "--features", &features, "--store", &store]);
+    let aside = succeeds(&[&fixed[..], &["--train", "c", "--aside", "1", "--json", text(&file)]].concat());
+    assert!(aside.contains("inverse-poincare-homogeneous+calibrated"), "{aside}");
+    let run = json(&file)["runs"][0].clone();
+    assert_eq!(
+        (run["learned_rooms"].as_array().unwrap().len(), run["calibration_rooms"].as_array().unwrap().len()),
+        (1, 1)
+    );
     refuses(&[&fixed[..], &["--baseline", "best"]].concat(), &["--baseline", "best"]);
 }
 
@@ -153,6 +167,13 @@ fn a_cut_or_sharded_sweep_gives_the_same_rows() {
     let parquet = std::fs::read(shards.join("runs.parquet")).unwrap();
     assert!(parquet.starts_with(b"PAR1") && parquet.ends_with(b"PAR1"));
     refuses(&sweep(&store, text(&shards), "4/3"), &["--shard", "4/3"]);
+    refuses(&[&sweep(&store, text(&shards), "1/1")[..], &["--lr", "0.1"]].concat(), &["--lr", "--lrs"]);
+    refuses(&[&sweep(&store, text(&shards), "1/1")[..], &["--split", "whole"]].concat(), &["--split whole"]);
+    // Another protocol in the same folder is another table.
+    let other = [&sweep(&store, text(&shards), "1/1")[..], &["--split", "pairs"]].concat();
+    let printed = succeeds(&other);
+    assert!(printed.contains("16 of them to be done here") && printed.contains("split pairs"), "{printed}");
+    assert!(printed.contains("over 16 runs") && printed.contains("(32 rows"), "{printed}");
     std::fs::write(cut.join(journal), "{}\n").unwrap();
     refuses(&sweep(&store, text(&cut), "1/1"), &["shard-1-of-1.runs.jsonl", "line 1"]);
 }
@@ -199,6 +220,9 @@ fn what_is_trained_is_evaluated() {
     let printed = succeeds(&[&evaluate[..], &chosen].concat());
     assert!(printed.contains("corrector-mlp-2+whitened") && !printed.contains("ridge-refit"), "{printed}");
     refuses(&[&evaluate[..], &["--navigators", "best"]].concat(), &["--navigators", "best", "ridge-refit"]);
+    refuses(&[&evaluate[..], &["--split", "whole", "--navigators", "ridge-refit"]].concat(), &["in-sample"]);
+    let printed = succeeds(&["evaluate", "--store", &store, "--room", "b", "--adapter", "all"]);
+    assert!(printed.contains("LEAK") && printed.contains("errors were measured in this room"), "{printed}");
     refuses(&[&fixed[..], &["--calibrate-on", "a"]].concat(), &["'a'", "learned from"]);
     refuses(&[&fixed[..], &["--charts", "0"]].concat(), &["charts"]);
     refuses(&[&fixed[..], &["--geo-dim", "5"]].concat(), &["geo_dim", "5"]);

@@ -8,7 +8,7 @@ use ndarray::{Array1, Array2, ArrayView1, Axis, concatenate, s};
 
 use super::phi::Widths;
 use super::seeded::Seeded;
-use super::{At, Error, Network, Objective, Real, Samples, Siamese, TENSOR_NAMES};
+use super::{At, Error, MAX_CHARTS, Network, Objective, Real, Samples, Siamese, TENSOR_NAMES};
 
 /// Columns of a prototype, r: the paper does not say.
 pub const ROUTE_DIM: usize = 16;
@@ -119,19 +119,22 @@ impl<T: Real> Mixture<T> {
     /// `experts.0.phi.0.weight`, …, `route.weight`, `prototypes`, `log_tau`.
     ///
     /// # Errors
-    /// As `tensor`, or [`Error::WeightShape`] when they do not fit one another.
+    /// As `tensor`, [`Error::Charts`], or [`Error::WeightShape`] when they do not fit one another.
     pub fn from_tensors<E: From<Error>>(
         charts: usize,
         mixing: Mixing,
         mut tensor: impl FnMut(&str) -> Result<Array2<T>, E>,
     ) -> Result<Self, E> {
+        if charts == 0 || charts > MAX_CHARTS {
+            return Err(Error::Charts { count: charts }.into());
+        }
         let mut read = Vec::with_capacity(charts);
         for chart in 0..charts {
             let mut arrays = Vec::with_capacity(TENSOR_NAMES.len());
             for name in TENSOR_NAMES {
                 arrays.push(tensor(&chart_name(charts, chart, name))?);
             }
-            let arrays = <[Array2<T>; 7]>::try_from(arrays).map_err(|_| Error::NoPairs)?;
+            let arrays = <[Array2<T>; 7]>::try_from(arrays).map_err(|_| Error::Charts { count: charts })?;
             read.push(Siamese::from_tensors(arrays)?);
         }
         let gate = match (charts, mixing) {
@@ -147,8 +150,9 @@ impl<T: Real> Mixture<T> {
     }
 
     fn check_shapes(&self) -> Result<(), Error> {
-        let Some(first) = self.charts.first() else {
-            return Err(Error::Charts { count: 0 });
+        let count = self.charts.len();
+        let Some(first) = self.charts.first().filter(|_| count <= MAX_CHARTS) else {
+            return Err(Error::Charts { count });
         };
         let (feature, latent) = (first.feature_dim(), first.latent_dim());
         for (position, chart) in self.charts.iter().enumerate() {

@@ -71,6 +71,12 @@ pub enum Error {
     Charts { count: usize },
     #[error("the adapter has no corrector '{name}'; it has {known}")]
     NoCorrector { name: &'static str, known: String },
+    #[error("charts under a gate have no one matrix from latents to motions; take another metric, or mix them evenly")]
+    GatedMotion,
+    #[error("whitening takes latents of at most {most} columns, these have {actual}")]
+    WhitenedColumns { actual: usize, most: usize },
+    #[error("features cannot be z-scored for charts under a gate; mix them evenly")]
+    GatedStandardised,
     #[error("the covariance of an adapter's errors must be symmetric and positive definite")]
     ErrorCovariance,
     #[error("the adapter's errors were not measured in rooms that it did not learn from")]

@@ -86,8 +86,12 @@ impl<T: Real> Phi<T> {
     /// W₁(z − m)/s + b₁ = (W₁/s) z + (b₁ − (W₁/s) m).
     pub(super) fn fold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
         let [first_weight, first_bias, ..] = &mut self.tensors;
-        *first_weight /= deviation;
-        *first_bias -= &mean.dot(&first_weight.t());
+        // In f64: the mean can be far larger than what it is taken off.
+        let wide = |tensor: &Array2<T>| tensor.mapv(|x| x.f64());
+        let weight = wide(first_weight) / &wide(deviation);
+        let bias = wide(first_bias) - wide(mean).dot(&weight.t());
+        *first_weight = weight.mapv(T::of);
+        *first_bias = bias.mapv(T::of);
     }
 
     pub(crate) fn forward(&self, input: Array2<T>) -> Activations<T> {

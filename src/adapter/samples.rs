@@ -6,6 +6,10 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{At, Error, Real, STILL, TargetScale};
 use crate::geometry::{Pose, Twist, body_twist};
+use crate::scores::median;
+
+/// The least deviation that a column is divided by, as a share of the columns' median.
+const LEAST_SPREAD: f64 = 1e-3;
 
 /// What is learned from: features of any number of rooms one below the other, and pairs of their rows.
 #[derive(Debug, Clone)]
@@ -125,7 +129,7 @@ impl<T: Real> Samples<T> {
 
 impl Samples<f32> {
     /// The same samples with features z-scored by the mean and the population deviation, each (1, d), of the rows that
-    /// occur in pairs; a column that does not vary there is only centred.
+    /// occur in pairs; a column that hardly varies there is divided by a thousandth of the median deviation instead.
     pub(super) fn standardised(&self) -> (Self, [Array2<f32>; 2]) {
         let mut used = vec![false; self.features.nrows()];
         self.pairs.iter().flatten().for_each(|&row| used[row] = true);
@@ -134,7 +138,10 @@ impl Samples<f32> {
         let count = rows.len().max(1) as f64;
         let mean = known.sum_axis(Axis(0)) / count;
         let variance = (&known - &mean).mapv(|x| x * x).sum_axis(Axis(0)) / count;
-        let deviation = variance.mapv(|x| if x.sqrt() > STILL { x.sqrt() } else { 1.0 });
+        // A column that hardly varies here is rounding; blown up, it would drown the others in a room where it varies.
+        let spreads: Vec<f64> = variance.iter().map(|x| x.sqrt()).collect();
+        let least = (LEAST_SPREAD * median(&spreads)).max(f64::MIN_POSITIVE);
+        let deviation = variance.mapv(|x| x.sqrt().max(least));
         let row = |values: ndarray::Array1<f64>| values.mapv(|x| x as f32).insert_axis(Axis(0));
         let (mean, deviation) = (row(mean), row(deviation));
         let features = (&self.features - &mean) / &deviation;

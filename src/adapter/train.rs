@@ -140,7 +140,10 @@ pub(crate) fn fit<T: Real, N: Objective<T>>(
         for batch in order.chunks(config.batch.max(1)) {
             losses.push(trainer.step(batch).loss);
             if let Some(average) = &mut average {
-                move_towards(average, &trainer.weights, 1.0 - config.average);
+                // Shorter at first, or the random weights of the start would stay in a short run.
+                let steps = trainer.steps as f64;
+                let decay = config.average.min((1.0 + steps) / (10.0 + steps));
+                move_towards(average, &trainer.weights, 1.0 - decay);
             }
         }
         let loss = crate::scores::mean(&losses);
@@ -173,10 +176,13 @@ pub fn train(
     if config.charts == 0 || config.charts > super::MAX_CHARTS {
         return Err(Error::Charts { count: config.charts });
     }
+    if config.charts > 1 && config.mixing == Mixing::Gate && config.standardise {
+        return Err(Error::GatedStandardised);
+    }
     if config.charts == 1 || config.mixing == Mixing::Gate {
         return train_together(samples, config, progress);
     }
-    let epochs = (config.epochs / config.charts).max(1);
+    let epochs = config.epochs.div_ceil(config.charts);
     let mut charts = Vec::with_capacity(config.charts);
     for member in 0..config.charts {
         // Seeds of members do not meet those of other runs, which count up by one.

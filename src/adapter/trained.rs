@@ -4,7 +4,7 @@ use nalgebra::{Matrix6, Vector6};
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis, s};
 
 use super::inverse::{pseudo_inverse, target};
-use super::{Corrector, CorrectorKind, Error, Inverse, MAX_LATENT, Mixture, Network, Reading, TargetScale};
+use super::{Corrector, CorrectorKind, Error, Inverse, MAX_LATENT, Mixing, Mixture, Network, Reading, TargetScale};
 use crate::features::FeatureSource;
 use crate::geometry::Twist;
 
@@ -29,7 +29,8 @@ impl Adapter {
     /// Checks trained weights and prepares W⁺.
     ///
     /// # Errors
-    /// [`Error::FeatureDim`], [`Error::WeightsNotFinite`], [`Error::Deviation`] or [`Error::RankDeficient`].
+    /// [`Error::FeatureDim`], [`Error::WeightsNotFinite`], [`Error::Deviation`], [`Error::NotFinite`] or
+    /// [`Error::RankDeficient`].
     pub fn new(source: FeatureSource, network: impl Into<Mixture<f32>>, scale: TargetScale) -> Result<Self, Error> {
         let network = network.into();
         if network.feature_dim() != source.dim {
@@ -72,8 +73,8 @@ impl Adapter {
         Ok(self)
     }
 
-    /// The same adapter with the covariance of its errors, Σ = mean (ΔP − σ⊙W(g₂ − g₁))(…)ᵀ, on (v, ω), measured in rooms
-    /// that it did not learn from.
+    /// The same adapter with the second moment of its errors, Σ = mean r rᵀ with r = ΔP − σ⊙W(g₂ − g₁), on (v, ω), measured
+    /// in rooms that it did not learn from.
     ///
     /// # Errors
     /// [`Error::ErrorCovariance`].
@@ -86,7 +87,7 @@ impl Adapter {
         Ok(self)
     }
 
-    /// The covariance of its errors, metres and radians, if it was measured.
+    /// The second moment of its errors, metres and radians, if it was measured.
     pub fn error_covariance(&self) -> Option<Matrix6<f64>> {
         self.error_covariance
     }
@@ -131,14 +132,20 @@ impl Adapter {
         self.network_f64.charts().iter().map(super::Siamese::motion_matrix).collect()
     }
 
-    /// σ ⊙ W̄, shape (6, [`Adapter::coordinate_count`]): a difference of latents to the motion without μ. Of a mixture,
-    /// with all charts' shares equal.
-    pub fn motion_of_coordinates(&self) -> Array2<f64> {
+    /// σ ⊙ W, shape (6, [`Adapter::coordinate_count`]): a difference of latents to the motion without μ; of an ensemble
+    /// σ ⊙ W̄.
+    ///
+    /// # Errors
+    /// [`Error::GatedMotion`] for charts under a gate, which changes with the source.
+    pub fn motion_of_coordinates(&self) -> Result<Array2<f64>, Error> {
+        if self.network.chart_count() > 1 && self.network.mixing() == Mixing::Gate {
+            return Err(Error::GatedMotion);
+        }
         let mut matrix = self.network_f64.motion_matrix(self.network_f64.even_gate().view());
         for (mut row, &deviation) in matrix.outer_iter_mut().zip(self.scale.deviation.iter()) {
             row *= deviation;
         }
-        matrix
+        Ok(matrix)
     }
 
     /// Refuses features of another source.
@@ -206,8 +213,8 @@ impl Adapter {
     ///
     /// Source: SeeSE3, ĝ = φ(z) + W⁺ΔP.
     pub fn step(&self, latent: ArrayView1<'_, f64>, twist: Twist, reading: Reading, mean_share: f64) -> Array1<f64> {
-        if self.network_f64.chart_count() == 1 {
-            return self.inverse.step(twist, reading, mean_share);
+        if self.network_f64.chart_count() == 1 || self.network_f64.mixing() == Mixing::Even {
+            return self.widened(self.inverse.step(twist, reading, mean_share));
         }
         let mixed = self.network_f64.motion_matrix(self.network_f64.gate_of(latent).view());
         let (inverse, ..) = pseudo_inverse(mixed.view());
@@ -215,7 +222,8 @@ impl Adapter {
     }
 
     /// The latent step of a motion from `latent` by a corrector: with a residual W⁺ΔP in the affine reading and what
-    /// the corrector adds, else the latent that it predicts.
+    /// the corrector adds, else the latent that it predicts. A part of a motion is a motion to it: μ is a part of its
+    /// input's scale, nothing that could be shared among parts.
     ///
     /// # Errors
     /// [`Error::NoCorrector`].
@@ -226,14 +234,13 @@ impl Adapter {
         kind: CorrectorKind,
         latent: ArrayView1<'_, f64>,
         twist: Twist,
-        mean_share: f64,
     ) -> Result<Array1<f64>, Error> {
         let corrector = self.corrector(kind)?;
-        let wanted = target(&self.scale, twist, Reading::Affine, mean_share);
+        let wanted = target(&self.scale, twist, Reading::Affine, 1.0);
         let here = latent.slice(s![..self.coordinate_count()]);
         let added = corrector.added(here, wanted.view());
         if kind.has_residual() {
-            Ok(self.step(latent, twist, Reading::Affine, mean_share) + self.widened(added))
+            Ok(self.step(latent, twist, Reading::Affine, 1.0) + self.widened(added))
         } else {
             Ok(self.widened(added - here))
         }
@@ -257,6 +264,9 @@ impl Adapter {
         let sum: f64 = gate.iter().sum();
         let off = gate.iter().position(|share| !(0.0..=1.0).contains(share));
         let off = off.or((!gate.is_empty() && (sum - 1.0).abs() > GATE_TOLERANCE).then_some(0));
+        let even = (gate.len() as f64).recip();
+        let uneven = |share: &f64| self.network.mixing() == Mixing::Even && (share - even).abs() > GATE_TOLERANCE;
+        let off = off.or(gate.iter().position(uneven));
         match off {
             Some(chart) => Err(Error::Gate { chart, value: gate[chart] }),
             None => Ok(()),

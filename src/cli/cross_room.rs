@@ -13,10 +13,11 @@ use super::protocol::{ProtocolOptions, SplitName};
 use super::rooms::{lesson, load_rooms, room_words};
 use super::{check_writable, say, write_json};
 use crate::adapter::{Adapter, Reading, TrainConfig, TrainingRecord};
-use crate::eval::{NavigatorKind, Protocol};
+use crate::eval::{NavigatorKind, Protocol, check_thresholds};
 use crate::features::Features;
 use crate::generalisation::{nested_choice, outcomes};
 use crate::navigation::{Metric, Refit, StepKind};
+use crate::pairs::Split;
 use crate::report::{CrossRoomRun, cross_room_json, cross_room_table, rooms_table, scaling_table};
 use crate::store::{Store, StoredRoom};
 use crate::training::{Lesson, Recipe, error_covariance, learn};
@@ -35,7 +36,8 @@ pub struct CrossRoom {
     /// Which of their features; may be left out when the first room has one
     #[arg(long)]
     features: Option<String>,
-    /// How many rooms to learn from, separated by commas: the scaling curve; all of them if nothing is given
+    /// How many rooms to take, those kept aside among them, separated by commas: the scaling curve; all of them if
+    /// nothing is given
     #[arg(long, value_delimiter = ',')]
     sizes: Vec<usize>,
     /// Of the rooms to learn from, so many are kept aside to measure the adapter's errors in, for +calibrated
@@ -89,6 +91,7 @@ impl CrossRoom {
         }
         let sizes = self.sizes(train.len())?;
         let protocol = self.test_protocol()?;
+        check_thresholds(&protocol.thresholds)?;
         let recipe = self.protocol.recipe(self.seed)?;
         let progress = bar((sizes.len() as u64) * self.seeds * (recipe.config.epochs + test.len()) as u64, "rooms");
         let mut runs = Vec::new();
@@ -104,12 +107,19 @@ impl CrossRoom {
             }
         }
         progress.finish_and_clear();
+        if let Some((room, why)) = runs.iter().find(|run| run.outcomes.is_empty()).and_then(|run| run.skipped.first()) {
+            bail!("no held-out room could be evaluated; room '{room}': {why}");
+        }
         self.say(&train, &test, &recipe, &runs)?;
         if let Some(file) = &self.json {
             let mut record = cross_room_json(&runs, &self.baseline);
             record["features"] = source.into();
             record["stride"] = recipe.stride.into();
             record["preset"] = recipe.preset.name().into();
+            record["epochs"] = recipe.config.epochs.into();
+            record["learning_rate"] = recipe.config.learning_rate.into();
+            record["split"] = recipe.split.name().into();
+            record["source_excluded"] = self.exclude_source.into();
             record["test_split"] = protocol.split.name().into();
             record["threshold"] = self.threshold.into();
             write_json(file, &record)?;
@@ -122,7 +132,10 @@ impl CrossRoom {
         let sizes = if self.sizes.is_empty() { vec![rooms] } else { self.sizes.clone() };
         for &size in &sizes {
             if size <= self.aside || size > rooms {
-                bail!("--sizes: {size} is not {} to {rooms}, the rooms to learn from besides --aside", self.aside + 1);
+                bail!(
+                    "of {size} rooms (--sizes, or all) {} are kept aside: sizes must be over --aside and at most {rooms}",
+                    self.aside
+                );
             }
         }
         Ok(sizes)
@@ -140,7 +153,24 @@ impl CrossRoom {
             if self.aside > 0 {
                 navigators.push(inverse(Reading::Homogeneous, Metric::Calibrated));
             }
-            navigators.extend([refit(false), refit(true)]);
+            if self.test_split != SplitName::Whole {
+                navigators.push(refit(false));
+            }
+            navigators.push(refit(true));
+        }
+        for kind in &navigators {
+            match kind {
+                NavigatorKind::Step(StepKind::Corrector(_), _) => bail!("--navigators: no correctors are trained here"),
+                NavigatorKind::Step(_, Metric::Calibrated) if self.aside == 0 => {
+                    bail!("--navigators: '{}' needs rooms to measure errors in; give --aside", kind.name());
+                }
+                NavigatorKind::Step(StepKind::Refit(refit), _)
+                    if !refit.in_sample && self.test_split == SplitName::Whole =>
+                {
+                    bail!("--navigators: '{}' has nothing to be fitted on under --test-split whole", kind.name());
+                }
+                _ => {}
+            }
         }
         let baseline = NavigatorKind::from_name(&self.baseline).with_context(|| {
             format!("--baseline: '{}' is not one of {}", self.baseline, NavigatorKind::known_names())
@@ -180,13 +210,17 @@ impl CrossRoom {
 
     fn say(&self, train: &[Loaded], test: &[Loaded], recipe: &Recipe, runs: &[CrossRoomRun]) -> anyhow::Result<()> {
         say(format_args!(
-            "learned from {}, features '{}', preset {}, split {}; held out: {}, stride {}",
+            "rooms to learn from: {}, features '{}', preset {} with {} epochs, split {}; held out: {}, stride {}, split \
+             {}, source {}",
             room_words(train),
             train[0].1.source().name,
             recipe.preset.name(),
+            recipe.config.epochs,
             recipe.split,
             room_words(test),
             recipe.stride,
+            Split::from(self.test_split),
+            if self.exclude_source { "excluded" } else { "included" },
         ));
         for run in runs {
             for (room, why) in &run.skipped {
@@ -194,12 +228,14 @@ impl CrossRoom {
             }
         }
         if runs.len() > 1 {
-            say(scaling_table(runs, &self.baseline).trim_end());
+            say(scaling_table(runs, &self.baseline, self.threshold).trim_end());
         }
         let last = runs.last().context("no run")?;
         say(format_args!(
-            "{} rooms learned from, {} to measure errors in, seed {}:",
-            last.learned_rooms, last.calibration_rooms, last.seed
+            "the last run: {} rooms learned from, {} to measure errors in, seed {}:",
+            last.learned.len(),
+            last.aside.len(),
+            last.seed
         ));
         say(cross_room_table(last, &self.baseline, self.threshold).trim_end());
         if self.rooms {
@@ -207,6 +243,10 @@ impl CrossRoom {
         }
         Ok(())
     }
+}
+
+fn names(rooms: &[(crate::room::RoomId, u64)]) -> Vec<String> {
+    rooms.iter().map(|(room, _)| room.to_string()).collect()
 }
 
 fn run_of(
@@ -222,8 +262,8 @@ fn run_of(
         }
     }
     CrossRoomRun {
-        learned_rooms: record.rooms.len(),
-        calibration_rooms: record.calibrated_on.len(),
+        learned: names(&record.rooms),
+        aside: names(&record.calibrated_on),
         seed,
         outcomes: evaluated,
         skipped,

@@ -45,7 +45,8 @@ pub struct Evaluate {
     /// ε of Hit@ε, separated by commas
     #[arg(long, value_delimiter = ',', default_values_t = crate::navigation::HIT_THRESHOLDS)]
     thresholds: Vec<f64>,
-    /// Rows of the table by name, separated by commas; a way to step may have +row-space, +whitened or +motion
+    /// Rows of the table by name, separated by commas; a way to step may have +row-space, +whitened or
+    /// +motion, inverse-poincare-homogeneous also +calibrated
     #[arg(long, value_delimiter = ',')]
     navigators: Vec<String>,
     /// Equal parts of each motion
@@ -75,10 +76,7 @@ impl Evaluate {
         let protocol = self.protocol(&record)?;
         let room = Arc::new(stored.room);
         let navigator = Navigator::new(room, &features, Arc::new(chosen.adapter), IndexKind::Exact)?;
-        let rows = match protocol.navigators.len() {
-            0 => NavigatorKind::table(navigator.adapter()).len(),
-            given => given,
-        };
+        let rows = protocol.rows(&navigator)?.len();
         let progress = bar(rows as u64, "evaluating");
         let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |done, kind| {
             progress.set_position(done as u64);
@@ -91,7 +89,8 @@ impl Evaluate {
             Some(revision) => !store.same_frames(&self.room, revision, stored.revision).await?,
             None => false,
         };
-        let leaks = in_room && (record.split != protocol.split || record.split == Split::Whole || other_frames);
+        let leaky = [Split::Whole, Split::Pairs].contains(&record.split);
+        let leaks = in_room && (record.split != protocol.split || leaky || other_frames);
         say(format_args!(
             "room '{}' revision {}, features '{features_name}', adapter '{}' revision {} ({})",
             self.room,
@@ -105,6 +104,12 @@ impl Evaluate {
             "split {}, stride {}: {} test pairs, {} candidate frames, source {side}",
             protocol.split, protocol.stride, report.n, report.candidate_count
         ));
+        if protocol.steps > 1 {
+            say(format_args!("{} equal parts of each motion, {}", protocol.steps, protocol.mode.name()));
+        }
+        if record.calibrated_on.iter().any(|(room, _)| room.as_str() == self.room) {
+            say("LEAK: the adapter's errors were measured in this room; +calibrated has seen its poses");
+        }
         if leaks {
             let why = if other_frames {
                 "on other frames of this room".to_owned()

@@ -13,6 +13,7 @@ mod import;
 mod probe;
 mod progress;
 mod protocol;
+mod reproduce;
 mod rooms;
 mod serve;
 mod studio;
@@ -54,6 +55,8 @@ enum Command {
     CrossRoom(cross_room::CrossRoom),
     /// Score many features at once
     Sweep(sweep::Sweep),
+    /// Run the paper's tables and figures on given rooms and write one report
+    Reproduce(reproduce::Reproduce),
     /// Check the paper's theorems numerically: measured against bound
     Theory(theory::Theory),
     /// Answer over gRPC until told to stop
@@ -87,6 +90,7 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Probe(arguments) => arguments.run().await,
         Command::CrossRoom(arguments) => arguments.run().await,
         Command::Sweep(arguments) => arguments.run().await,
+        Command::Reproduce(arguments) => arguments.run().await,
         Command::Theory(arguments) => arguments.run(),
         Command::Serve(arguments) => arguments.run().await,
         Command::Navigate(arguments) => arguments.run().await,
@@ -106,6 +110,9 @@ fn say(line: impl std::fmt::Display) {
 /// Refuses a file whose folder is not there, before long work is done for it.
 fn check_writable(path: &std::path::Path) -> anyhow::Result<()> {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    if path.is_dir() {
+        anyhow::bail!("{} is a folder; name a file in it", path.display());
+    }
     match folder {
         Some(folder) if !folder.is_dir() => anyhow::bail!("{}: the folder does not exist", path.display()),
         _ => Ok(()),

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 use serde_json::json;
@@ -102,17 +102,32 @@ impl Probe {
         }
         let store = Store::open(&self.store)?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
+        if self.metrics.contains(&Metric::M3) || self.metrics.contains(&Metric::M4) {
+            self.protocol.needs_test_pairs()?;
+        }
         let base = self.protocol.recipe(0)?;
         let recipes = self.recipes(&base)?;
         let pooled = self.pooled && self.metrics.contains(&Metric::M4);
         let progress = bar((rooms.len() + usize::from(pooled)) as u64, "probing");
         let one = |room: &Loaded| {
             let what = || format!("room '{}', features '{}'", room.0.room.id(), room.1.source().name);
-            let scores = self.scores(room, &recipes).with_context(what)?;
+            let scores = self.scores(room, &recipes).with_context(what);
             progress.inc(1);
-            Ok(scores)
+            scores
         };
-        let mut scores: Vec<ProbeScores> = rooms.par_iter().map(one).collect::<anyhow::Result<_>>()?;
+        let probed: Vec<anyhow::Result<ProbeScores>> = rooms.par_iter().map(one).collect();
+        let mut scores = Vec::with_capacity(probed.len());
+        let mut skipped = Vec::new();
+        for result in probed {
+            match result {
+                Ok(found) => scores.push(found),
+                Err(error) if rooms.len() > 1 => skipped.push(format!("{error:#}")),
+                Err(error) => return Err(error),
+            }
+        }
+        if let (true, Some(first)) = (scores.is_empty(), skipped.first()) {
+            bail!("no room could be probed; the first says: {first}");
+        }
         if pooled {
             let lessons: Vec<Lesson<'_>> = rooms.iter().map(lesson).collect();
             let m4 = self.adapters(&lessons, &recipes)?;
@@ -129,7 +144,14 @@ impl Probe {
             self.seeds
         ));
         say(probe_table(&scores).trim_end());
-        let still = scores.iter().flat_map(|score| &score.m3).flat_map(|at| &at.runs);
+        skipped.iter().for_each(|why| say(format_args!("skipped: {why}")));
+        for (score, (dimension, gap, _)) in scores.iter().filter_map(|score| Some((score, score.m2.as_ref()?))) {
+            say(format_args!(
+                "M2 of {}: {} rows used, {} dropped as duplicates, gap {gap}",
+                score.room, dimension.used, dimension.dropped
+            ));
+        }
+        let still = scores.iter().flat_map(|score| score.m3.iter().chain(&score.m4)).flat_map(|at| &at.runs);
         if still.map(MotionScores::still_components).any(|count| count > 0) {
             say("some components of the motion never vary; they have no R² and are left out of the means");
         }
@@ -138,6 +160,7 @@ impl Probe {
                 [one] => one.json(),
                 several => json!({ "rooms": several.iter().map(ProbeScores::json).collect::<Vec<_>>() }),
             };
+            record["skipped"] = json!(skipped);
             record["features"] = json!(rooms[0].1.source().name);
             record["split"] = json!(base.split.name());
             record["preset"] = json!(base.preset.name());

@@ -138,6 +138,25 @@ impl From<LossName> for Loss {
 }
 
 impl ProtocolOptions {
+    /// Refuses the split that sets nothing apart, where test pairs are what is asked for.
+    pub fn needs_test_pairs(&self) -> anyhow::Result<()> {
+        anyhow::ensure!(self.split != SplitName::Whole, "--split whole sets no test pairs apart; take another split");
+        Ok(())
+    }
+
+    /// Refuses what a grid decides.
+    pub fn leaves_to_the_grid(&self) -> anyhow::Result<()> {
+        for (given, option, grid) in [
+            (self.geo_dim.is_some(), "--geo-dim", "--geo-dims"),
+            (self.charts.is_some(), "--charts", "--chart-counts"),
+            (self.lr.is_some(), "--lr", "--lrs"),
+            (self.loss.is_some(), "--loss", "--losses"),
+        ] {
+            anyhow::ensure!(!given, "{option} is one of the sweep's own; give {grid}, with commas");
+        }
+        Ok(())
+    }
+
     /// The same at another stride.
     pub fn at_stride(&self, stride: u32) -> Self {
         Self { stride, ..self.clone() }
@@ -145,6 +164,11 @@ impl ProtocolOptions {
 
     /// The preset with what was given in its place.
     pub fn recipe(&self, seed: u64) -> anyhow::Result<Recipe> {
+        anyhow::ensure!(
+            (1..=MAX_STRIDE).contains(&self.stride),
+            "--stride must be 1 to {MAX_STRIDE}, got {}",
+            self.stride
+        );
         let mut recipe = Recipe::of(self.preset.into(), self.split.into(), self.stride, seed);
         let config = &mut recipe.config;
         let put = |into: &mut usize, given: Option<usize>| given.map_or((), |given| *into = given);
@@ -173,11 +197,18 @@ impl ProtocolOptions {
                 (end(ends.0)?, end(ends.1)?, count)
             }
         };
+        anyhow::ensure!(
+            low >= 1 && low <= high && high <= MAX_STRIDE,
+            "--strides: {low}-{high} is no range from 1 to {MAX_STRIDE}"
+        );
         let count = self.pairs.unwrap_or(count);
         anyhow::ensure!((1..=MAX_PAIRS).contains(&count), "--pairs must be 1 to {MAX_PAIRS}, got {count}");
         Ok(PairPlan::Range(StrideRange { low, high, count }))
     }
 }
+
+/// The longest stride.
+const MAX_STRIDE: u32 = 100_000;
 
 /// The most pairs that are drawn.
 const MAX_PAIRS: usize = 10_000_000;

@@ -21,7 +21,7 @@ use crate::pairs::Split;
 use crate::report::{TrainingRun, training_json, training_table};
 use crate::scores::Rate;
 use crate::store::{Published, Store, StoredRoom};
-use crate::training::{Lesson, Recipe, error_covariance, learn};
+use crate::training::{Lesson, Recipe, check_unseen, error_covariance, learn};
 
 /// The most seeds of one command.
 const MAX_SEEDS: u64 = 1_000;
@@ -76,6 +76,9 @@ impl Train {
             true => Vec::new(),
             false => load_rooms(&store, &self.calibrate_on, Some(&source)).await?,
         };
+        for room in &calibration {
+            check_unseen(&lesson(room), rooms.iter().map(|(stored, _)| stored.room.id()))?;
+        }
         let (mut adapter, mut runs) = train_seeds(&rooms, &recipe, self.seeds)?;
         if !calibration.is_empty() {
             let lessons: Vec<Lesson<'_>> = calibration.iter().map(lesson).collect();
@@ -96,13 +99,13 @@ impl Train {
             features.source().dim,
         ));
         let judged = match split {
-            Split::Whole => "R² and Hit@0.1 on the training pairs, for none are set apart".to_owned(),
-            _ => format!("{} test pairs", record.test.n),
+            Split::Whole => "no test pairs; train R², and in-sample Hit@0.1 of inverse Poincaré (affine)".to_owned(),
+            _ => format!(
+                "{} test pairs; test R² by room, averaged, and Hit@0.1 of inverse Poincaré (affine)",
+                record.test.n
+            ),
         };
-        say(format_args!(
-            "{} training pairs, {judged}, {} epochs; test R², and Hit@0.1 of inverse Poincaré (affine):",
-            record.pair_count, record.config.epochs
-        ));
+        say(format_args!("{} training pairs, {} epochs, {judged}:", record.pair_count, record.config.epochs));
         say(training_table(&runs).trim_end());
         let still = record.test.still_components();
         if record.test.n > 0 && still > 0 {
@@ -180,8 +183,18 @@ pub fn default_name(rooms: &[(StoredRoom, Features)], recipe: &Recipe) -> String
     let Recipe { preset, split, stride, config, .. } = recipe;
     let (first, features) = (rooms[0].0.room.id(), &rooms[0].1.source().name);
     let others = if rooms.len() > 1 { format!("-and-{}-more", rooms.len() - 1) } else { String::new() };
-    let charts = if config.charts > 1 { format!(".k{}", config.charts) } else { String::new() };
-    format!("{first}{others}.{features}.{}.s{stride}.{split}{charts}", preset.name())
+    let mut name = format!("{first}{others}.{features}.{}.s{stride}.{split}", preset.name());
+    let plain = preset.config(0);
+    if config.charts > 1 {
+        name.push_str(&format!(".{}{}", config.mixing.name(), config.charts));
+    }
+    if config.loss != plain.loss {
+        name.push_str(&format!(".{}", config.loss.name()));
+    }
+    if config.latent != plain.latent {
+        name.push_str(&format!(".g{}", config.latent));
+    }
+    name
 }
 
 /// Says where an adapter lies.

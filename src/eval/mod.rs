@@ -27,6 +27,11 @@ pub enum Error {
     Threshold { value: f64 },
     #[error("{count} thresholds were given; give 1 to {most}")]
     ThresholdCount { count: usize, most: usize },
+    #[error(
+        "'{navigator}' is fitted on pairs that are not tested, and the split '{split}' leaves none here; \
+         take its in-sample variant, or another split"
+    )]
+    NothingToFitOn { navigator: String, split: pairs::Split },
     #[error("no candidate frame is left for source frame {source_frame}")]
     NoCandidates { source_frame: room::FrameId },
     #[error("no predictions were given")]

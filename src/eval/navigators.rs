@@ -11,10 +11,10 @@ use crate::cancel::Cancellation;
 use crate::geometry::{Pose, body_twist};
 use crate::index::Exclusion;
 use crate::navigation::{
-    Ground, Leg, Metric, Mode, Navigator, Plan, Refit, Search, Space, Start, StepKind, Stepper, walk,
+    self, Ground, Leg, Metric, Mode, Navigator, Plan, Refit, Search, Space, Start, StepKind, Stepper, walk,
 };
 use crate::pairs::{Pair, Split};
-use crate::room::FrameId;
+use crate::room::{FrameId, Timeline};
 
 /// One way to choose the next frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,26 +36,32 @@ const UNDER: char = '+';
 impl NavigatorKind {
     /// Every navigator.
     pub fn all() -> Vec<Self> {
+        let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
         let steps = StepKind::all().into_iter();
-        let steps = steps.flat_map(|step| Metric::ALL.map(|metric| Self::Step(step, metric)));
+        let steps = steps.flat_map(|step| Metric::ALL.map(|metric| (step, metric)));
+        let steps = steps.filter(|&(step, metric)| metric != Metric::Calibrated || step == homogeneous);
+        let steps = steps.map(|(step, metric)| Self::Step(step, metric));
         [Self::Identity, Self::Random, Self::Oracle].into_iter().chain(steps).collect()
     }
 
     /// The rows of the table for an adapter: the baselines, the three readings, its correctors, the refits on raw
-    /// motions, and inverse Poincaré under the other metrics.
+    /// motions, and inverse Poincaré under the other metrics that it has.
     pub fn table(adapter: &Adapter) -> Vec<Self> {
         let full = |step: StepKind| Self::Step(step, Metric::Full);
         let corrector = |kind: CorrectorKind| full(StepKind::Corrector(kind));
         let refit = |in_sample: bool| full(StepKind::Refit(Refit { z_scored: false, intercept: false, in_sample }));
         let affine = StepKind::InversePoincare(Reading::Affine);
+        let gated = adapter.motion_of_coordinates().is_err();
         let others = [Metric::RowSpace, Metric::Whitened, Metric::Motion];
+        let others = others.into_iter().filter(|&metric| !(gated && metric == Metric::Motion));
         let mut rows = vec![Self::Identity, Self::Random, Self::Oracle];
         rows.extend(Reading::ALL.map(|reading| full(StepKind::InversePoincare(reading))));
         rows.extend(adapter.correctors().map(|known| corrector(known.kind())));
         rows.extend([refit(false), refit(true)]);
         rows.extend(others.map(|metric| Self::Step(affine, metric)));
         let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
-        rows.extend(adapter.error_covariance().map(|_| Self::Step(homogeneous, Metric::Calibrated)));
+        let calibrated = adapter.error_covariance().filter(|_| !gated);
+        rows.extend(calibrated.map(|_| Self::Step(homogeneous, Metric::Calibrated)));
         rows
     }
 
@@ -78,8 +84,11 @@ impl NavigatorKind {
     /// The names in words, for those who gave another.
     pub fn known_names() -> String {
         let steps: Vec<&str> = StepKind::all().into_iter().map(StepKind::name).collect();
-        let metrics: Vec<&str> = Metric::ALL.into_iter().skip(1).map(Metric::name).collect();
-        format!("identity, random, oracle, {}; the last ones also with +{}", steps.join(", "), metrics.join(", +"))
+        format!(
+            "identity, random, oracle, {}; ways to step also with +row-space, +whitened or +motion, and \
+             inverse-poincare-homogeneous with +calibrated",
+            steps.join(", ")
+        )
     }
 }
 
@@ -105,6 +114,33 @@ pub struct Protocol {
 }
 
 impl Protocol {
+    /// The rows that a table of this protocol has in a room: those that were asked for, or the adapter's own.
+    ///
+    /// # Errors
+    /// [`Error::NothingToFitOn`] for a refit without pairs of its own, [`Error::Navigation`] for no step at all.
+    pub fn rows(&self, navigator: &Navigator) -> Result<Vec<NavigatorKind>, Error> {
+        if self.steps == 0 {
+            return Err(navigation::Error::Steps { actual: 0, most: u32::MAX }.into());
+        }
+        let can_fit = self.can_fit(navigator.room().timeline());
+        let unfitted = |kind: &NavigatorKind| {
+            matches!(kind, NavigatorKind::Step(StepKind::Refit(refit), _) if !refit.in_sample) && !can_fit
+        };
+        if self.navigators.is_empty() {
+            let table = NavigatorKind::table(navigator.adapter());
+            return Ok(table.into_iter().filter(|kind| !unfitted(kind)).collect());
+        }
+        match self.navigators.iter().find(|kind| unfitted(kind)) {
+            Some(kind) => Err(Error::NothingToFitOn { navigator: kind.name(), split: self.split }),
+            None => Ok(self.navigators.clone()),
+        }
+    }
+
+    /// Whether there are pairs apart from those that are tested: a refit that is not in sample needs some.
+    fn can_fit(&self, timeline: &Timeline) -> bool {
+        self.split != Split::Whole && self.split.train_pairs(timeline, self.stride).is_ok()
+    }
+
     /// The paper's protocol at a stride: time split, source included, one step, ε of 0.1, 0.2, 0.3 and 0.5.
     pub fn paper(stride: u32) -> Self {
         Self {
@@ -160,10 +196,7 @@ pub fn evaluate(
 ) -> Result<Report, Error> {
     check_thresholds(&protocol.thresholds)?;
     let timeline = navigator.room().timeline();
-    let navigators = match protocol.navigators.as_slice() {
-        [] => NavigatorKind::table(navigator.adapter()),
-        given => given.to_vec(),
-    };
+    let navigators = protocol.rows(navigator)?;
     let bench = Bench {
         poses: navigator.room().poses(),
         adapter: navigator.adapter(),
@@ -225,7 +258,7 @@ impl Bench<'_> {
         }
     }
 
-    fn walked(&self, space: Space<'_>, pair: Pair) -> Result<Vec<crate::navigation::Step>, Error> {
+    fn walked(&self, space: Space<'_>, pair: Pair) -> Result<Vec<navigation::Step>, Error> {
         let Protocol { steps, mode, exclude_source, .. } = *self.protocol;
         let [source, target] = [pair.source, pair.target].map(|frame| self.poses[frame.row()]);
         let latent = self.latents.row(pair.source.row()).to_owned();
@@ -233,7 +266,7 @@ impl Bench<'_> {
         let leg = Leg { motion: body_twist(&source, &target), goal: Some(target) };
         let plan = Plan { mode, steps, hit_count: 1, exclude_source };
         walk(space, &start, leg, plan, self.cancel).map_err(|error| match error {
-            crate::navigation::Error::NoCandidates { .. } => Error::NoCandidates { source_frame: pair.source },
+            navigation::Error::NoCandidates { .. } => Error::NoCandidates { source_frame: pair.source },
             other => other.into(),
         })
     }

@@ -109,7 +109,7 @@ pub fn walk(space: Space<'_>, start: &Start, leg: Leg, plan: Plan, cancel: &Canc
             (Some(goal), Some(pose)) => (body_twist(&pose, &goal), plan.steps - done),
             _ => (leg.motion, plan.steps),
         };
-        let share = f64::from(parts).recip();
+        let share = f64::from(plan.steps).recip();
         let step = space.stepper.step(space.adapter, at.latent.view(), part.divided(parts), share)?;
         let latent = &at.latent + &step;
         let exclusion = plan.exclude_source.zip(at.frame).map(|(radius, centre)| Exclusion { centre, radius });

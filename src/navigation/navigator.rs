@@ -1,6 +1,6 @@
 //! One room, ready to answer.
 
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2};
 
@@ -73,6 +73,7 @@ pub struct Navigator {
     search: Search,
     /// Of the metrics but the first, made when they are first asked for.
     other_searches: [OnceLock<Search>; 4],
+    making: Mutex<()>,
 }
 
 impl Navigator {
@@ -88,7 +89,7 @@ impl Navigator {
         }
         let latents = adapter.embed(features.rows())?;
         let search = Search::new(kind, Metric::Full, &adapter, latents.view())?;
-        Ok(Self { room, adapter, latents, kind, search, other_searches: Default::default() })
+        Ok(Self { room, adapter, latents, kind, search, other_searches: Default::default(), making: Mutex::new(()) })
     }
 
     /// The room.
@@ -129,6 +130,11 @@ impl Navigator {
             Metric::Calibrated => 3,
         };
         let place = &self.other_searches[other];
+        if let Some(made) = place.get() {
+            return Ok(made);
+        }
+        // One caller makes it; a poisoned lock guards nothing that could be broken.
+        let _making = self.making.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(made) = place.get() {
             return Ok(made);
         }

@@ -10,6 +10,9 @@ use crate::room::FrameId;
 /// Singular values below this share of the largest count as zero, as in W⁺.
 const RANK_TOLERANCE: f64 = 1e-5;
 
+/// The most columns that are whitened: the work grows with their cube.
+const MOST_WHITENED: usize = 512;
+
 /// By which distance frames are near.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Metric {
@@ -21,10 +24,11 @@ pub enum Metric {
     /// Mahalanobis, under the covariance of the room's latents.
     Whitened,
     /// L2 of σ ⊙ W g: the length of the motion that the adapter sees between two latents, in the metres and radians
-    /// that Hit@ε is in. Of a mixture, with all charts' shares equal.
+    /// that Hit@ε is in. Not for charts under a gate.
     Motion,
-    /// Mahalanobis of σ ⊙ W g, under the covariance of the adapter's errors in rooms that it did not learn from: the
-    /// candidate under which the error of the wanted motion is least surprising. Ours, not the paper's.
+    /// Mahalanobis of σ ⊙ W g, under the second moment of the adapter's errors in rooms that it did not learn from: the
+    /// candidate under which the error of the wanted motion is least surprising. It belongs to the homogeneous reading,
+    /// whose imagined latent is ΔP away by W. Ours, not the paper's. Not for charts under a gate.
     Calibrated,
 }
 
@@ -73,13 +77,16 @@ impl Projection {
         let matrix = match metric {
             Metric::Full => None,
             Metric::RowSpace => Some(blocks(&adapter.motion_matrices().into_iter().map(row_basis).collect::<Vec<_>>())),
-            Metric::Motion => Some(adapter.motion_of_coordinates()),
+            Metric::Motion => Some(adapter.motion_of_coordinates()?),
             Metric::Calibrated => {
                 let covariance = adapter.error_covariance().ok_or(Error::NotCalibrated)?;
                 // Σ = L Lᵀ: the length of L⁻¹x is Mahalanobis' of x.
                 let lower = covariance.cholesky().ok_or(Error::ErrorCovariance)?.l();
                 let inverse = lower.try_inverse().ok_or(Error::ErrorCovariance)?;
-                Some(Array2::from_shape_fn((6, 6), |at| inverse[at]).dot(&adapter.motion_of_coordinates()))
+                Some(Array2::from_shape_fn((6, 6), |at| inverse[at]).dot(&adapter.motion_of_coordinates()?))
+            }
+            Metric::Whitened if coordinates > MOST_WHITENED => {
+                return Err(Error::WhitenedColumns { actual: coordinates, most: MOST_WHITENED });
             }
             Metric::Whitened => Some(whitening(latents.slice(s![.., ..coordinates]))),
         };
@@ -150,7 +157,8 @@ impl Search {
     /// An exact search among `candidates`, frames whose latents are rows of `latents`.
     ///
     /// # Errors
-    /// [`Error::NotCalibrated`] when the metric needs what the adapter lacks.
+    /// [`Error::NotCalibrated`], [`Error::GatedMotion`] or [`Error::WhitenedColumns`] when the metric needs what the
+    /// adapter lacks.
     pub fn exact(
         metric: Metric,
         adapter: &Adapter,

@@ -111,7 +111,7 @@ impl Stepper {
             StepKind::InversePoincare(reading) => Ok(Self::InversePoincare(reading)),
             StepKind::Corrector(kind) => {
                 let still = Array1::zeros(adapter.latent_dim());
-                adapter.corrected_step(kind, still.view(), Twist::default(), 1.0)?;
+                adapter.corrected_step(kind, still.view(), Twist::default())?;
                 Ok(Self::Corrector(kind))
             }
             StepKind::Refit(Refit { z_scored, intercept, in_sample }) => {
@@ -133,8 +133,9 @@ impl Stepper {
         }
     }
 
-    /// The latent step of a motion from `latent`. `mean_share` is the share of what does not depend on the motion (μ,
-    /// an intercept) that this step takes: 1 for a whole motion, 1/S for one of S equal parts.
+    /// The latent step of a motion from `latent`. `mean_share` is the share of what does not depend on the motion (μ in
+    /// the affine reading, a refit's intercept) that this step takes: 1 for a whole motion, 1/S for one of S equal
+    /// parts. A corrector takes each part for a motion of its own.
     ///
     /// # Errors
     /// [`Error::Adapter`] when the adapter lacks the corrector.
@@ -147,7 +148,7 @@ impl Stepper {
     ) -> Result<Array1<f64>, Error> {
         match self {
             Self::InversePoincare(reading) => Ok(adapter.step(latent, twist, *reading, mean_share)),
-            Self::Corrector(kind) => Ok(adapter.corrected_step(*kind, latent, twist, mean_share)?),
+            Self::Corrector(kind) => Ok(adapter.corrected_step(*kind, latent, twist)?),
             Self::Refit { fit, z_scored } => {
                 let moved = fit.coefficients.dot(&input(adapter, twist, *z_scored, mean_share));
                 let mut step = Array1::zeros(adapter.latent_dim());

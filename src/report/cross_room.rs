@@ -10,9 +10,9 @@ use crate::generalisation::{MotionSummary, RoomMean, RoomOutcome, difference, ov
 #[derive(Debug, Clone)]
 pub struct CrossRoomRun {
     /// Rooms that it learned from.
-    pub learned_rooms: usize,
+    pub learned: Vec<String>,
     /// Rooms that its errors were measured in.
-    pub calibration_rooms: usize,
+    pub aside: Vec<String>,
     /// Its seed.
     pub seed: u64,
     /// Room by room.
@@ -26,11 +26,13 @@ impl CrossRoomRun {
         self.outcomes.first().map_or(Vec::new(), |outcome| outcome.rows.iter().map(|row| row.name.as_str()).collect())
     }
 
-    fn hit_rates(&self, navigator: &str) -> Vec<f64> {
+    /// A navigator's hit rate, room by room.
+    pub fn hit_rates(&self, navigator: &str) -> Vec<f64> {
         self.outcomes.iter().filter_map(|outcome| outcome.hit_rate(navigator)).map(|rate| rate.rate).collect()
     }
 
-    fn r2(&self) -> Vec<f64> {
+    /// Overall R², room by room.
+    pub fn r2(&self) -> Vec<f64> {
         self.outcomes.iter().map(|outcome| outcome.motion.overall).collect()
     }
 }
@@ -61,14 +63,15 @@ pub fn cross_room_table(run: &CrossRoomRun, baseline: &str, threshold: f64) -> S
 }
 
 /// A line a run: how R² over the rooms grows with the rooms that were learned from.
-pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str) -> String {
-    let head = ["rooms", "seed", "R² > 0", "R² > 0.3", "best R²", "mean max(R², −1)", "hit rate"];
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
+pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str, threshold: f64) -> String {
+    let mut head = ["rooms", "seed", "R² > 0", "R² > 0.3", "best R²", "mean max(R², −1)"].map(str::to_owned).to_vec();
+    head.push(format!("Hit@{threshold}, {baseline}"));
+    let mut lines = vec![head];
     for run in runs {
         let Some(summary) = MotionSummary::of(&run.r2(), 0) else { continue };
         let MotionSummary { positive, above_0_3, best, clipped } = summary;
         lines.push(vec![
-            run.learned_rooms.to_string(),
+            run.learned.len().to_string(),
             run.seed.to_string(),
             format!("{:.0} % ({}/{})", 100.0 * positive.rate, positive.successes(), positive.n),
             format!("{:.0} %", 100.0 * above_0_3.rate),
@@ -129,8 +132,8 @@ pub fn cross_room_json(runs: &[CrossRoomRun], baseline: &str) -> Value {
             })
         });
         json!({
-            "learned_rooms": run.learned_rooms,
-            "calibration_rooms": run.calibration_rooms,
+            "learned_rooms": run.learned,
+            "calibration_rooms": run.aside,
             "seed": run.seed,
             "r2": summary,
             "navigators": run.navigators().into_iter().map(navigator).collect::<Vec<_>>(),
@@ -146,9 +149,16 @@ fn mean_json(mean: &RoomMean) -> Value {
 }
 
 fn interval(mean: &RoomMean) -> String {
+    // Of one room there is nothing to draw again.
+    if mean.rooms < 2 {
+        return format!("{:.3}", mean.mean);
+    }
     format!("{:.3} [{:.3}, {:.3}]", mean.mean, mean.low, mean.high)
 }
 
 fn signed(mean: &RoomMean) -> String {
+    if mean.rooms < 2 {
+        return format!("{:+.3}", mean.mean);
+    }
     format!("{:+.3} [{:+.3}, {:+.3}]", mean.mean, mean.low, mean.high)
 }

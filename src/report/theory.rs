@@ -7,15 +7,20 @@ use crate::theory::{Bound, Check};
 
 /// A line a check: measured against bound.
 pub fn theory_table(checks: &[Check]) -> String {
-    let head = ["theorem", "what", "measured", "bound", ""];
+    aligned(&theory_table_rows(checks))
+}
+
+/// The cells of [`theory_table`], the head first.
+pub fn theory_table_rows(checks: &[Check]) -> Vec<Vec<String>> {
+    let head = ["theorem: what", "measured", "bound", ""];
     let mut lines = vec![head.map(str::to_owned).to_vec()];
     for check in checks {
         let measured = number(check.measured);
         let verdict = if check.holds() { "" } else { "NOT KEPT" };
-        let (theorem, what) = (check.theorem.to_owned(), check.what.to_owned());
-        lines.push(vec![theorem, what, measured, bound_text(check.bound), verdict.to_owned()]);
+        let what = format!("{}: {}", check.theorem, check.what);
+        lines.push(vec![what, measured, bound_text(check.bound), verdict.to_owned()]);
     }
-    aligned(&lines)
+    lines
 }
 
 fn number(value: f64) -> String {

@@ -94,6 +94,10 @@ fn room(served: &ServedRoom) -> pb::Room {
     }
 }
 
+fn revisions(rooms: &[(crate::room::RoomId, u64)]) -> Vec<pb::Revision> {
+    rooms.iter().map(|(room, revision)| pb::Revision { name: room.to_string(), revision: *revision }).collect()
+}
+
 fn adapter(stored: &StoredAdapter) -> pb::Adapter {
     let (adapter, record) = (&stored.adapter, &stored.record);
     let scale = adapter.scale();
@@ -101,11 +105,7 @@ fn adapter(stored: &StoredAdapter) -> pb::Adapter {
         revision: Some(pb::Revision { name: stored.name.clone(), revision: stored.revision }),
         source: Some(convert::source_to_wire(adapter.source())),
         latent_dim: adapter.latent_dim() as u32,
-        training_rooms: record
-            .rooms
-            .iter()
-            .map(|(room, revision)| pb::Revision { name: room.to_string(), revision: *revision })
-            .collect(),
+        training_rooms: revisions(&record.rooms),
         preset: record.preset.clone(),
         split: record.split.name().to_owned(),
         stride: record.stride,
@@ -120,6 +120,8 @@ fn adapter(stored: &StoredAdapter) -> pb::Adapter {
         charts: adapter.network().chart_count() as u32,
         loss: record.config.loss.name().to_owned(),
         navigators: convert::navigator_names(adapter),
+        mixing: adapter.network().mixing().name().to_owned(),
+        calibration_rooms: revisions(&record.calibrated_on),
     }
 }
 

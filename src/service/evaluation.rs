@@ -13,7 +13,7 @@ use super::convert;
 use super::snapshot::{ServedNavigator, TrainedOn};
 use super::{Error, Handlers, Snapshot};
 use crate::cancel::Cancellation;
-use crate::eval::{NavigatorKind, PredictionScope, Protocol, evaluate, score_predictions};
+use crate::eval::{PredictionScope, Protocol, evaluate, score_predictions};
 use crate::pairs::Split;
 use crate::proto::v1 as pb;
 use crate::proto::v1::evaluation_service_server::EvaluationService;
@@ -95,13 +95,11 @@ fn protocol(
     } = request;
     let served = snapshot.navigator(&room, &adapter)?.clone();
     let record = &served.adapter.record;
-    let navigators = match convert::navigators(&navigators)? {
-        none if none.is_empty() => NavigatorKind::table(&served.adapter.adapter),
-        given => given,
-    };
+    let (split, stride) = (convert::split(&split)?.unwrap_or(record.split), stride.unwrap_or(record.stride));
+    let navigators = convert::navigators(&navigators)?;
     let protocol = Protocol {
-        split: convert::split(&split)?.unwrap_or(record.split),
-        stride: stride.unwrap_or(record.stride),
+        split,
+        stride,
         exclude_source: convert::exclusion(exclude_source, exclude_radius)?,
         thresholds: convert::thresholds(thresholds)?,
         seed,
@@ -112,7 +110,8 @@ fn protocol(
     if protocol.steps == 0 || protocol.steps > most_steps {
         return Err(Error::invalid("steps", format!("must be 1 to {most_steps}, got {}", protocol.steps)));
     }
-    Ok((served, protocol))
+    let navigators = protocol.rows(&served.navigator)?;
+    Ok((served, Protocol { navigators, ..protocol }))
 }
 
 fn report_to_wire(served: &ServedNavigator, report: &crate::eval::Report) -> pb::EvaluationReport {
@@ -131,8 +130,9 @@ fn report_to_wire(served: &ServedNavigator, report: &crate::eval::Report) -> pb:
         in_room,
         leaks: in_room
             && (record.split != report.protocol.split
-                || record.split == Split::Whole
+                || [Split::Whole, Split::Pairs].contains(&record.split)
                 || served.trained_on == Some(TrainedOn::OtherFrames)),
+        calibrated_here: record.calibrated_on.iter().any(|(room, _)| room == served.navigator.room().id()),
         navigators: report.rows.iter().map(convert::row_to_wire).collect(),
     }
 }

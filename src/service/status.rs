@@ -132,7 +132,12 @@ impl From<navigation::Error> for Error {
             E::FeatureRows { .. } | E::Features(_) => return Self::Internal,
             E::SourceFrame(_) => "source.frame_id",
             E::TargetFrame(_) => "displacement.target_frame_id",
-            E::Adapter(adapter::Error::NoCorrector { .. } | adapter::Error::NotCalibrated) => "navigator",
+            E::Adapter(
+                adapter::Error::NoCorrector { .. }
+                | adapter::Error::NotCalibrated
+                | adapter::Error::GatedMotion
+                | adapter::Error::WhitenedColumns { .. },
+            ) => "navigator",
             E::Adapter(problem) => return view_error(problem).within("source"),
             E::Refit(_) | E::Pairs(_) => return Self::Precondition(error.to_string()),
             E::Steps { .. } => "steps",
@@ -164,9 +169,14 @@ impl From<eval::Error> for Error {
         let field = match &error {
             E::Cancelled(_) | E::Navigation(navigation::Error::Cancelled(_)) => return Self::Cancelled,
             E::Navigation(navigation::Error::Adapter(
-                adapter::Error::NoCorrector { .. } | adapter::Error::NotCalibrated,
+                adapter::Error::NoCorrector { .. }
+                | adapter::Error::NotCalibrated
+                | adapter::Error::GatedMotion
+                | adapter::Error::WhitenedColumns { .. },
             ))
-            | E::Adapter(adapter::Error::NotCalibrated) => "navigators",
+            | E::Adapter(
+                adapter::Error::NotCalibrated | adapter::Error::GatedMotion | adapter::Error::WhitenedColumns { .. },
+            ) => "navigators",
             E::Navigation(navigation::Error::Refit(_)) => return Self::Precondition(error.to_string()),
             E::Navigation(_) | E::Adapter(_) => return Self::Internal,
             E::Room(_) => "room",
@@ -176,6 +186,7 @@ impl From<eval::Error> for Error {
             E::Pairs(pairs::Error::NoDatasetSplit) => "split",
             E::Threshold { .. } | E::ThresholdCount { .. } => "thresholds",
             E::NoCandidates { .. } => "exclude_radius",
+            E::NothingToFitOn { .. } => "navigators",
             E::NoPredictions | E::MixedPredictions => "predictions",
             E::NotACandidate { .. } | E::NotATestPair { .. } | E::Excluded { .. } => "predictions",
             E::Prediction { position, problem } => return Self::invalid(format!("predictions[{position}]"), problem),

@@ -245,7 +245,7 @@ fn golden_steps(adapter: &Adapter, kind: CorrectorKind, latents: &Array2<f64>) -
     let mut steps = Array2::zeros(latents.dim());
     for (latent, mut into) in latents.outer_iter().zip(steps.outer_iter_mut()) {
         let twist = adapter.motion(latents.row(0), latent);
-        into.assign(&adapter.corrected_step(kind, latent, twist, 1.0)?);
+        into.assign(&adapter.corrected_step(kind, latent, twist)?);
     }
     Ok(steps)
 }

@@ -28,7 +28,7 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
     let global = global(&map, &centre, effort.samples, random);
     vec![
         check("3", "order of the local readout's error, constructed map", order, Bound::Equals(2.0, 0.05)),
-        check("3", "order of the local readout's error, drawn room", drawn, Bound::AtLeast(1.0)),
+        check("3", "order of the local readout's error, drawn room", drawn, Bound::AtLeast(1.2)),
         check("5a", "largest ‖ε‖ / (sup ‖WJ − I‖ ‖ξ‖) along geodesics", global.readout, Bound::AtMost(1.0 + SLACK)),
         check("5b", "largest ‖WJ(g) − I‖ / (distance · sup ‖W∇J‖)", global.variation, Bound::AtMost(1.0 + SLACK)),
         check("5a", "sup ‖WJ − I‖ over the region, radius 0.3", global.spread, Bound::Free),

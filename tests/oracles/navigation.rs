@@ -200,6 +200,62 @@ fn calibrated_retrieval_is_the_least_surprising_candidate() {
     assert!(uncalibrated.with_error_covariance(-covariance).is_err());
 }
 
+/// Oracle: by hand. A linear corrector that moves the latent by A ΔP moves it by A ΔP in any number of parts, although
+/// its input is the z-scored motion.
+#[test]
+fn a_corrector_walks_a_motion_in_parts() {
+    let folder = crate::support::golden();
+    let plain = adapter_of(&folder, "synthetic", 1);
+    let scale = plain.scale().clone();
+    let map = |row: usize, column: usize| ((row * 6 + column) as f64 * 0.7).sin();
+    let read = |name: &str| {
+        let bias = |row: usize| (0..6).map(|c| map(row, c) * scale.mean[c]).sum::<f64>();
+        Ok::<_, Error>(match name {
+            "net.bias" => ndarray::Array2::from_shape_fn((1, 20), |(_, row)| bias(row) as f32),
+            _ => ndarray::Array2::from_shape_fn((20, 26), |(row, column)| match column {
+                0..20 => f32::from(u8::from(row == column)),
+                _ => (map(row, column - 20) * scale.deviation[column - 20]) as f32,
+            }),
+        })
+    };
+    let corrector = Corrector::from_tensors(CorrectorKind::Linear, 20, read).unwrap();
+    let adapter = plain.with_correctors(vec![corrector]).unwrap();
+    let twist = seese3::geometry::Twist { linear: [0.5, -0.2, 0.9].into(), angular: [0.1, 0.3, -0.2].into() };
+    for steps in [1u32, 2, 8] {
+        let mut latent = ndarray::Array1::zeros(20);
+        for _ in 0..steps {
+            let step = adapter.corrected_step(CorrectorKind::Linear, latent.view(), twist.divided(steps)).unwrap();
+            latent += &step;
+        }
+        for (row, &found) in latent.iter().enumerate() {
+            let expected: f64 = (0..6).map(|c| map(row, c) * twist.to_vector()[c]).sum();
+            near(&format!("{steps} steps"), found, expected, 1e-5);
+        }
+    }
+}
+
+/// Oracle: by hand. At the goal nothing is left to walk: what the affine reading takes off for μ, in all parts together,
+/// is μ once, closed loop or not.
+#[test]
+fn a_closed_loop_takes_the_mean_off_once() {
+    let folder = crate::support::golden();
+    let navigator = navigator(&folder, "synthetic", adapter(&folder, "synthetic"));
+    let stepper = Stepper::InversePoincare(Reading::Affine);
+    let start = navigator.start(&Source::Frame(seese3::room::FrameId(100)), None).unwrap();
+    let adapter = navigator.adapter();
+    let still = seese3::geometry::Twist::default();
+    let whole = adapter.inverse().step(still, Reading::Affine, 1.0);
+    // Only the start can be retrieved, so every part begins there, with nothing left to walk.
+    let search = Search::exact(Metric::Full, adapter, navigator.latents(), &[seese3::room::FrameId(100)]).unwrap();
+    let space = Space { search: &search, ..navigator.space(&stepper) };
+    let plan = Plan { mode: Mode::ClosedLoop, steps: 4, hit_count: 1, exclude_source: None };
+    let walked = walk(space, &start, Leg { motion: still, goal: start.pose }, plan, &Cancellation::default()).unwrap();
+    for step in walked {
+        let moved = &step.latent - &start.latent;
+        assert!(moved.iter().zip(&whole).all(|(a, b)| (a - b / 4.0).abs() < 1e-12));
+    }
+}
+
 /// Oracle: NumPy, a pseudo-inverse for every source with the gate that PyTorch gives it, distances over both charts.
 #[test]
 fn a_mixture_navigates_as_the_oracle() {

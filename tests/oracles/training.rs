@@ -5,6 +5,7 @@ use std::path::Path;
 use ndarray::Array2;
 use seese3::adapter::{
     Adapter, Error, Loss, Mixing, Mixture, Network, Real, Samples, Siamese, TENSOR_NAMES, TrainConfig, Trainer, Widths,
+    train,
 };
 use seese3::features::FeatureSource;
 use seese3::pairs::{Pair, Split};
@@ -173,7 +174,7 @@ fn a_seed_gives_pytorchs_initial_weights() {
     }
 }
 
-/// Oracle: the plain chart itself, bit by bit, after training (K = 1 has no gate).
+/// Oracle: the plain chart itself, bit by bit; the fifty steps above train it as PyTorch trains the plain adapter.
 #[test]
 fn a_mixture_of_one_is_the_plain_adapter() {
     let folder = crate::support::golden();
@@ -185,6 +186,60 @@ fn a_mixture_of_one_is_the_plain_adapter() {
     assert_eq!(mixture.charts(), std::slice::from_ref(&chart));
     let rows = features(&folder, "synthetic");
     assert_eq!(mixture.embed(rows.clone()), chart.embed(rows));
+}
+
+/// Oracle: the definition: charts learned by themselves, from seeds of their own, each for its share of the epochs.
+#[test]
+fn an_ensembles_members_are_adapters_learned_alone() {
+    let samples = samples::<f32>(&crate::support::golden(), "synthetic");
+    let alone = TrainConfig { epochs: 2, batch: 128, ..TrainConfig::default() };
+    let together = TrainConfig { epochs: 6, charts: 3, mixing: Mixing::Even, ..alone.clone() };
+    let ensemble = train(&samples, &together, &mut |_| ()).unwrap();
+    let first = train(&samples, &alone, &mut |_| ()).unwrap();
+    assert_eq!(ensemble.chart_count(), 3);
+    assert_eq!(ensemble.charts()[0], first.charts()[0]);
+    assert_ne!(ensemble.charts()[1], ensemble.charts()[0]);
+    let refused = TrainConfig { charts: 2, standardise: true, ..alone };
+    assert!(matches!(train(&samples, &refused, &mut |_| ()), Err(Error::GatedStandardised)));
+}
+
+/// Oracle: features that were z-scored before training, by means and deviations taken here: the weights that come back
+/// are for features as they are.
+#[test]
+fn weights_learned_on_z_scored_features_are_folded() {
+    let folder = crate::support::golden();
+    let rows = features(&folder, "synthetic");
+    let poses = crate::support::poses(&folder.join("rooms/synthetic/poses.npy"));
+    let pairs: Vec<[usize; 2]> = (0..500).map(|i| [i, i + 40]).collect();
+    let used = rows.slice(ndarray::s![..540, ..]).mapv(f64::from);
+    let mean = used.mean_axis(ndarray::Axis(0)).unwrap();
+    let deviation = used.std_axis(ndarray::Axis(0), 0.0);
+    let scored = ((rows.mapv(f64::from) - &mean) / &deviation).mapv(|x| x as f32);
+    let config = TrainConfig { epochs: 3, batch: 100, ..TrainConfig::default() };
+    let learned = |rows: &Array2<f32>, config: &TrainConfig| {
+        let samples = Samples::<f32>::new(rows.view(), poses.clone(), pairs.clone()).unwrap();
+        train(&samples, config, &mut |_| ()).unwrap()
+    };
+    let expected = learned(&scored, &config).embed(scored.clone()).mapv(f64::from);
+    let folded = learned(&rows, &TrainConfig { standardise: true, ..config }).embed(rows).mapv(f64::from);
+    let off = worst(&folded, &expected);
+    assert!(off < 2e-3, "off by {off}");
+}
+
+/// Oracle: by hand, two epochs of one step each. The average moves from the start by min(a, (1 + t)/(10 + t)).
+#[test]
+fn averaged_weights_lie_between_start_and_end() {
+    let samples = samples::<f32>(&crate::support::golden(), "synthetic");
+    let one_step = TrainConfig { epochs: 1, batch: 1_000, ..TrainConfig::default() };
+    let last = train(&samples, &one_step, &mut |_| ()).unwrap();
+    let averaged = train(&samples, &TrainConfig { average: 0.9, ..one_step }, &mut |_| ()).unwrap();
+    let widths = Widths { feature: samples.feature_dim(), hidden: 64, latent: 20 };
+    let start = Mixture::<f32>::initial(widths, 1, 0);
+    let share = 1.0 - 2.0 / 11.0;
+    for ((start, last), averaged) in start.parameters().iter().zip(last.parameters()).zip(averaged.parameters()) {
+        let expected = *start + (last - *start) * share as f32;
+        assert!(averaged.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-6));
+    }
 }
 
 /// Oracle: central differences of the loss itself, along one direction in each tensor, of every loss and two gates.

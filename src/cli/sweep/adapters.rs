@@ -1,19 +1,20 @@
 //! `seese3 sweep adapters`.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 use std::time::Instant;
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
 use rayon::prelude::*;
+use sha2::{Digest, Sha256};
 
 use super::super::progress::bar;
 use super::super::protocol::{LossName, ProtocolOptions};
-use super::super::rooms::{lesson, load_rooms, room_words};
+use super::super::rooms::{lesson, load_rooms};
 use super::super::{say, write_file};
 use super::journal::{self, Journal};
-use crate::adapter::{Loss, TrainConfig};
+use crate::adapter::{Loss, PairPlan, TrainConfig};
 use crate::features::Features;
 use crate::generalisation::nested_choice;
 use crate::report::{SweepRow, configurations_table, difficulty_table, parts_table, success_table, sweep_parquet};
@@ -75,6 +76,9 @@ struct Task<'a> {
 impl Adapters {
     pub async fn run(self) -> anyhow::Result<()> {
         let (part, parts) = self.shard()?;
+        self.protocol.needs_test_pairs()?;
+        self.protocol.leaves_to_the_grid()?;
+        ensure!(self.sample != Some(0), "--sample must be at least 1");
         let store = Store::open(&self.store)?;
         let mut rooms = Vec::new();
         match self.features.as_slice() {
@@ -88,12 +92,13 @@ impl Adapters {
         let journal = Journal::open(&self.out, &format!("shard-{part}-of-{parts}"))?;
         let known: HashSet<String> = journal::rows(&self.out)?.into_iter().map(|row| row.key).collect();
         let tasks = self.tasks(&rooms)?;
+        let keys: HashSet<String> = tasks.iter().map(|task| task.row.key.clone()).collect();
         let all = tasks.len();
         let ours: Vec<Task<'_>> =
             tasks.into_iter().skip(part - 1).step_by(parts).filter(|task| !known.contains(&task.row.key)).collect();
         say(format_args!(
-            "{}; {all} runs, {} of them to be done here (shard {part} of {parts})",
-            room_words(&rooms),
+            "{} rooms and features; {all} runs, {} of them to be done here (shard {part} of {parts})",
+            rooms.len(),
             ours.len()
         ));
         let progress = bar(ours.len() as u64, "sweep");
@@ -103,9 +108,18 @@ impl Adapters {
             journal.add(&row)
         })?;
         progress.finish_and_clear();
-        let rows = journal::rows(&self.out)?;
+        let in_folder = journal::rows(&self.out)?;
         let file = self.out.join("runs.parquet");
-        write_file(&file, &sweep_parquet(&rows).map_err(anyhow::Error::msg)?)?;
+        write_file(&file, &sweep_parquet(&in_folder).map_err(anyhow::Error::msg)?)?;
+        let rows: Vec<SweepRow> = in_folder.iter().filter(|row| keys.contains(&row.key)).cloned().collect();
+        let base = self.protocol.recipe(0)?;
+        say(format_args!(
+            "preset {} with {} epochs, split {}, stride {}; of each room the best run counts, chosen by its test score:",
+            base.preset.name(),
+            base.config.epochs,
+            base.split,
+            base.stride
+        ));
         say(success_table(&rows).trim_end());
         say("\nhow hard the rooms are:");
         say(difficulty_table(&rows).trim_end());
@@ -113,11 +127,15 @@ impl Adapters {
         say(parts_table(&rows).trim_end());
         say("\nthe best configurations by mean R²:");
         say(configurations_table(&rows, SHOWN).trim_end());
-        let failed = rows.iter().filter(|row| !row.failure.is_empty()).count();
-        if failed > 0 {
-            say(format_args!("{failed} runs have no scores; the column 'failure' says why"));
+        let mut failures: BTreeMap<(&str, &str), usize> = BTreeMap::new();
+        for row in rows.iter().filter(|row| !row.failure.is_empty()) {
+            *failures.entry((&row.room, &row.failure)).or_default() += 1;
         }
-        say(format_args!("wrote {} ({} rows)", file.display(), rows.len()));
+        for ((room, why), count) in &failures {
+            say(format_args!("room '{room}': {count} runs have no scores: {why}"));
+        }
+        say(format_args!("wrote {} ({} rows, every run of the folder)", file.display(), in_folder.len()));
+        ensure!(rows.iter().any(|row| row.failure.is_empty()), "no run of this grid has scores");
         Ok(())
     }
 
@@ -150,12 +168,13 @@ impl Adapters {
         let base = self.protocol.recipe(0)?;
         let mut tasks = Vec::new();
         for room in rooms {
+            let content = content(room);
             for &(latent, charts, learning_rate, loss) in &grid {
                 for seed in 0..self.seeds {
                     let config = TrainConfig { latent, charts, learning_rate, loss, seed, ..base.config.clone() };
                     let recipe = Recipe { config, ..base.clone() };
                     recipe.check().context("the grid")?;
-                    let row = row(room, &recipe);
+                    let row = row(room, &content, &recipe);
                     tasks.push(Task { room, recipe, row });
                 }
             }
@@ -176,8 +195,17 @@ fn done(task: Task<'_>) -> SweepRow {
     row
 }
 
+/// What poses and features are, whatever they are called: another store may call others by the same names.
+fn content((stored, features): &(StoredRoom, Features)) -> String {
+    let mut digest = Sha256::new();
+    features.rows().iter().for_each(|x| digest.update(x.to_le_bytes()));
+    let poses = stored.room.poses().iter().map(crate::geometry::Pose::to_homogeneous);
+    poses.for_each(|pose| pose.iter().for_each(|x| digest.update(x.to_le_bytes())));
+    digest.finalize().iter().take(16).map(|byte| format!("{byte:02x}")).collect()
+}
+
 /// What decides a run; its scores are still empty.
-fn row((stored, features): &(StoredRoom, Features), recipe: &Recipe) -> SweepRow {
+fn row((stored, features): &(StoredRoom, Features), content: &str, recipe: &Recipe) -> SweepRow {
     let config = &recipe.config;
     let row = SweepRow {
         key: String::new(),
@@ -191,6 +219,11 @@ fn row((stored, features): &(StoredRoom, Features), recipe: &Recipe) -> SweepRow
         stride: recipe.stride,
         geo_dim: config.latent,
         charts: config.charts,
+        mixing: config.mixing.name().to_owned(),
+        pairs: match &recipe.pairs {
+            PairPlan::Stride(stride) => format!("stride {stride}"),
+            PairPlan::Range(range) => format!("{} of strides {}-{}", range.count, range.low, range.high),
+        },
         lr: config.learning_rate,
         loss: config.loss.name().to_owned(),
         epochs: config.epochs,
@@ -208,5 +241,5 @@ fn row((stored, features): &(StoredRoom, Features), recipe: &Recipe) -> SweepRow
         seconds: 0.0,
         failure: String::new(),
     };
-    SweepRow { key: format!("{}@{} {:?} {:?}", row.room, row.room_revision, features.source(), recipe), ..row }
+    SweepRow { key: format!("{}@{} {content} {recipe:?}", row.room, row.room_revision), ..row }
 }

@@ -45,6 +45,7 @@ impl Formulations {
         if let Some(file) = &self.json {
             check_writable(file)?;
         }
+        self.protocol.needs_test_pairs()?;
         let store = Store::open(&self.store)?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
         let recipe = self.protocol.recipe(0)?;
@@ -70,14 +71,17 @@ impl Formulations {
             })
             .to_vec();
         say(format_args!(
-            "{}, features '{}', preset {}, stride {}, split {}, {} seeds{}",
+            "{}, features '{}', preset {} with {} epochs, stride {}, split {}; means over rooms ± sd over {} seeds{}; {} \
+             test pairs",
             room_words(&rooms),
             rooms[0].1.source().name,
             recipe.preset.name(),
+            recipe.config.epochs,
             recipe.stride,
             recipe.split,
             self.seeds,
             if self.pooled { ", rooms together" } else { "" },
+            scores[0].runs.first().map_or(0, |run| run.n),
         ));
         say(formulations_table(&scores).trim_end());
         if let Some(file) = &self.json {

@@ -51,11 +51,11 @@ pub fn rows(folder: &Path) -> anyhow::Result<Vec<SweepRow>> {
         if !path.to_string_lossy().ends_with(EXTENSION) {
             continue;
         }
-        let text = std::fs::read_to_string(&path).with_context(|| format!("{} cannot be read", path.display()))?;
+        let text = std::fs::read(&path).with_context(|| format!("{} cannot be read", path.display()))?;
         // Another shard may be writing its last line.
-        let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-        for (number, line) in whole.lines().enumerate() {
-            let row: SweepRow = serde_json::from_str(line)
+        let whole = text.iter().rposition(|&byte| byte == b'\n').map_or(&[][..], |end| &text[..end]);
+        for (number, line) in whole.split(|&byte| byte == b'\n').enumerate().filter(|(_, line)| !line.is_empty()) {
+            let row: SweepRow = serde_json::from_slice(line)
                 .with_context(|| format!("{}, line {}: no run of a sweep", path.display(), number + 1))?;
             found.insert(row.key.clone(), row);
         }

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use clap::Args;
 use rayon::prelude::*;
 
@@ -73,6 +73,7 @@ impl Layers {
         if let Some(file) = &self.json {
             check_writable(file)?;
         }
+        ensure!(self.split != SplitName::Whole, "--split whole sets no test pairs apart; take another split");
         let store = Store::open(&self.store)?;
         let mut rooms = Vec::new();
         for room in &self.rooms {

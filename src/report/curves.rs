@@ -1,0 +1,120 @@
+//! Curves and clouds of points, as SVG.
+
+use plotters::coord::Shift;
+use plotters::prelude::*;
+
+/// A named set of points (x, y).
+#[derive(Debug, Clone)]
+pub struct Series {
+    /// In the legend.
+    pub name: String,
+    /// In the order of the line.
+    pub points: Vec<[f64; 2]>,
+    /// Whether a line joins them.
+    pub joined: bool,
+}
+
+/// A plot.
+#[derive(Debug, Clone)]
+pub struct Curves {
+    /// Above it.
+    pub title: String,
+    /// Along x.
+    pub x: String,
+    /// Along y.
+    pub y: String,
+    /// One colour each; at least one point in all.
+    pub series: Vec<Series>,
+    /// Whether the line y = x is drawn.
+    pub diagonal: bool,
+}
+
+const SIZE: (u32, u32) = (860, 520);
+const COLOURS: [RGBColor; 8] = [
+    RGBColor(31, 119, 180),
+    RGBColor(214, 96, 20),
+    RGBColor(44, 140, 70),
+    RGBColor(148, 103, 189),
+    RGBColor(140, 86, 75),
+    RGBColor(200, 60, 90),
+    RGBColor(100, 100, 100),
+    RGBColor(23, 160, 180),
+];
+
+/// The plot as an SVG document.
+///
+/// # Errors
+/// What the drawing library says, in words.
+pub fn curves_svg(curves: &Curves) -> Result<String, String> {
+    let mut svg = String::new();
+    {
+        let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
+        draw(&root, curves).map_err(|error| error.to_string())?;
+    }
+    Ok(svg)
+}
+
+fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, curves: &Curves) -> Result<(), Box<dyn std::error::Error>> {
+    root.fill(&WHITE)?;
+    let values =
+        |axis: usize| curves.series.iter().flat_map(|s| &s.points).map(move |p| p[axis]).filter(|v| v.is_finite());
+    let (x_range, y_range) = (range(values(0)), range(values(1)));
+    let mut chart = ChartBuilder::on(root)
+        .caption(&curves.title, ("sans-serif", 20))
+        .margin(12)
+        .x_label_area_size(42)
+        .y_label_area_size(56)
+        .build_cartesian_2d(x_range.clone(), y_range.clone())?;
+    chart.configure_mesh().light_line_style(WHITE).x_desc(&curves.x).y_desc(&curves.y).draw()?;
+    if curves.diagonal {
+        let (low, high) = (x_range.start.max(y_range.start), x_range.end.min(y_range.end));
+        chart.draw_series(LineSeries::new([(low, low), (high, high)], BLACK.mix(0.3)))?;
+    }
+    for (series, colour) in curves.series.iter().zip(COLOURS.iter().cycle()) {
+        let points: Vec<(f64, f64)> =
+            series.points.iter().filter(|p| p.iter().all(|v| v.is_finite())).map(|p| (p[0], p[1])).collect();
+        if series.joined {
+            chart.draw_series(LineSeries::new(points.iter().copied(), colour.stroke_width(2)))?;
+        }
+        let legend = move |(x, y)| Circle::new((x + 10, y), 4, colour.filled());
+        let dots = points.iter().map(|&at| Circle::new(at, 3, colour.filled()));
+        chart.draw_series(dots)?.label(&series.name).legend(legend);
+    }
+    chart
+        .configure_series_labels()
+        .position(SeriesLabelPosition::LowerRight)
+        .background_style(WHITE.mix(0.85))
+        .border_style(BLACK.mix(0.2))
+        .draw()?;
+    root.present()?;
+    Ok(())
+}
+
+/// A little more than the values span.
+fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
+    let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
+    if low > high {
+        return 0.0..1.0;
+    }
+    let margin = if high > low { 0.06 * (high - low) } else { 0.5 };
+    low - margin..high + margin
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: SVG's own words: a circle for every point that is a number (and one a series for the legend), labels as given.
+    #[test]
+    fn every_point_is_drawn() {
+        let points = vec![[0.0, 1.0], [1.0, 2.0], [2.0, f64::NAN]];
+        let series = vec![Series { name: "grows".to_owned(), points, joined: true }];
+        let curves =
+            Curves { title: "T".to_owned(), x: "rooms".to_owned(), y: "hits".to_owned(), series, diagonal: false };
+        let svg = curves_svg(&curves).unwrap();
+        assert_eq!(svg.matches("<circle").count(), 2 + 1);
+        assert!(svg.contains("grows") && svg.contains("rooms") && svg.contains("hits"));
+        let empty = Curves { series: Vec::new(), ..curves };
+        assert!(curves_svg(&empty).unwrap().contains("<svg"));
+    }
+}

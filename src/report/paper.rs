@@ -1,0 +1,37 @@
+//! The paper's own numbers, to stand beside ours. Encoders and rooms differ: they are context, not a target.
+
+/// Alternatives on DINOv2-B, layer 7, three scenes, 15 seeds (sec. 2.5): name, overall, translation, rotation, direction,
+/// magnitude.
+pub const ALTERNATIVES: [(&str, [f64; 5]); 5] = [
+    ("poincare", [0.61, 0.63, 0.59, 0.41, 0.60]),
+    ("a-unanchored", [-6.82, -0.66, -12.98, -0.97, -0.99]),
+    ("b-absolute", [-1.75, -0.80, -2.70, -0.98, -3.10]),
+    ("c-se3-mlp", [-0.43, 0.25, -1.10, -0.05, -1.45]),
+    ("d-difference-input", [0.48, 0.44, 0.53, 0.08, -0.08]),
+];
+
+/// Navigation with DINOv2, layer 7, three scenes (sec. 2.6): name, MSE, R², Top-1, Hit@0.1, 0.2, 0.3, 0.5.
+pub const NAVIGATION: [(&str, [f64; 7]); 6] = [
+    ("identity", [0.578, -0.323, 0.0, 0.090, 0.204, 0.302, 0.523]),
+    ("inverse-poincare-affine", [0.350, 0.199, 0.041, 0.252, 0.479, 0.628, 0.741]),
+    ("corrector-linear", [0.254, 0.414, 0.020, 0.141, 0.263, 0.342, 0.415]),
+    ("corrector-mlp-2", [0.280, 0.355, 0.029, 0.185, 0.342, 0.410, 0.473]),
+    ("corrector-mlp-3", [0.219, 0.498, 0.051, 0.261, 0.451, 0.532, 0.581]),
+    ("corrector-attention", [0.258, 0.407, 0.018, 0.167, 0.323, 0.383, 0.422]),
+];
+
+/// Rooms of 31 in which zero-shot navigation and the ridge-refit beat Identity at Hit@0.1 (sec. 2.7): encoder, zero-shot,
+/// refit.
+pub const CROSS_ROOM: [(&str, &str, &str); 3] = [
+    ("DINOv2", "19/30 (63 %)", "29/31 (94 %)"),
+    ("DUSt3R", "17/29 (59 %)", "26/29 (90 %)"),
+    ("V-JEPA 2.1", "19/31 (61 %)", "29/31 (94 %)"),
+];
+
+/// Intrinsic dimension and ridge, at the best layer by M3 (Table 1): encoder, TwoNN, MLE, M3 R².
+pub const DIMENSIONS: [(&str, [f64; 3]); 4] = [
+    ("DINOv2-B, layer 9", [9.15, 6.41, -0.28]),
+    ("DUSt3R, layer 19", [7.16, 4.40, -0.22]),
+    ("CroCo, layer 10", [7.66, 5.92, -0.42]),
+    ("raw pixels", [5.01, 4.03, -5.29]),
+];
