@@ -1,4 +1,4 @@
-"""Checks what the README and the docs claim against the JSON that the program wrote. No packages needed."""
+"""Checks what the README and the docs claim against the JSON that the program wrote. No packages needed but pandas, for one of them."""
 
 import array
 import ast
@@ -84,9 +84,24 @@ def features(ours, published):
         assert off[-1] <= bound
 
 
+def sweep(file, count):
+    """pandas opens a sweep's table: a row a run, every one with scores."""
+    try:
+        import pandas
+    except ImportError:
+        print("SKIPPED the sweep's table: no pandas")
+        return
+    table = pandas.read_parquet(file)
+    print(table.groupby(["geo_dim", "charts", "loss"])["r2_overall"].agg(["mean", "std", "count"]))
+    assert len(table) == count and table["key"].is_unique and (table["failure"] == "").all()
+    assert table["r2_overall"].notna().all() and set(table["geo_dim"]) == {10, 20}
+
+
 if __name__ == "__main__":
     if sys.argv[1] == "demo":
         demo(sys.argv[2])
+    elif sys.argv[1] == "sweep":
+        sweep(sys.argv[2], int(sys.argv[3]))
     elif sys.argv[1] == "features":
         features(pathlib.Path(sys.argv[2]), pathlib.Path(sys.argv[3]))
     else:
