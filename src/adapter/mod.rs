@@ -69,7 +69,7 @@ pub enum Error {
     Gate { chart: usize, value: f64 },
     #[error("an adapter has 1 to {MAX_CHARTS} charts, not {count}")]
     Charts { count: usize },
-    #[error("the adapter has no corrector '{name}'; it has {known}")]
+    #[error("the adapter has no corrector '{name}' (train --correctors); it has {known}")]
     NoCorrector { name: &'static str, known: String },
     #[error("charts under a gate have no one matrix from latents to motions; take another metric, or mix them evenly")]
     GatedMotion,
@@ -79,7 +79,7 @@ pub enum Error {
     GatedStandardised,
     #[error("the covariance of an adapter's errors must be symmetric and positive definite")]
     ErrorCovariance,
-    #[error("the adapter's errors were not measured in rooms that it did not learn from")]
+    #[error("the adapter's errors were not measured in rooms that it did not learn from (train --calibrate-on)")]
     NotCalibrated,
     #[error("corrector '{name}' was given twice")]
     CorrectorTwice { name: &'static str },

@@ -195,7 +195,8 @@ fn twist(numbers: &[f64]) -> anyhow::Result<pb::Twist> {
 
 /// Prints the steps of a navigation.
 pub fn say_navigation(answer: &pb::NavigateResponse) {
-    say(format_args!("room {}, adapter {}", revision(answer.room.as_ref()), revision(answer.adapter.as_ref())));
+    let (room, adapter) = (revision(answer.room.as_ref()), revision(answer.adapter.as_ref()));
+    say(format_args!("room {room}, adapter {adapter}, {}", answer.navigator));
     if let Some(motion) = &answer.displacement {
         say(format_args!("motion {}", motion_text(motion)));
     }

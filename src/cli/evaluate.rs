@@ -104,20 +104,7 @@ impl Evaluate {
             "split {}, stride {}: {} test pairs, {} candidate frames, source {side}",
             protocol.split, protocol.stride, report.n, report.candidate_count
         ));
-        if protocol.steps > 1 {
-            say(format_args!("{} equal parts of each motion, {}", protocol.steps, protocol.mode.name()));
-        }
-        if record.calibrated_on.iter().any(|(room, _)| room.as_str() == self.room) {
-            say("LEAK: the adapter's errors were measured in this room; +calibrated has seen its poses");
-        }
-        if leaks {
-            let why = if other_frames {
-                "on other frames of this room".to_owned()
-            } else {
-                format!("under the split '{}'", record.split)
-            };
-            say(format_args!("LEAK: the adapter was trained {why}; test pairs may have been trained on"));
-        }
+        self.say_caveats(&protocol, &record, leaks, other_frames);
         say(evaluation_table(&report).trim_end());
         if let Some(path) = &self.json {
             let adapter = json!({ "name": chosen.name, "revision": chosen.revision, "preset": record.preset,
@@ -134,6 +121,24 @@ impl Evaluate {
             say(format_args!("wrote {}", path.display()));
         }
         Ok(())
+    }
+
+    /// What the table must not be read without.
+    fn say_caveats(&self, protocol: &Protocol, record: &TrainingRecord, leaks: bool, other_frames: bool) {
+        if protocol.steps > 1 {
+            say(format_args!("{} equal parts of each motion, {}", protocol.steps, protocol.mode.name()));
+        }
+        if record.calibrated_on.iter().any(|(room, _)| room.as_str() == self.room) {
+            say("LEAK: the adapter's errors were measured in this room; +calibrated has seen its poses");
+        }
+        if leaks {
+            let why = if other_frames {
+                "on other frames of this room".to_owned()
+            } else {
+                format!("under the split '{}'", record.split)
+            };
+            say(format_args!("LEAK: the adapter was trained {why}; test pairs may have been trained on"));
+        }
     }
 
     /// What is asked for, the adapter's own split and stride where nothing is.

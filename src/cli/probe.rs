@@ -109,25 +109,7 @@ impl Probe {
         let recipes = self.recipes(&base)?;
         let pooled = self.pooled && self.metrics.contains(&Metric::M4);
         let progress = bar((rooms.len() + usize::from(pooled)) as u64, "probing");
-        let one = |room: &Loaded| {
-            let what = || format!("room '{}', features '{}'", room.0.room.id(), room.1.source().name);
-            let scores = self.scores(room, &recipes).with_context(what);
-            progress.inc(1);
-            scores
-        };
-        let probed: Vec<anyhow::Result<ProbeScores>> = rooms.par_iter().map(one).collect();
-        let mut scores = Vec::with_capacity(probed.len());
-        let mut skipped = Vec::new();
-        for result in probed {
-            match result {
-                Ok(found) => scores.push(found),
-                Err(error) if rooms.len() > 1 => skipped.push(format!("{error:#}")),
-                Err(error) => return Err(error),
-            }
-        }
-        if let (true, Some(first)) = (scores.is_empty(), skipped.first()) {
-            bail!("no room could be probed; the first says: {first}");
-        }
+        let (mut scores, skipped) = self.probed(&rooms, &recipes, &progress)?;
         if pooled {
             let lessons: Vec<Lesson<'_>> = rooms.iter().map(lesson).collect();
             let m4 = self.adapters(&lessons, &recipes)?;
@@ -168,6 +150,35 @@ impl Probe {
             say(format_args!("wrote {}", file.display()));
         }
         Ok(())
+    }
+
+    /// Every room that can be probed, and why the others cannot.
+    fn probed(
+        &self,
+        rooms: &[Loaded],
+        recipes: &[Recipe],
+        progress: &indicatif::ProgressBar,
+    ) -> anyhow::Result<(Vec<ProbeScores>, Vec<String>)> {
+        let one = |room: &Loaded| {
+            let what = || format!("room '{}', features '{}'", room.0.room.id(), room.1.source().name);
+            let scores = self.scores(room, recipes).with_context(what);
+            progress.inc(1);
+            scores
+        };
+        let probed: Vec<anyhow::Result<ProbeScores>> = rooms.par_iter().map(one).collect();
+        let mut scores = Vec::with_capacity(probed.len());
+        let mut skipped = Vec::new();
+        for result in probed {
+            match result {
+                Ok(found) => scores.push(found),
+                Err(error) if rooms.len() > 1 => skipped.push(format!("{error:#}")),
+                Err(error) => return Err(error),
+            }
+        }
+        if let (true, Some(first)) = (scores.is_empty(), skipped.first()) {
+            bail!("no room could be probed; the first says: {first}");
+        }
+        Ok((scores, skipped))
     }
 
     /// One recipe a stride.

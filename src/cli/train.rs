@@ -86,6 +86,7 @@ impl Train {
             adapter = adapter.with_error_covariance(covariance)?;
             let room = |(stored, _): &(StoredRoom, Features)| (stored.room.id().clone(), stored.revision);
             runs[0].record.calibrated_on = calibration.iter().map(room).collect();
+            say(format_args!("errors measured in {}", room_words(&calibration)));
         }
         let features = &rooms[0].1;
         let name = self.name.unwrap_or_else(|| default_name(&rooms, &recipe));

@@ -45,10 +45,9 @@ impl Store {
     pub async fn publish_room(&self, room: &Room, features: &[Features]) -> Result<Published, Error> {
         check_features(room, features)?;
         let folder = Path::from(Kind::Room.folder()).join(room.id().as_str());
-        let (room, known) = self.with_what_is_known(&folder, room).await?;
-        let room = &room;
+        let (room, known) = &self.with_what_is_known(&folder, room).await?;
         let frames = match known {
-            Some(frames) => frames,
+            Some(frames) => frames.clone(),
             None => self.write_object(&folder, "frames", "safetensors", frames_file(room)?).await?,
         };
         let frame_names = match room.frame_names() {

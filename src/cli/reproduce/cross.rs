@@ -11,7 +11,9 @@ use super::in_room::plotted;
 use super::{Found, Loaded, Set, Setting};
 use crate::adapter::{Mixing, Preset, Reading, TrainConfig};
 use crate::eval::{NavigatorKind, Protocol};
-use crate::generalisation::{MotionSummary, RoomMean, difference, nested_choice, outcomes, over_rooms, wins};
+use crate::generalisation::{
+    CLIPPED_R2, MotionSummary, RoomMean, difference, nested_choice, outcomes, over_rooms, wins,
+};
 use crate::navigation::{Metric, Refit, StepKind};
 use crate::pairs::Split;
 use crate::report::{CrossRoomRun, Curves, Section, Series, cross_room_json, paper};
@@ -122,23 +124,7 @@ fn cross_room(setting: &Setting, reached: &[(&str, Vec<Reached>)], claims: &mut 
     let (mut zero_shot, mut refitted, mut grows) = (Vec::new(), Vec::new(), Vec::new());
     for (features, found) in reached {
         let whole = &found[0].run;
-        for name in [
-            AFFINE,
-            HOMOGENEOUS,
-            "inverse-poincare-affine+row-space",
-            "inverse-poincare-affine+whitened",
-            "ridge-refit-in-sample",
-        ] {
-            let summary = MotionSummary::of(&whole.r2(), 0);
-            let [positive, clipped] = match (name, &summary) {
-                (AFFINE, Some(s)) => [rate_text(&s.positive), mean_text(&s.clipped)],
-                _ => [String::new(), String::new()],
-            };
-            let won = wins(&whole.outcomes, name);
-            let beats = won.as_ref().map_or_else(String::new, rate_text);
-            let hit = mean_text(&over_rooms(&whole.hit_rates(name), 0));
-            rows.push(vec![(*features).to_owned(), name.to_owned(), beats, hit, positive, clipped]);
-        }
+        rows.extend(zero_shot_rows(features, whole));
         zero_shot.push(wins(&whole.outcomes, AFFINE).is_some_and(|rate| rate.low > 0.5));
         refitted.push(mean_of(whole, "ridge-refit-in-sample") > mean_of(whole, AFFINE));
         let mut curve: Vec<&Reached> = found.iter().filter(|reached| reached.plan.name == "paper-range").collect();
@@ -154,12 +140,7 @@ fn cross_room(setting: &Setting, reached: &[(&str, Vec<Reached>)], claims: &mut 
         let runs: Vec<CrossRoomRun> = curve.iter().map(|reached| reached.run.clone()).collect();
         record.push(json!({ "features": features, "paper_range_by_size": cross_room_json(&runs, AFFINE) }));
     }
-    for (encoder, zero, refit) in paper::CROSS_ROOM {
-        let cells = [format!("paper: {encoder}"), "zero-shot".to_owned(), zero.to_owned()];
-        rows.push(cells.into_iter().chain([const { String::new() }; 3]).collect());
-        let cells = [format!("paper: {encoder}"), "ridge-refit".to_owned(), refit.to_owned()];
-        rows.push(cells.into_iter().chain([const { String::new() }; 3]).collect());
-    }
+    rows.extend(paper_rows());
     section.table(rows);
     for (features, found) in reached {
         for (room, why) in &found[0].run.skipped {
@@ -172,14 +153,7 @@ fn cross_room(setting: &Setting, reached: &[(&str, Vec<Reached>)], claims: &mut 
          drawing the rooms again. The refit is fitted on the very pairs it is scored on.",
         setting.options.stride
     ));
-    let plot = |title: &str, y: &str, series: Vec<Series>| {
-        let (title, x, y) = (title.to_owned(), "rooms learned from".to_owned(), y.to_owned());
-        plotted(&Curves { title, x, y, series, diagonal: false })
-    };
-    let caption = "Zero-shot Hit@0.1 of inverse Poincaré by how many rooms were learned from";
-    section.picture("scaling-hits.svg", plot("Zero-shot Hit@0.1", "mean over held-out rooms", hits)?, caption);
-    let caption = "Held-out rooms with R² above 0 by how many rooms were learned from";
-    section.picture("scaling-r2.svg", plot("Rooms with R² > 0", "share of held-out rooms", fractions)?, caption);
+    add_curves(&mut section, hits, fractions)?;
     let count = |held: &[bool]| format!("so for {} of {} features", held.iter().filter(|&&h| h).count(), held.len());
     claims.push(Claim {
         claim: "zero-shot navigation beats Identity in most rooms never seen (Hit@0.1)",
@@ -197,6 +171,53 @@ fn cross_room(setting: &Setting, reached: &[(&str, Vec<Reached>)], claims: &mut 
         found: format!("Hit@0.1 with all rooms is above that with the fewest: {}", count(&grows)),
     });
     Ok((section, Value::Array(record)))
+}
+
+/// The scaling curves, of hits and of the share of rooms with R² > 0.
+fn add_curves(section: &mut Section, hits: Vec<Series>, fractions: Vec<Series>) -> anyhow::Result<()> {
+    let plot = |title: &str, y: &str, series: Vec<Series>| {
+        let (title, x, y) = (title.to_owned(), "rooms learned from".to_owned(), y.to_owned());
+        plotted(&Curves { title, x, y, series, diagonal: false })
+    };
+    let caption = "Zero-shot Hit@0.1 of inverse Poincaré by how many rooms were learned from";
+    section.picture("scaling-hits.svg", plot("Zero-shot Hit@0.1", "mean over held-out rooms", hits)?, caption);
+    let caption = "Held-out rooms with R² above 0 by how many rooms were learned from";
+    section.picture("scaling-r2.svg", plot("Rooms with R² > 0", "share of held-out rooms", fractions)?, caption);
+    Ok(())
+}
+
+/// Navigators of one adapter in the held-out rooms.
+fn zero_shot_rows(features: &str, run: &CrossRoomRun) -> Vec<Vec<String>> {
+    let summary = MotionSummary::of(&run.r2(), 0);
+    let names = [
+        AFFINE,
+        HOMOGENEOUS,
+        "inverse-poincare-affine+row-space",
+        "inverse-poincare-affine+whitened",
+        "ridge-refit-in-sample",
+    ];
+    let row = |name: &str| {
+        let [positive, clipped] = match (name, &summary) {
+            (AFFINE, Some(s)) => [rate_text(&s.positive), mean_text(&s.clipped)],
+            _ => [String::new(), String::new()],
+        };
+        let beats = wins(&run.outcomes, name).as_ref().map_or_else(String::new, rate_text);
+        let hit = mean_text(&over_rooms(&run.hit_rates(name), 0));
+        vec![features.to_owned(), name.to_owned(), beats, hit, positive, clipped]
+    };
+    names.map(row).to_vec()
+}
+
+/// The paper's counts.
+fn paper_rows() -> Vec<Vec<String>> {
+    let mut rows = Vec::new();
+    for (encoder, zero, refit) in paper::CROSS_ROOM {
+        for (what, count) in [("zero-shot", zero), ("ridge-refit", refit)] {
+            let cells = [format!("paper: {encoder}"), what.to_owned(), count.to_owned()];
+            rows.push(cells.into_iter().chain([const { String::new() }; 3]).collect());
+        }
+    }
+    rows
 }
 
 /// What stands beside the paper's navigator and recipe.
@@ -217,27 +238,9 @@ fn better(reached: &[(&str, Vec<Reached>)], claims: &mut Vec<Claim>) -> Found {
     for (features, found) in reached {
         let baseline = &found[0].run;
         for Reached { plan, run } in found.iter().filter(|r| r.plan.size == found[0].plan.size) {
-            let name = if plan.aside > 0 { CALIBRATED } else { HOMOGENEOUS };
-            let ours = run.hit_rates(name);
-            let over = |theirs: &str| difference(&ours, &baseline.hit_rates(theirs), 0);
-            let clipped = |run: &CrossRoomRun| run.r2().iter().map(|r2| r2.max(-1.0)).collect::<Vec<_>>();
-            let r2 = difference(&clipped(run), &clipped(baseline), 0);
-            let positive = MotionSummary::of(&run.r2(), 0).map_or_else(String::new, |s| rate_text(&s.positive));
-            let (affine, homogeneous) = (over(AFFINE), over(HOMOGENEOUS));
-            rows.push(vec![
-                (*features).to_owned(),
-                plan.name.to_owned(),
-                name.to_owned(),
-                mean_text(&over_rooms(&ours, 0)),
-                signed(&affine),
-                signed(&homogeneous),
-                positive,
-                signed(&r2),
-            ]);
-            record.push(json!({ "features": features, "adapter": plan.name, "navigator": name,
-                "learned_rooms": run.learned.len(), "calibration_rooms": run.aside.len(),
-                "hit": mean_json(&over_rooms(&ours, 0)), "over_affine": mean_json(&affine),
-                "over_homogeneous": mean_json(&homogeneous), "clipped_r2_over_paper_range": mean_json(&r2) }));
+            let (row, value, [affine, homogeneous, r2]) = compared(features, plan, run, baseline);
+            rows.push(row);
+            record.push(value);
             if plan.name == "paper-range, errors measured aside" {
                 navigator_wins.push(affine.low > 0.0 && homogeneous.low > 0.0);
             }
@@ -264,6 +267,45 @@ fn better(reached: &[(&str, Vec<Reached>)], claims: &mut Vec<Claim>) -> Found {
         found: format!("the interval of the difference of clipped R² is above zero {}", count(&recipe_wins)),
     });
     (section, Value::Array(record))
+}
+
+/// A row of the table, its record, and the differences from the baseline: hits over its affine and its homogeneous
+/// reading, clipped R².
+fn compared(
+    features: &str,
+    plan: &Plan,
+    run: &CrossRoomRun,
+    baseline: &CrossRoomRun,
+) -> (Vec<String>, Value, [RoomMean; 3]) {
+    let name = if plan.aside > 0 { CALIBRATED } else { HOMOGENEOUS };
+    let ours = run.hit_rates(name);
+    let over = |theirs: &str| difference(&ours, &baseline.hit_rates(theirs), 0);
+    let clipped = |run: &CrossRoomRun| run.r2().iter().map(|r2| r2.max(CLIPPED_R2)).collect::<Vec<_>>();
+    let r2 = difference(&clipped(run), &clipped(baseline), 0);
+    let positive = MotionSummary::of(&run.r2(), 0).map_or_else(String::new, |s| rate_text(&s.positive));
+    let (hit, affine, homogeneous) = (over_rooms(&ours, 0), over(AFFINE), over(HOMOGENEOUS));
+    let row = vec![
+        features.to_owned(),
+        plan.name.to_owned(),
+        name.to_owned(),
+        mean_text(&hit),
+        signed(&affine),
+        signed(&homogeneous),
+        positive,
+        signed(&r2),
+    ];
+    let value = json!({
+        "features": features,
+        "adapter": plan.name,
+        "navigator": name,
+        "learned_rooms": run.learned.len(),
+        "calibration_rooms": run.aside.len(),
+        "hit": mean_json(&hit),
+        "over_affine": mean_json(&affine),
+        "over_homogeneous": mean_json(&homogeneous),
+        "clipped_r2_over_paper_range": mean_json(&r2),
+    });
+    (row, value, [affine, homogeneous, r2])
 }
 
 fn mean_of(run: &CrossRoomRun, navigator: &str) -> f64 {

@@ -112,6 +112,14 @@ impl Adapters {
         let file = self.out.join("runs.parquet");
         write_file(&file, &sweep_parquet(&in_folder).map_err(anyhow::Error::msg)?)?;
         let rows: Vec<SweepRow> = in_folder.iter().filter(|row| keys.contains(&row.key)).cloned().collect();
+        self.say_summary(&rows)?;
+        say(format_args!("wrote {} ({} rows, every run of the folder)", file.display(), in_folder.len()));
+        ensure!(rows.iter().any(|row| row.failure.is_empty()), "no run of this grid has scores");
+        Ok(())
+    }
+
+    /// The tables of this grid, and which rooms have no scores.
+    fn say_summary(&self, rows: &[SweepRow]) -> anyhow::Result<()> {
         let base = self.protocol.recipe(0)?;
         say(format_args!(
             "preset {} with {} epochs, split {}, stride {}; of each room the best run counts, chosen by its test score:",
@@ -120,13 +128,13 @@ impl Adapters {
             base.split,
             base.stride
         ));
-        say(success_table(&rows).trim_end());
+        say(success_table(rows).trim_end());
         say("\nhow hard the rooms are:");
-        say(difficulty_table(&rows).trim_end());
+        say(difficulty_table(rows).trim_end());
         say(format_args!("\nby part of the motion, over {} runs:", rows.len()));
-        say(parts_table(&rows).trim_end());
+        say(parts_table(rows).trim_end());
         say("\nthe best configurations by mean R²:");
-        say(configurations_table(&rows, SHOWN).trim_end());
+        say(configurations_table(rows, SHOWN).trim_end());
         let mut failures: BTreeMap<(&str, &str), usize> = BTreeMap::new();
         for row in rows.iter().filter(|row| !row.failure.is_empty()) {
             *failures.entry((&row.room, &row.failure)).or_default() += 1;
@@ -134,8 +142,6 @@ impl Adapters {
         for ((room, why), count) in &failures {
             say(format_args!("room '{room}': {count} runs have no scores: {why}"));
         }
-        say(format_args!("wrote {} ({} rows, every run of the folder)", file.display(), in_folder.len()));
-        ensure!(rows.iter().any(|row| row.failure.is_empty()), "no run of this grid has scores");
         Ok(())
     }
 
