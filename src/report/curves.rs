@@ -29,7 +29,9 @@ pub struct Curves {
     pub diagonal: bool,
 }
 
-const SIZE: (u32, u32) = (860, 520);
+const SIZE: (u32, u32) = (1_080, 520);
+/// Where the legend begins, beside the plot so that it hides nothing.
+const LEGEND_X: u32 = 800;
 const COLOURS: [RGBColor; 8] = [
     RGBColor(31, 119, 180),
     RGBColor(214, 96, 20),
@@ -56,10 +58,17 @@ pub fn curves_svg(curves: &Curves) -> Result<String, String> {
 
 fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, curves: &Curves) -> Result<(), Box<dyn std::error::Error>> {
     root.fill(&WHITE)?;
-    let values =
-        |axis: usize| curves.series.iter().flat_map(|s| &s.points).map(move |p| p[axis]).filter(|v| v.is_finite());
-    let (x_range, y_range) = (range(values(0)), range(values(1)));
-    let mut chart = ChartBuilder::on(root)
+    let (plot, legend) = root.split_horizontally(LEGEND_X);
+    let values = |axis: usize| {
+        curves.series.iter().flat_map(|s| &s.points).map(move |p| p[axis]).filter(|value| value.is_finite())
+    };
+    let (mut x_range, mut y_range) = (range(values(0)), range(values(1)));
+    if curves.diagonal {
+        // One scale for both, or the diagonal would not be in sight.
+        let both = x_range.start.min(y_range.start)..x_range.end.max(y_range.end);
+        (x_range, y_range) = (both.clone(), both);
+    }
+    let mut chart = ChartBuilder::on(&plot)
         .caption(&curves.title, ("sans-serif", 20))
         .margin(12)
         .x_label_area_size(42)
@@ -67,25 +76,22 @@ fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, curves: &Curves) -> Result<()
         .build_cartesian_2d(x_range.clone(), y_range.clone())?;
     chart.configure_mesh().light_line_style(WHITE).x_desc(&curves.x).y_desc(&curves.y).draw()?;
     if curves.diagonal {
-        let (low, high) = (x_range.start.max(y_range.start), x_range.end.min(y_range.end));
-        chart.draw_series(LineSeries::new([(low, low), (high, high)], BLACK.mix(0.3)))?;
+        chart.draw_series(LineSeries::new(
+            [(x_range.start, x_range.start), (x_range.end, x_range.end)],
+            BLACK.mix(0.3),
+        ))?;
     }
-    for (series, colour) in curves.series.iter().zip(COLOURS.iter().cycle()) {
+    for (place, (series, colour)) in curves.series.iter().zip(COLOURS.iter().cycle()).enumerate() {
         let points: Vec<(f64, f64)> =
-            series.points.iter().filter(|p| p.iter().all(|v| v.is_finite())).map(|p| (p[0], p[1])).collect();
+            series.points.iter().filter(|p| p.iter().all(|value| value.is_finite())).map(|p| (p[0], p[1])).collect();
         if series.joined {
             chart.draw_series(LineSeries::new(points.iter().copied(), colour.stroke_width(2)))?;
         }
-        let legend = move |(x, y)| Circle::new((x + 10, y), 4, colour.filled());
-        let dots = points.iter().map(|&at| Circle::new(at, 3, colour.filled()));
-        chart.draw_series(dots)?.label(&series.name).legend(legend);
+        chart.draw_series(points.iter().map(|&at| Circle::new(at, 3, colour.filled())))?;
+        let at = 60 + 22 * i32::try_from(place).unwrap_or(0);
+        legend.draw(&Circle::new((8, at + 7), 4, colour.filled()))?;
+        legend.draw(&Text::new(series.name.clone(), (20, at), ("sans-serif", 13)))?;
     }
-    chart
-        .configure_series_labels()
-        .position(SeriesLabelPosition::LowerRight)
-        .background_style(WHITE.mix(0.85))
-        .border_style(BLACK.mix(0.2))
-        .draw()?;
     root.present()?;
     Ok(())
 }
