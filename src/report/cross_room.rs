@@ -54,10 +54,10 @@ pub fn cross_room_table(run: &CrossRoomRun, baseline: &str, threshold: f64) -> S
             format!("{}/{} ({:.0} %, {:.3}–{:.3})", rate.successes(), rate.n, 100.0 * rate.rate, rate.low, rate.high)
         });
         let over = match theirs.len() == ours.len() && name != baseline {
-            true => signed(&difference(&ours, &theirs, 0)),
+            true => room_difference_text(&difference(&ours, &theirs, 0)),
             false => String::new(),
         };
-        lines.push(vec![name.to_owned(), won, interval(&over_rooms(&ours, 0)), over]);
+        lines.push(vec![name.to_owned(), won, room_mean_text(&over_rooms(&ours, 0)), over]);
     }
     aligned(&lines)
 }
@@ -76,8 +76,8 @@ pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str, threshold: f64) -> S
             format!("{:.0} % ({}/{})", 100.0 * positive.rate, positive.successes(), positive.n),
             format!("{:.0} %", 100.0 * above_0_3.rate),
             format!("{best:.3}"),
-            interval(&clipped),
-            interval(&over_rooms(&run.hit_rates(baseline), 0)),
+            room_mean_text(&clipped),
+            room_mean_text(&over_rooms(&run.hit_rates(baseline), 0)),
         ]);
     }
     aligned(&lines)
@@ -107,8 +107,8 @@ pub fn cross_room_json(runs: &[CrossRoomRun], baseline: &str) -> Value {
             json!({
                 "name": name,
                 "beats_identity": wins(&run.outcomes, name).map(|rate| rate_json(&rate)),
-                "hit": mean_json(&over_rooms(&ours, 0)),
-                "over_baseline": mean_json(&difference(&ours, &theirs, 0)),
+                "hit": room_mean_json(&over_rooms(&ours, 0)),
+                "over_baseline": room_mean_json(&difference(&ours, &theirs, 0)),
             })
         };
         let room = |outcome: &RoomOutcome| {
@@ -128,7 +128,7 @@ pub fn cross_room_json(runs: &[CrossRoomRun], baseline: &str) -> Value {
                 "positive": rate_json(&summary.positive),
                 "above_0.3": rate_json(&summary.above_0_3),
                 "best": summary.best,
-                "clipped_mean": mean_json(&summary.clipped),
+                "clipped_mean": room_mean_json(&summary.clipped),
             })
         });
         json!({
@@ -144,11 +144,13 @@ pub fn cross_room_json(runs: &[CrossRoomRun], baseline: &str) -> Value {
     json!({ "baseline": baseline, "runs": runs.iter().map(run).collect::<Vec<_>>() })
 }
 
-fn mean_json(mean: &RoomMean) -> Value {
+/// A mean over rooms, for scripts.
+pub fn room_mean_json(mean: &RoomMean) -> Value {
     json!({ "mean": mean.mean, "low": mean.low, "high": mean.high, "rooms": mean.rooms })
 }
 
-fn interval(mean: &RoomMean) -> String {
+/// A mean over rooms with its interval.
+pub fn room_mean_text(mean: &RoomMean) -> String {
     // Of one room there is nothing to draw again.
     if mean.rooms < 2 {
         return format!("{:.3}", mean.mean);
@@ -156,7 +158,8 @@ fn interval(mean: &RoomMean) -> String {
     format!("{:.3} [{:.3}, {:.3}]", mean.mean, mean.low, mean.high)
 }
 
-fn signed(mean: &RoomMean) -> String {
+/// A difference over rooms with its interval.
+pub fn room_difference_text(mean: &RoomMean) -> String {
     if mean.rooms < 2 {
         return format!("{:+.3}", mean.mean);
     }

@@ -17,7 +17,10 @@ mod trajectory;
 
 pub use adapter_sweep::{SweepRow, configurations_table, difficulty_table, parts_table, success_table, sweep_parquet};
 pub use columns::{Column, parquet_file};
-pub use cross_room::{CrossRoomRun, cross_room_json, cross_room_table, rooms_table, scaling_table};
+pub use cross_room::{
+    CrossRoomRun, cross_room_json, cross_room_table, room_difference_text, room_mean_json, room_mean_text, rooms_table,
+    scaling_table,
+};
 pub use curves::{Curves, Series, curves_svg};
 pub use document::{Block, Document, Picture, Section};
 pub use formulations::{FormulationScores, formulations_json, formulations_table};

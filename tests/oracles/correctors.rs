@@ -1,9 +1,8 @@
 //! The four correctors against PyTorch: outputs, gradients, twenty steps of AdamW.
 
-use ndarray::Array2;
 use seese3::adapter::{Corrector, CorrectorKind, CorrectorSamples, Error, Network, TrainConfig, Trainer};
 
-use crate::support::{Tensors, golden, json, near, number, worst};
+use crate::support::{Tensors, digest, golden, json, near, number, worst};
 use crate::training::slopes;
 
 /// The oracle's name of a corrector.
@@ -62,12 +61,6 @@ fn correctors_match_pytorch() {
             near(name, trainer.step(&all).loss, number(&expected["losses_20_steps"][step]), 1e-10);
         }
     }
-}
-
-/// Sum, sum of squares, and sum weighted by cos k.
-fn digest(tensor: &Array2<f64>) -> [f64; 3] {
-    let numbered = tensor.iter().enumerate();
-    numbered.fold([0.0; 3], |[a, b, c], (k, x)| [a + x, b + x * x, c + x * ((k + 1) as f64).cos()])
 }
 
 /// Oracle: central differences of the loss.

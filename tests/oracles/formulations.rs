@@ -9,7 +9,7 @@ use seese3::geometry::Twist;
 use seese3::pairs::{Pair, Split};
 use seese3::room::Timeline;
 
-use crate::support::{Tensors, features, json, near, npy, number, oracle_rooms, poses, worst};
+use crate::support::{Tensors, digest, features, json, near, npy, number, oracle_rooms, poses, worst};
 use crate::training::{samples, slopes};
 
 /// Weights of a seed in the precision of the tests, checked to be PyTorch's bit by bit.
@@ -20,12 +20,6 @@ fn with_weights_of<N: Network<f64>>(mut network: N, file: &Path) -> N {
         assert_eq!(*into, tensors.rows(name), "{name} of {}", file.display());
     }
     network
-}
-
-/// Sum, sum of squares, and sum weighted by cos k.
-fn digest(tensor: &Array2<f64>) -> [f64; 3] {
-    let numbered = tensor.iter().enumerate();
-    numbered.fold([0.0; 3], |[a, b, c], (k, x)| [a + x, b + x * x, c + x * ((k + 1) as f64).cos()])
 }
 
 fn check<N: Objective<f64, Data = Samples<f64>>>(network: &N, letter: &str, room: &str, folder: &Path) {

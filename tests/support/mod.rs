@@ -99,6 +99,12 @@ pub fn number(value: &serde_json::Value) -> f64 {
     value.as_f64().unwrap_or_else(|| panic!("{value} is not a number"))
 }
 
+/// What oracles keep of a large tensor: sum, sum of squares, and sum weighted by cos k.
+pub fn digest(tensor: &Array2<f64>) -> [f64; 3] {
+    let numbered = tensor.iter().enumerate();
+    numbered.fold([0.0; 3], |[a, b, c], (k, x)| [a + x, b + x * x, c + x * ((k + 1) as f64).cos()])
+}
+
 /// The largest absolute difference of two arrays of one shape.
 pub fn worst(a: &Array2<f64>, b: &Array2<f64>) -> f64 {
     assert_eq!(a.dim(), b.dim());

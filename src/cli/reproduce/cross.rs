@@ -16,7 +16,9 @@ use crate::generalisation::{
 };
 use crate::navigation::{Metric, Refit, StepKind};
 use crate::pairs::Split;
-use crate::report::{CrossRoomRun, Curves, Section, Series, cross_room_json, paper};
+use crate::report::{
+    CrossRoomRun, Curves, Section, Series, cross_room_json, paper, room_difference_text, room_mean_json, room_mean_text,
+};
 use crate::training::{Lesson, Recipe, error_covariance, learn};
 
 const AFFINE: &str = "inverse-poincare-affine";
@@ -198,11 +200,11 @@ fn zero_shot_rows(features: &str, run: &CrossRoomRun) -> Vec<Vec<String>> {
     ];
     let row = |name: &str| {
         let [positive, clipped] = match (name, &summary) {
-            (AFFINE, Some(s)) => [rate_text(&s.positive), mean_text(&s.clipped)],
+            (AFFINE, Some(s)) => [rate_text(&s.positive), room_mean_text(&s.clipped)],
             _ => [String::new(), String::new()],
         };
         let beats = wins(&run.outcomes, name).as_ref().map_or_else(String::new, rate_text);
-        let hit = mean_text(&over_rooms(&run.hit_rates(name), 0));
+        let hit = room_mean_text(&over_rooms(&run.hit_rates(name), 0));
         vec![features.to_owned(), name.to_owned(), beats, hit, positive, clipped]
     };
     names.map(row).to_vec()
@@ -288,11 +290,11 @@ fn compared(
         features.to_owned(),
         plan.name.to_owned(),
         name.to_owned(),
-        mean_text(&hit),
-        signed(&affine),
-        signed(&homogeneous),
+        room_mean_text(&hit),
+        room_difference_text(&affine),
+        room_difference_text(&homogeneous),
         positive,
-        signed(&r2),
+        room_difference_text(&r2),
     ];
     let value = json!({
         "features": features,
@@ -300,28 +302,16 @@ fn compared(
         "navigator": name,
         "learned_rooms": run.learned.len(),
         "calibration_rooms": run.aside.len(),
-        "hit": mean_json(&hit),
-        "over_affine": mean_json(&affine),
-        "over_homogeneous": mean_json(&homogeneous),
-        "clipped_r2_over_paper_range": mean_json(&r2),
+        "hit": room_mean_json(&hit),
+        "over_affine": room_mean_json(&affine),
+        "over_homogeneous": room_mean_json(&homogeneous),
+        "clipped_r2_over_paper_range": room_mean_json(&r2),
     });
     (row, value, [affine, homogeneous, r2])
 }
 
 fn mean_of(run: &CrossRoomRun, navigator: &str) -> f64 {
     crate::scores::mean(&run.hit_rates(navigator))
-}
-
-fn mean_text(mean: &RoomMean) -> String {
-    format!("{:.3} [{:.3}, {:.3}]", mean.mean, mean.low, mean.high)
-}
-
-fn signed(mean: &RoomMean) -> String {
-    format!("{:+.3} [{:+.3}, {:+.3}]", mean.mean, mean.low, mean.high)
-}
-
-fn mean_json(mean: &RoomMean) -> Value {
-    json!({ "mean": mean.mean, "low": mean.low, "high": mean.high, "rooms": mean.rooms })
 }
 
 fn rate_text(rate: &crate::scores::Rate) -> String {

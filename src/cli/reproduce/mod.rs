@@ -82,10 +82,11 @@ type Found = (Section, Value);
 
 impl Reproduce {
     pub async fn run(self) -> anyhow::Result<()> {
-        std::fs::create_dir_all(&self.out).with_context(|| format!("{} cannot be made", self.out.display()))?;
         let begun = Instant::now();
         let setting = self.loaded().await?;
-        let progress = bar(7, "reproduce");
+        let out = &setting.options.out;
+        std::fs::create_dir_all(out).with_context(|| format!("{} cannot be made", out.display()))?;
+        let progress = bar(8, "reproduce");
         let mut record = Map::new();
         let mut sections = vec![data(&setting)];
         let mut claims = Vec::new();
