@@ -7,7 +7,7 @@ test:
 
 # What differs without the features: a model is answered with the line that builds them in.
 lean:
-    cargo test --test cli_rooms --test layering --test encoders --test datasets --test oracles
+    cargo test --test cli_rooms --test encoders
 
 # Formatting, warnings, protos, deployment files.
 lint:

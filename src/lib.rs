@@ -13,6 +13,7 @@ pub mod index; // nearest neighbours: exact, HNSW
 pub mod ridge; // closed-form ridge regression
 pub mod pairs; // which pairs of frames are learned from, and which are tested
 pub mod scores; // R² of motions, hit rates and their intervals
+pub mod trajectory; // paths against the true ones: association, alignment, APE, RPE
 pub mod adapter; // features to latents, latents to twists and back
 pub mod training; // from rooms to an adapter and its scores
 pub mod formulations; // the alternatives A to D, to compare with

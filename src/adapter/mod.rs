@@ -6,6 +6,7 @@
 //! - Weights are f32, as trained; every answer is computed in f64.
 
 mod attention;
+mod calibration;
 mod corrector;
 mod inverse;
 mod layers;
@@ -22,6 +23,7 @@ mod siamese;
 mod train;
 mod trained;
 
+pub use calibration::{Calibration, ErrorTable, Measured, Metric, MotionErrors, Stratum};
 pub use corrector::{Corrector, CorrectorKind, CorrectorSamples, train_corrector};
 pub use inverse::{Inverse, Reading};
 pub use layers::Dense;
@@ -53,7 +55,7 @@ pub const MAX_CHARTS: usize = 16;
 pub const LATENT_DIM: usize = 20;
 
 /// What is wrong with an adapter, its input or its training.
-#[derive(Debug, thiserror::Error, PartialEq)]
+#[derive(Debug, Clone, thiserror::Error, PartialEq)]
 pub enum Error {
     #[error("features have {actual} columns, the adapter was trained on {expected}")]
     FeatureDim { expected: usize, actual: usize },
@@ -79,6 +81,8 @@ pub enum Error {
     GatedStandardised,
     #[error("the covariance of an adapter's errors must be symmetric and positive definite")]
     ErrorCovariance,
+    #[error("{what} of an adapter's calibration is not sound: not finite, not rising or not positive definite")]
+    Calibration { what: &'static str },
     #[error("the adapter's errors were not measured in rooms that it did not learn from (train --calibrate-on)")]
     NotCalibrated,
     #[error("corrector '{name}' was given twice")]

@@ -207,3 +207,30 @@ fn normal(random: &mut ChaCha8Rng, count: usize) -> impl Iterator<Item = f64> + 
     };
     (0..count.div_ceil(2)).flat_map(move |_| pair(random)).take(count)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::adapter::TrainConfig;
+    use crate::geometry::exp;
+
+    /// Oracle: the definition of a normal deviate: mean 0 and the deviation asked for, other numbers at every step, the
+    /// same at the same step of the same seed.
+    #[test]
+    fn noise_has_the_deviation_asked_for() {
+        let features = Array2::<f32>::zeros((3, 20_000));
+        let ahead = exp(&Twist { linear: nalgebra::Vector3::z(), angular: nalgebra::Vector3::x() * 0.1 });
+        let pairs = vec![[0, 1], [1, 2]];
+        let samples =
+            Samples::<f64>::new(features.view(), vec![Pose::identity(), ahead, ahead * ahead * ahead], pairs).unwrap();
+        let config = |noise| TrainConfig { noise, ..crate::adapter::Preset::PaperBase.config(3) };
+        let batch = |noise: f64, step| samples.batch(&[0], At { config: &config(noise), step }).features;
+        assert!(batch(0.0, 1).iter().all(|&x| x == 0.0));
+        let noisy = batch(0.2, 1);
+        let count = noisy.len() as f64;
+        let (mean, second) = (noisy.sum() / count, noisy.mapv(|x| x * x).sum() / count);
+        assert!(mean.abs() < 0.005 && (second.sqrt() - 0.2).abs() < 0.004, "{mean} {second}");
+        assert_eq!(noisy, batch(0.2, 1));
+        assert_ne!(noisy, batch(0.2, 2));
+    }
+}

@@ -1,10 +1,14 @@
 //! A trained adapter: what answers are computed with.
 
+use std::sync::Arc;
+
 use nalgebra::{Matrix6, Vector6};
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis, s};
 
 use super::inverse::{pseudo_inverse, target};
-use super::{Corrector, CorrectorKind, Error, Inverse, MAX_LATENT, Mixing, Mixture, Network, Reading, TargetScale};
+use super::{
+    Calibration, Corrector, CorrectorKind, Error, Inverse, MAX_LATENT, Mixing, Mixture, Network, Reading, TargetScale,
+};
 use crate::features::FeatureSource;
 use crate::geometry::Twist;
 
@@ -23,6 +27,7 @@ pub struct Adapter {
     inverse: Inverse,
     correctors: Vec<(Corrector<f32>, Corrector<f64>)>,
     error_covariance: Option<Matrix6<f64>>,
+    calibration: Option<Arc<Calibration>>,
 }
 
 impl Adapter {
@@ -52,7 +57,16 @@ impl Adapter {
             Inverse::new(chart.motion_matrix(), &scale)?;
         }
         let inverse = Inverse::new(network_f64.motion_matrix(network_f64.even_gate().view()).view(), &scale)?;
-        Ok(Self { source, network, network_f64, scale, inverse, correctors: Vec::new(), error_covariance: None })
+        Ok(Self {
+            source,
+            network,
+            network_f64,
+            scale,
+            inverse,
+            correctors: Vec::new(),
+            error_covariance: None,
+            calibration: None,
+        })
     }
 
     /// The same adapter with correctors, one a kind.
@@ -90,6 +104,23 @@ impl Adapter {
     /// The second moment of its errors, metres and radians, if it was measured.
     pub fn error_covariance(&self) -> Option<Matrix6<f64>> {
         self.error_covariance
+    }
+
+    /// The same adapter with its errors as a tracker needs them.
+    ///
+    /// # Errors
+    /// [`Error::Calibration`] when its latents are of another size.
+    pub fn with_calibration(mut self, calibration: Calibration) -> Result<Self, Error> {
+        if calibration.flicker().size() != self.coordinate_count() {
+            return Err(Error::Calibration { what: "the size of a covariance of latents" });
+        }
+        self.calibration = Some(Arc::new(calibration));
+        Ok(self)
+    }
+
+    /// Its errors as a tracker needs them, if they were measured.
+    pub fn calibration(&self) -> Option<&Arc<Calibration>> {
+        self.calibration.as_ref()
     }
 
     /// The features it was trained on.
@@ -206,6 +237,11 @@ impl Adapter {
             }
         };
         self.scale.twist(&Vector6::from_fn(|row, _| normalised[row]))
+    }
+
+    /// [`Adapter::motion`] without μ: no difference of latents is no motion (A-16, homogeneous).
+    pub fn displacement(&self, from: ArrayView1<'_, f64>, to: ArrayView1<'_, f64>) -> Twist {
+        Twist::from_vector(&(self.motion(from, to).to_vector() - self.scale.mean))
     }
 
     /// The latent step of a motion from `latent`, ĝ − g = W⁺ΔP; what a mixture's gate says stays as it is at the

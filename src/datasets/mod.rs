@@ -20,7 +20,7 @@ pub use numpy::{read_features, read_poses, read_timestamps};
 pub use scannet::read_scannet;
 pub use sens::read_sens;
 pub use seven_scenes::{SevenScenes, read_seven_scenes};
-pub use tum::read_tum;
+pub use tum::{read_tum, read_tum_trajectory};
 pub use twelve_scenes::read_twelve_scenes;
 
 use std::path::{Path, PathBuf};

@@ -11,6 +11,7 @@ use super::collect::{About, Collected};
 use super::text::{data_lines, finite_row, nanoseconds, spaced, wrong};
 use super::{DropReason, Error, Reader, Recording, read_text};
 use crate::geometry::Pose;
+use crate::trajectory::Trajectory;
 
 /// The farthest that an image's pose may be in time.
 const MAX_DIFFERENCE_NS: u64 = 10_000_000;
@@ -39,6 +40,15 @@ pub fn read_tum(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Err
         collected.keep(About { name, image, timestamp_ns: Some(*timestamp_ns), ..About::default() }, pose);
     }
     collected.finish(folder, reader)
+}
+
+/// Reads a path, "timestamp tx ty tz qx qy qz qw" a line, by time.
+///
+/// # Errors
+/// [`Error`], naming the file and line.
+pub fn read_tum_trajectory(file: &Path) -> Result<Trajectory, Error> {
+    let (times_ns, poses) = read_trajectory(file)?.into_iter().unzip();
+    Ok(Trajectory { times_ns, poses })
 }
 
 /// The pose nearest in time, the earlier of two as near.

@@ -46,6 +46,16 @@ impl Twist {
         Self { linear: self.linear * share, angular: self.angular * share }
     }
 
+    /// A share of this motion: exp(sξ).
+    pub fn scaled(self, share: f64) -> Self {
+        Self { linear: self.linear * share, angular: self.angular * share }
+    }
+
+    /// The motion back: exp(−ξ) = exp(ξ)⁻¹.
+    pub fn reversed(self) -> Self {
+        Self { linear: -self.linear, angular: -self.angular }
+    }
+
     /// Whether all six numbers are finite.
     pub fn is_finite(self) -> bool {
         self.to_vector().iter().all(|x| x.is_finite())

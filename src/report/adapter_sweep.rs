@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::columns::{Column, parquet_file};
-use super::table::aligned;
 use crate::scores::{MotionScores, deviation, mean, mean_of_known};
 
 /// One run: what decided it, and what it reached. R² is null where it has no meaning or the run failed.
@@ -111,7 +110,7 @@ pub fn sweep_parquet(rows: &[SweepRow]) -> Result<Vec<u8>, String> {
 
 /// Best R², and the share of rooms above 0 and 0.3, by recording format and features: the paper's success table (sec. 2.7).
 /// Of each room the best run counts, chosen by its test score, as the paper's "Max R²" is.
-pub fn success_table(rows: &[SweepRow]) -> String {
+pub fn success_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     let mut groups: BTreeMap<(String, String), BTreeMap<String, f64>> = BTreeMap::new();
     for row in rows.iter().filter(|row| row.failure.is_empty()) {
         let best = groups.entry((row.format.clone(), row.features.clone())).or_default();
@@ -131,12 +130,12 @@ pub fn success_table(rows: &[SweepRow]) -> String {
             percent(&best, 0.3),
         ]);
     }
-    aligned(&lines)
+    lines
 }
 
 /// By recording format, over all features: frames and test pairs a room, the share of rooms whose best run is above 0,
 /// the best run: the paper's difficulty table (sec. 2.7).
-pub fn difficulty_table(rows: &[SweepRow]) -> String {
+pub fn difficulty_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     let mut groups: BTreeMap<&str, BTreeMap<&str, (usize, usize, f64)>> = BTreeMap::new();
     for row in rows.iter().filter(|row| row.failure.is_empty()) {
         let rooms = groups.entry(&row.format).or_default();
@@ -158,12 +157,12 @@ pub fn difficulty_table(rows: &[SweepRow]) -> String {
             format!("{:.3}", best.iter().copied().fold(f64::NEG_INFINITY, f64::max)),
         ]);
     }
-    aligned(&lines)
+    lines
 }
 
 /// By part of the motion: best R², the share of runs above 0 and 0.5, and the deviation over seeds, averaged over
 /// configurations and rooms that have several: the paper's sweep table.
-pub fn parts_table(rows: &[SweepRow]) -> String {
+pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     type Part = fn(&SweepRow) -> Option<f64>;
     let parts: [(&str, Part); 5] = [
         ("overall", |row| row.overall),
@@ -193,11 +192,11 @@ pub fn parts_table(rows: &[SweepRow]) -> String {
             format!("{:.3}", mean(&values)),
         ]);
     }
-    aligned(&lines)
+    lines
 }
 
 /// The configurations by mean R² over rooms and seeds, the best first.
-pub fn configurations_table(rows: &[SweepRow], most: usize) -> String {
+pub fn configurations_rows(rows: &[SweepRow], most: usize) -> Vec<Vec<String>> {
     let mut by_configuration: BTreeMap<_, Vec<f64>> = BTreeMap::new();
     for row in rows {
         by_configuration.entry(row.configuration()).or_default().extend(row.overall);
@@ -211,7 +210,7 @@ pub fn configurations_table(rows: &[SweepRow], most: usize) -> String {
         let spread = if values.len() > 1 { format!("{:.3}", deviation(&values)) } else { String::new() };
         lines.push(vec![features, geo_dim.to_string(), charts.to_string(), lr, loss, runs, middle, spread]);
     }
-    aligned(&lines)
+    lines
 }
 
 fn percent(values: &[f64], above: f64) -> String {
@@ -261,16 +260,10 @@ mod tests {
     #[test]
     fn rooms_count_by_their_best_run() {
         let rows = [row("a", 0, Some(-1.0)), row("a", 1, Some(0.4)), row("b", 0, Some(-0.5)), row("b", 1, None)];
-        let table = success_table(&rows);
-        let cells: Vec<&str> = table.lines().nth(1).unwrap().split_whitespace().collect();
-        assert_eq!(cells, ["tum", "f", "2", "0.400", "50", "50"]);
-        let difficulty = difficulty_table(&rows);
-        let cells: Vec<&str> = difficulty.lines().nth(1).unwrap().split_whitespace().collect();
-        assert_eq!(cells, ["tum", "2", "200", "40", "50", "0.400"]);
-        let parts = parts_table(&rows);
-        let cells: Vec<&str> = parts.lines().nth(1).unwrap().split_whitespace().collect();
+        assert_eq!(success_rows(&rows)[1], ["tum", "f", "2", "0.400", "50", "50"]);
+        assert_eq!(difficulty_rows(&rows)[1], ["tum", "2", "200", "40", "50", "0.400"]);
         // The seeds of room a deviate by 1.4/√2; room b has one that counts.
-        assert_eq!(cells, ["overall", "3", "0.400", "33", "0", "0.990", "-0.367"]);
+        assert_eq!(parts_rows(&rows)[1], ["overall", "3", "0.400", "33", "0", "0.990", "-0.367"]);
     }
 
     /// Oracle: the format's magic at both ends; `.ci/claims.py` has pandas read a file.

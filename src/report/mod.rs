@@ -9,13 +9,14 @@ mod formulations;
 mod json;
 mod layers;
 pub mod paper;
+mod path_errors;
 mod plot;
 mod probe;
 mod table;
 mod theory;
 mod trajectory;
 
-pub use adapter_sweep::{SweepRow, configurations_table, difficulty_table, parts_table, success_table, sweep_parquet};
+pub use adapter_sweep::{SweepRow, configurations_rows, difficulty_rows, parts_rows, success_rows, sweep_parquet};
 pub use columns::{Column, parquet_file};
 pub use cross_room::{
     CrossRoomRun, cross_room_json, cross_room_table, room_difference_text, room_mean_json, room_mean_text, rooms_table,
@@ -26,9 +27,10 @@ pub use document::{Block, Document, Picture, Section};
 pub use formulations::{FormulationScores, formulations_json, formulations_table};
 pub use json::{evaluation_json, training_json};
 pub use layers::{LayerScores, encoders_table, layers_json, layers_table};
+pub use path_errors::{APE_FORMULA, PathErrors, PathProtocol, RPE_FORMULA, path_errors_json, path_errors_table};
 pub use plot::{PathPlot, path_svg};
 pub use probe::{AtStride, ProbeScores, probe_table};
-pub use table::{evaluation_table, training_table};
+pub use table::{aligned, evaluation_table, training_table};
 pub use theory::{theory_json, theory_table, theory_table_rows};
 pub use trajectory::{kitti_trajectory, tum_trajectory};
 

@@ -28,6 +28,38 @@ pub const CROSS_ROOM: [(&str, &str, &str); 3] = [
     ("V-JEPA 2.1", "19/31 (61 %)", "29/31 (94 %)"),
 ];
 
+/// A collection of recordings.
+#[derive(Debug, Clone, Copy)]
+pub struct Recordings {
+    pub name: &'static str,
+    pub rooms: usize,
+}
+
+const TWELVE_SCENES: Recordings = Recordings { name: "12-Scenes", rooms: 10 };
+const SCANNET: Recordings = Recordings { name: "ScanNet", rooms: 707 };
+const ARKIT_SCENES: Recordings = Recordings { name: "ARKitScenes", rooms: 133 };
+const TUM: Recordings = Recordings { name: "TUM RGB-D", rooms: 17 };
+const SEVEN_SCENES: Recordings = Recordings { name: "7-Scenes", rooms: 46 };
+
+/// Rooms in which an adapter succeeds (Table 2): recordings, encoder, largest R², % of rooms above 0, above 0.3.
+pub const SUCCESS: [(Recordings, &str, [f64; 3]); 15] = [
+    (TWELVE_SCENES, "V-JEPA", [0.803, 100.0, 70.0]),
+    (TWELVE_SCENES, "DUSt3R", [0.789, 90.0, 80.0]),
+    (TWELVE_SCENES, "DINOv2", [0.682, 80.0, 50.0]),
+    (SCANNET, "V-JEPA", [0.735, 35.0, 4.0]),
+    (SCANNET, "DUSt3R", [0.711, 37.0, 6.0]),
+    (SCANNET, "DINOv2", [0.673, 31.0, 3.0]),
+    (ARKIT_SCENES, "V-JEPA", [0.344, 51.0, 3.0]),
+    (ARKIT_SCENES, "DUSt3R", [0.412, 50.0, 4.0]),
+    (ARKIT_SCENES, "DINOv2", [0.339, 47.0, 1.0]),
+    (TUM, "V-JEPA", [0.337, 41.0, 12.0]),
+    (TUM, "DUSt3R", [0.435, 41.0, 18.0]),
+    (TUM, "DINOv2", [0.348, 35.0, 12.0]),
+    (SEVEN_SCENES, "V-JEPA", [0.254, 4.0, 0.0]),
+    (SEVEN_SCENES, "DUSt3R", [0.320, 7.0, 2.0]),
+    (SEVEN_SCENES, "DINOv2", [0.331, 2.0, 2.0]),
+];
+
 /// Intrinsic dimension and ridge, at the best layer by M3 (Table 1): encoder, TwoNN, MLE, M3 R².
 pub const DIMENSIONS: [(&str, [f64; 3]); 4] = [
     ("DINOv2-B, layer 9", [9.15, 6.41, -0.28]),

@@ -10,6 +10,8 @@ mod correctors;
 mod formulations;
 mod geometry;
 mod metrics;
+mod multi_step;
 mod navigation;
 mod scores;
 mod training;
+mod trajectory;

@@ -22,7 +22,7 @@ use crate::training::samples;
 const STRIDE: u32 = 40;
 
 /// The oracle's trained adapter of so many charts; μ and σ come from the training pairs.
-fn adapter_of(folder: &Path, room: &str, charts: usize) -> Adapter {
+pub fn adapter_of(folder: &Path, room: &str, charts: usize) -> Adapter {
     let tensors = Tensors::open(&folder.join(format!("m4_adapter/{room}_k{charts}_trained.safetensors")));
     let network =
         Mixture::from_tensors(charts, Mixing::Gate, |name| Ok::<_, Error>(tensors.rows(name).mapv(|x| x as f32)))
@@ -46,7 +46,7 @@ fn corrected_adapter(folder: &Path, room: &str) -> Arc<Adapter> {
     Arc::new(adapter_of(folder, room, 1).with_correctors(correctors).unwrap())
 }
 
-fn navigator(folder: &Path, room: &str, adapter: Arc<Adapter>) -> Navigator {
+pub fn navigator(folder: &Path, room: &str, adapter: Arc<Adapter>) -> Navigator {
     let frames = Frames { poses: poses(&folder.join(format!("rooms/{room}/poses.npy"))), ..Frames::default() };
     let features = Features::new(FeatureSource::imported("oracle", 0), features(folder, room)).unwrap();
     let room = Room::new(RoomId::new(room).unwrap(), frames, Provenance::default()).unwrap();

@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 use super::super::rooms::lesson;
 use super::claims::{Claim, Verdict};
 use super::in_room::plotted;
+use super::notes::{Learned, Notes, published_name};
 use super::{Found, Loaded, Set, Setting};
 use crate::adapter::{Mixing, Preset, Reading, TrainConfig};
 use crate::eval::{NavigatorKind, Protocol};
@@ -24,13 +25,20 @@ use crate::training::{Lesson, Recipe, error_covariance, learn};
 const AFFINE: &str = "inverse-poincare-affine";
 const HOMOGENEOUS: &str = "inverse-poincare-homogeneous";
 const CALIBRATED: &str = "inverse-poincare-homogeneous+calibrated";
+/// The plan of preset steady on all rooms.
+const STEADY: &str = "steady";
 /// Members of an ensemble.
 const MEMBERS: usize = 4;
+
+/// The longest that a plan calls its adapter.
+pub const LONGEST_NAME: &str = "ensemble-aside-of-100000";
 
 /// One adapter in the held-out rooms.
 #[derive(Clone)]
 struct Plan {
     name: &'static str,
+    /// What its adapter is called, before the number of rooms.
+    short: &'static str,
     preset: Preset,
     size: usize,
     aside: usize,
@@ -43,37 +51,59 @@ struct Reached {
     run: CrossRoomRun,
 }
 
-pub fn sections(setting: &Setting, claims: &mut Vec<Claim>) -> anyhow::Result<Vec<(String, Found)>> {
+impl Plan {
+    /// What its adapter is called.
+    fn adapter(&self) -> String {
+        format!("{}-of-{}", self.short, self.size)
+    }
+}
+
+pub fn sections(setting: &Setting, notes: &mut Notes) -> anyhow::Result<Vec<(String, Found)>> {
     let mut reached = Vec::new();
     for set in &setting.sets {
-        let found: Vec<Reached> =
+        let found: Vec<(Reached, Learned)> =
             plans(setting, set).into_par_iter().map(|plan| reach(setting, set, plan)).collect::<anyhow::Result<_>>()?;
+        let (found, learned): (Vec<Reached>, Vec<Learned>) = found.into_iter().unzip();
+        notes.adapters.extend(learned);
         reached.push((set.features.as_str(), found));
     }
     Ok(vec![
-        ("cross_room".to_owned(), cross_room(setting, &reached, claims)?),
-        ("better".to_owned(), better(&reached, claims)),
+        ("cross_room".to_owned(), cross_room(setting, &reached, &mut notes.claims)?),
+        ("better".to_owned(), better(&reached, &mut notes.claims)),
     ])
 }
 
 fn plans(setting: &Setting, set: &Set) -> Vec<Plan> {
     let (all, aside) = (set.train.len(), setting.options.aside);
-    let plan = |name, preset, size, aside, members| Plan { name, preset, size, aside, members };
+    let plan = |name, short, preset, size, aside, members| Plan { name, short, preset, size, aside, members };
     let mut sizes = setting.options.sizes.clone();
     sizes.push(all);
     sizes.sort_unstable();
     sizes.dedup();
     // The largest first, so that they do not run alone at the end.
-    let mut plans: Vec<Plan> =
-        sizes.into_iter().rev().map(|size| plan("paper-range", Preset::PaperRange, size, 0, 1)).collect();
-    plans.insert(1, plan("paper-range, errors measured aside", Preset::PaperRange, all, aside, 1));
-    plans.insert(2, plan("ensemble of paper-range, errors measured aside", Preset::PaperRange, all, aside, MEMBERS));
-    plans.push(plan("steady", Preset::Steady, all, 0, 1));
-    plans.push(plan("steady, errors measured aside", Preset::Steady, all, aside, 1));
+    let mut plans: Vec<Plan> = sizes
+        .into_iter()
+        .rev()
+        .map(|size| plan("paper-range", "paper-range", Preset::PaperRange, size, 0, 1))
+        .collect();
+    plans.insert(1, plan("paper-range, errors measured aside", "paper-range-aside", Preset::PaperRange, all, aside, 1));
+    plans.insert(
+        2,
+        plan(
+            "ensemble of paper-range, errors measured aside",
+            "ensemble-aside",
+            Preset::PaperRange,
+            all,
+            aside,
+            MEMBERS,
+        ),
+    );
+    plans.push(plan(STEADY, STEADY, Preset::Steady, all, 0, 1));
+    plans.push(plan("steady, errors measured aside", "steady-aside", Preset::Steady, all, aside, 1));
     plans
 }
 
-fn reach(setting: &Setting, set: &Set, plan: Plan) -> anyhow::Result<Reached> {
+fn reach(setting: &Setting, set: &Set, plan: Plan) -> anyhow::Result<(Reached, Learned)> {
     let chosen: Vec<&Loaded> =
         nested_choice(plan.size, set.train.len(), 0).into_iter().map(|room| &set.train[room]).collect();
     let (learned, aside) = chosen.split_at(chosen.len() - plan.aside);
@@ -82,7 +112,7 @@ fn reach(setting: &Setting, set: &Set, plan: Plan) -> anyhow::Result<Reached> {
     let plain = setting.recipe(plan.preset, Split::Whole, setting.options.stride, 0, None);
     let config = TrainConfig { charts: plan.members, mixing: Mixing::Even, ..plain.config.clone() };
     let recipe = Recipe { config, ..plain };
-    let (mut adapter, record) = learn(&learned, &recipe, &mut |_| ())?;
+    let (mut adapter, mut record) = learn(&learned, &recipe, &mut |_| ())?;
     let step = |reading| StepKind::InversePoincare(reading);
     let refit = |in_sample| StepKind::Refit(Refit { z_scored: false, intercept: false, in_sample });
     let full = |step| NavigatorKind::Step(step, Metric::Full);
@@ -97,8 +127,10 @@ fn reach(setting: &Setting, set: &Set, plan: Plan) -> anyhow::Result<Reached> {
     if !aside.is_empty() {
         let covariance = error_covariance(&adapter, &record, &aside)?;
         adapter = adapter.with_error_covariance(covariance)?;
+        record.calibrated_on = aside.iter().map(|lesson| (lesson.room.id().clone(), lesson.revision)).collect();
         navigators.push(NavigatorKind::Step(step(Reading::Homogeneous), Metric::Calibrated));
     }
+    let published = Learned::new(&plan.adapter(), &set.train[0], adapter.clone(), record);
     let protocol =
         Protocol { split: Split::Whole, thresholds: vec![0.1], navigators, ..Protocol::paper(setting.options.stride) };
     let tests: Vec<Lesson<'_>> = set.test.iter().map(lesson).collect();
@@ -110,7 +142,12 @@ fn reach(setting: &Setting, set: &Set, plan: Plan) -> anyhow::Result<Reached> {
         }
     }
     let run = CrossRoomRun { learned: names(&learned), aside: names(&aside), seed: 0, outcomes: evaluated, skipped };
-    Ok(Reached { plan, run })
+    Ok((Reached { plan, run }, published))
+}
+
+/// The adapter of preset steady that learned from all rooms, without errors measured aside.
+pub fn steady(set: &Set) -> String {
+    format!("{STEADY}-of-{}", set.train.len())
 }
 
 fn names(lessons: &[Lesson<'_>]) -> Vec<String> {
@@ -139,8 +176,9 @@ fn cross_room(setting: &Setting, reached: &[(&str, Vec<Reached>)], claims: &mut 
         grows.push(hit.last().map(|p| p[1]) > hit.first().map(|p| p[1]));
         hits.push(Series { name: (*features).to_owned(), points: hit, joined: true });
         fractions.push(Series { name: (*features).to_owned(), points: fraction, joined: true });
+        let adapters: Vec<String> = curve.iter().map(|r| published_name(&r.plan.adapter(), features)).collect();
         let runs: Vec<CrossRoomRun> = curve.iter().map(|reached| reached.run.clone()).collect();
-        record.push(json!({ "features": features, "paper_range_by_size": cross_room_json(&runs, AFFINE) }));
+        record.push(json!({ "features": features, "adapters": adapters, "paper_range_by_size": cross_room_json(&runs, AFFINE) }));
     }
     rows.extend(paper_rows());
     section.table(rows);
@@ -246,7 +284,7 @@ fn better(reached: &[(&str, Vec<Reached>)], claims: &mut Vec<Claim>) -> Found {
             if plan.name == "paper-range, errors measured aside" {
                 navigator_wins.push(affine.low > 0.0 && homogeneous.low > 0.0);
             }
-            if plan.name == "steady" {
+            if plan.name == STEADY {
                 recipe_wins.push(r2.low > 0.0);
             }
         }
@@ -298,7 +336,8 @@ fn compared(
     ];
     let value = json!({
         "features": features,
-        "adapter": plan.name,
+        "plan": plan.name,
+        "adapter": published_name(&plan.adapter(), features),
         "navigator": name,
         "learned_rooms": run.learned.len(),
         "calibration_rooms": run.aside.len(),

@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 
 use super::super::rooms::lesson;
 use super::claims::{Claim, Verdict};
+use super::notes::{Learned, Notes};
 use super::{Found, Loaded, Set, Setting};
 use crate::adapter::{CorrectorKind, Preset, TrainConfig};
 use crate::cancel::Cancellation;
@@ -242,13 +243,16 @@ fn formulation_scores(setting: &Setting, set: &Set) -> anyhow::Result<Vec<Formul
 }
 
 /// The navigation table, correctors and all.
-pub fn navigation(setting: &Setting, claims: &mut Vec<Claim>) -> anyhow::Result<Found> {
+pub fn navigation(setting: &Setting, notes: &mut Notes) -> anyhow::Result<Found> {
     let mut section = Section::new("Latent navigation within a room");
     let mut record = Vec::new();
     let mut dominates = Vec::new();
     for (position, set) in setting.sets.iter().enumerate() {
-        let reports: Vec<Report> =
+        let navigated: Vec<(Report, Learned)> =
             set.in_room.par_iter().map(|room| navigated(setting, room)).collect::<anyhow::Result<_>>()?;
+        let (reports, learned): (Vec<Report>, Vec<Learned>) = navigated.into_iter().unzip();
+        let adapters: Vec<String> = learned.iter().map(|learned| learned.name.clone()).collect();
+        notes.adapters.extend(learned);
         let mut head = ["navigator", "MSE", "R²", "Top-1"].map(str::to_owned).to_vec();
         head.extend(reports[0].protocol.thresholds.iter().map(|epsilon| format!("Hit@{epsilon}")));
         let mut rows = vec![head];
@@ -260,7 +264,7 @@ pub fn navigation(setting: &Setting, claims: &mut Vec<Claim>) -> anyhow::Result<
             let hits = reports[0].protocol.thresholds.iter().zip(&numbers[3..]).map(|(&e, &hit)| [e, hit]).collect();
             series.push(Series { name: name.clone(), points: hits, joined: true });
             record.push(json!({ "features": set.features, "navigator": name, "mse": numbers[0], "r2": numbers[1],
-                "top1": numbers[2], "hits": numbers[3..], "n": reports.iter().map(|r| r.n).collect::<Vec<_>>() }));
+                "top1": numbers[2], "hits": numbers[3..], "adapters": adapters, "n": reports.iter().map(|r| r.n).collect::<Vec<_>>() }));
         }
         for (name, numbers) in paper::NAVIGATION {
             rows.push([format!("paper: {name}")].into_iter().chain(numbers.map(|x| format!("{x:.3}"))).collect());
@@ -293,7 +297,7 @@ pub fn navigation(setting: &Setting, claims: &mut Vec<Claim>) -> anyhow::Result<
          stride. 'in-sample' is fitted on the scored pairs: a leak, and the likely protocol of the paper's refit.",
         setting.options.stride
     ));
-    claims.push(Claim {
+    notes.claims.push(Claim {
         claim: "inverse Poincaré hits more often than every learned corrector (Hit@0.1)",
         verdict: Verdict::of(&dominates),
         found: format!("so for {} of {} features", dominates.iter().filter(|&&d| d).count(), dominates.len()),
@@ -301,13 +305,15 @@ pub fn navigation(setting: &Setting, claims: &mut Vec<Claim>) -> anyhow::Result<
     Ok((section, Value::Array(record)))
 }
 
-fn navigated(setting: &Setting, room: &Loaded) -> anyhow::Result<Report> {
+fn navigated(setting: &Setting, room: &Loaded) -> anyhow::Result<(Report, Learned)> {
     let stride = setting.options.stride;
     let mut recipe = setting.recipe(Preset::PaperBase, Split::Time, stride, 0, Some(NAVIGATION_EPOCHS));
     recipe.correctors = CorrectorKind::ALL.to_vec();
-    let (adapter, _) = learn(&[lesson(room)], &recipe, &mut |_| ())?;
+    let (adapter, record) = learn(&[lesson(room)], &recipe, &mut |_| ())?;
+    let learned = Learned::new(room.0.room.id().as_str(), room, adapter.clone(), record);
     let navigator = Navigator::new(Arc::new(room.0.room.clone()), &room.1, Arc::new(adapter), IndexKind::Exact)?;
-    Ok(evaluate(&navigator, &Protocol::paper(stride), &Cancellation::default(), &mut |_, _| ())?)
+    let report = evaluate(&navigator, &Protocol::paper(stride), &Cancellation::default(), &mut |_, _| ())?;
+    Ok((report, learned))
 }
 
 /// MSE, R², Top-1 and hits of one row, means over rooms.

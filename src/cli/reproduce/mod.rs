@@ -3,7 +3,9 @@
 mod claims;
 mod cross;
 mod in_room;
+mod notes;
 mod pictures;
+mod success;
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -12,11 +14,13 @@ use anyhow::{Context, bail};
 use clap::Args;
 use serde_json::{Map, Value, json};
 
+use self::notes::{Notes, published_name};
 use super::progress::bar;
 use super::rooms::load_rooms;
 use super::{say, write_file, write_json};
 use crate::features::Features;
 use crate::report::{Document, Section, theory_json, theory_table_rows};
+use crate::room::is_plain_name;
 use crate::store::{Store, StoredRoom};
 use crate::theory::{Effort, checks};
 
@@ -83,49 +87,64 @@ type Found = (Section, Value);
 impl Reproduce {
     pub async fn run(self) -> anyhow::Result<()> {
         let begun = Instant::now();
-        let setting = self.loaded().await?;
+        let store = Store::open(&self.store)?;
+        let setting = self.loaded(&store).await?;
         let out = &setting.options.out;
         std::fs::create_dir_all(out).with_context(|| format!("{} cannot be made", out.display()))?;
-        let progress = bar(8, "reproduce");
+        let progress = bar(9, "reproduce");
         let mut record = Map::new();
         let mut sections = vec![data(&setting)];
-        let mut claims = Vec::new();
+        let mut notes = Notes::default();
         let mut keep = |name: &str, (section, value): Found, record: &mut Map<String, Value>| {
             record.insert(name.to_owned(), value);
             sections.push(section);
             progress.inc(1);
         };
-        keep("probes", in_room::probes(&setting, &mut claims)?, &mut record);
-        keep("strides", in_room::strides(&setting, &mut claims)?, &mut record);
-        keep("formulations", in_room::formulations(&setting, &mut claims)?, &mut record);
-        keep("navigation", in_room::navigation(&setting, &mut claims)?, &mut record);
-        for found in cross::sections(&setting, &mut claims)? {
+        keep("probes", in_room::probes(&setting, &mut notes.claims)?, &mut record);
+        keep("strides", in_room::strides(&setting, &mut notes.claims)?, &mut record);
+        keep("rooms_alone", success::section(&setting)?, &mut record);
+        keep("formulations", in_room::formulations(&setting, &mut notes.claims)?, &mut record);
+        keep("navigation", in_room::navigation(&setting, &mut notes)?, &mut record);
+        for found in cross::sections(&setting, &mut notes)? {
             keep(&found.0, found.1, &mut record);
         }
-        keep("pictures", pictures::section(&setting)?, &mut record);
+        keep("pictures", pictures::section(&setting, &notes)?, &mut record);
         keep("theory", theory()?, &mut record);
         progress.finish_and_clear();
-        sections.insert(1, claims::section(&claims));
-        record.insert("claims".to_owned(), claims::json(&claims));
+        sections.insert(1, claims::section(&notes.claims));
+        record.insert("claims".to_owned(), claims::json(&notes.claims));
+        record.insert("adapters".to_owned(), notes.publish(&store).await?);
+        sections.push(published(&notes));
         record.insert("protocol".to_owned(), setting.protocol());
         record.insert("seconds".to_owned(), json!(begun.elapsed().as_secs_f64()));
         let document = Document { title: "SeeSE3 reproduced".to_owned(), sections };
         write(&setting.options.out, &document, &Value::Object(record))
     }
 
-    async fn loaded(self) -> anyhow::Result<Setting> {
-        let store = Store::open(&self.store)?;
+    async fn loaded(self, store: &Store) -> anyhow::Result<Setting> {
         let mut sets = Vec::new();
         for features in &self.features {
             let [train, test, in_room] = [&self.train, &self.test, &self.in_room];
-            let train = load_rooms(&store, train, Some(features)).await?;
-            let test = load_rooms(&store, test, Some(features)).await?;
-            let in_room = load_rooms(&store, in_room, Some(features)).await?;
+            let train = load_rooms(store, train, Some(features)).await?;
+            let test = load_rooms(store, test, Some(features)).await?;
+            let in_room = load_rooms(store, in_room, Some(features)).await?;
             let twice = train.iter().find(|(room, _)| test.iter().any(|(other, _)| other.room.id() == room.room.id()));
             if let Some((room, _)) = twice {
                 bail!("room '{}' is both learned from and held out", room.room.id());
             }
             sets.push(Set { features: features.clone(), train, test, in_room });
+        }
+        // Found out now, not when everything was learned.
+        for set in &sets {
+            let rooms = set.in_room.iter().map(|(stored, _)| stored.room.id().as_str());
+            for what in rooms.chain([cross::LONGEST_NAME]) {
+                let name = published_name(what, &set.features);
+                if !is_plain_name(&name) {
+                    bail!(
+                        "an adapter would be called '{name}', which is no name for one: too long by --features or --in-room"
+                    );
+                }
+            }
         }
         let rooms = sets.first().map_or(0, |set| set.train.len());
         if let Some(size) = self.sizes.iter().find(|&&size| size == 0 || size > rooms) {
@@ -187,6 +206,18 @@ fn data(setting: &Setting) -> Section {
     if let Some(epochs) = setting.options.epochs {
         section.text(format!("All training was cut to {epochs} epochs: this is a trial of the command, not a result."));
     }
+    section
+}
+
+/// Where the adapters are.
+fn published(notes: &Notes) -> Section {
+    let mut section = Section::new("Adapters");
+    section.text(format!(
+        "The {} adapters of the tables of navigation are in the store, named \"reproduced.\" and what they learned from: \
+         evaluate, navigate and serve take them. The record has their revisions, seeds and protocols; the other tables' \
+         adapters are what `seese3 train` gives for the same room, preset and seed.",
+        notes.adapters.len()
+    ));
     section
 }
 

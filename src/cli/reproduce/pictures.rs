@@ -8,10 +8,11 @@ use nalgebra::{DMatrix, SymmetricEigen};
 use ndarray::{Array2, ArrayView2, Axis, s};
 use serde_json::{Value, json};
 
-use super::super::rooms::lesson;
+use super::cross::steady;
 use super::in_room::plotted;
+use super::notes::Notes;
 use super::{Found, Loaded, Set, Setting};
-use crate::adapter::{Preset, Reading};
+use crate::adapter::Reading;
 use crate::cancel::Cancellation;
 use crate::encoder::{encode_png, read_image};
 use crate::image::RgbImage;
@@ -21,7 +22,6 @@ use crate::navigation::{
 use crate::pairs::Split;
 use crate::report::{Curves, Section, Series};
 use crate::room::FrameId;
-use crate::training::{Lesson, learn};
 
 /// Parts of a walk, as in the paper.
 const STEPS: u32 = 4;
@@ -33,12 +33,11 @@ const FAR: u32 = 50;
 const WIDTH: usize = 200;
 
 /// Strips of held-out rooms that have images, and the paths of features and latents.
-pub fn section(setting: &Setting) -> anyhow::Result<Found> {
+pub fn section(setting: &Setting, notes: &Notes) -> anyhow::Result<Found> {
     let mut section = Section::new("Walks in rooms never seen, and a recording unrolled");
     let set = &setting.sets[0];
-    let lessons: Vec<Lesson<'_>> = set.train.iter().map(lesson).collect();
-    let recipe = setting.recipe(Preset::Steady, Split::Whole, setting.options.stride, 0, None);
-    let adapter = Arc::new(learn(&lessons, &recipe, &mut |_| ())?.0);
+    let adapter = notes.adapter(&steady(set), &set.features).context("the steady adapter was not learned")?;
+    let adapter = Arc::new(adapter.clone());
     let mut record = Vec::new();
     let drawn =
         |room: &&Loaded| room.0.room.provenance().format.starts_with("studio") && !room.0.room.images().is_empty();

@@ -2,24 +2,23 @@
 
 use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
-use std::time::Instant;
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
 use rayon::prelude::*;
-use sha2::{Digest, Sha256};
 
 use super::super::progress::bar;
 use super::super::protocol::{LossName, ProtocolOptions};
-use super::super::rooms::{lesson, load_rooms};
+use super::super::rooms::load_rooms;
 use super::super::{say, write_file};
 use super::journal::{self, Journal};
-use crate::adapter::{Loss, PairPlan, TrainConfig};
+use super::one::{content, done, row};
+use crate::adapter::{Loss, TrainConfig};
 use crate::features::Features;
 use crate::generalisation::nested_choice;
-use crate::report::{SweepRow, configurations_table, difficulty_table, parts_table, success_table, sweep_parquet};
+use crate::report::{SweepRow, aligned, configurations_rows, difficulty_rows, parts_rows, success_rows, sweep_parquet};
 use crate::store::{Store, StoredRoom};
-use crate::training::{Recipe, learn};
+use crate::training::Recipe;
 
 /// Configurations that are shown.
 const SHOWN: usize = 10;
@@ -103,7 +102,7 @@ impl Adapters {
         ));
         let progress = bar(ours.len() as u64, "sweep");
         ours.into_par_iter().try_for_each(|task| {
-            let row = done(task);
+            let row = done(task.room, &task.recipe, task.row);
             progress.inc(1);
             journal.add(&row)
         })?;
@@ -128,13 +127,13 @@ impl Adapters {
             base.split,
             base.stride
         ));
-        say(success_table(rows).trim_end());
+        say(aligned(&success_rows(rows)).trim_end());
         say("\nhow hard the rooms are:");
-        say(difficulty_table(rows).trim_end());
+        say(aligned(&difficulty_rows(rows)).trim_end());
         say(format_args!("\nby part of the motion, over {} runs:", rows.len()));
-        say(parts_table(rows).trim_end());
+        say(aligned(&parts_rows(rows)).trim_end());
         say("\nthe best configurations by mean R²:");
-        say(configurations_table(rows, SHOWN).trim_end());
+        say(aligned(&configurations_rows(rows, SHOWN)).trim_end());
         let mut failures: BTreeMap<(&str, &str), usize> = BTreeMap::new();
         for row in rows.iter().filter(|row| !row.failure.is_empty()) {
             *failures.entry((&row.room, &row.failure)).or_default() += 1;
@@ -187,65 +186,4 @@ impl Adapters {
         }
         Ok(tasks)
     }
-}
-
-/// Runs a task; one that fails says why in its row.
-fn done(task: Task<'_>) -> SweepRow {
-    let Task { room, recipe, mut row } = task;
-    let begun = Instant::now();
-    match learn(&[lesson(room)], &recipe, &mut |_| ()) {
-        Ok((_, record)) => row.score(&record.test, &record.train),
-        Err(error) => row.failure = error.to_string(),
-    }
-    row.seconds = begun.elapsed().as_secs_f64();
-    row
-}
-
-/// What poses and features are, whatever they are called: another store may call others by the same names.
-fn content((stored, features): &(StoredRoom, Features)) -> String {
-    let mut digest = Sha256::new();
-    features.rows().iter().for_each(|x| digest.update(x.to_le_bytes()));
-    let poses = stored.room.poses().iter().map(crate::geometry::Pose::to_homogeneous);
-    poses.for_each(|pose| pose.iter().for_each(|x| digest.update(x.to_le_bytes())));
-    digest.finalize().iter().take(16).map(|byte| format!("{byte:02x}")).collect()
-}
-
-/// What decides a run; its scores are still empty.
-fn row((stored, features): &(StoredRoom, Features), content: &str, recipe: &Recipe) -> SweepRow {
-    let config = &recipe.config;
-    let row = SweepRow {
-        key: String::new(),
-        room: stored.room.id().to_string(),
-        room_revision: stored.revision,
-        format: stored.room.provenance().format.clone(),
-        frames: stored.room.frame_count(),
-        features: features.source().name.clone(),
-        preset: recipe.preset.name().to_owned(),
-        split: recipe.split.name().to_owned(),
-        stride: recipe.stride,
-        geo_dim: config.latent,
-        charts: config.charts,
-        mixing: config.mixing.name().to_owned(),
-        pairs: match &recipe.pairs {
-            PairPlan::Stride(stride) => format!("stride {stride}"),
-            PairPlan::Range(range) => format!("{} of strides {}-{}", range.count, range.low, range.high),
-        },
-        lr: config.learning_rate,
-        loss: config.loss.name().to_owned(),
-        epochs: config.epochs,
-        batch: config.batch,
-        weight_decay: config.weight_decay,
-        hidden: config.hidden,
-        seed: config.seed,
-        n: 0,
-        overall: None,
-        translation: None,
-        rotation: None,
-        direction: None,
-        magnitude: None,
-        train_overall: None,
-        seconds: 0.0,
-        failure: String::new(),
-    };
-    SweepRow { key: format!("{}@{} {content} {recipe:?}", row.room, row.room_revision), ..row }
 }

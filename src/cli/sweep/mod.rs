@@ -4,6 +4,7 @@ mod adapters;
 mod formulations;
 mod journal;
 mod layers;
+pub mod one;
 
 use clap::{Args, Subcommand};
 

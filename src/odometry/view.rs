@@ -1,4 +1,4 @@
-//! From two views to the motion between them.
+//! What a camera saw, and the motion between two views.
 
 use ndarray::Array1;
 

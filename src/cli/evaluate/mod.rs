@@ -1,10 +1,12 @@
-//! `seese3 evaluate`: the paper's navigation table on a room's held-out motions.
+//! `seese3 evaluate`: the paper's navigation table on a room's held-out motions, and the errors of paths.
+
+mod trajectory;
 
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
-use clap::Args;
+use clap::{Args, Subcommand};
 use serde_json::json;
 
 use super::ask::ModeName;
@@ -20,7 +22,33 @@ use crate::report::{evaluation_json, evaluation_table};
 use crate::store::{Store, StoredAdapter};
 
 #[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true)]
 pub struct Evaluate {
+    #[command(subcommand)]
+    what: Option<What>,
+    #[command(flatten)]
+    navigation: Option<Navigation>,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    /// APE and RPE of a path against the true one, as evo takes them
+    Trajectory(trajectory::Trajectory),
+}
+
+impl Evaluate {
+    pub async fn run(self) -> anyhow::Result<()> {
+        match (self.what, self.navigation) {
+            (Some(What::Trajectory(trajectory)), _) => trajectory.run(),
+            (None, Some(navigation)) => navigation.run().await,
+            (None, None) => bail!("name a room with --room, or what to evaluate: see `seese3 evaluate --help`"),
+        }
+    }
+}
+
+/// The navigation table.
+#[derive(Debug, Args)]
+struct Navigation {
     /// The store
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
@@ -63,8 +91,8 @@ pub struct Evaluate {
     json: Option<PathBuf>,
 }
 
-impl Evaluate {
-    pub async fn run(self) -> anyhow::Result<()> {
+impl Navigation {
+    async fn run(self) -> anyhow::Result<()> {
         if let Some(path) = &self.json {
             check_writable(path)?;
         }
@@ -166,7 +194,7 @@ pub fn navigators_named(names: &[String]) -> anyhow::Result<Vec<NavigatorKind>> 
 }
 
 /// The adapter that was named, or the newest that fits the room, its features, the split and, if one does, the stride.
-async fn choose(store: &Store, wanted: &Evaluate, split: Option<Split>) -> anyhow::Result<StoredAdapter> {
+async fn choose(store: &Store, wanted: &Navigation, split: Option<Split>) -> anyhow::Result<StoredAdapter> {
     if let Some(name) = &wanted.adapter {
         return Ok(store.load_adapter(name, None).await?);
     }

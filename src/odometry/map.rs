@@ -1,0 +1,105 @@
+//! A room as a tracker matches against it.
+
+use std::sync::Arc;
+
+use ndarray::{ArrayView1, Axis, s};
+
+use super::{Belief, Error};
+use crate::adapter::Calibration;
+use crate::geometry::exp;
+use crate::index::{ExactIndex, Exclusion, Index, Neighbour};
+use crate::navigation::Navigator;
+use crate::room::FrameId;
+
+/// Rows to each side of a frame that are its neighbours in time, not in place.
+const BESIDE: u32 = 10;
+/// Frames whose nearest others say how near a room's frames are to one another.
+const SAMPLED: usize = 1_000;
+
+/// Some frames of a room under an adapter whose errors are known.
+pub struct Map {
+    navigator: Arc<Navigator>,
+    calibration: Arc<Calibration>,
+    index: ExactIndex,
+    typical: f64,
+    extent_m: f64,
+}
+
+/// What a latent looks like in a map.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sighting {
+    /// The nearest frames, by distance in deviations of flicker; at least one.
+    pub nearest: Vec<Neighbour>,
+    /// The distance of the nearest over the room's limit: above 1 it looks like another place.
+    pub out_of_distribution: f64,
+    /// Where the nearest frame says that the camera is, `world_from_camera`.
+    pub anchor: Belief,
+}
+
+impl Map {
+    /// The frames `mapped` of a room.
+    ///
+    /// # Errors
+    /// [`Error::NotCalibrated`], [`Error::SmallMap`] when no frame has another one that is not beside it in time.
+    pub fn new(navigator: Arc<Navigator>, mapped: &[FrameId]) -> Result<Self, Error> {
+        let calibration = navigator.adapter().calibration().ok_or(Error::NotCalibrated)?.clone();
+        let columns = s![.., ..navigator.adapter().coordinate_count()];
+        let white = calibration.flicker().whitened(navigator.latents().slice(columns));
+        let index = ExactIndex::new(white.view(), mapped);
+        let every = mapped.len().div_ceil(SAMPLED).max(1);
+        let apart = mapped.iter().step_by(every).filter_map(|&centre| {
+            let row = white.row(centre.row()).to_vec();
+            Some(index.nearest(&row, 1, Some(Exclusion { centre, radius: BESIDE })).first()?.distance)
+        });
+        let typical = crate::scores::median(&apart.collect::<Vec<_>>());
+        if !(typical.is_finite() && typical > 0.0) {
+            return Err(Error::SmallMap { room: navigator.room().id().clone(), frames: mapped.len() });
+        }
+        let extent_m = extent(&navigator, mapped);
+        Ok(Self { navigator, calibration, index, typical, extent_m })
+    }
+
+    /// The room and its adapter.
+    pub fn navigator(&self) -> &Arc<Navigator> {
+        &self.navigator
+    }
+
+    /// The median distance of a mapped frame from the nearest that is not beside it in time, in deviations of flicker.
+    pub fn typical(&self) -> f64 {
+        self.typical
+    }
+
+    /// The diagonal of the box around the mapped cameras, metres.
+    pub fn extent_m(&self) -> f64 {
+        self.extent_m
+    }
+
+    /// What a latent looks like here, the `k` nearest frames.
+    pub fn sighting(&self, latent: ArrayView1<'_, f64>, k: usize) -> Sighting {
+        let adapter = self.navigator.adapter();
+        let coordinates = latent.slice(s![..adapter.coordinate_count()]);
+        let white = self.calibration.flicker().whitened(coordinates.insert_axis(Axis(0)));
+        let nearest = self.index.nearest(&white.row(0).to_vec(), k.max(1), None);
+        // A map has frames, or it would not have a typical distance.
+        let best = nearest.first().copied().unwrap_or(Neighbour { frame: FrameId(0), distance: f64::INFINITY });
+        let errors = self.calibration.anchor_errors(best.distance);
+        let latents = self.navigator.latents();
+        let stored = latents.row(best.frame.row());
+        let step = adapter.displacement(stored, latent).scaled(errors.gain);
+        let pose = self.navigator.room().poses()[best.frame.row()] * exp(&step);
+        Sighting {
+            nearest,
+            out_of_distribution: best.distance / (self.typical * self.calibration.measured().foreign),
+            anchor: Belief { pose, covariance: errors.covariance },
+        }
+    }
+}
+
+fn extent(navigator: &Navigator, mapped: &[FrameId]) -> f64 {
+    let positions = mapped.iter().map(|frame| navigator.room().poses()[frame.row()].translation.vector);
+    let (mut low, mut high) = (nalgebra::Vector3::repeat(f64::INFINITY), nalgebra::Vector3::repeat(f64::NEG_INFINITY));
+    for position in positions {
+        (low, high) = (low.inf(&position), high.sup(&position));
+    }
+    (high - low).norm()
+}

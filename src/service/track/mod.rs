@@ -1,0 +1,3 @@
+//! OdometryService.Track.
+
+pub mod token;
