@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
+use tokio_stream::Stream;
 use tonic::transport::{Channel, Endpoint};
-use tonic::{Code, Status};
+use tonic::{Code, Status, Streaming};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
@@ -30,7 +31,7 @@ pub enum Error {
     Refused(Box<Status>),
     #[error("no answer came before the deadline")]
     Deadline,
-    #[error("the server ended the evaluation without a report")]
+    #[error("the server ended its answer without a result")]
     NoReport,
 }
 
@@ -108,6 +109,27 @@ impl Client {
         Ok(service.batch_navigate(self.request(pb::BatchNavigateRequest { requests })).await?.into_inner().results)
     }
 
+    /// Walks to a goal; `feedback` hears of each step.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] or [`Error::NoReport`].
+    pub async fn navigate_to(
+        &self,
+        request: pb::NavigateToRequest,
+        mut feedback: impl FnMut(pb::NavigateToFeedback),
+    ) -> Result<pb::NavigateToResult, Error> {
+        let mut service = NavigationServiceClient::new(self.channel.clone());
+        let mut events = service.navigate_to(self.request(request)).await?.into_inner();
+        while let Some(pb::NavigateToResponse { event }) = events.message().await? {
+            match event {
+                Some(pb::navigate_to_response::Event::Result(result)) => return Ok(result),
+                Some(pb::navigate_to_response::Event::Feedback(step)) => feedback(step),
+                None => {}
+            }
+        }
+        Err(Error::NoReport)
+    }
+
     /// Localises a view.
     ///
     /// # Errors
@@ -115,6 +137,15 @@ impl Client {
     pub async fn localize(&self, request: pb::LocalizeRequest) -> Result<pb::LocalizeResponse, Error> {
         let mut service = LocalizationServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
         Ok(service.localize(self.request(request)).await?.into_inner())
+    }
+
+    /// Which room views are of, and where in it.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn relocalize(&self, request: pb::RelocalizeRequest) -> Result<pb::RelocalizeResponse, Error> {
+        let mut service = LocalizationServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service.relocalize(self.request(request)).await?.into_inner())
     }
 
     /// The motion between two views.
@@ -127,6 +158,19 @@ impl Client {
     ) -> Result<pb::EstimateMotionResponse, Error> {
         let mut service = OdometryServiceClient::new(self.channel.clone());
         Ok(service.estimate_motion(self.request(request)).await?.into_inner())
+    }
+
+    /// Follows a camera: requests as they are made, answers as they come. No deadline: a stream lasts as long as its robot
+    /// goes.
+    ///
+    /// # Errors
+    /// [`Error::Refused`]; once it has begun, in the stream.
+    pub async fn track(
+        &self,
+        requests: impl Stream<Item = pb::TrackRequest> + Send + 'static,
+    ) -> Result<Streaming<pb::TrackResponse>, Error> {
+        let mut service = OdometryServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service.track(requests).await?.into_inner())
     }
 
     /// All rooms, page by page.

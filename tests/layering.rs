@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 /// The longest source file.
 const LONGEST_FILE: usize = 400;
 /// Crates and modules that only some of ours may name: (what, who).
-const RESERVED: [(&str, &[&str]); 13] = [
+const RESERVED: [(&str, &[&str]); 14] = [
+    ("mcap", &["report"]),
     ("parquet", &["report"]),
     ("ort", &["encoder"]),
     ("tract_onnx", &["encoder"]),

@@ -47,6 +47,9 @@ impl ErrorTable {
 
     /// Errors where the number is `at`: between two strata by the logarithm, outside them the outermost.
     pub fn at(&self, at: f64) -> Stratum {
+        if at == f64::INFINITY {
+            return self.strata[self.strata.len() - 1];
+        }
         let after = self.strata.partition_point(|stratum| stratum.at <= at);
         let (Some(low), Some(high)) = (after.checked_sub(1).map(|i| self.strata[i]), self.strata.get(after)) else {
             // Before the first, behind the last, or not a number: the largest errors are the safe answer to the last.
@@ -63,27 +66,32 @@ impl ErrorTable {
     }
 }
 
-/// Covariances of read motions: they grow with the squared length u of the latents' difference, Σ = (u + u₀) S. Measured
-/// over many strides, their exponent is 1 within a few hundredths.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// Covariances of read motions, Σ = (u + u₀) S(n): they grow with the squared length u of the latents' difference, with an
+/// exponent of 1 within a few hundredths, and with the frames n in between, since over few of them u is mostly flicker.
+#[derive(Debug, Clone, PartialEq)]
 pub struct MotionErrors {
-    /// S, on (v, ω), metres and radians. Positive definite.
-    pub shape: Matrix6<f64>,
+    /// S by the number of frames in between, at 1 and more; on (v, ω), metres and radians.
+    pub shapes: ErrorTable,
     /// u₀, above 0: what is read of a camera that stands.
     pub floor: f64,
 }
 
 impl MotionErrors {
-    /// The covariance of a motion read from latents whose difference has the squared length `u`, 0 or more.
-    pub fn at(&self, u: f64) -> Matrix6<f64> {
-        self.shape * (u + self.floor)
+    /// The covariance of a motion over `frames`, read from latents whose difference has the squared length `u`.
+    pub fn at(&self, u: f64, frames: u64) -> Matrix6<f64> {
+        self.shapes.at(frames.max(1) as f64).covariance * (u + self.floor)
+    }
+
+    /// That of a motion over as many frames as were measured at most.
+    fn longest(&self, u: f64) -> Matrix6<f64> {
+        self.shapes.at(f64::INFINITY).covariance * (u + self.floor)
     }
 }
 
 /// What was measured of an adapter's errors in rooms that it did not learn from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Measured {
-    /// Second moment of the differences of latents from one frame to the next, shape (c, c).
+    /// Half the second moment of the differences of latents from one frame to the next, shape (c, c).
     pub flicker: Array2<f64>,
     /// Second moment of the differences of latents over the motions it was trained for, shape (c, c).
     pub spread: Array2<f64>,
@@ -91,10 +99,14 @@ pub struct Measured {
     pub motion: MotionErrors,
     /// Errors of a retrieved pose by its distance in `flicker`.
     pub anchor: ErrorTable,
-    /// The distance from a room over the room's own, above which a frame is another place's.
+    /// The distance from a room over the room's own, above which a frame looks like another place.
     pub foreign: f64,
+    /// That below which hardly a frame of another room is.
+    pub sure: f64,
     /// The distance in `flicker` from the nearest of the last frames, above which a view jumped.
     pub jump: f64,
+    /// What the covariances of places that a tracker just corrected have to be multiplied with to be those of its errors.
+    pub place: f64,
 }
 
 /// An adapter's errors in rooms that it did not learn from, as a tracker asks for them.
@@ -159,14 +171,11 @@ impl Calibration {
         if flicker.size() != spread.size() {
             return Err(Error::Calibration { what: "the size of a covariance of latents" });
         }
-        let MotionErrors { shape, floor } = measured.motion;
-        let symmetric = (shape - shape.transpose()).amax() <= 1e-9 * shape.amax();
-        if !symmetric || Cholesky::new(shape).is_none() {
-            return Err(Error::Calibration { what: "the covariance of motions" });
-        }
         for (what, value) in [
-            ("the floor of motions", floor),
+            ("the floor of motions", measured.motion.floor),
+            ("the factor of places", measured.place),
             ("the limit of a room", measured.foreign),
+            ("the sure limit of a room", measured.sure),
             ("the length of a jump", measured.jump),
         ] {
             if !(value.is_finite() && value > 0.0) {
@@ -186,15 +195,26 @@ impl Calibration {
         &self.flicker
     }
 
-    /// The covariance of a motion read over a difference of latents, shape (c,).
-    pub fn motion_errors(&self, difference: ArrayView1<'_, f64>) -> Matrix6<f64> {
-        self.measured.motion.at(self.spread.squared_length(difference))
+    /// The covariance of a motion over so many frames, read over a difference of latents, shape (c,).
+    pub fn motion_errors(&self, difference: ArrayView1<'_, f64>, frames: u64) -> Matrix6<f64> {
+        self.measured.motion.at(self.spread.squared_length(difference), frames)
+    }
+
+    /// The squared length of a difference of latents, shape (c,), against those over the motions that were trained for.
+    pub fn spread_length(&self, difference: ArrayView1<'_, f64>) -> f64 {
+        self.spread.squared_length(difference)
+    }
+
+    /// The most frames that motions' errors were measured over.
+    pub fn longest_frames(&self) -> f64 {
+        let strata = self.measured.motion.shapes.strata();
+        strata[strata.len() - 1].at
     }
 
     /// That of a motion of which nothing is known but that it is one of those the adapter was trained for.
     pub fn unread_errors(&self) -> Matrix6<f64> {
         // The mean squared length of a difference under its own second moment is the number of its columns.
-        self.measured.motion.at(self.spread.size() as f64)
+        self.measured.motion.longest(self.spread.size() as f64)
     }
 
     /// Errors of a pose found by retrieval at a distance in [`Calibration::flicker`].

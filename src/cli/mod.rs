@@ -19,6 +19,7 @@ mod serve;
 mod studio;
 mod sweep;
 mod theory;
+mod track;
 mod train;
 
 use clap::{Parser, Subcommand};
@@ -67,6 +68,8 @@ enum Command {
     Localize(ask::Localize),
     /// Ask a server for the motion between two views
     Motion(ask::Motion),
+    /// Have a server follow a camera whose features are in a file
+    Track(track::Track),
     /// List what a server answers for
     Catalog(ask::Catalog),
     /// Succeed if a server serves, for containers and supervisors
@@ -96,6 +99,7 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Navigate(arguments) => arguments.run().await,
         Command::Localize(arguments) => arguments.run().await,
         Command::Motion(arguments) => arguments.run().await,
+        Command::Track(arguments) => arguments.run().await,
         Command::Catalog(arguments) => arguments.run().await,
         Command::Health(arguments) => arguments.run().await,
     }

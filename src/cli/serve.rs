@@ -1,6 +1,7 @@
 //! `seese3 serve`: answer over gRPC until told to stop.
 
 use std::io::IsTerminal;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Context;
@@ -12,7 +13,7 @@ use super::say;
 use crate::encoder::{Bounds, Runtime};
 use crate::index::HnswParameters;
 use crate::navigation::{IndexKind, Limits};
-use crate::service::{Config, ImageEncoders, run, shutdown_signal};
+use crate::service::{Config, ImageEncoders, TokenKey, run, shutdown_signal};
 use crate::store::Store;
 
 #[derive(Debug, Args)]
@@ -57,6 +58,13 @@ pub struct Serve {
     /// How long requests in flight may go on after SIGTERM, seconds
     #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = 10, value_parser = clap::value_parser!(u64).range(0..=86_400))]
     drain_seconds: u64,
+    /// Cameras that are followed at a time
+    #[arg(long, env = "SEESE3_MAX_STREAMS", default_value_t = Config::default().streams)]
+    max_streams: usize,
+    /// A file whose bytes, 16 or more, seal resume tokens: servers that share it go on with one another's streams; without
+    /// one they end with the server
+    #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_KEY_FILE")]
+    token_key_file: Option<PathBuf>,
     /// Requests computed at a time; the machine's cores if not given
     #[arg(long, env = "SEESE3_THREADS", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
@@ -103,6 +111,8 @@ impl Serve {
             threads,
             queue: self.queue as usize,
             longest: Duration::from_secs(self.max_request_seconds),
+            streams: self.max_streams,
+            token_key: self.token_key()?,
             drain: Duration::from_secs(self.drain_seconds),
             ..defaults
         };
@@ -113,6 +123,15 @@ impl Serve {
         run(listener, store, config, shutdown_signal()).await?;
         say("stopped");
         Ok(())
+    }
+}
+
+impl Serve {
+    fn token_key(&self) -> anyhow::Result<TokenKey> {
+        let Some(file) = &self.token_key_file else { return Ok(TokenKey::random()) };
+        let secret =
+            std::fs::read(file).with_context(|| format!("--token-key-file: {} cannot be read", file.display()))?;
+        TokenKey::new(&secret).map_err(|problem| anyhow::anyhow!("--token-key-file: {} {problem}", file.display()))
     }
 }
 

@@ -12,8 +12,9 @@ use super::progress::bar;
 use super::protocol::ProtocolOptions;
 use super::rooms::{lesson, load_rooms, room_words};
 use super::{check_writable, say, write_json};
-use crate::adapter::{Adapter, CorrectorKind, Reading, TrainConfig};
+use crate::adapter::{Adapter, Calibration, CorrectorKind, Measured, Reading, TrainConfig, TrainingRecord};
 use crate::cancel::Cancellation;
+use crate::eval::tracking::place_factor;
 use crate::eval::{NavigatorKind, Protocol, evaluate};
 use crate::features::Features;
 use crate::navigation::{IndexKind, Metric, Navigator, StepKind};
@@ -21,7 +22,7 @@ use crate::pairs::Split;
 use crate::report::{TrainingRun, training_json, training_table};
 use crate::scores::Rate;
 use crate::store::{Published, Store, StoredRoom};
-use crate::training::{Lesson, Recipe, check_unseen, error_covariance, learn};
+use crate::training::{Lesson, Recipe, calibrate, check_unseen, error_covariance, learn};
 
 /// The most seeds of one command.
 const MAX_SEEDS: u64 = 1_000;
@@ -42,8 +43,8 @@ pub struct Train {
     /// Train these after the adapter, as further navigators: linear, mlp-2, mlp-3, attention, or all
     #[arg(long, value_delimiter = ',')]
     correctors: Vec<String>,
-    /// Rooms in which the adapter's errors are measured, for navigators with +calibrated: names or patterns, none of them
-    /// learned from
+    /// Rooms in which the adapter's errors are measured, for navigators with +calibrated, and with two or more for
+    /// tracking and relocalisation: names or patterns, none of them learned from
     #[arg(long)]
     calibrate_on: Vec<String>,
     /// Of weights and order, as PyTorch takes it: 32 bits
@@ -81,12 +82,7 @@ impl Train {
         }
         let (mut adapter, mut runs) = train_seeds(&rooms, &recipe, self.seeds)?;
         if !calibration.is_empty() {
-            let lessons: Vec<Lesson<'_>> = calibration.iter().map(lesson).collect();
-            let covariance = error_covariance(&adapter, &runs[0].record, &lessons)?;
-            adapter = adapter.with_error_covariance(covariance)?;
-            let room = |(stored, _): &(StoredRoom, Features)| (stored.room.id().clone(), stored.revision);
-            runs[0].record.calibrated_on = calibration.iter().map(room).collect();
-            say(format_args!("errors measured in {}", room_words(&calibration)));
+            adapter = calibrated(adapter, &mut runs[0].record, &calibration)?;
         }
         let features = &rooms[0].1;
         let name = self.name.unwrap_or_else(|| default_name(&rooms, &recipe));
@@ -119,6 +115,34 @@ impl Train {
         }
         Ok(())
     }
+}
+
+/// The adapter with its errors measured in rooms, which the record then names.
+fn calibrated(
+    adapter: Adapter,
+    record: &mut TrainingRecord,
+    rooms: &[(StoredRoom, Features)],
+) -> anyhow::Result<Adapter> {
+    let lessons: Vec<Lesson<'_>> = rooms.iter().map(lesson).collect();
+    let covariance = error_covariance(&adapter, record, &lessons)?;
+    let mut adapter = adapter.with_error_covariance(covariance)?;
+    if lessons.len() > 1 {
+        adapter = tracking(adapter, record, &lessons)?;
+    } else {
+        say("one room is too few to tell rooms apart in: the adapter can navigate, not track");
+    }
+    record.calibrated_on = rooms.iter().map(|(stored, _)| (stored.room.id().clone(), stored.revision)).collect();
+    say(format_args!("errors measured in {}", room_words(rooms)));
+    Ok(adapter)
+}
+
+/// The adapter with its errors as a tracker needs them: measured pair by pair, then along the ways of the same rooms.
+fn tracking(adapter: Adapter, record: &TrainingRecord, lessons: &[Lesson<'_>]) -> anyhow::Result<Adapter> {
+    let first = calibrate(&adapter, record, lessons)?;
+    let adapter = Arc::new(adapter.with_calibration(first.clone())?);
+    let place = place_factor(&adapter, lessons)?.context("no place was found in the rooms to calibrate on")?;
+    let measured = Measured { place, ..first.measured().clone() };
+    Ok(Arc::unwrap_or_clone(adapter).with_calibration(Calibration::new(measured)?)?)
 }
 
 fn correctors(names: &[String]) -> anyhow::Result<Vec<CorrectorKind>> {

@@ -3,12 +3,13 @@
 mod navigators;
 mod predictions;
 mod retrieval;
+pub mod tracking;
 
 pub use navigators::{NavigatorKind, Protocol, Report, Row, evaluate};
 pub use predictions::{Prediction, PredictionScope, score_predictions};
 pub use retrieval::{LatentScores, PoseRecall, RetrievalScores};
 
-use crate::{adapter, cancel, navigation, pairs, room};
+use crate::{adapter, cancel, navigation, odometry, pairs, room};
 
 /// Why an evaluation cannot be done.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -21,6 +22,8 @@ pub enum Error {
     Adapter(#[from] adapter::Error),
     #[error(transparent)]
     Navigation(#[from] navigation::Error),
+    #[error(transparent)]
+    Odometry(#[from] odometry::Error),
     #[error(transparent)]
     Cancelled(#[from] cancel::Cancelled),
     #[error("threshold {value:e} must be greater than 0 and at most {MAX_THRESHOLD:e}")]

@@ -7,6 +7,7 @@
 
 mod multi_step;
 mod navigator;
+mod pursuit;
 mod query;
 mod search;
 mod stepper;
@@ -14,6 +15,7 @@ mod stepper;
 pub use crate::adapter::Reading;
 pub use multi_step::{Leg, Mode, Plan, Space, Start, Step, walk};
 pub use navigator::{Answer, AnswerStep, Hit, Navigator, StepError};
+pub use pursuit::{Feedback, Outcome, Pursuit, pursue};
 pub use query::{Displacement, FitOn, Limits, Query, Source, SourceAt};
 pub use search::{IndexKind, Metric, Search};
 pub use stepper::{Ground, Refit, StepKind, Stepper};

@@ -25,17 +25,36 @@ pub enum Chain {
     },
 }
 
+/// How a frame looks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Look {
+    /// Whether it looks like the room.
+    pub on_map: bool,
+    /// Whether hardly a frame of another room looks as much like it.
+    pub sure: bool,
+    /// Whether it shows what no camera sees that was just where the frames before were.
+    pub jumped: bool,
+    /// Whether so many frames are missing before it that a jump could not be told.
+    pub gap: bool,
+}
+
 impl Chain {
     /// Before the first frame, in a room that is known to be the right one or not.
     pub fn beginning(known: bool) -> Self {
         if known { Self::Held { count: CONFIRMED, confirmed: true } } else { Self::Fresh }
     }
 
-    /// After a frame that looks like the room or not, and that follows from those before or not.
+    /// After a frame.
     #[must_use]
-    pub fn after(self, on_map: bool, jumped: bool) -> Self {
+    pub fn after(self, look: Look) -> Self {
+        let Look { on_map, sure, jumped, gap } = look;
         match self {
             Self::Held { .. } if jumped => Self::Lost { count: 0 },
+            // What happened in between was not seen.
+            Self::Held { .. } if gap => match on_map {
+                true => Self::Held { count: 1, confirmed: false },
+                false => Self::Lost { count: 0 },
+            },
             Self::Held { confirmed: true, .. } => self,
             Self::Held { count, .. } => match if on_map { count + 1 } else { count - 2 } {
                 ..0 => Self::Lost { count: 0 },
@@ -43,7 +62,7 @@ impl Chain {
             },
             Self::Fresh if on_map => Self::Held { count: 1, confirmed: false },
             Self::Fresh => Self::Lost { count: 0 },
-            Self::Lost { .. } if jumped || !on_map => Self::Lost { count: 0 },
+            Self::Lost { .. } if jumped || !sure => Self::Lost { count: 0 },
             Self::Lost { count } if count + 1 >= REGAINED => Self::Held { count: 0, confirmed: false },
             Self::Lost { count } => Self::Lost { count: count + 1 },
         }
@@ -64,7 +83,7 @@ mod tests {
         frames
             .iter()
             .map(|&(on_map, jumped)| {
-                chain = chain.after(on_map, jumped);
+                chain = chain.after(Look { on_map, sure: on_map, jumped, gap: false });
                 chain.is_lost()
             })
             .collect()
@@ -86,6 +105,9 @@ mod tests {
         // Five in a row regain it.
         let frames = [&[(false, false)][..], &[(true, false); 6]].concat();
         assert_eq!(run(Chain::Fresh, &frames), [true, true, true, true, true, false, false]);
+        // A gap has to be bridged by what is seen behind it.
+        let gap = |on_map| Chain::beginning(true).after(Look { on_map, sure: on_map, jumped: false, gap: true });
+        assert!(gap(false).is_lost() && gap(true) == Chain::Held { count: 1, confirmed: false });
         // Twenty confirm it: then it may explore.
         let frames = [&[(true, false); 20][..], &[(false, false); 9]].concat();
         assert!(run(Chain::Fresh, &frames).iter().all(|lost| !lost));

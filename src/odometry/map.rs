@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use ndarray::{ArrayView1, Axis, s};
 
-use super::{Belief, Error};
-use crate::adapter::Calibration;
+use super::{Belief, Error, own_errors};
+use crate::adapter::{Calibration, MotionErrors};
 use crate::geometry::exp;
 use crate::index::{ExactIndex, Exclusion, Index, Neighbour};
 use crate::navigation::Navigator;
@@ -23,6 +23,8 @@ pub struct Map {
     index: ExactIndex,
     typical: f64,
     extent_m: f64,
+    motion: MotionErrors,
+    anchor_factor: f64,
 }
 
 /// What a latent looks like in a map.
@@ -32,12 +34,14 @@ pub struct Sighting {
     pub nearest: Vec<Neighbour>,
     /// The distance of the nearest over the room's limit: above 1 it looks like another place.
     pub out_of_distribution: f64,
+    /// Whether hardly a frame of another room is as near.
+    pub is_sure: bool,
     /// Where the nearest frame says that the camera is, `world_from_camera`.
     pub anchor: Belief,
 }
 
 impl Map {
-    /// The frames `mapped` of a room.
+    /// The frames `mapped` of a room, in order.
     ///
     /// # Errors
     /// [`Error::NotCalibrated`], [`Error::SmallMap`] when no frame has another one that is not beside it in time.
@@ -56,7 +60,10 @@ impl Map {
             return Err(Error::SmallMap { room: navigator.room().id().clone(), frames: mapped.len() });
         }
         let extent_m = extent(&navigator, mapped);
-        Ok(Self { navigator, calibration, index, typical, extent_m })
+        // Sums of sound covariances by positive factors are sound.
+        let motion = own_errors::motion_errors(&navigator, &calibration, mapped).map_err(|_| Error::NotCalibrated)?;
+        let anchor_factor = own_errors::anchor_factor(&navigator, &calibration, mapped, &white);
+        Ok(Self { navigator, calibration, index, typical, extent_m, motion, anchor_factor })
     }
 
     /// The room and its adapter.
@@ -67,6 +74,11 @@ impl Map {
     /// The median distance of a mapped frame from the nearest that is not beside it in time, in deviations of flicker.
     pub fn typical(&self) -> f64 {
         self.typical
+    }
+
+    /// The errors of motions here: told by the mapped frames, whose motions are known.
+    pub fn motion(&self) -> &MotionErrors {
+        &self.motion
     }
 
     /// The diagonal of the box around the mapped cameras, metres.
@@ -87,10 +99,12 @@ impl Map {
         let stored = latents.row(best.frame.row());
         let step = adapter.displacement(stored, latent).scaled(errors.gain);
         let pose = self.navigator.room().poses()[best.frame.row()] * exp(&step);
+        let apart = best.distance / self.typical;
         Sighting {
             nearest,
-            out_of_distribution: best.distance / (self.typical * self.calibration.measured().foreign),
-            anchor: Belief { pose, covariance: errors.covariance },
+            out_of_distribution: apart / self.calibration.measured().foreign,
+            is_sure: apart <= self.calibration.measured().sure,
+            anchor: Belief { pose, covariance: errors.covariance * self.anchor_factor },
         }
     }
 }

@@ -6,13 +6,18 @@
 mod belief;
 mod chain;
 mod map;
+mod own_errors;
+mod relocalize;
+mod state;
 mod tracker;
 mod view;
 
 pub use belief::{Belief, Innovation};
-pub use chain::Chain;
+pub use chain::{Chain, Look};
 pub use map::{Map, Sighting};
-pub use tracker::{Candidate, KEYFRAME_FRAMES, Keyframe, Last, Observation, Refusal, Settings, State, Tracker, Update};
+pub use relocalize::{ROOM_RATIO, Relocalized, RoomMatch, relocalize};
+pub use state::{Candidate, Keyframe, Last, Observation, Refusal, State, Update};
+pub use tracker::{Settings, Tracker};
 pub use view::{View, motion};
 
 use crate::room::RoomId;
@@ -33,9 +38,13 @@ pub enum Status {
 /// Why a camera cannot be followed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Error {
-    #[error("a tracker needs at least one room")]
+    #[error("at least one room is needed")]
     NoMap,
-    #[error("rooms of several adapters cannot be tracked together: their latents do not compare")]
+    #[error("at least one view is needed")]
+    NoView,
+    #[error("cancelled")]
+    Cancelled,
+    #[error("rooms of several adapters cannot be looked in together: their latents do not compare")]
     Adapters,
     #[error("the adapter's errors were not measured in rooms that it did not learn from (train --calibrate-on)")]
     NotCalibrated,

@@ -6,33 +6,33 @@
 
 use std::sync::Arc;
 
-use ndarray::{Array1, ArrayView1, Axis, s};
+use ndarray::{ArrayView1, Axis, s};
 
-use super::chain::Chain;
-use super::{Belief, Error, Map, Sighting, Status};
+use super::chain::{Chain, Look};
+use super::state::{Candidate, Keyframe, Last, Observation, Refusal, State, Update};
+use super::{Belief, Error, Map, ROOM_RATIO, Sighting, Status};
 use crate::adapter::{Adapter, Calibration};
 use crate::geometry::{Twist, body_twist};
-use crate::index::Neighbour;
 
 /// χ² with six degrees of freedom: 99 % of right matches are below it.
 const GATE: f64 = 16.81;
 /// Anchors of neighbouring keyframes err alike: each counts as this many times less sure.
-const ANCHOR_INFLATION: f64 = 3.0;
-/// Keyframes whose anchors must agree on a place before it is taken against what was believed, or without belief.
-const AGREEING: u32 = 3;
+const ANCHOR_INFLATION: f64 = 2.0;
+/// Frames from one look for an anchor to the next: those in between err alike.
+const ANCHOR_EVERY: u32 = 3;
+/// Anchors in a row that must agree on a place before it is taken against what was believed, or without belief.
+const AGREEING: u32 = 4;
 /// Latents that a jump is told from.
 const RECENT: usize = 5;
 /// Frames without a mapped place after which the place is in doubt.
 const UNSEEN: u32 = 10;
-/// The nearest frame of the best room must be this much nearer than that of any other.
-const ROOM_RATIO: f64 = 0.9;
 /// How surely a stream's own origin is known, metres and radians: it is where it is by definition.
 const ORIGIN: f64 = 1e-6;
 
 /// How a tracker follows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// Frames after which a new keyframe is taken, at least 1.
+    /// Frames after which a new keyframe is taken, by their numbers, at least 1.
     pub keyframe_frames: u32,
     /// Displacement after which one is taken, ‖(v, ω)‖, metres and radians mixed, above 0.
     pub keyframe_displacement: f64,
@@ -40,16 +40,17 @@ pub struct Settings {
     pub fuse: bool,
 }
 
-/// Keyframes this often: few enough to drift little in between, tried on the studio's calibration rooms.
-pub const KEYFRAME_FRAMES: u32 = 3;
-
 impl Settings {
-    /// What fits an adapter: a keyframe every [`KEYFRAME_FRAMES`] frames, or once the displacement is past the root mean
-    /// square of those that it was trained for.
+    /// What keeps motions within those that an adapter was trained for and its errors were measured over: a keyframe after
+    /// as many frames as the longest of them, or twice the root mean square of their displacements.
+    ///
+    /// Motions of latents add up, so that many keyframes do not read a way better than few; their errors are those that
+    /// were measured only while no more than one motion is read since the last place.
     pub fn of(adapter: &Adapter) -> Self {
         let scale = adapter.scale();
-        let displacement = (scale.mean.norm_squared() + scale.deviation.norm_squared()).sqrt();
-        Self { keyframe_frames: KEYFRAME_FRAMES, keyframe_displacement: displacement, fuse: true }
+        let displacement = 2.0 * (scale.mean.norm_squared() + scale.deviation.norm_squared()).sqrt();
+        let longest = adapter.calibration().map_or(1.0, |calibration| calibration.longest_frames());
+        Self { keyframe_frames: longest as u32, keyframe_displacement: displacement, fuse: true }
     }
 }
 
@@ -58,119 +59,7 @@ pub struct Tracker {
     maps: Vec<Arc<Map>>,
     settings: Settings,
     calibration: Arc<Calibration>,
-}
-
-/// A frame as it comes.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Observation {
-    /// Nanoseconds on the sensor's clock.
-    pub time_ns: i64,
-    /// The sender's number.
-    pub sequence: u64,
-    /// Of the tracker's adapter.
-    pub latent: Array1<f64>,
-}
-
-/// All that is known of a stream.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct State {
-    /// The map that the camera is thought to be in.
-    pub room: Option<usize>,
-    /// The last frame that was taken.
-    pub last: Option<Last>,
-    /// What motions are read from.
-    pub keyframe: Option<Keyframe>,
-    /// Where the camera was put from outside, until the first frame comes: `world_from_camera`.
-    pub initial: Option<Belief>,
-    /// Whitened latents of the last frames, the newest last.
-    pub recent: Vec<Vec<f64>>,
-    /// Whether the frames hang together, and with the room.
-    pub chain: Chain,
-    /// A place that recent anchors speak for.
-    pub candidate: Option<Candidate>,
-    /// Frames since the last that looked like a mapped place.
-    pub unseen: u32,
-}
-
-/// The last frame of a stream.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Last {
-    /// Nanoseconds.
-    pub time_ns: i64,
-    /// The sender's number.
-    pub sequence: u64,
-    /// `odom_from_camera`.
-    pub odom: Belief,
-}
-
-/// The frame that motions are read from.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Keyframe {
-    /// The sender's number.
-    pub sequence: u64,
-    /// Its latent.
-    pub latent: Vec<f64>,
-    /// `odom_from_camera` there.
-    pub odom: Belief,
-    /// `map_from_camera` there, if it is known.
-    pub place: Option<Belief>,
-    /// Frames since.
-    pub age: u32,
-}
-
-/// A place that recent anchors agree on.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Candidate {
-    /// The map.
-    pub room: usize,
-    /// `map_from_camera` at the keyframe.
-    pub place: Belief,
-    /// Anchors that agreed.
-    pub agreed: u32,
-}
-
-/// What a frame says.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Update {
-    /// From the keyframe, in its body frame.
-    pub motion: Twist,
-    /// Of the motion's six numbers.
-    pub motion_covariance: nalgebra::Matrix6<f64>,
-    /// The keyframe's number.
-    pub keyframe_sequence: u64,
-    /// Whether this frame is a keyframe from now on.
-    pub is_keyframe: bool,
-    /// `odom_from_camera`.
-    pub odom: Belief,
-    /// `map_from_camera`, if a place is known.
-    pub place: Option<Belief>,
-    /// Metres and radians a second in the camera's body frame since the frame before.
-    pub velocity: Option<Twist>,
-    /// Whether the place is known, and confirmed.
-    pub status: Status,
-    /// Why, in words.
-    pub reason: String,
-    /// Above 1 it looks like another place.
-    pub out_of_distribution: f64,
-    /// The map that the camera is thought to be in.
-    pub room: Option<usize>,
-    /// The map and the frame that look most alike.
-    pub best: (usize, Neighbour),
-    /// Whether that corrected the pose.
-    pub used: bool,
-    /// Its squared Mahalanobis distance from the expected place, if one was expected.
-    pub surprise: Option<f64>,
-}
-
-/// Why a frame was not taken.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Refusal {
-    #[error("timestamp {time_ns} ns is not later than that of the frame before, {last_ns} ns")]
-    Late { time_ns: i64, last_ns: i64 },
-    #[error("sequence {sequence} is not larger than that of the frame before, {last}")]
-    Duplicate { sequence: u64, last: u64 },
-    #[error(transparent)]
-    View(#[from] crate::adapter::Error),
+    place_factor: f64,
 }
 
 impl Tracker {
@@ -184,12 +73,24 @@ impl Tracker {
             return Err(Error::Adapters);
         }
         let calibration = first.calibration().ok_or(Error::NotCalibrated)?.clone();
-        Ok(Self { maps, settings, calibration })
+        let place_factor = calibration.measured().place;
+        Ok(Self { maps, settings, calibration, place_factor })
+    }
+
+    /// The same with another factor of the covariances of corrected places: to find the right one.
+    #[must_use]
+    pub fn with_place_factor(self, place_factor: f64) -> Self {
+        Self { place_factor, ..self }
     }
 
     /// Its rooms.
     pub fn maps(&self) -> &[Arc<Map>] {
         &self.maps
+    }
+
+    /// How it follows.
+    pub fn settings(&self) -> Settings {
+        self.settings
     }
 
     /// A stream that begins: in the only map there is, or in one that is to be found; where it is put, if that is known.
@@ -203,7 +104,7 @@ impl Tracker {
         state.chain = Chain::beginning(true);
         (state.candidate, state.unseen) = (None, 0);
         match &mut state.keyframe {
-            Some(keyframe) => keyframe.place = Some(place),
+            Some(keyframe) => (keyframe.place, keyframe.told) = (Some(place), Some(place)),
             None => state.initial = Some(place),
         }
     }
@@ -236,22 +137,27 @@ impl Tracker {
         let (room, sighting) = self.look(state.room, frame.latent.view());
         let best = (room.unwrap_or(0), sighting.nearest[0]);
         let on_map = sighting.out_of_distribution <= 1.0;
-        let jumped = self.jumped(state, frame.latent.view());
-        state.chain = state.chain.after(on_map, jumped);
+        // Numbers that are missing are frames that are missing.
+        let gap = state.last.as_ref().is_some_and(|last| frame.sequence - last.sequence > RECENT as u64);
+        let jumped = self.jumped(state, frame.latent.view(), gap);
+        state.chain = state.chain.after(Look { on_map, sure: sighting.is_sure, jumped, gap });
         state.unseen = if on_map { 0 } else { state.unseen.saturating_add(1) };
         if state.chain.is_lost() && self.maps.len() > 1 {
             (state.room, state.candidate) = (None, None);
         }
         let read = self.read(state, frame, jumped);
-        let due = self.is_due(state, &read);
         let mut moved = read.moved;
         let (mut used, mut surprise) = (false, None);
-        if due && self.settings.fuse {
-            let motion = (read.motion, read.covariance);
-            (used, surprise) =
-                self.correct(state, &mut moved, motion, room.filter(|_| on_map).map(|room| (room, &sighting)));
+        state.unlooked = state.unlooked.saturating_add(1);
+        if self.settings.fuse && on_map && (state.unlooked >= ANCHOR_EVERY || state.keyframe.is_none()) {
+            state.unlooked = 0;
+            if let Some(room) = room {
+                (used, surprise) = self.correct(state, &mut moved, frame, (room, &sighting));
+            }
         }
-        let Moved { odom, place } = moved;
+        let due = used || self.is_due(state, frame.sequence, &read);
+        let Moved { odom, place, .. } = moved;
+        let told = if used { place.map(|place| self.told(place)) } else { moved.told };
         let keyframe_sequence = state.keyframe.as_ref().map_or(frame.sequence, |keyframe| keyframe.sequence);
         let velocity = state.last.as_ref().map(|last| {
             let seconds = (frame.time_ns - last.time_ns) as f64 * 1e-9;
@@ -259,20 +165,18 @@ impl Tracker {
         });
         if due {
             let (sequence, latent) = (frame.sequence, frame.latent.to_vec());
-            state.keyframe = Some(Keyframe { sequence, latent, odom, place, age: 0 });
+            state.keyframe = Some(Keyframe { sequence, latent, odom, place, told });
             state.initial = None;
-        } else if let Some(keyframe) = &mut state.keyframe {
-            keyframe.age += 1;
         }
         state.last = Some(Last { time_ns: frame.time_ns, sequence: frame.sequence, odom });
-        let (status, reason) = self.status(state, place.as_ref(), jumped);
+        let (status, reason) = self.status(state, told.as_ref(), jumped);
         Update {
             motion: read.motion,
             motion_covariance: read.covariance,
             keyframe_sequence,
             is_keyframe: due,
             odom,
-            place,
+            place: told,
             velocity,
             status,
             reason,
@@ -299,11 +203,14 @@ impl Tracker {
     }
 
     /// Whether the frame shows what no camera sees that was just where the frames before were. Keeps the frame's latent.
-    fn jumped(&self, state: &mut State, latent: ArrayView1<'_, f64>) -> bool {
+    fn jumped(&self, state: &mut State, latent: ArrayView1<'_, f64>, gap: bool) -> bool {
         let coordinates = latent.slice(s![..self.adapter().coordinate_count()]);
         let white = self.calibration.flicker().whitened(coordinates.insert_axis(Axis(0))).row(0).to_vec();
         let distance = |other: &Vec<f64>| other.iter().zip(&white).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
         let nearest = state.recent.iter().map(distance).fold(f64::INFINITY, f64::min);
+        if gap {
+            state.recent.clear();
+        }
         let jumped = !state.recent.is_empty() && nearest > self.calibration.measured().jump;
         if jumped {
             state.recent.clear();
@@ -320,13 +227,13 @@ impl Tracker {
         let Some(keyframe) = &state.keyframe else {
             let odom = Belief::known(crate::geometry::Pose::identity(), ORIGIN, ORIGIN);
             let covariance = odom.covariance;
-            return Read { motion: Twist::default(), covariance, moved: Moved { odom, place: state.initial } };
+            return Read {
+                motion: Twist::default(),
+                covariance,
+                moved: Moved { odom, place: state.initial, told: state.initial },
+            };
         };
-        let from = ArrayView1::from(&keyframe.latent);
-        let coordinates = s![..self.adapter().coordinate_count()];
-        let difference = &frame.latent.slice(coordinates) - &from.slice(coordinates);
-        let mut motion = self.adapter().displacement(from, frame.latent.view());
-        let mut covariance = self.calibration.motion_errors(difference.view());
+        let (mut motion, mut covariance) = self.between(state.room, (&keyframe.latent, keyframe.sequence), frame);
         if jumped || state.chain.is_lost() {
             covariance += self.calibration.unread_errors();
         }
@@ -336,14 +243,37 @@ impl Tracker {
             motion = body_twist(&keyframe.odom.pose, &last);
         }
         let moved = |belief: &Belief| belief.moved(motion, &covariance);
-        let moved = Moved { odom: moved(&keyframe.odom), place: keyframe.place.as_ref().map(moved) };
+        let moved = Moved {
+            odom: moved(&keyframe.odom),
+            place: keyframe.place.as_ref().map(moved),
+            told: keyframe.told.as_ref().map(moved),
+        };
         Read { motion, covariance, moved }
     }
 
-    fn is_due(&self, state: &State, read: &Read) -> bool {
+    /// A corrected place as it is told: with the covariance that its errors have.
+    fn told(&self, place: Belief) -> Belief {
+        Belief { covariance: place.covariance * self.place_factor, ..place }
+    }
+
+    fn is_due(&self, state: &State, sequence: u64, read: &Read) -> bool {
         let Settings { keyframe_frames, keyframe_displacement, .. } = self.settings;
-        let aged = state.keyframe.as_ref().is_none_or(|keyframe| keyframe.age + 1 >= keyframe_frames);
+        let aged = state
+            .keyframe
+            .as_ref()
+            .is_none_or(|keyframe| sequence.saturating_sub(keyframe.sequence) >= u64::from(keyframe_frames));
         aged || state.chain.is_lost() || read.motion.norm() >= keyframe_displacement
+    }
+
+    /// The motion between two frames, and the covariance of its error.
+    fn between(&self, room: Option<usize>, from: (&[f64], u64), to: &Observation) -> (Twist, nalgebra::Matrix6<f64>) {
+        let latent = ArrayView1::from(from.0);
+        let coordinates = s![..self.adapter().coordinate_count()];
+        let difference = &to.latent.slice(coordinates) - &latent.slice(coordinates);
+        let errors = room.map_or(&self.calibration.measured().motion, |room| self.maps[room].motion());
+        let length = self.calibration.spread_length(difference.view());
+        let covariance = errors.at(length, to.sequence.saturating_sub(from.1));
+        (self.adapter().displacement(latent, to.latent.view()), covariance)
     }
 
     /// Corrects a place by what the frame looks like: an anchor within the gate is taken; others, and those without a
@@ -353,14 +283,13 @@ impl Tracker {
         &self,
         state: &mut State,
         moved: &mut Moved,
-        (motion, covariance): (Twist, nalgebra::Matrix6<f64>),
-        seen: Option<(usize, &Sighting)>,
+        frame: &Observation,
+        (room, sighting): (usize, &Sighting),
     ) -> (bool, Option<f64>) {
-        let carried = state.candidate.take().map(|c| Candidate { place: c.place.moved(motion, &covariance), ..c });
-        let Some((room, sighting)) = seen.filter(|_| !state.chain.is_lost()) else {
-            state.candidate = carried.filter(|_| !state.chain.is_lost());
+        let candidate = state.candidate.take();
+        if state.chain.is_lost() {
             return (false, None);
-        };
+        }
         let Belief { pose, covariance } = sighting.anchor;
         let anchor = Belief { pose, covariance: covariance * ANCHOR_INFLATION };
         let surprise = |belief: &Belief| belief.innovation(&anchor).map_or(f64::INFINITY, |found| found.squared_length);
@@ -371,18 +300,20 @@ impl Tracker {
             moved.place = Some(place.corrected(&anchor));
             return (true, Some(surprise));
         }
-        let fresh = Candidate { room, place: anchor, agreed: 1 };
-        let candidate = match carried {
-            Some(old) if old.room == room && surprise(&old.place) <= GATE => {
-                Candidate { room, place: old.place.corrected(&anchor), agreed: old.agreed + 1 }
-            }
-            _ => fresh,
+        let carried = candidate.filter(|candidate| candidate.room == room).map(|candidate| {
+            let (motion, covariance) = self.between(Some(room), (&candidate.latent, candidate.sequence), frame);
+            (candidate.place.moved(motion, &covariance), candidate.agreed)
+        });
+        let (place, agreed) = match carried {
+            Some((place, agreed)) if surprise(&place) <= GATE => (place.corrected(&anchor), agreed + 1),
+            _ => (anchor, 1),
         };
-        let taken = candidate.agreed >= AGREEING;
+        let taken = agreed >= AGREEING;
         if taken {
-            (state.room, moved.place) = (Some(room), Some(candidate.place));
+            (state.room, moved.place) = (Some(room), Some(place));
         } else {
-            state.candidate = Some(candidate);
+            let (sequence, latent) = (frame.sequence, frame.latent.to_vec());
+            state.candidate = Some(Candidate { room, sequence, latent, place, agreed });
         }
         (taken, expected.map(|(_, surprise)| surprise))
     }
@@ -393,8 +324,8 @@ impl Tracker {
             return (Status::Lost, why.to_owned());
         }
         let Some(place) = place else {
-            let agreed = state.candidate.map_or(0, |candidate| candidate.agreed);
-            return (Status::Relocalizing, format!("{agreed} of {AGREEING} keyframes agree on a place"));
+            let agreed = state.candidate.as_ref().map_or(0, |candidate| candidate.agreed);
+            return (Status::Relocalizing, format!("{agreed} of {AGREEING} anchors agree on a place"));
         };
         let (deviation, extent) =
             (place.position_deviation_m(), state.room.map_or(0.0, |room| self.maps[room].extent_m()));
@@ -416,6 +347,7 @@ impl Tracker {
 struct Moved {
     odom: Belief,
     place: Option<Belief>,
+    told: Option<Belief>,
 }
 
 /// A motion and where it leads.

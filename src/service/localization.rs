@@ -17,6 +17,13 @@ use crate::room;
 
 #[tonic::async_trait]
 impl LocalizationService for Handlers {
+    async fn relocalize(
+        &self,
+        request: Request<pb::RelocalizeRequest>,
+    ) -> Result<Response<pb::RelocalizeResponse>, Status> {
+        Ok(Response::new(self.relocalized(request).await?))
+    }
+
     async fn localize(&self, request: Request<pb::LocalizeRequest>) -> Result<Response<pb::LocalizeResponse>, Status> {
         let (snapshot, most) = (self.snapshot()?, self.config.limits.hits);
         let budget = self.workers.budget(request.metadata());
@@ -51,7 +58,7 @@ fn answer(
         }
         other => Error::from(other),
     })?;
-    let navigators = served.iter().map(|served| &served.navigator);
+    let navigators = served.iter().map(|served| served.navigator.as_ref());
     let places = localize(navigators, start.latent.view(), k as usize, cancel)?;
     let revision = |room: &str| served.iter().find(|served| served.navigator.room().id().as_str() == room);
     let place = |place: &crate::localization::Place| {
@@ -72,7 +79,11 @@ fn answer(
 }
 
 /// The rooms to look in, all under one adapter; at least one.
-fn rooms_under(snapshot: &Snapshot, rooms: &[String], adapter: &str) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+pub(super) fn rooms_under(
+    snapshot: &Snapshot,
+    rooms: &[String],
+    adapter: &str,
+) -> Result<Vec<Arc<ServedNavigator>>, Error> {
     for (position, room) in rooms.iter().enumerate() {
         snapshot.room(room).map_err(|error| error.named(&format!("rooms[{position}]")))?;
         if rooms[..position].contains(room) {

@@ -6,16 +6,19 @@
 
 mod catalog;
 mod convert;
-mod eye;
 mod evaluation;
+mod eye;
+mod goals;
 mod health;
 mod localization;
 mod navigation;
 mod odometry;
+mod relocalization;
 mod shutdown;
 mod snapshot;
 mod status;
 mod telemetry;
+mod track;
 mod work;
 
 pub use convert::pose as pose_from_wire;
@@ -23,13 +26,14 @@ pub use eye::ImageEncoders;
 pub use shutdown::shutdown_signal;
 pub use snapshot::Snapshot;
 pub use status::Error;
+pub use track::TokenKey;
 
 use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::net::TcpListener;
-use tokio::sync::{oneshot, watch};
+use tokio::sync::{Semaphore, oneshot, watch};
 use tonic::transport::Server;
 use tonic::transport::server::TcpIncoming;
 
@@ -47,7 +51,7 @@ use work::Workers;
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
 /// What a server allows.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Config {
     /// Which index its navigators search.
     pub index: IndexKind,
@@ -67,6 +71,10 @@ pub struct Config {
     pub queue: usize,
     /// The longest a request may take, whatever its own deadline.
     pub longest: Duration,
+    /// Cameras that are followed at a time; one more is refused.
+    pub streams: usize,
+    /// Seals what a stream goes on from. Servers that share it take one another's tokens.
+    pub token_key: TokenKey,
     /// How long requests in flight may go on after the server was told to stop.
     pub drain: Duration,
 }
@@ -83,6 +91,8 @@ impl Default for Config {
             threads: std::thread::available_parallelism().map_or(1, usize::from),
             queue: 1_024,
             longest: Duration::from_secs(300),
+            streams: 4_096,
+            token_key: TokenKey::random(),
             drain: Duration::from_secs(10),
         }
     }
@@ -125,6 +135,7 @@ struct Handlers {
     phase: watch::Receiver<Phase>,
     workers: Workers,
     config: Arc<Config>,
+    streams: Arc<Semaphore>,
 }
 
 impl Handlers {
@@ -149,7 +160,12 @@ pub async fn run(
     let (phase, watched) = watch::channel(Phase::Loading);
     let (stop, stopped) = oneshot::channel::<()>();
     let workers = Workers::new(&config);
-    let handlers = Handlers { phase: watched.clone(), workers: workers.clone(), config: Arc::new(config.clone()) };
+    let handlers = Handlers {
+        phase: watched.clone(),
+        workers: workers.clone(),
+        config: Arc::new(config.clone()),
+        streams: Arc::new(Semaphore::new(config.streams)),
+    };
     let server = server(handlers, watched, listener, async {
         // An error means the sender is gone: the server is to stop all the same.
         let _ = stopped.await;

@@ -20,6 +20,15 @@ impl NavigationService for Handlers {
         Ok(Response::new(answer))
     }
 
+    type NavigateToStream = super::goals::Events;
+
+    async fn navigate_to(
+        &self,
+        request: Request<pb::NavigateToRequest>,
+    ) -> Result<Response<Self::NavigateToStream>, Status> {
+        Ok(Response::new(self.begin_pursuit(request).await?))
+    }
+
     async fn batch_navigate(
         &self,
         request: Request<pb::BatchNavigateRequest>,

@@ -15,6 +15,15 @@ use crate::room::FrameId;
 
 #[tonic::async_trait]
 impl OdometryService for Handlers {
+    type TrackStream = super::track::Answers;
+
+    async fn track(
+        &self,
+        request: Request<tonic::Streaming<pb::TrackRequest>>,
+    ) -> Result<Response<Self::TrackStream>, Status> {
+        Ok(Response::new(self.follow(request.into_inner()).await?))
+    }
+
     async fn estimate_motion(
         &self,
         request: Request<pb::EstimateMotionRequest>,

@@ -7,7 +7,8 @@ use super::eye::{self, Eye, ImageEncoders};
 use super::{Error, RunError};
 use crate::features::FeatureSource;
 use crate::navigation::{IndexKind, Navigator};
-use crate::room::Room;
+use crate::odometry::Map;
+use crate::room::{FrameId, Room};
 use crate::store::{Store, StoredAdapter};
 
 /// A room that is served.
@@ -27,7 +28,9 @@ pub struct ServedRoom {
 /// A room under an adapter.
 pub struct ServedNavigator {
     /// Answers.
-    pub navigator: Navigator,
+    pub navigator: Arc<Navigator>,
+    /// What cameras are followed against, if the adapter is calibrated and the room not too small.
+    pub map: Option<Arc<Map>>,
     /// With whose numbers.
     pub adapter: Arc<StoredAdapter>,
     /// The room's revision.
@@ -126,9 +129,11 @@ pub async fn load(store: Store, index: IndexKind, encoders: Option<ImageEncoders
 }
 
 async fn load_all(store: &Store, index: IndexKind, encoders: Option<&ImageEncoders>) -> Result<Snapshot, RunError> {
-    let mut adapters = BTreeMap::new();
+    let (mut adapters, mut shared) = (BTreeMap::new(), BTreeMap::new());
     for name in store.adapter_names().await? {
         let stored = store.load_adapter(&name, None).await?;
+        // One for all rooms: maps of one adapter are told by it.
+        shared.insert(name.clone(), Arc::new(stored.adapter.clone()));
         adapters.insert(name, Arc::new(stored));
     }
     let eyes = eye::open(encoders, &adapters)?;
@@ -148,19 +153,14 @@ async fn load_all(store: &Store, index: IndexKind, encoders: Option<&ImageEncode
             let Some(features) = stored.features.iter().find(|features| features.source().is_like(source)) else {
                 continue;
             };
-            let navigator = Navigator::new(room.clone(), features, Arc::new(adapter.adapter.clone()), index);
+            let Some(computing) = shared.get(&adapter.name) else { continue };
+            let navigator = Navigator::new(room.clone(), features, computing.clone(), index);
             let navigator = navigator.map_err(|problem| RunError::Navigator {
                 adapter: adapter.name.clone(),
                 room: room.id().to_string(),
                 problem,
             })?;
-            if let Some(audit) = navigator.audit() {
-                tracing::info!(
-                    room = %room.id(), adapter = adapter.name, frames = audit.frame_count,
-                    unreachable = audit.unreachable, recall = audit.recall, k = audit.k, queries = audit.queries,
-                    "approximate index audited against the exact scan"
-                );
-            }
+            log_audit(&navigator, &adapter.name);
             let trained = adapter.record.rooms.iter().find(|(name, _)| name == room.id());
             let trained_on = match trained {
                 None => None,
@@ -170,7 +170,9 @@ async fn load_all(store: &Store, index: IndexKind, encoders: Option<&ImageEncode
                 Some(_) => Some(TrainedOn::OtherFrames),
             };
             let (adapter, room_revision) = (adapter.clone(), stored.revision);
-            navigators.push(Arc::new(ServedNavigator { navigator, adapter, room_revision, trained_on }));
+            let navigator = Arc::new(navigator);
+            let map = map(&navigator);
+            navigators.push(Arc::new(ServedNavigator { navigator, map, adapter, room_revision, trained_on }));
         }
         let sources = stored.features.iter().map(|features| features.source().clone()).collect();
         let served = ServedRoom { room, revision: stored.revision, created: stored.created, sources, navigators };
@@ -180,4 +182,27 @@ async fn load_all(store: &Store, index: IndexKind, encoders: Option<&ImageEncode
         return Err(RunError::NoRoom { location: store.location().to_owned() });
     }
     Ok(Snapshot { rooms, adapters, eyes })
+}
+
+fn log_audit(navigator: &Navigator, adapter: &str) {
+    if let Some(audit) = navigator.audit() {
+        tracing::info!(
+            room = %navigator.room().id(), adapter, frames = audit.frame_count, unreachable = audit.unreachable,
+            recall = audit.recall, k = audit.k, queries = audit.queries,
+            "approximate index audited against the exact scan"
+        );
+    }
+}
+
+/// All frames of a room as a map; none where cameras cannot be followed, which the log says if it is the room's fault.
+fn map(navigator: &Arc<Navigator>) -> Option<Arc<Map>> {
+    navigator.adapter().calibration()?;
+    let frames: Vec<FrameId> = (0..navigator.room().frame_count() as u32).map(FrameId).collect();
+    match Map::new(navigator.clone(), &frames) {
+        Ok(map) => Some(Arc::new(map)),
+        Err(error) => {
+            tracing::warn!(room = %navigator.room().id(), %error, "the room cannot be tracked in");
+            None
+        }
+    }
 }

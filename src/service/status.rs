@@ -178,7 +178,7 @@ impl From<eval::Error> for Error {
                 adapter::Error::NotCalibrated | adapter::Error::GatedMotion | adapter::Error::WhitenedColumns { .. },
             ) => "navigators",
             E::Navigation(navigation::Error::Refit(_)) => return Self::Precondition(error.to_string()),
-            E::Navigation(_) | E::Adapter(_) => return Self::Internal,
+            E::Navigation(_) | E::Adapter(_) | E::Odometry(_) => return Self::Internal,
             E::Room(_) => "room",
             E::Pairs(pairs::Error::ZeroStride | pairs::Error::NoPairs { .. } | pairs::Error::EmptyRange { .. }) => {
                 "stride"

@@ -82,6 +82,30 @@ impl Workers {
         drop(guard);
         result
     }
+
+    /// Runs short work of a stream on a blocking thread: it waits its turn, for as long as that takes.
+    ///
+    /// # Errors
+    /// [`Error::Loading`] if the server gave it up, [`Error::Internal`] if it panicked.
+    pub async fn run_admitted<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Error> {
+        let mut halted = self.halted.subscribe();
+        let computed = async {
+            let thread = self.threads.clone().acquire_owned().await.map_err(|_| Error::Internal)?;
+            let span = tracing::Span::current();
+            let task = tokio::task::spawn_blocking(move || {
+                let _thread = thread;
+                span.in_scope(work)
+            });
+            task.await.map_err(|error| {
+                tracing::error!(%error, "a request panicked");
+                Error::Internal
+            })
+        };
+        tokio::select! {
+            result = computed => result,
+            _ = halted.wait_for(|halted| *halted) => Err(Error::Loading),
+        }
+    }
 }
 
 /// The time a caller gives, from the header `grpc-timeout`, less a little, so that the answer DEADLINE_EXCEEDED comes

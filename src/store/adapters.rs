@@ -7,7 +7,7 @@ use object_store::path::Path;
 use super::format::{AdapterBody, TrainingEntry};
 use super::manifest::{self, SCHEMA};
 use super::tensors::{TensorReader, TensorWriter};
-use super::{ATTEMPTS, Error, Kind, Published, Store, revision_path};
+use super::{ATTEMPTS, Error, Kind, Published, Store, calibration, revision_path};
 use crate::adapter::{self, Adapter, Corrector, CorrectorKind, Mixture, Network, TargetScale, TrainingRecord};
 use crate::room::is_plain_name;
 
@@ -101,6 +101,7 @@ impl Store {
         let (file, bytes) = self.read_object(&folder, &body.weights).await?;
         let damaged = |problem: String| Error::Damaged { file: file.clone(), problem };
         let tensors = TensorReader::new(&file, &bytes)?;
+        let calibration = calibration::read(&tensors, &file)?;
         let mixing = body.training.mixing().map_err(&damaged)?;
         let network = Mixture::from_tensors(body.training.charts, mixing, |name| read_weights(&tensors, name));
         let network = network.map_err(|error| error.within(&file))?;
@@ -124,6 +125,10 @@ impl Store {
             .and_then(|adapter| adapter.with_correctors(correctors))
             .and_then(|adapter| match error_covariance {
                 Some(covariance) => adapter.with_error_covariance(covariance),
+                None => Ok(adapter),
+            })
+            .and_then(|adapter| match calibration {
+                Some(calibration) => adapter.with_calibration(calibration),
                 None => Ok(adapter),
             })
             .map_err(|error| damaged(error.to_string()))?;
@@ -213,6 +218,9 @@ fn adapter_file(name: &str, adapter: &Adapter, features: ArrayView2<'_, f32>) ->
     tensors.f64("target.deviation", &[6], adapter.scale().deviation.iter().copied());
     if let Some(covariance) = adapter.error_covariance() {
         tensors.f64(ERROR_COVARIANCE, &[6, 6], covariance.transpose().iter().copied());
+    }
+    if let Some(calibration) = adapter.calibration() {
+        calibration::write(&mut tensors, calibration);
     }
     let rows: Vec<usize> = (0..features.nrows()).step_by(features.nrows().div_ceil(GOLDEN_ROWS).max(1)).collect();
     let golden = features.select(ndarray::Axis(0), &rows);

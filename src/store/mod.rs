@@ -9,6 +9,7 @@
 //! Tensors are safetensors files; in Python: `safetensors.numpy.load_file(path)`. Published revisions never change.
 
 mod adapters;
+mod calibration;
 mod format;
 mod manifest;
 mod rooms;

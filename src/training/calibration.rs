@@ -19,7 +19,7 @@ use crate::scores::median;
 /// χ² with six degrees of freedom: 68 % and 95 % are below.
 const ELLIPSOIDS: [f64; 2] = [7.012, 12.592];
 /// The shares wanted within them, and how far off counts as one.
-const WANTED: [(f64, f64); 2] = [(0.68, 0.08), (0.94, 0.04)];
+const WANTED: [(f64, f64); 2] = [(0.68, 0.08), (0.945, 0.035)];
 /// Degrees of freedom of the t that shapes are fitted by.
 const TAILS: f64 = 4.0;
 /// u₀ of [`MotionErrors`]: what u is for frames that follow one another.
@@ -30,10 +30,18 @@ const LEFT_OUT: [u32; 10] = [0, 1, 2, 4, 6, 8, 10, 15, 20, 30];
 const BESIDE: u32 = 10;
 /// Strata of anchors.
 const STRATA: usize = 8;
+/// Factors that are tried: from a hundredth on, each one and a half percent above the one before, to a hundred.
+const LEAST_FACTOR: f64 = 0.01;
+const FACTOR_STEP: f64 = 1.015;
+const FACTORS: i32 = 620;
 /// Every so many frames of another room are looked for in a room.
 const FOREIGN_EVERY: usize = 4;
-/// The share of other rooms' frames that may look like a room.
-const FOREIGN_SHARE: f64 = 0.001;
+/// Parts of a room's way, of which every fifth is looked for in the others.
+const PARTS: usize = 20;
+/// A room's limit lies between the distances of these shares of its own frames and of others'.
+const OWN_AND_OTHERS: [f64; 2] = [0.97, 0.02];
+/// The share of other rooms' frames below the sure limit.
+const OTHERS_SURE: f64 = 0.0003;
 /// Frames before one that a jump is told from, as the tracker has them.
 const RECENT: usize = 5;
 
@@ -69,17 +77,23 @@ pub fn calibrate(adapter: &Adapter, record: &TrainingRecord, lessons: &[Lesson<'
         };
         lessons.iter().enumerate().flat_map(of).collect()
     };
-    let flicker = second_moment(&rooms, &pairs(1))?;
+    let flicker = second_moment(&rooms, &pairs(1))? * 0.5;
     let all: Vec<(usize, Pair)> = strides(&record.pairs).into_iter().flat_map(pairs).collect();
     let spread = second_moment(&rooms, &all)?;
     let white: Vec<Array2<f64>> = {
         let metric = Metric::new(flicker.view())?;
         rooms.iter().map(|room| metric.whitened(room.coordinates.view())).collect()
     };
-    let motion = motion_errors(adapter, &rooms, &all, &Metric::new(spread.view())?)?;
+    let mut shapes = Vec::new();
+    for stride in strides(&record.pairs) {
+        let residuals = residuals(adapter, &rooms, &pairs(stride), &Metric::new(spread.view())?);
+        let covariance = balanced(&residuals).ok_or(NOT_SOUND)?;
+        shapes.push(Stratum { at: f64::from(stride), gain: 1.0, covariance });
+    }
+    let motion = MotionErrors { shapes: ErrorTable::new(shapes)?, floor: FLOOR };
     let anchor = anchor_errors(adapter, &rooms, &white)?;
-    let (foreign, jump) = (foreign(&white)?, jump(&white)?);
-    Ok(Calibration::new(Measured { flicker, spread, motion, anchor, foreign, jump })?)
+    let ([foreign, sure], jump) = (limits(&white)?, jump(&white)?);
+    Ok(Calibration::new(Measured { flicker, spread, motion, anchor, foreign, sure, jump, place: 1.0 })?)
 }
 
 /// 1, 2, 3, 5, 8, ... up to the longest stride that was trained on, and that one.
@@ -114,12 +128,8 @@ fn second_moment(rooms: &[Seen<'_>], pairs: &[(usize, Pair)]) -> Result<Array2<f
     Ok((&moment + &moment.t()) * 0.5)
 }
 
-fn motion_errors(
-    adapter: &Adapter,
-    rooms: &[Seen<'_>],
-    pairs: &[(usize, Pair)],
-    spread: &Metric,
-) -> Result<MotionErrors, Error> {
+/// Errors of the motions read over pairs, by the root of u + u₀.
+fn residuals(adapter: &Adapter, rooms: &[Seen<'_>], pairs: &[(usize, Pair)], spread: &Metric) -> Vec<Vector6<f64>> {
     let residual = |(room, pair): &(usize, Pair)| {
         let Seen { poses, coordinates, latents } = &rooms[*room];
         let (from, to) = (pair.source.row(), pair.target.row());
@@ -127,8 +137,7 @@ fn motion_errors(
         let u = spread.squared_length((&coordinates.row(to) - &coordinates.row(from)).view());
         (body_twist(&poses[from], &poses[to]).to_vector() - read) / (u + FLOOR).sqrt()
     };
-    let residuals: Vec<Vector6<f64>> = pairs.iter().map(residual).collect();
-    Ok(MotionErrors { shape: balanced(&residuals).ok_or(NOT_SOUND)?, floor: FLOOR })
+    pairs.iter().map(residual).collect()
 }
 
 const NOT_SOUND: Error = Error::Adapter(adapter::Error::Calibration { what: "the covariance of errors" });
@@ -200,34 +209,56 @@ fn balanced(residuals: &[Vector6<f64>]) -> Option<Matrix6<f64>> {
     }
     let inverse = shape.cholesky()?.inverse();
     let mut lengths: Vec<f64> = residuals.iter().map(|r| r.dot(&(inverse * r))).collect();
-    lengths.sort_by(f64::total_cmp);
-    let share = |limit: f64| lengths.partition_point(|&length| length <= limit) as f64 / count;
-    let off = |factor: f64| {
-        let of = |(ellipsoid, (wanted, unit)): (&f64, &(f64, f64))| (share(ellipsoid * factor) - wanted).abs() / unit;
-        ELLIPSOIDS.iter().zip(&WANTED).map(of).fold(0.0, f64::max)
-    };
-    let factors = (0..400).map(|step| 0.1 * 1.015_f64.powi(step));
-    let factor = factors.min_by(|a, b| off(*a).total_cmp(&off(*b)))?;
-    Some((shape + shape.transpose()) * (0.5 * factor))
+    Some((shape + shape.transpose()) * (0.5 * balancing_factor(&mut lengths)?))
 }
 
-/// The score that one in a thousand frames of other rooms stays below: distance from a room over the room's own.
-fn foreign(white: &[Array2<f64>]) -> Result<f64, Error> {
-    let mut scores = Vec::new();
-    for (room, map) in white.iter().enumerate() {
-        let index = index_of(map.view());
-        let own = (0..map.nrows()).filter_map(|row| {
-            let exclusion = Exclusion { centre: FrameId(row as u32), radius: BESIDE };
-            Some(index.nearest(&map.row(row).to_vec(), 1, Some(exclusion)).first()?.distance)
+/// What a covariance has to be multiplied with so that both shares of errors within its ellipsoids are nearest to their
+/// wishes; `lengths` are the errors' squared Mahalanobis lengths, which are put in order. None without any.
+pub fn balancing_factor(lengths: &mut [f64]) -> Option<f64> {
+    lengths.sort_by(f64::total_cmp);
+    let factors = (0..FACTORS).map(|step| LEAST_FACTOR * FACTOR_STEP.powi(step));
+    factors.min_by(|a, b| off(lengths, *a).total_cmp(&off(lengths, *b))).filter(|_| !lengths.is_empty())
+}
+
+/// How far the shares of errors within both ellipsoids are from their wishes: the larger of the two, 1 where it is a
+/// tolerance off. None without any.
+pub fn imbalance(lengths: &mut [f64]) -> Option<f64> {
+    lengths.sort_by(f64::total_cmp);
+    (!lengths.is_empty()).then(|| off(lengths, 1.0))
+}
+
+/// The same of ordered lengths, if covariances were multiplied with a factor.
+fn off(lengths: &[f64], factor: f64) -> f64 {
+    let share = |limit: f64| lengths.partition_point(|&length| length <= limit) as f64 / lengths.len() as f64;
+    let of = |(ellipsoid, (wanted, unit)): (&f64, &(f64, f64))| (share(ellipsoid * factor) - wanted).abs() / unit;
+    ELLIPSOIDS.iter().zip(&WANTED).map(of).fold(0.0, f64::max)
+}
+
+/// The distance from a room over the room's own that parts its frames from other rooms', and the one that hardly a frame
+/// of another room is below. A room's own frames are those of parts of its way that the map lacks.
+fn limits(white: &[Array2<f64>]) -> Result<[f64; 2], Error> {
+    let (mut own, mut others) = (Vec::new(), Vec::new());
+    for (place, room) in white.iter().enumerate() {
+        let part = room.nrows().div_ceil(PARTS).max(1);
+        let is_mapped = |row: &usize| (row / part) % 5 != 2;
+        let mapped: Vec<FrameId> = (0..room.nrows()).filter(is_mapped).map(|row| FrameId(row as u32)).collect();
+        let index = ExactIndex::new(room.view(), &mapped);
+        let apart = mapped.iter().filter_map(|&centre| {
+            let exclusion = Exclusion { centre, radius: BESIDE };
+            Some(index.nearest(&room.row(centre.row()).to_vec(), 1, Some(exclusion)).first()?.distance)
         });
-        let typical = median(&own.collect::<Vec<_>>());
-        for other in white.iter().enumerate().filter(|(other, _)| *other != room).map(|(_, rows)| rows) {
-            for row in other.outer_iter().step_by(FOREIGN_EVERY) {
-                scores.extend(index.nearest(&row.to_vec(), 1, None).first().map(|best| best.distance / typical));
-            }
+        let typical = median(&apart.collect::<Vec<_>>());
+        let score =
+            |row: ndarray::ArrayView1<'_, f64>| Some(index.nearest(&row.to_vec(), 1, None).first()?.distance / typical);
+        own.extend((0..room.nrows()).filter(|row| !is_mapped(row)).filter_map(|row| score(room.row(row))));
+        for other in white.iter().enumerate().filter(|(other, _)| *other != place).map(|(_, rows)| rows) {
+            others.extend(other.outer_iter().step_by(FOREIGN_EVERY).filter_map(score));
         }
     }
-    quantile(&mut scores, FOREIGN_SHARE).ok_or(Error::Adapter(adapter::Error::NoPairs))
+    let limits = quantile(&mut own, OWN_AND_OTHERS[0]).zip(quantile(&mut others, OWN_AND_OTHERS[1]));
+    let ((of_own, of_others), sure) =
+        limits.zip(quantile(&mut others, OTHERS_SURE)).ok_or(Error::Adapter(adapter::Error::NoPairs))?;
+    Ok([(of_own * of_others).sqrt(), sure])
 }
 
 /// Between how far a frame is from the nearest of those before it, and how far one of another room would be.
@@ -274,6 +305,9 @@ mod tests {
             let ratio = found[(axis, axis)].sqrt() / deviation;
             assert!((0.95..1.05).contains(&ratio), "axis {axis}: {ratio}");
         }
+        let mut lengths = vec![4.0 * 7.0, 4.0 * 7.0, 4.0 * 12.0];
+        assert!((3.9..4.4).contains(&balancing_factor(&mut lengths).unwrap()), "two of three within the inner one");
+        assert!(balancing_factor(&mut []).is_none());
         let flat: Vec<Vector6<f64>> = drawn.iter().map(|r| Vector6::new(r[0], r[1], 0.0, r[3], r[4], r[5])).collect();
         assert!(balanced(&flat).is_none(), "errors that never leave a plane have no covariance");
     }

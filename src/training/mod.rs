@@ -3,7 +3,7 @@
 mod calibration;
 mod errors;
 
-pub use calibration::calibrate;
+pub use calibration::{balancing_factor, calibrate, imbalance};
 pub use errors::error_covariance;
 
 use ndarray::{Array2, ArrayView2, s};

@@ -4,8 +4,10 @@
 mod support;
 
 mod answers;
+mod goals;
 mod harness;
 mod images;
 mod lifecycle;
 mod navigators;
 mod refusals;
+mod tracking;

@@ -1,5 +1,6 @@
 //! `seese3 evaluate`: the paper's navigation table on a room's held-out motions, and the errors of paths.
 
+mod odometry;
 mod trajectory;
 
 use std::path::PathBuf;
@@ -32,6 +33,8 @@ pub struct Evaluate {
 
 #[derive(Debug, Subcommand)]
 enum What {
+    /// Follow held-out frames: paths, covariances, what is lost, and which room it is
+    Odometry(odometry::Odometry),
     /// APE and RPE of a path against the true one, as evo takes them
     Trajectory(trajectory::Trajectory),
 }
@@ -39,6 +42,7 @@ enum What {
 impl Evaluate {
     pub async fn run(self) -> anyhow::Result<()> {
         match (self.what, self.navigation) {
+            (Some(What::Odometry(odometry)), _) => odometry.run().await,
             (Some(What::Trajectory(trajectory)), _) => trajectory.run(),
             (None, Some(navigation)) => navigation.run().await,
             (None, None) => bail!("name a room with --room, or what to evaluate: see `seese3 evaluate --help`"),

@@ -275,10 +275,8 @@ pub fn navigation(setting: &Setting, notes: &mut Notes) -> anyhow::Result<Found>
         let inverse = hit("inverse-poincare-affine");
         dominates.push(CorrectorKind::ALL.iter().all(|kind| inverse >= hit(&format!("corrector-{}", kind.name()))));
         let shown = |s: &Series| {
-            s.name == "identity"
-                || s.name == "oracle"
+            ["identity", "oracle", "inverse-poincare-affine"].contains(&s.name.as_str())
                 || s.name.starts_with("corrector")
-                || s.name == "inverse-poincare-affine"
                 || s.name.ends_with("+motion")
         };
         let curves = Curves {

@@ -17,6 +17,11 @@ pub fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
     pb::Vector3 { x: vector.x, y: vector.y, z: vector.z }
 }
 
+/// Row by row.
+pub fn matrix_to_wire(matrix: &nalgebra::Matrix6<f64>) -> Vec<f64> {
+    matrix.transpose().iter().copied().collect()
+}
+
 pub fn twist_to_wire(twist: &Twist) -> pb::Twist {
     pb::Twist { linear: Some(vector_to_wire(&twist.linear)), angular: Some(vector_to_wire(&twist.angular)) }
 }

@@ -37,12 +37,24 @@ impl TokenKey {
         if secret.len() < LEAST_KEY_BYTES {
             return Err(format!("has {} bytes; a secret has at least {LEAST_KEY_BYTES}", secret.len()));
         }
-        // The id gives nothing of the key away: it is a hash of another hash.
-        let digest = Sha256::digest([b"seese3 token key id".as_slice(), secret].concat());
+        Ok(Self::of(secret))
+    }
+
+    fn of(secret: &[u8]) -> Self {
+        // Secrets of every length become 32 bytes; the id is another hash, and gives nothing of the key away.
+        let hash = |what: &[u8]| Sha256::digest([what, secret].concat());
         let mut id = [0; KEY_ID];
-        id.copy_from_slice(&digest[..KEY_ID]);
-        let mac = Hmac::new_from_slice(secret).map_err(|error| error.to_string())?;
-        Ok(Self { mac, id })
+        id.copy_from_slice(&hash(b"seese3 token key id ")[..KEY_ID]);
+        let mut block = [0; 64];
+        block[..32].copy_from_slice(&hash(b"seese3 token key "));
+        Self { mac: <Hmac<Sha256> as Mac>::new(&block.into()), id }
+    }
+
+    /// A key that nobody else has: its tokens end with this server.
+    pub fn random() -> Self {
+        let secret: [u8; 32] = rand::random();
+        // HMAC takes keys of every length, and this one is long enough.
+        Self::of(&secret)
     }
 
     /// A state as a token.

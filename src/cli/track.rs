@@ -1,0 +1,204 @@
+//! `seese3 track`: have a server follow a camera whose features are in a file.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, bail};
+use clap::Args;
+use tokio_stream::wrappers::ReceiverStream;
+
+use super::ask::Server;
+use super::progress::bar;
+use super::{check_writable, say, write_file};
+use crate::datasets::read_features;
+use crate::geometry::Pose;
+use crate::proto::v1 as pb;
+use crate::proto::v1::track_request::Message;
+use crate::proto::v1::track_response::Answer;
+use crate::report::{Recording, tum_trajectory};
+use crate::service::pose_from_wire;
+
+/// Requests that may wait to be sent.
+const WAITING: usize = 32;
+
+#[derive(Debug, Args)]
+pub struct Track {
+    #[command(flatten)]
+    server: Server,
+    /// The room; without one it is found among all that the adapter fits
+    #[arg(long)]
+    room: Option<String>,
+    /// The adapter; may be left out when only one fits
+    #[arg(long)]
+    adapter: Option<String>,
+    /// A NumPy file of features, (n, d), a row a frame
+    #[arg(long, value_name = "FILE")]
+    feature: PathBuf,
+    /// The first row
+    #[arg(long, default_value_t = 0)]
+    from: usize,
+    /// How many rows; all that follow if nothing is given
+    #[arg(long)]
+    count: Option<usize>,
+    /// Frames a second, for their times
+    #[arg(long, default_value_t = 30.0)]
+    hz: f64,
+    /// Dead reckoning alone
+    #[arg(long)]
+    no_fusion: bool,
+    /// Go on from the token in this file, which --save-token wrote
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["room", "adapter", "no_fusion"])]
+    resume: Option<PathBuf>,
+    /// Write the last answer's resume token here
+    #[arg(long, value_name = "FILE")]
+    save_token: Option<PathBuf>,
+    /// Write the camera's path in the room here, as a TUM file
+    #[arg(long, value_name = "FILE")]
+    tum: Option<PathBuf>,
+    /// Write the camera's path in odom here, as a TUM file
+    #[arg(long, value_name = "FILE")]
+    odom_tum: Option<PathBuf>,
+    /// Write poses and transforms here, as an MCAP file
+    #[arg(long = "mcap", value_name = "FILE")]
+    recording: Option<PathBuf>,
+}
+
+/// What came back.
+#[derive(Default)]
+struct Heard {
+    updates: Vec<pb::TrackUpdate>,
+    refusals: Vec<pb::TrackRefusal>,
+    names: pb::FrameNames,
+    token: Vec<u8>,
+}
+
+impl Track {
+    pub async fn run(self) -> anyhow::Result<()> {
+        for path in [&self.save_token, &self.tum, &self.odom_tum, &self.recording].into_iter().flatten() {
+            check_writable(path)?;
+        }
+        if !(self.hz.is_finite() && self.hz > 0.0) {
+            bail!("--hz must be above 0, got {}", self.hz);
+        }
+        let features = read_features(&self.feature)?;
+        let rows = features.nrows();
+        if self.from >= rows {
+            bail!("--from {}: {} has {rows} rows", self.from, self.feature.display());
+        }
+        let end = self.count.map_or(rows, |count| (self.from + count).min(rows));
+        let config = self.config()?;
+        let client = self.server.connect().await?;
+        let (sender, requests) = tokio::sync::mpsc::channel(WAITING);
+        let (from, hz) = (self.from, self.hz);
+        tokio::spawn(async move {
+            let frames = (from..end).map(|row| Message::Frame(frame(row, features.row(row).to_vec(), hz)));
+            for message in [Message::Config(config)].into_iter().chain(frames) {
+                // Nobody listens any more: the error comes with the answers.
+                if sender.send(pb::TrackRequest { message: Some(message) }).await.is_err() {
+                    return;
+                }
+            }
+        });
+        let mut answers = client.track(ReceiverStream::new(requests)).await?;
+        let progress = bar((end - from) as u64, "tracking");
+        let mut heard = Heard::default();
+        while let Some(answer) = answers.message().await.map_err(crate::client::Error::from)? {
+            heard.token = answer.resume_token;
+            match answer.answer {
+                Some(Answer::Started(started)) => heard.names = started.frames.unwrap_or_default(),
+                Some(Answer::Update(update)) => heard.updates.push(update),
+                Some(Answer::Refusal(refusal)) => heard.refusals.push(refusal),
+                _ => {}
+            }
+            progress.inc(1);
+        }
+        progress.finish_and_clear();
+        self.report(&heard)
+    }
+
+    fn config(&self) -> anyhow::Result<pb::TrackConfig> {
+        if let Some(file) = &self.resume {
+            let resume_token = std::fs::read(file).with_context(|| format!("{} cannot be read", file.display()))?;
+            return Ok(pb::TrackConfig { resume_token, ..pb::TrackConfig::default() });
+        }
+        let fusion = if self.no_fusion { pb::Fusion::None } else { pb::Fusion::Anchors };
+        Ok(pb::TrackConfig {
+            room: self.room.clone().unwrap_or_default(),
+            adapter: self.adapter.clone().unwrap_or_default(),
+            fusion: fusion as i32,
+            ..pb::TrackConfig::default()
+        })
+    }
+
+    fn report(&self, heard: &Heard) -> anyhow::Result<()> {
+        let mut before = None;
+        for update in &heard.updates {
+            if before != Some(update.status()) {
+                let room = update.room.as_ref().map_or("", |room| &room.name);
+                let status = update.status().as_str_name().trim_start_matches("TRACK_STATUS_");
+                say(format_args!("frame {}: {status} {room}: {}", update.sequence - 1, update.reason));
+                before = Some(update.status());
+            }
+        }
+        for refusal in &heard.refusals {
+            say(format_args!("frame {} was refused: {}", refusal.sequence.saturating_sub(1), refusal.message));
+        }
+        let tracking = heard.updates.iter().filter(|update| update.status() == pb::TrackStatus::Tracking).count();
+        say(format_args!("{} frames, {tracking} of them TRACKING", heard.updates.len()));
+        for (file, of) in [(&self.tum, map as PoseOf), (&self.odom_tum, odom as PoseOf)] {
+            if let Some(file) = file {
+                let known = heard.updates.iter().filter_map(|update| Some((update.timestamp_ns, of(update)?)));
+                let (times, poses): (Vec<i64>, Vec<Pose>) = known.unzip();
+                write_file(file, tum_trajectory(&times, &poses).as_bytes())?;
+                say(format_args!("wrote {} ({} poses)", file.display(), poses.len()));
+            }
+        }
+        if let Some(file) = &self.recording {
+            write_file(file, &recorded(heard)?)?;
+            say(format_args!("wrote {}", file.display()));
+        }
+        if let Some(file) = &self.save_token {
+            write_file(file, &heard.token)?;
+            say(format_args!("wrote {}", file.display()));
+        }
+        Ok(())
+    }
+}
+
+fn frame(row: usize, values: Vec<f32>, hz: f64) -> pb::TrackFrame {
+    let feature = pb::Feature { values, source_name: String::new() };
+    let view = Some(pb::View { view: Some(pb::view::View::Feature(feature)) });
+    pb::TrackFrame { timestamp_ns: (row as f64 / hz * 1e9) as i64, sequence: row as u64 + 1, view }
+}
+
+type PoseOf = fn(&pb::TrackUpdate) -> Option<Pose>;
+
+fn map(update: &pb::TrackUpdate) -> Option<Pose> {
+    plain(update.map_from_camera.clone())
+}
+
+fn odom(update: &pb::TrackUpdate) -> Option<Pose> {
+    plain(update.odom_from_camera.clone())
+}
+
+/// A pose whatever its frames are called.
+fn plain(pose: Option<pb::Pose>) -> Option<Pose> {
+    pose_from_wire(pb::Pose { parent_frame: String::new(), child_frame: String::new(), ..pose? }, "").ok()
+}
+
+fn recorded(heard: &Heard) -> anyhow::Result<Vec<u8>> {
+    let names = &heard.names;
+    let mut recording = Recording::new()?;
+    for update in &heard.updates {
+        let time = update.timestamp_ns;
+        if let Some(pose) = odom(update) {
+            recording.transform(time, &names.odom, &names.camera, &pose)?;
+        }
+        if let Some(pose) = plain(update.map_from_odom.clone()) {
+            recording.transform(time, &names.map, &names.odom, &pose)?;
+        }
+        if let Some(pose) = map(update) {
+            recording.pose("/pose", time, &names.map, &pose)?;
+        }
+    }
+    Ok(recording.finish()?)
+}

@@ -1,0 +1,371 @@
+//! Following a camera over the wire: answers, refusals, and going on elsewhere.
+
+use seese3::adapter::{Adapter, Preset, TrainingRecord};
+use seese3::features::{FeatureSource, Features};
+use seese3::geometry::{Pose, PoseError};
+use seese3::pairs::Split;
+use seese3::proto::v1 as pb;
+use seese3::proto::v1::track_request::Message;
+use seese3::proto::v1::track_response::Answer;
+use seese3::room::{Frames, Provenance, Room, RoomId};
+use seese3::service::{Config, TokenKey, pose_from_wire};
+use seese3::store::Store;
+use seese3::training::{Lesson, Recipe, calibrate, learn};
+use tonic::Code;
+
+use crate::harness::{TestServer, feature, frame, start_on};
+
+const FRAMES: usize = 300;
+const COLUMNS: usize = 48;
+
+/// A number between -1 and 1 that depends on nothing but its place.
+fn noise(seed: u64, place: usize) -> f64 {
+    let mixed = (seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ place as u64).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    ((mixed ^ (mixed >> 29)).wrapping_mul(0x94d0_49bb_1331_11eb) >> 40) as f64 / f64::from(1 << 23) - 1.0
+}
+
+/// A made-up place: a camera that sways and comes back, and features that tell where it is, with noise, and which place
+/// it is.
+fn place(name: &str, seed: u64) -> (Room, Features) {
+    let phase = |axis: usize| 3.0 * noise(seed, 1_000_000 + axis);
+    let sway = |t: usize, axis: usize| (t as f64 / (18.0 + 3.0 * axis as f64) + phase(axis)).sin();
+    let poses: Vec<Pose> = (0..FRAMES)
+        .map(|t| {
+            let position = nalgebra::Vector3::new(0.6 * sway(t, 0), 0.1 * sway(t, 1), 0.8 * sway(t, 2));
+            let turn = nalgebra::Vector3::new(0.05 * sway(t, 3), 0.3 * sway(t, 4), 0.05 * sway(t, 5));
+            Pose::new(position, turn)
+        })
+        .collect();
+    let features = ndarray::Array2::from_shape_fn((FRAMES, COLUMNS), |(row, column)| {
+        let (t, r) = (poses[row].translation.vector, poses[row].rotation.scaled_axis());
+        let numbers = [t.x, t.y, t.z, r.x, r.y, r.z];
+        let seen: f64 = (0..6).map(|i| noise(7, column * 6 + i) * numbers[i]).sum();
+        let which = 2.0 * noise(seed, 2_000_000 + column);
+        (seen + which + 0.01 * noise(seed, row * COLUMNS + column)) as f32
+    });
+    let frames = Frames { poses, ..Frames::default() };
+    let room = Room::new(RoomId::new(name).unwrap(), frames, Provenance::default()).unwrap();
+    (room, Features::new(FeatureSource::imported("made-up", COLUMNS), features).unwrap())
+}
+
+/// The two places that are served.
+fn served(name: &str) -> (Room, Features) {
+    place(name, if name == "hall" { 1 } else { 2 })
+}
+
+/// An adapter learned in both, its errors measured in four others.
+fn calibrated() -> (Adapter, TrainingRecord) {
+    let learned = [served("hall"), served("attic"), place("barn", 3)];
+    let mut recipe = Recipe::of(Preset::PaperBase, Split::Whole, 10, 0);
+    recipe.config.epochs = 60;
+    let lessons: Vec<Lesson<'_>> =
+        learned.iter().map(|(room, features)| Lesson { room, revision: 1, features }).collect();
+    let (adapter, record) = learn(&lessons, &recipe, &mut |_| ()).unwrap();
+    let others: Vec<(Room, Features)> = (10..14).map(|seed| place(&format!("other{seed}"), seed)).collect();
+    let lessons: Vec<Lesson<'_>> =
+        others.iter().map(|(room, features)| Lesson { room, revision: 1, features }).collect();
+    let calibration = calibrate(&adapter, &record, &lessons).unwrap();
+    (adapter.with_calibration(calibration).unwrap(), record)
+}
+
+/// Two places, and an adapter that can be followed with; `key` seals tokens.
+async fn server(key: &[u8]) -> TestServer {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+    for name in ["hall", "attic"] {
+        let (room, features) = served(name);
+        store.publish_room(&room, &[features]).await.unwrap();
+    }
+    let (adapter, record) = calibrated();
+    store.publish_adapter("followed", &adapter, &record, served("hall").1.rows()).await.unwrap();
+    let token_key = TokenKey::new(key).unwrap();
+    start_on(folder, store, Config { token_key, ..Config::default() }).await
+}
+
+const KEY: &[u8] = b"a secret of the tests";
+
+fn config() -> pb::TrackConfig {
+    pb::TrackConfig { room: "hall".to_owned(), ..pb::TrackConfig::default() }
+}
+
+fn begin(config: pb::TrackConfig) -> pb::TrackRequest {
+    pb::TrackRequest { message: Some(Message::Config(config)) }
+}
+
+/// Row `row` of the hall, as a camera's frame with that number and time.
+fn seen(row: usize) -> pb::TrackRequest {
+    seen_of("hall", row)
+}
+
+fn seen_of(room: &str, row: usize) -> pb::TrackRequest {
+    let view = feature(served(room).1.rows().row(row).to_vec());
+    message(pb::TrackFrame { timestamp_ns: row as i64 * 33_000_000, sequence: row as u64 + 1, view })
+}
+
+fn message(frame: pb::TrackFrame) -> pb::TrackRequest {
+    pb::TrackRequest { message: Some(Message::Frame(frame)) }
+}
+
+/// All answers of a stream; an error ends it.
+async fn answers(
+    server: &TestServer,
+    requests: Vec<pb::TrackRequest>,
+) -> Result<Vec<pb::TrackResponse>, tonic::Status> {
+    let mut stream = match server.client.track(tokio_stream::iter(requests)).await {
+        Ok(stream) => stream,
+        Err(seese3::client::Error::Refused(status)) => return Err(*status),
+        Err(other) => panic!("{other}"),
+    };
+    let mut answers = Vec::new();
+    while let Some(mut answer) = stream.message().await? {
+        if let Some(Answer::Update(update)) = &mut answer.answer {
+            // The one thing that two runs may differ in.
+            update.elapsed_ns = 0;
+        }
+        answers.push(answer);
+    }
+    Ok(answers)
+}
+
+fn update(answer: &pb::TrackResponse) -> &pb::TrackUpdate {
+    match &answer.answer {
+        Some(Answer::Update(update)) => update,
+        other => panic!("no update: {other:?}"),
+    }
+}
+
+fn matrix(numbers: &[f64]) -> nalgebra::Matrix6<f64> {
+    nalgebra::Matrix6::from_row_slice(numbers)
+}
+
+fn initial_pose(row: usize) -> Option<pb::InitialPose> {
+    let pose = served("hall").0.poses()[row];
+    let (t, q) = (pose.translation.vector, pose.rotation.coords);
+    let pose = pb::Pose {
+        position: Some(pb::Vector3 { x: t.x, y: t.y, z: t.z }),
+        orientation: Some(pb::Quaternion { w: q.w, x: q.x, y: q.y, z: q.z }),
+        ..pb::Pose::default()
+    };
+    Some(pb::InitialPose { pose: Some(pose), ..pb::InitialPose::default() })
+}
+
+/// Oracle: the recorded poses, and the definitions: odom begins at the origin, map is odom seen from map, covariances are
+/// symmetric and positive definite.
+#[tokio::test]
+async fn a_camera_in_a_mapped_room_is_followed() {
+    let server = server(KEY).await;
+    let requests = [begin(config())].into_iter().chain((0..120).map(seen)).collect();
+    let answers = answers(&server, requests).await.unwrap();
+    assert_eq!(answers.len(), 121);
+    assert!(matches!(&answers[0].answer, Some(Answer::Started(started)) if started.room.is_some()));
+    let poses = served("hall").0.poses().to_vec();
+    for (row, answer) in answers[1..].iter().enumerate() {
+        let update = update(answer);
+        assert_eq!((update.sequence, update.timestamp_ns), (row as u64 + 1, row as i64 * 33_000_000));
+        for covariance in [&update.odom_from_camera_covariance, &update.motion_covariance] {
+            let covariance = matrix(covariance);
+            assert!((covariance - covariance.transpose()).amax() < 1e-12 && covariance.cholesky().is_some(), "{row}");
+        }
+    }
+    let last = update(&answers[120]);
+    assert_eq!(last.status(), pb::TrackStatus::Tracking, "{}", last.reason);
+    let of = |pose: &Option<pb::Pose>| {
+        let plain = pb::Pose { parent_frame: String::new(), child_frame: String::new(), ..pose.clone().unwrap() };
+        pose_from_wire(plain, "hall").unwrap()
+    };
+    let error = PoseError::between(&of(&last.map_from_camera), &poses[119]);
+    assert!(error.translation_m < 0.2 && error.rotation_rad < 0.2, "{error:?}");
+    let through = of(&last.map_from_odom) * of(&last.odom_from_camera);
+    assert!(PoseError::between(&through, &of(&last.map_from_camera)).translation_m < 1e-9);
+    assert_eq!(last.map_from_odom.as_ref().unwrap().parent_frame, "map");
+    assert_eq!(last.odom_from_camera.as_ref().unwrap().parent_frame, "odom");
+    let first = update(&answers[1]);
+    assert!(of(&first.odom_from_camera).translation.vector.norm() < 1e-12 && first.body_velocity.is_none());
+}
+
+/// Oracle: a stream that was never cut, bit by bit, tokens and all; the second server shares the store's content and the
+/// key, and nothing else.
+#[tokio::test]
+async fn a_stream_goes_on_at_another_server_as_if_it_had_never_been_cut() {
+    let (one, two) = (server(KEY).await, server(KEY).await);
+    let whole = answers(&one, [begin(config())].into_iter().chain((0..60).map(seen)).collect()).await.unwrap();
+    for cut in [1, 7, 31, 60] {
+        let first = answers(&one, [begin(config())].into_iter().chain((0..cut).map(seen)).collect()).await.unwrap();
+        assert_eq!(first, whole[..=cut], "up to {cut}");
+        let resume = pb::TrackConfig { resume_token: first[cut].resume_token.clone(), ..pb::TrackConfig::default() };
+        let rest = [begin(resume)].into_iter().chain((cut..60).map(seen)).collect();
+        let second = answers(&two, rest).await.unwrap();
+        assert_eq!(second[1..], whole[cut + 1..], "from {cut}");
+    }
+}
+
+/// Oracle: the promise: forged, altered, foreign and outdated tokens are refused by name.
+#[tokio::test]
+async fn tokens_that_are_not_genuine_are_refused() {
+    let (server, other) = (server(KEY).await, self::server(b"another secret, long enough").await);
+    let first = answers(&server, vec![begin(config()), seen(0)]).await.unwrap();
+    let token = first[1].resume_token.clone();
+    let mut altered = token.clone();
+    altered[40] ^= 1;
+    for (what, server, token) in
+        [("altered", &server, altered), ("forged", &server, vec![7; 300]), ("another server's", &other, token.clone())]
+    {
+        let resume = pb::TrackConfig { resume_token: token, ..pb::TrackConfig::default() };
+        let error = answers(server, vec![begin(resume), seen(1)]).await.unwrap_err();
+        assert_eq!(error.code(), Code::InvalidArgument, "{what}: {error:?}");
+        assert!(error.message().contains("resume_token"), "{what}: {error:?}");
+    }
+    let both = pb::TrackConfig { resume_token: token.clone(), ..config() };
+    assert_eq!(answers(&server, vec![begin(both)]).await.unwrap_err().code(), Code::InvalidArgument);
+    let (room, features) = place("hall", 99);
+    let store = Store::open(other.folder.path().to_str().unwrap()).unwrap();
+    store.publish_room(&room, &[features]).await.unwrap();
+    let newer = start_on(
+        tempfile::tempdir().unwrap(),
+        store,
+        Config { token_key: TokenKey::new(KEY).unwrap(), ..Config::default() },
+    );
+    let resume = pb::TrackConfig { resume_token: token, ..pb::TrackConfig::default() };
+    let error = answers(&newer.await, vec![begin(resume)]).await.unwrap_err();
+    assert_eq!(error.code(), Code::FailedPrecondition, "{error:?}");
+}
+
+/// Oracle: the same stream without them: what is refused leaves no trace.
+#[tokio::test]
+async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
+    let server = server(KEY).await;
+    let plain = answers(&server, [begin(config())].into_iter().chain((0..20).map(seen)).collect()).await.unwrap();
+    let late = pb::TrackFrame { timestamp_ns: 0, sequence: 100, view: feature(vec![0.0; 48]) };
+    let duplicate = pb::TrackFrame { timestamp_ns: i64::MAX, sequence: 3, view: feature(vec![0.0; 48]) };
+    let narrow = pb::TrackFrame { timestamp_ns: i64::MAX, sequence: 100, view: feature(vec![0.0; 47]) };
+    let nan = pb::TrackFrame { timestamp_ns: i64::MAX, sequence: 100, view: feature(vec![f32::NAN; 48]) };
+    let of_room = pb::TrackFrame { timestamp_ns: i64::MAX, sequence: 100, view: frame(3) };
+    let empty = pb::TrackFrame { timestamp_ns: i64::MAX, sequence: 100, view: None };
+    let bad = [late, duplicate, narrow, nan, of_room, empty].map(message);
+    let requests = [begin(config())].into_iter().chain((0..10).map(seen)).chain(bad).chain((10..20).map(seen));
+    let found = answers(&server, requests.collect()).await.unwrap();
+    assert_eq!(found[..11], plain[..11]);
+    assert_eq!(found[17..], plain[11..]);
+    use pb::TrackRefusalReason as Reason;
+    let reasons = [Reason::Late, Reason::Duplicate, Reason::View, Reason::View, Reason::View, Reason::View];
+    for (answer, reason) in found[11..17].iter().zip(reasons) {
+        let Some(Answer::Refusal(refusal)) = &answer.answer else { panic!("{answer:?}") };
+        assert_eq!(refusal.reason(), reason, "{refusal:?}");
+        assert!(!refusal.message.is_empty());
+    }
+}
+
+/// Oracle: the promise: other places are LOST, and the covariance grows while it lasts.
+#[tokio::test]
+async fn a_camera_in_another_place_is_lost_and_less_and_less_sure() {
+    let server = server(KEY).await;
+    let moon = place("moon", 77).1;
+    let elsewhere = |row: usize| {
+        let view = feature(moon.rows().row(row).to_vec());
+        message(pb::TrackFrame { timestamp_ns: row as i64 * 33_000_000, sequence: row as u64 + 1, view })
+    };
+    let known = pb::TrackConfig { initial_pose: initial_pose(0), ..config() };
+    let requests = [begin(known)].into_iter().chain((0..20).map(seen)).chain((20..40).map(elsewhere));
+    let found = answers(&server, requests.collect()).await.unwrap();
+    assert_eq!(update(&found[20]).status(), pb::TrackStatus::Tracking);
+    let mut before = 0.0;
+    for answer in &found[21..] {
+        let update = update(answer);
+        assert_eq!(update.status(), pb::TrackStatus::Lost, "{}", update.reason);
+        assert!(update.out_of_distribution > 1.0);
+        let volume = matrix(&update.map_from_camera_covariance).determinant();
+        assert!(volume > before, "the covariance did not grow");
+        before = volume;
+    }
+}
+
+/// Oracle: the order of messages, by hand.
+#[tokio::test]
+async fn a_stream_is_configured_once_and_first() {
+    let server = server(KEY).await;
+    for (requests, word) in [
+        (vec![seen(0)], "config"),
+        (vec![], "config"),
+        (vec![begin(config()), begin(config())], "config"),
+        (vec![begin(config()), pb::TrackRequest { message: None }], "message"),
+        (vec![begin(pb::TrackConfig { room: "nowhere".to_owned(), ..config() })], "config.room"),
+        (vec![begin(pb::TrackConfig { rooms: vec!["hall".to_owned()], ..config() })], "config.rooms"),
+        (vec![begin(pb::TrackConfig { fusion: 9, ..config() })], "config.fusion"),
+        (vec![begin(pb::TrackConfig { back_pressure: 9, ..config() })], "config.back_pressure"),
+        (
+            vec![begin(pb::TrackConfig {
+                keyframes: Some(pb::KeyframePolicy { displacement: f64::NAN, frames: 0 }),
+                ..config()
+            })],
+            "config.keyframes.displacement",
+        ),
+        (
+            vec![begin(pb::TrackConfig { initial_pose: Some(pb::InitialPose::default()), ..config() })],
+            "config.initial_pose.pose",
+        ),
+        (
+            vec![begin(pb::TrackConfig {
+                frames: Some(pb::FrameNames { map: "x".to_owned(), odom: "x".to_owned(), camera: String::new() }),
+                ..config()
+            })],
+            "config.frames",
+        ),
+    ] {
+        let error = answers(&server, requests).await.unwrap_err();
+        assert!([Code::InvalidArgument, Code::NotFound].contains(&error.code()), "{error:?}");
+        assert!(error.message().contains(word), "{error:?} does not say {word}");
+    }
+}
+
+/// Oracle: the definitions of both verbs.
+#[tokio::test]
+async fn a_camera_can_be_put_and_forgotten() {
+    let server = server(KEY).await;
+    let put = pb::TrackRequest {
+        message: Some(Message::SetInitialPose(pb::SetInitialPose { initial_pose: initial_pose(5) })),
+    };
+    let reset = pb::TrackRequest { message: Some(Message::Reset(pb::Reset {})) };
+    let requests = [begin(config())].into_iter().chain((0..5).map(seen)).chain([put, seen(5), reset, seen(0)]);
+    let found = answers(&server, requests.collect()).await.unwrap();
+    assert!(matches!(found[6].answer, Some(Answer::Acknowledged(_))));
+    let after = update(&found[7]);
+    assert_eq!(after.status(), pb::TrackStatus::Tracking, "{}", after.reason);
+    assert!(after.map_from_camera.is_some());
+    let fresh = update(&found[9]);
+    assert_eq!((fresh.keyframe_sequence, fresh.body_velocity.is_none()), (1, true));
+    assert_eq!(found[9], found[1], "as if nothing had been");
+}
+
+/// Oracle: the recorded rooms and poses; what looks like no room is called ambiguous.
+#[tokio::test]
+async fn a_view_is_found_among_rooms_or_called_ambiguous() {
+    let server = server(KEY).await;
+    let before = server.client.rooms().await.unwrap();
+    for (room, row) in [("hall", 50), ("attic", 250)] {
+        let view = feature(served(room).1.rows().row(row).to_vec()).unwrap();
+        let request = pb::RelocalizeRequest { views: vec![view], hit_count: Some(2), ..Default::default() };
+        let found = server.client.relocalize(request).await.unwrap();
+        assert!(!found.ambiguous && found.margin.is_none_or(|margin| margin > 1.1), "{found:?}");
+        assert_eq!((found.room_count, found.rooms.len()), (2, 2));
+        assert_eq!(found.rooms[0].room.as_ref().unwrap().name, room);
+        assert_eq!((found.rooms[0].hits.len(), found.rooms[0].hits[0].frame_id), (2, row as u32));
+        let pose = pose_from_wire(found.rooms[0].pose.clone().unwrap(), room).unwrap();
+        let error = PoseError::between(&pose, &served(room).0.poses()[row]);
+        assert!(error.translation_m < 1e-9, "{error:?}");
+        assert!(matrix(&found.rooms[0].covariance).cholesky().is_some());
+    }
+    let strange = feature((0..48).map(|column| (column as f32).sin() * 9.0).collect()).unwrap();
+    let request = pb::RelocalizeRequest { views: vec![strange.clone(), strange], ..Default::default() };
+    let found = server.client.relocalize(request).await.unwrap();
+    assert!(found.ambiguous && !found.reason.is_empty(), "{found:?}");
+    assert_eq!(server.client.rooms().await.unwrap(), before, "nothing changes");
+    for (request, field) in [
+        (pb::RelocalizeRequest::default(), "views"),
+        (pb::RelocalizeRequest { views: vec![frame(1).unwrap()], ..Default::default() }, "views[0].frame_id"),
+        (pb::RelocalizeRequest { views: vec![pb::View::default()], ..Default::default() }, "views[0]"),
+        (pb::RelocalizeRequest { room_count: Some(0), ..Default::default() }, "room_count"),
+    ] {
+        let error = server.client.relocalize(request).await.unwrap_err();
+        assert_eq!(error.field().as_deref(), Some(field), "{error}");
+    }
+}
