@@ -11,9 +11,12 @@ Frames are named as REP-105 says; the camera's axes are the optical ones (x righ
 
 import queue
 import threading
+import time
 
 from seese3.v1 import geometry_pb2, odometry_pb2, odometry_pb2_grpc
 
+# What ROS takes for unknown: the twist is read from two poses, and its errors were not measured.
+UNKNOWN = 9999.0
 LEVELS = {"TRACKING": 0, "DEGRADED": 1, "RELOCALIZING": 1, "LOST": 2}
 
 
@@ -39,6 +42,7 @@ def odometry_message(update, Odometry):
     message.child_frame_id = pose.child_frame
     set_pose(message.pose.pose, pose)
     message.pose.covariance = list(update.odom_from_camera_covariance)
+    message.twist.covariance = [UNKNOWN if place % 7 == 0 else 0.0 for place in range(36)]
     if update.HasField("body_velocity"):
         for part in ("linear", "angular"):
             for axis in "xyz":
@@ -73,28 +77,40 @@ def transforms(update, TransformStamped):
 class Stream:
     """Frames in, answers out; goes on with the last token when the server goes away."""
 
-    def __init__(self, connect, config):
-        self.connect, self.config, self.token, self.frames = connect, config, b"", queue.Queue(maxsize=8)
+    def __init__(self, channel, config):
+        self.stub, self.config, self.token = odometry_pb2_grpc.OdometryServiceStub(channel), config, b""
+        self.frames = queue.Queue(maxsize=8)
 
-    def requests(self):
+    def requests(self, frames):
         resumed = odometry_pb2.TrackConfig(resume_token=self.token)
         yield odometry_pb2.TrackRequest(config=resumed if self.token else self.config)
-        while (frame := self.frames.get()) is not None:
+        while (frame := frames.get()) is not None:
             yield odometry_pb2.TrackRequest(frame=frame)
 
     def offer(self, frame):
-        """Takes a frame if there is room; a robot's next one is better than an old one."""
-        try:
-            self.frames.put_nowait(frame)
-        except queue.Full:
-            pass
+        """Takes a frame; the oldest that waits goes when there is no room."""
+        while True:
+            try:
+                return self.frames.put_nowait(frame)
+            except queue.Full:
+                try:
+                    self.frames.get_nowait()
+                except queue.Empty:
+                    pass
 
     def answers(self):
-        stub = odometry_pb2_grpc.OdometryServiceStub(self.connect())
-        for answer in stub.Track(self.requests()):
-            self.token = answer.resume_token
-            if answer.WhichOneof("answer") == "update":
-                yield answer.update
+        """Updates until the call ends. Every call has a queue of its own: an old one must not take a new one's frames."""
+        frames = self.frames = queue.Queue(maxsize=8)
+        try:
+            for answer in self.stub.Track(self.requests(frames)):
+                self.token = answer.resume_token
+                if answer.WhichOneof("answer") == "update":
+                    yield answer.update
+        finally:
+            # Ends the requests of the call that is over.
+            while frames.full():
+                frames.get_nowait()
+            frames.put_nowait(None)
 
 
 def main():
@@ -114,7 +130,7 @@ def main():
     config = odometry_pb2.TrackConfig(
         room=given["room"], adapter=given["adapter"], back_pressure=odometry_pb2.BACK_PRESSURE_NEWEST,
         frames=odometry_pb2.FrameNames(camera=given["camera_frame"]))
-    stream = Stream(lambda: grpc.insecure_channel(given["server"]), config)
+    stream = Stream(grpc.insecure_channel(given["server"]), config)
     odom = node.create_publisher(Odometry, "~/odom", 10)
     pose = node.create_publisher(PoseWithCovarianceStamped, "~/pose", 10)
     status = node.create_publisher(DiagnosticStatus, "~/status", 10)
@@ -124,9 +140,9 @@ def main():
     def on_image(image):
         nonlocal count
         count += 1
-        time = image.header.stamp.sec * 1_000_000_000 + image.header.stamp.nanosec
+        stamp = image.header.stamp.sec * 1_000_000_000 + image.header.stamp.nanosec
         view = geometry_pb2.View(image=bytes(image.data))
-        stream.offer(odometry_pb2.TrackFrame(timestamp_ns=time, sequence=count, view=view))
+        stream.offer(odometry_pb2.TrackFrame(timestamp_ns=stamp, sequence=count, view=view))
 
     def follow():
         while rclpy.ok():
@@ -143,6 +159,7 @@ def main():
                 node.get_logger().warning(f"{error.code().name}: {error.details()}")
                 if error.code() not in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED):
                     stream.token = b""
+                time.sleep(1.0)
 
     node.create_subscription(CompressedImage, "~/image", on_image, 10)
     threading.Thread(target=follow, daemon=True).start()

@@ -95,7 +95,7 @@ pub struct Measured {
     pub flicker: Array2<f64>,
     /// Second moment of the differences of latents over the motions it was trained for, shape (c, c).
     pub spread: Array2<f64>,
-    /// Errors of read motions by the squared length of the latents' difference in `spread`.
+    /// Errors of read motions; lengths are in `spread`.
     pub motion: MotionErrors,
     /// Errors of a retrieved pose by its distance in `flicker`.
     pub anchor: ErrorTable,

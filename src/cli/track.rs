@@ -1,4 +1,4 @@
-//! `seese3 track`: have a server follow a camera whose features are in a file.
+//! `seese3 track`: have a server follow a camera whose features or images are in files.
 
 use std::path::PathBuf;
 
@@ -31,12 +31,15 @@ pub struct Track {
     #[arg(long)]
     adapter: Option<String>,
     /// A NumPy file of features, (n, d), a row a frame
-    #[arg(long, value_name = "FILE")]
-    feature: PathBuf,
-    /// The first row
+    #[arg(long, value_name = "FILE", required_unless_present = "images")]
+    feature: Option<PathBuf>,
+    /// A folder of JPEG or PNG files, a file a frame by name, for a server that was started with --encoder
+    #[arg(long, value_name = "FOLDER", conflicts_with = "feature")]
+    images: Option<PathBuf>,
+    /// The first frame
     #[arg(long, default_value_t = 0)]
     from: usize,
-    /// How many rows; all that follow if nothing is given
+    /// How many frames; all that follow if nothing is given
     #[arg(long)]
     count: Option<usize>,
     /// Frames a second, for their times
@@ -79,19 +82,19 @@ impl Track {
         if !(self.hz.is_finite() && self.hz > 0.0) {
             bail!("--hz must be above 0, got {}", self.hz);
         }
-        let features = read_features(&self.feature)?;
-        let rows = features.nrows();
-        if self.from >= rows {
-            bail!("--from {}: {} has {rows} rows", self.from, self.feature.display());
+        let views = self.views()?;
+        if self.from >= views.len() {
+            bail!("--from {}: there are {} frames", self.from, views.len());
         }
-        let end = self.count.map_or(rows, |count| (self.from + count).min(rows));
-        let config = self.config()?;
+        let end = self.count.map_or(views.len(), |count| self.from.saturating_add(count).min(views.len()));
+        let (config, images) = (self.config()?, views.clone());
         let client = self.server.connect().await?;
         let (sender, requests) = tokio::sync::mpsc::channel(WAITING);
         let (from, hz) = (self.from, self.hz);
         tokio::spawn(async move {
-            let frames = (from..end).map(|row| Message::Frame(frame(row, features.row(row).to_vec(), hz)));
-            for message in [Message::Config(config)].into_iter().chain(frames) {
+            let frames = (from..end).map(|row| Some(Message::Frame(frame(row, views[row].view()?, hz))));
+            // An image that went away since it was listed ends the stream.
+            for message in [Some(Message::Config(config))].into_iter().chain(frames).map_while(|message| message) {
                 // Nobody listens any more: the error comes with the answers.
                 if sender.send(pb::TrackRequest { message: Some(message) }).await.is_err() {
                     return;
@@ -101,7 +104,17 @@ impl Track {
         let mut answers = client.track(ReceiverStream::new(requests)).await?;
         let progress = bar((end - from) as u64, "tracking");
         let mut heard = Heard::default();
-        while let Some(answer) = answers.message().await.map_err(crate::client::Error::from)? {
+        let mut ended = Ok(());
+        loop {
+            let answer = match answers.message().await {
+                Ok(Some(answer)) => answer,
+                Ok(None) => break,
+                // What came before is kept: with its token another server goes on.
+                Err(status) => {
+                    ended = Err(crate::client::Error::from(status));
+                    break;
+                }
+            };
             heard.token = answer.resume_token;
             match answer.answer {
                 Some(Answer::Started(started)) => heard.names = started.frames.unwrap_or_default(),
@@ -112,12 +125,41 @@ impl Track {
             progress.inc(1);
         }
         progress.finish_and_clear();
-        self.report(&heard)
+        self.report(&heard, &images)?;
+        ended?;
+        match heard.refusals.as_slice() {
+            [] => Ok(()),
+            [first, ..] => bail!("{} of {} frames were refused: {}", heard.refusals.len(), end - from, first.message),
+        }
+    }
+
+    fn views(&self) -> anyhow::Result<Vec<Seen>> {
+        if let Some(file) = &self.feature {
+            return Ok(read_features(file)?.outer_iter().map(|row| Seen::Feature(row.to_vec())).collect());
+        }
+        let folder = self.images.as_ref().context("give --feature FILE or --images FOLDER")?;
+        let entries = std::fs::read_dir(folder).with_context(|| format!("{} cannot be read", folder.display()))?;
+        let mut files = Vec::new();
+        for entry in entries {
+            let path = entry?.path();
+            let extension = path.extension().map(|extension| extension.to_string_lossy().to_lowercase());
+            if matches!(extension.as_deref(), Some("jpg" | "jpeg" | "png")) {
+                files.push(path);
+            }
+        }
+        files.sort();
+        if files.is_empty() {
+            bail!("{} has no .jpg, .jpeg or .png file", folder.display());
+        }
+        Ok(files.into_iter().map(Seen::Image).collect())
     }
 
     fn config(&self) -> anyhow::Result<pb::TrackConfig> {
         if let Some(file) = &self.resume {
             let resume_token = std::fs::read(file).with_context(|| format!("{} cannot be read", file.display()))?;
+            if resume_token.is_empty() {
+                bail!("{} is empty: it has no token", file.display());
+            }
             return Ok(pb::TrackConfig { resume_token, ..pb::TrackConfig::default() });
         }
         let fusion = if self.no_fusion { pb::Fusion::None } else { pb::Fusion::Anchors };
@@ -129,18 +171,16 @@ impl Track {
         })
     }
 
-    fn report(&self, heard: &Heard) -> anyhow::Result<()> {
+    fn report(&self, heard: &Heard, seen: &[Seen]) -> anyhow::Result<()> {
         let mut before = None;
         for update in &heard.updates {
             if before != Some(update.status()) {
                 let room = update.room.as_ref().map_or("", |room| &room.name);
                 let status = update.status().as_str_name().trim_start_matches("TRACK_STATUS_");
-                say(format_args!("frame {}: {status} {room}: {}", update.sequence - 1, update.reason));
+                let place = if room.is_empty() { String::new() } else { format!(" in {room}") };
+                say(format_args!("frame {}: {status}{place}: {}", update.sequence - 1, update.reason));
                 before = Some(update.status());
             }
-        }
-        for refusal in &heard.refusals {
-            say(format_args!("frame {} was refused: {}", refusal.sequence.saturating_sub(1), refusal.message));
         }
         let tracking = heard.updates.iter().filter(|update| update.status() == pb::TrackStatus::Tracking).count();
         say(format_args!("{} frames, {tracking} of them TRACKING", heard.updates.len()));
@@ -153,7 +193,7 @@ impl Track {
             }
         }
         if let Some(file) = &self.recording {
-            write_file(file, &recorded(heard)?)?;
+            write_file(file, &recorded(heard, seen)?)?;
             say(format_args!("wrote {}", file.display()));
         }
         if let Some(file) = &self.save_token {
@@ -164,9 +204,27 @@ impl Track {
     }
 }
 
-fn frame(row: usize, values: Vec<f32>, hz: f64) -> pb::TrackFrame {
-    let feature = pb::Feature { values, source_name: String::new() };
-    let view = Some(pb::View { view: Some(pb::view::View::Feature(feature)) });
+/// What the camera saw.
+#[derive(Clone)]
+enum Seen {
+    Feature(Vec<f32>),
+    Image(PathBuf),
+}
+
+impl Seen {
+    /// None when the image cannot be read.
+    fn view(&self) -> Option<pb::view::View> {
+        match self {
+            Self::Feature(values) => {
+                Some(pb::view::View::Feature(pb::Feature { values: values.clone(), source_name: String::new() }))
+            }
+            Self::Image(file) => std::fs::read(file).ok().map(pb::view::View::Image),
+        }
+    }
+}
+
+fn frame(row: usize, view: pb::view::View, hz: f64) -> pb::TrackFrame {
+    let view = Some(pb::View { view: Some(view) });
     pb::TrackFrame { timestamp_ns: (row as f64 / hz * 1e9) as i64, sequence: row as u64 + 1, view }
 }
 
@@ -185,7 +243,7 @@ fn plain(pose: Option<pb::Pose>) -> Option<Pose> {
     pose_from_wire(pb::Pose { parent_frame: String::new(), child_frame: String::new(), ..pose? }, "").ok()
 }
 
-fn recorded(heard: &Heard) -> anyhow::Result<Vec<u8>> {
+fn recorded(heard: &Heard, seen: &[Seen]) -> anyhow::Result<Vec<u8>> {
     let names = &heard.names;
     let mut recording = Recording::new()?;
     for update in &heard.updates {
@@ -198,6 +256,11 @@ fn recorded(heard: &Heard) -> anyhow::Result<Vec<u8>> {
         }
         if let Some(pose) = map(update) {
             recording.pose("/pose", time, &names.map, &pose)?;
+        }
+        let row = usize::try_from(update.sequence).unwrap_or(usize::MAX).saturating_sub(1);
+        if let Some(Seen::Image(file)) = seen.get(row) {
+            let image = std::fs::read(file).with_context(|| format!("{} cannot be read", file.display()))?;
+            recording.image(time, &names.camera, &image)?;
         }
     }
     Ok(recording.finish()?)

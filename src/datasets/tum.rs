@@ -93,7 +93,16 @@ fn read_images(file: &Path) -> Result<Vec<(i64, String)>, Error> {
     Ok(images)
 }
 
+/// Nanoseconds from seconds in scientific notation, as NumPy writes them; rounded as doubles are.
+fn scientific(seconds: &str) -> Option<i64> {
+    let seconds: f64 = seconds.contains(['e', 'E']).then(|| seconds.parse().ok())??;
+    let nanoseconds = (seconds * 1e9).round();
+    (0.0..9.2e18).contains(&nanoseconds).then_some(nanoseconds as i64)
+}
+
 fn time(file: &Path, line: usize, row: &str) -> Result<i64, Error> {
     let word = row.split(' ').next().unwrap_or_default();
-    nanoseconds(word).ok_or_else(|| wrong(file, line, format!("'{word}' is no time in decimal seconds")))
+    nanoseconds(word)
+        .or_else(|| scientific(word))
+        .ok_or_else(|| wrong(file, line, format!("'{word}' is no time in decimal seconds")))
 }

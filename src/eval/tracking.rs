@@ -47,8 +47,8 @@ impl Course {
     /// The frames that are mapped, of so many.
     pub fn mapped(self, frame_count: usize) -> Vec<FrameId> {
         let keep = |row: &usize| match self {
-            Self::Interleaved => row % 2 == 0,
-            Self::Blocks => row % 2 == 0 && !Self::is_gap(*row, frame_count),
+            Self::Interleaved => row.is_multiple_of(2),
+            Self::Blocks => row.is_multiple_of(2) && !Self::is_gap(*row, frame_count),
             Self::Time => *row < frame_count * 4 / 5,
         };
         (0..frame_count).filter(keep).map(|row| FrameId(row as u32)).collect()
@@ -63,6 +63,15 @@ impl Course {
         (0..frame_count).filter(keep).map(|row| FrameId(row as u32)).collect()
     }
 
+    /// Whether the frames beside a followed one are mapped.
+    pub fn is_mapped_beside(self, frame: FrameId, frame_count: usize) -> bool {
+        match self {
+            Self::Interleaved => true,
+            Self::Blocks => !Self::is_gap(frame.row(), frame_count),
+            Self::Time => false,
+        }
+    }
+
     fn is_gap(row: usize, frame_count: usize) -> bool {
         (row / frame_count.div_ceil(PARTS).max(1)) % 5 == 2
     }
@@ -73,35 +82,52 @@ impl Course {
 pub struct Followed {
     /// The true path.
     pub truth: Trajectory,
-    /// The frames' numbers: their rows, so that frames which were left out are missing.
+    /// The frames' numbers, in which those that were left out are missing.
     pub numbers: Vec<u64>,
     /// What was said, frame by frame.
     pub updates: Vec<Update>,
 }
 
-/// Follows frames of a recording: `latents` by row, `poses` `world_from_camera`, nanoseconds between rows. With a place to
-/// begin at, that is known to a millimetre; without one it has to be found.
-pub fn follow(
-    tracker: &Tracker,
-    latents: ndarray::ArrayView2<'_, f64>,
-    poses: &[Pose],
-    frames: &[FrameId],
-    period_ns: i64,
-    begins_known: bool,
-) -> Followed {
-    let start = frames.first().map(|first| Belief::known(poses[first.row()], 1e-3, 1e-3));
-    let mut state: State = tracker.start(start.filter(|_| begins_known));
-    let (mut truth, mut numbers, mut updates) = (Trajectory::default(), Vec::new(), Vec::with_capacity(frames.len()));
-    for frame in frames {
-        let time_ns = i64::from(frame.0) * period_ns;
-        let latent = latents.row(frame.row()).to_owned();
-        // Latents of the tracker's own adapter, in order: none is refused.
-        let observation = Observation { time_ns, sequence: u64::from(frame.0), latent };
-        if let Ok(update) = tracker.observe(&mut state, &observation) {
-            truth.times_ns.push(time_ns);
-            truth.poses.push(poses[frame.row()]);
-            numbers.push(u64::from(frame.0));
-            updates.push(update);
+/// Some frames of a recording.
+#[derive(Debug, Clone, Copy)]
+pub struct Stretch<'a> {
+    /// Row by frame, of the tracker's adapter.
+    pub latents: ndarray::ArrayView2<'a, f64>,
+    /// `world_from_camera`, row by frame.
+    pub poses: &'a [Pose],
+    /// In order.
+    pub frames: &'a [FrameId],
+}
+
+/// What is known at the beginning of a stream.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Begin {
+    /// Where the camera is, to a millimetre.
+    Known,
+    /// Nothing.
+    Unknown,
+}
+
+/// Follows stretches one after the other, as if no frame lay in between, so many nanoseconds from row to row.
+pub fn follow(tracker: &Tracker, stretches: &[Stretch<'_>], period_ns: i64, begin: Begin) -> Followed {
+    let first = stretches.first().and_then(|stretch| Some(stretch.poses[stretch.frames.first()?.row()]));
+    let start = first.map(|pose| Belief::known(pose, 1e-3, 1e-3));
+    let mut state: State = tracker.start(start.filter(|_| begin == Begin::Known));
+    let (mut truth, mut numbers, mut updates) = (Trajectory::default(), Vec::new(), Vec::new());
+    let mut number: u64 = 0;
+    for Stretch { latents, poses, frames } in stretches {
+        for (place, frame) in frames.iter().enumerate() {
+            // As many numbers on as rows; one on from stretch to stretch.
+            number += place.checked_sub(1).map_or(1, |before| u64::from(frame.0 - frames[before].0));
+            let time_ns = number as i64 * period_ns;
+            let observation = Observation { time_ns, sequence: number, latent: latents.row(frame.row()).to_owned() };
+            // Latents of the tracker's own adapter, in order: none is refused.
+            if let Ok(update) = tracker.observe(&mut state, &observation) {
+                truth.times_ns.push(time_ns);
+                truth.poses.push(poses[frame.row()]);
+                numbers.push(number);
+                updates.push(update);
+            }
         }
     }
     Followed { truth, numbers, updates }
@@ -126,6 +152,12 @@ impl Followed {
     /// The squared Mahalanobis lengths of the errors of places.
     pub fn place_surprises(&self) -> Vec<f64> {
         self.updates.iter().zip(&self.truth.poses).filter_map(place_surprise).collect()
+    }
+
+    /// The same, of frames whose neighbours on the way are mapped or not.
+    pub fn place_surprises_where(&self, is_mapped: impl Fn(usize) -> bool, wanted: bool) -> Vec<f64> {
+        let frames = self.updates.iter().zip(&self.truth.poses).enumerate();
+        frames.filter(|(at, _)| is_mapped(*at) == wanted).filter_map(|(_, frame)| place_surprise(frame)).collect()
     }
 
     /// The squared Mahalanobis lengths of the errors of read motions, with the lengths of the motions read.
@@ -188,7 +220,8 @@ pub fn place_factor(adapter: &Arc<Adapter>, lessons: &[Lesson<'_>]) -> Result<Op
         for (tracker, lesson) in trackers.iter().zip(lessons) {
             let frames = Course::Blocks.followed(lesson.room.frame_count());
             let latents = tracker.maps()[0].navigator().latents();
-            surprises.extend(follow(tracker, latents, lesson.room.poses(), &frames, 1, true).place_surprises());
+            let stretch = Stretch { latents, poses: lesson.room.poses(), frames: &frames };
+            surprises.extend(follow(tracker, &[stretch], 1, Begin::Known).place_surprises());
         }
         if let Some(off) = imbalance(&mut surprises)
             && best.is_none_or(|(_, least)| off < least)

@@ -10,6 +10,9 @@ use crate::room::FrameId;
 /// Frames that a step chooses among.
 const CHOICE: usize = 16;
 
+/// Times that a motion is halved where nothing nearer looks like it.
+const HALVINGS: u32 = 4;
+
 /// How a goal is pursued.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pursuit {
@@ -67,16 +70,21 @@ pub fn pursue(
     each: &mut dyn FnMut(Feedback),
 ) -> Result<Outcome, Error> {
     let mut pose = start.pose.ok_or(Error::PoseNeeded { what: "a goal" })?;
-    let (mut latent, mut recoveries, mut halvings) = (start.latent, 0, 0);
+    let (mut latent, mut recoveries, mut halvings, mut at) = (start.latent, 0, 0, None);
     let mut seen: BTreeSet<FrameId> = start.frame.into_iter().collect();
     each(Feedback { step: 0, hit: None, remaining: PoseError::between(&pose, goal), recoveries });
-    for step in 1.. {
+    let mut step = 0;
+    loop {
+        step += 1;
         let remaining = PoseError::between(&pose, goal);
         if remaining.translation_m <= pursuit.tolerance_m && remaining.rotation_rad <= pursuit.tolerance_rad {
             return Ok(Outcome::Reached);
         }
+        if recoveries > pursuit.recoveries {
+            return Ok(Outcome::Stuck);
+        }
         if step > pursuit.steps {
-            return Ok(Outcome::Spent);
+            return Ok(if halvings > 0 { Outcome::Stuck } else { Outcome::Spent });
         }
         cancel.check()?;
         let left = body_twist(&pose, goal);
@@ -96,19 +104,18 @@ pub fn pursue(
         };
         match chosen {
             Some(hit) => {
-                (pose, halvings) = (hit.pose, 0);
+                (pose, halvings, at) = (hit.pose, 0, Some(*hit));
                 latent = navigator.latents().row(hit.neighbour.frame.row()).to_owned();
                 seen.insert(hit.neighbour.frame);
-                each(Feedback { step, hit: Some(*hit), remaining: PoseError::between(&pose, goal), recoveries });
+                each(Feedback { step, hit: at, remaining: PoseError::between(&pose, goal), recoveries });
             }
-            None if recoveries <= pursuit.recoveries && halvings < 4 => halvings += 1,
+            None if halvings < HALVINGS => {
+                halvings += 1;
+                each(Feedback { step, hit: at, remaining, recoveries });
+            }
             None => return Ok(Outcome::Stuck),
         }
-        if recoveries > pursuit.recoveries {
-            return Ok(Outcome::Stuck);
-        }
     }
-    Ok(Outcome::Spent)
 }
 
 impl Pursuit {

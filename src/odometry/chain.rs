@@ -1,7 +1,7 @@
 //! Whether a stream's frames hang together, and with the room: what tells a lost camera from one that explores.
 
 /// Frames in a row that must look like the room before a lost stream is not lost any more.
-const REGAINED: u32 = 5;
+pub const REGAINED: u32 = 5;
 /// Frames that must look like the room, two for each that does not, before a new chain is beyond doubt.
 const CONFIRMED: i32 = 20;
 

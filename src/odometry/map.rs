@@ -71,11 +71,6 @@ impl Map {
         &self.navigator
     }
 
-    /// The median distance of a mapped frame from the nearest that is not beside it in time, in deviations of flicker.
-    pub fn typical(&self) -> f64 {
-        self.typical
-    }
-
     /// The errors of motions here: told by the mapped frames, whose motions are known.
     pub fn motion(&self) -> &MotionErrors {
         &self.motion

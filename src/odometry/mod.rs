@@ -10,6 +10,7 @@ mod own_errors;
 mod relocalize;
 mod state;
 mod tracker;
+mod verdict;
 mod view;
 
 pub use belief::{Belief, Innovation};
@@ -46,7 +47,9 @@ pub enum Error {
     Cancelled,
     #[error("rooms of several adapters cannot be looked in together: their latents do not compare")]
     Adapters,
-    #[error("the adapter's errors were not measured in rooms that it did not learn from (train --calibrate-on)")]
+    #[error(
+        "the adapter's errors were not measured in two or more rooms that it did not learn from (train --calibrate-on)"
+    )]
     NotCalibrated,
     #[error(
         "room '{room}' has {frames} mapped frames, none with another that is not beside it in time: too few to tell it \

@@ -57,6 +57,7 @@ pub fn relocalize(
         let newest = map.sighting(last.view(), hit_count);
         let (mut distance, mut foreign) = (newest.nearest[0].distance, newest.out_of_distribution);
         for latent in &latents[..latents.len() - 1] {
+            cancel.check().map_err(|_| Error::Cancelled)?;
             let sighting = map.sighting(latent.view(), 1);
             distance += sighting.nearest[0].distance;
             foreign += sighting.out_of_distribution;

@@ -42,12 +42,14 @@ pub struct State {
 }
 
 /// The last frame of a stream.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Last {
     /// Nanoseconds.
     pub time_ns: i64,
     /// The sender's number.
     pub sequence: u64,
+    /// Its latent.
+    pub latent: Vec<f64>,
     /// `odom_from_camera`.
     pub odom: Belief,
 }
@@ -61,9 +63,10 @@ pub struct Keyframe {
     pub latent: Vec<f64>,
     /// `odom_from_camera` there.
     pub odom: Belief,
-    /// `map_from_camera` there, if it is known: what anchors are weighed against.
+    /// `map_from_camera` there, if it is believed: what anchors are weighed against.
     pub place: Option<Belief>,
-    /// The same with the covariance that its errors have: what is told.
+    /// `map_from_camera` with the covariance that its errors have: what is told, also of a place that is not believed
+    /// any more.
     pub told: Option<Belief>,
 }
 

@@ -29,7 +29,7 @@ pub use document::{Block, Document, Picture, Section};
 pub use formulations::{FormulationScores, formulations_json, formulations_table};
 pub use json::{evaluation_json, training_json};
 pub use layers::{LayerScores, encoders_table, layers_json, layers_table};
-pub use odometry::{Relocalisation, TrackedRoom, coverage_table, foreign_text, odometry_json, odometry_table};
+pub use odometry::{Foreign, Relocalisation, TrackedRoom, coverage_table, foreign_text, odometry_json, odometry_table};
 pub use path_errors::{APE_FORMULA, PathErrors, PathProtocol, RPE_FORMULA, path_errors_json, path_errors_table};
 pub use plot::{PathPlot, path_svg};
 pub use probe::{AtStride, ProbeScores, probe_table};

@@ -21,16 +21,25 @@ pub struct TrackedRoom {
     pub ape_rad: [f64; 2],
     /// The same of relative errors of one frame, metres.
     pub rpe_m: [f64; 2],
-    /// Squared Mahalanobis lengths of the errors of places.
-    pub places: Vec<f64>,
+    /// Squared Mahalanobis lengths of the errors of places, where the frames beside are mapped and where not.
+    pub places: [Vec<f64>; 2],
     /// Of read motions, with the lengths of the motions.
     pub motions: Vec<(f64, f64)>,
     /// Shares of frames TRACKING, DEGRADED, LOST, RELOCALIZING.
     pub statuses: [f64; 4],
     /// Of the same stream when nothing was known at its beginning: the share LOST, and frames until the place was right.
     pub unknown: (f64, Option<usize>),
-    /// Frames of other rooms that were followed here, and those answered LOST.
-    pub foreign: [usize; 2],
+    /// Frames of other rooms that were followed here, from the beginning and after the room's own.
+    pub foreign: [Foreign; 2],
+}
+
+/// Frames of other rooms.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Foreign {
+    /// That were followed.
+    pub frames: usize,
+    /// That were answered LOST.
+    pub lost: usize,
 }
 
 /// Which room single views were thought to be in.
@@ -79,7 +88,12 @@ fn line(name: &str, count: String, rooms: &[TrackedRoom]) -> Vec<String> {
     let of = |figure: &dyn Fn(&TrackedRoom) -> f64| mean(&rooms.iter().map(figure).collect::<Vec<_>>());
     let (odom, fused) = (of(&|room| room.ape_m[0]), of(&|room| room.ape_m[1]));
     let found: Vec<f64> = rooms.iter().filter_map(|room| room.unknown.1).map(|frames| frames as f64).collect();
-    let found = if found.is_empty() { "never".to_owned() } else { format!("{:.0}", crate::scores::median(&found)) };
+    let found = match found.len() {
+        0 => "never".to_owned(),
+        // Of those that were found.
+        some if some < rooms.len() => format!("{:.0} ({some} of {})", crate::scores::median(&found), rooms.len()),
+        _ => format!("{:.0}", crate::scores::median(&found)),
+    };
     vec![
         name.to_owned(),
         count,
@@ -103,7 +117,13 @@ pub fn coverage_table(rooms: &[TrackedRoom]) -> String {
         let [inner, outer] = coverage(surprises);
         lines.push(vec![name, surprises.len().to_string(), format!("{inner:.3}"), format!("{outer:.3}")]);
     };
-    row("places".to_owned(), &rooms.iter().flat_map(|room| room.places.clone()).collect::<Vec<_>>());
+    let places = |at: usize| rooms.iter().flat_map(|room| room.places[at].clone()).collect::<Vec<f64>>();
+    for (at, name) in ["places, way mapped", "places, way not mapped"].into_iter().enumerate() {
+        if !places(at).is_empty() {
+            row(name.to_owned(), &places(at));
+        }
+    }
+    row("places, all".to_owned(), &[places(0), places(1)].concat());
     let mut motions: Vec<(f64, f64)> = rooms.iter().flat_map(|room| room.motions.clone()).collect();
     row("motions".to_owned(), &motions.iter().map(|motion| motion.1).collect::<Vec<_>>());
     motions.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -116,12 +136,16 @@ pub fn coverage_table(rooms: &[TrackedRoom]) -> String {
 
 /// Frames of other rooms answered LOST, in words.
 pub fn foreign_text(rooms: &[TrackedRoom]) -> String {
-    let [count, lost] = [0, 1].map(|at| rooms.iter().map(|room| room.foreign[at]).sum::<usize>());
-    let rate = Rate::of(lost, count);
-    format!(
-        "frames of other rooms answered LOST: {lost} of {count} ({:.4} [{:.4}, {:.4}])",
-        rate.rate, rate.low, rate.high
-    )
+    let line = |(at, when): (usize, &str)| {
+        let sum = |of: fn(&Foreign) -> usize| rooms.iter().map(|room| of(&room.foreign[at])).sum::<usize>();
+        let (frames, lost) = (sum(|foreign| foreign.frames), sum(|foreign| foreign.lost));
+        let rate = Rate::of(lost, frames);
+        format!(
+            "frames of other rooms answered LOST, {when}: {lost} of {frames} ({:.4} [{:.4}, {:.4}])\n",
+            rate.rate, rate.low, rate.high
+        )
+    };
+    [(0, "from the beginning"), (1, "after the room's own")].map(line).concat()
 }
 
 impl Relocalisation {
@@ -148,17 +172,17 @@ pub fn odometry_json(rooms: &[TrackedRoom], relocalisation: Option<&Relocalisati
             "ape_translation_rmse_m": { "odom": room.ape_m[0], "fused": room.ape_m[1] },
             "ape_rotation_rmse_rad": { "odom": room.ape_rad[0], "fused": room.ape_rad[1] },
             "rpe_translation_rmse_m": { "odom": room.rpe_m[0], "fused": room.rpe_m[1] },
-            "coverage_places": coverage(&room.places), "coverage_motions": coverage(&motions),
+            "coverage_places": coverage(&room.places.concat()), "coverage_motions": coverage(&motions),
             "tracking": room.statuses[0], "degraded": room.statuses[1], "lost": room.statuses[2],
             "relocalizing": room.statuses[3],
             "lost_without_initial_pose": room.unknown.0, "frames_to_relocalise": room.unknown.1,
-            "foreign_frames": room.foreign[0], "foreign_lost": room.foreign[1],
+            "foreign": room.foreign.map(|foreign| json!({ "frames": foreign.frames, "lost": foreign.lost })),
         })
     };
     let relocalisation = relocalisation.map(|found| {
         json!({ "rooms": found.rooms, "right": found.right, "wrong": found.wrong, "ambiguous": found.ambiguous })
     });
-    let places: Vec<f64> = rooms.iter().flat_map(|room| room.places.clone()).collect();
+    let places: Vec<f64> = rooms.iter().flat_map(|room| room.places.concat()).collect();
     let motions: Vec<f64> = rooms.iter().flat_map(|room| room.motions.iter().map(|motion| motion.1)).collect();
     json!({
         "rooms": rooms.iter().map(room).collect::<Vec<_>>(),

@@ -39,9 +39,12 @@ impl Handlers {
         let (snapshot, most) = (self.snapshot()?, self.config.limits.steps);
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
+        let begun = Instant::now();
         let ready = self.workers.run(budget, move |_| ready(&snapshot, request, most)).await?;
-        let (events, stream) = mpsc::channel(16);
-        tokio::spawn(self.clone().pursue(ready, budget, events).instrument(tracing::Span::current()));
+        // Room for every step's feedback, so that none is lost and no thread waits for a listener.
+        let (events, stream) = mpsc::channel(ready.pursuit.steps as usize + 2);
+        let left = budget.saturating_sub(begun.elapsed());
+        tokio::spawn(self.clone().pursue(ready, left, events).instrument(tracing::Span::current()));
         Ok(Box::pin(ReceiverStream::new(stream)))
     }
 
@@ -58,7 +61,7 @@ impl Handlers {
             let stepper = Stepper::InversePoincare(Reading::Homogeneous);
             let mut each = |feedback: Feedback| {
                 let feedback = feedback_to_wire(&feedback, &served, begun);
-                // A listener that is slow misses feedback; it must never hold a thread.
+                // An error means that nobody listens; the work is told elsewhere.
                 let _ = events.try_send(Ok(pb::NavigateToResponse { event: Some(Event::Feedback(feedback)) }));
             };
             let outcome = pursue(&served.navigator, &stepper, start, &goal, pursuit, cancel, &mut each)?;
@@ -70,7 +73,7 @@ impl Handlers {
         };
         let last =
             finished.map(|result| pb::NavigateToResponse { event: Some(Event::Result(result)) }).map_err(Status::from);
-        // As above: without a listener there is nobody to tell.
+        // Without a listener there is nobody to tell.
         let _ = heard.send(last).await;
     }
 }

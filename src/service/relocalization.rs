@@ -45,7 +45,7 @@ fn answer(
     if views.is_empty() || views.len() > MAX_VIEWS {
         return Err(Error::invalid("views", format!("must be 1 to {MAX_VIEWS}, got {}", views.len())));
     }
-    let served = rooms_under(snapshot, &rooms, &adapter)?;
+    let served = rooms_to_track_in(snapshot, &rooms, &adapter)?;
     let maps = maps(&served)?;
     let stored = &served[0].adapter;
     let mut latents = Vec::with_capacity(views.len());
@@ -78,6 +78,48 @@ fn answer(
     })
 }
 
+/// Rooms under one adapter, whose errors were measured if none is named.
+///
+/// # Errors
+/// As [`rooms_under`].
+pub fn rooms_to_track_in(
+    snapshot: &Snapshot,
+    rooms: &[String],
+    adapter: &str,
+) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+    if !adapter.is_empty() {
+        return rooms_under(snapshot, rooms, adapter);
+    }
+    let mut fitting: Option<Vec<&str>> = None;
+    for served in
+        snapshot.rooms().iter().filter(|(name, _)| rooms.is_empty() || rooms.contains(name)).map(|(_, room)| room)
+    {
+        let here: Vec<&str> =
+            served.navigators.iter().filter(|n| n.map.is_some()).map(|n| n.adapter.name.as_str()).collect();
+        match (&mut fitting, rooms.is_empty()) {
+            (Some(fitting), false) => fitting.retain(|name| here.contains(name)),
+            (Some(fitting), true) => fitting.extend(here),
+            (none, _) => *none = Some(here),
+        }
+    }
+    let mut fitting = fitting.unwrap_or_default();
+    // The newest is the default in one room; several rooms have no newest that is the same.
+    if rooms.len() == 1 {
+        fitting.truncate(1);
+    }
+    fitting.sort_unstable();
+    fitting.dedup();
+    match fitting.as_slice() {
+        [] => rooms_under(snapshot, rooms, ""),
+        [only] => rooms_under(snapshot, rooms, only),
+        several => {
+            let problem =
+                format!("is required: {} adapters can track in these rooms ({})", several.len(), several.join(", "));
+            Err(Error::invalid("adapter", problem))
+        }
+    }
+}
+
 /// The rooms as maps.
 ///
 /// # Errors
@@ -88,8 +130,8 @@ pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
         served.map.clone().ok_or_else(|| {
             Error::Precondition(match served.adapter.adapter.calibration() {
                 None => format!(
-                    "adapter '{name}' neither tracks nor relocalises: its errors were not measured in rooms that it did \
-                     not learn from; train it with --calibrate-on"
+                    "adapter '{name}' neither tracks nor relocalises: its errors were not measured in two or more rooms that \
+                     it did not learn from; train it with --calibrate-on"
                 ),
                 Some(_) => format!("room '{room}' is too small to be told from others: no frame is apart from the rest"),
             })

@@ -3,8 +3,11 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use sha2::{Digest, Sha256};
+
 use super::eye::{self, Eye, ImageEncoders};
 use super::{Error, RunError};
+use crate::adapter::Network;
 use crate::features::FeatureSource;
 use crate::navigation::{IndexKind, Navigator};
 use crate::odometry::Map;
@@ -33,6 +36,8 @@ pub struct ServedNavigator {
     pub map: Option<Arc<Map>>,
     /// With whose numbers.
     pub adapter: Arc<StoredAdapter>,
+    /// SHA-256 of what answers are computed from: poses, latents, and how the adapter reads them.
+    pub content: [u8; 32],
     /// The room's revision.
     pub room_revision: u64,
     /// Whether the adapter learned from this room, and from which frames of it.
@@ -171,8 +176,9 @@ async fn load_all(store: &Store, index: IndexKind, encoders: Option<&ImageEncode
             };
             let (adapter, room_revision) = (adapter.clone(), stored.revision);
             let navigator = Arc::new(navigator);
-            let map = map(&navigator);
-            navigators.push(Arc::new(ServedNavigator { navigator, map, adapter, room_revision, trained_on }));
+            let (map, content) = (map(&navigator), content(&navigator));
+            let served = ServedNavigator { navigator, map, content, adapter, room_revision, trained_on };
+            navigators.push(Arc::new(served));
         }
         let sources = stored.features.iter().map(|features| features.source().clone()).collect();
         let served = ServedRoom { room, revision: stored.revision, created: stored.created, sources, navigators };
@@ -182,6 +188,22 @@ async fn load_all(store: &Store, index: IndexKind, encoders: Option<&ImageEncode
         return Err(RunError::NoRoom { location: store.location().to_owned() });
     }
     Ok(Snapshot { rooms, adapters, eyes })
+}
+
+/// What answers are computed from, hashed: names and revisions of two stores may be the same by chance.
+fn content(navigator: &Navigator) -> [u8; 32] {
+    let mut digest = Sha256::new();
+    let poses = navigator.room().poses().iter().flat_map(|pose| {
+        let (t, q) = (pose.translation.vector, pose.rotation.coords);
+        [t.x, t.y, t.z, q.x, q.y, q.z, q.w]
+    });
+    poses.chain(navigator.latents().iter().copied()).for_each(|x| digest.update(x.to_le_bytes()));
+    let adapter = navigator.adapter();
+    for parameter in adapter.network().parameters() {
+        parameter.iter().for_each(|x| digest.update(x.to_le_bytes()));
+    }
+    digest.update(format!("{:?} {:?}", adapter.scale(), adapter.calibration()));
+    digest.finalize().into()
 }
 
 fn log_audit(navigator: &Navigator, adapter: &str) {

@@ -128,7 +128,7 @@ fn second_moment(rooms: &[Seen<'_>], pairs: &[(usize, Pair)]) -> Result<Array2<f
     Ok((&moment + &moment.t()) * 0.5)
 }
 
-/// Errors of the motions read over pairs, by the root of u + u₀.
+/// Errors of the motions read over pairs, divided by the root of u + u₀.
 fn residuals(adapter: &Adapter, rooms: &[Seen<'_>], pairs: &[(usize, Pair)], spread: &Metric) -> Vec<Vector6<f64>> {
     let residual = |(room, pair): &(usize, Pair)| {
         let Seen { poses, coordinates, latents } = &rooms[*room];

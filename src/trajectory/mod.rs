@@ -45,9 +45,9 @@ impl Trajectory {
 pub enum Error {
     #[error("the paths have {reference} and {estimate} poses; associate them first")]
     Unequal { reference: usize, estimate: usize },
-    #[error("no pose of one path is within {max_difference_ns} ns of one of the other")]
+    #[error("no pose of one path is within {} ms of one of the other", *max_difference_ns as f64 * 1e-6)]
     NothingMatches { max_difference_ns: u64 },
-    #[error("{have} poses are too few to align: their positions must span at least a plane")]
+    #[error("the {have} poses cannot be aligned: their positions must span at least a plane")]
     Degenerate { have: usize },
     #[error("{have} poses have no pair {delta} apart")]
     NoPairs { have: usize, delta: usize },

@@ -1,6 +1,8 @@
 //! What several test programs share: where oracles lie, and how their files are read.
 #![allow(dead_code, reason = "each test program uses a part")]
 
+pub mod world;
+
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Ix2};

@@ -12,12 +12,12 @@ use super::super::rooms::load_rooms;
 use super::super::{check_writable, say, write_file, write_json};
 use crate::adapter::Adapter;
 use crate::cancel::Cancellation;
-use crate::eval::tracking::{Course, Followed, follow};
+use crate::eval::tracking::{Begin, Course, Followed, Stretch, follow};
 use crate::features::Features;
 use crate::navigation::{IndexKind, Navigator};
 use crate::odometry::{Map, Settings, Status, Tracker, relocalize};
 use crate::report::{
-    APE_FORMULA, Relocalisation, TrackedRoom, coverage_table, foreign_text, kitti_trajectory, odometry_json,
+    APE_FORMULA, Foreign, Relocalisation, TrackedRoom, coverage_table, foreign_text, kitti_trajectory, odometry_json,
     odometry_table, tum_trajectory,
 };
 use crate::store::{Store, StoredRoom};
@@ -115,8 +115,9 @@ impl Odometry {
         progress.finish_and_clear();
         let relocalisation = (ready.len() > 1).then(|| relocalised(self.course.into(), &ready)).transpose()?;
         say(format_args!(
-            "{} rooms, adapter '{}' revision {}, course {}, {}",
+            "{} {}, adapter '{}' revision {}, course {}, {}",
             ready.len(),
+            if ready.len() == 1 { "room" } else { "rooms" },
             stored.name,
             stored.revision,
             Course::from(self.course).name(),
@@ -127,7 +128,7 @@ impl Odometry {
         say(shown.trim_end());
         say(format_args!("\ncovariances:\n{}", coverage_table(&tracked).trim_end()));
         if ready.len() > 1 {
-            say(foreign_text(&tracked));
+            say(foreign_text(&tracked).trim_end());
         }
         if let Some(found) = &relocalisation {
             say(found.text());
@@ -159,7 +160,7 @@ impl Odometry {
     fn tracked(&self, room: &Ready, all: &[Ready]) -> anyhow::Result<TrackedRoom> {
         let stored = &room.stored.room;
         let course = Course::from(self.course);
-        let followed = followed(room, &room.tracker, course, true);
+        let followed = followed(room, course, Begin::Known);
         let (fused, places) = followed.map_path();
         if let Some(folder) = &self.paths {
             write_paths(folder, stored.id().as_str(), &followed, &fused)?;
@@ -175,7 +176,9 @@ impl Odometry {
             0 | 1 => [f64::NAN; 3],
             _ => errors(&fused, &followed.truth.select(&places))?,
         };
-        let unknown = self::followed(room, &room.tracker, course, false);
+        let unknown = self::followed(room, course, Begin::Unknown);
+        let frames = course.followed(stored.frame_count());
+        let is_mapped = |at: usize| course.is_mapped_beside(frames[at], stored.frame_count());
         Ok(TrackedRoom {
             room: stored.id().to_string(),
             format: stored.provenance().format.clone(),
@@ -183,37 +186,46 @@ impl Odometry {
             ape_m: [odom[0], fused[0]],
             ape_rad: [odom[1], fused[1]],
             rpe_m: [odom[2], fused[2]],
-            places: followed.place_surprises(),
+            places: [true, false].map(|wanted| followed.place_surprises_where(is_mapped, wanted)),
             motions: followed.motion_surprises(),
             statuses: [Status::Tracking, Status::Degraded, Status::Lost, Status::Relocalizing]
                 .map(|status| followed.share(status)),
             unknown: (unknown.share(Status::Lost), unknown.frames_to_relocalise()),
-            foreign: foreign(room, all),
+            foreign: foreign(room, all, course),
         })
     }
 }
 
-fn followed(room: &Ready, tracker: &Tracker, course: Course, begins_known: bool) -> Followed {
+fn followed(room: &Ready, course: Course, begin: Begin) -> Followed {
     let stored = &room.stored.room;
     let frames = course.followed(stored.frame_count());
-    let latents = room.map.navigator().latents();
-    follow(tracker, latents, stored.poses(), &frames, PERIOD_NS, begins_known)
+    let stretch = Stretch { latents: room.map.navigator().latents(), poses: stored.poses(), frames: &frames };
+    follow(&room.tracker, &[stretch], PERIOD_NS, begin)
 }
 
-/// Frames of other rooms followed in this one, half of each after the room's own last frame: how many, and how many are
-/// answered LOST.
-fn foreign(room: &Ready, all: &[Ready]) -> [usize; 2] {
-    let (mut count, mut lost) = (0, 0);
-    for other in all.iter().filter(|other| other.stored.room.id() != room.stored.room.id()) {
+/// Frames of other rooms followed in this one, from the beginning and after the room's own last frame: how many, and how
+/// many are answered LOST.
+fn foreign(room: &Ready, all: &[Ready], course: Course) -> [Foreign; 2] {
+    let own = &room.stored.room;
+    let mut own_frames = course.followed(own.frame_count());
+    let before = own_frames.split_off(own_frames.len().saturating_sub(FOREIGN_FRAMES));
+    let mut found = [Foreign::default(); 2];
+    for other in all.iter().filter(|other| other.stored.room.id() != own.id()) {
         let stored = &other.stored.room;
         let frames = Course::Interleaved.followed(stored.frame_count());
         let frames = &frames[..frames.len().min(FOREIGN_FRAMES)];
-        let latents = other.map.navigator().latents();
-        let followed = follow(&room.tracker, latents, stored.poses(), frames, PERIOD_NS, false);
-        count += followed.updates.len();
-        lost += followed.updates.iter().filter(|update| update.status == Status::Lost).count();
+        let theirs = Stretch { latents: other.map.navigator().latents(), poses: stored.poses(), frames };
+        let ours = Stretch { latents: room.map.navigator().latents(), poses: own.poses(), frames: &before };
+        for (found, (stretches, begin)) in
+            found.iter_mut().zip([(vec![theirs], Begin::Unknown), (vec![ours, theirs], Begin::Known)])
+        {
+            let followed = follow(&room.tracker, &stretches, PERIOD_NS, begin);
+            let updates = &followed.updates[followed.updates.len() - frames.len()..];
+            found.frames += updates.len();
+            found.lost += updates.iter().filter(|update| update.status == Status::Lost).count();
+        }
     }
-    [count, lost]
+    found
 }
 
 /// Single views of followed frames, every fifth, looked for in all rooms.

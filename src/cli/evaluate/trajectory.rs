@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::Args;
 
 use super::super::{check_writable, say, write_json};
@@ -52,6 +52,11 @@ impl Trajectory {
             check_writable(path)?;
         }
         let (reference, estimate) = (read_tum_trajectory(&self.reference)?, read_tum_trajectory(&self.estimate)?);
+        for (path, file) in [(&reference, &self.reference), (&estimate, &self.estimate)] {
+            if path.is_empty() {
+                bail!("{} has no poses", file.display());
+            }
+        }
         let files = || format!("{} and {}", self.reference.display(), self.estimate.display());
         let matches = associate(&reference, &estimate, self.max_difference_ms * 1_000_000).with_context(files)?;
         let errors = PathErrors::of(&reference, &estimate, &matches, self.relative.protocol()).with_context(files)?;

@@ -24,32 +24,50 @@ use session::Session;
 /// The answers of a stream.
 pub type Answers = Pin<Box<dyn Stream<Item = Result<pb::TrackResponse, Status>> + Send>>;
 
-/// Frames that may wait in the server; behind them the sender waits.
-const WAITING: usize = 32;
 /// Answers that may wait for a listener; behind them frames wait.
 const UNREAD: usize = 32;
 
-/// A message and when it came.
-type Came = (Instant, Result<Message, Status>);
+/// A message, when it came, and the frames that it overtook.
+struct Came {
+    since: Instant,
+    message: Result<Message, Status>,
+    overtaken: Option<Overtaken>,
+}
+
+/// Frames that a newer one overtook: the last of them, and how many they are.
+#[derive(Debug, Clone, Copy)]
+pub struct Overtaken {
+    pub timestamp_ns: i64,
+    pub sequence: u64,
+    pub frames: u32,
+}
 
 impl Handlers {
     /// Answers a stream's messages until it ends, goes wrong, or the server is told to stop.
-    pub(super) async fn follow(&self, mut requests: Streaming<pb::TrackRequest>) -> Result<Answers, Error> {
-        let place = self.streams.clone().try_acquire_owned().map_err(|_| Error::Busy)?;
+    pub(super) async fn follow(&self, mut requests: Streaming<pb::TrackRequest>) -> Result<Answers, Status> {
         let snapshot = self.snapshot()?;
-        let config = match requests.message().await {
-            Ok(Some(pb::TrackRequest { message: Some(Message::Config(config)) })) => config,
-            Ok(_) => return Err(Error::invalid("config", "must be the first message of a stream")),
-            Err(_) => return Err(Error::Cancelled),
+        let first = tokio::time::timeout(self.config.longest, requests.message()).await;
+        let config = match first.map_err(|_| Error::Deadline)?? {
+            Some(pb::TrackRequest { message: Some(Message::Config(config)) }) => config,
+            _ => return Err(Error::invalid("config", "must be the first message of a stream").into()),
         };
+        let place = self.streams.clone().try_acquire_owned().map_err(|_| Error::Busy)?;
         let key = self.config.token_key.clone();
         let session = self.workers.run(self.config.longest, move |_| Session::open(&snapshot, config, &key)).await?;
-        let (sender, frames) = mpsc::channel(WAITING);
+        // One waits here, one is read ahead; what is behind them waits with the sender.
+        let (sender, frames) = mpsc::channel(1);
         let (answers, stream) = mpsc::channel(UNREAD);
-        tokio::spawn(read(requests, sender));
+        tokio::spawn(read(requests, sender, session.newest_wins()));
         let handlers = self.clone();
         let run = async move {
-            handlers.answer_all(session, frames, answers).await;
+            let mut phase = handlers.phase.clone();
+            tokio::select! {
+                () = handlers.answer_all(session, frames, &answers) => {}
+                () = told_to_stop(&mut phase) => {
+                    // The token of the last answer goes on elsewhere. A listener that does not read is not waited for.
+                    let _ = answers.try_send(Err(Error::Loading.into()));
+                }
+            }
             drop(place);
         };
         tokio::spawn(run.instrument(tracing::Span::current()));
@@ -60,49 +78,33 @@ impl Handlers {
         &self,
         mut session: Session,
         mut frames: mpsc::Receiver<Came>,
-        answers: mpsc::Sender<Result<pb::TrackResponse, Status>>,
+        answers: &mpsc::Sender<Result<pb::TrackResponse, Status>>,
     ) {
-        let mut phase = self.phase.clone();
         if answers.send(Ok(session.started())).await.is_err() {
             return;
         }
-        loop {
-            let came = tokio::select! {
-                came = frames.recv() => came,
-                () = told_to_stop(&mut phase) => {
-                    // The token of the last answer goes on elsewhere.
-                    let _ = answers.send(Err(Error::Loading.into())).await;
-                    return;
-                }
-            };
-            let Some(first) = came else { return };
-            let mut batch = vec![first];
-            if session.newest_wins() {
-                while let Ok(more) = frames.try_recv() {
-                    batch.push(more);
-                }
+        while let Some(Came { since, message, overtaken }) = frames.recv().await {
+            if let Some(frames) = overtaken
+                && answers.send(Ok(session.superseded(frames))).await.is_err()
+            {
+                return;
             }
-            let overtaken: Vec<bool> =
-                (0..batch.len()).map(|at| is_frame(&batch[at]) && batch.get(at + 1).is_some_and(is_frame)).collect();
-            for ((since, message), overtaken) in batch.into_iter().zip(overtaken) {
-                let answer = match message {
-                    Ok(Message::Frame(frame)) if overtaken => Ok(session.superseded(&frame)),
-                    Ok(message) => match self.handled(session, message, since).await {
-                        Ok((back, answer)) => {
-                            session = back;
-                            answer.map_err(Status::from)
-                        }
-                        Err(error) => {
-                            let _ = answers.send(Err(error.into())).await;
-                            return;
-                        }
-                    },
-                    Err(status) => Err(status),
-                };
-                let ends = answer.is_err();
-                if answers.send(answer).await.is_err() || ends {
-                    return;
-                }
+            let answer = match message {
+                Ok(message) => match self.handled(session, message, since).await {
+                    Ok((back, answer)) => {
+                        session = back;
+                        answer.map_err(Status::from)
+                    }
+                    Err(error) => {
+                        let _ = answers.send(Err(error.into())).await;
+                        return;
+                    }
+                },
+                Err(status) => Err(status),
+            };
+            let ends = answer.is_err();
+            if answers.send(answer).await.is_err() || ends {
+                return;
             }
         }
     }
@@ -118,7 +120,7 @@ impl Handlers {
             .run_admitted(move || {
                 let answer = match message {
                     Message::Frame(frame) => session.take(frame, since.elapsed()),
-                    Message::SetInitialPose(given) => session.put(given),
+                    Message::SetInitialPose(given) => Ok(session.put(given)),
                     Message::Reset(_) => Ok(session.reset()),
                     Message::Config(_) => Err(Error::invalid("config", "may only be the first message of a stream")),
                 };
@@ -134,23 +136,62 @@ async fn told_to_stop(phase: &mut watch::Receiver<Phase>) {
     let _ = phase.wait_for(|phase| !matches!(phase, Phase::Serving(_))).await.map(drop);
 }
 
-fn is_frame((_, message): &Came) -> bool {
-    matches!(message, Ok(Message::Frame(_)))
-}
-
-/// Reads messages as they come; what is not read yet stays with the sender.
-async fn read(mut requests: Streaming<pb::TrackRequest>, sender: mpsc::Sender<Came>) {
-    while let Some(next) = requests.next().await {
-        let message = match next {
-            Ok(pb::TrackRequest { message: Some(message) }) => Ok(message),
-            Ok(pb::TrackRequest { message: None }) => {
-                Err(Error::invalid("message", "is required: a frame, set_initial_pose or reset").into())
+/// Reads messages as they come, one ahead; where the newest frame wins, further, as long as each overtakes the one before.
+/// Ends with the stream, or when nobody asks for its messages any more.
+async fn read(mut requests: Streaming<pb::TrackRequest>, sender: mpsc::Sender<Came>, newest_wins: bool) {
+    let mut waiting: Option<Came> = None;
+    loop {
+        let may_read = waiting.is_none() || newest_wins;
+        tokio::select! {
+            biased;
+            () = sender.closed() => return,
+            permit = sender.reserve(), if waiting.is_some() => {
+                let (Ok(permit), Some(came)) = (permit, waiting.take()) else { return };
+                let ends = came.message.is_err();
+                permit.send(came);
+                if ends {
+                    return;
+                }
             }
-            Err(status) => Err(status),
-        };
-        let ends = message.is_err();
-        if sender.send((Instant::now(), message)).await.is_err() || ends {
-            return;
+            next = requests.next(), if may_read => {
+                let Some(next) = next else {
+                    if let Some(came) = waiting.take() {
+                        // An error means that nobody asks any more.
+                        let _ = sender.send(came).await;
+                    }
+                    return;
+                };
+                let mut came = Came { since: Instant::now(), message: message_of(next), overtaken: None };
+                if let Some(before) = waiting.take()
+                    && let Some(before) = overtake(before, &mut came)
+                    && sender.send(before).await.is_err()
+                {
+                    return;
+                }
+                waiting = Some(came);
+            }
         }
     }
+}
+
+fn message_of(next: Result<pb::TrackRequest, Status>) -> Result<Message, Status> {
+    match next? {
+        pb::TrackRequest { message: Some(message) } => Ok(message),
+        pb::TrackRequest { message: None } => {
+            Err(Error::invalid("message", "is required: a frame, set_initial_pose or reset").into())
+        }
+    }
+}
+
+/// Has a later frame take the place of one that waits; gives that one back when the other is none.
+fn overtake(before: Came, came: &mut Came) -> Option<Came> {
+    let (Ok(Message::Frame(old)), Ok(Message::Frame(new))) = (&before.message, &came.message) else {
+        return Some(before);
+    };
+    if new.timestamp_ns <= old.timestamp_ns || new.sequence <= old.sequence {
+        return Some(before);
+    }
+    let frames = before.overtaken.map_or(0, |overtaken| overtaken.frames).saturating_add(1);
+    came.overtaken = Some(Overtaken { timestamp_ns: old.timestamp_ns, sequence: old.sequence, frames });
+    None
 }

@@ -56,6 +56,8 @@ struct SealedLast {
     sequence: u64,
     #[prost(double, repeated, tag = "3")]
     odom: Vec<f64>,
+    #[prost(double, repeated, tag = "4")]
+    latent: Vec<f64>,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -88,8 +90,8 @@ struct SealedCandidate {
 
 impl SealedLast {
     fn opened(self) -> Result<Last, Error> {
-        let Self { time_ns, sequence, odom } = self;
-        Ok(Last { time_ns, sequence, odom: required(&odom)? })
+        let Self { time_ns, sequence, odom, latent } = self;
+        Ok(Last { time_ns, sequence, latent, odom: required(&odom)? })
     }
 }
 
@@ -155,10 +157,11 @@ impl From<&State> for SealedState {
         };
         Self {
             room: room.map(|room| room as u64),
-            last: last.as_ref().map(|Last { time_ns, sequence, odom }| SealedLast {
+            last: last.as_ref().map(|Last { time_ns, sequence, latent, odom }| SealedLast {
                 time_ns: *time_ns,
                 sequence: *sequence,
                 odom: belief_to_numbers(odom),
+                latent: latent.clone(),
             }),
             keyframe: keyframe.as_ref().map(|Keyframe { sequence, latent, odom, place, told }| SealedKeyframe {
                 sequence: *sequence,
@@ -186,7 +189,10 @@ impl From<&State> for SealedState {
 }
 
 impl SealedState {
-    /// The state; a genuine token of other rooms than these gives [`Error::Internal`], which its hash rules out.
+    /// The state.
+    ///
+    /// # Errors
+    /// [`Error::Internal`] when a number is missing: no token that was sealed lacks one.
     pub fn state(self) -> Result<State, Error> {
         let Self {
             room,
@@ -241,7 +247,7 @@ mod tests {
         );
         let state = State {
             room: Some(3),
-            last: Some(Last { time_ns: -5, sequence: u64::MAX, odom: belief }),
+            last: Some(Last { time_ns: -5, sequence: u64::MAX, latent: vec![-1.5; 20], odom: belief }),
             keyframe: Some(Keyframe {
                 sequence: 9,
                 latent: vec![1.0 / 3.0; 20],

@@ -8,9 +8,10 @@ use sha2::{Digest, Sha256};
 
 use super::super::Error;
 use super::super::convert;
-use super::super::relocalization::maps;
+use super::super::relocalization::{maps, rooms_to_track_in};
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use super::super::status::view_error;
+use super::Overtaken;
 use super::sealed::{Sealed, SealedState};
 use super::token::TokenKey;
 use super::wire;
@@ -36,7 +37,6 @@ pub struct Session {
     config: pb::TrackConfig,
     names: pb::FrameNames,
     state: State,
-    begins: Option<Belief>,
     key: TokenKey,
     digest: Vec<u8>,
 }
@@ -62,11 +62,29 @@ impl Session {
             other => other,
         })?;
         if session.digest != sealed.served {
-            let problem = "the adapter or the rooms have other revisions here than where the token is from; start anew";
+            let problem = "the adapter or the rooms are others here than where the token is from; start anew";
             return Err(Error::Precondition(format!("{field}: {problem}")));
         }
         session.state = state.state()?;
+        if !session.fits() {
+            return Err(Error::Precondition(format!("{field}: was sealed by a server of another version; start anew")));
+        }
         Ok(session)
+    }
+
+    /// Whether the state is one of these rooms and this adapter. The hash says so; a state that is not would be a panic.
+    fn fits(&self) -> bool {
+        let (adapter, rooms) = (&self.served[0].adapter.adapter, self.served.len());
+        let State { room, last, keyframe, recent, candidate, .. } = &self.state;
+        let latents = [
+            last.as_ref().map(|last| &last.latent),
+            keyframe.as_ref().map(|keyframe| &keyframe.latent),
+            candidate.as_ref().map(|candidate| &candidate.latent),
+        ];
+        let named = [*room, candidate.as_ref().map(|candidate| candidate.room)];
+        latents.into_iter().flatten().all(|latent| adapter.check_latent(latent).is_ok())
+            && recent.iter().all(|row| row.len() == adapter.coordinate_count())
+            && named.into_iter().flatten().all(|room| room < rooms)
     }
 
     fn configured(snapshot: &Arc<Snapshot>, config: pb::TrackConfig, key: &TokenKey) -> Result<Self, Error> {
@@ -79,12 +97,18 @@ impl Session {
         let begins = match config.initial_pose.clone() {
             None => None,
             Some(_) if config.room.is_empty() => return Err(Error::invalid("initial_pose", "needs the room it is in")),
-            Some(given) => Some(known_pose(given, &config.room).map_err(|error| error.within("initial_pose"))?),
+            Some(given) => Some(known_pose(given, &config.room, &names).map_err(|error| error.within("initial_pose"))?),
         };
+        if !settings.fuse && begins.is_none() {
+            return Err(Error::invalid(
+                "fusion",
+                "of nothing finds no place: give room and initial_pose, or let places correct",
+            ));
+        }
         let tracker = Tracker::new(maps, settings).map_err(|error| Error::Precondition(error.to_string()))?;
         let (state, digest) = (tracker.start(begins), digest(&served));
         let snapshot = snapshot.clone();
-        Ok(Self { snapshot, served, tracker, config, names, state, begins, key: key.clone(), digest })
+        Ok(Self { snapshot, served, tracker, config, names, state, key: key.clone(), digest })
     }
 
     /// Whether only the newest frame that waits is to be answered.
@@ -127,43 +151,54 @@ impl Session {
                 sequence,
                 reason: reason as i32,
                 message,
+                frames: 1,
             }),
             Err(Refused::Server(error)) => return Err(error),
         };
         Ok(self.answer(answer))
     }
 
-    /// A frame that a newer one overtook.
-    pub fn superseded(&self, frame: &pb::TrackFrame) -> pb::TrackResponse {
+    /// Frames that a newer one overtook: one answer for all of them.
+    pub fn superseded(&self, frames: Overtaken) -> pb::TrackResponse {
+        let Overtaken { timestamp_ns, sequence, frames } = frames;
         self.answer(pb::track_response::Answer::Refusal(pb::TrackRefusal {
-            timestamp_ns: frame.timestamp_ns,
-            sequence: frame.sequence,
+            timestamp_ns,
+            sequence,
             reason: pb::TrackRefusalReason::Superseded as i32,
             message: "a newer frame came before this one's turn".to_owned(),
+            frames,
         }))
     }
 
-    /// Puts the camera somewhere.
-    ///
-    /// # Errors
-    /// [`Error`], naming the field.
-    pub fn put(&mut self, given: pb::SetInitialPose) -> Result<pb::TrackResponse, Error> {
-        let field = "set_initial_pose.initial_pose";
-        let given = given.initial_pose.ok_or_else(|| Error::invalid(field, "is required"))?;
-        let Some(room) = self.state.room else {
-            return Err(Error::Precondition(format!(
-                "{field}: the room is not known yet; name it in the configuration"
-            )));
+    /// Puts the camera somewhere, or refuses to.
+    pub fn put(&mut self, given: pb::SetInitialPose) -> pb::TrackResponse {
+        let answer = match self.place_of(given) {
+            Ok(place) => {
+                self.tracker.put(&mut self.state, place);
+                pb::track_response::Answer::Acknowledged(pb::TrackAcknowledged {})
+            }
+            Err(error) => pb::track_response::Answer::Refusal(pb::TrackRefusal {
+                reason: pb::TrackRefusalReason::Pose as i32,
+                message: error.to_string(),
+                ..pb::TrackRefusal::default()
+            }),
         };
-        let name = self.served[room].navigator.room().id().to_string();
-        let place = known_pose(given, &name).map_err(|error| error.within(field))?;
-        self.tracker.put(&mut self.state, place);
-        Ok(self.answer(pb::track_response::Answer::Acknowledged(pb::TrackAcknowledged {})))
+        self.answer(answer)
     }
 
-    /// Forgets everything but the configuration.
+    fn place_of(&self, given: pb::SetInitialPose) -> Result<Belief, Error> {
+        let field = "set_initial_pose.initial_pose";
+        let given = given.initial_pose.ok_or_else(|| Error::invalid(field, "is required"))?;
+        let room = self.state.room.ok_or_else(|| {
+            Error::Precondition(format!("{field}: the room is not known yet; name it in the configuration"))
+        })?;
+        let name = self.served[room].navigator.room().id().to_string();
+        known_pose(given, &name, &self.names).map_err(|error| error.within(field))
+    }
+
+    /// Forgets everything but the configuration; where the camera began is not where it is.
     pub fn reset(&mut self) -> pb::TrackResponse {
-        self.state = self.tracker.start(self.begins);
+        self.state = self.tracker.start(None);
         self.answer(pb::track_response::Answer::Acknowledged(pb::TrackAcknowledged {}))
     }
 
@@ -221,8 +256,13 @@ enum Refused {
 /// The rooms of a configuration, under one adapter; at least one.
 fn rooms(snapshot: &Snapshot, config: &pb::TrackConfig) -> Result<Vec<Arc<ServedNavigator>>, Error> {
     match (config.room.as_str(), config.rooms.as_slice()) {
-        ("", rooms) => super::super::localization::rooms_under(snapshot, rooms, &config.adapter),
-        (room, []) => Ok(vec![snapshot.navigator(room, &config.adapter)?.clone()]),
+        ("", rooms) => rooms_to_track_in(snapshot, rooms, &config.adapter),
+        (room, []) => rooms_to_track_in(snapshot, &[room.to_owned()], &config.adapter).map_err(|error| match error {
+            Error::NotFound { ref field, .. } | Error::Invalid { ref field, .. } if field.starts_with("rooms") => {
+                error.named("room")
+            }
+            other => other,
+        }),
         _ => Err(Error::invalid("rooms", "are for a room that is not known; leave them or room empty")),
     }
 }
@@ -271,9 +311,15 @@ fn frame_names(given: pb::FrameNames) -> Result<pb::FrameNames, Error> {
     Ok(pb::FrameNames { map, odom, camera })
 }
 
-fn known_pose(given: pb::InitialPose, room: &str) -> Result<Belief, Error> {
+/// A pose in the room's world, which a stream also calls by its own name.
+fn known_pose(given: pb::InitialPose, room: &str, names: &pb::FrameNames) -> Result<Belief, Error> {
     let pb::InitialPose { pose, translation_deviation_m, rotation_deviation_rad } = given;
-    let pose = pose.ok_or_else(|| Error::invalid("pose", "is required"))?;
+    let mut pose = pose.ok_or_else(|| Error::invalid("pose", "is required"))?;
+    for (frame, name) in [(&mut pose.parent_frame, &names.map), (&mut pose.child_frame, &names.camera)] {
+        if frame == name {
+            frame.clear();
+        }
+    }
     let pose = convert::pose(pose, room).map_err(|error| error.within("pose"))?;
     let deviation = |field: &str, given: f64| match given {
         0.0 => Ok(KNOWN),
@@ -285,13 +331,13 @@ fn known_pose(given: pb::InitialPose, room: &str) -> Result<Belief, Error> {
     Ok(Belief::known(pose, translation, rotation))
 }
 
-/// What the answers depend on: the adapter and the rooms, with their revisions.
+/// What the answers depend on: the rooms under the adapter, by name, revision and content.
 fn digest(served: &[Arc<ServedNavigator>]) -> Vec<u8> {
     let mut digest = Sha256::new();
-    let adapter = &served[0].adapter;
-    digest.update(format!("{}@{}\n", adapter.name, adapter.revision));
     for served in served {
-        digest.update(format!("{}@{}\n", served.navigator.room().id(), served.room_revision));
+        let (room, adapter) = (served.navigator.room().id(), &served.adapter);
+        digest.update(format!("{room}@{} {}@{}\n", served.room_revision, adapter.name, adapter.revision));
+        digest.update(served.content);
     }
     digest.finalize().to_vec()
 }
