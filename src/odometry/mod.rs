@@ -18,7 +18,7 @@ pub use chain::{Chain, Look};
 pub use map::{Map, Sighting};
 pub use relocalize::{ROOM_RATIO, Relocalized, RoomMatch, relocalize};
 pub use state::{Candidate, Keyframe, Last, Observation, Refusal, State, Update};
-pub use tracker::{Settings, Tracker};
+pub use tracker::{AGREEING, Settings, Tracker};
 pub use view::{View, motion};
 
 use crate::room::RoomId;

@@ -116,6 +116,8 @@ pub struct Update {
     pub used: bool,
     /// Its squared Mahalanobis distance from the expected place, if one was expected.
     pub surprise: Option<f64>,
+    /// A place that recent anchors speak for and that is not believed yet.
+    pub candidate: Option<Candidate>,
 }
 
 /// Why a frame was not taken.

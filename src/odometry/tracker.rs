@@ -21,7 +21,7 @@ const ANCHOR_INFLATION: f64 = 2.0;
 /// Frames from one look for an anchor to the next: those in between err alike.
 const ANCHOR_EVERY: u32 = 3;
 /// Anchors in a row that must agree on a place before it is taken against what was believed, or without belief.
-pub(super) const AGREEING: u32 = 4;
+pub const AGREEING: u32 = 4;
 /// Latents that a jump is told from. How far a camera's own latents are from them grows with the frames in between about
 /// as their cube root: 14, 23 and 33 deviations of flicker after 1, 5 and 10 in the calibration rooms of the studio.
 const RECENT: usize = 5;
@@ -193,6 +193,7 @@ impl Tracker {
             best: (room, sighting.nearest[0]),
             used,
             surprise,
+            candidate: state.candidate.clone(),
         }
     }
 

@@ -110,7 +110,12 @@ async fn a_camera_in_a_mapped_room_is_followed() {
             assert!((covariance - covariance.transpose()).amax() < 1e-12 && covariance.cholesky().is_some(), "{row}");
         }
     }
+    let searching = update(&answers[1]);
+    let candidate = searching.candidate.as_ref().unwrap();
+    assert_eq!((candidate.sequence, candidate.agreed, candidate.needed), (1, 1, 4));
+    assert!(searching.map_from_camera.is_none(), "it is reported, not believed");
     let last = update(&answers[120]);
+    assert!(last.candidate.is_none());
     assert_eq!(last.status(), pb::TrackStatus::Tracking, "{}", last.reason);
     let of = |pose: &Option<pb::Pose>| {
         let plain = pb::Pose { parent_frame: String::new(), child_frame: String::new(), ..pose.clone().unwrap() };
@@ -264,6 +269,23 @@ async fn a_stream_is_configured_once_and_first() {
         assert!([Code::InvalidArgument, Code::NotFound].contains(&error.code()), "{error:?}");
         assert!(error.message().contains(word), "{error:?} does not say {word}");
     }
+}
+
+/// Oracle: the recorded poses: a camera that is put somewhere is there at its last frame, however old its keyframe is.
+#[tokio::test]
+async fn a_camera_is_put_where_it_is_not_where_its_keyframe_was() {
+    let server = server(KEY).await;
+    let config = pb::TrackConfig { initial_pose: initial_pose(0), fusion: pb::Fusion::None as i32, ..config() };
+    let put = pb::TrackRequest {
+        message: Some(Message::SetInitialPose(pb::SetInitialPose { initial_pose: initial_pose(8) })),
+    };
+    let requests = [begin(config)].into_iter().chain((0..9).map(seen)).chain([put, seen(9)]);
+    let found = answers(&server, requests.collect()).await.unwrap();
+    assert_eq!(update(&found[9]).keyframe_sequence, 1, "the keyframe is old");
+    let named = update(&found[11]).map_from_camera.clone().unwrap();
+    let plain = pb::Pose { parent_frame: String::new(), child_frame: String::new(), ..named };
+    let error = PoseError::between(&pose_from_wire(plain, "hall").unwrap(), &served("hall").0.poses()[9]);
+    assert!(error.translation_m < 0.05 && error.rotation_rad < 0.05, "{error:?}");
 }
 
 /// Oracle: the definitions of both verbs.

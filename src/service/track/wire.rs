@@ -6,7 +6,7 @@ use super::super::convert;
 use super::super::snapshot::ServedNavigator;
 use crate::geometry::Pose;
 use crate::navigation::Hit;
-use crate::odometry::{Status, Update};
+use crate::odometry::{AGREEING, Status, Update};
 use crate::proto::v1 as pb;
 
 /// An update without the frame's own numbers and its time.
@@ -40,6 +40,13 @@ pub fn update(update: &Update, names: &pb::FrameNames, served: &[Arc<ServedNavig
         match_used: update.used,
         match_surprise: update.surprise,
         elapsed_ns: 0,
+        candidate: update.candidate.as_ref().map(|candidate| pb::PlaceCandidate {
+            room: Some(convert::room_revision(&served[candidate.room])),
+            map_from_camera: Some(pose(&candidate.place.pose, &names.map, &names.camera)),
+            sequence: candidate.sequence,
+            agreed: candidate.agreed,
+            needed: AGREEING,
+        }),
     }
 }
 
