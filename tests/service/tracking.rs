@@ -288,6 +288,25 @@ async fn a_camera_is_put_where_it_is_not_where_its_keyframe_was() {
     assert!(error.translation_m < 0.05 && error.rotation_rad < 0.05, "{error:?}");
 }
 
+/// Oracle: the recorded rooms: a room that is not named is found, also when the stream is cut before that.
+#[tokio::test]
+async fn a_room_that_is_not_named_is_found() {
+    let server = server(KEY).await;
+    let nowhere = pb::TrackConfig::default();
+    let whole = [begin(nowhere.clone())].into_iter().chain((0..40).map(|row| seen_of("attic", row))).collect();
+    let found = answers(&server, whole).await.unwrap();
+    let last = update(&found[40]);
+    assert_eq!(last.status(), pb::TrackStatus::Tracking, "{}", last.reason);
+    assert_eq!(last.room.as_ref().unwrap().name, "attic");
+    let named =
+        pb::Pose { parent_frame: String::new(), child_frame: String::new(), ..last.map_from_camera.clone().unwrap() };
+    let error = PoseError::between(&pose_from_wire(named, "attic").unwrap(), &served("attic").0.poses()[39]);
+    assert!(error.translation_m < 0.2, "{error:?}");
+    let resume = pb::TrackConfig { resume_token: found[4].resume_token.clone(), ..nowhere };
+    let rest = [begin(resume)].into_iter().chain((4..40).map(|row| seen_of("attic", row))).collect();
+    assert_eq!(answers(&server, rest).await.unwrap()[1..], found[5..]);
+}
+
 /// Oracle: the definitions of both verbs.
 #[tokio::test]
 async fn a_camera_can_be_put_and_forgotten() {
