@@ -5,6 +5,13 @@ use ndarray::{Array2, ArrayView1, ArrayView2};
 
 use super::Error;
 
+/// χ² with six degrees of freedom: 68 % and 95 % are below.
+pub const ELLIPSOIDS: [f64; 2] = [7.012, 12.592];
+/// Rows to each side of a frame that are its neighbours in time, not in place.
+pub const BESIDE: u32 = 10;
+/// Frames before one that a jump is told from.
+pub const RECENT: usize = 5;
+
 /// Covariances of errors by one number that says how large they are to be expected.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ErrorTable {

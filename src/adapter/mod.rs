@@ -23,7 +23,7 @@ mod siamese;
 mod train;
 mod trained;
 
-pub use calibration::{Calibration, ErrorTable, Measured, Metric, MotionErrors, Stratum};
+pub use calibration::{BESIDE, Calibration, ELLIPSOIDS, ErrorTable, Measured, Metric, MotionErrors, RECENT, Stratum};
 pub use corrector::{Corrector, CorrectorKind, CorrectorSamples, train_corrector};
 pub use inverse::{Inverse, Reading};
 pub use layers::Dense;

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::Error;
-use crate::adapter::Adapter;
+use crate::adapter::{Adapter, ELLIPSOIDS};
 use crate::geometry::{Pose, body_twist, log};
 use crate::navigation::{IndexKind, Navigator};
 use crate::odometry::{Belief, Map, Observation, Settings, State, Status, Tracker, Update};
@@ -11,8 +11,6 @@ use crate::room::FrameId;
 use crate::training::{Lesson, imbalance};
 use crate::trajectory::Trajectory;
 
-/// χ² with six degrees of freedom: 68 % and 95 % are below.
-pub const ELLIPSOIDS: [f64; 2] = [7.012, 12.592];
 /// Parts of a recording's way, of which every fifth is held out of a map.
 const PARTS: usize = 20;
 /// Factors of places that are tried: from the least on, each a tenth above the one before.

@@ -5,14 +5,12 @@ use std::sync::Arc;
 use ndarray::{ArrayView1, Axis, s};
 
 use super::{Belief, Error, own_errors};
-use crate::adapter::{Calibration, MotionErrors};
+use crate::adapter::{BESIDE, Calibration, MotionErrors};
 use crate::geometry::exp;
 use crate::index::{ExactIndex, Exclusion, Index, Neighbour};
 use crate::navigation::Navigator;
 use crate::room::FrameId;
 
-/// Rows to each side of a frame that are its neighbours in time, not in place.
-const BESIDE: u32 = 10;
 /// Frames whose nearest others say how near a room's frames are to one another.
 const SAMPLED: usize = 1_000;
 

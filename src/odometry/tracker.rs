@@ -11,7 +11,7 @@ use ndarray::{ArrayView1, Axis, s};
 use super::chain::{Chain, Look};
 use super::state::{Candidate, Keyframe, Last, Observation, Refusal, State, Update};
 use super::{Belief, Error, Map, ROOM_RATIO, Sighting};
-use crate::adapter::{Adapter, Calibration};
+use crate::adapter::{Adapter, Calibration, RECENT};
 use crate::geometry::{Twist, body_twist};
 
 /// χ² with six degrees of freedom: 99 % of right matches are below it.
@@ -22,9 +22,6 @@ const ANCHOR_INFLATION: f64 = 2.0;
 const ANCHOR_EVERY: u32 = 3;
 /// Anchors in a row that must agree on a place before it is taken against what was believed, or without belief.
 pub const AGREEING: u32 = 4;
-/// Latents that a jump is told from. How far a camera's own latents are from them grows with the frames in between about
-/// as their cube root: 14, 23 and 33 deviations of flicker after 1, 5 and 10 in the calibration rooms of the studio.
-const RECENT: usize = 5;
 /// How surely a stream's own origin is known, metres and radians: it is where it is by definition.
 const ORIGIN: f64 = 1e-6;
 
@@ -221,6 +218,7 @@ impl Tracker {
         if frames > RECENT as u64 {
             state.recent.clear();
         }
+        // How far a camera's own latents lie apart grows with the frames in between, slowly: about as their cube root.
         let limit = self.calibration.measured().jump * (frames as f64).cbrt();
         let jumped = !state.recent.is_empty() && nearest > limit;
         if jumped {

@@ -8,7 +8,8 @@ use ndarray::{Array2, ArrayView2, Axis, s};
 
 use super::{Error, Lesson, check_lessons, check_unseen};
 use crate::adapter::{
-    self, Adapter, Calibration, ErrorTable, Measured, Metric, MotionErrors, PairPlan, Stratum, TrainingRecord,
+    self, Adapter, BESIDE, Calibration, ELLIPSOIDS, ErrorTable, Measured, Metric, MotionErrors, PairPlan, RECENT,
+    Stratum, TrainingRecord,
 };
 use crate::geometry::{Pose, body_twist, exp};
 use crate::index::{ExactIndex, Exclusion, Index};
@@ -16,9 +17,7 @@ use crate::pairs::{Pair, Split};
 use crate::room::FrameId;
 use crate::scores::median;
 
-/// χ² with six degrees of freedom: 68 % and 95 % are below.
-const ELLIPSOIDS: [f64; 2] = [7.012, 12.592];
-/// The shares wanted within them, and how far off counts as one.
+/// The shares wanted within [`ELLIPSOIDS`], and how far off counts as one.
 const WANTED: [(f64, f64); 2] = [(0.68, 0.08), (0.945, 0.035)];
 /// Degrees of freedom of the t that shapes are fitted by.
 const TAILS: f64 = 4.0;
@@ -26,8 +25,6 @@ const TAILS: f64 = 4.0;
 const FLOOR: f64 = 0.05;
 /// Frames to each side of a query that are left out of the map, one round each: matches of every distance.
 const LEFT_OUT: [u32; 10] = [0, 1, 2, 4, 6, 8, 10, 15, 20, 30];
-/// Rows to each side of a frame that are its neighbours in time, not in place.
-const BESIDE: u32 = 10;
 /// Strata of anchors.
 const STRATA: usize = 8;
 /// Factors that are tried: from a hundredth on, each one and a half percent above the one before, to a hundred.
@@ -42,8 +39,6 @@ const PARTS: usize = 20;
 const OWN_AND_OTHERS: [f64; 2] = [0.97, 0.02];
 /// The share of other rooms' frames below the sure limit.
 const OTHERS_SURE: f64 = 0.0003;
-/// Frames before one that a jump is told from, as the tracker has them.
-const RECENT: usize = 5;
 
 /// A room through the adapter.
 struct Seen<'a> {
