@@ -1,7 +1,8 @@
 //! What it costs to make a feature: decode, resize, draw, run, and all of it together.
 //!
-//! With the folder of large inputs (`SEESE3_SHARED`, else `../shared`) and `--features full`; onnxruntime where
-//! ORT_DYLIB_PATH names its library. The peer of a whole room is the runtime alone on images that are ready.
+//! With the folder of large inputs (`SEESE3_SHARED`, else `../shared`) and `--features full`;
+//! onnxruntime where ORT_DYLIB_PATH names its library. The peer of a whole room is the runtime
+//! alone on images that are ready.
 
 use std::hint::black_box;
 use std::path::{Path, PathBuf};
@@ -10,7 +11,8 @@ use std::time::Duration;
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use seese3::cancel::Cancellation;
 use seese3::encoder::{
-    Encoder, Layer, ModelTask, OnBadImage, Runtime, RuntimeKind, Task, encode_room, read_image, recipe,
+    Encoder, Layer, ModelTask, OnBadImage, Runtime, RuntimeKind, Task, encode_room, read_image,
+    recipe,
 };
 use seese3::image::RgbImage;
 use seese3::room::Timeline;
@@ -31,17 +33,32 @@ fn threads() -> usize {
 
 fn encoder(shared: &Path, kind: RuntimeKind) -> Option<Encoder> {
     let library = std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from);
-    let runtime = Runtime { kind, threads: threads(), library };
+    let runtime = Runtime {
+        kind,
+        threads: threads(),
+        library,
+    };
+
     let recipe = recipe("effnetlite0").unwrap();
+
     let layer = Layer {
         name: "block14".to_owned(),
         base: "0".to_owned(),
         norm: "none".to_owned(),
         pooling: "mean".parse().unwrap(),
     };
+
     let file = shared.join("models/effnetlite0.onnx");
-    let task = ModelTask { file, preparation: recipe.preparation.clone(), layers: vec![layer], window: 1 };
-    Encoder::model(task, &runtime).inspect_err(|error| eprintln!("SKIPPED {}: {error}", kind.name())).ok()
+    let task = ModelTask {
+        file,
+        preparation: recipe.preparation.clone(),
+        layers: vec![layer],
+        window: 1,
+    };
+
+    Encoder::model(task, &runtime)
+        .inspect_err(|error| eprintln!("SKIPPED {}: {error}", kind.name()))
+        .ok()
 }
 
 fn parts(criterion: &mut Criterion) {
@@ -51,13 +68,22 @@ fn parts(criterion: &mut Criterion) {
     group.bench_function("draw 320x240", |b| {
         b.iter(|| render(&suite.scene, Camera::sized(320, 240), black_box(&pose)));
     });
-    let Some(shared) = shared() else { return eprintln!("SKIPPED photographs: no folder SEESE3_SHARED or ../shared") };
+
+    let Some(shared) = shared() else {
+        return eprintln!("SKIPPED photographs: no folder SEESE3_SHARED or ../shared");
+    };
     let kitchen = shared.join("rooms/kitchen");
+
     let name = "seq-01/frame-000000.color.jpg";
-    group.bench_function("read and decode a JPEG of 640x480", |b| b.iter(|| read_image(&kitchen, name).unwrap()));
+    group.bench_function("read and decode a JPEG of 640x480", |b| {
+        b.iter(|| read_image(&kitchen, name).unwrap())
+    });
+
     let image = read_image(&kitchen, name).unwrap();
     let preparation = recipe("effnetlite0").unwrap().preparation.clone();
-    group.bench_function("resize it to 320x240", |b| b.iter(|| preparation.pixels(image.clone()).unwrap()));
+    group.bench_function("resize it to 320x240", |b| {
+        b.iter(|| preparation.pixels(image.clone()).unwrap())
+    });
 }
 
 fn rooms(criterion: &mut Criterion) {
@@ -65,24 +91,53 @@ fn rooms(criterion: &mut Criterion) {
     let kitchen = shared.join("rooms/kitchen");
     let read = |row: usize| read_image(&kitchen, &format!("seq-01/frame-{row:06}.color.jpg"));
     let timeline = Timeline::unbroken(FRAMES);
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads()).build().unwrap();
+
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads())
+        .build()
+        .unwrap();
+
     for kind in [RuntimeKind::OnnxRuntime, RuntimeKind::Tract] {
-        let Some(encoder) = encoder(&shared, kind) else { continue };
-        let images: Vec<RgbImage> = (0..FRAMES).map(|row| encoder.prepare(read(row).unwrap()).unwrap()).collect();
+        let Some(encoder) = encoder(&shared, kind) else {
+            continue;
+        };
+        let images: Vec<RgbImage> = (0..FRAMES)
+            .map(|row| encoder.prepare(read(row).unwrap()).unwrap())
+            .collect();
         let clips: Vec<Vec<&RgbImage>> = images.iter().map(|image| vec![image]).collect();
-        let mut group = criterion.benchmark_group("64 photographs, EfficientNet-lite0, all threads");
-        group.sample_size(10).measurement_time(Duration::from_secs(12)).throughput(Throughput::Elements(FRAMES as u64));
+
+        let mut group =
+            criterion.benchmark_group("64 photographs, EfficientNet-lite0, all threads");
+        group
+            .sample_size(10)
+            .measurement_time(Duration::from_secs(12))
+            .throughput(Throughput::Elements(FRAMES as u64));
+
         group.bench_function(BenchmarkId::new("runtime alone", kind.name()), |b| {
             b.iter(|| {
-                pool.install(|| clips.chunks(BATCH).for_each(|clips| drop(black_box(encoder.encode(clips).unwrap()))));
+                pool.install(|| {
+                    clips
+                        .chunks(BATCH)
+                        .for_each(|clips| drop(black_box(encoder.encode(clips).unwrap())))
+                });
             });
         });
-        group.bench_function(BenchmarkId::new("from files to features", kind.name()), |b| {
-            let cancel = Cancellation::default();
-            let task =
-                Task { timeline: &timeline, image: &read, batch: BATCH, on_bad: OnBadImage::Stop, cancel: &cancel };
-            b.iter(|| pool.install(|| encode_room(&task, &encoder, None, &|_| ()).unwrap()));
-        });
+
+        group.bench_function(
+            BenchmarkId::new("from files to features", kind.name()),
+            |b| {
+                let cancel = Cancellation::default();
+                let task = Task {
+                    timeline: &timeline,
+                    image: &read,
+                    batch: BATCH,
+                    on_bad: OnBadImage::Stop,
+                    cancel: &cancel,
+                };
+
+                b.iter(|| pool.install(|| encode_room(&task, &encoder, None, &|_| ()).unwrap()));
+            },
+        );
     }
 }
 

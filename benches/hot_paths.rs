@@ -1,6 +1,8 @@
-//! Baselines of the hot paths: one answer by room size, the indexes' scans, a training epoch, one RPC.
+//! Baselines of the hot paths: one answer by room size, the indexes' scans, a training epoch, one
+//! RPC.
 //!
-//! No targets: each group has a simpler peer beside it, so that what is read is a ratio of the same run.
+//! No targets: each group has a simpler peer beside it, so that what is read is a ratio of the same
+//! run.
 
 use std::hint::black_box;
 use std::sync::Arc;
@@ -16,7 +18,8 @@ use seese3::features::{FeatureSource, Features};
 use seese3::geometry::{Twist, exp};
 use seese3::index::{ExactIndex, HnswIndex, HnswParameters, Index};
 use seese3::navigation::{
-    Displacement, FitOn, IndexKind, Limits, Metric, Mode, Navigator, Query, Reading, Source, SourceAt, StepKind,
+    Displacement, FitOn, IndexKind, Limits, Metric, Mode, Navigator, Query, Reading, Source,
+    SourceAt, StepKind,
 };
 use seese3::proto::v1 as pb;
 use seese3::room::{FrameId, Frames, Provenance, Room, RoomId};
@@ -32,50 +35,96 @@ fn random(rows: usize, columns: usize, seed: u64) -> Array2<f64> {
 fn trajectory(rows: usize) -> Array2<f64> {
     Array2::from_shape_fn((rows, 20), |(row, column)| {
         let t = row as f64 / 50.0;
-        (0..6).map(|axis| ((t / (axis + 2) as f64) * (1.0 + column as f64 / 7.0) + axis as f64).sin()).sum()
+        (0..6)
+            .map(|axis| ((t / (axis + 2) as f64) * (1.0 + column as f64 / 7.0) + axis as f64).sin())
+            .sum()
     })
 }
 
 fn room(frame_count: usize) -> (Arc<Room>, Features) {
-    let step = exp(&Twist { linear: [0.01, 0.0, 0.02].into(), angular: [0.0, 0.01, 0.0].into() });
-    let poses = std::iter::successors(Some(nalgebra::Isometry3::identity()), |pose| Some(pose * step));
-    let frames = Frames { poses: poses.take(frame_count).collect(), ..Frames::default() };
+    let step = exp(&Twist {
+        linear: [0.01, 0.0, 0.02].into(),
+        angular: [0.0, 0.01, 0.0].into(),
+    });
+    let poses = std::iter::successors(Some(nalgebra::Isometry3::identity()), |pose| {
+        Some(pose * step)
+    });
+
+    let frames = Frames {
+        poses: poses.take(frame_count).collect(),
+        ..Frames::default()
+    };
     let room = Room::new(RoomId::new("bench").unwrap(), frames, Provenance::default()).unwrap();
+
     let rows = random(frame_count, DIM, 1).mapv(|x| x as f32);
-    (Arc::new(room), Features::new(FeatureSource::imported("bench", DIM), rows).unwrap())
+    (
+        Arc::new(room),
+        Features::new(FeatureSource::imported("bench", DIM), rows).unwrap(),
+    )
 }
 
 fn twists(count: usize) -> Vec<Twist> {
     let numbers = random(count, 6, 2);
-    let row = |row: ndarray::ArrayView1<'_, f64>| Twist::from_vector(&nalgebra::Vector6::from_fn(|i, _| row[i]));
+    let row = |row: ndarray::ArrayView1<'_, f64>| {
+        Twist::from_vector(&nalgebra::Vector6::from_fn(|i, _| row[i]))
+    };
+
     numbers.outer_iter().map(row).collect()
 }
 
 fn adapter() -> Arc<Adapter> {
-    let widths = Widths { feature: DIM, hidden: 64, latent: 20 };
+    let widths = Widths {
+        feature: DIM,
+        hidden: 64,
+        latent: 20,
+    };
+
     let (room, features) = room(200);
-    let samples =
-        Samples::<f32>::new(features.rows(), room.poses().to_vec(), (0..100).map(|i| [i, i + 40]).collect()).unwrap();
+    let samples = Samples::<f32>::new(
+        features.rows(),
+        room.poses().to_vec(),
+        (0..100).map(|i| [i, i + 40]).collect(),
+    )
+    .unwrap();
+
     let scale = samples.scale().clone();
-    Arc::new(Adapter::new(FeatureSource::imported("bench", DIM), Siamese::initial(widths, 0), scale).unwrap())
+    Arc::new(
+        Adapter::new(
+            FeatureSource::imported("bench", DIM),
+            Siamese::initial(widths, 0),
+            scale,
+        )
+        .unwrap(),
+    )
 }
 
 fn query(steps: u32) -> Query {
-    let twist = Twist { linear: [0.1, 0.0, 0.3].into(), angular: [0.0, 0.2, 0.0].into() };
+    let twist = Twist {
+        linear: [0.1, 0.0, 0.3].into(),
+        angular: [0.0, 0.2, 0.0].into(),
+    };
+
     Query {
-        source: SourceAt { source: Source::Frame(FrameId(7)), pose: None },
+        source: SourceAt {
+            source: Source::Frame(FrameId(7)),
+            pose: None,
+        },
         displacement: Displacement::Twists(vec![twist]),
         steps,
         mode: Mode::OpenLoop,
         step: StepKind::InversePoincare(Reading::Homogeneous),
         metric: Metric::Full,
-        fit_on: FitOn { split: seese3::pairs::Split::Time, stride: 40 },
+        fit_on: FitOn {
+            split: seese3::pairs::Split::Time,
+            stride: 40,
+        },
         hit_count: 10,
         exclude_source: None,
     }
 }
 
-/// One answer of four steps; the peer is the same with a source feature, which has to be embedded first.
+/// One answer of four steps; the peer is the same with a source feature, which has to be embedded
+/// first.
 fn one_answer(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("answer");
     for frame_count in [200, 1_000, 5_000] {
@@ -83,13 +132,30 @@ fn one_answer(criterion: &mut Criterion) {
         let navigator = Navigator::new(room, &features, adapter(), IndexKind::Exact).unwrap();
         let by_frame = query(4);
         let feature = Source::Feature(features.rows().row(7).to_vec());
-        let by_feature = Query { source: SourceAt { source: feature, pose: None }, ..query(4) };
+
+        let by_feature = Query {
+            source: SourceAt {
+                source: feature,
+                pose: None,
+            },
+            ..query(4)
+        };
+
         for (name, query) in [("frame", by_frame), ("feature", by_feature)] {
-            group.bench_with_input(BenchmarkId::new(name, frame_count), &query, |bencher, query| {
-                bencher.iter(|| navigator.answer(query, Limits::default(), &Cancellation::default()).unwrap());
-            });
+            group.bench_with_input(
+                BenchmarkId::new(name, frame_count),
+                &query,
+                |bencher, query| {
+                    bencher.iter(|| {
+                        navigator
+                            .answer(query, Limits::default(), &Cancellation::default())
+                            .unwrap()
+                    });
+                },
+            );
         }
     }
+
     group.finish();
 }
 
@@ -101,8 +167,10 @@ fn scan(criterion: &mut Criterion) {
         let frames: Vec<FrameId> = (0..frame_count as u32).map(FrameId).collect();
         let queries = random(64, 20, 3);
         let exact = ExactIndex::new(latents.view(), &frames);
+
         let hnsw = HnswIndex::new(latents.view(), &frames, HnswParameters::default());
         group.throughput(Throughput::Elements(frame_count as u64));
+
         for (name, index) in [("exact", &exact as &dyn Index), ("hnsw_rs", &hnsw)] {
             group.bench_function(BenchmarkId::new(name, frame_count), |bencher| {
                 let mut next = queries.outer_iter().cycle();
@@ -110,31 +178,60 @@ fn scan(criterion: &mut Criterion) {
             });
         }
     }
+
     group.finish();
 }
 
-/// An epoch of 30,000 pairs of 1,000 frames at 768 columns; the peer is its first layer's products alone, which no
-/// implementation can do without: one forward and one backward product for each distinct frame of each batch.
+/// An epoch of 30,000 pairs of 1,000 frames at 768 columns; the peer is its first layer's products
+/// alone, which no implementation can do without: one forward and one backward product for each
+/// distinct frame of each batch.
 fn epoch(criterion: &mut Criterion) {
     const PAIRS: usize = 30_000;
+
     let (room, features) = room(1_000);
     let mut random_rows = rand_chacha::ChaCha8Rng::seed_from_u64(4);
+
     let pairs: Vec<[usize; 2]> = (0..PAIRS)
         .map(|_| {
             let source = random_rows.random_range(0..960usize);
             [source, source + random_rows.random_range(10..=40usize)]
         })
         .collect();
-    let samples = Samples::<f32>::new(features.rows(), room.poses().to_vec(), pairs.clone()).unwrap();
-    let widths = Widths { feature: DIM, hidden: 64, latent: 20 };
-    let batches: Vec<Vec<usize>> = (0..PAIRS).collect::<Vec<_>>().chunks(512).map(<[usize]>::to_vec).collect();
+    let samples =
+        Samples::<f32>::new(features.rows(), room.poses().to_vec(), pairs.clone()).unwrap();
+
+    let widths = Widths {
+        feature: DIM,
+        hidden: 64,
+        latent: 20,
+    };
+
+    let batches: Vec<Vec<usize>> = (0..PAIRS)
+        .collect::<Vec<_>>()
+        .chunks(512)
+        .map(<[usize]>::to_vec)
+        .collect();
+
     let mut group = criterion.benchmark_group("epoch");
     group.sample_size(10);
+
     group.bench_function("train", |bencher| {
-        let mut trainer = Trainer::new(&samples, Mixture::initial(widths, 1, 0), TrainConfig::default());
-        bencher.iter(|| batches.iter().map(|batch| trainer.step(batch).loss).sum::<f64>());
+        let mut trainer = Trainer::new(
+            &samples,
+            Mixture::initial(widths, 1, 0),
+            TrainConfig::default(),
+        );
+
+        bencher.iter(|| {
+            batches
+                .iter()
+                .map(|batch| trainer.step(batch).loss)
+                .sum::<f64>()
+        });
     });
+
     let weight = random(64, DIM, 5).mapv(|x| x as f32);
+
     let gathered: Vec<Array2<f32>> = batches
         .iter()
         .map(|batch| {
@@ -144,6 +241,7 @@ fn epoch(criterion: &mut Criterion) {
             features.rows().select(ndarray::Axis(0), &rows)
         })
         .collect();
+
     group.bench_function("first-layer-products", |bencher| {
         bencher.iter(|| {
             for batch in &gathered {
@@ -152,6 +250,7 @@ fn epoch(criterion: &mut Criterion) {
             }
         });
     });
+
     group.finish();
 }
 
@@ -160,29 +259,47 @@ fn rpc(criterion: &mut Criterion) {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let folder = tempfile::tempdir().unwrap();
     let client = runtime.block_on(serve(folder.path().to_str().unwrap()));
+
     let request = pb::NavigateRequest {
         room: "bench".to_owned(),
-        source: Some(pb::View { view: Some(pb::view::View::FrameId(7)) }),
-        displacement: Some(pb::Displacement { displacement: Some(pb::displacement::Displacement::TargetFrameId(47)) }),
+        source: Some(pb::View {
+            view: Some(pb::view::View::FrameId(7)),
+        }),
+        displacement: Some(pb::Displacement {
+            displacement: Some(pb::displacement::Displacement::TargetFrameId(47)),
+        }),
         steps: Some(4),
         ..pb::NavigateRequest::default()
     };
+
     let mut group = criterion.benchmark_group("rpc");
     group.bench_function("navigate", |bencher| {
-        bencher.iter(|| runtime.block_on(client.0.navigate(request.clone())).unwrap());
+        bencher.iter(|| {
+            runtime
+                .block_on(client.0.navigate(request.clone()))
+                .unwrap()
+        });
     });
+
     group.bench_function("health-check", |bencher| {
         let mut health = tonic_health::pb::health_client::HealthClient::new(client.1.clone());
-        let request = tonic_health::pb::HealthCheckRequest { service: String::new() };
+        let request = tonic_health::pb::HealthCheckRequest {
+            service: String::new(),
+        };
         bencher.iter(|| runtime.block_on(health.check(request.clone())).unwrap());
     });
+
     group.finish();
 }
 
 async fn serve(folder: &str) -> (Client, tonic::transport::Channel) {
     let store = seese3::store::Store::create(folder).unwrap();
     let (room, features) = room(1_000);
-    store.publish_room(&room, std::slice::from_ref(&features)).await.unwrap();
+    store
+        .publish_room(&room, std::slice::from_ref(&features))
+        .await
+        .unwrap();
+
     let record = seese3::adapter::TrainingRecord {
         preset: "bench".to_owned(),
         split: seese3::pairs::Split::Time,
@@ -197,14 +314,29 @@ async fn serve(folder: &str) -> (Client, tonic::transport::Channel) {
         train: seese3::scores::MotionScores::of(&twists(9), &twists(9)),
         train_mean_r2: 0.0,
     };
-    store.publish_adapter("bench", &adapter(), &record, features.rows()).await.unwrap();
+
+    store
+        .publish_adapter("bench", &adapter(), &record, features.rows())
+        .await
+        .unwrap();
+
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();
-    tokio::spawn(seese3::service::run(listener, store, seese3::service::Config::default(), std::future::pending()));
-    let client = Client::connect(&address, Duration::from_secs(10)).await.unwrap();
+
+    tokio::spawn(seese3::service::run(
+        listener,
+        store,
+        seese3::service::Config::default(),
+        std::future::pending(),
+    ));
+
+    let client = Client::connect(&address, Duration::from_secs(10))
+        .await
+        .unwrap();
     while client.rooms().await.is_err() {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
+
     let endpoint = tonic::transport::Endpoint::from_shared(format!("http://{address}")).unwrap();
     (client, endpoint.connect().await.unwrap())
 }

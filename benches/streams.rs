@@ -1,8 +1,8 @@
-//! How many cameras one machine follows: streams of 768-column features at a camera's rate over loopback, beside a server
-//! that answers the same messages without looking at them.
+//! How many cameras one machine follows: streams of 768-column features at a camera's rate over
+//! loopback, beside a server that answers the same messages without looking at them.
 //!
-//! `cargo bench --bench streams -- [STREAMS] [HZ] [SECONDS]`; 1,000 at 10 Hz for 20 s if nothing is said. Clients and server
-//! share the machine.
+//! `cargo bench --bench streams -- [STREAMS] [HZ] [SECONDS]`; 1,000 at 10 Hz for 20 s if nothing is
+//! said. Clients and server share the machine.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -36,30 +36,56 @@ fn room(name: &str, seed: u64) -> (Room, Features) {
     let mut pose = Pose::identity();
     let phases: Vec<f64> = (0..6).map(|_| random.random_range(0.0..6.0)).collect();
     let wave = |t: f64, axis: usize| 0.02 * (t / (9.0 + 3.0 * axis as f64) + phases[axis]).sin();
+
     let poses: Vec<Pose> = (0..FRAMES)
         .map(|t| {
-            let twist = |from: usize| nalgebra::Vector3::from_fn(|axis, _| wave(t as f64, from + axis));
-            pose *= exp(&Twist { linear: twist(0), angular: twist(3) });
+            let twist =
+                |from: usize| nalgebra::Vector3::from_fn(|axis, _| wave(t as f64, from + axis));
+            pose *= exp(&Twist {
+                linear: twist(0),
+                angular: twist(3),
+            });
+
             pose
         })
         .collect();
+
     let weights = Array2::from_shape_simple_fn((COLUMNS, 13), || random.random_range(-1.0..1.0));
     let features = Array2::from_shape_fn((FRAMES, COLUMNS), |(row, column)| {
         let numbers = poses[row].to_homogeneous();
-        let sum: f64 = (0..12).map(|i| weights[(column, i)] * numbers[(i / 4, i % 4)]).sum();
+        let sum: f64 = (0..12)
+            .map(|i| weights[(column, i)] * numbers[(i / 4, i % 4)])
+            .sum();
+
         ((sum + weights[(column, 12)]).sin() + 0.01 * random.random_range(-1.0..1.0)) as f32
     });
-    let frames = Frames { poses, ..Frames::default() };
+
+    let frames = Frames {
+        poses,
+        ..Frames::default()
+    };
     let room = Room::new(RoomId::new(name).unwrap(), frames, Provenance::default()).unwrap();
-    (room, Features::new(FeatureSource::imported("bench", COLUMNS), features).unwrap())
+
+    (
+        room,
+        Features::new(FeatureSource::imported("bench", COLUMNS), features).unwrap(),
+    )
 }
 
 fn adapter(rooms: &[(Room, Features)]) -> (Adapter, seese3::adapter::TrainingRecord) {
-    let lessons: Vec<Lesson<'_>> =
-        rooms.iter().map(|(room, features)| Lesson { room, revision: 1, features }).collect();
+    let lessons: Vec<Lesson<'_>> = rooms
+        .iter()
+        .map(|(room, features)| Lesson {
+            room,
+            revision: 1,
+            features,
+        })
+        .collect();
+
     let recipe = Recipe::of(Preset::PaperBase, Split::Whole, 20, 0);
     let (adapter, record) = learn(&lessons[..1], &recipe, &mut |_| ()).unwrap();
     let calibration = calibrate(&adapter, &record, &lessons[1..]).unwrap();
+
     (adapter.with_calibration(calibration).unwrap(), record)
 }
 
@@ -68,7 +94,8 @@ struct Echo;
 
 #[tonic::async_trait]
 impl OdometryService for Echo {
-    type TrackStream = std::pin::Pin<Box<dyn Stream<Item = Result<pb::TrackResponse, tonic::Status>> + Send>>;
+    type TrackStream =
+        std::pin::Pin<Box<dyn Stream<Item = Result<pb::TrackResponse, tonic::Status>> + Send>>;
 
     async fn estimate_motion(
         &self,
@@ -86,9 +113,17 @@ impl OdometryService for Echo {
                 Some(Message::Frame(frame)) => frame.sequence,
                 _ => 0,
             };
-            let update = pb::TrackUpdate { sequence, ..pb::TrackUpdate::default() };
-            Ok(pb::TrackResponse { answer: Some(Answer::Update(update)), resume_token: vec![0; 3_000] })
+            let update = pb::TrackUpdate {
+                sequence,
+                ..pb::TrackUpdate::default()
+            };
+
+            Ok(pb::TrackResponse {
+                answer: Some(Answer::Update(update)),
+                resume_token: vec![0; 3_000],
+            })
         });
+
         Ok(tonic::Response::new(Box::pin(answers)))
     }
 }
@@ -103,7 +138,9 @@ struct Held {
 
 impl Held {
     fn line(&self, what: &str) -> String {
-        let at = |share: f64| self.latencies_ms[((self.latencies_ms.len() - 1) as f64 * share) as usize];
+        let at =
+            |share: f64| self.latencies_ms[((self.latencies_ms.len() - 1) as f64 * share) as usize];
+
         format!(
             "{what}: {:.0} answers a second of {:.0} asked; p50 {:.2} ms, p95 {:.2} ms, p99 {:.2} ms, largest {:.1} ms",
             self.answered as f64 / self.seconds,
@@ -117,36 +154,79 @@ impl Held {
 }
 
 /// Follows `streams` cameras at `hz` for `seconds`; a frame's time runs from when it is due.
-async fn load(address: &str, features: &Arc<Features>, streams: usize, hz: f64, seconds: f64) -> Held {
+async fn load(
+    address: &str,
+    features: &Arc<Features>,
+    streams: usize,
+    hz: f64,
+    seconds: f64,
+) -> Held {
     let period = Duration::from_secs_f64(1.0 / hz);
     let count = (hz * seconds) as usize;
     let mut clients = Vec::new();
     for _ in 0..streams.div_ceil(SHARED) {
-        clients.push(Client::connect(address, Duration::from_secs(60)).await.unwrap());
+        clients.push(
+            Client::connect(address, Duration::from_secs(60))
+                .await
+                .unwrap(),
+        );
     }
+
     let begin = Instant::now() + Duration::from_secs(2);
     let mut tasks = Vec::new();
     for stream in 0..streams {
-        let (client, features) = (clients[stream / SHARED].clone(), features.clone());
+        let client = clients[stream / SHARED].clone();
+        let features = features.clone();
+
         // Cameras are not in step.
         let first = begin + period.mul_f64(stream as f64 / streams as f64);
         tasks.push(tokio::spawn(async move {
             let (sender, requests) = tokio::sync::mpsc::channel(4);
-            let config = pb::TrackConfig { room: "map".to_owned(), ..pb::TrackConfig::default() };
-            sender.send(pb::TrackRequest { message: Some(Message::Config(config)) }).await.unwrap();
+
+            let config = pb::TrackConfig {
+                room: "map".to_owned(),
+                ..pb::TrackConfig::default()
+            };
+
+            sender
+                .send(pb::TrackRequest {
+                    message: Some(Message::Config(config)),
+                })
+                .await
+                .unwrap();
+
             tokio::spawn(async move {
                 for number in 0..count {
                     tokio::time::sleep_until((first + period * number as u32).into()).await;
                     let row = (stream * 7 + number) % FRAMES;
-                    let feature = pb::Feature { values: features.rows().row(row).to_vec(), source_name: String::new() };
-                    let view = Some(pb::View { view: Some(pb::view::View::Feature(feature)) });
-                    let (timestamp_ns, sequence) = ((number as i64 + 1) * 100_000_000, number as u64 + 1);
-                    let frame = pb::TrackFrame { timestamp_ns, sequence, view };
-                    if sender.send(pb::TrackRequest { message: Some(Message::Frame(frame)) }).await.is_err() {
+                    let feature = pb::Feature {
+                        values: features.rows().row(row).to_vec(),
+                        source_name: String::new(),
+                    };
+                    let view = Some(pb::View {
+                        view: Some(pb::view::View::Feature(feature)),
+                    });
+
+                    let timestamp_ns = (number as i64 + 1) * 100_000_000;
+                    let sequence = number as u64 + 1;
+                    let frame = pb::TrackFrame {
+                        timestamp_ns,
+                        sequence,
+                        view,
+                    };
+
+                    if sender
+                        .send(pb::TrackRequest {
+                            message: Some(Message::Frame(frame)),
+                        })
+                        .await
+                        .is_err()
+                    {
                         return;
                     }
                 }
             });
+
             let mut answers = client.track(ReceiverStream::new(requests)).await.unwrap();
             let mut latencies = Vec::with_capacity(count);
             while let Some(answer) = answers.message().await.unwrap() {
@@ -157,44 +237,85 @@ async fn load(address: &str, features: &Arc<Features>, streams: usize, hz: f64, 
                     latencies.push(due.elapsed().as_secs_f64() * 1e3);
                 }
             }
+
             latencies
         }));
     }
+
     let mut latencies_ms = Vec::new();
     for task in tasks {
         latencies_ms.extend(task.await.unwrap());
     }
+
     let elapsed = begin.elapsed().as_secs_f64();
     latencies_ms.sort_by(f64::total_cmp);
-    Held { answered: latencies_ms.len(), asked: streams * count, seconds: elapsed, latencies_ms }
+
+    Held {
+        answered: latencies_ms.len(),
+        asked: streams * count,
+        seconds: elapsed,
+        latencies_ms,
+    }
 }
 
 #[tokio::main]
 async fn main() {
-    let given: Vec<f64> = std::env::args().skip(1).filter_map(|word| word.parse().ok()).collect();
+    let given: Vec<f64> = std::env::args()
+        .skip(1)
+        .filter_map(|word| word.parse().ok())
+        .collect();
     let [streams, hz, seconds] =
         [(0, 1_000.0), (1, 10.0), (2, 20.0)].map(|(at, plain)| *given.get(at).unwrap_or(&plain));
-    let rooms: Vec<(Room, Features)> =
-        [("map", 1), ("second", 2), ("third", 3)].map(|(name, seed)| room(name, seed)).into();
+
+    let rooms: Vec<(Room, Features)> = [("map", 1), ("second", 2), ("third", 3)]
+        .map(|(name, seed)| room(name, seed))
+        .into();
     let (adapter, record) = adapter(&rooms);
+
     let folder = tempfile::tempdir().unwrap();
     let store = Store::create(folder.path().to_str().unwrap()).unwrap();
-    store.publish_room(&rooms[0].0, std::slice::from_ref(&rooms[0].1)).await.unwrap();
-    store.publish_adapter("bench", &adapter, &record, rooms[0].1.rows()).await.unwrap();
+    store
+        .publish_room(&rooms[0].0, std::slice::from_ref(&rooms[0].1))
+        .await
+        .unwrap();
+
+    store
+        .publish_adapter("bench", &adapter, &record, rooms[0].1.rows())
+        .await
+        .unwrap();
+
     let features = Arc::new(rooms[0].1.clone());
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();
-    tokio::spawn(run(listener, store, Config::default(), std::future::pending()));
-    let ready = Client::connect(&address, Duration::from_secs(20)).await.unwrap();
+
+    tokio::spawn(run(
+        listener,
+        store,
+        Config::default(),
+        std::future::pending(),
+    ));
+
+    let ready = Client::connect(&address, Duration::from_secs(20))
+        .await
+        .unwrap();
     while ready.rooms().await.is_err() {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
+
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let echo = listener.local_addr().unwrap().to_string();
     let incoming = tonic::transport::server::TcpIncoming::from(listener).with_nodelay(Some(true));
     let service = OdometryServiceServer::new(Echo);
-    tokio::spawn(tonic::transport::Server::builder().add_service(service).serve_with_incoming(incoming));
-    println!("{streams} streams at {hz} Hz for {seconds} s, {COLUMNS} columns, room of {FRAMES} frames");
+    tokio::spawn(
+        tonic::transport::Server::builder()
+            .add_service(service)
+            .serve_with_incoming(incoming),
+    );
+
+    println!(
+        "{streams} streams at {hz} Hz for {seconds} s, {COLUMNS} columns, room of {FRAMES} frames"
+    );
+
     let peer = load(&echo, &features, streams as usize, hz, seconds).await;
     println!("{}", peer.line("echo "));
     let ours = load(&address, &features, streams as usize, hz, seconds).await;

@@ -46,11 +46,21 @@ impl Error {
 
     /// The field that the server wants changed, if it named one.
     pub fn field(&self) -> Option<String> {
-        let Self::Refused(status) = self else { return None };
+        let Self::Refused(status) = self else {
+            return None;
+        };
         let details = status.get_error_details();
-        let violation = details.bad_request().and_then(|bad| bad.field_violations.first());
-        let resource = details.resource_info().map(|resource| resource.resource_type.clone());
-        violation.map(|violation| violation.field.clone()).or(resource)
+        let violation = details
+            .bad_request()
+            .and_then(|bad| bad.field_violations.first());
+
+        let resource = details
+            .resource_info()
+            .map(|resource| resource.resource_type.clone());
+
+        violation
+            .map(|violation| violation.field.clone())
+            .or(resource)
     }
 }
 
@@ -60,6 +70,7 @@ impl From<Status> for Error {
         if status.code() == Code::Cancelled && status.message() == "Timeout expired" {
             return Self::Deadline;
         }
+
         Self::Refused(Box::new(status))
     }
 }
@@ -77,14 +88,29 @@ impl Client {
     /// # Errors
     /// [`Error::Address`] or [`Error::Connect`].
     pub async fn connect(address: &str, deadline: Duration) -> Result<Self, Error> {
-        let url = if address.contains("://") { address.to_owned() } else { format!("http://{address}") };
-        let endpoint = Endpoint::from_shared(url)
-            .map_err(|error| Error::Address { address: address.to_owned(), problem: error.to_string() })?;
-        let endpoint = endpoint.connect_timeout(deadline.min(Duration::from_secs(10))).tcp_nodelay(true);
-        let channel = endpoint.connect().await.map_err(|error| {
-            let cause = std::error::Error::source(&error).map_or(error.to_string(), ToString::to_string);
-            Error::Connect { address: address.to_owned(), problem: cause }
+        let url = if address.contains("://") {
+            address.to_owned()
+        } else {
+            format!("http://{address}")
+        };
+        let endpoint = Endpoint::from_shared(url).map_err(|error| Error::Address {
+            address: address.to_owned(),
+            problem: error.to_string(),
         })?;
+
+        let endpoint = endpoint
+            .connect_timeout(deadline.min(Duration::from_secs(10)))
+            .tcp_nodelay(true);
+
+        let channel = endpoint.connect().await.map_err(|error| {
+            let cause =
+                std::error::Error::source(&error).map_or(error.to_string(), ToString::to_string);
+            Error::Connect {
+                address: address.to_owned(),
+                problem: cause,
+            }
+        })?;
+
         Ok(Self { channel, deadline })
     }
 
@@ -92,8 +118,12 @@ impl Client {
     ///
     /// # Errors
     /// [`Error::Refused`], as for every call.
-    pub async fn navigate(&self, request: pb::NavigateRequest) -> Result<pb::NavigateResponse, Error> {
-        let mut service = NavigationServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
+    pub async fn navigate(
+        &self,
+        request: pb::NavigateRequest,
+    ) -> Result<pb::NavigateResponse, Error> {
+        let mut service = NavigationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
         Ok(service.navigate(self.request(request)).await?.into_inner())
     }
 
@@ -105,8 +135,13 @@ impl Client {
         &self,
         requests: Vec<pb::NavigateRequest>,
     ) -> Result<Vec<pb::BatchNavigateResult>, Error> {
-        let mut service = NavigationServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
-        Ok(service.batch_navigate(self.request(pb::BatchNavigateRequest { requests })).await?.into_inner().results)
+        let mut service = NavigationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service
+            .batch_navigate(self.request(pb::BatchNavigateRequest { requests }))
+            .await?
+            .into_inner()
+            .results)
     }
 
     /// Walks to a goal; `feedback` hears of each step.
@@ -119,7 +154,11 @@ impl Client {
         mut feedback: impl FnMut(pb::NavigateToFeedback),
     ) -> Result<pb::NavigateToResult, Error> {
         let mut service = NavigationServiceClient::new(self.channel.clone());
-        let mut events = service.navigate_to(self.request(request)).await?.into_inner();
+        let mut events = service
+            .navigate_to(self.request(request))
+            .await?
+            .into_inner();
+
         while let Some(pb::NavigateToResponse { event }) = events.message().await? {
             match event {
                 Some(pb::navigate_to_response::Event::Result(result)) => return Ok(result),
@@ -127,6 +166,7 @@ impl Client {
                 None => {}
             }
         }
+
         Err(Error::NoReport)
     }
 
@@ -134,8 +174,12 @@ impl Client {
     ///
     /// # Errors
     /// [`Error::Refused`].
-    pub async fn localize(&self, request: pb::LocalizeRequest) -> Result<pb::LocalizeResponse, Error> {
-        let mut service = LocalizationServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
+    pub async fn localize(
+        &self,
+        request: pb::LocalizeRequest,
+    ) -> Result<pb::LocalizeResponse, Error> {
+        let mut service = LocalizationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
         Ok(service.localize(self.request(request)).await?.into_inner())
     }
 
@@ -143,9 +187,16 @@ impl Client {
     ///
     /// # Errors
     /// [`Error::Refused`].
-    pub async fn relocalize(&self, request: pb::RelocalizeRequest) -> Result<pb::RelocalizeResponse, Error> {
-        let mut service = LocalizationServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
-        Ok(service.relocalize(self.request(request)).await?.into_inner())
+    pub async fn relocalize(
+        &self,
+        request: pb::RelocalizeRequest,
+    ) -> Result<pb::RelocalizeResponse, Error> {
+        let mut service = LocalizationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service
+            .relocalize(self.request(request))
+            .await?
+            .into_inner())
     }
 
     /// The motion between two views.
@@ -157,11 +208,14 @@ impl Client {
         request: pb::EstimateMotionRequest,
     ) -> Result<pb::EstimateMotionResponse, Error> {
         let mut service = OdometryServiceClient::new(self.channel.clone());
-        Ok(service.estimate_motion(self.request(request)).await?.into_inner())
+        Ok(service
+            .estimate_motion(self.request(request))
+            .await?
+            .into_inner())
     }
 
-    /// Follows a camera: requests as they are made, answers as they come. No deadline: a stream lasts as long as its robot
-    /// goes.
+    /// Follows a camera: requests as they are made, answers as they come. No deadline: a stream
+    /// lasts as long as its robot goes.
     ///
     /// # Errors
     /// [`Error::Refused`]; once it has begun, in the stream.
@@ -169,7 +223,8 @@ impl Client {
         &self,
         requests: impl Stream<Item = pb::TrackRequest> + Send + 'static,
     ) -> Result<Streaming<pb::TrackResponse>, Error> {
-        let mut service = OdometryServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
+        let mut service = OdometryServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
         Ok(service.track(requests).await?.into_inner())
     }
 
@@ -179,11 +234,16 @@ impl Client {
     /// [`Error::Refused`].
     pub async fn rooms(&self) -> Result<Vec<pb::Room>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        let (mut rooms, mut page_token) = (Vec::new(), String::new());
+        let mut rooms = Vec::new();
+        let mut page_token = String::new();
         loop {
-            let request = self.request(pb::ListRoomsRequest { page_size: 0, page_token });
+            let request = self.request(pb::ListRoomsRequest {
+                page_size: 0,
+                page_token,
+            });
             let page = service.list_rooms(request).await?.into_inner();
             rooms.extend(page.rooms);
+
             page_token = page.next_page_token;
             if page_token.is_empty() {
                 return Ok(rooms);
@@ -197,7 +257,13 @@ impl Client {
     /// [`Error::Refused`].
     pub async fn room(&self, room: &str) -> Result<Option<pb::Room>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        Ok(service.get_room(self.request(pb::GetRoomRequest { room: room.to_owned() })).await?.into_inner().room)
+        Ok(service
+            .get_room(self.request(pb::GetRoomRequest {
+                room: room.to_owned(),
+            }))
+            .await?
+            .into_inner()
+            .room)
     }
 
     /// All adapters, page by page.
@@ -206,11 +272,16 @@ impl Client {
     /// [`Error::Refused`].
     pub async fn adapters(&self) -> Result<Vec<pb::Adapter>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        let (mut adapters, mut page_token) = (Vec::new(), String::new());
+        let mut adapters = Vec::new();
+        let mut page_token = String::new();
         loop {
-            let request = self.request(pb::ListAdaptersRequest { page_size: 0, page_token });
+            let request = self.request(pb::ListAdaptersRequest {
+                page_size: 0,
+                page_token,
+            });
             let page = service.list_adapters(request).await?.into_inner();
             adapters.extend(page.adapters);
+
             page_token = page.next_page_token;
             if page_token.is_empty() {
                 return Ok(adapters);
@@ -224,7 +295,10 @@ impl Client {
     /// [`Error::Refused`].
     pub async fn adapter(&self, adapter: &str) -> Result<Option<pb::Adapter>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone());
-        let request = self.request(pb::GetAdapterRequest { adapter: adapter.to_owned() });
+        let request = self.request(pb::GetAdapterRequest {
+            adapter: adapter.to_owned(),
+        });
+
         Ok(service.get_adapter(request).await?.into_inner().adapter)
     }
 
@@ -237,7 +311,8 @@ impl Client {
         request: pb::EvaluateRequest,
         mut progress: impl FnMut(pb::EvaluationProgress),
     ) -> Result<pb::EvaluationReport, Error> {
-        let mut service = EvaluationServiceClient::new(self.channel.clone()).max_decoding_message_size(MESSAGE_BYTES);
+        let mut service = EvaluationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
         let mut events = service.evaluate(self.request(request)).await?.into_inner();
         while let Some(pb::EvaluateResponse { event }) = events.message().await? {
             match event {
@@ -246,6 +321,7 @@ impl Client {
                 None => {}
             }
         }
+
         Err(Error::NoReport)
     }
 
@@ -258,16 +334,23 @@ impl Client {
         request: pb::ScorePredictionsRequest,
     ) -> Result<pb::ScorePredictionsResponse, Error> {
         let mut service = EvaluationServiceClient::new(self.channel.clone());
-        Ok(service.score_predictions(self.request(request)).await?.into_inner())
+        Ok(service
+            .score_predictions(self.request(request))
+            .await?
+            .into_inner())
     }
 
-    /// Whether the server serves: `""` for the whole server, a service's full name, or `rooms/NAME`.
+    /// Whether the server serves: `""` for the whole server, a service's full name, or
+    /// `rooms/NAME`.
     ///
     /// # Errors
     /// [`Error::Refused`], also for a name that the server does not know.
     pub async fn serves(&self, name: &str) -> Result<bool, Error> {
         let mut health = HealthClient::new(self.channel.clone());
-        let request = self.request(HealthCheckRequest { service: name.to_owned() });
+        let request = self.request(HealthCheckRequest {
+            service: name.to_owned(),
+        });
+
         Ok(health.check(request).await?.into_inner().status() == ServingStatus::Serving)
     }
 

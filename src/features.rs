@@ -6,9 +6,20 @@ use ndarray::{Array2, ArrayView2};
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum Error {
     #[error("features '{name}' are empty ({rows} rows, {columns} columns)")]
-    Empty { name: String, rows: usize, columns: usize },
-    #[error("features '{name}', row {row}, column {column} is {value}; every number must be finite")]
-    NotFinite { name: String, row: usize, column: usize, value: f32 },
+    Empty {
+        name: String,
+        rows: usize,
+        columns: usize,
+    },
+    #[error(
+        "features '{name}', row {row}, column {column} is {value}; every number must be finite"
+    )]
+    NotFinite {
+        name: String,
+        row: usize,
+        column: usize,
+        value: f32,
+    },
     #[error("features '{name}' have {columns} columns, over the limit of {MAX_COLUMNS}")]
     TooWide { name: String, columns: usize },
 }
@@ -19,7 +30,8 @@ pub const MAX_COLUMNS: usize = 65_536;
 /// What is said of an origin that is not known.
 pub const UNSPECIFIED: &str = "unspecified";
 
-/// What made a set of features. Two sources never mix: an adapter answers only for the one it was trained on.
+/// What made a set of features. Two sources never mix: an adapter answers only for the one it was
+/// trained on.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FeatureSource {
     /// The short name by which a room's features are called for, for instance `effnet-block14`.
@@ -28,9 +40,11 @@ pub struct FeatureSource {
     pub encoder: String,
     /// The layer by the model's own name for it, for instance `block14`.
     pub layer: String,
-    /// What the layer's number counts from: `0`, `1`, or `name` when the layer is only named.
+    /// What the layer's number counts from: `0`, `1`, or `name` when the layer is only named
+    ///
     pub base: String,
-    /// Whether the encoder's last norm was applied to the layer: `none`, `final`, or `unspecified`.
+    /// Whether the encoder's last norm was applied to the layer: `none`, `final`, or `unspecified`
+    ///
     pub norm: String,
     /// How a map became one row, for instance `cls`, `mean`, `grid2x2`.
     pub pooling: String,
@@ -41,7 +55,8 @@ pub struct FeatureSource {
 }
 
 impl FeatureSource {
-    /// The source of features that came as numbers alone, so that only their name and width are known.
+    /// The source of features that came as numbers alone, so that only their name and width are
+    /// known.
     pub fn imported(name: &str, dim: usize) -> Self {
         let unspecified = || UNSPECIFIED.to_owned();
         Self {
@@ -56,13 +71,32 @@ impl FeatureSource {
         }
     }
 
-    /// Whether two sources give comparable numbers: made alike, whatever they are called for short. Where an origin is
-    /// unspecified the name is all there is to go by, so it must be the same.
+    /// Whether two sources give comparable numbers: made alike, whatever they are called for short.
+    /// Where an origin is unspecified the name is all there is to go by, so it must be the same.
     pub fn is_like(&self, other: &Self) -> bool {
         // Destructured with no `..`, so that a new field breaks the build here.
-        let Self { name, encoder, layer, base, norm, pooling, preprocess, dim } = self;
+        let Self {
+            name,
+            encoder,
+            layer,
+            base,
+            norm,
+            pooling,
+            preprocess,
+            dim,
+        } = self;
+
         let alike = (encoder, layer, base, norm, pooling, preprocess, dim)
-            == (&other.encoder, &other.layer, &other.base, &other.norm, &other.pooling, &other.preprocess, &other.dim);
+            == (
+                &other.encoder,
+                &other.layer,
+                &other.base,
+                &other.norm,
+                &other.pooling,
+                &other.preprocess,
+                &other.dim,
+            );
+
         alike && (encoder != UNSPECIFIED || *name == other.name)
     }
 }
@@ -83,14 +117,28 @@ impl Features {
         let name = source.name.clone();
         let (row_count, columns) = rows.dim();
         if row_count == 0 || columns == 0 {
-            return Err(Error::Empty { name, rows: row_count, columns });
+            return Err(Error::Empty {
+                name,
+                rows: row_count,
+                columns,
+            });
         }
+
         if columns > MAX_COLUMNS {
             return Err(Error::TooWide { name, columns });
         }
-        if let Some(((row, column), &value)) = rows.indexed_iter().find(|(_, value)| !value.is_finite()) {
-            return Err(Error::NotFinite { name, row, column, value });
+
+        if let Some(((row, column), &value)) =
+            rows.indexed_iter().find(|(_, value)| !value.is_finite())
+        {
+            return Err(Error::NotFinite {
+                name,
+                row,
+                column,
+                value,
+            });
         }
+
         source.dim = columns;
         Ok(Self { source, rows })
     }
@@ -98,7 +146,10 @@ impl Features {
     /// The features of these rows, in their order. Every row must be there.
     #[must_use]
     pub fn select(&self, rows: &[usize]) -> Self {
-        Self { source: self.source.clone(), rows: self.rows.select(ndarray::Axis(0), rows) }
+        Self {
+            source: self.source.clone(),
+            rows: self.rows.select(ndarray::Axis(0), rows),
+        }
     }
 
     /// What made them.
@@ -116,8 +167,8 @@ impl Features {
 mod tests {
     use super::*;
 
-    /// Oracle: the definition: how features were made counts, what they are called does not, unless nothing else is
-    /// known.
+    /// Oracle: the definition: how features were made counts, what they are called does not, unless
+    /// nothing else is known.
     #[test]
     fn sources_are_alike_by_their_making() {
         let made = |name: &str, layer: &str| FeatureSource {
@@ -125,6 +176,7 @@ mod tests {
             layer: layer.to_owned(),
             ..FeatureSource::imported(name, 3)
         };
+
         assert!(made("a", "block1").is_like(&made("b", "block1")));
         assert!(!made("a", "block1").is_like(&made("a", "block2")));
         assert!(FeatureSource::imported("a", 3).is_like(&FeatureSource::imported("a", 3)));

@@ -1,4 +1,5 @@
-//! How an adapter does in rooms that it never saw, and whether one way is better than another there.
+//! How an adapter does in rooms that it never saw, and whether one way is better than another
+//! there.
 //!
 //! Rooms, not pairs, are what is drawn again for an interval: pairs of one room are alike.
 
@@ -18,7 +19,8 @@ use crate::training::{Lesson, motions, predictions};
 
 /// Rooms drawn again for an interval.
 const RESAMPLES: usize = 10_000;
-/// R² below this counts as this in a clipped mean: it has no lower bound, and one room would be all of it.
+/// R² below this counts as this in a clipped mean: it has no lower bound, and one room would be all
+/// of it.
 pub const CLIPPED_R2: f64 = -1.0;
 
 /// Why a room has no outcome.
@@ -51,7 +53,8 @@ impl RoomOutcome {
     }
 }
 
-/// An adapter in each of several rooms, in their order; a room that cannot be evaluated says why (A-25).
+/// An adapter in each of several rooms, in their order; a room that cannot be evaluated says why
+/// (A-25).
 pub fn outcomes(
     adapter: &Arc<Adapter>,
     lessons: &[Lesson<'_>],
@@ -59,19 +62,41 @@ pub fn outcomes(
     done: &(dyn Fn() + Sync),
 ) -> Vec<Result<RoomOutcome, (RoomId, Error)>> {
     let of = |lesson: &Lesson<'_>| {
-        let outcome = outcome(adapter, lesson, protocol).map_err(|error| (lesson.room.id().clone(), error));
+        let outcome =
+            outcome(adapter, lesson, protocol).map_err(|error| (lesson.room.id().clone(), error));
         done();
         outcome
     };
     lessons.par_iter().map(of).collect()
 }
 
-fn outcome(adapter: &Arc<Adapter>, lesson: &Lesson<'_>, protocol: &Protocol) -> Result<RoomOutcome, Error> {
+fn outcome(
+    adapter: &Arc<Adapter>,
+    lesson: &Lesson<'_>,
+    protocol: &Protocol,
+) -> Result<RoomOutcome, Error> {
     let room = Arc::new(lesson.room.clone());
-    let navigator = Navigator::new(room.clone(), lesson.features, adapter.clone(), IndexKind::Exact)?;
-    let report = evaluate(&navigator, protocol, &Cancellation::default(), &mut |_, _| ())?;
-    let pairs = protocol.split.test_pairs(room.timeline(), protocol.stride).map_err(eval::Error::from)?;
-    let predicted = predictions(adapter, lesson.features.rows(), &pairs).map_err(eval::Error::from)?;
+    let navigator = Navigator::new(
+        room.clone(),
+        lesson.features,
+        adapter.clone(),
+        IndexKind::Exact,
+    )?;
+
+    let report = evaluate(
+        &navigator,
+        protocol,
+        &Cancellation::default(),
+        &mut |_, _| (),
+    )?;
+
+    let pairs = protocol
+        .split
+        .test_pairs(room.timeline(), protocol.stride)
+        .map_err(eval::Error::from)?;
+    let predicted =
+        predictions(adapter, lesson.features.rows(), &pairs).map_err(eval::Error::from)?;
+
     Ok(RoomOutcome {
         room: room.id().clone(),
         motion: MotionScores::of(&motions(room.poses(), &pairs), &predicted),
@@ -85,9 +110,19 @@ pub fn wins(outcomes: &[RoomOutcome], navigator: &str) -> Option<Rate> {
     let identity = NavigatorKind::Identity.name();
     let pairs: Vec<(f64, f64)> = outcomes
         .iter()
-        .filter_map(|outcome| Some((outcome.hit_rate(navigator)?.rate, outcome.hit_rate(&identity)?.rate)))
+        .filter_map(|outcome| {
+            Some((
+                outcome.hit_rate(navigator)?.rate,
+                outcome.hit_rate(&identity)?.rate,
+            ))
+        })
         .collect();
-    let won = pairs.iter().filter(|(ours, identity)| ours > identity).count();
+
+    let won = pairs
+        .iter()
+        .filter(|(ours, identity)| ours > identity)
+        .count();
+
     (!pairs.is_empty()).then(|| Rate::of(won, pairs.len()))
 }
 
@@ -113,12 +148,20 @@ pub fn over_rooms(values: &[f64], seed: u64) -> RoomMean {
             drawn.sum::<f64>() / values.len() as f64
         })
         .collect();
+
     means.sort_by(f64::total_cmp);
     let point = |share: f64| means[((RESAMPLES - 1) as f64 * share).round() as usize];
-    RoomMean { mean: mean(values), low: point(0.025), high: point(0.975), rooms: values.len() }
+
+    RoomMean {
+        mean: mean(values),
+        low: point(0.025),
+        high: point(0.975),
+        rooms: values.len(),
+    }
 }
 
-/// How much more often one navigator hits than another, room by room: both in the same rooms, in the same order.
+/// How much more often one navigator hits than another, room by room: both in the same rooms, in
+/// the same order.
 pub fn difference(ours: &[f64], theirs: &[f64], seed: u64) -> RoomMean {
     let differences: Vec<f64> = ours.iter().zip(theirs).map(|(a, b)| a - b).collect();
     over_rooms(&differences, seed)
@@ -141,8 +184,10 @@ impl MotionSummary {
     /// Of one overall R² a room; none without a room that has one.
     pub fn of(r2: &[f64], seed: u64) -> Option<Self> {
         let known: Vec<f64> = r2.iter().copied().filter(|r2| !r2.is_nan()).collect();
-        let above = |least: f64| Rate::of(known.iter().filter(|&&r2| r2 > least).count(), known.len());
+        let above =
+            |least: f64| Rate::of(known.iter().filter(|&&r2| r2 > least).count(), known.len());
         let clipped: Vec<f64> = known.iter().map(|r2| r2.max(CLIPPED_R2)).collect();
+
         (!known.is_empty()).then(|| Self {
             positive: above(0.0),
             above_0_3: above(0.3),
@@ -152,7 +197,8 @@ impl MotionSummary {
     }
 }
 
-/// The first rooms of a seeded order: the rooms of a smaller number are among those of a larger one.
+/// The first rooms of a seeded order: the rooms of a smaller number are among those of a larger
+/// one.
 pub fn nested_choice(count: usize, of: usize, seed: u64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..of).collect();
     let mut random = ChaCha8Rng::seed_from_u64(seed);
@@ -160,6 +206,7 @@ pub fn nested_choice(count: usize, of: usize, seed: u64) -> Vec<usize> {
         let other = random.random_range(place..of);
         order.swap(place, other);
     }
+
     order.truncate(count);
     order
 }
@@ -168,21 +215,31 @@ pub fn nested_choice(count: usize, of: usize, seed: u64) -> Vec<usize> {
 mod tests {
     use super::*;
 
-    /// Oracle: the normal approximation, mean ± 1.96 standard errors, which is near for a hundred even values.
+    /// Oracle: the normal approximation, mean ± 1.96 standard errors, which is near for a hundred
+    /// even values.
     #[test]
     fn the_bootstrap_interval_is_near_the_normal_one() {
         let values: Vec<f64> = (0..100).map(|i| f64::from(i) / 99.0).collect();
         let found = over_rooms(&values, 1);
         let error = 1.96 * crate::scores::deviation(&values) / 10.0;
+
         assert!((found.mean - 0.5).abs() < 1e-12 && found.rooms == 100);
-        assert!((found.low - (0.5 - error)).abs() < 0.005 && (found.high - (0.5 + error)).abs() < 0.005, "{found:?}");
+
+        assert!(
+            (found.low - (0.5 - error)).abs() < 0.005 && (found.high - (0.5 + error)).abs() < 0.005,
+            "{found:?}"
+        );
     }
 
-    /// Oracle: by hand. A difference that is the same in every room has no spread, however the rooms differ.
+    /// Oracle: by hand. A difference that is the same in every room has no spread, however the
+    /// rooms differ.
     #[test]
     fn differences_are_paired_by_room() {
         let found = difference(&[0.9, 0.5, 0.1], &[0.8, 0.4, 0.0], 1);
-        assert!((found.mean - 0.1).abs() < 1e-12 && (found.high - found.low).abs() < 1e-12, "{found:?}");
+        assert!(
+            (found.mean - 0.1).abs() < 1e-12 && (found.high - found.low).abs() < 1e-12,
+            "{found:?}"
+        );
     }
 
     /// Oracle: by hand: of three rooms one is won, one lost, one tied, and a tie is no win.
@@ -197,7 +254,14 @@ mod tests {
             rotation_rad_median: 0.0,
             pose_recalls: Vec::new(),
         };
-        let row = |name: &str, hits| Row { name: name.to_owned(), n: 10, latent: None, retrieval: retrieval(hits) };
+
+        let row = |name: &str, hits| Row {
+            name: name.to_owned(),
+            n: 10,
+            latent: None,
+            retrieval: retrieval(hits),
+        };
+
         let outcome = |ours, identity| RoomOutcome {
             room: RoomId::new("r").unwrap(),
             motion: MotionScores::of(&[], &[]),
@@ -205,6 +269,7 @@ mod tests {
             candidate_count: 10,
         };
         let won = wins(&[outcome(5, 4), outcome(3, 4), outcome(4, 4)], "ours").unwrap();
+
         assert_eq!((won.successes(), won.n), (1, 3));
         assert!(wins(&[outcome(5, 4)], "theirs").is_none());
     }
@@ -216,14 +281,17 @@ mod tests {
         assert_eq!((summary.positive.rate, summary.positive.n), (2.0 / 3.0, 3));
         assert_eq!((summary.above_0_3.rate, summary.best), (1.0 / 3.0, 0.5));
         assert!((summary.clipped.mean + 0.4 / 3.0).abs() < 1e-12);
+
         assert!(MotionSummary::of(&[f64::NAN], 0).is_none());
     }
 
     /// Oracle: the definition: no room twice, and the smaller choice within the larger one.
     #[test]
     fn smaller_choices_are_within_larger_ones() {
-        let (small, large) = (nested_choice(5, 100, 3), nested_choice(50, 100, 3));
+        let small = nested_choice(5, 100, 3);
+        let large = nested_choice(50, 100, 3);
         assert_eq!(small, large[..5]);
+
         let distinct: std::collections::HashSet<_> = large.iter().collect();
         assert_eq!(distinct.len(), 50);
         assert_ne!(large, nested_choice(50, 100, 4));

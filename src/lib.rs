@@ -1,6 +1,8 @@
-//! Latent navigation: Poincaré adapters turn image features into camera motion, and camera motion into the next frame.
+//! Latent navigation: Poincaré adapters turn image features into camera motion, and camera motion
+//! into the next frame.
 //!
-//! The modules stand bottom to top; each uses only those above its line. `tests/layering.rs` enforces it.
+//! The modules stand bottom to top; each uses only those above its line. `tests/layering.rs`
+//! enforces it.
 
 // Core: pure computation. No files, no network, no clock, no async.
 pub mod cancel; // a flag that says nobody waits any more

@@ -31,12 +31,24 @@ pub fn localize<'a>(
     for navigator in rooms {
         cancel.check()?;
         let room = navigator.room().id();
-        places.extend(navigator.nearest(latent, k).into_iter().map(|hit| Place { room: room.clone(), hit }));
+        places.extend(navigator.nearest(latent, k).into_iter().map(|hit| Place {
+            room: room.clone(),
+            hit,
+        }));
+
         places.sort_by(|a, b| {
-            let distance = a.hit.neighbour.distance.total_cmp(&b.hit.neighbour.distance);
-            distance.then_with(|| a.room.cmp(&b.room)).then(a.hit.neighbour.frame.cmp(&b.hit.neighbour.frame))
+            let distance = a
+                .hit
+                .neighbour
+                .distance
+                .total_cmp(&b.hit.neighbour.distance);
+            distance
+                .then_with(|| a.room.cmp(&b.room))
+                .then(a.hit.neighbour.frame.cmp(&b.hit.neighbour.frame))
         });
+
         places.truncate(k);
     }
+
     Ok(places)
 }

@@ -10,6 +10,7 @@ const LAST_WORK: Duration = Duration::from_secs(1);
 
 fn main() -> ExitCode {
     let cli = seese3::cli::Cli::parse();
+
     let runtime = match tokio::runtime::Runtime::new() {
         Ok(runtime) => runtime,
         Err(error) => {
@@ -17,8 +18,10 @@ fn main() -> ExitCode {
             return ExitCode::FAILURE;
         }
     };
+
     let result = runtime.block_on(seese3::cli::run(cli));
     runtime.shutdown_timeout(LAST_WORK);
+
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

@@ -1,6 +1,8 @@
-//! Which pairs of frames are learned from, which are tested, and among which frames an answer is looked for.
+//! Which pairs of frames are learned from, which are tested, and among which frames an answer is
+//! looked for.
 //!
-//! A pair (i, j) is two frames of one room, j = i + stride. Frame i is the source, frame j the target.
+//! A pair (i, j) is two frames of one room, j = i + stride. Frame i is the source, frame j the
+//! target.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -15,9 +17,18 @@ const BLOCK_FRAMES: usize = 50;
 pub enum Error {
     #[error("stride must be at least 1")]
     ZeroStride,
-    #[error("{frame_count} frames are too few for stride {stride} under the split '{split}': no {side} pair is left")]
-    NoPairs { frame_count: usize, stride: u32, split: Split, side: &'static str },
-    #[error("the split 'dataset' is the recording's own, and this room has none; use time or blocks")]
+    #[error(
+        "{frame_count} frames are too few for stride {stride} under the split '{split}': no {side} pair is left"
+    )]
+    NoPairs {
+        frame_count: usize,
+        stride: u32,
+        split: Split,
+        side: &'static str,
+    },
+    #[error(
+        "the split 'dataset' is the recording's own, and this room has none; use time or blocks"
+    )]
     NoDatasetSplit,
     #[error("strides {low} to {high} are no range")]
     EmptyRange { low: u32, high: u32 },
@@ -35,23 +46,32 @@ pub struct Pair {
 /// How frames are kept apart for testing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Split {
-    /// The first 80 % of the frames train, the rest test; both ends of a pair on one side. The paper's.
+    /// The first 80 % of the frames train, the rest test; both ends of a pair on one side.
+    /// The paper's.
     Time,
-    /// Blocks of 50 frames; block b tests when b mod 5 = 2; a test pair lies in one block, a training pair
-    /// has both ends outside test blocks.
+    /// Blocks of 50 frames; block b tests when b mod 5 = 2; a test pair lies in one block, a
+    /// training pair has both ends outside test blocks.
     Blocks,
-    /// The pair (i, j) tests when i mod 5 = 2. Frames are shared between the sides: leaky on purpose, a check
-    /// that an implementation is right, no measure of generalisation.
+    /// The pair (i, j) tests when i mod 5 = 2. Frames are shared between the sides: leaky on
+    /// purpose, a check that an implementation is right, no measure of generalisation.
     Pairs,
-    /// The recording's own: 7-Scenes' TestSplit, 12-Scenes' first sequence. Both ends of a pair on one side.
+    /// The recording's own: 7-Scenes' TestSplit, 12-Scenes' first sequence. Both ends of a pair on
+    /// one side.
     Dataset,
-    /// Every pair trains, and every pair tests: for rooms that are learned from, or held out, as a whole.
+    /// Every pair trains, and every pair tests: for rooms that are learned from, or held out, as a
+    /// whole.
     Whole,
 }
 
 impl Split {
     /// Every split.
-    pub const ALL: [Self; 5] = [Self::Time, Self::Blocks, Self::Pairs, Self::Dataset, Self::Whole];
+    pub const ALL: [Self; 5] = [
+        Self::Time,
+        Self::Blocks,
+        Self::Pairs,
+        Self::Dataset,
+        Self::Whole,
+    ];
 
     /// The word for it on the command line, on the wire and in a manifest.
     pub fn name(self) -> &'static str {
@@ -98,12 +118,13 @@ impl Split {
         frames(timeline.frame_count).filter(candidate).collect()
     }
 
-    /// `count` training pairs drawn with replacement from all pairs of all rooms whose stride lies in `low..=high`, each
-    /// with the position of its room (the paper's range pairing; A-8, and with replacement because 30,000 exceed the
-    /// distinct pairs of a room).
+    /// `count` training pairs drawn with replacement from all pairs of all rooms whose stride lies
+    /// in `low..=high`, each with the position of its room (the paper's range pairing; A-8, and
+    /// with replacement because 30,000 exceed the distinct pairs of a room).
     ///
     /// # Errors
-    /// [`Error::EmptyRange`], or as [`Split::train_pairs`] when no stride of the range gives a pair of some room.
+    /// [`Error::EmptyRange`], or as [`Split::train_pairs`] when no stride of the range gives a pair
+    /// of some room.
     pub fn sampled_range(
         self,
         timelines: &[&Timeline],
@@ -114,20 +135,31 @@ impl Split {
         if low == 0 || low > high {
             return Err(Error::EmptyRange { low, high });
         }
+
         let mut pool: Vec<(usize, Pair)> = Vec::new();
         for (room, timeline) in timelines.iter().enumerate() {
             let before = pool.len();
             let longest = u32::try_from(timeline.frame_count).unwrap_or(u32::MAX);
-            let pairs =
-                (low..=high.min(longest)).filter_map(|stride| self.train_pairs(timeline, stride).ok()).flatten();
+            let pairs = (low..=high.min(longest))
+                .filter_map(|stride| self.train_pairs(timeline, stride).ok())
+                .flatten();
             pool.extend(pairs.map(|pair| (room, pair)));
+
             if pool.len() == before {
                 let frame_count = timeline.frame_count;
-                return Err(Error::NoPairs { frame_count, stride: low, split: self, side: Side::Train.name() });
+                return Err(Error::NoPairs {
+                    frame_count,
+                    stride: low,
+                    split: self,
+                    side: Side::Train.name(),
+                });
             }
         }
+
         let mut random = ChaCha8Rng::seed_from_u64(seed);
-        Ok((0..count).map(|_| pool[random.random_range(0..pool.len())]).collect())
+        Ok((0..count)
+            .map(|_| pool[random.random_range(0..pool.len())])
+            .collect())
     }
 
     fn pairs(self, timeline: &Timeline, stride: u32, side: Side) -> Result<Vec<Pair>, Error> {
@@ -137,15 +169,27 @@ impl Split {
         if self == Self::Dataset && timeline.held_out.is_empty() {
             return Err(Error::NoDatasetSplit);
         }
+
         let frame_count = timeline.frame_count;
         let last_source = frame_count.saturating_sub(stride as usize);
+
         let pairs: Vec<Pair> = frames(last_source)
-            .map(|source| Pair { source, target: FrameId(source.0 + stride) })
+            .map(|source| Pair {
+                source,
+                target: FrameId(source.0 + stride),
+            })
             .filter(|&pair| self.is_on(timeline, pair, side))
             .collect();
+
         if pairs.is_empty() {
-            return Err(Error::NoPairs { frame_count, stride, split: self, side: side.name() });
+            return Err(Error::NoPairs {
+                frame_count,
+                stride,
+                split: self,
+                side: side.name(),
+            });
         }
+
         Ok(pairs)
     }
 
@@ -156,21 +200,32 @@ impl Split {
         }
     }
 
-    /// The side a pair belongs to, or none when its ends lie on different sides or in different sequences.
+    /// The side a pair belongs to, or none when its ends lie on different sides or in different
+    /// sequences.
     fn side(self, timeline: &Timeline, pair: Pair) -> Option<Side> {
         if !timeline.joins(pair.source, pair.target) {
             return None;
         }
+
         let tested = |frame| self.tests_frame(timeline, frame);
         let block = |frame: FrameId| frame.row() / BLOCK_FRAMES;
         match self {
-            Self::Pairs => Some(if pair.source.0 % 5 == 2 { Side::Test } else { Side::Train }),
-            Self::Time | Self::Blocks | Self::Dataset | Self::Whole => match (tested(pair.source), tested(pair.target))
-            {
-                (false, false) => Some(Side::Train),
-                (true, true) if self != Self::Blocks || block(pair.source) == block(pair.target) => Some(Side::Test),
-                _ => None,
-            },
+            Self::Pairs => Some(if pair.source.0 % 5 == 2 {
+                Side::Test
+            } else {
+                Side::Train
+            }),
+            Self::Time | Self::Blocks | Self::Dataset | Self::Whole => {
+                match (tested(pair.source), tested(pair.target)) {
+                    (false, false) => Some(Side::Train),
+                    (true, true)
+                        if self != Self::Blocks || block(pair.source) == block(pair.target) =>
+                    {
+                        Some(Side::Test)
+                    }
+                    _ => None,
+                }
+            }
         }
     }
 
@@ -236,46 +291,108 @@ mod tests {
             (Split::Time, 40, 160),
         ] {
             assert_eq!(
-                split.test_pairs(&Timeline::unbroken(1000), stride).unwrap().len(),
+                split
+                    .test_pairs(&Timeline::unbroken(1000), stride)
+                    .unwrap()
+                    .len(),
                 expected,
                 "{split} {stride}"
             );
         }
-        assert_eq!(Split::Time.train_pairs(&Timeline::unbroken(1000), 40).unwrap().len(), 760);
+
+        assert_eq!(
+            Split::Time
+                .train_pairs(&Timeline::unbroken(1000), 40)
+                .unwrap()
+                .len(),
+            760
+        );
     }
 
     /// Oracle: the definition of a time split, floor(0.8 N) frames train.
     #[test]
     fn no_frame_is_on_both_sides_of_the_time_or_block_split() {
         for split in [Split::Time, Split::Blocks] {
-            let ends = |pairs: Vec<Pair>| pairs.into_iter().flat_map(|pair| [pair.source, pair.target]);
+            let ends = |pairs: Vec<Pair>| {
+                pairs
+                    .into_iter()
+                    .flat_map(|pair| [pair.source, pair.target])
+            };
             let trained: std::collections::HashSet<_> =
                 ends(split.train_pairs(&Timeline::unbroken(503), 10).unwrap()).collect();
+
             assert!(
-                ends(split.test_pairs(&Timeline::unbroken(503), 10).unwrap()).all(|frame| !trained.contains(&frame)),
+                ends(split.test_pairs(&Timeline::unbroken(503), 10).unwrap())
+                    .all(|frame| !trained.contains(&frame)),
                 "{split}"
             );
-            assert!(split.candidates(&Timeline::unbroken(503)).iter().all(|frame| !trained.contains(frame)), "{split}");
+
+            assert!(
+                split
+                    .candidates(&Timeline::unbroken(503))
+                    .iter()
+                    .all(|frame| !trained.contains(frame)),
+                "{split}"
+            );
         }
-        assert_eq!(Split::Time.candidates(&Timeline::unbroken(503))[0], FrameId(402));
+
+        assert_eq!(
+            Split::Time.candidates(&Timeline::unbroken(503))[0],
+            FrameId(402)
+        );
     }
 
-    /// Oracle: paper finding 6, 9,145 distinct pairs with strides 10 to 40 among 320 training frames.
+    /// Oracle: paper finding 6, 9,145 distinct pairs with strides 10 to 40 among 320 training
+    /// frames.
     #[test]
     fn range_pairing_draws_from_the_papers_pool() {
-        let distinct: usize =
-            (10..=40).map(|s| Split::Time.train_pairs(&Timeline::unbroken(400), s).unwrap().len()).sum();
+        let distinct: usize = (10..=40)
+            .map(|s| {
+                Split::Time
+                    .train_pairs(&Timeline::unbroken(400), s)
+                    .unwrap()
+                    .len()
+            })
+            .sum();
+
         assert_eq!(distinct, 9_145);
-        let range = StrideRange { low: 10, high: 40, count: 30_000 };
+
+        let range = StrideRange {
+            low: 10,
+            high: 40,
+            count: 30_000,
+        };
+
         let room = Timeline::unbroken(400);
         let drawn = Split::Time.sampled_range(&[&room], &range, 7).unwrap();
         assert_eq!(drawn.len(), 30_000);
-        let fits = |pair: &Pair| (10..=40).contains(&(pair.target.0 - pair.source.0)) && pair.target.0 < 320;
+
+        let fits = |pair: &Pair| {
+            (10..=40).contains(&(pair.target.0 - pair.source.0)) && pair.target.0 < 320
+        };
+
         assert!(drawn.iter().all(|(room, pair)| *room == 0 && fits(pair)));
-        assert_ne!(drawn, Split::Time.sampled_range(&[&room], &range, 8).unwrap());
-        let pooled = Split::Time.sampled_range(&[&room, &room, &room], &range, 7).unwrap();
-        let share = |of: usize| pooled.iter().filter(|(room, pair)| *room == of && fits(pair)).count();
-        assert!((0..3).all(|of| share(of).abs_diff(10_000) < 500), "rooms are drawn from alike");
+
+        assert_ne!(
+            drawn,
+            Split::Time.sampled_range(&[&room], &range, 8).unwrap()
+        );
+
+        let pooled = Split::Time
+            .sampled_range(&[&room, &room, &room], &range, 7)
+            .unwrap();
+
+        let share = |of: usize| {
+            pooled
+                .iter()
+                .filter(|(room, pair)| *room == of && fits(pair))
+                .count()
+        };
+
+        assert!(
+            (0..3).all(|of| share(of).abs_diff(10_000) < 500),
+            "rooms are drawn from alike"
+        );
     }
 
     /// Oracle: by hand.
@@ -285,6 +402,7 @@ mod tests {
         let train = Split::Whole.train_pairs(&room, 4).unwrap();
         assert_eq!(train.len(), 6);
         assert_eq!(train, Split::Whole.test_pairs(&room, 4).unwrap());
+
         assert_eq!(Split::Whole.candidates(&room).len(), 10);
     }
 
@@ -294,11 +412,15 @@ mod tests {
             Split::Time.test_pairs(&Timeline::unbroken(100), 40),
             Err(Error::NoPairs { side: "test", .. })
         ));
-        assert_eq!(Split::Time.test_pairs(&Timeline::unbroken(100), 0), Err(Error::ZeroStride));
+
+        assert_eq!(
+            Split::Time.test_pairs(&Timeline::unbroken(100), 0),
+            Err(Error::ZeroStride)
+        );
     }
 
-    /// Oracle: by hand. Two sequences of four frames, the second held out: no pair joins them, and the recording's own
-    /// split tests the second.
+    /// Oracle: by hand. Two sequences of four frames, the second held out: no pair joins them, and
+    /// the recording's own split tests the second.
     #[test]
     fn pairs_stay_in_their_sequence_and_the_datasets_own_split_is_kept() {
         let timeline = Timeline {
@@ -306,11 +428,37 @@ mod tests {
             sequences: vec![0, 0, 0, 0, 1, 1, 1, 1],
             held_out: vec![false, false, false, false, true, true, true, true],
         };
-        let rows = |pairs: Vec<Pair>| pairs.iter().map(|p| (p.source.0, p.target.0)).collect::<Vec<_>>();
-        assert_eq!(rows(Split::Dataset.train_pairs(&timeline, 2).unwrap()), [(0, 2), (1, 3)]);
-        assert_eq!(rows(Split::Dataset.test_pairs(&timeline, 2).unwrap()), [(4, 6), (5, 7)]);
-        assert_eq!(rows(Split::Time.train_pairs(&timeline, 2).unwrap()), [(0, 2), (1, 3)]);
-        assert_eq!(Split::Dataset.candidates(&timeline), [4, 5, 6, 7].map(FrameId));
-        assert_eq!(Split::Dataset.test_pairs(&Timeline::unbroken(8), 2), Err(Error::NoDatasetSplit));
+
+        let rows = |pairs: Vec<Pair>| {
+            pairs
+                .iter()
+                .map(|p| (p.source.0, p.target.0))
+                .collect::<Vec<_>>()
+        };
+
+        assert_eq!(
+            rows(Split::Dataset.train_pairs(&timeline, 2).unwrap()),
+            [(0, 2), (1, 3)]
+        );
+
+        assert_eq!(
+            rows(Split::Dataset.test_pairs(&timeline, 2).unwrap()),
+            [(4, 6), (5, 7)]
+        );
+
+        assert_eq!(
+            rows(Split::Time.train_pairs(&timeline, 2).unwrap()),
+            [(0, 2), (1, 3)]
+        );
+
+        assert_eq!(
+            Split::Dataset.candidates(&timeline),
+            [4, 5, 6, 7].map(FrameId)
+        );
+
+        assert_eq!(
+            Split::Dataset.test_pairs(&Timeline::unbroken(8), 2),
+            Err(Error::NoDatasetSplit)
+        );
     }
 }

@@ -8,4 +8,5 @@ pub mod v1 {
 }
 
 /// The descriptors of all files, for reflection.
-pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/seese3_descriptor.bin"));
+pub const FILE_DESCRIPTOR_SET: &[u8] =
+    include_bytes!(concat!(env!("OUT_DIR"), "/seese3_descriptor.bin"));

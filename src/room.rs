@@ -10,7 +10,9 @@ use crate::geometry::Pose;
 /// What is wrong with a room.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum Error {
-    #[error("name {name:?} must be 1 to 100 letters, digits, '.', '-' or '_', and begin with a letter or digit")]
+    #[error(
+        "name {name:?} must be 1 to 100 letters, digits, '.', '-' or '_', and begin with a letter or digit"
+    )]
     Name { name: String },
     #[error("room '{room}' has no frames")]
     Empty { room: RoomId },
@@ -20,13 +22,28 @@ pub enum Error {
     )]
     PoseNotFinite { room: RoomId, frame: usize },
     #[error("room '{room}' has {frame_count} poses but {actual} {what}; every frame needs one")]
-    Count { room: RoomId, frame_count: usize, actual: usize, what: &'static str },
+    Count {
+        room: RoomId,
+        frame_count: usize,
+        actual: usize,
+        what: &'static str,
+    },
     #[error("room '{room}' has {frame_count} frames, over the limit of {MAX_FRAMES}")]
     TooManyFrames { room: RoomId, frame_count: usize },
-    #[error("room '{room}', frame {frame}: image '{image}' must be a path below the recording's folder, without '..'")]
-    ImagePath { room: RoomId, frame: usize, image: String },
+    #[error(
+        "room '{room}', frame {frame}: image '{image}' must be a path below the recording's folder, without '..'"
+    )]
+    ImagePath {
+        room: RoomId,
+        frame: usize,
+        image: String,
+    },
     #[error("room '{room}' has no frame {frame}; it has frames 0 to {}", frame_count - 1)]
-    UnknownFrame { room: RoomId, frame: FrameId, frame_count: usize },
+    UnknownFrame {
+        room: RoomId,
+        frame: FrameId,
+        frame_count: usize,
+    },
 }
 
 /// The farthest that a camera may be from its world's origin, metres.
@@ -45,7 +62,13 @@ impl RoomId {
     /// # Errors
     /// [`Error::Name`] if it could not be a folder's name everywhere.
     pub fn new(name: &str) -> Result<Self, Error> {
-        if is_plain_name(name) { Ok(Self(name.to_owned())) } else { Err(Error::Name { name: name.to_owned() }) }
+        if is_plain_name(name) {
+            Ok(Self(name.to_owned()))
+        } else {
+            Err(Error::Name {
+                name: name.to_owned(),
+            })
+        }
     }
 
     /// The name.
@@ -60,11 +83,14 @@ impl fmt::Display for RoomId {
     }
 }
 
-/// Whether `name` can be a folder or file name on every system: no separators, no leading dot, not long.
+/// Whether `name` can be a folder or file name on every system: no separators, no leading dot, not
+/// long.
 pub fn is_plain_name(name: &str) -> bool {
     name.len() <= 100
         && name.starts_with(|c: char| c.is_ascii_alphanumeric())
-        && name.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_'))
+        && name
+            .chars()
+            .all(|c| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_'))
 }
 
 /// The row of a frame in its room.
@@ -106,14 +132,16 @@ pub struct Frames {
     pub timestamps_ns: Vec<i64>,
     /// The recording's own frame names, one a frame, or empty if it has none.
     pub names: Vec<String>,
-    /// The recording's own frame numbers, one a frame, or empty if it has none. Dropped frames leave gaps.
+    /// The recording's own frame numbers, one a frame, or empty if it has none. Dropped frames
+    /// leave gaps.
     pub numbers: Vec<i64>,
-    /// Where each frame's image is, relative to [`Provenance::images_root`], or empty if there are none.
-    /// `FILE@OFFSET+LENGTH` is an image inside a file, bytes.
+    /// Where each frame's image is, relative to [`Provenance::images_root`], or empty if there are
+    /// none. `FILE@OFFSET+LENGTH` is an image inside a file, bytes.
     pub images: Vec<String>,
     /// Which unbroken sequence each frame belongs to, or empty if all are one.
     pub sequences: Vec<u32>,
-    /// Whether the recording's own split holds each frame out for testing, or empty if it defines none.
+    /// Whether the recording's own split holds each frame out for testing, or empty if it defines
+    /// none.
     pub held_out: Vec<bool>,
 }
 
@@ -128,15 +156,23 @@ impl Frames {
             ("sequence marks", self.sequences.len()),
             ("split marks", self.held_out.len()),
         ];
-        columns.into_iter().find(|(_, length)| *length != 0 && *length != self.poses.len())
+
+        columns
+            .into_iter()
+            .find(|(_, length)| *length != 0 && *length != self.poses.len())
     }
 
     /// The frames of these rows, in their order. Every row must be there.
     #[must_use]
     pub fn select(&self, rows: &[usize]) -> Self {
         fn pick<T: Clone>(values: &[T], rows: &[usize]) -> Vec<T> {
-            if values.is_empty() { Vec::new() } else { rows.iter().map(|&row| values[row].clone()).collect() }
+            if values.is_empty() {
+                Vec::new()
+            } else {
+                rows.iter().map(|&row| values[row].clone()).collect()
+            }
         }
+
         Self {
             poses: pick(&self.poses, rows),
             timestamps_ns: pick(&self.timestamps_ns, rows),
@@ -163,7 +199,10 @@ pub struct Timeline {
 impl Timeline {
     /// One unbroken sequence without a split of its own.
     pub fn unbroken(frame_count: usize) -> Self {
-        Self { frame_count, ..Self::default() }
+        Self {
+            frame_count,
+            ..Self::default()
+        }
     }
 
     /// Whether two frames were recorded in one go.
@@ -185,30 +224,59 @@ impl Room {
     /// Checks the frames and makes the room.
     ///
     /// # Errors
-    /// The first of [`Error::Empty`], [`Error::TooManyFrames`], [`Error::Count`], [`Error::PoseNotFinite`],
-    /// [`Error::ImagePath`].
+    /// The first of [`Error::Empty`], [`Error::TooManyFrames`], [`Error::Count`],
+    /// [`Error::PoseNotFinite`], [`Error::ImagePath`].
     pub fn new(id: RoomId, frames: Frames, provenance: Provenance) -> Result<Self, Error> {
         let frame_count = frames.poses.len();
         if frame_count == 0 {
             return Err(Error::Empty { room: id });
         }
+
         if frame_count > MAX_FRAMES {
-            return Err(Error::TooManyFrames { room: id, frame_count });
+            return Err(Error::TooManyFrames {
+                room: id,
+                frame_count,
+            });
         }
+
         if let Some((what, actual)) = frames.unequal() {
-            return Err(Error::Count { room: id, frame_count, actual, what });
+            return Err(Error::Count {
+                room: id,
+                frame_count,
+                actual,
+                what,
+            });
         }
+
         let near = |pose: &Pose| pose.translation.vector.norm() <= MAX_DISTANCE_M;
-        let finite = |pose: &Pose| near(pose) && pose.to_homogeneous().iter().all(|x| x.is_finite());
+        let finite =
+            |pose: &Pose| near(pose) && pose.to_homogeneous().iter().all(|x| x.is_finite());
         if let Some(frame) = frames.poses.iter().position(|pose| !finite(pose)) {
             return Err(Error::PoseNotFinite { room: id, frame });
         }
+
         if let Some(frame) = frames.images.iter().position(|image| !stays_below(image)) {
-            return Err(Error::ImagePath { room: id, frame, image: frames.images[frame].clone() });
+            return Err(Error::ImagePath {
+                room: id,
+                frame,
+                image: frames.images[frame].clone(),
+            });
         }
-        let (sequences, held_out) = (frames.sequences.clone(), frames.held_out.clone());
-        let timeline = Timeline { frame_count, sequences, held_out };
-        Ok(Self { id, frames, timeline, provenance })
+
+        let sequences = frames.sequences.clone();
+        let held_out = frames.held_out.clone();
+        let timeline = Timeline {
+            frame_count,
+            sequences,
+            held_out,
+        };
+
+        Ok(Self {
+            id,
+            frames,
+            timeline,
+            provenance,
+        })
     }
 
     /// The room's name.
@@ -241,7 +309,8 @@ impl Room {
         &self.frames.numbers
     }
 
-    /// Where each frame's image is, relative to [`Provenance::images_root`]; empty if there are none.
+    /// Where each frame's image is, relative to [`Provenance::images_root`]; empty if there are
+    /// none.
     pub fn images(&self) -> &[String] {
         &self.frames.images
     }
@@ -266,11 +335,14 @@ impl Room {
     /// # Errors
     /// [`Error::UnknownFrame`].
     pub fn pose(&self, frame: FrameId) -> Result<&Pose, Error> {
-        self.frames.poses.get(frame.row()).ok_or_else(|| Error::UnknownFrame {
-            room: self.id.clone(),
-            frame,
-            frame_count: self.frame_count(),
-        })
+        self.frames
+            .poses
+            .get(frame.row())
+            .ok_or_else(|| Error::UnknownFrame {
+                room: self.id.clone(),
+                frame,
+                frame_count: self.frame_count(),
+            })
     }
 }
 
@@ -292,8 +364,14 @@ mod tests {
     /// Oracle: the definition of a frame id, a row.
     #[test]
     fn a_frame_past_the_end_is_unknown() {
-        let room = room(Frames { poses: vec![Pose::identity(); 2], ..Frames::default() }).unwrap();
+        let room = room(Frames {
+            poses: vec![Pose::identity(); 2],
+            ..Frames::default()
+        })
+        .unwrap();
+
         assert!(room.pose(FrameId(1)).is_ok());
+
         let message = room.pose(FrameId(2)).unwrap_err().to_string();
         assert_eq!(message, "room 'r' has no frame 2; it has frames 0 to 1");
     }
@@ -302,25 +380,61 @@ mod tests {
     #[test]
     fn bad_frames_are_refused() {
         assert!(matches!(room(Frames::default()), Err(Error::Empty { .. })));
+
         let nan = Pose::translation(f64::NAN, 0.0, 0.0);
         assert!(matches!(
-            room(Frames { poses: vec![Pose::identity(), nan], ..Frames::default() }),
+            room(Frames {
+                poses: vec![Pose::identity(), nan],
+                ..Frames::default()
+            }),
             Err(Error::PoseNotFinite { frame: 1, .. })
         ));
-        let frames = Frames { poses: vec![Pose::identity()], timestamps_ns: vec![1, 2], ..Frames::default() };
+
+        let frames = Frames {
+            poses: vec![Pose::identity()],
+            timestamps_ns: vec![1, 2],
+            ..Frames::default()
+        };
+
         assert!(matches!(room(frames), Err(Error::Count { actual: 2, .. })));
-        for image in ["../secret.png", "/etc/passwd", "a/../../b.png", "", "c:/x.png", "a//b.png"] {
-            let frames = Frames { poses: vec![Pose::identity()], images: vec![image.to_owned()], ..Frames::default() };
-            assert!(matches!(room(frames), Err(Error::ImagePath { .. })), "{image:?}");
+
+        for image in [
+            "../secret.png",
+            "/etc/passwd",
+            "a/../../b.png",
+            "",
+            "c:/x.png",
+            "a//b.png",
+        ] {
+            let frames = Frames {
+                poses: vec![Pose::identity()],
+                images: vec![image.to_owned()],
+                ..Frames::default()
+            };
+
+            assert!(
+                matches!(room(frames), Err(Error::ImagePath { .. })),
+                "{image:?}"
+            );
         }
     }
 
     /// Oracle: what a path traversal or a hidden file looks like.
     #[test]
     fn names_that_could_escape_their_folder_are_refused() {
-        for name in ["", "..", ".hidden", "a/b", "a\\b", "a b", "ä", &"x".repeat(101)] {
+        for name in [
+            "",
+            "..",
+            ".hidden",
+            "a/b",
+            "a\\b",
+            "a b",
+            "ä",
+            &"x".repeat(101),
+        ] {
             assert!(RoomId::new(name).is_err(), "{name:?}");
         }
+
         assert!(RoomId::new("scene0000_00").is_ok());
     }
 }

@@ -7,8 +7,8 @@ use crate::geometry::Twist;
 /// Motions whose true translation |v| is shorter, metres, have no direction to score.
 pub const LEAST_DIRECTED_M: f64 = 1e-3;
 
-/// R² of predicted twists. A component whose targets do not vary has no R²; it is left out of the means, and a mean of
-/// none is NaN.
+/// R² of predicted twists. A component whose targets do not vary has no R²; it is left out of the
+/// means, and a mean of none is NaN.
 ///
 /// R² = 1 − Σ(y − ŷ)² / Σ(y − ȳ)², ȳ the mean of the evaluated targets (scikit-learn's `r2_score`).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -36,6 +36,7 @@ impl MotionScores {
     pub fn of(truth: &[Twist], predicted: &[Twist]) -> Self {
         let components: [f64; 6] =
             std::array::from_fn(|c| r2(pairs_of(truth, predicted, |twist| twist.to_vector()[c])));
+
         let moving: Vec<(Vector3<f64>, Vector3<f64>)> = truth
             .iter()
             .zip(predicted)
@@ -45,7 +46,11 @@ impl MotionScores {
                 (truth.linear.normalize(), predicted.linear / length)
             })
             .collect();
-        let direction: Vec<f64> = (0..3).map(|c| r2(moving.iter().map(|(t, p)| (t[c], p[c])).collect())).collect();
+
+        let direction: Vec<f64> = (0..3)
+            .map(|c| r2(moving.iter().map(|(t, p)| (t[c], p[c])).collect()))
+            .collect();
+
         Self {
             n: truth.len(),
             components,
@@ -62,8 +67,19 @@ impl MotionScores {
 impl MotionScores {
     /// The mean of several scores, figure by figure, over those that have it; counts are added up.
     pub fn mean(scores: &[Self]) -> Self {
-        let of = |figure: fn(&Self) -> f64| mean_of_known(&scores.iter().map(figure).collect::<Vec<_>>());
-        let component = |c: usize| mean_of_known(&scores.iter().map(|score| score.components[c]).collect::<Vec<_>>());
+        let of = |figure: fn(&Self) -> f64| {
+            mean_of_known(&scores.iter().map(figure).collect::<Vec<_>>())
+        };
+
+        let component = |c: usize| {
+            mean_of_known(
+                &scores
+                    .iter()
+                    .map(|score| score.components[c])
+                    .collect::<Vec<_>>(),
+            )
+        };
+
         Self {
             n: scores.iter().map(|score| score.n).sum(),
             components: std::array::from_fn(component),
@@ -72,7 +88,10 @@ impl MotionScores {
             rotation: of(|score| score.rotation),
             direction: of(|score| score.direction),
             magnitude: of(|score| score.magnitude),
-            direction_pairs_dropped: scores.iter().map(|score| score.direction_pairs_dropped).sum(),
+            direction_pairs_dropped: scores
+                .iter()
+                .map(|score| score.direction_pairs_dropped)
+                .sum(),
         }
     }
 
@@ -95,8 +114,17 @@ const STILL: f64 = 1e-9;
 pub fn r2(pairs: Vec<(f64, f64)>) -> f64 {
     let mean = pairs.iter().map(|(truth, _)| truth).sum::<f64>() / pairs.len() as f64;
     let total: f64 = pairs.iter().map(|(truth, _)| (truth - mean).powi(2)).sum();
-    let residual: f64 = pairs.iter().map(|(truth, predicted)| (truth - predicted).powi(2)).sum();
-    if total > pairs.len() as f64 * STILL * STILL { 1.0 - residual / total } else { f64::NAN }
+
+    let residual: f64 = pairs
+        .iter()
+        .map(|(truth, predicted)| (truth - predicted).powi(2))
+        .sum();
+
+    if total > pairs.len() as f64 * STILL * STILL {
+        1.0 - residual / total
+    } else {
+        f64::NAN
+    }
 }
 
 /// A rate with its count and its 95 % interval.
@@ -117,11 +145,25 @@ impl Rate {
     pub fn of(successes: usize, n: usize) -> Self {
         /// The 97.5 % point of the normal distribution.
         const Z: f64 = 1.959_963_984_540_054;
-        let (count, rate) = (n as f64, successes as f64 / n as f64);
+
+        let count = n as f64;
+        let rate = successes as f64 / n as f64;
         let spread = Z * (rate * (1.0 - rate) / count + Z * Z / (4.0 * count * count)).sqrt();
-        let (centre, scale) = (rate + Z * Z / (2.0 * count), 1.0 + Z * Z / count);
-        let low = if successes == 0 { 0.0 } else { (centre - spread) / scale };
-        let high = if successes == n { 1.0 } else { (centre + spread) / scale };
+        let centre = rate + Z * Z / (2.0 * count);
+
+        let scale = 1.0 + Z * Z / count;
+        let low = if successes == 0 {
+            0.0
+        } else {
+            (centre - spread) / scale
+        };
+
+        let high = if successes == n {
+            1.0
+        } else {
+            (centre + spread) / scale
+        };
+
         Self { rate, low, high, n }
     }
 
@@ -135,6 +177,7 @@ impl Rate {
 pub fn median(values: &[f64]) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
+
     match sorted.len() {
         0 => f64::NAN,
         n if n % 2 == 1 => sorted[n / 2],
@@ -149,7 +192,13 @@ pub fn mean(values: &[f64]) -> f64 {
 
 /// The arithmetic mean of the values that are numbers; NaN of none.
 pub fn mean_of_known(values: &[f64]) -> f64 {
-    mean(&values.iter().copied().filter(|value| !value.is_nan()).collect::<Vec<_>>())
+    mean(
+        &values
+            .iter()
+            .copied()
+            .filter(|value| !value.is_nan())
+            .collect::<Vec<_>>(),
+    )
 }
 
 /// Sample standard deviation (n − 1).
@@ -159,19 +208,32 @@ pub fn deviation(values: &[f64]) -> f64 {
     (squares / (values.len() as f64 - 1.0)).sqrt()
 }
 
-fn pairs_of(truth: &[Twist], predicted: &[Twist], value: impl Fn(&Twist) -> f64) -> Vec<(f64, f64)> {
-    truth.iter().zip(predicted).map(|(truth, predicted)| (value(truth), value(predicted))).collect()
+fn pairs_of(
+    truth: &[Twist],
+    predicted: &[Twist],
+    value: impl Fn(&Twist) -> f64,
+) -> Vec<(f64, f64)> {
+    truth
+        .iter()
+        .zip(predicted)
+        .map(|(truth, predicted)| (value(truth), value(predicted)))
+        .collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Oracle: by hand; SciPy's `binomtest(8, 40).proportion_ci(method="wilson")` is (0.10497, 0.34758).
+    /// Oracle: by hand; SciPy's `binomtest(8, 40).proportion_ci(method="wilson")` is (0.10497,
+    /// 0.34758).
     #[test]
     fn wilson_interval_of_eight_in_forty() {
         let rate = Rate::of(8, 40);
-        assert!((rate.low - 0.104_97).abs() < 1e-4 && (rate.high - 0.347_58).abs() < 1e-4, "{rate:?}");
+        assert!(
+            (rate.low - 0.104_97).abs() < 1e-4 && (rate.high - 0.347_58).abs() < 1e-4,
+            "{rate:?}"
+        );
+
         assert_eq!(Rate::of(0, 40).low, 0.0);
         assert_eq!(Rate::of(40, 40).high, 1.0);
     }

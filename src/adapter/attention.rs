@@ -1,12 +1,16 @@
-//! The attention corrector: two tokens, one pre-norm transformer block (4 heads, 256 wide), their mean, a linear layer.
+//! The attention corrector: two tokens, one pre-norm transformer block (4 heads, 256 wide), their
+//! mean, a linear layer.
 //!
-//! As PyTorch's `TransformerEncoderLayer(64, 4, 256, activation="gelu", norm_first=True)` without dropout. The two
-//! tokens of n samples are kept as 2n rows: the latents' first, the motions' below.
+//! As PyTorch's `TransformerEncoderLayer(64, 4, 256, activation="gelu", norm_first=True)` without
+//! dropout. The two tokens of n samples are kept as 2n rows: the latents' first, the motions'
+//! below.
 
 use ndarray::{Array2, ArrayView2, Axis, concatenate, s};
 
 use super::Real;
-use super::layers::{cumulative, gelu_backward, linear, linear_initial, normalise, normalise_backward, within};
+use super::layers::{
+    cumulative, gelu_backward, linear, linear_initial, normalise, normalise_backward, within,
+};
 use super::seeded::Seeded;
 
 /// Columns of a token.
@@ -90,12 +94,16 @@ impl<T: Real> Attention<T> {
         let [token_g, token_g_bias] = linear_initial(coordinates, WIDTH, random);
         let [token_p, token_p_bias] = linear_initial(6, WIDTH, random);
         let [out, out_bias] = linear_initial(WIDTH, coordinates, random);
+
         // Its bias is drawn, then set to zero.
         let [out_projection, _] = linear_initial(WIDTH, WIDTH, random);
         let in_projection = within(3 * WIDTH, WIDTH, (6.0 / (4 * WIDTH) as f64).sqrt(), random);
         let [first, first_bias] = linear_initial(WIDTH, INNER, random);
         let [second, second_bias] = linear_initial(INNER, WIDTH, random);
-        let (zeros, ones) = (|width| Array2::zeros((1, width)), || Array2::ones((1, WIDTH)));
+
+        let zeros = |width| Array2::zeros((1, width));
+        let ones = || Array2::ones((1, WIDTH));
+
         Self {
             tensors: [
                 token_g,
@@ -133,7 +141,12 @@ impl<T: Real> Attention<T> {
     }
 
     pub fn cast<U: Real>(&self) -> Attention<U> {
-        Attention { tensors: self.tensors.each_ref().map(|tensor| tensor.mapv(|x| U::of(x.f64()))) }
+        Attention {
+            tensors: self
+                .tensors
+                .each_ref()
+                .map(|tensor| tensor.mapv(|x| U::of(x.f64()))),
+        }
     }
 
     /// Columns of the latents that it corrects.
@@ -149,15 +162,26 @@ impl<T: Real> Attention<T> {
         let mut normalised = input.clone();
         let inverse_deviation = normalise(&mut normalised);
         let output = &normalised * &self.tensors[at] + &self.tensors[at + 1];
-        Normed { normalised, inverse_deviation, output }
+
+        Normed {
+            normalised,
+            inverse_deviation,
+            output,
+        }
     }
 
     pub fn forward(&self, latents: Array2<T>, motions: Array2<T>) -> Activations<T> {
-        let (n, half) = (latents.nrows(), T::of(0.5));
-        let tokens = stacked(self.linear(&latents, TOKEN_G).view(), self.linear(&motions, TOKEN_P).view());
+        let n = latents.nrows();
+        let half = T::of(0.5);
+
+        let tokens = stacked(
+            self.linear(&latents, TOKEN_G).view(),
+            self.linear(&motions, TOKEN_P).view(),
+        );
         let before = self.norm(&tokens, NORM_1);
         let projected = self.linear(&before.output, IN_PROJECTION);
         let (looks, seen) = attend(&projected, n);
+
         let middle = tokens + self.linear(&seen, OUT_PROJECTION);
         let between = self.norm(&middle, NORM_2);
         let inner = self.linear(&between.output, FIRST);
@@ -165,6 +189,7 @@ impl<T: Real> Attention<T> {
         let inner_passed = &inner * &inner_cumulative;
         let last = middle + self.linear(&inner_passed, SECOND);
         let mean = (&last.slice(s![..n, ..]) + &last.slice(s![n.., ..])) * half;
+
         let output = self.linear(&mean, OUT);
         Activations {
             latents,
@@ -189,28 +214,50 @@ impl<T: Real> Attention<T> {
         let mut d_rows = stacked(d_mean.view(), d_mean.view());
         let mut d_inner = self.linear_backward(SECOND, &forward.inner_passed, &d_rows, gradient);
         gelu_backward(&mut d_inner, &forward.inner, &forward.inner_cumulative);
+
         let d_between = self.linear_backward(FIRST, &forward.between.output, &d_inner, gradient);
         d_rows += &self.norm_backward(NORM_2, &forward.between, d_between, gradient);
         let d_seen = self.linear_backward(OUT_PROJECTION, &forward.seen, &d_rows, gradient);
         let d_projected = attend_backward(&forward.projected, &forward.looks, &d_seen);
-        let d_before = self.linear_backward(IN_PROJECTION, &forward.before.output, &d_projected, gradient);
+
+        let d_before = self.linear_backward(
+            IN_PROJECTION,
+            &forward.before.output,
+            &d_projected,
+            gradient,
+        );
         d_rows += &self.norm_backward(NORM_1, &forward.before, d_before, gradient);
-        let (d_g, d_p) = (d_rows.slice(s![..n, ..]).to_owned(), d_rows.slice(s![n.., ..]).to_owned());
+
+        let d_g = d_rows.slice(s![..n, ..]).to_owned();
+        let d_p = d_rows.slice(s![n.., ..]).to_owned();
         self.linear_backward(TOKEN_G, &forward.latents, &d_g, gradient);
         self.linear_backward(TOKEN_P, &forward.motions, &d_p, gradient);
     }
 
-    fn linear_backward(&self, at: usize, input: &Array2<T>, d: &Array2<T>, gradient: &mut Self) -> Array2<T> {
+    fn linear_backward(
+        &self,
+        at: usize,
+        input: &Array2<T>,
+        d: &Array2<T>,
+        gradient: &mut Self,
+    ) -> Array2<T> {
         gradient.tensors[at] += &d.t().dot(input);
         gradient.tensors[at + 1] += &d.sum_axis(Axis(0));
         d.dot(&self.tensors[at])
     }
 
-    fn norm_backward(&self, at: usize, forward: &Normed<T>, d: Array2<T>, gradient: &mut Self) -> Array2<T> {
+    fn norm_backward(
+        &self,
+        at: usize,
+        forward: &Normed<T>,
+        d: Array2<T>,
+        gradient: &mut Self,
+    ) -> Array2<T> {
         gradient.tensors[at] += &(&d * &forward.normalised).sum_axis(Axis(0));
         gradient.tensors[at + 1] += &d.sum_axis(Axis(0));
         let mut d = d * &self.tensors[at];
         normalise_backward(&mut d, &forward.normalised, &forward.inverse_deviation);
+
         d
     }
 }
@@ -235,42 +282,60 @@ fn attend<T: Real>(projected: &Array2<T>, n: usize) -> (Vec<Looks<T>>, Array2<T>
         let rows = [sample, sample + n];
         let mut of_sample = [[[T::zero(); 2]; 2]; HEADS];
         for (head, of_head) in of_sample.iter_mut().enumerate() {
-            let part = |part: usize, token: usize| projected.slice(s![rows[token], columns(part, head)]);
+            let part =
+                |part: usize, token: usize| projected.slice(s![rows[token], columns(part, head)]);
             for (token, look) in of_head.iter_mut().enumerate() {
                 let scores = [0, 1].map(|other| part(0, token).dot(&part(1, other)) * scale);
                 let largest = scores[0].max(scores[1]);
                 let shares = scores.map(|score| (score - largest).exp());
                 *look = shares.map(|share| share / (shares[0] + shares[1]));
+
                 let mut into = seen.slice_mut(s![rows[token], head * HEAD..(head + 1) * HEAD]);
                 into.scaled_add(look[0], &part(2, 0));
                 into.scaled_add(look[1], &part(2, 1));
             }
         }
+
         looks.push(of_sample);
     }
+
     (looks, seen)
 }
 
 /// The gradient by the projection, of the gradient by what the tokens saw.
-fn attend_backward<T: Real>(projected: &Array2<T>, looks: &[Looks<T>], d_seen: &Array2<T>) -> Array2<T> {
+fn attend_backward<T: Real>(
+    projected: &Array2<T>,
+    looks: &[Looks<T>],
+    d_seen: &Array2<T>,
+) -> Array2<T> {
     let scale = T::of((HEAD as f64).sqrt().recip());
     let mut d_projected = Array2::zeros(projected.dim());
     for (sample, of_sample) in looks.iter().enumerate() {
         let rows = [sample, sample + looks.len()];
         for (head, of_head) in of_sample.iter().enumerate() {
-            let part = |part: usize, token: usize| projected.slice(s![rows[token], columns(part, head)]);
+            let part =
+                |part: usize, token: usize| projected.slice(s![rows[token], columns(part, head)]);
             for (token, look) in of_head.iter().enumerate() {
                 let d = d_seen.slice(s![rows[token], head * HEAD..(head + 1) * HEAD]);
                 let d_look = [0, 1].map(|other| d.dot(&part(2, other)));
                 let mean = look[0] * d_look[0] + look[1] * d_look[1];
                 for other in 0..2 {
-                    d_projected.slice_mut(s![rows[other], columns(2, head)]).scaled_add(look[other], &d);
+                    d_projected
+                        .slice_mut(s![rows[other], columns(2, head)])
+                        .scaled_add(look[other], &d);
+
                     let d_score = look[other] * (d_look[other] - mean) * scale;
-                    d_projected.slice_mut(s![rows[token], columns(0, head)]).scaled_add(d_score, &part(1, other));
-                    d_projected.slice_mut(s![rows[other], columns(1, head)]).scaled_add(d_score, &part(0, token));
+                    d_projected
+                        .slice_mut(s![rows[token], columns(0, head)])
+                        .scaled_add(d_score, &part(1, other));
+
+                    d_projected
+                        .slice_mut(s![rows[other], columns(1, head)])
+                        .scaled_add(d_score, &part(0, token));
                 }
             }
         }
     }
+
     d_projected
 }

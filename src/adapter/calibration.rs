@@ -1,4 +1,5 @@
-//! What an adapter's errors are like in rooms that it did not learn from: measured once, kept with it.
+//! What an adapter's errors are like in rooms that it did not learn from: measured once, kept with
+//! it.
 
 use nalgebra::{Cholesky, Matrix6};
 use ndarray::{Array2, ArrayView1, ArrayView2};
@@ -36,14 +37,29 @@ impl ErrorTable {
     /// [`Error::Calibration`].
     pub fn new(strata: Vec<Stratum>) -> Result<Self, Error> {
         let rising = strata.windows(2).all(|pair| pair[0].at < pair[1].at);
+
         let sound = |stratum: &Stratum| {
-            let Stratum { at, gain, covariance } = stratum;
-            let symmetric = (covariance - covariance.transpose()).amax() <= 1e-9 * covariance.amax();
-            at.is_finite() && *at > 0.0 && gain.is_finite() && symmetric && Cholesky::new(*covariance).is_some()
+            let Stratum {
+                at,
+                gain,
+                covariance,
+            } = stratum;
+            let symmetric =
+                (covariance - covariance.transpose()).amax() <= 1e-9 * covariance.amax();
+
+            at.is_finite()
+                && *at > 0.0
+                && gain.is_finite()
+                && symmetric
+                && Cholesky::new(*covariance).is_some()
         };
+
         if strata.is_empty() || !rising || !strata.iter().all(sound) {
-            return Err(Error::Calibration { what: "an error table" });
+            return Err(Error::Calibration {
+                what: "an error table",
+            });
         }
+
         Ok(Self { strata })
     }
 
@@ -52,17 +68,28 @@ impl ErrorTable {
         &self.strata
     }
 
-    /// Errors where the number is `at`: between two strata by the logarithm, outside them the outermost.
+    /// Errors where the number is `at`: between two strata by the logarithm, outside them the
+    /// outermost.
     pub fn at(&self, at: f64) -> Stratum {
         if at == f64::INFINITY {
             return self.strata[self.strata.len() - 1];
         }
+
         let after = self.strata.partition_point(|stratum| stratum.at <= at);
-        let (Some(low), Some(high)) = (after.checked_sub(1).map(|i| self.strata[i]), self.strata.get(after)) else {
-            // Before the first, behind the last, or not a number: the largest errors are the safe answer to the last.
-            let outermost = if after == 0 && !at.is_nan() { 0 } else { self.strata.len() - 1 };
+        let (Some(low), Some(high)) = (
+            after.checked_sub(1).map(|i| self.strata[i]),
+            self.strata.get(after),
+        ) else {
+            // Before the first, behind the last, or not a number: the largest errors are the safe
+            // answer to the last.
+            let outermost = if after == 0 && !at.is_nan() {
+                0
+            } else {
+                self.strata.len() - 1
+            };
             return self.strata[outermost];
         };
+
         let share = (at / low.at).ln() / (high.at / low.at).ln();
         Stratum {
             at,
@@ -73,8 +100,9 @@ impl ErrorTable {
     }
 }
 
-/// Covariances of read motions, Σ = (u + u₀) S(n): they grow with the squared length u of the latents' difference, with an
-/// exponent of 1 within a few hundredths, and with the frames n in between, since over few of them u is mostly flicker.
+/// Covariances of read motions, Σ = (u + u₀) S(n): they grow with the squared length u of the
+/// latents' difference, with an exponent of 1 within a few hundredths, and with the frames n in
+/// between, since over few of them u is mostly flicker.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionErrors {
     /// S by the number of frames in between, at 1 and more; on (v, ω), metres and radians.
@@ -84,7 +112,8 @@ pub struct MotionErrors {
 }
 
 impl MotionErrors {
-    /// The covariance of a motion over `frames`, read from latents whose difference has the squared length `u`.
+    /// The covariance of a motion over `frames`, read from latents whose difference has the squared
+    /// length `u`.
     pub fn at(&self, u: f64, frames: u64) -> Matrix6<f64> {
         self.shapes.at(frames.max(1) as f64).covariance * (u + self.floor)
     }
@@ -98,9 +127,11 @@ impl MotionErrors {
 /// What was measured of an adapter's errors in rooms that it did not learn from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Measured {
-    /// Half the second moment of the differences of latents from one frame to the next, shape (c, c).
+    /// Half the second moment of the differences of latents from one frame to the next, shape (c,
+    /// c).
     pub flicker: Array2<f64>,
-    /// Second moment of the differences of latents over the motions it was trained for, shape (c, c).
+    /// Second moment of the differences of latents over the motions it was trained for, shape (c,
+    /// c).
     pub spread: Array2<f64>,
     /// Errors of read motions; lengths are in `spread`.
     pub motion: MotionErrors,
@@ -112,7 +143,8 @@ pub struct Measured {
     pub sure: f64,
     /// The distance in `flicker` from the nearest of the last frames, above which a view jumped.
     pub jump: f64,
-    /// What the covariances of places that a tracker just corrected have to be multiplied with to be those of its errors.
+    /// What the covariances of places that a tracker just corrected have to be multiplied with to
+    /// be those of its errors.
     pub place: f64,
 }
 
@@ -137,18 +169,24 @@ impl Metric {
     /// # Errors
     /// [`Error::Calibration`] when it is not symmetric and positive definite.
     pub fn new(covariance: ArrayView2<'_, f64>) -> Result<Self, Error> {
-        let wrong = Error::Calibration { what: "a covariance of latents" };
+        let wrong = Error::Calibration {
+            what: "a covariance of latents",
+        };
+
         let size = covariance.nrows();
         if size == 0 || covariance.ncols() != size || covariance.iter().any(|x| !x.is_finite()) {
             return Err(wrong);
         }
+
         let matrix = nalgebra::DMatrix::from_fn(size, size, |i, j| covariance[(i, j)]);
         if (&matrix - matrix.transpose()).amax() > 1e-9 * matrix.amax() {
             return Err(wrong);
         }
+
         let lower = Cholesky::new(matrix).ok_or(wrong.clone())?.unpack();
         let inverse = lower.try_inverse().ok_or(wrong)?;
         let whitener = Array2::from_shape_fn((size, size), |at| inverse[at]);
+
         Ok(Self { whitener })
     }
 
@@ -174,10 +212,14 @@ impl Calibration {
     /// # Errors
     /// [`Error::Calibration`].
     pub fn new(measured: Measured) -> Result<Self, Error> {
-        let (flicker, spread) = (Metric::new(measured.flicker.view())?, Metric::new(measured.spread.view())?);
+        let flicker = Metric::new(measured.flicker.view())?;
+        let spread = Metric::new(measured.spread.view())?;
         if flicker.size() != spread.size() {
-            return Err(Error::Calibration { what: "the size of a covariance of latents" });
+            return Err(Error::Calibration {
+                what: "the size of a covariance of latents",
+            });
         }
+
         for (what, value) in [
             ("the floor of motions", measured.motion.floor),
             ("the factor of places", measured.place),
@@ -189,7 +231,12 @@ impl Calibration {
                 return Err(Error::Calibration { what });
             }
         }
-        Ok(Self { measured, flicker, spread })
+
+        Ok(Self {
+            measured,
+            flicker,
+            spread,
+        })
     }
 
     /// What was measured.
@@ -202,12 +249,16 @@ impl Calibration {
         &self.flicker
     }
 
-    /// The covariance of a motion over so many frames, read over a difference of latents, shape (c,).
+    /// The covariance of a motion over so many frames, read over a difference of latents, shape
+    /// (c,).
     pub fn motion_errors(&self, difference: ArrayView1<'_, f64>, frames: u64) -> Matrix6<f64> {
-        self.measured.motion.at(self.spread.squared_length(difference), frames)
+        self.measured
+            .motion
+            .at(self.spread.squared_length(difference), frames)
     }
 
-    /// The squared length of a difference of latents, shape (c,), against those over the motions that were trained for.
+    /// The squared length of a difference of latents, shape (c,), against those over the motions
+    /// that were trained for.
     pub fn spread_length(&self, difference: ArrayView1<'_, f64>) -> f64 {
         self.spread.squared_length(difference)
     }
@@ -218,9 +269,11 @@ impl Calibration {
         strata[strata.len() - 1].at
     }
 
-    /// That of a motion of which nothing is known but that it is one of those the adapter was trained for.
+    /// That of a motion of which nothing is known but that it is one of those the adapter was
+    /// trained for.
     pub fn unread_errors(&self) -> Matrix6<f64> {
-        // The mean squared length of a difference under its own second moment is the number of its columns.
+        // The mean squared length of a difference under its own second moment is the number of its
+        // columns.
         self.measured.motion.longest(self.spread.size() as f64)
     }
 
@@ -235,17 +288,36 @@ mod tests {
     use super::*;
 
     fn stratum(at: f64, variance: f64) -> Stratum {
-        Stratum { at, gain: at, covariance: Matrix6::from_diagonal_element(variance) }
+        Stratum {
+            at,
+            gain: at,
+            covariance: Matrix6::from_diagonal_element(variance),
+        }
     }
 
     /// Oracle: by hand: half way between 1 and 100 by the logarithm is 10.
     #[test]
     fn errors_between_strata_are_between_theirs() {
         let table = ErrorTable::new(vec![stratum(1.0, 2.0), stratum(100.0, 4.0)]).unwrap();
-        for (at, expected) in [(0.0, 2.0), (1.0, 2.0), (10.0, 3.0), (100.0, 4.0), (1e9, 4.0), (f64::NAN, 4.0)] {
-            assert!((table.at(at).covariance[(2, 2)] - expected).abs() < 1e-12, "{at}");
+        for (at, expected) in [
+            (0.0, 2.0),
+            (1.0, 2.0),
+            (10.0, 3.0),
+            (100.0, 4.0),
+            (1e9, 4.0),
+            (f64::NAN, 4.0),
+        ] {
+            assert!(
+                (table.at(at).covariance[(2, 2)] - expected).abs() < 1e-12,
+                "{at}"
+            );
         }
-        for wrong in [vec![], vec![stratum(2.0, 1.0), stratum(1.0, 1.0)], vec![stratum(1.0, 0.0)]] {
+
+        for wrong in [
+            vec![],
+            vec![stratum(2.0, 1.0), stratum(1.0, 1.0)],
+            vec![stratum(1.0, 0.0)],
+        ] {
             assert!(ErrorTable::new(wrong).is_err());
         }
     }
@@ -256,6 +328,7 @@ mod tests {
         let metric = Metric::new(ndarray::array![[4.0, 0.0], [0.0, 9.0]].view()).unwrap();
         let difference = ndarray::array![2.0, 3.0];
         assert!((metric.squared_length(difference.view()) - 2.0).abs() < 1e-12);
+
         let white = metric.whitened(ndarray::array![[2.0, 3.0], [0.0, 0.0]].view());
         assert!(((&white.row(0) - &white.row(1)).mapv(|x| x * x).sum() - 2.0).abs() < 1e-12);
         assert!(Metric::new(ndarray::array![[1.0, 2.0], [2.0, 1.0]].view()).is_err());

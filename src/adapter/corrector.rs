@@ -1,7 +1,8 @@
-//! Correctors: small networks that say where a motion leads in latent space, learned with φ and W frozen.
+//! Correctors: small networks that say where a motion leads in latent space, learned with φ and W
+//! frozen.
 //!
-//! Their input is \[g; (ΔP − μ)/σ\]. The linear one predicts ĝ itself, the others what W⁺ΔP lacks (sec. 2.6). Widths,
-//! heads and the z-scored input are ours: the paper does not say.
+//! Their input is \[g; (ΔP − μ)/σ\]. The linear one predicts ĝ itself, the others what W⁺ΔP lacks
+//! (sec. 2.6). Widths, heads and the z-scored input are ours: the paper does not say.
 
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis, concatenate};
 
@@ -55,7 +56,11 @@ impl CorrectorKind {
             Self::Mlp2 => &[64],
             Self::Mlp3 => &[128, 128],
         };
-        [coordinates + 6].into_iter().chain(hidden.iter().copied()).chain([coordinates]).collect()
+        [coordinates + 6]
+            .into_iter()
+            .chain(hidden.iter().copied())
+            .chain([coordinates])
+            .collect()
     }
 }
 
@@ -80,7 +85,9 @@ impl<T: Real> Corrector<T> {
 
     fn random(kind: CorrectorKind, coordinates: usize, random: &mut Seeded) -> Self {
         let body = match kind {
-            CorrectorKind::Attention => Body::Attention(Box::new(Attention::random(coordinates, random))),
+            CorrectorKind::Attention => {
+                Body::Attention(Box::new(Attention::random(coordinates, random)))
+            }
             _ => Body::Dense(Dense::random(&kind.widths(coordinates), random)),
         };
         Self { kind, body }
@@ -96,14 +103,27 @@ impl<T: Real> Corrector<T> {
         mut tensor: impl FnMut(&str) -> Result<Array2<T>, E>,
     ) -> Result<Self, E> {
         let mut corrector = Self::initial(kind, coordinates, 0);
-        for (name, into) in corrector.names().into_iter().zip(corrector.parameters_mut()) {
+        for (name, into) in corrector
+            .names()
+            .into_iter()
+            .zip(corrector.parameters_mut())
+        {
             let read = tensor(&name)?;
             if read.dim() != into.dim() {
-                let (expected, actual) = (into.shape().to_vec(), read.shape().to_vec());
-                return Err(Error::WeightShape { tensor: name, expected, actual }.into());
+                let expected = into.shape().to_vec();
+                let actual = read.shape().to_vec();
+
+                return Err(Error::WeightShape {
+                    tensor: name,
+                    expected,
+                    actual,
+                }
+                .into());
             }
+
             *into = read;
         }
+
         Ok(corrector)
     }
 
@@ -117,11 +137,21 @@ impl<T: Real> Corrector<T> {
         let body = match &self.body {
             Body::Dense(dense) => {
                 let cast = |tensor: &Array2<T>| tensor.mapv(|x| U::of(x.f64()));
-                Body::Dense(Dense { layers: dense.layers.iter().map(|layer| layer.each_ref().map(cast)).collect() })
+                Body::Dense(Dense {
+                    layers: dense
+                        .layers
+                        .iter()
+                        .map(|layer| layer.each_ref().map(cast))
+                        .collect(),
+                })
             }
             Body::Attention(attention) => Body::Attention(Box::new(attention.cast())),
         };
-        Corrector { kind: self.kind, body }
+
+        Corrector {
+            kind: self.kind,
+            body,
+        }
     }
 
     /// Refuses weights that are not finite or do not fit latents of `coordinates` columns.
@@ -130,9 +160,15 @@ impl<T: Real> Corrector<T> {
             Body::Dense(dense) => (dense.widths(), self.kind.widths(coordinates)),
             Body::Attention(attention) => (vec![attention.coordinates()], vec![coordinates]),
         };
+
         if given != expected {
-            return Err(Error::WeightShape { tensor: self.kind.name().to_owned(), expected, actual: given });
+            return Err(Error::WeightShape {
+                tensor: self.kind.name().to_owned(),
+                expected,
+                actual: given,
+            });
         }
+
         match self.not_finite() {
             Some(tensor) => Err(Error::WeightsNotFinite { tensor }),
             None => Ok(()),
@@ -143,13 +179,23 @@ impl<T: Real> Corrector<T> {
     pub fn output(&self, latents: ArrayView2<'_, T>, motions: ArrayView2<'_, T>) -> Array2<T> {
         match &self.body {
             Body::Dense(dense) => dense.forward(side_by_side(latents, motions)).output,
-            Body::Attention(attention) => attention.forward(latents.to_owned(), motions.to_owned()).output,
+            Body::Attention(attention) => {
+                attention
+                    .forward(latents.to_owned(), motions.to_owned())
+                    .output
+            }
         }
     }
 
     /// As [`Corrector::output`], for one latent.
-    pub(super) fn added(&self, latent: ArrayView1<'_, T>, motion: ArrayView1<'_, T>) -> ndarray::Array1<T> {
-        self.output(latent.insert_axis(Axis(0)), motion.insert_axis(Axis(0))).row(0).to_owned()
+    pub(super) fn added(
+        &self,
+        latent: ArrayView1<'_, T>,
+        motion: ArrayView1<'_, T>,
+    ) -> ndarray::Array1<T> {
+        self.output(latent.insert_axis(Axis(0)), motion.insert_axis(Axis(0)))
+            .row(0)
+            .to_owned()
     }
 }
 
@@ -203,25 +249,37 @@ impl<T: Real> Objective<T> for Corrector<T> {
 
     fn gradient(&self, samples: &Self::Data, batch: &[usize], _at: At<'_>) -> (f64, Self) {
         let take = |rows: &Array2<T>| rows.select(Axis(0), batch);
-        let (latents, motions, targets) = (take(&samples.latents), take(&samples.motions), take(&samples.targets));
-        let base = if self.kind.has_residual() { take(&samples.imagined) } else { Array2::zeros(targets.dim()) };
+        let latents = take(&samples.latents);
+        let motions = take(&samples.motions);
+        let targets = take(&samples.targets);
+        let base = if self.kind.has_residual() {
+            take(&samples.imagined)
+        } else {
+            Array2::zeros(targets.dim())
+        };
+
         let mut gradient = self.zeros_like();
         let loss = match (&self.body, &mut gradient.body) {
             (Body::Dense(dense), Body::Dense(into)) => {
                 let forward = dense.forward(side_by_side(latents.view(), motions.view()));
-                let (loss, d) = mean_squared_error((&forward.output + &base).view(), targets.view());
+                let (loss, d) =
+                    mean_squared_error((&forward.output + &base).view(), targets.view());
                 dense.backward(&forward, &d, into);
+
                 loss
             }
             (Body::Attention(attention), Body::Attention(into)) => {
                 let forward = attention.forward(latents, motions);
-                let (loss, d) = mean_squared_error((&forward.output + &base).view(), targets.view());
+                let (loss, d) =
+                    mean_squared_error((&forward.output + &base).view(), targets.view());
                 attention.backward(&forward, &d, into);
+
                 loss
             }
             // A gradient has its network's shape.
             _ => f64::NAN,
         };
+
         (loss, gradient)
     }
 }
@@ -243,19 +301,45 @@ pub fn train_corrector(
     fit(&samples, start, config, &mut random, progress)
 }
 
-fn corrector_samples(adapter: &Adapter, samples: &Samples<f32>) -> Result<CorrectorSamples<f32>, Error> {
+fn corrector_samples(
+    adapter: &Adapter,
+    samples: &Samples<f32>,
+) -> Result<CorrectorSamples<f32>, Error> {
     let latents = adapter.embed(samples.features())?;
-    let (n, k) = (samples.pair_count(), adapter.coordinate_count());
+    let n = samples.pair_count();
+    let k = adapter.coordinate_count();
     let mut imagined = Array2::zeros((n, k));
+
     for (pair, &twist) in samples.twists().iter().enumerate() {
         let here = latents.row(samples.pair(pair)[0]);
         let there = &here + &adapter.step(here, twist, Reading::Affine, 1.0);
-        imagined.row_mut(pair).iter_mut().zip(&there).for_each(|(into, &x)| *into = x as f32);
+        imagined
+            .row_mut(pair)
+            .iter_mut()
+            .zip(&there)
+            .for_each(|(into, &x)| *into = x as f32);
     }
-    let end =
-        |end: usize| Array2::from_shape_fn((n, k), |(pair, column)| latents[(samples.pair(pair)[end], column)] as f32);
+
+    let end = |end: usize| {
+        Array2::from_shape_fn((n, k), |(pair, column)| {
+            latents[(samples.pair(pair)[end], column)] as f32
+        })
+    };
+
     let scale = adapter.scale();
-    let normalised: Vec<_> = samples.twists().iter().map(|&twist| scale.normalised(twist)).collect();
-    let motions = Array2::from_shape_fn((n, 6), |(pair, component)| normalised[pair][component] as f32);
-    Ok(CorrectorSamples { latents: end(0), motions, imagined, targets: end(1) })
+    let normalised: Vec<_> = samples
+        .twists()
+        .iter()
+        .map(|&twist| scale.normalised(twist))
+        .collect();
+    let motions = Array2::from_shape_fn((n, 6), |(pair, component)| {
+        normalised[pair][component] as f32
+    });
+
+    Ok(CorrectorSamples {
+        latents: end(0),
+        motions,
+        imagined,
+        targets: end(1),
+    })
 }

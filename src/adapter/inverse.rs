@@ -53,9 +53,18 @@ impl Inverse {
         let (pseudo_inverse, singular_values, rank) = pseudo_inverse(motion);
         let [largest, .., smallest] = singular_values;
         if rank < 6 {
-            return Err(Error::RankDeficient { rank, largest, smallest });
+            return Err(Error::RankDeficient {
+                rank,
+                largest,
+                smallest,
+            });
         }
-        Ok(Self { pseudo_inverse, singular_values, scale: scale.clone() })
+
+        Ok(Self {
+            pseudo_inverse,
+            singular_values,
+            scale: scale.clone(),
+        })
     }
 
     /// W⁺, shape (k, 6).
@@ -68,44 +77,60 @@ impl Inverse {
         self.singular_values
     }
 
-    /// The latent step of a motion. `mean_share` is the share of μ that an affine step takes off: 1 for a whole
-    /// motion, 1/S for one of S equal parts, so that S parts add up to the whole.
+    /// The latent step of a motion. `mean_share` is the share of μ that an affine step takes off: 1
+    /// for a whole motion, 1/S for one of S equal parts, so that S parts add up to the whole
+    ///
     ///
     /// Source: SeeSE3, ĝ = φ(z) + W⁺ΔP.
     pub fn step(&self, twist: Twist, reading: Reading, mean_share: f64) -> Array1<f64> {
-        self.pseudo_inverse.dot(&target(&self.scale, twist, reading, mean_share))
+        self.pseudo_inverse
+            .dot(&target(&self.scale, twist, reading, mean_share))
     }
 }
 
 /// What W should map a latent step to, for a motion in a reading.
-pub(super) fn target(scale: &TargetScale, twist: Twist, reading: Reading, mean_share: f64) -> Array1<f64> {
+pub(super) fn target(
+    scale: &TargetScale,
+    twist: Twist,
+    reading: Reading,
+    mean_share: f64,
+) -> Array1<f64> {
     let motion = twist.to_vector();
     let target: Vector6<f64> = match reading {
         Reading::Affine => (motion - scale.mean * mean_share).component_div(&scale.deviation),
         Reading::Homogeneous => motion.component_div(&scale.deviation),
         Reading::Literal => motion,
     };
+
     Array1::from_iter(target.iter().copied())
 }
 
-/// The pseudo-inverse (k, 6) of a matrix (6, k), its singular values, the largest first, and how many of them count;
-/// those that do not are left out of the inverse.
+/// The pseudo-inverse (k, 6) of a matrix (6, k), its singular values, the largest first, and how
+/// many of them count; those that do not are left out of the inverse.
 pub(super) fn pseudo_inverse(motion: ArrayView2<'_, f64>) -> (Array2<f64>, [f64; 6], usize) {
     // The tall transpose has the thin SVD with six columns: Wᵀ = U S Vᵀ, so W⁺ = U S⁻¹ Vᵀ.
     let columns = motion.ncols();
     let svd = DMatrix::from_fn(columns, 6, |row, column| motion[(column, row)]).svd(true, true);
     let mut sorted: Vec<f64> = svd.singular_values.iter().copied().collect();
     sorted.sort_by(|a, b| b.total_cmp(a));
+
     sorted.resize(6, 0.0);
     let least = RANK_TOLERANCE * sorted[0];
     let rank = sorted.iter().filter(|&&value| value > least).count();
-    let reciprocal = svd.singular_values.map(|value| if value > least { value.recip() } else { 0.0 });
+    let reciprocal = svd
+        .singular_values
+        .map(|value| if value > least { value.recip() } else { 0.0 });
     let inverse = match (svd.u, svd.v_t) {
         (Some(u), Some(v_t)) => u * DMatrix::from_diagonal(&reciprocal) * v_t,
         // Both were asked for.
         _ => DMatrix::zeros(columns, 6),
     };
-    (Array2::from_shape_fn((columns, 6), |at| inverse[at]), std::array::from_fn(|i| sorted[i]), rank)
+
+    (
+        Array2::from_shape_fn((columns, 6), |at| inverse[at]),
+        std::array::from_fn(|i| sorted[i]),
+        rank,
+    )
 }
 
 #[cfg(test)]
@@ -113,27 +138,48 @@ mod tests {
     use super::*;
 
     fn unit_scale() -> TargetScale {
-        TargetScale { mean: Vector6::zeros(), deviation: Vector6::repeat(1.0) }
+        TargetScale {
+            mean: Vector6::zeros(),
+            deviation: Vector6::repeat(1.0),
+        }
     }
 
-    /// Oracle: the definition of a right inverse, W W⁺ = I for a W of full row rank, and Moore and Penrose's
-    /// symmetry of W⁺W, which singles out the shortest step.
+    /// Oracle: the definition of a right inverse, W W⁺ = I for a W of full row rank, and Moore and
+    /// Penrose's symmetry of W⁺W, which singles out the shortest step.
     #[test]
     fn the_pseudo_inverse_is_the_shortest_right_inverse() {
-        let w = Array2::from_shape_fn((6, 20), |(row, column)| (((row * 20 + column) as f64).powi(2) * 0.37).sin());
+        let w = Array2::from_shape_fn((6, 20), |(row, column)| {
+            (((row * 20 + column) as f64).powi(2) * 0.37).sin()
+        });
         let inverse = Inverse::new(w.view(), &unit_scale()).unwrap();
         let identity = w.dot(&inverse.matrix());
-        assert!((&identity - &Array2::<f64>::eye(6)).iter().all(|x| x.abs() < 1e-12));
+
+        assert!(
+            (&identity - &Array2::<f64>::eye(6))
+                .iter()
+                .all(|x| x.abs() < 1e-12)
+        );
+
         let projector = inverse.matrix().dot(&w);
-        assert!((&projector - &projector.t()).iter().all(|x| x.abs() < 1e-12));
+        assert!(
+            (&projector - &projector.t())
+                .iter()
+                .all(|x| x.abs() < 1e-12)
+        );
     }
 
     /// Oracle: a W with two equal rows has rank 5 by definition.
     #[test]
     fn a_direction_that_was_never_trained_is_refused() {
-        let mut w = Array2::from_shape_fn((6, 20), |(row, column)| (((row * 20 + column) as f64).powi(2) * 0.37).sin());
+        let mut w = Array2::from_shape_fn((6, 20), |(row, column)| {
+            (((row * 20 + column) as f64).powi(2) * 0.37).sin()
+        });
         let copy = w.row(0).to_owned();
         w.row_mut(5).assign(&copy);
-        assert!(matches!(Inverse::new(w.view(), &unit_scale()), Err(Error::RankDeficient { rank: 5, .. })));
+
+        assert!(matches!(
+            Inverse::new(w.view(), &unit_scale()),
+            Err(Error::RankDeficient { rank: 5, .. })
+        ));
     }
 }

@@ -38,14 +38,20 @@ impl Loss {
     }
 
     /// The loss of predictions (n, 6) against targets (n, 6), and its gradient by the predictions.
-    pub fn value<T: Real>(self, predicted: ArrayView2<'_, T>, target: ArrayView2<'_, T>) -> (f64, Array2<T>) {
+    pub fn value<T: Real>(
+        self,
+        predicted: ArrayView2<'_, T>,
+        target: ArrayView2<'_, T>,
+    ) -> (f64, Array2<T>) {
         match self {
             Self::MeanSquaredError => mean_squared_error(predicted, target),
             Self::Cosine => cosine(predicted, target),
             Self::Rotation => {
                 let mut gradient = Array2::zeros(predicted.dim());
-                let (loss, inner) = mean_squared_error(predicted.slice(s![.., 3..]), target.slice(s![.., 3..]));
+                let (loss, inner) =
+                    mean_squared_error(predicted.slice(s![.., 3..]), target.slice(s![.., 3..]));
                 gradient.slice_mut(s![.., 3..]).assign(&inner);
+
                 (loss, gradient)
             }
         }
@@ -53,7 +59,10 @@ impl Loss {
 }
 
 /// The mean over rows and columns of (y − t)², and its gradient by y.
-pub(super) fn mean_squared_error<T: Real>(predicted: ArrayView2<'_, T>, target: ArrayView2<'_, T>) -> (f64, Array2<T>) {
+pub(super) fn mean_squared_error<T: Real>(
+    predicted: ArrayView2<'_, T>,
+    target: ArrayView2<'_, T>,
+) -> (f64, Array2<T>) {
     let difference = &predicted - &target;
     let count = difference.len() as f64;
     let loss = difference.iter().map(|x| x.f64() * x.f64()).sum::<f64>() / count;
@@ -64,18 +73,34 @@ fn cosine<T: Real>(predicted: ArrayView2<'_, T>, target: ArrayView2<'_, T>) -> (
     let n = predicted.nrows() as f64;
     let mut gradient = Array2::zeros(predicted.dim());
     let mut loss = 0.0;
-    for ((y, t), mut d) in
-        predicted.axis_iter(Axis(0)).zip(target.axis_iter(Axis(0))).zip(gradient.axis_iter_mut(Axis(0)))
+    for ((y, t), mut d) in predicted
+        .axis_iter(Axis(0))
+        .zip(target.axis_iter(Axis(0)))
+        .zip(gradient.axis_iter_mut(Axis(0)))
     {
         let length = |row: &ndarray::ArrayView1<'_, T>| {
-            row.iter().map(|x| x.f64() * x.f64()).sum::<f64>().sqrt().max(COSINE_EPS)
+            row.iter()
+                .map(|x| x.f64() * x.f64())
+                .sum::<f64>()
+                .sqrt()
+                .max(COSINE_EPS)
         };
-        let (a, c) = (length(&y), length(&t));
-        let cosine = y.iter().zip(&t).map(|(y, t)| y.f64() * t.f64()).sum::<f64>() / (a * c);
+
+        let a = length(&y);
+        let c = length(&t);
+
+        let cosine = y
+            .iter()
+            .zip(&t)
+            .map(|(y, t)| y.f64() * t.f64())
+            .sum::<f64>()
+            / (a * c);
         loss += 1.0 - cosine;
+
         Zip::from(&mut d).and(&y).and(&t).for_each(|d, &y, &t| {
             *d = T::of(-(t.f64() / (a * c) - cosine * y.f64() / (a * a)) / n);
         });
     }
+
     (loss / n, gradient)
 }

@@ -1,8 +1,11 @@
 //! Charts, and the gate that mixes them: ΔP ≈ Σ_k α_k(z₁) W_k(φ_k(z₂) − φ_k(z₁)).
 //!
-//! - α = softmax_k((W_route z)·p_k / e^τ); the gate sees only the source (sec. 2.7). One chart has no gate.
-//! - Charts that were learned apart can be mixed evenly, as an ensemble: then W̄ = \[W_1, …, W_K\]/K.
-//! - φ_k is a whole MLP. A latent of K > 1 charts is their K·k coordinates, then the K numbers of the gate.
+//! - α = softmax_k((W_route z)·p_k / e^τ); the gate sees only the source (sec. 2.7). One chart has
+//!   no gate.
+//! - Charts that were learned apart can be mixed evenly, as an ensemble: then W̄ = \[W_1, …,
+//!   W_K\]/K.
+//! - φ_k is a whole MLP. A latent of K > 1 charts is their K·k coordinates, then the K
+//!   numbers of the gate.
 
 use ndarray::{Array1, Array2, ArrayView1, Axis, concatenate, s};
 
@@ -59,7 +62,10 @@ pub struct Mixture<T> {
 
 impl<T: Real> From<Siamese<T>> for Mixture<T> {
     fn from(chart: Siamese<T>) -> Self {
-        Self { charts: vec![chart], gate: None }
+        Self {
+            charts: vec![chart],
+            gate: None,
+        }
     }
 }
 
@@ -69,16 +75,23 @@ impl<T: Real> Gate<T> {
         let route = super::layers::uniform(ROUTE_DIM, feature, feature, random);
         let scale = (ROUTE_DIM as f32).sqrt();
         let drawn = random.normal(charts * ROUTE_DIM);
-        let prototypes =
-            Array2::from_shape_fn((charts, ROUTE_DIM), |(k, r)| T::of(f64::from(drawn[k * ROUTE_DIM + r] / scale)));
-        Self { tensors: [route, prototypes, Array2::zeros((1, 1))] }
+        let prototypes = Array2::from_shape_fn((charts, ROUTE_DIM), |(k, r)| {
+            T::of(f64::from(drawn[k * ROUTE_DIM + r] / scale))
+        });
+
+        Self {
+            tensors: [route, prototypes, Array2::zeros((1, 1))],
+        }
     }
 
     /// W_route z and (W_route z)·p / e^τ.
     fn scores(&self, features: &Array2<T>) -> (Array2<T>, Array2<T>) {
         let [route, prototypes, log_tau] = &self.tensors;
         let routed = features.dot(&route.t());
-        let scores = routed.dot(&prototypes.t()).mapv(|x| x / log_tau[(0, 0)].exp());
+        let scores = routed
+            .dot(&prototypes.t())
+            .mapv(|x| x / log_tau[(0, 0)].exp());
+
         (routed, scores)
     }
 }
@@ -90,6 +103,7 @@ fn softmax<T: Real>(mut scores: Array2<T>) -> Array2<T> {
         let sum = row.sum();
         row.mapv_inplace(|x| x / sum);
     }
+
     scores
 }
 
@@ -100,8 +114,11 @@ impl<T: Real> Mixture<T> {
     }
 
     pub(super) fn random(widths: Widths, charts: usize, random: &mut Seeded) -> Self {
-        let charts: Vec<_> = (0..charts.max(1)).map(|_| Siamese::random(widths, random)).collect();
+        let charts: Vec<_> = (0..charts.max(1))
+            .map(|_| Siamese::random(widths, random))
+            .collect();
         let gate = (charts.len() > 1).then(|| Gate::random(widths.feature, charts.len(), random));
+
         Self { charts, gate }
     }
 
@@ -115,8 +132,8 @@ impl<T: Real> Mixture<T> {
         Ok(mixture)
     }
 
-    /// Takes tensors under PyTorch's names from `tensor`: those of [`TENSOR_NAMES`], or with more charts
-    /// `experts.0.phi.0.weight`, …, `route.weight`, `prototypes`, `log_tau`.
+    /// Takes tensors under PyTorch's names from `tensor`: those of [`TENSOR_NAMES`], or with more
+    /// charts `experts.0.phi.0.weight`, …, `route.weight`, `prototypes`, `log_tau`.
     ///
     /// # Errors
     /// As `tensor`, [`Error::Charts`], or [`Error::WeightShape`] when they do not fit one another.
@@ -128,24 +145,32 @@ impl<T: Real> Mixture<T> {
         if charts == 0 || charts > MAX_CHARTS {
             return Err(Error::Charts { count: charts }.into());
         }
+
         let mut read = Vec::with_capacity(charts);
         for chart in 0..charts {
             let mut arrays = Vec::with_capacity(TENSOR_NAMES.len());
             for name in TENSOR_NAMES {
                 arrays.push(tensor(&chart_name(charts, chart, name))?);
             }
-            let arrays = <[Array2<T>; 7]>::try_from(arrays).map_err(|_| Error::Charts { count: charts })?;
+
+            let arrays =
+                <[Array2<T>; 7]>::try_from(arrays).map_err(|_| Error::Charts { count: charts })?;
             read.push(Siamese::from_tensors(arrays)?);
         }
+
         let gate = match (charts, mixing) {
             (0 | 1, _) | (_, Mixing::Even) => None,
             _ => {
                 let [route, prototypes, log_tau] = GATE_NAMES;
-                Some(Gate { tensors: [tensor(route)?, tensor(prototypes)?, tensor(log_tau)?] })
+                Some(Gate {
+                    tensors: [tensor(route)?, tensor(prototypes)?, tensor(log_tau)?],
+                })
             }
         };
+
         let network = Self { charts: read, gate };
         network.check_shapes()?;
+
         Ok(network)
     }
 
@@ -154,28 +179,46 @@ impl<T: Real> Mixture<T> {
         let Some(first) = self.charts.first().filter(|_| count <= MAX_CHARTS) else {
             return Err(Error::Charts { count });
         };
-        let (feature, latent) = (first.feature_dim(), first.latent_dim());
+        let feature = first.feature_dim();
+
+        let latent = first.latent_dim();
         for (position, chart) in self.charts.iter().enumerate() {
             if (chart.feature_dim(), chart.latent_dim()) != (feature, latent) {
                 let tensor = chart_name(self.charts.len(), position, "phi");
                 let actual = vec![chart.feature_dim(), chart.latent_dim()];
-                return Err(Error::WeightShape { tensor, expected: vec![feature, latent], actual });
+
+                return Err(Error::WeightShape {
+                    tensor,
+                    expected: vec![feature, latent],
+                    actual,
+                });
             }
         }
-        let Some(Gate { tensors }) = &self.gate else { return Ok(()) };
+
+        let Some(Gate { tensors }) = &self.gate else {
+            return Ok(());
+        };
         let route = tensors[0].nrows();
         let expected = [(route, feature), (self.charts.len(), route), (1, 1)];
+
         for ((tensor, array), expected) in GATE_NAMES.into_iter().zip(tensors).zip(expected) {
             if array.dim() != expected || array.is_empty() {
-                let (tensor, expected) = (tensor.to_owned(), vec![expected.0, expected.1]);
-                return Err(Error::WeightShape { tensor, expected, actual: array.shape().to_vec() });
+                let tensor = tensor.to_owned();
+                let expected = vec![expected.0, expected.1];
+
+                return Err(Error::WeightShape {
+                    tensor,
+                    expected,
+                    actual: array.shape().to_vec(),
+                });
             }
         }
+
         Ok(())
     }
 
-    /// Makes charts that were learned on (z − mean)/deviation, each (1, d), charts for z. A gate has no bias that could
-    /// take the mean up: [`crate::training::Recipe::check`] refuses it.
+    /// Makes charts that were learned on (z − mean)/deviation, each (1, d), charts for z. A gate
+    /// has no bias that could take the mean up: [`crate::training::Recipe::check`] refuses it.
     pub(super) fn fold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
         for chart in &mut self.charts {
             chart.phi.fold_standardisation(mean, deviation);
@@ -184,7 +227,11 @@ impl<T: Real> Mixture<T> {
 
     /// How the charts are mixed.
     pub fn mixing(&self) -> Mixing {
-        if self.charts.len() > 1 && self.gate.is_none() { Mixing::Even } else { Mixing::Gate }
+        if self.charts.len() > 1 && self.gate.is_none() {
+            Mixing::Even
+        } else {
+            Mixing::Gate
+        }
     }
 
     /// How many charts there are, K.
@@ -209,7 +256,12 @@ impl<T: Real> Mixture<T> {
 
     /// Columns of a latent: the coordinates, and the gate if there is one.
     pub fn latent_dim(&self) -> usize {
-        self.coordinate_count() + if self.charts.len() > 1 { self.charts.len() } else { 0 }
+        self.coordinate_count()
+            + if self.charts.len() > 1 {
+                self.charts.len()
+            } else {
+                0
+            }
     }
 
     /// The same numbers in another precision.
@@ -217,7 +269,9 @@ impl<T: Real> Mixture<T> {
         let cast = |tensor: &Array2<T>| tensor.mapv(|x| U::of(x.f64()));
         Mixture {
             charts: self.charts.iter().map(Siamese::cast).collect(),
-            gate: self.gate.as_ref().map(|gate| Gate { tensors: gate.tensors.each_ref().map(cast) }),
+            gate: self.gate.as_ref().map(|gate| Gate {
+                tensors: gate.tensors.each_ref().map(cast),
+            }),
         }
     }
 
@@ -226,12 +280,23 @@ impl<T: Real> Mixture<T> {
         if let [chart] = self.charts.as_slice() {
             return chart.embed(features);
         }
+
         let alpha = match &self.gate {
             Some(gate) => softmax(gate.scores(&features).1),
             None => Array2::from_elem((features.nrows(), self.charts.len()), self.even_share()),
         };
-        let coordinates: Vec<_> = self.charts.iter().map(|chart| chart.embed(features.clone())).collect();
-        let parts: Vec<_> = coordinates.iter().chain([&alpha]).map(|part| part.view()).collect();
+
+        let coordinates: Vec<_> = self
+            .charts
+            .iter()
+            .map(|chart| chart.embed(features.clone()))
+            .collect();
+        let parts: Vec<_> = coordinates
+            .iter()
+            .chain([&alpha])
+            .map(|part| part.view())
+            .collect();
+
         // All parts have a row a feature.
         concatenate(Axis(1), &parts).unwrap_or(alpha)
     }
@@ -255,33 +320,49 @@ impl<T: Real> Mixture<T> {
 
     /// \[α_1 W_1, …, α_K W_K\], shape (6, K·k).
     pub fn motion_matrix(&self, gate: ArrayView1<'_, T>) -> Array2<T> {
-        let parts: Vec<_> = self.charts.iter().zip(gate).map(|(chart, &alpha)| &chart.motion * alpha).collect();
+        let parts: Vec<_> = self
+            .charts
+            .iter()
+            .zip(gate)
+            .map(|(chart, &alpha)| &chart.motion * alpha)
+            .collect();
         let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
+
         // All parts have six rows.
         concatenate(Axis(1), &views).unwrap_or_default()
     }
 }
 
 fn chart_name(charts: usize, chart: usize, name: &str) -> String {
-    if charts == 1 { name.to_owned() } else { format!("experts.{chart}.{name}") }
+    if charts == 1 {
+        name.to_owned()
+    } else {
+        format!("experts.{chart}.{name}")
+    }
 }
 
 impl<T: Real> Network<T> for Mixture<T> {
     fn names(&self) -> Vec<String> {
         let count = self.charts.len();
-        let charts = (0..count).flat_map(|chart| TENSOR_NAMES.map(|name| chart_name(count, chart, name)));
+        let charts =
+            (0..count).flat_map(|chart| TENSOR_NAMES.map(|name| chart_name(count, chart, name)));
         let gate = self.gate.iter().flat_map(|_| GATE_NAMES.map(str::to_owned));
+
         charts.chain(gate).collect()
     }
 
     fn parameters(&self) -> Vec<&Array2<T>> {
         let charts = self.charts.iter().flat_map(Siamese::tensors);
-        charts.chain(self.gate.iter().flat_map(|gate| &gate.tensors)).collect()
+        charts
+            .chain(self.gate.iter().flat_map(|gate| &gate.tensors))
+            .collect()
     }
 
     fn parameters_mut(&mut self) -> Vec<&mut Array2<T>> {
         let charts = self.charts.iter_mut().flat_map(Siamese::parameters_mut);
-        charts.chain(self.gate.iter_mut().flat_map(|gate| &mut gate.tensors)).collect()
+        charts
+            .chain(self.gate.iter_mut().flat_map(|gate| &mut gate.tensors))
+            .collect()
     }
 }
 
@@ -298,14 +379,31 @@ impl<T: Real> Objective<T> for Mixture<T> {
             let (routed, scores) = gate.scores(&batch.features);
             (routed, softmax(scores.clone()), scores)
         });
+
         let gate_at_source = |chart: usize| {
-            let column = |(_, alpha, _): &(_, Array2<T>, _)| batch.sources(&alpha.slice(s![.., chart..=chart]));
+            let column = |(_, alpha, _): &(_, Array2<T>, _)| {
+                batch.sources(&alpha.slice(s![.., chart..=chart]))
+            };
             alpha.as_ref().map(column)
         };
-        let forward: Vec<_> = self.charts.iter().map(|chart| chart.phi.forward(batch.features.clone())).collect();
-        let steps: Vec<_> = forward.iter().map(|forward| batch.differences(&forward.latents)).collect();
-        let motions: Vec<_> =
-            self.charts.iter().zip(&steps).map(|(chart, steps)| steps.dot(&chart.motion.t())).collect();
+
+        let forward: Vec<_> = self
+            .charts
+            .iter()
+            .map(|chart| chart.phi.forward(batch.features.clone()))
+            .collect();
+        let steps: Vec<_> = forward
+            .iter()
+            .map(|forward| batch.differences(&forward.latents))
+            .collect();
+
+        let motions: Vec<_> = self
+            .charts
+            .iter()
+            .zip(&steps)
+            .map(|(chart, steps)| steps.dot(&chart.motion.t()))
+            .collect();
+
         let mut predicted = Array2::zeros(batch.targets.dim());
         for (chart, motion) in motions.iter().enumerate() {
             match gate_at_source(chart) {
@@ -313,33 +411,47 @@ impl<T: Real> Objective<T> for Mixture<T> {
                 None => predicted += &(motion * self.even_share()),
             }
         }
+
         let (loss, d_predicted) = at.config.loss.value(predicted.view(), batch.targets.view());
         let mut gradient = self.zeros_like();
         let mut d_alpha = Array2::zeros((batch.targets.nrows(), self.charts.len()));
         for (position, chart) in self.charts.iter().enumerate() {
             let d_motion = match gate_at_source(position) {
                 Some(alpha) => {
-                    d_alpha.column_mut(position).assign(&(&d_predicted * &motions[position]).sum_axis(Axis(1)));
+                    d_alpha
+                        .column_mut(position)
+                        .assign(&(&d_predicted * &motions[position]).sum_axis(Axis(1)));
                     &d_predicted * &alpha
                 }
                 None => &d_predicted * self.even_share(),
             };
+
             let into = &mut gradient.charts[position];
             into.motion += &d_motion.t().dot(&steps[position]);
             let d_latents = batch.scattered(&d_motion.dot(&chart.motion));
-            chart.phi.backward(&forward[position], &d_latents, &mut into.phi);
+            chart
+                .phi
+                .backward(&forward[position], &d_latents, &mut into.phi);
         }
-        if let (Some(gate), Some((routed, alpha, scores)), Some(into)) = (&self.gate, &alpha, &mut gradient.gate) {
+
+        if let (Some(gate), Some((routed, alpha, scores)), Some(into)) =
+            (&self.gate, &alpha, &mut gradient.gate)
+        {
             // Through the softmax: ds_k = α_k (dα_k − Σ_j α_j dα_j).
             let at_source = batch.sources(alpha);
-            let mean = (&at_source * &d_alpha).sum_axis(Axis(1)).insert_axis(Axis(1));
+            let mean = (&at_source * &d_alpha)
+                .sum_axis(Axis(1))
+                .insert_axis(Axis(1));
             let d_scores = batch.scattered_to_sources(&(&at_source * &(d_alpha - mean)));
+
             let [_, prototypes, log_tau] = &gate.tensors;
             let scale = log_tau[(0, 0)].exp().recip();
             into.tensors[2][(0, 0)] = -(&d_scores * scores).sum();
             into.tensors[1] += &(d_scores.t().dot(routed) * scale);
+
             into.tensors[0] += &((d_scores.dot(prototypes) * scale).t().dot(&batch.features));
         }
+
         (loss, gradient)
     }
 }

@@ -1,6 +1,7 @@
 //! What every trained network has in common: named tensors, and AdamW over them.
 //!
-//! Tensors are named as PyTorch's state dicts name them. Vectors are (1, n) here and scalars (1, 1).
+//! Tensors are named as PyTorch's state dicts name them. Vectors are (1, n) here and scalars (1,
+//! 1).
 
 use ndarray::{Array2, Zip};
 
@@ -25,14 +26,22 @@ pub trait Network<T: Real>: Clone {
     /// All zeros, in this one's shape.
     fn zeros_like(&self) -> Self {
         let mut zeros = self.clone();
-        zeros.parameters_mut().into_iter().for_each(|tensor| tensor.fill(T::zero()));
+        zeros
+            .parameters_mut()
+            .into_iter()
+            .for_each(|tensor| tensor.fill(T::zero()));
+
         zeros
     }
 
     /// The first tensor with a number that is not finite.
     fn not_finite(&self) -> Option<String> {
         let bad = |tensor: &&Array2<T>| tensor.iter().any(|x| !x.is_finite());
-        self.names().into_iter().zip(self.parameters()).find(|(_, tensor)| bad(tensor)).map(|(name, _)| name)
+        self.names()
+            .into_iter()
+            .zip(self.parameters())
+            .find(|(_, tensor)| bad(tensor))
+            .map(|(name, _)| name)
     }
 }
 
@@ -66,31 +75,67 @@ pub(super) struct AdamW<T> {
 
 impl<T: Real> AdamW<T> {
     pub fn new(network: &impl Network<T>) -> Self {
-        let zeros = || network.parameters().into_iter().map(|tensor| Array2::zeros(tensor.dim())).collect();
-        Self { first_moments: zeros(), second_moments: zeros(), steps: 0 }
+        let zeros = || {
+            network
+                .parameters()
+                .into_iter()
+                .map(|tensor| Array2::zeros(tensor.dim()))
+                .collect()
+        };
+
+        Self {
+            first_moments: zeros(),
+            second_moments: zeros(),
+            steps: 0,
+        }
     }
 
     /// One step down the gradient; the gradient's global norm before clipping.
-    pub fn step<N: Network<T>>(&mut self, weights: &mut N, gradient: &N, config: &TrainConfig) -> f64 {
+    pub fn step<N: Network<T>>(
+        &mut self,
+        weights: &mut N,
+        gradient: &N,
+        config: &TrainConfig,
+    ) -> f64 {
         let gradient = gradient.parameters();
-        let squares: f64 = gradient.iter().flat_map(|tensor| tensor.iter()).map(|x| x.f64() * x.f64()).sum();
+        let squares: f64 = gradient
+            .iter()
+            .flat_map(|tensor| tensor.iter())
+            .map(|x| x.f64() * x.f64())
+            .sum();
         let gradient_norm = squares.sqrt();
+
         let clip = T::of((config.clip_norm / (gradient_norm + CLIP_EPS)).min(1.0));
         self.steps += 1;
-        let (beta_1, beta_2) = (T::of(BETA_1), T::of(BETA_2));
+        let beta_1 = T::of(BETA_1);
+        let beta_2 = T::of(BETA_2);
+
         let decay = T::of(1.0 - config.learning_rate * config.weight_decay);
         let rate = T::of(config.learning_rate / (1.0 - BETA_1.powi(self.steps)));
         let root = T::of((1.0 - BETA_2.powi(self.steps)).sqrt());
-        let (rest_1, rest_2, eps) = (T::of(1.0 - BETA_1), T::of(1.0 - BETA_2), T::of(ADAM_EPS));
+        let rest_1 = T::of(1.0 - BETA_1);
+
+        let rest_2 = T::of(1.0 - BETA_2);
+        let eps = T::of(ADAM_EPS);
         let moments = self.first_moments.iter_mut().zip(&mut self.second_moments);
-        for ((weight, gradient), (first, second)) in weights.parameters_mut().into_iter().zip(gradient).zip(moments) {
-            Zip::from(weight).and(gradient).and(first).and(second).for_each(|w, &g, m, v| {
-                let g = g * clip;
-                *m = *m * beta_1 + g * rest_1;
-                *v = *v * beta_2 + g * g * rest_2;
-                *w = *w * decay - rate * *m / (v.sqrt() / root + eps);
-            });
+        for ((weight, gradient), (first, second)) in weights
+            .parameters_mut()
+            .into_iter()
+            .zip(gradient)
+            .zip(moments)
+        {
+            Zip::from(weight)
+                .and(gradient)
+                .and(first)
+                .and(second)
+                .for_each(|w, &g, m, v| {
+                    let g = g * clip;
+                    *m = *m * beta_1 + g * rest_1;
+                    *v = *v * beta_2 + g * g * rest_2;
+                    *w = *w * decay - rate * *m / (v.sqrt() / root + eps);
+                });
         }
+
         gradient_norm
     }
 }

@@ -1,9 +1,12 @@
-//! The network φ: Linear(d, 64) → LayerNorm(64) → GELU (erf) → Linear(64, 20), forward, and backward by hand.
+//! The network φ: Linear(d, 64) → LayerNorm(64) → GELU (erf) → Linear(64, 20), forward, and
+//! backward by hand.
 
 use ndarray::{Array2, Axis};
 
 use super::Real;
-use super::layers::{cumulative, gelu_backward, linear, linear_initial, normalise, normalise_backward};
+use super::layers::{
+    cumulative, gelu_backward, linear, linear_initial, normalise, normalise_backward,
+};
 use super::seeded::Seeded;
 
 /// Sizes of φ.
@@ -38,21 +41,49 @@ pub(crate) struct Activations<T> {
 
 impl<T: Real> Phi<T> {
     /// PyTorch's names, in a `Sequential`.
-    pub const NAMES: [&str; 6] = ["0.weight", "0.bias", "1.weight", "1.bias", "3.weight", "3.bias"];
+    pub const NAMES: [&str; 6] = [
+        "0.weight", "0.bias", "1.weight", "1.bias", "3.weight", "3.bias",
+    ];
 
-    /// Drawn as PyTorch draws it: linear weights and biases uniform in ±1/√fan_in, LayerNorm 1 and 0.
+    /// Drawn as PyTorch draws it: linear weights and biases uniform in ±1/√fan_in, LayerNorm 1 and
+    /// 0.
     pub(crate) fn random(widths: Widths, random: &mut Seeded) -> Self {
-        let Widths { feature, hidden, latent } = widths;
+        let Widths {
+            feature,
+            hidden,
+            latent,
+        } = widths;
         let [first_weight, first_bias] = linear_initial(feature, hidden, random);
+
         let [last_weight, last_bias] = linear_initial(hidden, latent, random);
-        let (norm_weight, norm_bias) = (Array2::ones((1, hidden)), Array2::zeros((1, hidden)));
-        Self { tensors: [first_weight, first_bias, norm_weight, norm_bias, last_weight, last_bias] }
+        let norm_weight = Array2::ones((1, hidden));
+        let norm_bias = Array2::zeros((1, hidden));
+
+        Self {
+            tensors: [
+                first_weight,
+                first_bias,
+                norm_weight,
+                norm_bias,
+                last_weight,
+                last_bias,
+            ],
+        }
     }
 
     /// The shapes that the tensors must have to fit the first and the second to last of them.
     pub(super) fn expected_shapes(&self) -> [(usize, usize); 6] {
-        let ((hidden, feature), latent) = (self.tensors[0].dim(), self.tensors[4].nrows());
-        [(hidden, feature), (1, hidden), (1, hidden), (1, hidden), (latent, hidden), (1, latent)]
+        let (hidden, feature) = self.tensors[0].dim();
+        let latent = self.tensors[4].nrows();
+
+        [
+            (hidden, feature),
+            (1, hidden),
+            (1, hidden),
+            (1, hidden),
+            (latent, hidden),
+            (1, latent),
+        ]
     }
 
     /// Columns of a feature, d.
@@ -75,55 +106,102 @@ impl<T: Real> Phi<T> {
 
     /// All zeros, in this one's shape.
     pub(crate) fn zeros(&self) -> Self {
-        Self { tensors: self.tensors.each_ref().map(|tensor| Array2::zeros(tensor.dim())) }
+        Self {
+            tensors: self
+                .tensors
+                .each_ref()
+                .map(|tensor| Array2::zeros(tensor.dim())),
+        }
     }
 
     /// The same numbers in another precision.
     pub(super) fn cast<U: Real>(&self) -> Phi<U> {
-        Phi { tensors: self.tensors.each_ref().map(|tensor| tensor.mapv(|x| U::of(x.f64()))) }
+        Phi {
+            tensors: self
+                .tensors
+                .each_ref()
+                .map(|tensor| tensor.mapv(|x| U::of(x.f64()))),
+        }
     }
 
     /// W₁(z − m)/s + b₁ = (W₁/s) z + (b₁ − (W₁/s) m).
     pub(super) fn fold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
         let [first_weight, first_bias, ..] = &mut self.tensors;
+
         // In f64: the mean can be far larger than what it is taken off.
         let wide = |tensor: &Array2<T>| tensor.mapv(|x| x.f64());
         let weight = wide(first_weight) / &wide(deviation);
         let bias = wide(first_bias) - wide(mean).dot(&weight.t());
         *first_weight = weight.mapv(T::of);
+
         *first_bias = bias.mapv(T::of);
     }
 
     pub(crate) fn forward(&self, input: Array2<T>) -> Activations<T> {
-        let [first_weight, first_bias, norm_weight, norm_bias, last_weight, last_bias] = &self.tensors;
+        let [
+            first_weight,
+            first_bias,
+            norm_weight,
+            norm_bias,
+            last_weight,
+            last_bias,
+        ] = &self.tensors;
+
         let mut normalised = linear(&input, first_weight, first_bias);
         let inverse_deviation = normalise(&mut normalised);
         let scaled = &normalised * norm_weight + norm_bias;
         let cumulative = cumulative(&scaled);
         let hidden = &scaled * &cumulative;
         let latents = linear(&hidden, last_weight, last_bias);
-        Activations { input, normalised, inverse_deviation, scaled, cumulative, hidden, latents }
+
+        Activations {
+            input,
+            normalised,
+            inverse_deviation,
+            scaled,
+            cumulative,
+            hidden,
+            latents,
+        }
     }
 
     /// Adds to `gradient` the gradient for the latents' gradient `d_latents`, shape (n, k).
     ///
-    /// The last bias is left alone: a Siamese difference cancels it, so its gradient is exactly zero, and rounding
-    /// noise in its place would be amplified by Adam to the full learning rate. See [`Phi::backward_whole`].
-    pub(crate) fn backward(&self, forward: &Activations<T>, d_latents: &Array2<T>, gradient: &mut Self) {
+    /// The last bias is left alone: a Siamese difference cancels it, so its gradient is exactly
+    /// zero, and rounding noise in its place would be amplified by Adam to the full learning rate.
+    /// See [`Phi::backward_whole`].
+    pub(crate) fn backward(
+        &self,
+        forward: &Activations<T>,
+        d_latents: &Array2<T>,
+        gradient: &mut Self,
+    ) {
         let [_, _, norm_weight, _, last_weight, _] = &self.tensors;
         gradient.tensors[4] += &d_latents.t().dot(&forward.hidden);
         let mut d_scaled = d_latents.dot(last_weight);
         gelu_backward(&mut d_scaled, &forward.scaled, &forward.cumulative);
+
         gradient.tensors[2] += &(&d_scaled * &forward.normalised).sum_axis(Axis(0));
         gradient.tensors[3] += &d_scaled.sum_axis(Axis(0));
         let mut d_first = d_scaled * norm_weight;
-        normalise_backward(&mut d_first, &forward.normalised, &forward.inverse_deviation);
+        normalise_backward(
+            &mut d_first,
+            &forward.normalised,
+            &forward.inverse_deviation,
+        );
+
         gradient.tensors[0] += &d_first.t().dot(&forward.input);
         gradient.tensors[1] += &d_first.sum_axis(Axis(0));
     }
 
-    /// As [`Phi::backward`], for latents that are not subtracted from one another: the last bias counts.
-    pub(crate) fn backward_whole(&self, forward: &Activations<T>, d_latents: &Array2<T>, gradient: &mut Self) {
+    /// As [`Phi::backward`], for latents that are not subtracted from one another: the last bias
+    /// counts.
+    pub(crate) fn backward_whole(
+        &self,
+        forward: &Activations<T>,
+        d_latents: &Array2<T>,
+        gradient: &mut Self,
+    ) {
         self.backward(forward, d_latents, gradient);
         gradient.tensors[5] += &d_latents.sum_axis(Axis(0));
     }

@@ -11,8 +11,8 @@ pub enum Preset {
     PaperBase,
     /// 30,000 pairs with strides 10 to 40, 200 epochs: the paper's "optimal config".
     PaperRange,
-    /// Ours, for rooms that were never seen: 17 epochs of 30,000 pairs with strides 1 to 40, about 1,000 steps, on z-scored
-    /// features with noise, with averaged weights and no mean motion.
+    /// Ours, for rooms that were never seen: 17 epochs of 30,000 pairs with strides 1 to 40, about
+    /// 1,000 steps, on z-scored features with noise, with averaged weights and no mean motion.
     Steady,
 }
 
@@ -40,10 +40,20 @@ impl Preset {
 
     /// The optimiser's settings with a seed.
     pub fn config(self, seed: u64) -> TrainConfig {
-        let plain = TrainConfig { seed, ..TrainConfig::default() };
+        let plain = TrainConfig {
+            seed,
+            ..TrainConfig::default()
+        };
+
         match self {
-            Self::PaperBase => TrainConfig { epochs: 10, ..plain },
-            Self::PaperRange => TrainConfig { epochs: 200, ..plain },
+            Self::PaperBase => TrainConfig {
+                epochs: 10,
+                ..plain
+            },
+            Self::PaperRange => TrainConfig {
+                epochs: 200,
+                ..plain
+            },
             Self::Steady => TrainConfig {
                 epochs: 17,
                 learning_rate: 3e-4,
@@ -60,8 +70,16 @@ impl Preset {
     pub fn plan(self, stride: u32) -> PairPlan {
         match self {
             Self::PaperBase => PairPlan::Stride(stride),
-            Self::PaperRange => PairPlan::Range(StrideRange { low: 10, high: 40, count: 30_000 }),
-            Self::Steady => PairPlan::Range(StrideRange { low: 1, high: 40, count: 30_000 }),
+            Self::PaperRange => PairPlan::Range(StrideRange {
+                low: 10,
+                high: 40,
+                count: 30_000,
+            }),
+            Self::Steady => PairPlan::Range(StrideRange {
+                low: 1,
+                high: 40,
+                count: 30_000,
+            }),
         }
     }
 }
@@ -71,13 +89,24 @@ impl PairPlan {
     ///
     /// # Errors
     /// As [`Split::train_pairs`] and [`Split::sampled_range`].
-    pub fn pairs(&self, split: Split, rooms: &[&Timeline], seed: u64) -> Result<Vec<(usize, Pair)>, PairError> {
+    pub fn pairs(
+        &self,
+        split: Split,
+        rooms: &[&Timeline],
+        seed: u64,
+    ) -> Result<Vec<(usize, Pair)>, PairError> {
         match self {
             Self::Stride(stride) => {
                 let mut pairs = Vec::new();
                 for (room, timeline) in rooms.iter().enumerate() {
-                    pairs.extend(split.train_pairs(timeline, *stride)?.into_iter().map(|pair| (room, pair)));
+                    pairs.extend(
+                        split
+                            .train_pairs(timeline, *stride)?
+                            .into_iter()
+                            .map(|pair| (room, pair)),
+                    );
                 }
+
                 Ok(pairs)
             }
             Self::Range(range) => split.sampled_range(rooms, range, seed),

@@ -1,4 +1,5 @@
-//! The two precisions that the network runs in: f32 to train, f64 to answer and to be checked against.
+//! The two precisions that the network runs in: f32 to train, f64 to answer and to be checked
+//! against.
 
 /// f32 or f64.
 pub trait Real: ndarray::NdFloat + Default {

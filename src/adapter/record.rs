@@ -30,6 +30,7 @@ pub struct TrainingRecord {
     pub room_tests: Vec<MotionScores>,
     /// On the training pairs.
     pub train: MotionScores,
-    /// R² on the test pairs of always predicting the mean of the training twists: the mean over rooms.
+    /// R² on the test pairs of always predicting the mean of the training twists: the mean over
+    /// rooms.
     pub train_mean_r2: f64,
 }

@@ -1,7 +1,9 @@
-//! Random numbers as PyTorch draws them on the CPU, so that a seed here gives the very run that it gives there.
+//! Random numbers as PyTorch draws them on the CPU, so that a seed here gives the very run that it
+//! gives there.
 //!
-//! MT19937 seeded by `torch.manual_seed(seed)`; a float takes the low 24 bits of a draw; `torch.randperm` takes one
-//! draw a place. Initial weights are compared with PyTorch's bit by bit in the tests.
+//! MT19937 seeded by `torch.manual_seed(seed)`; a float takes the low 24 bits of a draw;
+//! `torch.randperm` takes one draw a place. Initial weights are compared with PyTorch's bit by bit
+//! in the tests.
 
 use rand_mt::Mt;
 
@@ -16,21 +18,24 @@ impl Seeded {
 
     /// One number of `uniform_(-bound, bound)` on a float tensor.
     pub fn symmetric(&mut self, bound: f64) -> f32 {
-        let (low, high) = (-bound as f32, bound as f32);
+        let low = -bound as f32;
+        let high = bound as f32;
         self.unit().mul_add(high - low, low)
     }
 
-    /// `torch.randn(count)` of floats for a count that is a multiple of 16, to the last bits: PyTorch's own sine and
-    /// logarithm are vectorised.
+    /// `torch.randn(count)` of floats for a count that is a multiple of 16, to the last bits:
+    /// PyTorch's own sine and logarithm are vectorised.
     pub fn normal(&mut self, count: usize) -> Vec<f32> {
         let mut values: Vec<f32> = (0..count).map(|_| self.unit()).collect();
         for block in values.chunks_exact_mut(16) {
             for place in 0..8 {
                 let radius = (-2.0 * (1.0 - block[place]).ln()).sqrt();
                 let (sine, cosine) = (std::f32::consts::TAU * block[place + 8]).sin_cos();
-                (block[place], block[place + 8]) = (radius * cosine, radius * sine);
+                block[place] = radius * cosine;
+                block[place + 8] = radius * sine;
             }
         }
+
         values
     }
 
@@ -45,6 +50,7 @@ impl Seeded {
             let ahead = self.0.next_u32() as usize % (count - place);
             order.swap(place, place + ahead);
         }
+
         order
     }
 }
@@ -53,7 +59,8 @@ impl Seeded {
 mod tests {
     use super::*;
 
-    /// Oracle: `torch.manual_seed(3); torch.randperm(10)`, then five of `torch.randperm(1000)`, PyTorch 2.15.
+    /// Oracle: `torch.manual_seed(3); torch.randperm(10)`, then five of `torch.randperm(1000)`,
+    /// PyTorch 2.15.
     #[test]
     fn permutations_are_pytorchs() {
         let mut random = Seeded::new(3);

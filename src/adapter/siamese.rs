@@ -7,11 +7,18 @@ use super::{Error, Network, Real};
 use ndarray::{Array2, ArrayView2};
 
 /// Names of the tensors, in the order of [`Siamese::tensors`].
-pub const TENSOR_NAMES: [&str; 7] =
-    ["phi.0.weight", "phi.0.bias", "phi.1.weight", "phi.1.bias", "phi.3.weight", "phi.3.bias", "W.weight"];
+pub const TENSOR_NAMES: [&str; 7] = [
+    "phi.0.weight",
+    "phi.0.bias",
+    "phi.1.weight",
+    "phi.1.bias",
+    "phi.3.weight",
+    "phi.3.bias",
+    "W.weight",
+];
 
-/// Parameters of φ and W, or anything shaped like them. Tensors are shaped as in PyTorch: `phi.0.weight` (64, d), …,
-/// `W.weight` (6, 20); vectors are (1, n) here.
+/// Parameters of φ and W, or anything shaped like them. Tensors are shaped as in PyTorch:
+/// `phi.0.weight` (64, d), …, `W.weight` (6, 20); vectors are (1, n) here.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Siamese<T> {
     pub(crate) phi: Phi<T>,
@@ -21,10 +28,14 @@ pub struct Siamese<T> {
 impl<T: Real> Siamese<T> {
     /// A chart drawn as PyTorch draws it.
     pub(crate) fn random(widths: Widths, random: &mut Seeded) -> Self {
-        Self { phi: Phi::random(widths, random), motion: uniform(6, widths.latent, widths.latent, random) }
+        Self {
+            phi: Phi::random(widths, random),
+            motion: uniform(6, widths.latent, widths.latent, random),
+        }
     }
 
-    /// The initial weights of a seed: those that PyTorch gives the same network after `torch.manual_seed(seed)`.
+    /// The initial weights of a seed: those that PyTorch gives the same network after
+    /// `torch.manual_seed(seed)`.
     pub fn initial(widths: Widths, seed: u64) -> Self {
         Self::random(widths, &mut Seeded::new(seed))
     }
@@ -34,16 +45,48 @@ impl<T: Real> Siamese<T> {
     /// # Errors
     /// [`Error::WeightShape`] when they do not fit one another.
     pub fn from_tensors(tensors: [Array2<T>; 7]) -> Result<Self, Error> {
-        let [first_weight, first_bias, norm_weight, norm_bias, last_weight, last_bias, motion] = tensors;
-        let phi = Phi { tensors: [first_weight, first_bias, norm_weight, norm_bias, last_weight, last_bias] };
-        let expected = phi.expected_shapes().into_iter().chain([(6, phi.latent_dim())]);
+        let [
+            first_weight,
+            first_bias,
+            norm_weight,
+            norm_bias,
+            last_weight,
+            last_bias,
+            motion,
+        ] = tensors;
+
+        let phi = Phi {
+            tensors: [
+                first_weight,
+                first_bias,
+                norm_weight,
+                norm_bias,
+                last_weight,
+                last_bias,
+            ],
+        };
+
+        let expected = phi
+            .expected_shapes()
+            .into_iter()
+            .chain([(6, phi.latent_dim())]);
+
         let chart = Self { phi, motion };
-        for ((tensor, array), (rows, columns)) in TENSOR_NAMES.into_iter().zip(chart.tensors()).zip(expected) {
+        for ((tensor, array), (rows, columns)) in
+            TENSOR_NAMES.into_iter().zip(chart.tensors()).zip(expected)
+        {
             if array.dim() != (rows, columns) || rows * columns == 0 {
-                let (tensor, actual) = (tensor.to_owned(), array.shape().to_vec());
-                return Err(Error::WeightShape { tensor, expected: vec![rows, columns], actual });
+                let tensor = tensor.to_owned();
+                let actual = array.shape().to_vec();
+
+                return Err(Error::WeightShape {
+                    tensor,
+                    expected: vec![rows, columns],
+                    actual,
+                });
             }
         }
+
         Ok(chart)
     }
 
@@ -55,7 +98,10 @@ impl<T: Real> Siamese<T> {
 
     /// The same numbers in another precision.
     pub fn cast<U: Real>(&self) -> Siamese<U> {
-        Siamese { phi: self.phi.cast(), motion: self.motion.mapv(|x| U::of(x.f64())) }
+        Siamese {
+            phi: self.phi.cast(),
+            motion: self.motion.mapv(|x| U::of(x.f64())),
+        }
     }
 
     /// Columns of a feature, d.
@@ -89,6 +135,10 @@ impl<T: Real> Network<T> for Siamese<T> {
     }
 
     fn parameters_mut(&mut self) -> Vec<&mut Array2<T>> {
-        self.phi.tensors.iter_mut().chain([&mut self.motion]).collect()
+        self.phi
+            .tensors
+            .iter_mut()
+            .chain([&mut self.motion])
+            .collect()
     }
 }

@@ -1,8 +1,9 @@
 //! Training: any network, in seeded order.
 //!
-//! A frame occurs in many pairs, so φ runs once for each distinct frame of a batch; the gradient of its latent is
-//! the sum over its pairs. On one machine the same seed gives the same bits; a seed draws the weights and orders that
-//! PyTorch draws from it (`torch.manual_seed`, the module, then `torch.randperm` an epoch).
+//! A frame occurs in many pairs, so φ runs once for each distinct frame of a batch; the gradient of
+//! its latent is the sum over its pairs. On one machine the same seed gives the same bits; a seed
+//! draws the weights and orders that PyTorch draws from it (`torch.manual_seed`, the module, then
+//! `torch.randperm` an epoch).
 
 use super::network::AdamW;
 use super::phi::Widths;
@@ -28,17 +29,22 @@ pub struct TrainConfig {
     pub latent: usize,
     /// Charts, the paper's K.
     pub charts: usize,
-    /// How the charts are mixed; those mixed evenly are learned apart, each for its share of the epochs.
+    /// How the charts are mixed; those mixed evenly are learned apart, each for its share of the
+    /// epochs.
     pub mixing: Mixing,
     /// What is minimised.
     pub loss: Loss,
-    /// Whether features are z-scored by the training frames' statistics; it ends up in the first layer's weights.
+    /// Whether features are z-scored by the training frames' statistics; it ends up in the first
+    /// layer's weights.
     pub standardise: bool,
-    /// Deviation of the noise that is added to every feature at every step, in units of the features as they are learned.
+    /// Deviation of the noise that is added to every feature at every step, in units of the
+    /// features as they are learned.
     pub noise: f64,
-    /// Decay of the running average of the weights that is returned instead of the last weights; 0 for none.
+    /// Decay of the running average of the weights that is returned instead of the last weights; 0
+    /// for none.
     pub average: f64,
-    /// Whether μ is taken as zero and σ as the root mean square: then zero motion stays put in every reading.
+    /// Whether μ is taken as zero and σ as the root mean square: then zero motion stays put in
+    /// every reading.
     pub through_zero: bool,
     /// Of the initial weights and of the order of the pairs.
     pub seed: u64,
@@ -88,7 +94,13 @@ impl<'a, T: Real, N: Objective<T>> Trainer<'a, T, N> {
     /// Begins at `weights`.
     pub fn new(data: &'a N::Data, weights: N, config: TrainConfig) -> Self {
         let optimiser = AdamW::new(&weights);
-        Self { data, config, weights, optimiser, steps: 0 }
+        Self {
+            data,
+            config,
+            weights,
+            optimiser,
+            steps: 0,
+        }
     }
 
     /// The weights as they are now.
@@ -98,15 +110,28 @@ impl<'a, T: Real, N: Objective<T>> Trainer<'a, T, N> {
 
     /// Loss and gradient of a batch of samples, before clipping.
     pub fn gradient(&self, batch: &[usize]) -> (f64, N) {
-        self.weights.gradient(self.data, batch, At { config: &self.config, step: self.steps })
+        self.weights.gradient(
+            self.data,
+            batch,
+            At {
+                config: &self.config,
+                step: self.steps,
+            },
+        )
     }
 
     /// One step on the samples that `batch` names.
     pub fn step(&mut self, batch: &[usize]) -> StepReport {
         let (loss, gradient) = self.gradient(batch);
         self.steps += 1;
-        let gradient_norm = self.optimiser.step(&mut self.weights, &gradient, &self.config);
-        StepReport { loss, gradient_norm }
+        let gradient_norm = self
+            .optimiser
+            .step(&mut self.weights, &gradient, &self.config);
+
+        StepReport {
+            loss,
+            gradient_norm,
+        }
     }
 }
 
@@ -139,6 +164,7 @@ pub(crate) fn fit<T: Real, N: Objective<T>>(
         let mut losses = Vec::new();
         for batch in order.chunks(config.batch.max(1)) {
             losses.push(trainer.step(batch).loss);
+
             if let Some(average) = &mut average {
                 // Shorter at first, or the random weights of the start would stay in a short run.
                 let steps = trainer.steps as f64;
@@ -146,19 +172,32 @@ pub(crate) fn fit<T: Real, N: Objective<T>>(
                 move_towards(average, &trainer.weights, 1.0 - decay);
             }
         }
+
         let loss = crate::scores::mean(&losses);
         if !loss.is_finite() {
             return Err(Error::Diverged { epoch, loss });
         }
-        progress(EpochProgress { done: epoch, epochs: config.epochs, loss });
+
+        progress(EpochProgress {
+            done: epoch,
+            epochs: config.epochs,
+            loss,
+        });
     }
+
     Ok(average.unwrap_or(trainer.weights))
 }
 
 /// Moves every number by a share of the way to another.
 fn move_towards<T: Real, N: Objective<T>>(average: &mut N, weights: &N, share: f64) {
-    for (into, weight) in average.parameters_mut().into_iter().zip(weights.parameters()) {
-        into.zip_mut_with(weight, |into, &weight| *into += (weight - *into) * T::of(share));
+    for (into, weight) in average
+        .parameters_mut()
+        .into_iter()
+        .zip(weights.parameters())
+    {
+        into.zip_mut_with(weight, |into, &weight| {
+            *into += (weight - *into) * T::of(share)
+        });
     }
 }
 
@@ -174,26 +213,45 @@ pub fn train(
     progress: &mut dyn FnMut(EpochProgress),
 ) -> Result<Mixture<f32>, Error> {
     if config.charts == 0 || config.charts > super::MAX_CHARTS {
-        return Err(Error::Charts { count: config.charts });
+        return Err(Error::Charts {
+            count: config.charts,
+        });
     }
+
     if config.charts > 1 && config.mixing == Mixing::Gate && config.standardise {
         return Err(Error::GatedStandardised);
     }
     if config.charts == 1 || config.mixing == Mixing::Gate {
         return train_together(samples, config, progress);
     }
+
     let epochs = config.epochs.div_ceil(config.charts);
     let mut charts = Vec::with_capacity(config.charts);
     for member in 0..config.charts {
         // Seeds of members do not meet those of other runs, which count up by one.
-        let seed = u64::from((config.seed as u32).wrapping_add((member as u32).wrapping_mul(MEMBER_SEED_STEP)));
-        let alone = TrainConfig { charts: 1, epochs, seed, ..config.clone() };
+        let seed = u64::from(
+            (config.seed as u32).wrapping_add((member as u32).wrapping_mul(MEMBER_SEED_STEP)),
+        );
+
+        let alone = TrainConfig {
+            charts: 1,
+            epochs,
+            seed,
+            ..config.clone()
+        };
+
         let done = member * epochs;
         let trained = train_together(samples, &alone, &mut |epoch| {
-            progress(EpochProgress { done: done + epoch.done, epochs: config.charts * epochs, ..epoch });
+            progress(EpochProgress {
+                done: done + epoch.done,
+                epochs: config.charts * epochs,
+                ..epoch
+            });
         })?;
+
         charts.extend(trained.charts().iter().cloned());
     }
+
     Mixture::even(charts)
 }
 
@@ -205,14 +263,21 @@ fn train_together(
     config: &TrainConfig,
     progress: &mut dyn FnMut(EpochProgress),
 ) -> Result<Mixture<f32>, Error> {
-    let widths = Widths { feature: samples.feature_dim(), hidden: config.hidden, latent: config.latent };
+    let widths = Widths {
+        feature: samples.feature_dim(),
+        hidden: config.hidden,
+        latent: config.latent,
+    };
+
     let mut random = Seeded::new(config.seed);
     let start = Mixture::random(widths, config.charts, &mut random);
     if !config.standardise {
         return fit(samples, start, config, &mut random, progress);
     }
+
     let (standardised, [mean, deviation]) = samples.standardised();
     let mut network = fit(&standardised, start, config, &mut random, progress)?;
     network.fold_standardisation(&mean, &deviation);
+
     Ok(network)
 }

@@ -7,7 +7,8 @@ use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis, s};
 
 use super::inverse::{pseudo_inverse, target};
 use super::{
-    Calibration, Corrector, CorrectorKind, Error, Inverse, MAX_LATENT, Mixing, Mixture, Network, Reading, TargetScale,
+    Calibration, Corrector, CorrectorKind, Error, Inverse, MAX_LATENT, Mixing, Mixture, Network,
+    Reading, TargetScale,
 };
 use crate::features::FeatureSource;
 use crate::geometry::Twist;
@@ -34,29 +35,51 @@ impl Adapter {
     /// Checks trained weights and prepares W⁺.
     ///
     /// # Errors
-    /// [`Error::FeatureDim`], [`Error::WeightsNotFinite`], [`Error::Deviation`], [`Error::NotFinite`] or
-    /// [`Error::RankDeficient`].
-    pub fn new(source: FeatureSource, network: impl Into<Mixture<f32>>, scale: TargetScale) -> Result<Self, Error> {
+    /// [`Error::FeatureDim`], [`Error::WeightsNotFinite`], [`Error::Deviation`],
+    /// [`Error::NotFinite`] or [`Error::RankDeficient`].
+    pub fn new(
+        source: FeatureSource,
+        network: impl Into<Mixture<f32>>,
+        scale: TargetScale,
+    ) -> Result<Self, Error> {
         let network = network.into();
         if network.feature_dim() != source.dim {
-            return Err(Error::FeatureDim { expected: network.feature_dim(), actual: source.dim });
+            return Err(Error::FeatureDim {
+                expected: network.feature_dim(),
+                actual: source.dim,
+            });
         }
+
         if let Some(tensor) = network.not_finite() {
             return Err(Error::WeightsNotFinite { tensor });
         }
+
         for (component, &value) in scale.deviation.iter().enumerate() {
             if !(value.is_finite() && value > 0.0) {
                 return Err(Error::Deviation { component, value });
             }
         }
+
         if let Some(position) = scale.mean.iter().position(|x| !x.is_finite()) {
-            return Err(Error::NotFinite { what: "target mean", position, value: scale.mean[position] });
+            return Err(Error::NotFinite {
+                what: "target mean",
+                position,
+                value: scale.mean[position],
+            });
         }
+
         let network_f64 = network.cast::<f64>();
         for chart in network_f64.charts() {
             Inverse::new(chart.motion_matrix(), &scale)?;
         }
-        let inverse = Inverse::new(network_f64.motion_matrix(network_f64.even_gate().view()).view(), &scale)?;
+
+        let inverse = Inverse::new(
+            network_f64
+                .motion_matrix(network_f64.even_gate().view())
+                .view(),
+            &scale,
+        )?;
+
         Ok(Self {
             source,
             network,
@@ -72,23 +95,25 @@ impl Adapter {
     /// The same adapter with correctors, one a kind.
     ///
     /// # Errors
-    /// [`Error::CorrectorTwice`], [`Error::WeightsNotFinite`], or [`Error::WeightShape`] when one does not fit the
-    /// adapter's latents.
+    /// [`Error::CorrectorTwice`], [`Error::WeightsNotFinite`], or [`Error::WeightShape`] when one
+    /// does not fit the adapter's latents.
     pub fn with_correctors(mut self, correctors: Vec<Corrector<f32>>) -> Result<Self, Error> {
         for corrector in correctors {
             let name = corrector.kind().name();
             if self.corrector(corrector.kind()).is_ok() {
                 return Err(Error::CorrectorTwice { name });
             }
+
             corrector.check(self.network.coordinate_count())?;
             let precise = corrector.cast::<f64>();
             self.correctors.push((corrector, precise));
         }
+
         Ok(self)
     }
 
-    /// The same adapter with the second moment of its errors, Σ = mean r rᵀ with r = ΔP − σ⊙W(g₂ − g₁), on (v, ω), measured
-    /// in rooms that it did not learn from.
+    /// The same adapter with the second moment of its errors, Σ = mean r rᵀ with r = ΔP − σ⊙W(g₂ −
+    /// g₁), on (v, ω), measured in rooms that it did not learn from.
     ///
     /// # Errors
     /// [`Error::ErrorCovariance`].
@@ -97,6 +122,7 @@ impl Adapter {
         if !symmetric || covariance.cholesky().is_none() {
             return Err(Error::ErrorCovariance);
         }
+
         self.error_covariance = Some(covariance);
         Ok(self)
     }
@@ -112,8 +138,11 @@ impl Adapter {
     /// [`Error::Calibration`] when its latents are of another size.
     pub fn with_calibration(mut self, calibration: Calibration) -> Result<Self, Error> {
         if calibration.flicker().size() != self.coordinate_count() {
-            return Err(Error::Calibration { what: "the size of a covariance of latents" });
+            return Err(Error::Calibration {
+                what: "the size of a covariance of latents",
+            });
         }
+
         self.calibration = Some(Arc::new(calibration));
         Ok(self)
     }
@@ -160,11 +189,15 @@ impl Adapter {
 
     /// W of each chart, shape (6, k).
     pub fn motion_matrices(&self) -> Vec<ArrayView2<'_, f64>> {
-        self.network_f64.charts().iter().map(super::Siamese::motion_matrix).collect()
+        self.network_f64
+            .charts()
+            .iter()
+            .map(super::Siamese::motion_matrix)
+            .collect()
     }
 
-    /// σ ⊙ W, shape (6, [`Adapter::coordinate_count`]): a difference of latents to the motion without μ; of an ensemble
-    /// σ ⊙ W̄.
+    /// σ ⊙ W, shape (6, [`Adapter::coordinate_count`]): a difference of latents to the motion
+    /// without μ; of an ensemble σ ⊙ W̄.
     ///
     /// # Errors
     /// [`Error::GatedMotion`] for charts under a gate, which changes with the source.
@@ -172,10 +205,14 @@ impl Adapter {
         if self.network.chart_count() > 1 && self.network.mixing() == Mixing::Gate {
             return Err(Error::GatedMotion);
         }
-        let mut matrix = self.network_f64.motion_matrix(self.network_f64.even_gate().view());
+
+        let mut matrix = self
+            .network_f64
+            .motion_matrix(self.network_f64.even_gate().view());
         for (mut row, &deviation) in matrix.outer_iter_mut().zip(self.scale.deviation.iter()) {
             row *= deviation;
         }
+
         Ok(matrix)
     }
 
@@ -185,11 +222,19 @@ impl Adapter {
     /// [`Error::FeatureDim`] or [`Error::FeatureSource`].
     pub fn check_source(&self, source: &FeatureSource) -> Result<(), Error> {
         if source.dim != self.source.dim {
-            return Err(Error::FeatureDim { expected: self.source.dim, actual: source.dim });
+            return Err(Error::FeatureDim {
+                expected: self.source.dim,
+                actual: source.dim,
+            });
         }
+
         if !source.is_like(&self.source) {
-            return Err(Error::FeatureSource { expected: describe(&self.source), actual: describe(source) });
+            return Err(Error::FeatureSource {
+                expected: describe(&self.source),
+                actual: describe(source),
+            });
         }
+
         Ok(())
     }
 
@@ -201,16 +246,29 @@ impl Adapter {
     /// Source: SeeSE3, sec. 2.4.
     pub fn embed(&self, features: ArrayView2<'_, f32>) -> Result<Array2<f64>, Error> {
         if features.ncols() != self.source.dim {
-            return Err(Error::FeatureDim { expected: self.source.dim, actual: features.ncols() });
+            return Err(Error::FeatureDim {
+                expected: self.source.dim,
+                actual: features.ncols(),
+            });
         }
-        if let Some(((_, position), &value)) = features.indexed_iter().find(|(_, value)| !value.is_finite()) {
-            return Err(Error::NotFinite { what: "feature", position, value: f64::from(value) });
+
+        if let Some(((_, position), &value)) = features
+            .indexed_iter()
+            .find(|(_, value)| !value.is_finite())
+        {
+            return Err(Error::NotFinite {
+                what: "feature",
+                position,
+                value: f64::from(value),
+            });
         }
+
         let mut latents = Array2::zeros((features.nrows(), self.latent_dim()));
         let chunks = features.axis_chunks_iter(Axis(0), EMBED_ROWS);
         for (rows, mut out) in chunks.zip(latents.axis_chunks_iter_mut(Axis(0), EMBED_ROWS)) {
             out.assign(&self.network_f64.embed(rows.mapv(f64::from)));
         }
+
         Ok(latents)
     }
 
@@ -223,8 +281,8 @@ impl Adapter {
         Ok(self.embed(row.insert_axis(Axis(0)))?.row(0).to_owned())
     }
 
-    /// The camera's motion between two latents, ΔP = σ ⊙ W(g₂ − g₁) + μ, in the first camera's body frame; W is mixed
-    /// by the gate of the first.
+    /// The camera's motion between two latents, ΔP = σ ⊙ W(g₂ − g₁) + μ, in the first camera's body
+    /// frame; W is mixed by the gate of the first.
     ///
     /// Source: SeeSE3, sec. 2.4; targets un-normalised.
     pub fn motion(&self, from: ArrayView1<'_, f64>, to: ArrayView1<'_, f64>) -> Twist {
@@ -233,10 +291,15 @@ impl Adapter {
             _ => {
                 let coordinates = s![..self.coordinate_count()];
                 let step = &to.slice(coordinates) - &from.slice(coordinates);
-                self.network_f64.motion_matrix(self.network_f64.gate_of(from).view()).dot(&step)
+
+                self.network_f64
+                    .motion_matrix(self.network_f64.gate_of(from).view())
+                    .dot(&step)
             }
         };
-        self.scale.twist(&Vector6::from_fn(|row, _| normalised[row]))
+
+        self.scale
+            .twist(&Vector6::from_fn(|row, _| normalised[row]))
     }
 
     /// [`Adapter::motion`] without μ: no difference of latents is no motion (A-16, homogeneous).
@@ -244,22 +307,32 @@ impl Adapter {
         Twist::from_vector(&(self.motion(from, to).to_vector() - self.scale.mean))
     }
 
-    /// The latent step of a motion from `latent`, ĝ − g = W⁺ΔP; what a mixture's gate says stays as it is at the
-    /// source (A-36). `mean_share` as in [`Inverse::step`].
+    /// The latent step of a motion from `latent`, ĝ − g = W⁺ΔP; what a mixture's gate says stays as
+    /// it is at the source (A-36). `mean_share` as in [`Inverse::step`].
     ///
     /// Source: SeeSE3, ĝ = φ(z) + W⁺ΔP.
-    pub fn step(&self, latent: ArrayView1<'_, f64>, twist: Twist, reading: Reading, mean_share: f64) -> Array1<f64> {
+    pub fn step(
+        &self,
+        latent: ArrayView1<'_, f64>,
+        twist: Twist,
+        reading: Reading,
+        mean_share: f64,
+    ) -> Array1<f64> {
         if self.network_f64.chart_count() == 1 || self.network_f64.mixing() == Mixing::Even {
             return self.widened(self.inverse.step(twist, reading, mean_share));
         }
-        let mixed = self.network_f64.motion_matrix(self.network_f64.gate_of(latent).view());
+
+        let mixed = self
+            .network_f64
+            .motion_matrix(self.network_f64.gate_of(latent).view());
         let (inverse, ..) = pseudo_inverse(mixed.view());
+
         self.widened(inverse.dot(&target(&self.scale, twist, reading, mean_share)))
     }
 
-    /// The latent step of a motion from `latent` by a corrector: with a residual W⁺ΔP in the affine reading and what
-    /// the corrector adds, else the latent that it predicts. A part of a motion is a motion to it: μ is a part of its
-    /// input's scale, nothing that could be shared among parts.
+    /// The latent step of a motion from `latent` by a corrector: with a residual W⁺ΔP in the affine
+    /// reading and what the corrector adds, else the latent that it predicts. A part of a motion is
+    /// a motion to it: μ is a part of its input's scale, nothing that could be shared among parts.
     ///
     /// # Errors
     /// [`Error::NoCorrector`].
@@ -275,6 +348,7 @@ impl Adapter {
         let wanted = target(&self.scale, twist, Reading::Affine, 1.0);
         let here = latent.slice(s![..self.coordinate_count()]);
         let added = corrector.added(here, wanted.view());
+
         if kind.has_residual() {
             Ok(self.step(latent, twist, Reading::Affine, 1.0) + self.widened(added))
         } else {
@@ -282,29 +356,50 @@ impl Adapter {
         }
     }
 
-    /// Refuses a latent of the wrong width, with a number that is not finite, or with a gate that is none.
+    /// Refuses a latent of the wrong width, with a number that is not finite, or with a gate that
+    /// is none.
     ///
     /// # Errors
     /// [`Error::LatentDim`], [`Error::NotFinite`], [`Error::LatentRange`] or [`Error::Gate`].
     pub fn check_latent(&self, latent: &[f64]) -> Result<(), Error> {
         if latent.len() != self.latent_dim() {
-            return Err(Error::LatentDim { expected: self.latent_dim(), actual: latent.len() });
+            return Err(Error::LatentDim {
+                expected: self.latent_dim(),
+                actual: latent.len(),
+            });
         }
+
         if let Some(position) = latent.iter().position(|x| !x.is_finite()) {
-            return Err(Error::NotFinite { what: "latent", position, value: latent[position] });
+            return Err(Error::NotFinite {
+                what: "latent",
+                position,
+                value: latent[position],
+            });
         }
+
         if let Some(position) = latent.iter().position(|x| x.abs() > MAX_LATENT) {
-            return Err(Error::LatentRange { position, value: latent[position] });
+            return Err(Error::LatentRange {
+                position,
+                value: latent[position],
+            });
         }
+
         let gate = &latent[self.coordinate_count()..];
         let sum: f64 = gate.iter().sum();
         let off = gate.iter().position(|share| !(0.0..=1.0).contains(share));
         let off = off.or((!gate.is_empty() && (sum - 1.0).abs() > GATE_TOLERANCE).then_some(0));
+
         let even = (gate.len() as f64).recip();
-        let uneven = |share: &f64| self.network.mixing() == Mixing::Even && (share - even).abs() > GATE_TOLERANCE;
+        let uneven = |share: &f64| {
+            self.network.mixing() == Mixing::Even && (share - even).abs() > GATE_TOLERANCE
+        };
         let off = off.or(gate.iter().position(uneven));
+
         match off {
-            Some(chart) => Err(Error::Gate { chart, value: gate[chart] }),
+            Some(chart) => Err(Error::Gate {
+                chart,
+                value: gate[chart],
+            }),
             None => Ok(()),
         }
     }
@@ -314,24 +409,53 @@ impl Adapter {
         if coordinates.len() == self.latent_dim() {
             return coordinates;
         }
+
         let mut step = Array1::zeros(self.latent_dim());
         step.slice_mut(s![..coordinates.len()]).assign(&coordinates);
+
         step
     }
 
     fn corrector(&self, kind: CorrectorKind) -> Result<&Corrector<f64>, Error> {
-        let found = self.correctors.iter().map(|(_, precise)| precise).find(|corrector| corrector.kind() == kind);
+        let found = self
+            .correctors
+            .iter()
+            .map(|(_, precise)| precise)
+            .find(|corrector| corrector.kind() == kind);
+
         found.ok_or_else(|| {
-            let names: Vec<&str> = self.correctors.iter().map(|(corrector, _)| corrector.kind().name()).collect();
-            let known = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
-            Error::NoCorrector { name: kind.name(), known }
+            let names: Vec<&str> = self
+                .correctors
+                .iter()
+                .map(|(corrector, _)| corrector.kind().name())
+                .collect();
+            let known = if names.is_empty() {
+                "none".to_owned()
+            } else {
+                names.join(", ")
+            };
+
+            Error::NoCorrector {
+                name: kind.name(),
+                known,
+            }
         })
     }
 }
 
 /// A source in words, enough to see which of its parts differ.
 fn describe(source: &FeatureSource) -> String {
-    let FeatureSource { name, encoder, layer, base, norm, pooling, preprocess, dim } = source;
+    let FeatureSource {
+        name,
+        encoder,
+        layer,
+        base,
+        norm,
+        pooling,
+        preprocess,
+        dim,
+    } = source;
+
     format!(
         "{name} (encoder {encoder}, layer {layer}, base {base}, norm {norm}, pooling {pooling}, \
          preprocess {preprocess}, {dim} columns)"

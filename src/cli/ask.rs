@@ -48,6 +48,7 @@ impl FeatureRow {
         if let Some(file) = &self.image {
             return Ok(Some(image_view(file)?));
         }
+
         match (&self.feature, self.row) {
             (Some(file), Some(row)) => Ok(Some(feature_view(file, row)?)),
             (None, Some(_)) => bail!("--row needs --feature FILE"),
@@ -59,19 +60,34 @@ impl FeatureRow {
 fn feature_view(file: &Path, row: usize) -> anyhow::Result<pb::View> {
     let features = read_features(file)?;
     if row >= features.nrows() {
-        bail!("{} has {} rows, there is no row {row}", file.display(), features.nrows());
+        bail!(
+            "{} has {} rows, there is no row {row}",
+            file.display(),
+            features.nrows()
+        );
     }
-    let feature = pb::Feature { values: features.row(row).to_vec(), source_name: String::new() };
-    Ok(pb::View { view: Some(pb::view::View::Feature(feature)) })
+
+    let feature = pb::Feature {
+        values: features.row(row).to_vec(),
+        source_name: String::new(),
+    };
+
+    Ok(pb::View {
+        view: Some(pb::view::View::Feature(feature)),
+    })
 }
 
 fn image_view(file: &Path) -> anyhow::Result<pb::View> {
     let bytes = std::fs::read(file).with_context(|| file.display().to_string())?;
-    Ok(pb::View { view: Some(pb::view::View::Image(bytes)) })
+    Ok(pb::View {
+        view: Some(pb::view::View::Image(bytes)),
+    })
 }
 
 fn frame_view(frame: u32) -> pb::View {
-    pb::View { view: Some(pb::view::View::FrameId(frame)) }
+    pb::View {
+        view: Some(pb::view::View::FrameId(frame)),
+    }
 }
 
 #[derive(Debug, Args)]
@@ -92,7 +108,8 @@ pub struct Navigate {
     /// The frame to go to
     #[arg(long, conflicts_with = "twist")]
     to: Option<u32>,
-    /// The motion: vx,vy,vz,wx,wy,wz in metres and radians, in the camera's frame (x right, y down, z forward)
+    /// The motion: vx,vy,vz,wx,wy,wz in metres and radians, in the camera's frame (x right, y down,
+    /// z forward)
     #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
     twist: Option<Vec<f64>>,
     /// Equal parts of the motion
@@ -101,10 +118,12 @@ pub struct Navigate {
     /// How the steps hang together
     #[arg(long, value_enum, default_value_t = ModeName::OpenLoop)]
     mode: ModeName,
-    /// How the training motions' mean and deviation enter the inverse; homogeneous if nothing is given
+    /// How the training motions' mean and deviation enter the inverse; homogeneous if nothing is
+    /// given
     #[arg(long, value_enum, conflicts_with = "navigator")]
     reading: Option<ReadingName>,
-    /// How to step, by name, instead of inverse Poincaré: corrector-mlp-3, ridge-refit, inverse-poincare-affine+motion, …
+    /// How to step, by name, instead of inverse Poincaré: corrector-mlp-3, ridge-refit,
+    /// inverse-poincare-affine+motion, …
     #[arg(long, default_value = "")]
     navigator: String,
     /// Frames for each step
@@ -145,32 +164,41 @@ enum ReadingName {
 impl Navigate {
     pub async fn run(self) -> anyhow::Result<()> {
         use pb::displacement::Displacement;
+
         let source = match (self.from, self.feature.view()?) {
             (Some(frame), _) => frame_view(frame),
             (None, Some(view)) => view,
-            (None, None) => bail!("--from FRAME, --feature FILE --row ROW or --image FILE is required"),
+            (None, None) => {
+                bail!("--from FRAME, --feature FILE --row ROW or --image FILE is required")
+            }
         };
+
         let displacement = match (self.to, &self.twist) {
             (Some(frame), _) => Displacement::TargetFrameId(frame),
             (None, Some(numbers)) => Displacement::Twist(twist(numbers)?),
             (None, None) => bail!("--to FRAME or --twist vx,vy,vz,wx,wy,wz is required"),
         };
+
         let mode = match self.mode {
             ModeName::OpenLoop => pb::Mode::OpenLoop,
             ModeName::Snap => pb::Mode::Snap,
             ModeName::ClosedLoop => pb::Mode::ClosedLoop,
         };
+
         let reading = match self.reading {
             None => pb::Reading::Unspecified,
             Some(ReadingName::Affine) => pb::Reading::Affine,
             Some(ReadingName::Homogeneous) => pb::Reading::Homogeneous,
             Some(ReadingName::Literal) => pb::Reading::Literal,
         };
+
         let request = pb::NavigateRequest {
             room: self.room,
             adapter: self.adapter,
             source: Some(source),
-            displacement: Some(pb::Displacement { displacement: Some(displacement) }),
+            displacement: Some(pb::Displacement {
+                displacement: Some(displacement),
+            }),
             steps: Some(self.steps),
             mode: mode.into(),
             reading: reading.into(),
@@ -179,39 +207,73 @@ impl Navigate {
             exclude_source: self.exclude_source,
             ..pb::NavigateRequest::default()
         };
+
         let answer = self.server.connect().await?.navigate(request).await?;
         say_navigation(&answer);
+
         Ok(())
     }
 }
 
 fn twist(numbers: &[f64]) -> anyhow::Result<pb::Twist> {
     let &[vx, vy, vz, wx, wy, wz] = numbers else {
-        bail!("--twist needs six numbers, vx,vy,vz,wx,wy,wz, got {}", numbers.len());
+        bail!(
+            "--twist needs six numbers, vx,vy,vz,wx,wy,wz, got {}",
+            numbers.len()
+        );
     };
+
     let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
-    Ok(pb::Twist { linear: vector(vx, vy, vz), angular: vector(wx, wy, wz) })
+    Ok(pb::Twist {
+        linear: vector(vx, vy, vz),
+        angular: vector(wx, wy, wz),
+    })
 }
 
 /// Prints the steps of a navigation.
 pub fn say_navigation(answer: &pb::NavigateResponse) {
-    let (room, adapter) = (revision(answer.room.as_ref()), revision(answer.adapter.as_ref()));
-    say(format_args!("room {room}, adapter {adapter}, {}", answer.navigator));
+    let room = revision(answer.room.as_ref());
+    let adapter = revision(answer.adapter.as_ref());
+    say(format_args!(
+        "room {room}, adapter {adapter}, {}",
+        answer.navigator
+    ));
+
     if let Some(motion) = &answer.displacement {
         say(format_args!("motion {}", motion_text(motion)));
     }
+
     for step in &answer.steps {
         for (rank, hit) in step.hits.iter().enumerate() {
-            let label = if rank == 0 { format!("step {}", step.step) } else { String::new() };
-            let error = step.error.as_ref().filter(|_| rank == 0).map_or(String::new(), error_text);
+            let label = if rank == 0 {
+                format!("step {}", step.step)
+            } else {
+                String::new()
+            };
+
+            let error = step
+                .error
+                .as_ref()
+                .filter(|_| rank == 0)
+                .map_or(String::new(), error_text);
             say(format_args!("{label:8}{}{error}", hit_text(hit)));
         }
     }
 }
 
 fn error_text(error: &pb::PoseError) -> String {
-    let hits: Vec<String> =
-        error.hits.iter().map(|hit| format!("@{} {}", hit.threshold, if hit.hit { "hit" } else { "miss" })).collect();
+    let hits: Vec<String> = error
+        .hits
+        .iter()
+        .map(|hit| {
+            format!(
+                "@{} {}",
+                hit.threshold,
+                if hit.hit { "hit" } else { "miss" }
+            )
+        })
+        .collect();
+
     format!(
         "  error {:.3} m {:.2}°, ‖Δ‖ {:.3} ({})",
         error.translation_m,
@@ -223,7 +285,9 @@ fn error_text(error: &pb::PoseError) -> String {
 
 fn hit_text(hit: &pb::Hit) -> String {
     let pose = hit.pose.clone().unwrap_or_default();
-    let (p, q) = (pose.position.unwrap_or_default(), pose.orientation.unwrap_or_default());
+    let p = pose.position.unwrap_or_default();
+    let q = pose.orientation.unwrap_or_default();
+
     format!(
         "frame {:5}  distance {:.4}  at ({:.3}, {:.3}, {:.3}) m, wxyz ({:.3}, {:.3}, {:.3}, {:.3}) in {}",
         hit.frame_id, hit.distance, p.x, p.y, p.z, q.w, q.x, q.y, q.z, pose.parent_frame
@@ -231,12 +295,19 @@ fn hit_text(hit: &pb::Hit) -> String {
 }
 
 fn motion_text(motion: &pb::Twist) -> String {
-    let (v, w) = (motion.linear.unwrap_or_default(), motion.angular.unwrap_or_default());
-    format!("v ({:.4}, {:.4}, {:.4}) m, ω ({:.4}, {:.4}, {:.4}) rad", v.x, v.y, v.z, w.x, w.y, w.z)
+    let v = motion.linear.unwrap_or_default();
+    let w = motion.angular.unwrap_or_default();
+
+    format!(
+        "v ({:.4}, {:.4}, {:.4}) m, ω ({:.4}, {:.4}, {:.4}) rad",
+        v.x, v.y, v.z, w.x, w.y, w.z
+    )
 }
 
 fn revision(revision: Option<&pb::Revision>) -> String {
-    revision.map_or(String::new(), |revision| format!("'{}' revision {}", revision.name, revision.revision))
+    revision.map_or(String::new(), |revision| {
+        format!("'{}' revision {}", revision.name, revision.revision)
+    })
 }
 
 #[derive(Debug, Args)]
@@ -264,8 +335,11 @@ impl Localize {
         let view = match (self.frame, self.feature.view()?) {
             (Some(frame), _) => frame_view(frame),
             (None, Some(view)) => view,
-            (None, None) => bail!("--feature FILE --row ROW, --image FILE or --frame FRAME is required"),
+            (None, None) => {
+                bail!("--feature FILE --row ROW, --image FILE or --frame FRAME is required")
+            }
         };
+
         let request = pb::LocalizeRequest {
             rooms: self.rooms,
             adapter: self.adapter,
@@ -273,12 +347,26 @@ impl Localize {
             hit_count: Some(self.hits),
             ..pb::LocalizeRequest::default()
         };
+
         let answer = self.server.connect().await?.localize(request).await?;
-        say(format_args!("adapter {}, {} rooms", revision(answer.adapter.as_ref()), answer.room_count));
+        say(format_args!(
+            "adapter {}, {} rooms",
+            revision(answer.adapter.as_ref()),
+            answer.room_count
+        ));
+
         for place in &answer.places {
-            let hit = place.hit.as_ref().context("the server sent a place without a hit")?;
-            say(format_args!("{}{}", hit_text(hit), place.error.as_ref().map_or(String::new(), error_text)));
+            let hit = place
+                .hit
+                .as_ref()
+                .context("the server sent a place without a hit")?;
+            say(format_args!(
+                "{}{}",
+                hit_text(hit),
+                place.error.as_ref().map_or(String::new(), error_text)
+            ));
         }
+
         Ok(())
     }
 }
@@ -294,7 +382,12 @@ pub struct Motion {
     #[arg(long, default_value = "")]
     room: String,
     /// Two frames of the room, A,B
-    #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with = "features")]
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "A,B",
+        conflicts_with = "features"
+    )]
     frames: Option<Vec<u32>>,
     /// Two JPEG or PNG files, A,B, for a server that was started with --encoder
     #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "features"])]
@@ -317,6 +410,7 @@ impl Motion {
                 _ => bail!("--frames A,B, --features FILE --rows A,B or --images A,B is required"),
             },
         };
+
         let request = pb::EstimateMotionRequest {
             adapter: self.adapter,
             room: self.room,
@@ -324,13 +418,36 @@ impl Motion {
             second: Some(second),
             ..pb::EstimateMotionRequest::default()
         };
-        let answer = self.server.connect().await?.estimate_motion(request).await?;
-        let motion = answer.motion.as_ref().context("the server sent no motion")?;
-        say(format_args!("adapter {}", revision(answer.adapter.as_ref())));
-        say(format_args!("motion {} in the body frame of the first camera", motion_text(motion)));
+
+        let answer = self
+            .server
+            .connect()
+            .await?
+            .estimate_motion(request)
+            .await?;
+        let motion = answer
+            .motion
+            .as_ref()
+            .context("the server sent no motion")?;
+
+        say(format_args!(
+            "adapter {}",
+            revision(answer.adapter.as_ref())
+        ));
+
+        say(format_args!(
+            "motion {} in the body frame of the first camera",
+            motion_text(motion)
+        ));
+
         if let (Some(truth), Some(error)) = (&answer.true_motion, &answer.error) {
-            say(format_args!("truth  {}{}", motion_text(truth), error_text(error)));
+            say(format_args!(
+                "truth  {}{}",
+                motion_text(truth),
+                error_text(error)
+            ));
         }
+
         Ok(())
     }
 }
@@ -345,8 +462,12 @@ impl Catalog {
     pub async fn run(self) -> anyhow::Result<()> {
         let client = self.server.connect().await?;
         for room in client.rooms().await? {
-            let features: Vec<String> =
-                room.features.iter().map(|source| format!("{} ({})", source.name, source.dim)).collect();
+            let features: Vec<String> = room
+                .features
+                .iter()
+                .map(|source| format!("{} ({})", source.name, source.dim))
+                .collect();
+
             say(format_args!(
                 "room {}: {} frames, features {}; adapters {}",
                 revision(room.revision.as_ref()),
@@ -355,8 +476,13 @@ impl Catalog {
                 room.adapters.join(", ")
             ));
         }
+
         for adapter in client.adapters().await? {
-            let r2 = adapter.test.and_then(|test| test.overall).map_or("undefined".to_owned(), |r2| format!("{r2:.3}"));
+            let r2 = adapter
+                .test
+                .and_then(|test| test.overall)
+                .map_or("undefined".to_owned(), |r2| format!("{r2:.3}"));
+
             say(format_args!(
                 "adapter {}: preset {}, split {}, stride {}, test R² {r2}",
                 revision(adapter.revision.as_ref()),
@@ -365,6 +491,7 @@ impl Catalog {
                 adapter.stride
             ));
         }
+
         Ok(())
     }
 }

@@ -53,30 +53,58 @@ pub struct Demo {
 
 impl Demo {
     pub async fn run(self) -> anyhow::Result<()> {
-        Split::Time.test_pairs(&Timeline::unbroken(self.frames), STRIDE).context("--frames")?;
+        Split::Time
+            .test_pairs(&Timeline::unbroken(self.frames), STRIDE)
+            .context("--frames")?;
+
         if self.frames > MOST_FRAMES {
-            anyhow::bail!("--frames must be at most {MOST_FRAMES}, got {}", self.frames);
+            anyhow::bail!(
+                "--frames must be at most {MOST_FRAMES}, got {}",
+                self.frames
+            );
         }
+
         let store_path = self.out.join("store");
         let location = store_path.to_str().context("--out is not valid UTF-8")?;
         let store = Store::create(location)?;
 
-        say(format_args!("1. Drawing a room and walking a camera through it: {} images", self.frames));
+        say(format_args!(
+            "1. Drawing a room and walking a camera through it: {} images",
+            self.frames
+        ));
+
         let (room, features) = draw(self.frames, self.seed)?;
-        let published = store.publish_room(&room, std::slice::from_ref(&features)).await?;
-        say(format_args!("   room '{ROOM}' revision {}: {location}/{}", published.revision, published.manifest));
+        let published = store
+            .publish_room(&room, std::slice::from_ref(&features))
+            .await?;
+        say(format_args!(
+            "   room '{ROOM}' revision {}: {location}/{}",
+            published.revision, published.manifest
+        ));
 
         say("2. Training a Poincaré adapter on the first 80 % of the path (preset paper-range)");
         let recipe = Recipe::of(Preset::PaperRange, Split::Time, STRIDE, self.seed);
-        let stored = StoredRoom { room, revision: published.revision, created: String::new(), features: Vec::new() };
+
+        let stored = StoredRoom {
+            room,
+            revision: published.revision,
+            created: String::new(),
+            features: Vec::new(),
+        };
         let rooms = [(stored, features)];
+
         let (adapter, runs) = train_seeds(&rooms, &recipe, 1)?;
         say(training_table(&runs).trim_end());
         let name = default_name(&rooms, &recipe);
-        let adapter_published = store.publish_adapter(&name, &adapter, &runs[0].record, rooms[0].1.rows()).await?;
+        let adapter_published = store
+            .publish_adapter(&name, &adapter, &runs[0].record, rooms[0].1.rows())
+            .await?;
         say_published(&store, &name, &adapter_published);
 
-        say(format_args!("3. Navigating the last 20 %, which the adapter never saw, {STRIDE} frames ahead"));
+        say(format_args!(
+            "3. Navigating the last 20 %, which the adapter never saw, {STRIDE} frames ahead"
+        ));
+
         let [(stored, features)] = rooms;
         let room = Arc::new(stored.room);
         say(score(&room, &features, adapter)?.trim_end());
@@ -84,24 +112,35 @@ impl Demo {
         say(format_args!(
             "4. Serving the store and asking it over gRPC: one motion of {STRIDE} frames in {STEPS} steps, closed loop"
         ));
+
         let picture = self.out.join("path.svg");
         serve_and_ask(&store, &room, &name, &picture).await?;
 
         say("Files written:");
-        for folder in [store_path.join("rooms").join(ROOM), store_path.join("adapters").join(&name)] {
+
+        for folder in [
+            store_path.join("rooms").join(ROOM),
+            store_path.join("adapters").join(&name),
+        ] {
             for file in files_under(&folder)? {
                 say(format_args!("   {}", file.display()));
             }
         }
+
         say(format_args!("   {}", picture.display()));
         let from = example_source(room.frame_count());
         say("Go on from here:");
         say(format_args!("   seese3 serve --store {location}"));
+
         say(format_args!(
             "   seese3 navigate --room {ROOM} --from {from} --to {} --steps {STEPS} --mode closed-loop",
             from + STRIDE
         ));
-        say(format_args!("   seese3 evaluate --store {location} --room {ROOM} --exclude-source"));
+
+        say(format_args!(
+            "   seese3 evaluate --store {location} --room {ROOM} --exclude-source"
+        ));
+
         say("(`cargo run --release --` stands for `seese3` in a checkout)");
         Ok(())
     }
@@ -112,6 +151,7 @@ fn draw(frame_count: usize, seed: u64) -> anyhow::Result<(Room, Features)> {
     let scene = Scene::new(seed);
     let poses = camera_path(&scene, frame_count, seed);
     let progress = bar(frame_count as u64, "drawing");
+
     let rows: Vec<Vec<f32>> = poses
         .par_iter()
         .map(|pose| {
@@ -120,34 +160,76 @@ fn draw(frame_count: usize, seed: u64) -> anyhow::Result<(Room, Features)> {
             feature
         })
         .collect();
+
     progress.finish_and_clear();
     let rows = Array2::from_shape_vec((frame_count, BUILTIN_DIM), rows.concat())?;
     let features = Features::new(builtin_source(FEATURES), rows)?;
-    let provenance = Provenance { format: "studio".to_owned(), ..Provenance::default() };
-    let room = Room::new(RoomId::new(ROOM)?, Frames { poses, ..Frames::default() }, provenance)?;
+
+    let provenance = Provenance {
+        format: "studio".to_owned(),
+        ..Provenance::default()
+    };
+
+    let room = Room::new(
+        RoomId::new(ROOM)?,
+        Frames {
+            poses,
+            ..Frames::default()
+        },
+        provenance,
+    )?;
+
     Ok((room, features))
 }
 
 fn score(room: &Arc<Room>, features: &Features, adapter: Adapter) -> anyhow::Result<String> {
     let navigator = Navigator::new(room.clone(), features, Arc::new(adapter), IndexKind::Exact)?;
-    let leaks =
-        |kind: &NavigatorKind| matches!(kind, NavigatorKind::Step(StepKind::Refit(refit), _) if refit.in_sample);
-    let navigators = NavigatorKind::table(navigator.adapter()).into_iter().filter(|kind| !leaks(kind)).collect();
-    let protocol = Protocol { navigators, ..Protocol::paper(STRIDE) };
-    let report = evaluate(&navigator, &protocol, &Cancellation::default(), &mut |_, _| ())?;
+    let leaks = |kind: &NavigatorKind| matches!(kind, NavigatorKind::Step(StepKind::Refit(refit), _) if refit.in_sample);
+    let navigators = NavigatorKind::table(navigator.adapter())
+        .into_iter()
+        .filter(|kind| !leaks(kind))
+        .collect();
+    let protocol = Protocol {
+        navigators,
+        ..Protocol::paper(STRIDE)
+    };
+
+    let report = evaluate(
+        &navigator,
+        &protocol,
+        &Cancellation::default(),
+        &mut |_, _| (),
+    )?;
+
     Ok(evaluation_table(&report))
 }
 
-/// Starts a server on a free loopback port, asks it for a navigation, draws the answer, and stops it.
-async fn serve_and_ask(store: &Store, room: &Arc<Room>, adapter: &str, picture: &Path) -> anyhow::Result<()> {
-    let listener = TcpListener::bind("127.0.0.1:0").await.context("cannot listen on a loopback port")?;
+/// Starts a server on a free loopback port, asks it for a navigation, draws the answer, and stops
+/// it.
+async fn serve_and_ask(
+    store: &Store,
+    room: &Arc<Room>,
+    adapter: &str,
+    picture: &Path,
+) -> anyhow::Result<()> {
+    let listener = TcpListener::bind("127.0.0.1:0")
+        .await
+        .context("cannot listen on a loopback port")?;
     let address = listener.local_addr()?.to_string();
+
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
-    let mut server = tokio::spawn(service::run(listener, store.clone(), service::Config::default(), async {
-        // An error means the demo has failed: the server is to stop all the same.
-        let _ = stopped.await;
-    }));
+    let mut server = tokio::spawn(service::run(
+        listener,
+        store.clone(),
+        service::Config::default(),
+        async {
+            // An error means the demo has failed: the server is to stop all the same.
+            let _ = stopped.await;
+        },
+    ));
+
     say(format_args!("   listening on {address}"));
+
     let answer = tokio::select! {
         // A server that ends before it answers says why.
         ended = &mut server => {
@@ -156,21 +238,31 @@ async fn serve_and_ask(store: &Store, room: &Arc<Room>, adapter: &str, picture: 
         }
         answer = ask(&address, adapter, room.frame_count()) => answer?,
     };
+
     say_navigation(&answer);
     let svg = path_svg(&plot_of(room, &answer)?).map_err(anyhow::Error::msg)?;
     write_file(picture, svg.as_bytes())?;
-    say(format_args!("   the path from above: {}", picture.display()));
+
+    say(format_args!(
+        "   the path from above: {}",
+        picture.display()
+    ));
+
     // An error means the server has ended already; its own result follows.
     let _ = stop.send(());
     server.await??;
     say("   server stopped");
+
     Ok(())
 }
 
 /// The frame that the example starts from: five sixths into the held-out part, whatever is there.
 fn example_source(frame_count: usize) -> u32 {
-    let (frame_count, held_out) =
-        (frame_count as u32, Split::Time.candidates(&Timeline::unbroken(frame_count)).len() as u32);
+    let held_out = Split::Time
+        .candidates(&Timeline::unbroken(frame_count))
+        .len() as u32;
+
+    let frame_count = frame_count as u32;
     frame_count - held_out + (held_out - STRIDE) * 5 / 6
 }
 
@@ -185,25 +277,36 @@ fn files_under(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
             files.push(entry.path());
         }
     }
+
     files.sort();
     Ok(files)
 }
 
 /// A 4-step closed loop in the held-out part to the frame 40 later.
-async fn ask(address: &str, adapter: &str, frame_count: usize) -> anyhow::Result<pb::NavigateResponse> {
+async fn ask(
+    address: &str,
+    adapter: &str,
+    frame_count: usize,
+) -> anyhow::Result<pb::NavigateResponse> {
     let client = Client::connect(address, Duration::from_secs(30)).await?;
     let source = example_source(frame_count);
+
     let request = pb::NavigateRequest {
         room: ROOM.to_owned(),
         adapter: adapter.to_owned(),
-        source: Some(pb::View { view: Some(pb::view::View::FrameId(source)) }),
+        source: Some(pb::View {
+            view: Some(pb::view::View::FrameId(source)),
+        }),
         displacement: Some(pb::Displacement {
-            displacement: Some(pb::displacement::Displacement::TargetFrameId(source + STRIDE)),
+            displacement: Some(pb::displacement::Displacement::TargetFrameId(
+                source + STRIDE,
+            )),
         }),
         steps: Some(STEPS),
         mode: pb::Mode::ClosedLoop.into(),
         ..pb::NavigateRequest::default()
     };
+
     for _ in 0..LOADING_POLLS {
         match client.navigate(request.clone()).await {
             // The server is still loading its store.
@@ -213,22 +316,29 @@ async fn ask(address: &str, adapter: &str, frame_count: usize) -> anyhow::Result
             answer => return Ok(answer?),
         }
     }
+
     anyhow::bail!("the server did not finish loading its store")
 }
 
 fn plot_of(room: &Room, answer: &pb::NavigateResponse) -> anyhow::Result<PathPlot> {
     let place = |pose: &crate::geometry::Pose| {
-        let (at, view) = (pose.translation.vector, pose.rotation * nalgebra::Vector3::z());
+        let at = pose.translation.vector;
+        let view = pose.rotation * nalgebra::Vector3::z();
         [at.x, at.y, view.y.atan2(view.x)]
     };
     let wire_place = |pose: Option<&pb::Pose>| -> anyhow::Result<[f64; 3]> {
         let pose = service::pose_from_wire(pose.context("the server sent no pose")?.clone(), ROOM)?;
         Ok(place(&pose))
     };
+
     let source = example_source(room.frame_count()) as usize;
     Ok(PathPlot {
         title: format!("{STEPS} steps, closed loop, {STRIDE} frames ahead"),
-        map: room.poses().iter().map(|pose| [pose.translation.x, pose.translation.y]).collect(),
+        map: room
+            .poses()
+            .iter()
+            .map(|pose| [pose.translation.x, pose.translation.y])
+            .collect(),
         source: place(&room.poses()[source]),
         target: place(&room.poses()[source + STRIDE as usize]),
         requested: answer

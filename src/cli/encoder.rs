@@ -6,7 +6,8 @@ use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 
 use crate::encoder::{
-    self, Encoder, Filter, Layer, ModelTask, Pooling, Preparation, Recipe, Resize, Runtime, RuntimeKind,
+    self, Encoder, Filter, Layer, ModelTask, Pooling, Preparation, Recipe, Resize, Runtime,
+    RuntimeKind,
 };
 
 /// How models are run.
@@ -43,12 +44,20 @@ impl From<RuntimeName> for RuntimeKind {
 impl RuntimeOptions {
     /// As the library wants it.
     pub fn runtime(&self) -> Runtime {
-        Runtime { kind: self.runtime.into(), threads: self.threads(), library: self.library.clone() }
+        Runtime {
+            kind: self.runtime.into(),
+            threads: self.threads(),
+            library: self.library.clone(),
+        }
     }
 
     /// How many threads are meant.
     pub fn threads(&self) -> usize {
-        if self.threads > 0 { self.threads } else { std::thread::available_parallelism().map_or(1, usize::from) }
+        if self.threads > 0 {
+            self.threads
+        } else {
+            std::thread::available_parallelism().map_or(1, usize::from)
+        }
     }
 }
 
@@ -61,7 +70,8 @@ pub struct EncoderOptions {
     /// Layers to keep, separated by commas; all declared outputs if `all`
     #[arg(long, value_delimiter = ',', default_value = "all")]
     layers: Vec<String>,
-    /// How a layer becomes one row: cls, mean, grid2x2, grid4x4 or any gridCOLUMNSxROWS; the recipe's, else mean
+    /// How a layer becomes one row: cls, mean, grid2x2, grid4x4 or any gridCOLUMNSxROWS; the
+    /// recipe's, else mean
     #[arg(long)]
     pool: Option<String>,
     /// Tokens before the patches: the class token and registers; the recipe's, else 0
@@ -101,53 +111,123 @@ impl EncoderOptions {
     pub fn open(&self, model: &str, runtime: &Runtime) -> anyhow::Result<Encoder> {
         match model {
             "builtin" | "pixels" if !self.is_plain() => {
-                bail!("'{model}' is one fixed encoder; leave out --layers, --pool, --recipe, --resize and their like")
+                bail!(
+                    "'{model}' is one fixed encoder; leave out --layers, --pool, --recipe, --resize and their like"
+                )
             }
             "builtin" => return Ok(Encoder::builtin()),
             "pixels" => return Ok(Encoder::pixels()),
             _ => {}
         }
+
         let file = Path::new(model);
+
         if !runtime.kind.is_built() {
-            return Err(encoder::Error::NotBuilt { runtime: runtime.kind.name() }.into());
+            return Err(encoder::Error::NotBuilt {
+                runtime: runtime.kind.name(),
+            }
+            .into());
         }
+
         if !file.is_file() {
             bail!("{model} is no file; give an ONNX file, `pixels` or `builtin`");
         }
+
         let recipe = self.recipe()?;
         let preparation = self.preparation(recipe, file)?;
-        let names = if self.layers == ["all"] { encoder::declared_outputs(file)? } else { self.layers.clone() };
-        let skip = self.prefix_tokens.unwrap_or(recipe.map_or(0, |recipe| recipe.prefix_tokens));
-        let pooling: Pooling =
-            self.pool.as_deref().unwrap_or(recipe.map_or("mean", |recipe| recipe.pooling)).parse()?;
-        let word = |given: &Option<String>, recipe: Option<&str>, otherwise: &str| {
-            given.clone().unwrap_or_else(|| recipe.unwrap_or(otherwise).to_owned())
+
+        let names = if self.layers == ["all"] {
+            encoder::declared_outputs(file)?
+        } else {
+            self.layers.clone()
         };
+
+        let skip = self
+            .prefix_tokens
+            .unwrap_or(recipe.map_or(0, |recipe| recipe.prefix_tokens));
+
+        let pooling: Pooling = self
+            .pool
+            .as_deref()
+            .unwrap_or(recipe.map_or("mean", |recipe| recipe.pooling))
+            .parse()?;
+
+        let word = |given: &Option<String>, recipe: Option<&str>, otherwise: &str| {
+            given
+                .clone()
+                .unwrap_or_else(|| recipe.unwrap_or(otherwise).to_owned())
+        };
+
         let layer = |name: &String| Layer {
             name: name.clone(),
             base: word(&self.base, recipe.map(|recipe| recipe.base), "name"),
-            norm: word(&self.norm, recipe.map(|recipe| recipe.norm), crate::features::UNSPECIFIED),
+            norm: word(
+                &self.norm,
+                recipe.map(|recipe| recipe.norm),
+                crate::features::UNSPECIFIED,
+            ),
             pooling: pooling.after(skip),
         };
-        let window = self.window.map_or(recipe.map_or(1, |recipe| recipe.window), |window| window as usize);
+
+        let window = self
+            .window
+            .map_or(recipe.map_or(1, |recipe| recipe.window), |window| {
+                window as usize
+            });
+
         let layers = names.iter().map(layer).collect();
-        Ok(Encoder::model(ModelTask { file: file.to_owned(), preparation, layers, window }, runtime)?)
+        Ok(Encoder::model(
+            ModelTask {
+                file: file.to_owned(),
+                preparation,
+                layers,
+                window,
+            },
+            runtime,
+        )?)
     }
 
     /// Whether nothing was asked for.
     fn is_plain(&self) -> bool {
         // Destructured with no `..`, so that a new option breaks the build here.
-        let Self { recipe, layers, pool, prefix_tokens, base, norm, window, resize, filter, crop, divisor, mean, std } =
-            self;
+        let Self {
+            recipe,
+            layers,
+            pool,
+            prefix_tokens,
+            base,
+            norm,
+            window,
+            resize,
+            filter,
+            crop,
+            divisor,
+            mean,
+            std,
+        } = self;
+
         let words = [recipe, pool, base, norm, resize, filter, crop, mean, std];
         let numbers = [prefix_tokens.is_some(), window.is_some(), divisor.is_some()];
+
         layers == &["all"] && words.iter().all(|word| word.is_none()) && numbers == [false; 3]
     }
 
     fn recipe(&self) -> anyhow::Result<Option<&'static Recipe>> {
-        let Some(name) = &self.recipe else { return Ok(None) };
-        let known = || encoder::RECIPES.iter().map(|recipe| recipe.name).collect::<Vec<_>>().join(", ");
-        encoder::recipe(name).map(Some).with_context(|| format!("there is no recipe '{name}'; there are {}", known()))
+        let Some(name) = &self.recipe else {
+            return Ok(None);
+        };
+
+        let known = || {
+            encoder::RECIPES
+                .iter()
+                .map(|recipe| recipe.name)
+                .collect::<Vec<_>>()
+                .join(", ")
+        };
+
+        encoder::recipe(name)
+            .map(Some)
+            .with_context(|| format!("there is no recipe '{name}'; there are {}", known()))
     }
 
     fn preparation(&self, recipe: Option<&Recipe>, file: &Path) -> anyhow::Result<Preparation> {
@@ -161,10 +241,18 @@ impl EncoderOptions {
             ),
             None => {
                 let size = encoder::declared_size(file)?;
-                let resize = size.map_or(Resize::None, |(width, height)| Resize::Whole { width, height });
-                Preparation { resize, ..Preparation::default() }
+                let resize = size.map_or(Resize::None, |(width, height)| Resize::Whole {
+                    width,
+                    height,
+                });
+
+                Preparation {
+                    resize,
+                    ..Preparation::default()
+                }
             }
         };
+
         if let Some(resize) = &self.resize {
             preparation.resize = resize.parse()?;
         }
@@ -174,6 +262,7 @@ impl EncoderOptions {
         if let Some(crop) = &self.crop {
             preparation.crop = encoder::parse_crop(crop)?;
         }
+
         preparation.divisor = self.divisor.unwrap_or(preparation.divisor);
         if let Some(mean) = &self.mean {
             preparation.mean = encoder::parse_channels("--mean", mean)?;
@@ -181,6 +270,7 @@ impl EncoderOptions {
         if let Some(std) = &self.std {
             preparation.deviation = encoder::parse_channels("--std", std)?;
         }
+
         Ok(preparation)
     }
 }

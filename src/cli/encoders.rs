@@ -13,42 +13,84 @@ pub struct Encoders {
 
 impl Encoders {
     pub fn run(self) -> anyhow::Result<()> {
-        let chosen: Vec<_> =
-            RECIPES.iter().filter(|recipe| self.name.as_ref().is_none_or(|name| name == recipe.name)).collect();
+        let chosen: Vec<_> = RECIPES
+            .iter()
+            .filter(|recipe| self.name.as_ref().is_none_or(|name| name == recipe.name))
+            .collect();
+
         if chosen.is_empty() {
             let known: Vec<&str> = RECIPES.iter().map(|recipe| recipe.name).collect();
-            anyhow::bail!("there is no recipe '{}'; there are {}", self.name.unwrap_or_default(), known.join(", "));
+            anyhow::bail!(
+                "there is no recipe '{}'; there are {}",
+                self.name.unwrap_or_default(),
+                known.join(", ")
+            );
         }
+
         if self.name.is_none() {
             say("Without a model:");
-            say("  pixels    raw pixels: the image at 320x240 in means over 16x12 patches, 576 columns");
-            say("  builtin   gradient orientations and coarse colour, no weights, 528 columns; a stand-in");
+            say(
+                "  pixels    raw pixels: the image at 320x240 in means over 16x12 patches, 576 columns",
+            );
+
+            say(
+                "  builtin   gradient orientations and coarse colour, no weights, 528 columns; a stand-in",
+            );
+
             say("");
-            say("With a model: seese3 encode --model FILE.onnx --recipe NAME. Any ONNX image model works whose values");
-            say("are named; without a recipe say how images are prepared (--resize, --divisor, --mean, --std).");
+            say(
+                "With a model: seese3 encode --model FILE.onnx --recipe NAME. Any ONNX image model works whose values",
+            );
+
+            say(
+                "are named; without a recipe say how images are prepared (--resize, --divisor, --mean, --std).",
+            );
+
             say("");
         }
+
         for recipe in chosen {
             say(format_args!("{}: {}", recipe.name, recipe.about));
-            say(format_args!("  images   {}", recipe.preparation.describe(recipe.window)));
+
+            say(format_args!(
+                "  images   {}",
+                recipe.preparation.describe(recipe.window)
+            ));
+
             say(format_args!(
                 "  layers   {}; base {}, norm {}, {} prefix tokens, pool {}",
                 recipe.layers, recipe.base, recipe.norm, recipe.prefix_tokens, recipe.pooling
             ));
+
             say(format_args!("  paper    {}", recipe.paper));
             say(format_args!("  checked  {}", recipe.checked));
+
             if self.name.is_some() {
                 say("  export");
-                recipe.export.lines().for_each(|line| say(format_args!("    {line}")));
+
+                recipe
+                    .export
+                    .lines()
+                    .for_each(|line| say(format_args!("    {line}")));
             }
+
             say("");
         }
-        let built = |kind: RuntimeKind| if kind.is_built() { "built in" } else { "not built: --features full" };
+
+        let built = |kind: RuntimeKind| {
+            if kind.is_built() {
+                "built in"
+            } else {
+                "not built: --features full"
+            }
+        };
+
         say(format_args!(
             "Runtimes: tract ({}), onnxruntime ({})",
             built(RuntimeKind::Tract),
             built(RuntimeKind::OnnxRuntime)
         ));
+
         Ok(())
     }
 }

@@ -59,23 +59,32 @@ impl Export {
                 for file in write_numpy(&from.out, &stored.room, &stored.features)? {
                     say(format_args!("wrote {}", file.display()));
                 }
+
                 Ok(())
             }
             Format::Tum(Timed { from, rate }) => {
                 let stored = from.load().await?;
                 let times = match (stored.room.timestamps_ns(), rate) {
                     ([], Some(rate)) if (1e-3..=1e6).contains(&rate) => {
-                        (0..stored.room.frame_count()).map(|row| (row as f64 / rate * 1e9).round() as i64).collect()
+                        (0..stored.room.frame_count())
+                            .map(|row| (row as f64 / rate * 1e9).round() as i64)
+                            .collect()
                     }
-                    ([], Some(rate)) => bail!("--rate must be 0.001 to 1,000,000 frames a second, got {rate}"),
+                    ([], Some(rate)) => {
+                        bail!("--rate must be 0.001 to 1,000,000 frames a second, got {rate}")
+                    }
                     ([], None) => bail!(
                         "room '{}' has no timestamps, which the format needs; give --rate FRAMES_A_SECOND, \
                          or export kitti",
                         from.room
                     ),
                     (times, None) => times.to_vec(),
-                    (_, Some(_)) => bail!("room '{}' has timestamps of its own; leave out --rate", from.room),
+                    (_, Some(_)) => bail!(
+                        "room '{}' has timestamps of its own; leave out --rate",
+                        from.room
+                    ),
                 };
+
                 from.write(&tum_trajectory(&times, stored.room.poses()))
             }
             Format::Kitti(from) => {
@@ -89,7 +98,9 @@ impl Export {
 impl From {
     async fn load(&self) -> anyhow::Result<StoredRoom> {
         check_writable(&self.out)?;
-        Ok(Store::open(&self.store)?.load_room(&self.room, self.revision).await?)
+        Ok(Store::open(&self.store)?
+            .load_room(&self.room, self.revision)
+            .await?)
     }
 
     fn write(&self, text: &str) -> anyhow::Result<()> {

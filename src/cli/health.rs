@@ -20,6 +20,7 @@ impl Health {
         if !self.server.connect().await?.serves(&self.name).await? {
             bail!("the server does not serve yet, or no more");
         }
+
         say("serving");
         Ok(())
     }

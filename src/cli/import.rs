@@ -67,7 +67,8 @@ struct Seven {
 
 #[derive(Debug, Args)]
 struct Numpy {
-    /// A folder of poses.npy and, where there are, timestamps.npy, frame_ids.npy and features_NAME.npy
+    /// A folder of poses.npy and, where there are, timestamps.npy, frame_ids.npy and
+    /// features_NAME.npy
     #[arg(required_unless_present = "poses", conflicts_with_all = ["poses", "timestamps"])]
     path: Option<PathBuf>,
     /// Poses, world_from_camera, (n, 4, 4) f64 or f32, metres
@@ -94,7 +95,8 @@ struct Destination {
     /// Refuse the recording if a frame is unusable, instead of dropping that frame
     #[arg(long)]
     strict: bool,
-    /// Publish a new revision of a room that has other frames in the store; its features do not carry over
+    /// Publish a new revision of a room that has other frames in the store; its features do not
+    /// carry over
     #[arg(long)]
     replace: bool,
     /// Features of the usable frames, NAME=FILE.npy, shape (n, d); may be given several times
@@ -116,6 +118,7 @@ impl Import {
                         datasets::read_scannet(&path, reader)
                     }
                 })?;
+
                 to.publish("scannet", &path, recording).await
             }
             Format::Arkitscenes(Plain { path, to }) => {
@@ -130,12 +133,27 @@ impl Import {
                 let recording = to.read(|reader| datasets::read_twelve_scenes(&path, reader))?;
                 to.publish("12scenes", &path, recording).await
             }
-            Format::SevenScenes(Seven { path, sequence, rgb_from_depth, to }) => {
-                let choice = SevenScenes { sequence, rgb_from_depth };
-                let recording = to.read(|reader| datasets::read_seven_scenes(&path, &choice, reader))?;
+            Format::SevenScenes(Seven {
+                path,
+                sequence,
+                rgb_from_depth,
+                to,
+            }) => {
+                let choice = SevenScenes {
+                    sequence,
+                    rgb_from_depth,
+                };
+                let recording =
+                    to.read(|reader| datasets::read_seven_scenes(&path, &choice, reader))?;
+
                 to.publish("7scenes", &path, recording).await
             }
-            Format::Numpy(Numpy { path, poses, timestamps, to }) => {
+            Format::Numpy(Numpy {
+                path,
+                poses,
+                timestamps,
+                to,
+            }) => {
                 let recording = match (&path, &poses) {
                     (Some(folder), _) => datasets::read_numpy(folder)?,
                     (None, Some(file)) => {
@@ -147,10 +165,13 @@ impl Import {
                     }
                     (None, None) => bail!("a folder or --poses FILE is required"),
                 };
+
                 if path.is_none() && to.name.is_none() {
                     bail!("--name NAME is required");
                 }
-                to.publish("numpy", path.as_deref().unwrap_or(Path::new("")), recording).await
+
+                to.publish("numpy", path.as_deref().unwrap_or(Path::new("")), recording)
+                    .await
             }
             Format::Bundle(Plain { path, to }) => {
                 let recording = datasets::read_bundle(&path)?;
@@ -168,9 +189,11 @@ impl Destination {
             Err(crate::store::Error::Unknown { .. }) => return Ok(()),
             Err(error) => return Err(error.into()),
         };
+
         if self.replace || same_poses(&before, room) {
             return Ok(());
         }
+
         bail!(
             "room '{}' is in the store with other frames ({} from {}, these are {}); give another --name, or --replace, \
              which leaves its features behind",
@@ -187,23 +210,41 @@ impl Destination {
         read: impl FnOnce(&mut Reader<'_>) -> Result<Recording, datasets::Error>,
     ) -> anyhow::Result<Recording> {
         let progress = bar(0, "reading");
-        let unusable = if self.strict { Unusable::Refuse } else { Unusable::Drop };
+
+        let unusable = if self.strict {
+            Unusable::Refuse
+        } else {
+            Unusable::Drop
+        };
+
         let mut tell = |done: usize, total: usize| {
             progress.set_length(total as u64);
             progress.set_position(done as u64);
         };
-        let recording = read(&mut Reader { unusable, progress: &mut tell })?;
+        let recording = read(&mut Reader {
+            unusable,
+            progress: &mut tell,
+        })?;
+
         progress.finish_and_clear();
         Ok(recording)
     }
 
-    async fn publish(&self, format: &str, path: &Path, mut recording: Recording) -> anyhow::Result<()> {
+    async fn publish(
+        &self,
+        format: &str,
+        path: &Path,
+        mut recording: Recording,
+    ) -> anyhow::Result<()> {
         let read_count = recording.frames.poses.len();
+
         for given in &self.features {
             recording.features.push(read_features(given)?);
         }
+
         for set in &recording.features {
-            let (rows, unusable) = (set.rows().nrows(), recording.dropped.len());
+            let rows = set.rows().nrows();
+            let unusable = recording.dropped.len();
             if rows != read_count {
                 let name = &set.source().name;
                 bail!(
@@ -212,16 +253,30 @@ impl Destination {
                 );
             }
         }
+
         let kept = recording.every(self.every as usize);
-        let features = recording.features.iter().map(|set| set.select(&kept)).collect::<Vec<_>>();
+        let features = recording
+            .features
+            .iter()
+            .map(|set| set.select(&kept))
+            .collect::<Vec<_>>();
+
         let stated = &recording.stated;
-        let either = |given: &str, stated: &str| if given.is_empty() { stated.to_owned() } else { given.to_owned() };
+        let either = |given: &str, stated: &str| {
+            if given.is_empty() {
+                stated.to_owned()
+            } else {
+                given.to_owned()
+            }
+        };
+
         let provenance = Provenance {
             format: either(&stated.format, format),
             licence: either(&self.licence, &stated.licence),
             images_root: recording.images_root.clone(),
             worst_rotation_deviation: recording.worst_rotation_deviation,
         };
+
         let name = match &self.name {
             Some(name) => name.clone(),
             None if !stated.name.is_empty() => stated.name.clone(),
@@ -229,32 +284,78 @@ impl Destination {
         };
         let id = RoomId::new(&name).context("give another name with --name")?;
         let room = Room::new(id, recording.frames.select(&kept), provenance)?;
+
         check_features(&room, &features)?;
         let store = Store::create(&self.store)?;
         self.check_same(&store, &room).await?;
         let published = store.publish_room(&room, &features).await?;
-        let times = if room.timestamps_ns().is_empty() { "without timestamps" } else { "with timestamps" };
-        let thinned = if self.every > 1 { format!(", every {} of {read_count}", self.every) } else { String::new() };
-        say(format_args!("room '{}': {} frames {times}{thinned}", room.id(), room.frame_count()));
+
+        let times = if room.timestamps_ns().is_empty() {
+            "without timestamps"
+        } else {
+            "with timestamps"
+        };
+
+        let thinned = if self.every > 1 {
+            format!(", every {} of {read_count}", self.every)
+        } else {
+            String::new()
+        };
+        say(format_args!(
+            "room '{}': {} frames {times}{thinned}",
+            room.id(),
+            room.frame_count()
+        ));
+
         say_frames(&room);
         let deviation = recording.worst_rotation_deviation;
-        say(format_args!("rotations: at most {deviation:.1e} off SO(3), projected"));
+        say(format_args!(
+            "rotations: at most {deviation:.1e} off SO(3), projected"
+        ));
+
         for set in &features {
-            say(format_args!("features '{}': {} columns", set.source().name, set.source().dim));
+            say(format_args!(
+                "features '{}': {} columns",
+                set.source().name,
+                set.source().dim
+            ));
         }
+
         say_dropped(&recording.dropped);
-        let state = if published.is_new { "published" } else { "already there, unchanged:" };
-        say(format_args!("{state} revision {}: {}/{}", published.revision, store.location(), published.manifest));
+
+        let state = if published.is_new {
+            "published"
+        } else {
+            "already there, unchanged:"
+        };
+
+        say(format_args!(
+            "{state} revision {}: {}/{}",
+            published.revision,
+            store.location(),
+            published.manifest
+        ));
+
         Ok(())
     }
 }
 
-/// A room's name from where it lies: 12-Scenes and 7-Scenes repeat theirs, so that the folder above belongs to it.
+/// A room's name from where it lies: 12-Scenes and 7-Scenes repeat theirs, so that the folder above
+/// belongs to it.
 fn name_from(format: &str, path: &Path) -> Option<String> {
     let path = path.canonicalize().ok()?;
-    let stem = if path.is_file() { path.file_stem() } else { path.file_name() };
+    let stem = if path.is_file() {
+        path.file_stem()
+    } else {
+        path.file_name()
+    };
     let own = stem?.to_string_lossy().into_owned();
-    let above = path.parent().and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned());
+
+    let above = path
+        .parent()
+        .and_then(Path::file_name)
+        .map(|name| name.to_string_lossy().into_owned());
+
     match (format, above) {
         ("12scenes", Some(house)) => Some(format!("{house}-{own}")),
         ("7scenes", Some(scene)) if own.starts_with("seq-") => Some(format!("{scene}-{own}")),
@@ -266,17 +367,36 @@ fn name_from(format: &str, path: &Path) -> Option<String> {
 fn say_frames(room: &Room) {
     let timeline = room.timeline();
     if let Some(most) = timeline.sequences.iter().max() {
-        say(format_args!("sequences: up to number {most}; no pair of frames joins two of them"));
+        say(format_args!(
+            "sequences: up to number {most}; no pair of frames joins two of them"
+        ));
     }
-    let held_out = timeline.held_out.iter().filter(|held_out| **held_out).count();
+
+    let held_out = timeline
+        .held_out
+        .iter()
+        .filter(|held_out| **held_out)
+        .count();
+
     if !timeline.held_out.is_empty() {
         let train = room.frame_count() - held_out;
-        say(format_args!("the recording's own split (--split dataset): {train} training, {held_out} test frames"));
+        say(format_args!(
+            "the recording's own split (--split dataset): {train} training, {held_out} test frames"
+        ));
     }
-    let gaps = room.frame_numbers().windows(2).filter(|pair| pair[1] > pair[0] + 1).count();
+
+    let gaps = room
+        .frame_numbers()
+        .windows(2)
+        .filter(|pair| pair[1] > pair[0] + 1)
+        .count();
+
     if gaps > 0 {
-        say(format_args!("frame numbers have {gaps} gaps: a stride counts frames of the room, not of the recording"));
+        say(format_args!(
+            "frame numbers have {gaps} gaps: a stride counts frames of the room, not of the recording"
+        ));
     }
+
     let root = &room.provenance().images_root;
     if !room.images().is_empty() {
         say(format_args!("images: {} below {root}", room.images().len()));
@@ -287,13 +407,22 @@ fn say_dropped(dropped: &[Dropped]) {
     for frame in dropped.iter().take(NAMED) {
         say(format_args!("dropped {}: {}", frame.name, frame.reason));
     }
+
     let mut counts = BTreeMap::new();
     for frame in dropped {
         *counts.entry(frame.reason).or_insert(0) += 1;
     }
+
     if !dropped.is_empty() {
-        let counts: Vec<String> = counts.iter().map(|(reason, count)| format!("{count} {reason}")).collect();
-        say(format_args!("dropped {} frames in all: {}", dropped.len(), counts.join(", ")));
+        let counts: Vec<String> = counts
+            .iter()
+            .map(|(reason, count)| format!("{count} {reason}"))
+            .collect();
+        say(format_args!(
+            "dropped {} frames in all: {}",
+            dropped.len(),
+            counts.join(", ")
+        ));
     }
 }
 
@@ -303,5 +432,6 @@ fn read_features(given: &str) -> anyhow::Result<Features> {
     };
     let rows = datasets::read_features(&PathBuf::from(file))?;
     let dim = rows.ncols();
+
     Features::new(FeatureSource::imported(name, dim), rows).with_context(|| file.to_owned())
 }

@@ -52,7 +52,8 @@ enum Command {
     Evaluate(evaluate::Evaluate),
     /// Measure how much of SE(3) features hold: M1 to M4
     Probe(probe::Probe),
-    /// Learn from some rooms, navigate in others: zero-shot, against Identity, by how many rooms were learned from
+    /// Learn from some rooms, navigate in others: zero-shot, against Identity, by how many rooms
+    /// were learned from
     CrossRoom(cross_room::CrossRoom),
     /// Score many features at once
     Sweep(sweep::Sweep),
@@ -113,12 +114,17 @@ fn say(line: impl std::fmt::Display) {
 
 /// Refuses a file whose folder is not there, before long work is done for it.
 fn check_writable(path: &std::path::Path) -> anyhow::Result<()> {
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let folder = path
+        .parent()
+        .filter(|folder| !folder.as_os_str().is_empty());
     if path.is_dir() {
         anyhow::bail!("{} is a folder; name a file in it", path.display());
     }
+
     match folder {
-        Some(folder) if !folder.is_dir() => anyhow::bail!("{}: the folder does not exist", path.display()),
+        Some(folder) if !folder.is_dir() => {
+            anyhow::bail!("{}: the folder does not exist", path.display())
+        }
         _ => Ok(()),
     }
 }
@@ -126,10 +132,13 @@ fn check_writable(path: &std::path::Path) -> anyhow::Result<()> {
 /// Writes a file whole or not at all.
 fn write_file(path: &std::path::Path, content: &[u8]) -> anyhow::Result<()> {
     use anyhow::Context;
+
     let mut partial = path.as_os_str().to_owned();
     partial.push(".partial");
     let partial = std::path::PathBuf::from(partial);
-    std::fs::write(&partial, content).with_context(|| format!("{} cannot be written", path.display()))?;
+    std::fs::write(&partial, content)
+        .with_context(|| format!("{} cannot be written", path.display()))?;
+
     std::fs::rename(&partial, path).with_context(|| format!("{} cannot be written", path.display()))
 }
 

@@ -60,7 +60,8 @@ pub enum PresetName {
     PaperBase,
     /// 30,000 pairs with strides 10 to 40, 200 epochs
     PaperRange,
-    /// Ours, for rooms never seen: strides 1 to 40, 1,000 steps on z-scored features with noise, averaged weights
+    /// Ours, for rooms never seen: strides 1 to 40, 1,000 steps on z-scored features with noise,
+    /// averaged weights
     Steady,
 }
 
@@ -140,7 +141,11 @@ impl From<LossName> for Loss {
 impl ProtocolOptions {
     /// Refuses the split that sets nothing apart, where test pairs are what is asked for.
     pub fn needs_test_pairs(&self) -> anyhow::Result<()> {
-        anyhow::ensure!(self.split != SplitName::Whole, "--split whole sets no test pairs apart; take another split");
+        anyhow::ensure!(
+            self.split != SplitName::Whole,
+            "--split whole sets no test pairs apart; take another split"
+        );
+
         Ok(())
     }
 
@@ -152,14 +157,21 @@ impl ProtocolOptions {
             (self.lr.is_some(), "--lr", "--lrs"),
             (self.loss.is_some(), "--loss", "--losses"),
         ] {
-            anyhow::ensure!(!given, "{option} is one of the sweep's own; give {grid}, with commas");
+            anyhow::ensure!(
+                !given,
+                "{option} is one of the sweep's own; give {grid}, with commas"
+            );
         }
+
         Ok(())
     }
 
     /// The same at another stride.
     pub fn at_stride(&self, stride: u32) -> Self {
-        Self { stride, ..self.clone() }
+        Self {
+            stride,
+            ..self.clone()
+        }
     }
 
     /// The preset with what was given in its place.
@@ -169,18 +181,22 @@ impl ProtocolOptions {
             "--stride must be 1 to {MAX_STRIDE}, got {}",
             self.stride
         );
+
         let mut recipe = Recipe::of(self.preset.into(), self.split.into(), self.stride, seed);
         let config = &mut recipe.config;
         let put = |into: &mut usize, given: Option<usize>| given.map_or((), |given| *into = given);
         put(&mut config.epochs, self.epochs);
+
         put(&mut config.batch, self.batch);
         put(&mut config.hidden, self.hidden);
         put(&mut config.latent, self.geo_dim);
         put(&mut config.charts, self.charts);
+
         config.learning_rate = self.lr.unwrap_or(config.learning_rate);
         config.weight_decay = self.weight_decay.unwrap_or(config.weight_decay);
         config.mixing = self.mixing.map_or(config.mixing, Into::into);
         config.loss = self.loss.map_or(config.loss, Into::into);
+
         recipe.pairs = self.plan(recipe.pairs)?;
         Ok(recipe)
     }
@@ -191,18 +207,37 @@ impl ProtocolOptions {
             (None, PairPlan::Stride(stride)) => (*stride, *stride, 30_000),
             (None, PairPlan::Range(range)) => (range.low, range.high, range.count),
             (Some(text), _) => {
-                let ends = text.split_once('-').context("--strides is LOW-HIGH, for instance 10-40")?;
-                let end = |text: &str| text.trim().parse().with_context(|| format!("--strides: '{text}' is no stride"));
-                let count = if let PairPlan::Range(range) = &preset { range.count } else { 30_000 };
+                let ends = text
+                    .split_once('-')
+                    .context("--strides is LOW-HIGH, for instance 10-40")?;
+
+                let end = |text: &str| {
+                    text.trim()
+                        .parse()
+                        .with_context(|| format!("--strides: '{text}' is no stride"))
+                };
+
+                let count = if let PairPlan::Range(range) = &preset {
+                    range.count
+                } else {
+                    30_000
+                };
+
                 (end(ends.0)?, end(ends.1)?, count)
             }
         };
+
         anyhow::ensure!(
             low >= 1 && low <= high && high <= MAX_STRIDE,
             "--strides: {low}-{high} is no range from 1 to {MAX_STRIDE}"
         );
+
         let count = self.pairs.unwrap_or(count);
-        anyhow::ensure!((1..=MAX_PAIRS).contains(&count), "--pairs must be 1 to {MAX_PAIRS}, got {count}");
+        anyhow::ensure!(
+            (1..=MAX_PAIRS).contains(&count),
+            "--pairs must be 1 to {MAX_PAIRS}, got {count}"
+        );
+
         Ok(PairPlan::Range(StrideRange { low, high, count }))
     }
 }

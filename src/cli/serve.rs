@@ -27,9 +27,14 @@ pub struct Serve {
     /// How frames are searched
     #[arg(long, env = "SEESE3_INDEX", value_enum, default_value_t = IndexName::Exact)]
     index: IndexName,
-    /// Take images instead of features: `builtin`, `pixels`, or the ONNX file that an adapter's features were made by;
-    /// several are divided by commas
-    #[arg(long = "encoder", value_name = "MODEL", env = "SEESE3_ENCODER", value_delimiter = ',')]
+    /// Take images instead of features: `builtin`, `pixels`, or the ONNX file that an adapter's
+    /// features were made by; several are divided by commas
+    #[arg(
+        long = "encoder",
+        value_name = "MODEL",
+        env = "SEESE3_ENCODER",
+        value_delimiter = ','
+    )]
     encoders: Vec<String>,
     /// What runs ONNX models: tract needs nothing, onnxruntime is faster
     #[arg(long, env = "SEESE3_RUNTIME", value_enum, default_value_t = RuntimeName::Tract)]
@@ -61,8 +66,8 @@ pub struct Serve {
     /// Cameras that are followed at a time
     #[arg(long, env = "SEESE3_MAX_STREAMS", default_value_t = Config::default().streams)]
     max_streams: usize,
-    /// A file whose bytes, 16 or more, seal resume tokens: servers that share it go on with one another's streams; without
-    /// one they end with the server
+    /// A file whose bytes, 16 or more, seal resume tokens: servers that share it go on with one
+    /// another's streams; without one they end with the server
     #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_KEY_FILE")]
     token_key_file: Option<PathBuf>,
     /// Requests computed at a time; the machine's cores if not given
@@ -96,6 +101,7 @@ impl Serve {
         let store = Store::open(&self.store)?;
         let defaults = Config::default();
         let threads = self.threads.map_or(defaults.threads, usize::from);
+
         let config = Config {
             index: match self.index {
                 IndexName::Exact => IndexKind::Exact,
@@ -103,10 +109,21 @@ impl Serve {
             },
             encoders: (!self.encoders.is_empty()).then(|| ImageEncoders {
                 models: self.encoders.clone(),
-                runtime: Runtime { kind: self.runtime.into(), threads, library: self.library.clone() },
-                bounds: Bounds { bytes: self.max_message_bytes as u64, pixels: self.max_image_pixels },
+                runtime: Runtime {
+                    kind: self.runtime.into(),
+                    threads,
+                    library: self.library.clone(),
+                },
+                bounds: Bounds {
+                    bytes: self.max_message_bytes as u64,
+                    pixels: self.max_image_pixels,
+                },
             }),
-            limits: Limits { steps: self.max_steps, hits: self.max_hits, hits_in_all: self.max_hits_in_all },
+            limits: Limits {
+                steps: self.max_steps,
+                hits: self.max_hits,
+                hits_in_all: self.max_hits_in_all,
+            },
             message_bytes: self.max_message_bytes,
             threads,
             queue: self.queue as usize,
@@ -116,22 +133,32 @@ impl Serve {
             drain: Duration::from_secs(self.drain_seconds),
             ..defaults
         };
-        let listener =
-            TcpListener::bind(&self.listen).await.with_context(|| format!("cannot listen on {}", self.listen))?;
-        let address = listener.local_addr().context("the listener has no address")?;
+
+        let listener = TcpListener::bind(&self.listen)
+            .await
+            .with_context(|| format!("cannot listen on {}", self.listen))?;
+        let address = listener
+            .local_addr()
+            .context("the listener has no address")?;
         say(format_args!("listening on {address}"));
+
         run(listener, store, config, shutdown_signal()).await?;
         say("stopped");
+
         Ok(())
     }
 }
 
 impl Serve {
     fn token_key(&self) -> anyhow::Result<TokenKey> {
-        let Some(file) = &self.token_key_file else { return Ok(TokenKey::random()) };
-        let secret =
-            std::fs::read(file).with_context(|| format!("--token-key-file: {} cannot be read", file.display()))?;
-        TokenKey::new(&secret).map_err(|problem| anyhow::anyhow!("--token-key-file: {} {problem}", file.display()))
+        let Some(file) = &self.token_key_file else {
+            return Ok(TokenKey::random());
+        };
+        let secret = std::fs::read(file)
+            .with_context(|| format!("--token-key-file: {} cannot be read", file.display()))?;
+
+        TokenKey::new(&secret)
+            .map_err(|problem| anyhow::anyhow!("--token-key-file: {} {problem}", file.display()))
     }
 }
 
@@ -142,6 +169,7 @@ fn start_log(format: LogFormat) {
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal());
+
     match format {
         LogFormat::Text => log.init(),
         LogFormat::Json => log.json().flatten_event(true).init(),

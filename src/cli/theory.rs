@@ -31,22 +31,31 @@ impl Theory {
         if let Some(file) = &self.json {
             check_writable(file)?;
         }
-        let effort = Effort { seed: self.seed, poses: self.poses as usize, samples: self.samples as usize };
+
+        let effort = Effort {
+            seed: self.seed,
+            poses: self.poses as usize,
+            samples: self.samples as usize,
+        };
+
         let progress = bar(4, "theory");
         let found = checks(effort, &mut |part| {
             progress.set_message(part);
             progress.inc(1);
         })?;
+
         progress.finish_and_clear();
         say(theory_table(&found).trim_end());
         if let Some(file) = &self.json {
             write_json(file, &theory_json(&found))?;
             say(format_args!("wrote {}", file.display()));
         }
+
         let broken = found.iter().filter(|check| !check.holds()).count();
         if broken > 0 {
             bail!("{broken} of {} bounds are not kept", found.len());
         }
+
         Ok(())
     }
 }

@@ -33,7 +33,8 @@ pub struct Track {
     /// A NumPy file of features, (n, d), a row a frame
     #[arg(long, value_name = "FILE", required_unless_present = "images")]
     feature: Option<PathBuf>,
-    /// A folder of JPEG or PNG files, a file a frame by name, for a server that was started with --encoder
+    /// A folder of JPEG or PNG files, a file a frame by name, for a server that was started with
+    /// --encoder
     #[arg(long, value_name = "FOLDER", conflicts_with = "feature")]
     images: Option<PathBuf>,
     /// The first frame
@@ -76,35 +77,62 @@ struct Heard {
 
 impl Track {
     pub async fn run(self) -> anyhow::Result<()> {
-        for path in [&self.save_token, &self.tum, &self.odom_tum, &self.recording].into_iter().flatten() {
+        for path in [&self.save_token, &self.tum, &self.odom_tum, &self.recording]
+            .into_iter()
+            .flatten()
+        {
             check_writable(path)?;
         }
+
         if !(self.hz.is_finite() && self.hz > 0.0) {
             bail!("--hz must be above 0, got {}", self.hz);
         }
+
         let views = self.views()?;
         if self.from >= views.len() {
             bail!("--from {}: there are {} frames", self.from, views.len());
         }
-        let end = self.count.map_or(views.len(), |count| self.from.saturating_add(count).min(views.len()));
-        let (config, images) = (self.config()?, views.clone());
+
+        let end = self.count.map_or(views.len(), |count| {
+            self.from.saturating_add(count).min(views.len())
+        });
+
+        let config = self.config()?;
+        let images = views.clone();
         let client = self.server.connect().await?;
         let (sender, requests) = tokio::sync::mpsc::channel(WAITING);
-        let (from, hz) = (self.from, self.hz);
+
+        let from = self.from;
+        let hz = self.hz;
+
         tokio::spawn(async move {
-            let frames = (from..end).map(|row| Some(Message::Frame(frame(row, views[row].view()?, hz))));
+            let frames =
+                (from..end).map(|row| Some(Message::Frame(frame(row, views[row].view()?, hz))));
+
             // An image that went away since it was listed ends the stream.
-            for message in [Some(Message::Config(config))].into_iter().chain(frames).map_while(|message| message) {
+            for message in [Some(Message::Config(config))]
+                .into_iter()
+                .chain(frames)
+                .map_while(|message| message)
+            {
                 // Nobody listens any more: the error comes with the answers.
-                if sender.send(pb::TrackRequest { message: Some(message) }).await.is_err() {
+                if sender
+                    .send(pb::TrackRequest {
+                        message: Some(message),
+                    })
+                    .await
+                    .is_err()
+                {
                     return;
                 }
             }
         });
+
         let mut answers = client.track(ReceiverStream::new(requests)).await?;
         let progress = bar((end - from) as u64, "tracking");
         let mut heard = Heard::default();
         let mut ended = Ok(());
+
         loop {
             let answer = match answers.message().await {
                 Ok(Some(answer)) => answer,
@@ -115,54 +143,89 @@ impl Track {
                     break;
                 }
             };
+
             heard.token = answer.resume_token;
+
             match answer.answer {
                 Some(Answer::Started(started)) => heard.names = started.frames.unwrap_or_default(),
                 Some(Answer::Update(update)) => heard.updates.push(update),
                 Some(Answer::Refusal(refusal)) => heard.refusals.push(refusal),
                 _ => {}
             }
+
             progress.inc(1);
         }
+
         progress.finish_and_clear();
         self.report(&heard, &images)?;
         ended?;
+
         match heard.refusals.as_slice() {
             [] => Ok(()),
-            [first, ..] => bail!("{} of {} frames were refused: {}", heard.refusals.len(), end - from, first.message),
+            [first, ..] => bail!(
+                "{} of {} frames were refused: {}",
+                heard.refusals.len(),
+                end - from,
+                first.message
+            ),
         }
     }
 
     fn views(&self) -> anyhow::Result<Vec<Seen>> {
         if let Some(file) = &self.feature {
-            return Ok(read_features(file)?.outer_iter().map(|row| Seen::Feature(row.to_vec())).collect());
+            return Ok(read_features(file)?
+                .outer_iter()
+                .map(|row| Seen::Feature(row.to_vec()))
+                .collect());
         }
-        let folder = self.images.as_ref().context("give --feature FILE or --images FOLDER")?;
-        let entries = std::fs::read_dir(folder).with_context(|| format!("{} cannot be read", folder.display()))?;
+
+        let folder = self
+            .images
+            .as_ref()
+            .context("give --feature FILE or --images FOLDER")?;
+        let entries = std::fs::read_dir(folder)
+            .with_context(|| format!("{} cannot be read", folder.display()))?;
+
         let mut files = Vec::new();
         for entry in entries {
             let path = entry?.path();
-            let extension = path.extension().map(|extension| extension.to_string_lossy().to_lowercase());
+            let extension = path
+                .extension()
+                .map(|extension| extension.to_string_lossy().to_lowercase());
+
             if matches!(extension.as_deref(), Some("jpg" | "jpeg" | "png")) {
                 files.push(path);
             }
         }
+
         files.sort();
         if files.is_empty() {
             bail!("{} has no .jpg, .jpeg or .png file", folder.display());
         }
+
         Ok(files.into_iter().map(Seen::Image).collect())
     }
 
     fn config(&self) -> anyhow::Result<pb::TrackConfig> {
         if let Some(file) = &self.resume {
-            let resume_token = std::fs::read(file).with_context(|| format!("{} cannot be read", file.display()))?;
+            let resume_token = std::fs::read(file)
+                .with_context(|| format!("{} cannot be read", file.display()))?;
             if resume_token.is_empty() {
                 bail!("{} is empty: it has no token", file.display());
             }
-            return Ok(pb::TrackConfig { resume_token, ..pb::TrackConfig::default() });
+
+            return Ok(pb::TrackConfig {
+                resume_token,
+                ..pb::TrackConfig::default()
+            });
         }
-        let fusion = if self.no_fusion { pb::Fusion::None } else { pb::Fusion::Anchors };
+
+        let fusion = if self.no_fusion {
+            pb::Fusion::None
+        } else {
+            pb::Fusion::Anchors
+        };
+
         Ok(pb::TrackConfig {
             room: self.room.clone().unwrap_or_default(),
             adapter: self.adapter.clone().unwrap_or_default(),
@@ -176,22 +239,54 @@ impl Track {
         for update in &heard.updates {
             if before != Some(update.status()) {
                 let room = update.room.as_ref().map_or("", |room| &room.name);
-                let status = update.status().as_str_name().trim_start_matches("TRACK_STATUS_");
-                let place = if room.is_empty() { String::new() } else { format!(" in {room}") };
-                say(format_args!("frame {}: {status}{place}: {}", update.sequence - 1, update.reason));
+
+                let status = update
+                    .status()
+                    .as_str_name()
+                    .trim_start_matches("TRACK_STATUS_");
+
+                let place = if room.is_empty() {
+                    String::new()
+                } else {
+                    format!(" in {room}")
+                };
+                say(format_args!(
+                    "frame {}: {status}{place}: {}",
+                    update.sequence - 1,
+                    update.reason
+                ));
+
                 before = Some(update.status());
             }
         }
-        let tracking = heard.updates.iter().filter(|update| update.status() == pb::TrackStatus::Tracking).count();
-        say(format_args!("{} frames, {tracking} of them TRACKING", heard.updates.len()));
+
+        let tracking = heard
+            .updates
+            .iter()
+            .filter(|update| update.status() == pb::TrackStatus::Tracking)
+            .count();
+        say(format_args!(
+            "{} frames, {tracking} of them TRACKING",
+            heard.updates.len()
+        ));
+
         for (file, of) in [(&self.tum, map as PoseOf), (&self.odom_tum, odom as PoseOf)] {
             if let Some(file) = file {
-                let known = heard.updates.iter().filter_map(|update| Some((update.timestamp_ns, of(update)?)));
+                let known = heard
+                    .updates
+                    .iter()
+                    .filter_map(|update| Some((update.timestamp_ns, of(update)?)));
                 let (times, poses): (Vec<i64>, Vec<Pose>) = known.unzip();
                 write_file(file, tum_trajectory(&times, &poses).as_bytes())?;
-                say(format_args!("wrote {} ({} poses)", file.display(), poses.len()));
+
+                say(format_args!(
+                    "wrote {} ({} poses)",
+                    file.display(),
+                    poses.len()
+                ));
             }
         }
+
         if let Some(file) = &self.recording {
             write_file(file, &recorded(heard, seen)?)?;
             say(format_args!("wrote {}", file.display()));
@@ -200,6 +295,7 @@ impl Track {
             write_file(file, &heard.token)?;
             say(format_args!("wrote {}", file.display()));
         }
+
         Ok(())
     }
 }
@@ -215,9 +311,10 @@ impl Seen {
     /// None when the image cannot be read.
     fn view(&self) -> Option<pb::view::View> {
         match self {
-            Self::Feature(values) => {
-                Some(pb::view::View::Feature(pb::Feature { values: values.clone(), source_name: String::new() }))
-            }
+            Self::Feature(values) => Some(pb::view::View::Feature(pb::Feature {
+                values: values.clone(),
+                source_name: String::new(),
+            })),
             Self::Image(file) => std::fs::read(file).ok().map(pb::view::View::Image),
         }
     }
@@ -225,7 +322,11 @@ impl Seen {
 
 fn frame(row: usize, view: pb::view::View, hz: f64) -> pb::TrackFrame {
     let view = Some(pb::View { view: Some(view) });
-    pb::TrackFrame { timestamp_ns: (row as f64 / hz * 1e9) as i64, sequence: row as u64 + 1, view }
+    pb::TrackFrame {
+        timestamp_ns: (row as f64 / hz * 1e9) as i64,
+        sequence: row as u64 + 1,
+        view,
+    }
 }
 
 type PoseOf = fn(&pb::TrackUpdate) -> Option<Pose>;
@@ -240,7 +341,15 @@ fn odom(update: &pb::TrackUpdate) -> Option<Pose> {
 
 /// A pose whatever its frames are called.
 fn plain(pose: Option<pb::Pose>) -> Option<Pose> {
-    pose_from_wire(pb::Pose { parent_frame: String::new(), child_frame: String::new(), ..pose? }, "").ok()
+    pose_from_wire(
+        pb::Pose {
+            parent_frame: String::new(),
+            child_frame: String::new(),
+            ..pose?
+        },
+        "",
+    )
+    .ok()
 }
 
 fn recorded(heard: &Heard, seen: &[Seen]) -> anyhow::Result<Vec<u8>> {
@@ -257,11 +366,16 @@ fn recorded(heard: &Heard, seen: &[Seen]) -> anyhow::Result<Vec<u8>> {
         if let Some(pose) = map(update) {
             recording.pose("/pose", time, &names.map, &pose)?;
         }
-        let row = usize::try_from(update.sequence).unwrap_or(usize::MAX).saturating_sub(1);
+
+        let row = usize::try_from(update.sequence)
+            .unwrap_or(usize::MAX)
+            .saturating_sub(1);
         if let Some(Seen::Image(file)) = seen.get(row) {
-            let image = std::fs::read(file).with_context(|| format!("{} cannot be read", file.display()))?;
+            let image = std::fs::read(file)
+                .with_context(|| format!("{} cannot be read", file.display()))?;
             recording.image(time, &names.camera, &image)?;
         }
     }
+
     Ok(recording.finish()?)
 }

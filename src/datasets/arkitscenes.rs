@@ -1,8 +1,9 @@
 //! ARKitScenes: `VIDEO/lowres_wide/VIDEO_TIME.png`, `VIDEO/lowres_wide.traj`.
 //!
-//! A line of the trajectory is a time, an axis times angle (radians) and a translation (metres): **world-to-camera**,
-//! inverted here. About one image in six has a pose. As in the official loader, a pose's key is its time rounded to
-//! milliseconds; an image takes the pose of its own key, else the nearest under 5 ms away.
+//! A line of the trajectory is a time, an axis times angle (radians) and a translation (metres):
+//! **world-to-camera**, inverted here. About one image in six has a pose. As in the official
+//! loader, a pose's key is its time rounded to milliseconds; an image takes the pose of its own
+//! key, else the nearest under 5 ms away.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -26,12 +27,21 @@ pub fn read_arkitscenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Record
     let poses = read_trajectory(&folder.join(format!("{IMAGES}.traj")))?;
     let mut images = Vec::new();
     for name in entries(&folder.join(IMAGES))? {
-        let Some(stem) = name.strip_suffix(".png") else { continue };
-        let time = stem.rsplit_once('_').and_then(|(_, time)| nanoseconds(time));
+        let Some(stem) = name.strip_suffix(".png") else {
+            continue;
+        };
+        let time = stem
+            .rsplit_once('_')
+            .and_then(|(_, time)| nanoseconds(time));
+
         let problem = format!("'{name}' is not of the form VIDEO_SECONDS.png");
-        let time = time.ok_or_else(|| Error::Malformed { file: folder.join(IMAGES), problem })?;
+        let time = time.ok_or_else(|| Error::Malformed {
+            file: folder.join(IMAGES),
+            problem,
+        })?;
         images.push((time, stem.to_owned()));
     }
+
     images.sort();
     let mut collected = Collected::default();
     for (done, (timestamp_ns, stem)) in images.iter().enumerate() {
@@ -42,10 +52,18 @@ pub fn read_arkitscenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Record
             collected.drop(stem.clone(), DropReason::NoPoseWithinTolerance);
             continue;
         };
+
         let image = Some(format!("{IMAGES}/{stem}.png"));
-        let about = About { name: stem.clone(), image, timestamp_ns: Some(*timestamp_ns), ..About::default() };
+        let about = About {
+            name: stem.clone(),
+            image,
+            timestamp_ns: Some(*timestamp_ns),
+            ..About::default()
+        };
+
         collected.keep(about, *pose);
     }
+
     collected.finish(folder, reader)
 }
 
@@ -53,14 +71,20 @@ pub fn read_arkitscenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Record
 fn read_trajectory(file: &Path) -> Result<BTreeMap<i64, Pose>, Error> {
     let text = read_text(file)?;
     let mut poses = BTreeMap::new();
-    for (line, row) in (1..).zip(text.lines()).filter(|(_, row)| !row.trim().is_empty()) {
+    for (line, row) in (1..)
+        .zip(text.lines())
+        .filter(|(_, row)| !row.trim().is_empty())
+    {
         let [_, rx, ry, rz, x, y, z] = finite_row(file, line, row.trim_end())?;
         let word = row.split(' ').next().unwrap_or_default();
-        let time = nanoseconds(word).ok_or_else(|| wrong(file, line, format!("'{word}' is no time in seconds")))?;
+        let time = nanoseconds(word)
+            .ok_or_else(|| wrong(file, line, format!("'{word}' is no time in seconds")))?;
+
         let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(rx, ry, rz));
         let camera_from_world = Pose::from_parts(Translation3::new(x, y, z), rotation);
         poses.insert(milliseconds(time), camera_from_world.inverse());
     }
+
     Ok(poses)
 }
 

@@ -5,8 +5,8 @@
 //! bundle.json           what arrays cannot say: name, licence, images, sequences, split, what made the features
 //! ```
 //!
-//! `import numpy` reads such a folder without its `bundle.json`, `import bundle` with it, so that an exported room comes
-//! back whole.
+//! `import numpy` reads such a folder without its `bundle.json`, `import bundle` with it, so that
+//! an exported room comes back whole.
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +16,9 @@ use serde::{Deserialize, Serialize};
 
 use super::collect::check_lengths;
 use super::numpy::read_numbers;
-use super::{Error, Recording, Stated, entries, read_bytes, read_features, read_poses, read_timestamps};
+use super::{
+    Error, Recording, Stated, entries, read_bytes, read_features, read_poses, read_timestamps,
+};
 use crate::features::{FeatureSource, Features};
 use crate::room::Room;
 
@@ -69,14 +71,24 @@ pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
     if let Some(file) = there("frame_ids.npy") {
         recording.frames.numbers = read_numbers(&file)?;
     }
+
     check_lengths(&folder.join("poses.npy"), &recording)?;
+
     for file_name in entries(folder)? {
-        let name = file_name.strip_prefix("features_").and_then(|name| name.strip_suffix(".npy"));
+        let name = file_name
+            .strip_prefix("features_")
+            .and_then(|name| name.strip_suffix(".npy"));
         let Some(name) = name else { continue };
+
         let file = folder.join(&file_name);
         let rows = read_features(&file)?;
-        recording.features.push(checked(FeatureSource::imported(name, rows.ncols()), rows, &file)?);
+        recording.features.push(checked(
+            FeatureSource::imported(name, rows.ncols()),
+            rows,
+            &file,
+        )?);
     }
+
     Ok(recording)
 }
 
@@ -86,8 +98,13 @@ pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
 /// [`Error`], naming the file.
 pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     let file = folder.join(SAYS);
-    let malformed = |problem: String| Error::Malformed { file: file.clone(), problem };
-    let bundle: Bundle = serde_json::from_slice(&read_bytes(&file)?).map_err(|error| malformed(error.to_string()))?;
+    let malformed = |problem: String| Error::Malformed {
+        file: file.clone(),
+        problem,
+    };
+    let bundle: Bundle = serde_json::from_slice(&read_bytes(&file)?)
+        .map_err(|error| malformed(error.to_string()))?;
+
     // Destructured with no `..`, so that a new field breaks the build here.
     let Bundle {
         format,
@@ -103,24 +120,60 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
         worst_rotation_deviation,
         features,
     } = bundle;
+
     if format != FORMAT {
-        return Err(malformed(format!("is of format '{format}', this program reads '{FORMAT}'")));
+        return Err(malformed(format!(
+            "is of format '{format}', this program reads '{FORMAT}'"
+        )));
     }
+
     let mut recording = read_numpy(folder)?;
     let frames = &mut recording.frames;
     if !numbered {
         frames.numbers.clear();
     }
-    (frames.names, frames.images, frames.sequences, frames.held_out) = (names, images, sequences, held_out);
-    recording.worst_rotation_deviation = recording.worst_rotation_deviation.max(worst_rotation_deviation);
-    recording.images_root = if images_root.is_empty() { images_root } else { resolved(folder, &images_root)? };
+
+    frames.names = names;
+    frames.images = images;
+    frames.sequences = sequences;
+    frames.held_out = held_out;
+
+    recording.worst_rotation_deviation = recording
+        .worst_rotation_deviation
+        .max(worst_rotation_deviation);
+
+    recording.images_root = if images_root.is_empty() {
+        images_root
+    } else {
+        resolved(folder, &images_root)?
+    };
+
     check_lengths(&file, &recording)?;
-    recording.stated = Stated { name, format: recorded_as, licence };
+
+    recording.stated = Stated {
+        name,
+        format: recorded_as,
+        licence,
+    };
+
     let read = std::mem::take(&mut recording.features);
     for set in read {
         let made = features.iter().find(|made| made.name == set.source().name);
-        let Made { name, encoder, layer, base, norm, pooling, preprocess } =
-            made.ok_or_else(|| malformed(format!("says nothing of features_{}.npy", set.source().name)))?;
+        let Made {
+            name,
+            encoder,
+            layer,
+            base,
+            norm,
+            pooling,
+            preprocess,
+        } = made.ok_or_else(|| {
+            malformed(format!(
+                "says nothing of features_{}.npy",
+                set.source().name
+            ))
+        })?;
+
         let source = FeatureSource {
             name: name.clone(),
             encoder: encoder.clone(),
@@ -131,43 +184,91 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
             preprocess: preprocess.clone(),
             dim: set.source().dim,
         };
-        recording.features.push(checked(source, set.rows().to_owned(), &file)?);
+
+        recording
+            .features
+            .push(checked(source, set.rows().to_owned(), &file)?);
     }
-    if let Some(lost) = features.iter().find(|made| recording.features.iter().all(|set| set.source().name != made.name))
-    {
-        return Err(malformed(format!("names features '{}', but features_{}.npy is missing", lost.name, lost.name)));
+
+    if let Some(lost) = features.iter().find(|made| {
+        recording
+            .features
+            .iter()
+            .all(|set| set.source().name != made.name)
+    }) {
+        return Err(malformed(format!(
+            "names features '{}', but features_{}.npy is missing",
+            lost.name, lost.name
+        )));
     }
+
     Ok(recording)
 }
 
-/// Writes a room and its features into a folder, made if it is not there; `bundle.json` last. Returns the files.
+/// Writes a room and its features into a folder, made if it is not there; `bundle.json` last.
+/// Returns the files.
 ///
 /// # Errors
 /// [`Error::Io`]; [`Error::Malformed`] if the folder holds anything already.
-pub fn write_numpy(folder: &Path, room: &Room, features: &[Features]) -> Result<Vec<PathBuf>, Error> {
-    let io = |cause| Error::Io { file: folder.to_owned(), cause };
+pub fn write_numpy(
+    folder: &Path,
+    room: &Room,
+    features: &[Features],
+) -> Result<Vec<PathBuf>, Error> {
+    let io = |cause| Error::Io {
+        file: folder.to_owned(),
+        cause,
+    };
     std::fs::create_dir_all(folder).map_err(io)?;
+
     if !entries(folder)?.is_empty() {
         return Err(Error::Malformed {
             file: folder.to_owned(),
             problem: "is not empty; name another folder".to_owned(),
         });
     }
+
     let n = room.frame_count();
     let mut files = Vec::new();
-    let numbers = room.poses().iter().flat_map(|pose| pose.to_homogeneous().transpose().as_slice().to_vec()).collect();
-    let poses = Array3::from_shape_vec((n, 4, 4), numbers)
-        .map_err(|error| Error::Malformed { file: folder.to_owned(), problem: error.to_string() })?;
+
+    let numbers = room
+        .poses()
+        .iter()
+        .flat_map(|pose| pose.to_homogeneous().transpose().as_slice().to_vec())
+        .collect();
+    let poses = Array3::from_shape_vec((n, 4, 4), numbers).map_err(|error| Error::Malformed {
+        file: folder.to_owned(),
+        problem: error.to_string(),
+    })?;
+
     files.push(write_array(folder, "poses.npy", &poses)?);
+
     if !room.timestamps_ns().is_empty() {
-        files.push(write_array(folder, "timestamps.npy", &Array1::from(room.timestamps_ns().to_vec()))?);
+        files.push(write_array(
+            folder,
+            "timestamps.npy",
+            &Array1::from(room.timestamps_ns().to_vec()),
+        )?);
     }
-    let ids = if room.frame_numbers().is_empty() { (0..n as i64).collect() } else { room.frame_numbers().to_vec() };
+
+    let ids = if room.frame_numbers().is_empty() {
+        (0..n as i64).collect()
+    } else {
+        room.frame_numbers().to_vec()
+    };
     files.push(write_array(folder, "frame_ids.npy", &Array1::from(ids))?);
+
     for set in features {
-        files.push(write_array(folder, &format!("features_{}.npy", set.source().name), &set.rows())?);
+        files.push(write_array(
+            folder,
+            &format!("features_{}.npy", set.source().name),
+            &set.rows(),
+        )?);
     }
-    let (frames, provenance) = (room.frames(), room.provenance());
+
+    let frames = room.frames();
+    let provenance = room.provenance();
+
     let bundle = Bundle {
         format: FORMAT.to_owned(),
         name: room.id().to_string(),
@@ -182,29 +283,64 @@ pub fn write_numpy(folder: &Path, room: &Room, features: &[Features]) -> Result<
         worst_rotation_deviation: provenance.worst_rotation_deviation,
         features: features.iter().map(|set| made(set.source())).collect(),
     };
+
     let file = folder.join(SAYS);
-    let text = serde_json::to_vec_pretty(&bundle)
-        .map_err(|error| Error::Malformed { file: file.clone(), problem: error.to_string() })?;
-    std::fs::write(&file, text).map_err(|cause| Error::Io { file: file.clone(), cause })?;
+    let text = serde_json::to_vec_pretty(&bundle).map_err(|error| Error::Malformed {
+        file: file.clone(),
+        problem: error.to_string(),
+    })?;
+    std::fs::write(&file, text).map_err(|cause| Error::Io {
+        file: file.clone(),
+        cause,
+    })?;
+
     files.push(file);
     Ok(files)
 }
 
 fn made(source: &FeatureSource) -> Made {
-    let FeatureSource { name, encoder, layer, base, norm, pooling, preprocess, dim: _ } = source.clone();
-    Made { name, encoder, layer, base, norm, pooling, preprocess }
+    let FeatureSource {
+        name,
+        encoder,
+        layer,
+        base,
+        norm,
+        pooling,
+        preprocess,
+        dim: _,
+    } = source.clone();
+
+    Made {
+        name,
+        encoder,
+        layer,
+        base,
+        norm,
+        pooling,
+        preprocess,
+    }
 }
 
-fn write_array<T, S, D>(folder: &Path, name: &str, array: &ArrayBase<S, D>) -> Result<PathBuf, Error>
+fn write_array<T, S, D>(
+    folder: &Path,
+    name: &str,
+    array: &ArrayBase<S, D>,
+) -> Result<PathBuf, Error>
 where
     T: WritableElement,
     S: Data<Elem = T>,
     D: Dimension,
 {
     let path = folder.join(name);
-    let io = |cause| Error::Io { file: path.clone(), cause };
+    let io = |cause| Error::Io {
+        file: path.clone(),
+        cause,
+    };
     let mut file = std::io::BufWriter::new(std::fs::File::create(&path).map_err(io)?);
-    array.write_npy(&mut file).map_err(|error| io(std::io::Error::other(error)))?;
+    array
+        .write_npy(&mut file)
+        .map_err(|error| io(std::io::Error::other(error)))?;
+
     std::io::Write::flush(&mut file).map_err(io)?;
     Ok(path)
 }
@@ -213,10 +349,24 @@ fn resolved(folder: &Path, root: &str) -> Result<String, Error> {
     // Where the images are not there any more the path stays as it is said.
     let path = folder.join(root);
     let path = path.canonicalize().unwrap_or(path);
-    let malformed = |problem: &str| Error::Malformed { file: folder.join(SAYS), problem: problem.to_owned() };
-    path.to_str().map(str::to_owned).ok_or_else(|| malformed("images_root is not UTF-8"))
+
+    let malformed = |problem: &str| Error::Malformed {
+        file: folder.join(SAYS),
+        problem: problem.to_owned(),
+    };
+
+    path.to_str()
+        .map(str::to_owned)
+        .ok_or_else(|| malformed("images_root is not UTF-8"))
 }
 
-fn checked(source: FeatureSource, rows: ndarray::Array2<f32>, file: &Path) -> Result<Features, Error> {
-    Features::new(source, rows).map_err(|error| Error::Malformed { file: file.to_owned(), problem: error.to_string() })
+fn checked(
+    source: FeatureSource,
+    rows: ndarray::Array2<f32>,
+    file: &Path,
+) -> Result<Features, Error> {
+    Features::new(source, rows).map_err(|error| Error::Malformed {
+        file: file.to_owned(),
+        problem: error.to_string(),
+    })
 }

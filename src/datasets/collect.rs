@@ -34,12 +34,17 @@ pub(super) fn pose_of(matrix: &Matrix4<f64>) -> MatrixPose {
     if matrix.row(3) != nalgebra::RowVector4::new(0.0, 0.0, 0.0, 1.0) {
         return MatrixPose::NotHomogeneous;
     }
+
     let Some(nearest) = nearest_rotation(&matrix.fixed_view::<3, 3>(0, 0).into_owned()) else {
         return MatrixPose::NotARotation;
     };
     let rotation = UnitQuaternion::from_rotation_matrix(&nearest.rotation);
+
     let translation = matrix.fixed_view::<3, 1>(0, 3).into_owned();
-    MatrixPose::Pose(Pose::from_parts(translation.into(), rotation), nearest.deviation)
+    MatrixPose::Pose(
+        Pose::from_parts(translation.into(), rotation),
+        nearest.deviation,
+    )
 }
 
 /// Refuses columns that are not as long as the poses, before anything is done by rows.
@@ -47,8 +52,14 @@ pub(super) fn check_lengths(file: &Path, recording: &Recording) -> Result<(), Er
     match recording.frames.unequal() {
         None => Ok(()),
         Some((what, actual)) => {
-            let problem = format!("there are {} poses but {actual} {what}", recording.frames.poses.len());
-            Err(Error::Malformed { file: file.to_owned(), problem })
+            let problem = format!(
+                "there are {} poses but {actual} {what}",
+                recording.frames.poses.len()
+            );
+            Err(Error::Malformed {
+                file: file.to_owned(),
+                problem,
+            })
         }
     }
 }
@@ -71,25 +82,45 @@ pub(super) struct Collected(Recording);
 impl Collected {
     /// Keeps a frame with a pose that needs no mending.
     pub fn keep(&mut self, about: About, pose: Pose) {
-        let About { name, image, number, timestamp_ns, sequence, held_out } = about;
+        let About {
+            name,
+            image,
+            number,
+            timestamp_ns,
+            sequence,
+            held_out,
+        } = about;
+
         let frames = &mut self.0.frames;
         frames.poses.push(pose);
         frames.names.push(name);
         frames.images.extend(image);
+
         frames.numbers.extend(number);
         frames.timestamps_ns.extend(timestamp_ns);
         frames.sequences.extend(sequence);
         frames.held_out.extend(held_out);
     }
 
-    /// Keeps or drops a frame by its matrix, `world_from_camera`; one that is no pose at all refuses the recording.
+    /// Keeps or drops a frame by its matrix, `world_from_camera`; one that is no pose at all
+    /// refuses the recording.
     pub fn take(&mut self, about: About, matrix: &Matrix4<f64>, file: &Path) -> Result<(), Error> {
-        let malformed = |problem: String| Error::Malformed { file: file.to_owned(), problem };
+        let malformed = |problem: String| Error::Malformed {
+            file: file.to_owned(),
+            problem,
+        };
+
         match pose_of(matrix) {
             MatrixPose::Pose(_, deviation) if deviation > MAX_ROTATION_DEVIATION => {
-                return Err(malformed(format!("{}: {}", about.name, deviation_problem(deviation))));
+                return Err(malformed(format!(
+                    "{}: {}",
+                    about.name,
+                    deviation_problem(deviation)
+                )));
             }
-            MatrixPose::NotHomogeneous => return Err(malformed(format!("{}: {LAST_ROW_PROBLEM}", about.name))),
+            MatrixPose::NotHomogeneous => {
+                return Err(malformed(format!("{}: {LAST_ROW_PROBLEM}", about.name)));
+            }
             MatrixPose::Pose(pose, deviation) => {
                 self.0.worst_rotation_deviation = self.0.worst_rotation_deviation.max(deviation);
                 self.keep(about, pose);
@@ -97,6 +128,7 @@ impl Collected {
             MatrixPose::NotFinite => self.drop(about.name, DropReason::NonFinitePose),
             MatrixPose::NotARotation => self.drop(about.name, DropReason::NotARotation),
         }
+
         Ok(())
     }
 
@@ -110,17 +142,33 @@ impl Collected {
         let Self(mut recording) = self;
         let folder = root.to_owned();
         if reader.unusable == Unusable::Refuse && !recording.dropped.is_empty() {
-            return Err(Error::Strict { folder, dropped: recording.dropped });
+            return Err(Error::Strict {
+                folder,
+                dropped: recording.dropped,
+            });
         }
+
         if recording.frames.poses.is_empty() {
-            return Err(Error::NoFrames { folder, dropped: recording.dropped });
+            return Err(Error::NoFrames {
+                folder,
+                dropped: recording.dropped,
+            });
         }
+
         if !recording.frames.images.is_empty() {
-            let io = |cause| Error::Io { file: root.to_owned(), cause };
+            let io = |cause| Error::Io {
+                file: root.to_owned(),
+                cause,
+            };
             let root = root.canonicalize().map_err(io)?;
-            let not_text = || Error::Malformed { file: folder, problem: "the path is not UTF-8".to_owned() };
+
+            let not_text = || Error::Malformed {
+                file: folder,
+                problem: "the path is not UTF-8".to_owned(),
+            };
             recording.images_root = root.to_str().ok_or_else(not_text)?.to_owned();
         }
+
         Ok(recording)
     }
 }

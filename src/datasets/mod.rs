@@ -1,7 +1,8 @@
 //! Recordings on disk, as rooms.
 //!
-//! Whatever a recording's convention, poses leave here as `world_from_camera`, metres, with rotations on SO(3).
-//! Frames are in order of capture. One file a format; what they share is in `collect`.
+//! Whatever a recording's convention, poses leave here as `world_from_camera`, metres, with
+//! rotations on SO(3). Frames are in order of capture. One file a format; what they share is in
+//! `collect`.
 
 mod arkitscenes;
 mod bundle;
@@ -35,17 +36,34 @@ pub const MAX_ROTATION_DEVIATION: f64 = 1e-2;
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     #[error("{}: {cause}", file.display())]
-    Io { file: PathBuf, cause: std::io::Error },
+    Io {
+        file: PathBuf,
+        cause: std::io::Error,
+    },
     #[error("{}: {problem}", file.display())]
     Malformed { file: PathBuf, problem: String },
     #[error("{}, line {line}: {problem}", file.display())]
-    Line { file: PathBuf, line: usize, problem: String },
+    Line {
+        file: PathBuf,
+        line: usize,
+        problem: String,
+    },
     #[error("{}, frame {frame}: {problem}", file.display())]
-    Frame { file: PathBuf, frame: usize, problem: String },
+    Frame {
+        file: PathBuf,
+        frame: usize,
+        problem: String,
+    },
     #[error("{}: {} frames are unusable, the first is {}: {}; leave out --strict to drop them", folder.display(), dropped.len(), dropped[0].name, dropped[0].reason)]
-    Strict { folder: PathBuf, dropped: Vec<Dropped> },
+    Strict {
+        folder: PathBuf,
+        dropped: Vec<Dropped>,
+    },
     #[error("{}: no usable frame was found{}", folder.display(), first_reason(dropped))]
-    NoFrames { folder: PathBuf, dropped: Vec<Dropped> },
+    NoFrames {
+        folder: PathBuf,
+        dropped: Vec<Dropped>,
+    },
 }
 
 /// A frame that was left out.
@@ -119,17 +137,26 @@ impl Recording {
     /// Which rows stay when only every `step`-th frame of each sequence is kept.
     pub fn every(&self, step: usize) -> Vec<usize> {
         let frame_count = self.frames.poses.len();
-        let timeline = Timeline { frame_count, sequences: self.frames.sequences.clone(), held_out: Vec::new() };
+        let timeline = Timeline {
+            frame_count,
+            sequences: self.frames.sequences.clone(),
+            held_out: Vec::new(),
+        };
+
         let mut start = 0;
         let mut rows = Vec::new();
         for row in 0..frame_count {
-            if !timeline.sequences.is_empty() && timeline.sequences[row] != timeline.sequences[start] {
+            if !timeline.sequences.is_empty()
+                && timeline.sequences[row] != timeline.sequences[start]
+            {
                 start = row;
             }
+
             if (row - start).is_multiple_of(step) {
                 rows.push(row);
             }
         }
+
         rows
     }
 }
@@ -143,7 +170,8 @@ pub enum Unusable {
     Refuse,
 }
 
-/// How a recording is read: what becomes of unusable frames, and who hears of (frames read, frames in all).
+/// How a recording is read: what becomes of unusable frames, and who hears of (frames read, frames
+/// in all).
 pub struct Reader<'a> {
     /// What is done with frames that cannot be used.
     pub unusable: Unusable,
@@ -152,25 +180,44 @@ pub struct Reader<'a> {
 }
 
 fn first_reason(dropped: &[Dropped]) -> String {
-    dropped.first().map_or(String::new(), |first| format!(" ({} dropped, the first: {})", dropped.len(), first.reason))
+    dropped.first().map_or(String::new(), |first| {
+        format!(" ({} dropped, the first: {})", dropped.len(), first.reason)
+    })
 }
 
 fn read_bytes(file: &Path) -> Result<Vec<u8>, Error> {
-    std::fs::read(file).map_err(|cause| Error::Io { file: file.to_owned(), cause })
+    std::fs::read(file).map_err(|cause| Error::Io {
+        file: file.to_owned(),
+        cause,
+    })
 }
 
 fn read_text(file: &Path) -> Result<String, Error> {
-    let malformed = |_| Error::Malformed { file: file.to_owned(), problem: "is not text".to_owned() };
+    let malformed = |_| Error::Malformed {
+        file: file.to_owned(),
+        problem: "is not text".to_owned(),
+    };
     String::from_utf8(read_bytes(file)?).map_err(malformed)
 }
 
 /// Names in a folder, in order.
 fn entries(folder: &Path) -> Result<Vec<String>, Error> {
-    let io = |cause| Error::Io { file: folder.to_owned(), cause };
+    let io = |cause| Error::Io {
+        file: folder.to_owned(),
+        cause,
+    };
+
     let mut names = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(io)? {
-        names.push(entry.map_err(io)?.file_name().to_string_lossy().into_owned());
+        names.push(
+            entry
+                .map_err(io)?
+                .file_name()
+                .to_string_lossy()
+                .into_owned(),
+        );
     }
+
     names.sort();
     Ok(names)
 }
@@ -183,9 +230,16 @@ mod tests {
     /// Oracle: by hand. Every third frame, counted anew in each sequence.
     #[test]
     fn every_counts_within_a_sequence() {
-        let frames =
-            Frames { poses: vec![Pose::identity(); 7], sequences: vec![0, 0, 0, 0, 1, 1, 1], ..Frames::default() };
-        let recording = Recording { frames, ..Recording::default() };
+        let frames = Frames {
+            poses: vec![Pose::identity(); 7],
+            sequences: vec![0, 0, 0, 0, 1, 1, 1],
+            ..Frames::default()
+        };
+        let recording = Recording {
+            frames,
+            ..Recording::default()
+        };
+
         assert_eq!(recording.every(3), [0, 3, 4]);
         assert_eq!(recording.every(1).len(), 7);
     }

@@ -13,7 +13,8 @@ use crate::room::Frames;
 /// NumPy aligns data to 64 bytes; views need no more than this.
 const ALIGNMENT: usize = 16;
 
-/// A `.npy` file in memory, laid so that its numbers are aligned. Sizes are believed only as far as bytes are there.
+/// A `.npy` file in memory, laid so that its numbers are aligned. Sizes are believed only as far as
+/// bytes are there.
 struct NpyFile {
     bytes: Vec<u8>,
     start: usize,
@@ -24,12 +25,17 @@ impl NpyFile {
         let content = read_bytes(file)?;
         let header = match content.get(6..12) {
             Some(&[1, _, low, high, _, _]) => 10 + usize::from(u16::from_le_bytes([low, high])),
-            Some(&[_, _, a, b, c, d]) => 12usize.saturating_add(u32::from_le_bytes([a, b, c, d]) as usize),
+            Some(&[_, _, a, b, c, d]) => {
+                12usize.saturating_add(u32::from_le_bytes([a, b, c, d]) as usize)
+            }
             _ => 0,
         };
+
         let mut bytes = vec![0; content.len() + ALIGNMENT];
-        let start = (ALIGNMENT - (bytes.as_ptr() as usize).wrapping_add(header) % ALIGNMENT) % ALIGNMENT;
+        let start =
+            (ALIGNMENT - (bytes.as_ptr() as usize).wrapping_add(header) % ALIGNMENT) % ALIGNMENT;
         bytes[start..start + content.len()].copy_from_slice(&content);
+
         bytes.truncate(start + content.len());
         Ok(Self { bytes, start })
     }
@@ -52,7 +58,10 @@ impl NpyFile {
 }
 
 fn malformed(file: &Path, problem: &str) -> Error {
-    Error::Malformed { file: file.to_owned(), problem: problem.to_owned() }
+    Error::Malformed {
+        file: file.to_owned(),
+        problem: problem.to_owned(),
+    }
 }
 
 /// Poses, `world_from_camera`, metres, from an array (n, 4, 4) of f64 or f32.
@@ -62,18 +71,35 @@ fn malformed(file: &Path, problem: &str) -> Error {
 pub fn read_poses(file: &Path) -> Result<Recording, Error> {
     let matrices = NpyFile::read(file)?.floats(file)?;
     let &[count, 4, 4] = matrices.shape() else {
-        return Err(malformed(file, &format!("has shape {:?}, poses are (n, 4, 4)", matrices.shape())));
+        return Err(malformed(
+            file,
+            &format!("has shape {:?}, poses are (n, 4, 4)", matrices.shape()),
+        ));
     };
-    let mut frames = Frames { poses: Vec::with_capacity(count), ..Frames::default() };
+
+    let mut frames = Frames {
+        poses: Vec::with_capacity(count),
+        ..Frames::default()
+    };
+
     let mut worst: f64 = 0.0;
     for (frame, matrix) in matrices.outer_iter().enumerate() {
-        let wrong = |problem: String| Error::Frame { file: file.to_owned(), frame, problem };
+        let wrong = |problem: String| Error::Frame {
+            file: file.to_owned(),
+            frame,
+            problem,
+        };
+
         let matrix = Matrix4::from_row_iterator(matrix.iter().copied());
         match pose_of(&matrix) {
-            MatrixPose::NotFinite => return Err(wrong("the pose has a number that is not finite".to_owned())),
+            MatrixPose::NotFinite => {
+                return Err(wrong("the pose has a number that is not finite".to_owned()));
+            }
             MatrixPose::NotHomogeneous => return Err(wrong(LAST_ROW_PROBLEM.to_owned())),
             MatrixPose::NotARotation => {
-                return Err(wrong("the upper left 3×3 block is no rotation (singular or mirrored)".to_owned()));
+                return Err(wrong(
+                    "the upper left 3×3 block is no rotation (singular or mirrored)".to_owned(),
+                ));
             }
             MatrixPose::Pose(_, deviation) if deviation > MAX_ROTATION_DEVIATION => {
                 return Err(wrong(deviation_problem(deviation)));
@@ -84,7 +110,12 @@ pub fn read_poses(file: &Path) -> Result<Recording, Error> {
             }
         }
     }
-    Ok(Recording { frames, worst_rotation_deviation: worst, ..Recording::default() })
+
+    Ok(Recording {
+        frames,
+        worst_rotation_deviation: worst,
+        ..Recording::default()
+    })
 }
 
 /// Features from an array (n, d) of f32 or f64.
@@ -99,6 +130,7 @@ pub fn read_features(file: &Path) -> Result<Array2<f32>, Error> {
         Err(error) => return Err(malformed(file, &error.to_string())),
     };
     let shape = array.shape().to_vec();
+
     let wrong_shape = |_| malformed(file, &format!("has shape {shape:?}, features are (n, d)"));
     array.into_dimensionality::<Ix2>().map_err(wrong_shape)
 }
@@ -117,9 +149,14 @@ pub(super) fn read_numbers(file: &Path) -> Result<Vec<i64>, Error> {
             .map_err(|error| malformed(file, &format!("{error}; expected int64 or int32")))?,
         Err(error) => return Err(malformed(file, &error.to_string())),
     };
+
     if array.ndim() != 1 {
-        return Err(malformed(file, &format!("has shape {:?}, frame ids are (n,)", array.shape())));
+        return Err(malformed(
+            file,
+            &format!("has shape {:?}, frame ids are (n,)", array.shape()),
+        ));
     }
+
     Ok(array.iter().copied().collect())
 }
 
@@ -136,13 +173,19 @@ pub fn read_timestamps(file: &Path) -> Result<Vec<i64>, Error> {
             if let Some(bad) = seconds.iter().find(|x| !x.is_finite() || x.abs() > 9.2e9) {
                 return Err(malformed(file, &format!("time {bad} s is out of range")));
             }
+
             seconds.mapv(|x| (x * 1e9).round() as i64)
         }
         Err(error) => return Err(malformed(file, &error.to_string())),
     };
+
     if array.ndim() != 1 {
-        return Err(malformed(file, &format!("has shape {:?}, timestamps are (n,)", array.shape())));
+        return Err(malformed(
+            file,
+            &format!("has shape {:?}, timestamps are (n,)", array.shape()),
+        ));
     }
+
     Ok(array.iter().copied().collect())
 }
 
@@ -157,25 +200,36 @@ mod tests {
     }
 
     fn npy(descr: &str, shape: &str, data: &[u8]) -> Vec<u8> {
-        let header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n");
+        let header =
+            format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}\n");
         let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
         bytes.extend((header.len() as u16).to_le_bytes());
+
         bytes.extend(header.as_bytes());
         bytes.extend(data);
+
         bytes
     }
 
     /// Oracle: the NumPy format's own definition, with a header of odd length, and f64 beside f32.
     #[test]
     fn both_float_types_are_read_at_any_alignment() {
-        let data: Vec<u8> = [1.5f64, -2.0].iter().flat_map(|x| x.to_le_bytes()).collect();
+        let data: Vec<u8> = [1.5f64, -2.0]
+            .iter()
+            .flat_map(|x| x.to_le_bytes())
+            .collect();
+
         for shape in ["(1, 2)", "(1,  2)", "(1,   2)"] {
             let file = written(&npy("<f8", shape, &data));
-            assert_eq!(read_features(file.path()).unwrap(), ndarray::array![[1.5, -2.0]]);
+            assert_eq!(
+                read_features(file.path()).unwrap(),
+                ndarray::array![[1.5, -2.0]]
+            );
         }
     }
 
-    /// Oracle: the list of bad visitors: truncated, hostile size, wrong shape, no NumPy file at all.
+    /// Oracle: the list of bad visitors: truncated, hostile size, wrong shape, no NumPy
+    /// file at all.
     #[test]
     fn hostile_files_are_refused_without_believing_their_sizes() {
         for bytes in [
@@ -192,7 +246,8 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand. A scaled rotation is over the limit; a transposed pose has its translation in the last row.
+    /// Oracle: by hand. A scaled rotation is over the limit; a transposed pose has its translation
+    /// in the last row.
     #[test]
     fn matrices_that_are_no_poses_are_refused_by_frame() {
         let pose = |scale: f64, last: f64| -> Vec<u8> {
@@ -200,13 +255,26 @@ mod tests {
             m[(3, 3)] = 1.0;
             m[(3, 0)] = last;
             let eye = Matrix4::<f64>::identity();
-            eye.transpose().iter().chain(m.transpose().iter()).flat_map(|x| x.to_le_bytes()).collect()
+
+            eye.transpose()
+                .iter()
+                .chain(m.transpose().iter())
+                .flat_map(|x| x.to_le_bytes())
+                .collect()
         };
-        for (scale, last) in [(1.1, 0.0), (-1.0, 0.0), (0.0, 0.0), (1.0, 0.5), (f64::NAN, 0.0)] {
+
+        for (scale, last) in [
+            (1.1, 0.0),
+            (-1.0, 0.0),
+            (0.0, 0.0),
+            (1.0, 0.5),
+            (f64::NAN, 0.0),
+        ] {
             let file = written(&npy("<f8", "(2, 4, 4)", &pose(scale, last)));
             let message = read_poses(file.path()).unwrap_err().to_string();
             assert!(message.contains("frame 1"), "{message}");
         }
+
         let file = written(&npy("<f8", "(2, 4, 4)", &pose(1.0005, 0.0)));
         let recording = read_poses(file.path()).unwrap();
         assert!((recording.worst_rotation_deviation - 0.001_000_25).abs() < 1e-12);

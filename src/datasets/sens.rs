@@ -1,4 +1,5 @@
-//! ScanNet's `.sens`: one file of colour and depth images with camera-to-world poses, metres, little-endian.
+//! ScanNet's `.sens`: one file of colour and depth images with camera-to-world poses, metres,
+//! little-endian.
 //!
 //! ```text
 //! u32 version = 4, u64 length, name, 4 × (4×4 f32): intrinsics, extrinsics of colour and depth
@@ -6,8 +7,9 @@
 //! each frame: 4×4 f32 pose, u64 colour time, u64 depth time, u64 colour bytes, u64 depth bytes, the bytes
 //! ```
 //!
-//! Images stay where they are: a frame's image is `FILE@OFFSET+LENGTH`. Times are taken for microseconds, and only
-//! where they grow from frame to frame. Sizes are believed only as far as the file reaches.
+//! Images stay where they are: a frame's image is `FILE@OFFSET+LENGTH`. Times are taken for
+//! microseconds, and only where they grow from frame to frame. Sizes are believed only as far as
+//! the file reaches.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -28,31 +30,56 @@ const LONGEST_NAME: u64 = 4_096;
 /// Reads the frames of a `.sens` file.
 ///
 /// # Errors
-/// [`Error::Malformed`], also when the file ends before its last frame: a part is not taken for the whole.
+/// [`Error::Malformed`], also when the file ends before its last frame: a part is not taken for the
+/// whole.
 pub fn read_sens(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
     let mut file = Sens::open(path)?;
     let frame_count = file.header()?;
-    let file_name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+
+    let file_name = path
+        .file_name()
+        .map(|name| name.to_string_lossy().into_owned())
+        .unwrap_or_default();
+
     let mut collected = Collected::default();
     for number in 0..frame_count {
         (reader.progress)(number as usize, frame_count as usize);
         let frame = file.frame(number)?;
         let name = number.to_string();
         let image = Some(format!("{file_name}@{}+{}", frame.offset, frame.bytes));
+
         // A time so large that this cuts it is no time, and does not grow.
-        let timestamp_ns = Some(i64::try_from(frame.time_us).unwrap_or(i64::MAX).saturating_mul(1_000));
-        let about = About { name, image, number: i64::try_from(number).ok(), timestamp_ns, ..About::default() };
+        let timestamp_ns = Some(
+            i64::try_from(frame.time_us)
+                .unwrap_or(i64::MAX)
+                .saturating_mul(1_000),
+        );
+
+        let about = About {
+            name,
+            image,
+            number: i64::try_from(number).ok(),
+            timestamp_ns,
+            ..About::default()
+        };
+
         if is_suspect(&frame.pose, number == 0) {
             collected.drop(about.name, DropReason::SuspectIdentityPose);
         } else {
             collected.take(about, &frame.pose, path)?;
         }
     }
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+
+    let folder = path
+        .parent()
+        .filter(|folder| !folder.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
     let mut recording = collected.finish(folder, reader)?;
+
     if !recording.frames.timestamps_ns.is_sorted_by(|a, b| a < b) {
         recording.frames.timestamps_ns.clear();
     }
+
     Ok(recording)
 }
 
@@ -73,35 +100,56 @@ struct Sens<'a> {
 
 impl<'a> Sens<'a> {
     fn open(path: &'a Path) -> Result<Self, Error> {
-        let io = |cause| Error::Io { file: path.to_owned(), cause };
+        let io = |cause| Error::Io {
+            file: path.to_owned(),
+            cause,
+        };
         let file = File::open(path).map_err(io)?;
         let size = file.metadata().map_err(io)?.len();
-        Ok(Self { path, reader: BufReader::new(file), at: 0, size })
+
+        Ok(Self {
+            path,
+            reader: BufReader::new(file),
+            at: 0,
+            size,
+        })
     }
 
     /// How many frames follow.
     fn header(&mut self) -> Result<u64, Error> {
         let version = u32::from_le_bytes(self.array("its version")?);
         if version != VERSION {
-            return Err(self.malformed(format!("is version {version} of the format, expected {VERSION}")));
+            return Err(self.malformed(format!(
+                "is version {version} of the format, expected {VERSION}"
+            )));
         }
+
         let name = self.number("its name's length")?;
         if name > LONGEST_NAME {
-            return Err(self.malformed(format!("has a sensor name of {name} bytes; is it a .sens file?")));
+            return Err(self.malformed(format!(
+                "has a sensor name of {name} bytes; is it a .sens file?"
+            )));
         }
+
         self.skip(name, "its name")?;
         self.skip(4 * MATRIX_BYTES, "its calibration")?;
         let colour = i32::from_le_bytes(self.array("its colour compression")?);
         if !matches!(colour, 1 | 2) {
-            let problem = format!("stores colour in format {colour}; only PNG (1) and JPEG (2) are read");
+            let problem =
+                format!("stores colour in format {colour}; only PNG (1) and JPEG (2) are read");
             return Err(self.malformed(problem));
         }
+
         self.skip(4 + 4 * 4 + 4, "its sizes")?;
         let frames = self.number("its number of frames")?;
         if frames > (self.size - self.at) / FRAME_HEADER_BYTES {
-            let problem = format!("is truncated: it says {frames} frames, which do not fit into {} bytes", self.size);
+            let problem = format!(
+                "is truncated: it says {frames} frames, which do not fit into {} bytes",
+                self.size
+            );
             return Err(self.malformed(problem));
         }
+
         Ok(frames)
     }
 
@@ -111,13 +159,22 @@ impl<'a> Sens<'a> {
         for value in &mut numbers {
             *value = f64::from(f32::from_le_bytes(self.array(&what)?));
         }
+
         let time_us = self.number(&what)?;
         self.number(&what)?;
-        let (bytes, depth) = (self.number(&what)?, self.number(&what)?);
+        let bytes = self.number(&what)?;
+        let depth = self.number(&what)?;
+
         let offset = self.at;
         self.skip(bytes, &what)?;
         self.skip(depth, &what)?;
-        Ok(Frame { pose: Matrix4::from_row_slice(&numbers), time_us, offset, bytes })
+
+        Ok(Frame {
+            pose: Matrix4::from_row_slice(&numbers),
+            time_us,
+            offset,
+            bytes,
+        })
     }
 
     fn number(&mut self, what: &str) -> Result<u64, Error> {
@@ -127,7 +184,14 @@ impl<'a> Sens<'a> {
     fn array<const N: usize>(&mut self, what: &str) -> Result<[u8; N], Error> {
         self.check(N as u64, what)?;
         let mut bytes = [0; N];
-        self.reader.read_exact(&mut bytes).map_err(|cause| Error::Io { file: self.path.to_owned(), cause })?;
+
+        self.reader
+            .read_exact(&mut bytes)
+            .map_err(|cause| Error::Io {
+                file: self.path.to_owned(),
+                cause,
+            })?;
+
         self.at += N as u64;
         Ok(bytes)
     }
@@ -135,21 +199,33 @@ impl<'a> Sens<'a> {
     fn skip(&mut self, bytes: u64, what: &str) -> Result<(), Error> {
         self.check(bytes, what)?;
         self.at += bytes;
+
         let moved = match i64::try_from(bytes) {
             Ok(bytes) => self.reader.seek_relative(bytes),
             Err(_) => self.reader.seek(SeekFrom::Start(self.at)).map(|_| ()),
         };
-        moved.map_err(|cause| Error::Io { file: self.path.to_owned(), cause })
+
+        moved.map_err(|cause| Error::Io {
+            file: self.path.to_owned(),
+            cause,
+        })
     }
 
     fn check(&self, bytes: u64, what: &str) -> Result<(), Error> {
         if bytes <= self.size - self.at {
             return Ok(());
         }
-        Err(self.malformed(format!("is truncated in {what}, at byte {} of {}; copy it again", self.at, self.size)))
+
+        Err(self.malformed(format!(
+            "is truncated in {what}, at byte {} of {}; copy it again",
+            self.at, self.size
+        )))
     }
 
     fn malformed(&self, problem: String) -> Error {
-        Error::Malformed { file: self.path.to_owned(), problem }
+        Error::Malformed {
+            file: self.path.to_owned(),
+            problem,
+        }
     }
 }

@@ -1,9 +1,9 @@
 //! 7-Scenes: `SCENE/seq-XX/frame-XXXXXX.{color.*,pose.txt}`, poses camera-to-world, metres.
 //!
-//! - The published pose is that of the depth sensor; it is taken for the camera's, as most users of the set do, unless
-//!   a calibration is given.
-//! - A scene's sequences make one room; no pair of frames joins two of them. `TrainSplit.txt` and `TestSplit.txt` name
-//!   sequences as `sequenceN`, for `seq-0N`.
+//! - The published pose is that of the depth sensor; it is taken for the camera's, as most users of
+//!   the set do, unless a calibration is given.
+//! - A scene's sequences make one room; no pair of frames joins two of them. `TrainSplit.txt` and
+//!   `TestSplit.txt` name sequences as `sequenceN`, for `seq-0N`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -26,33 +26,62 @@ pub struct SevenScenes {
 ///
 /// # Errors
 /// [`Error`], naming the file or folder.
-pub fn read_seven_scenes(folder: &Path, choice: &SevenScenes, reader: &mut Reader<'_>) -> Result<Recording, Error> {
-    let depth_from_rgb = choice.rgb_from_depth.as_deref().map(calibration).transpose()?;
+pub fn read_seven_scenes(
+    folder: &Path,
+    choice: &SevenScenes,
+    reader: &mut Reader<'_>,
+) -> Result<Recording, Error> {
+    let depth_from_rgb = choice
+        .rgb_from_depth
+        .as_deref()
+        .map(calibration)
+        .transpose()?;
+
     let (root, sequences) = sequences_of(folder, choice.sequence.as_deref())?;
-    let held_out = if sequences.len() > 1 { dataset_split(&root, &sequences)? } else { None };
+    let held_out = if sequences.len() > 1 {
+        dataset_split(&root, &sequences)?
+    } else {
+        None
+    };
+
     let several = sequences.len() > 1;
     let mut frames = Vec::new();
     for (number, sequence) in (0..).zip(&sequences) {
         let files = entries(&root.join(sequence))?;
-        let stem = |name: &String| Some(name.split('.').next()?.to_owned()).filter(|stem| stem.starts_with("frame-"));
+        let stem = |name: &String| {
+            Some(name.split('.').next()?.to_owned()).filter(|stem| stem.starts_with("frame-"))
+        };
         let stems: BTreeSet<String> = files.iter().filter_map(stem).collect();
-        let images: BTreeMap<&str, &String> = files.iter().filter_map(|name| Some((image_stem(name)?, name))).collect();
+
+        let images: BTreeMap<&str, &String> = files
+            .iter()
+            .filter_map(|name| Some((image_stem(name)?, name)))
+            .collect();
+
         for stem in stems {
-            let image = images.get(stem.as_str()).map(|name| format!("{sequence}/{name}"));
+            let image = images
+                .get(stem.as_str())
+                .map(|name| format!("{sequence}/{name}"));
+
             let about = About {
                 name: format!("{sequence}/{stem}"),
                 number: stem.trim_start_matches("frame-").parse().ok(),
                 image,
                 sequence: several.then_some(number),
-                held_out: held_out.as_ref().map(|held_out| held_out.contains(sequence)),
+                held_out: held_out
+                    .as_ref()
+                    .map(|held_out| held_out.contains(sequence)),
                 ..About::default()
             };
+
             frames.push(about);
         }
     }
+
     if frames.iter().any(|about| about.number.is_none()) {
         frames.iter_mut().for_each(|about| about.number = None);
     }
+
     let count = frames.len();
     let mut collected = Collected::default();
     for (done, about) in frames.into_iter().enumerate() {
@@ -64,41 +93,73 @@ pub fn read_seven_scenes(folder: &Path, choice: &SevenScenes, reader: &mut Reade
             Ok(world_from_depth) => collected.take(about, &world_from_depth, &file)?,
         }
     }
+
     let mut recording = collected.finish(&root, reader)?;
     if let Some(depth_from_rgb) = depth_from_rgb {
-        recording.frames.poses.iter_mut().for_each(|world_from_depth| *world_from_depth *= depth_from_rgb);
+        recording
+            .frames
+            .poses
+            .iter_mut()
+            .for_each(|world_from_depth| *world_from_depth *= depth_from_rgb);
     }
+
     Ok(recording)
 }
 
 /// The frame that a colour image belongs to.
 fn image_stem(name: &str) -> Option<&str> {
-    let stem = name.strip_suffix(".png").or_else(|| name.strip_suffix(".jpg"))?;
+    let stem = name
+        .strip_suffix(".png")
+        .or_else(|| name.strip_suffix(".jpg"))?;
     stem.strip_suffix(".color")
 }
 
 /// The scene's folder and the sequences to read of it.
 fn sequences_of(folder: &Path, wanted: Option<&str>) -> Result<(PathBuf, Vec<String>), Error> {
-    let malformed = |problem: String| Error::Malformed { file: folder.to_owned(), problem };
+    let malformed = |problem: String| Error::Malformed {
+        file: folder.to_owned(),
+        problem,
+    };
+
     let names = entries(folder)?;
-    let sequences: Vec<String> = names.iter().filter(|name| name.starts_with("seq-")).cloned().collect();
+    let sequences: Vec<String> = names
+        .iter()
+        .filter(|name| name.starts_with("seq-"))
+        .cloned()
+        .collect();
+
     if let Some(wanted) = wanted {
         if !sequences.iter().any(|name| name == wanted) {
-            return Err(malformed(format!("has no sequence '{wanted}'; it has {}", sequences.join(", "))));
+            return Err(malformed(format!(
+                "has no sequence '{wanted}'; it has {}",
+                sequences.join(", ")
+            )));
         }
+
         return Ok((folder.to_owned(), vec![wanted.to_owned()]));
     }
+
     if names.iter().any(|name| name.starts_with("frame-")) {
-        let folder = folder.canonicalize().map_err(|cause| Error::Io { file: folder.to_owned(), cause })?;
-        let name = folder.file_name().map(|name| name.to_string_lossy().into_owned());
+        let folder = folder.canonicalize().map_err(|cause| Error::Io {
+            file: folder.to_owned(),
+            cause,
+        })?;
+        let name = folder
+            .file_name()
+            .map(|name| name.to_string_lossy().into_owned());
+
         return match (folder.parent(), name) {
             (Some(scene), Some(name)) => Ok((scene.to_owned(), vec![name])),
             _ => Err(malformed("is the root folder".to_owned())),
         };
     }
+
     if sequences.is_empty() {
-        return Err(malformed("holds neither frame-*.pose.txt nor a folder seq-XX".to_owned()));
+        return Err(malformed(
+            "holds neither frame-*.pose.txt nor a folder seq-XX".to_owned(),
+        ));
     }
+
     Ok((folder.to_owned(), sequences))
 }
 
@@ -108,6 +169,7 @@ fn dataset_split(scene: &Path, sequences: &[String]) -> Result<Option<BTreeSet<S
     if files.iter().all(|file| !file.is_file()) {
         return Ok(None);
     }
+
     let [train, test] = [split_file(&files[0])?, split_file(&files[1])?];
     if let Some(both) = train.intersection(&test).next() {
         return Err(Error::Malformed {
@@ -115,36 +177,62 @@ fn dataset_split(scene: &Path, sequences: &[String]) -> Result<Option<BTreeSet<S
             problem: format!("names {both}, as TrainSplit.txt does"),
         });
     }
-    if let Some(unlisted) = sequences.iter().find(|name| !train.contains(*name) && !test.contains(*name)) {
-        let problem = format!("does not name {unlisted}, nor does TrainSplit.txt; add it, or move the sequence away");
-        return Err(Error::Malformed { file: files[1].clone(), problem });
+
+    if let Some(unlisted) = sequences
+        .iter()
+        .find(|name| !train.contains(*name) && !test.contains(*name))
+    {
+        let problem = format!(
+            "does not name {unlisted}, nor does TrainSplit.txt; add it, or move the sequence away"
+        );
+        return Err(Error::Malformed {
+            file: files[1].clone(),
+            problem,
+        });
     }
+
     Ok(Some(test))
 }
 
 fn split_file(file: &Path) -> Result<BTreeSet<String>, Error> {
     let text = read_text(file)?;
-    let lines = (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty());
+    let lines = (1..)
+        .zip(text.lines())
+        .filter(|(_, line)| !line.trim().is_empty());
+
     let name = |(line, text): (usize, &str)| {
-        let number = text.trim().strip_prefix("sequence").and_then(|number| number.parse::<u32>().ok());
+        let number = text
+            .trim()
+            .strip_prefix("sequence")
+            .and_then(|number| number.parse::<u32>().ok());
+
         let problem = format!("'{}' is not of the form sequenceN", text.trim());
-        number.map(|number| format!("seq-{number:02}")).ok_or_else(|| Error::Line {
-            file: file.to_owned(),
-            line,
-            problem,
-        })
+        number
+            .map(|number| format!("seq-{number:02}"))
+            .ok_or_else(|| Error::Line {
+                file: file.to_owned(),
+                line,
+                problem,
+            })
     };
+
     lines.map(name).collect()
 }
 
 /// The inverse of the rigid transform in a file.
 fn calibration(file: &Path) -> Result<Pose, Error> {
-    let malformed = |problem: String| Error::Malformed { file: file.to_owned(), problem };
+    let malformed = |problem: String| Error::Malformed {
+        file: file.to_owned(),
+        problem,
+    };
     let matrix = read_matrix(file)?.map_err(|reason| malformed(reason.to_string()))?;
+
     match pose_of(&matrix) {
         MatrixPose::Pose(rgb_from_depth, deviation) if deviation <= MAX_ROTATION_DEVIATION => {
             Ok(rgb_from_depth.inverse())
         }
-        _ => Err(malformed("is no rigid transform; expected rgb_from_depth, 4×4, metres".to_owned())),
+        _ => Err(malformed(
+            "is no rigid transform; expected rgb_from_depth, 4×4, metres".to_owned(),
+        )),
     }
 }

@@ -11,6 +11,7 @@ pub(super) fn read_matrix(file: &Path) -> Result<Result<Matrix4<f64>, DropReason
     if !file.exists() {
         return Ok(Err(DropReason::MissingPoseFile));
     }
+
     let text = read_text(file)?;
     let mut numbers = Vec::with_capacity(16);
     for (line, words) in (1..).zip(text.lines()) {
@@ -18,24 +19,35 @@ pub(super) fn read_matrix(file: &Path) -> Result<Result<Matrix4<f64>, DropReason
             numbers.push(number(file, line, word)?);
         }
     }
+
     match numbers.len() {
         16 => Ok(Ok(Matrix4::from_row_slice(&numbers))),
         0..16 => Ok(Err(DropReason::TruncatedPoseFile)),
-        more => Err(Error::Malformed { file: file.to_owned(), problem: format!("has {more} numbers, expected 16") }),
+        more => Err(Error::Malformed {
+            file: file.to_owned(),
+            problem: format!("has {more} numbers, expected 16"),
+        }),
     }
 }
 
 /// A number, finite or not.
 pub(super) fn number(file: &Path, line: usize, word: &str) -> Result<f64, Error> {
-    word.parse().map_err(|_| wrong(file, line, format!("'{word}' is no number")))
+    word.parse()
+        .map_err(|_| wrong(file, line, format!("'{word}' is no number")))
 }
 
 /// `N` numbers divided by single spaces, all finite.
-pub(super) fn finite_row<const N: usize>(file: &Path, line: usize, text: &str) -> Result<[f64; N], Error> {
+pub(super) fn finite_row<const N: usize>(
+    file: &Path,
+    line: usize,
+    text: &str,
+) -> Result<[f64; N], Error> {
     let words = spaced(file, line, text)?;
     let count = words.len();
-    let words: [&str; N] =
-        words.try_into().map_err(|_| wrong(file, line, format!("has {count} columns, expected {N}")))?;
+    let words: [&str; N] = words
+        .try_into()
+        .map_err(|_| wrong(file, line, format!("has {count} columns, expected {N}")))?;
+
     let mut row = [0.0; N];
     for (value, word) in row.iter_mut().zip(words) {
         *value = number(file, line, word)?;
@@ -43,15 +55,24 @@ pub(super) fn finite_row<const N: usize>(file: &Path, line: usize, text: &str) -
             return Err(wrong(file, line, format!("'{word}' is not finite")));
         }
     }
+
     Ok(row)
 }
 
 /// Words divided by single spaces, none empty.
 pub(super) fn spaced<'a>(file: &Path, line: usize, text: &'a str) -> Result<Vec<&'a str>, Error> {
     let words: Vec<&str> = text.split(' ').collect();
-    if words.iter().any(|word| word.is_empty() || word.contains(char::is_whitespace)) {
-        return Err(wrong(file, line, "columns are divided by single spaces, with none at the ends".to_owned()));
+    if words
+        .iter()
+        .any(|word| word.is_empty() || word.contains(char::is_whitespace))
+    {
+        return Err(wrong(
+            file,
+            line,
+            "columns are divided by single spaces, with none at the ends".to_owned(),
+        ));
     }
+
     Ok(words)
 }
 
@@ -68,12 +89,21 @@ pub(super) fn nanoseconds(seconds: &str) -> Option<i64> {
     if whole.is_empty() || !digits(whole) || !digits(part) {
         return None;
     }
+
     let fraction: String = part.chars().chain("000000000".chars()).take(9).collect();
-    whole.parse::<i64>().ok()?.checked_mul(1_000_000_000)?.checked_add(fraction.parse().ok()?)
+    whole
+        .parse::<i64>()
+        .ok()?
+        .checked_mul(1_000_000_000)?
+        .checked_add(fraction.parse().ok()?)
 }
 
 pub(super) fn wrong(file: &Path, line: usize, problem: String) -> Error {
-    Error::Line { file: file.to_owned(), line, problem }
+    Error::Line {
+        file: file.to_owned(),
+        line,
+        problem,
+    }
 }
 
 #[cfg(test)]

@@ -1,7 +1,9 @@
-//! TUM RGB-D: `rgb.txt` ("timestamp file"), `groundtruth.txt` ("timestamp tx ty tz qx qy qz qw"), camera-to-world.
+//! TUM RGB-D: `rgb.txt` ("timestamp file"), `groundtruth.txt` ("timestamp tx ty tz qx qy qz qw"),
+//! camera-to-world.
 //!
-//! An image takes the pose nearest in time, at most 10 ms away, as evo associates. Times are decimal text and are kept
-//! to the nanosecond. Lines are read as strictly as evo reads them, and more: numbers must be finite.
+//! An image takes the pose nearest in time, at most 10 ms away, as evo associates. Times are
+//! decimal text and are kept to the nanosecond. Lines are read as strictly as evo reads them, and
+//! more: numbers must be finite.
 
 use std::path::Path;
 
@@ -28,17 +30,31 @@ pub fn read_tum(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Err
     let mut collected = Collected::default();
     for (done, (timestamp_ns, image)) in images.iter().enumerate() {
         (reader.progress)(done, images.len());
+
         let Some(pose) = nearest(&poses, *timestamp_ns) else {
             collected.drop(image.clone(), DropReason::NoPoseWithinTolerance);
             continue;
         };
+
         if !folder.join(image).is_file() {
             collected.drop(image.clone(), DropReason::MissingImage);
             continue;
         }
-        let (name, image) = (image.clone(), Some(image.clone()));
-        collected.keep(About { name, image, timestamp_ns: Some(*timestamp_ns), ..About::default() }, pose);
+
+        let name = image.clone();
+        let image = Some(image.clone());
+
+        collected.keep(
+            About {
+                name,
+                image,
+                timestamp_ns: Some(*timestamp_ns),
+                ..About::default()
+            },
+            pose,
+        );
     }
+
     collected.finish(folder, reader)
 }
 
@@ -68,12 +84,19 @@ fn read_trajectory(file: &Path) -> Result<Vec<(i64, Pose)>, Error> {
         let time = time(file, line, row)?;
         let quaternion = Quaternion::new(qw, qx, qy, qz);
         let norm = quaternion.norm();
+
         if (norm - 1.0).abs() > NORM_TOLERANCE {
-            return Err(wrong(file, line, format!("the quaternion has norm {norm}, a rotation has 1")));
+            return Err(wrong(
+                file,
+                line,
+                format!("the quaternion has norm {norm}, a rotation has 1"),
+            ));
         }
+
         let rotation = UnitQuaternion::from_quaternion(quaternion);
         poses.push((time, Pose::from_parts(Translation3::new(x, y, z), rotation)));
     }
+
     poses.sort_by_key(|(time, _)| *time);
     Ok(poses)
 }
@@ -85,24 +108,41 @@ fn read_images(file: &Path) -> Result<Vec<(i64, String)>, Error> {
     for (line, row) in data_lines(&text) {
         let words = spaced(file, line, row)?;
         let &[_, image] = words.as_slice() else {
-            return Err(wrong(file, line, format!("has {} columns, expected timestamp and file", words.len())));
+            return Err(wrong(
+                file,
+                line,
+                format!("has {} columns, expected timestamp and file", words.len()),
+            ));
         };
+
         images.push((time(file, line, row)?, image.to_owned()));
     }
+
     images.sort_by_key(|(time, _)| *time);
     Ok(images)
 }
 
 /// Nanoseconds from seconds in scientific notation, as NumPy writes them; rounded as doubles are.
 fn scientific(seconds: &str) -> Option<i64> {
-    let seconds: f64 = seconds.contains(['e', 'E']).then(|| seconds.parse().ok())??;
+    let seconds: f64 = seconds
+        .contains(['e', 'E'])
+        .then(|| seconds.parse().ok())??;
     let nanoseconds = (seconds * 1e9).round();
-    (0.0..9.2e18).contains(&nanoseconds).then_some(nanoseconds as i64)
+
+    (0.0..9.2e18)
+        .contains(&nanoseconds)
+        .then_some(nanoseconds as i64)
 }
 
 fn time(file: &Path, line: usize, row: &str) -> Result<i64, Error> {
     let word = row.split(' ').next().unwrap_or_default();
     nanoseconds(word)
         .or_else(|| scientific(word))
-        .ok_or_else(|| wrong(file, line, format!("'{word}' is no time in decimal seconds")))
+        .ok_or_else(|| {
+            wrong(
+                file,
+                line,
+                format!("'{word}' is no time in decimal seconds"),
+            )
+        })
 }

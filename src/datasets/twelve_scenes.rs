@@ -1,7 +1,9 @@
-//! 12-Scenes: `HOUSE/ROOM/{info.txt,split.txt,data/frame-XXXXXX.{color.jpg,pose.txt}}`, camera-to-world, metres.
+//! 12-Scenes: `HOUSE/ROOM/{info.txt,split.txt,data/frame-XXXXXX.{color.jpg,pose.txt}}`,
+//! camera-to-world, metres.
 //!
 //! - Lost poses hold the text INF.
-//! - `split.txt` has a line a sequence, `sequenceK [frames=N] …`; the first sequence is held out for testing.
+//! - `split.txt` has a line a sequence, `sequenceK [frames=N] …`; the first sequence is held out
+//!   for testing.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -19,17 +21,28 @@ pub fn read_twelve_scenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Reco
     let names = entries(&folder.join("data"))?;
     let mut frames: BTreeMap<u32, [Option<&String>; 2]> = BTreeMap::new();
     for name in &names {
-        let Some((stem, kind)) = name.strip_prefix("frame-").and_then(|rest| rest.split_once('.')) else { continue };
-        let (Ok(number), Some(kind)) = (stem.parse(), ["color.jpg", "pose.txt"].iter().position(|k| *k == kind)) else {
+        let Some((stem, kind)) = name
+            .strip_prefix("frame-")
+            .and_then(|rest| rest.split_once('.'))
+        else {
+            continue;
+        };
+
+        let (Ok(number), Some(kind)) = (
+            stem.parse(),
+            ["color.jpg", "pose.txt"].iter().position(|k| *k == kind),
+        ) else {
             continue;
         };
         frames.entry(number).or_default()[kind] = Some(name);
     }
+
     let mut collected = Collected::default();
     let count = frames.len();
     for (position, (number, [image, pose])) in frames.into_iter().enumerate() {
         (reader.progress)(position, count);
         let sequence = sequence_of(&lengths, position);
+
         let about = About {
             name: format!("data/frame-{number:06}"),
             image: image.map(|name| format!("data/{name}")),
@@ -38,17 +51,25 @@ pub fn read_twelve_scenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Reco
             held_out: Some(sequence == 0),
             ..About::default()
         };
+
         let (Some(pose), Some(_)) = (pose, image) else {
-            let reason = if image.is_none() { DropReason::MissingImage } else { DropReason::MissingPoseFile };
+            let reason = if image.is_none() {
+                DropReason::MissingImage
+            } else {
+                DropReason::MissingPoseFile
+            };
             collected.drop(about.name, reason);
+
             continue;
         };
+
         let file = folder.join("data").join(pose);
         match read_matrix(&file)? {
             Err(reason) => collected.drop(about.name, reason),
             Ok(matrix) => collected.take(about, &matrix, &file)?,
         }
     }
+
     collected.finish(folder, reader)
 }
 
@@ -61,6 +82,7 @@ fn sequence_of(lengths: &[usize], position: usize) -> u32 {
             return sequence;
         }
     }
+
     lengths.len().saturating_sub(1) as u32
 }
 
@@ -68,13 +90,25 @@ fn sequence_of(lengths: &[usize], position: usize) -> u32 {
 fn sequence_lengths(file: &Path) -> Result<Vec<usize>, Error> {
     let text = read_text(file)?;
     let mut lengths = Vec::new();
-    for (line, text) in (1..).zip(text.lines()).filter(|(_, text)| !text.trim().is_empty()) {
-        let frames = text.split_whitespace().find_map(|word| word.strip_prefix("[frames=")?.strip_suffix(']'));
+    for (line, text) in (1..)
+        .zip(text.lines())
+        .filter(|(_, text)| !text.trim().is_empty())
+    {
+        let frames = text
+            .split_whitespace()
+            .find_map(|word| word.strip_prefix("[frames=")?.strip_suffix(']'));
         let length = frames.and_then(|frames| frames.parse::<u32>().ok());
-        lengths.push(length.ok_or_else(|| wrong(file, line, "has no [frames=N]".to_owned()))? as usize);
+        lengths.push(
+            length.ok_or_else(|| wrong(file, line, "has no [frames=N]".to_owned()))? as usize,
+        );
     }
+
     if lengths.is_empty() {
-        return Err(Error::Malformed { file: file.to_owned(), problem: "names no sequence".to_owned() });
+        return Err(Error::Malformed {
+            file: file.to_owned(),
+            problem: "names no sequence".to_owned(),
+        });
     }
+
     Ok(lengths)
 }

@@ -1,8 +1,9 @@
 //! The built-in, weight-free encoder: gradient-orientation histograms and coarse colour.
 //!
-//! It stands in for the encoder that one brings, so that the whole path can be shown without a model. An 8×6 grid of
-//! cells; each cell gives a histogram of 8 gradient orientations and its mean colour. A pixel votes for the cells and
-//! orientations on both sides of it, so that features move smoothly with the camera.
+//! It stands in for the encoder that one brings, so that the whole path can be shown without a
+//! model. An 8×6 grid of cells; each cell gives a histogram of 8 gradient orientations and its mean
+//! colour. A pixel votes for the cells and orientations on both sides of it, so that features move
+//! smoothly with the camera.
 
 use std::f32::consts::TAU;
 
@@ -18,11 +19,21 @@ const CELL_DIM: usize = ORIENTATIONS + 3;
 /// Columns of a feature.
 pub const BUILTIN_DIM: usize = COLUMNS * ROWS * CELL_DIM;
 
-pub(super) const POOLING: Pooling = Pooling::Grid { columns: COLUMNS, rows: ROWS, skip: 0 };
+pub(super) const POOLING: Pooling = Pooling::Grid {
+    columns: COLUMNS,
+    rows: ROWS,
+    skip: 0,
+};
 
 /// The images that the encoder is meant for are small.
 pub(super) fn preparation() -> Preparation {
-    Preparation { resize: Resize::Whole { width: 64, height: 48 }, ..Preparation::default() }
+    Preparation {
+        resize: Resize::Whole {
+            width: 64,
+            height: 48,
+        },
+        ..Preparation::default()
+    }
 }
 
 /// What [`encode_builtin`] makes of images of 64×48 pixels.
@@ -39,12 +50,14 @@ pub fn builtin_source(name: &str) -> FeatureSource {
     }
 }
 
-/// The feature of an image at least 3×3 pixels large, shape ([`BUILTIN_DIM`],). A smaller one has no gradient: its
-/// histograms are zero.
+/// The feature of an image at least 3×3 pixels large, shape ([`BUILTIN_DIM`],). A smaller one has
+/// no gradient: its histograms are zero.
 pub fn encode_builtin(image: &RgbImage) -> Vec<f32> {
-    let (width, height) = (image.width, image.height);
+    let width = image.width;
+    let height = image.height;
     let grey: Vec<f32> = image.bytes.chunks_exact(3).map(luminance).collect();
     let mut feature = vec![0.0; BUILTIN_DIM];
+
     let mut weight = [0.0; COLUMNS * ROWS];
     for y in 0..height {
         for x in 0..width {
@@ -52,41 +65,58 @@ pub fn encode_builtin(image: &RgbImage) -> Vec<f32> {
             let pixel = image.pixel(x, y);
             for &(cell, share) in &cells {
                 weight[cell] += share;
+
                 for (channel, &value) in pixel.iter().enumerate() {
-                    feature[cell * CELL_DIM + ORIENTATIONS + channel] += share * f32::from(value) / 255.0;
+                    feature[cell * CELL_DIM + ORIENTATIONS + channel] +=
+                        share * f32::from(value) / 255.0;
                 }
             }
+
             if x == 0 || y == 0 || x + 1 == width || y + 1 == height {
                 continue;
             }
+
             let at = |x: usize, y: usize| grey[y * width + x];
-            let (dx, dy) = (at(x + 1, y) - at(x - 1, y), at(x, y + 1) - at(x, y - 1));
+            let dx = at(x + 1, y) - at(x - 1, y);
+            let dy = at(x, y + 1) - at(x, y - 1);
             let strength = dx.hypot(dy);
-            let place = (dy.atan2(dx).rem_euclid(TAU) / TAU * ORIENTATIONS as f32) % ORIENTATIONS as f32;
-            let (low, part) = (place.floor() as usize % ORIENTATIONS, place.fract());
+
+            let place =
+                (dy.atan2(dx).rem_euclid(TAU) / TAU * ORIENTATIONS as f32) % ORIENTATIONS as f32;
+            let low = place.floor() as usize % ORIENTATIONS;
+            let part = place.fract();
+
             for &(cell, share) in &cells {
                 feature[cell * CELL_DIM + low] += strength * share * (1.0 - part);
                 feature[cell * CELL_DIM + (low + 1) % ORIENTATIONS] += strength * share * part;
             }
         }
     }
+
     for (cell, values) in feature.chunks_exact_mut(CELL_DIM).enumerate() {
         let (histogram, colour) = values.split_at_mut(ORIENTATIONS);
         let area = weight[cell].max(1e-6);
-        histogram.iter_mut().for_each(|value| *value = (8.0 * *value / area).sqrt());
+        histogram
+            .iter_mut()
+            .for_each(|value| *value = (8.0 * *value / area).sqrt());
+
         colour.iter_mut().for_each(|value| *value /= area);
     }
+
     feature
 }
 
-/// The four cells around a pixel and its share in each; shares add up to 1, and fall off to the cells' centres.
+/// The four cells around a pixel and its share in each; shares add up to 1, and fall off to the
+/// cells' centres.
 fn cells_of(x: usize, y: usize, width: usize, height: usize) -> [(usize, f32); 4] {
     let place = |pixel: usize, pixels: usize, cells: usize| {
-        let at = ((pixel as f32 + 0.5) * cells as f32 / pixels as f32 - 0.5).clamp(0.0, cells as f32 - 1.0);
+        let at = ((pixel as f32 + 0.5) * cells as f32 / pixels as f32 - 0.5)
+            .clamp(0.0, cells as f32 - 1.0);
         let low = (at.floor() as usize).min(cells - 1);
         (low, (low + 1).min(cells - 1), at - low as f32)
     };
     let (left, right, s) = place(x, width, COLUMNS);
+
     let (top, bottom, t) = place(y, height, ROWS);
     [
         (top * COLUMNS + left, (1.0 - s) * (1.0 - t)),
@@ -97,29 +127,46 @@ fn cells_of(x: usize, y: usize, width: usize, height: usize) -> [(usize, f32); 4
 }
 
 fn luminance(pixel: &[u8]) -> f32 {
-    (0.299 * f32::from(pixel[0]) + 0.587 * f32::from(pixel[1]) + 0.114 * f32::from(pixel[2])) / 255.0
+    (0.299 * f32::from(pixel[0]) + 0.587 * f32::from(pixel[1]) + 0.114 * f32::from(pixel[2]))
+        / 255.0
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Oracle: by hand. Brightness that grows to the right has its gradient at angle 0, the first orientation, in
-    /// every cell, and none elsewhere.
+    /// Oracle: by hand. Brightness that grows to the right has its gradient at angle 0, the first
+    /// orientation, in every cell, and none elsewhere.
     #[test]
     fn a_ramp_votes_for_one_orientation() {
-        let (width, height) = (64, 48);
-        let bytes = (0..width * height).flat_map(|i| [(2 * (i % width)) as u8; 3]).collect();
-        let feature = encode_builtin(&RgbImage { width, height, bytes });
+        let width = 64;
+        let height = 48;
+        let bytes = (0..width * height)
+            .flat_map(|i| [(2 * (i % width)) as u8; 3])
+            .collect();
+        let feature = encode_builtin(&RgbImage {
+            width,
+            height,
+            bytes,
+        });
+
         for cell in feature.chunks_exact(CELL_DIM) {
-            assert!(cell[0] > 0.1 && cell[1..ORIENTATIONS].iter().all(|&x| x < 1e-3), "{cell:?}");
+            assert!(
+                cell[0] > 0.1 && cell[1..ORIENTATIONS].iter().all(|&x| x < 1e-3),
+                "{cell:?}"
+            );
         }
     }
 
     /// Oracle: by hand. A uniform image has no gradient, and its own colour in every cell.
     #[test]
     fn a_uniform_image_is_its_colour() {
-        let image = RgbImage { width: 10, height: 7, bytes: [51, 102, 255].repeat(70) };
+        let image = RgbImage {
+            width: 10,
+            height: 7,
+            bytes: [51, 102, 255].repeat(70),
+        };
+
         for cell in encode_builtin(&image).chunks_exact(CELL_DIM) {
             assert!(cell[..ORIENTATIONS].iter().all(|&x| x == 0.0));
             for (value, expected) in cell[ORIENTATIONS..].iter().zip([0.2, 0.4, 1.0]) {

@@ -24,7 +24,8 @@ pub struct Bounds {
     pub pixels: u64,
 }
 
-/// The longest side of an image, pixels: a longer one would be resized by way of something much larger.
+/// The longest side of an image, pixels: a longer one would be resized by way of something much
+/// larger.
 const LONGEST_SIDE: usize = 16_384;
 
 /// The last two bytes of a JPEG; anything may follow them.
@@ -34,20 +35,33 @@ const HEADER_ALLOC: u64 = 16 << 20;
 
 impl Bounds {
     /// For files of one's own.
-    pub const LOCAL: Self = Self { bytes: 256 << 20, pixels: 100_000_000 };
+    pub const LOCAL: Self = Self {
+        bytes: 256 << 20,
+        pixels: 100_000_000,
+    };
 }
 
-/// Decodes a JPEG or PNG; `name` is for messages. Alpha is dropped, grey becomes RGB, 16 bits become 8.
+/// Decodes a JPEG or PNG; `name` is for messages. Alpha is dropped, grey becomes RGB, 16 bits
+/// become 8.
 ///
 /// # Errors
 /// [`Error::BadImage`], for another format, a file that is not whole, or one out of bounds.
 pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Error> {
     // Decoders' messages may go over several lines.
     let one_line = |problem: String| problem.split_whitespace().collect::<Vec<_>>().join(" ");
-    let bad = |problem: String| Error::BadImage { image: name.to_owned(), problem: one_line(problem) };
+    let bad = |problem: String| Error::BadImage {
+        image: name.to_owned(),
+        problem: one_line(problem),
+    };
+
     if bytes.len() as u64 > bounds.bytes {
-        return Err(bad(format!("is {} bytes, over the limit of {}", bytes.len(), bounds.bytes)));
+        return Err(bad(format!(
+            "is {} bytes, over the limit of {}",
+            bytes.len(),
+            bounds.bytes
+        )));
     }
+
     let format = image::guess_format(bytes).ok();
     if !matches!(format, Some(ImageFormat::Jpeg | ImageFormat::Png)) {
         return Err(bad("is neither JPEG nor PNG".to_owned()));
@@ -55,30 +69,52 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
     if format == Some(ImageFormat::Jpeg) {
         return decode_jpeg(bytes, bounds).map_err(bad);
     }
+
     let read = |most: u64| {
         let mut reader = ImageReader::new(Cursor::new(bytes));
         reader.set_format(ImageFormat::Png);
         let mut limits = Limits::default();
         limits.max_alloc = Some(most);
+
         reader.limits(limits);
         reader
     };
-    let (width, height) = read(HEADER_ALLOC).into_dimensions().map_err(|error| bad(error.to_string()))?;
+
+    let (width, height) = read(HEADER_ALLOC)
+        .into_dimensions()
+        .map_err(|error| bad(error.to_string()))?;
     check_size(width as usize, height as usize, bounds).map_err(bad)?;
+
     // Sixteen bits, four channels, and as much again for the decoder.
-    let most = (u64::from(width) * u64::from(height)).saturating_mul(16).saturating_add(HEADER_ALLOC);
-    let decoded = read(most).decode().map_err(|error| bad(error.to_string()))?;
+    let most = (u64::from(width) * u64::from(height))
+        .saturating_mul(16)
+        .saturating_add(HEADER_ALLOC);
+    let decoded = read(most)
+        .decode()
+        .map_err(|error| bad(error.to_string()))?;
     let bytes = decoded.into_rgb8().into_raw();
-    Ok(RgbImage { width: width as usize, height: height as usize, bytes })
+
+    Ok(RgbImage {
+        width: width as usize,
+        height: height as usize,
+        bytes,
+    })
 }
 
 fn check_size(width: usize, height: usize, bounds: Bounds) -> Result<(), String> {
     if width.max(height) > LONGEST_SIDE {
-        return Err(format!("has {width}×{height} pixels, over the limit of {LONGEST_SIDE} a side"));
+        return Err(format!(
+            "has {width}×{height} pixels, over the limit of {LONGEST_SIDE} a side"
+        ));
     }
+
     if width as u64 * height as u64 > bounds.pixels {
-        return Err(format!("has {width}×{height} pixels, over the limit of {}", bounds.pixels));
+        return Err(format!(
+            "has {width}×{height} pixels, over the limit of {}",
+            bounds.pixels
+        ));
     }
+
     Ok(())
 }
 
@@ -87,20 +123,29 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
     if !bytes.windows(2).rev().any(|marker| marker == END_OF_IMAGE) {
         return Err("ends before its end marker: it was cut".to_owned());
     }
+
     let options = DecoderOptions::default()
         .set_strict_mode(true)
         .set_max_width(usize::from(u16::MAX))
         .set_max_height(usize::from(u16::MAX))
         .jpeg_set_out_colorspace(ColorSpace::RGB);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
-    decoder.decode_headers().map_err(|error| error.to_string())?;
+    decoder
+        .decode_headers()
+        .map_err(|error| error.to_string())?;
+
     let (width, height) = decoder.dimensions().ok_or("says no size")?;
     check_size(width, height, bounds)?;
     let bytes = decoder.decode().map_err(|error| error.to_string())?;
     if bytes.len() != width * height * 3 {
         return Err("has colours that are no RGB".to_owned());
     }
-    Ok(RgbImage { width, height, bytes })
+
+    Ok(RgbImage {
+        width,
+        height,
+        bytes,
+    })
 }
 
 /// Reads and decodes a room's image: a file below `root`, or the part `FILE@OFFSET+LENGTH` of one.
@@ -108,27 +153,49 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
 /// # Errors
 /// [`Error::Io`] or [`Error::BadImage`].
 pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
-    let bad = |problem: String| Error::BadImage { image: root.join(image).display().to_string(), problem };
+    let bad = |problem: String| Error::BadImage {
+        image: root.join(image).display().to_string(),
+        problem,
+    };
+
     let part = image.rsplit_once('@').and_then(|(file, part)| {
         let (offset, length) = part.split_once('+')?;
-        Some((file, offset.parse::<u64>().ok()?, length.parse::<u64>().ok()?))
+        Some((
+            file,
+            offset.parse::<u64>().ok()?,
+            length.parse::<u64>().ok()?,
+        ))
     });
+
     let path = root.join(part.map_or(image, |(file, _, _)| file));
-    let io = |cause| Error::Io { file: path.clone(), cause };
+    let io = |cause| Error::Io {
+        file: path.clone(),
+        cause,
+    };
     let mut file = File::open(&path).map_err(io)?;
     let mut length = file.metadata().map_err(io)?.len();
+
     if let Some((_, offset, part_length)) = part {
         if offset.saturating_add(part_length) > length {
-            return Err(bad(format!("reaches past the end of the file, which has {length} bytes")));
+            return Err(bad(format!(
+                "reaches past the end of the file, which has {length} bytes"
+            )));
         }
+
         file.seek(SeekFrom::Start(offset)).map_err(io)?;
         length = part_length;
     }
+
     if length > Bounds::LOCAL.bytes {
-        return Err(bad(format!("is {length} bytes, over the limit of {}", Bounds::LOCAL.bytes)));
+        return Err(bad(format!(
+            "is {length} bytes, over the limit of {}",
+            Bounds::LOCAL.bytes
+        )));
     }
+
     let mut bytes = Vec::with_capacity(length as usize);
     file.take(length).read_to_end(&mut bytes).map_err(io)?;
+
     decode(&path.display().to_string(), &bytes, Bounds::LOCAL)
 }
 
@@ -139,11 +206,16 @@ pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
 pub fn encode_png(picture: &RgbImage) -> Result<Vec<u8>, Error> {
     let mut bytes = Vec::new();
     let encoder = PngEncoder::new(&mut bytes);
-    let (width, height) = (picture.width as u32, picture.height as u32);
-    encoder.write_image(&picture.bytes, width, height, ExtendedColorType::Rgb8).map_err(|error| Error::BadImage {
-        image: format!("picture of {width}×{height} pixels"),
-        problem: error.to_string(),
-    })?;
+    let width = picture.width as u32;
+    let height = picture.height as u32;
+
+    encoder
+        .write_image(&picture.bytes, width, height, ExtendedColorType::Rgb8)
+        .map_err(|error| Error::BadImage {
+            image: format!("picture of {width}×{height} pixels"),
+            problem: error.to_string(),
+        })?;
+
     Ok(bytes)
 }
 
@@ -153,35 +225,52 @@ mod tests {
 
     fn png(width: u32, height: u32) -> Vec<u8> {
         let mut bytes = Vec::new();
-        let image = image::GrayImage::from_fn(width, height, |x, y| image::Luma([(x * 16 + y) as u8]));
-        image.write_to(&mut Cursor::new(&mut bytes), ImageFormat::Png).unwrap();
+        let image =
+            image::GrayImage::from_fn(width, height, |x, y| image::Luma([(x * 16 + y) as u8]));
+        image
+            .write_to(&mut Cursor::new(&mut bytes), ImageFormat::Png)
+            .unwrap();
+
         bytes
     }
 
-    /// Oracle: PNG is lossless, so pixels come back as they were written, grey in all three channels.
+    /// Oracle: PNG is lossless, so pixels come back as they were written, grey in all three
+    /// channels.
     #[test]
     fn a_png_comes_back_and_a_part_of_a_file_is_found() {
         let bytes = png(4, 3);
         let found = decode("a.png", &bytes, Bounds::LOCAL).unwrap();
-        assert_eq!((found.width, found.height, found.pixel(3, 2)), (4, 3, [50, 50, 50]));
+        assert_eq!(
+            (found.width, found.height, found.pixel(3, 2)),
+            (4, 3, [50, 50, 50])
+        );
+
         let folder = tempfile::tempdir().unwrap();
         let packed = [b"head".as_slice(), &bytes, b"tail"].concat();
         std::fs::write(folder.path().join("p.bin"), packed).unwrap();
         let image = format!("p.bin@4+{}", bytes.len());
+
         assert_eq!(read_image(folder.path(), &image).unwrap(), found);
         assert!(read_image(folder.path(), "p.bin@4+99999").is_err());
     }
 
-    /// Oracle: the photographs of a tiny recording, whole and under every cut: a JPEG that ends early is no image, whatever
-    /// a lenient decoder would make of it.
+    /// Oracle: the photographs of a tiny recording, whole and under every cut: a JPEG that ends
+    /// early is no image, whatever a lenient decoder would make of it.
     #[test]
     fn a_jpeg_that_ends_early_is_refused() {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/datasets/scannet/scene0000_00/color");
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("tests/golden/datasets/scannet/scene0000_00/color");
         let whole = std::fs::read(folder.join("9.jpg")).unwrap();
         let image = decode("9.jpg", &whole, Bounds::LOCAL).unwrap();
+
         assert_eq!((image.width, image.height), (8, 6));
+
         for cut in 0..whole.len() - 1 {
-            assert!(decode("9.jpg", &whole[..cut], Bounds::LOCAL).is_err(), "cut at {cut} of {}", whole.len());
+            assert!(
+                decode("9.jpg", &whole[..cut], Bounds::LOCAL).is_err(),
+                "cut at {cut} of {}",
+                whole.len()
+            );
         }
     }
 
@@ -189,11 +278,22 @@ mod tests {
     #[test]
     fn bad_images_are_named() {
         let bytes = png(64, 64);
-        let small = Bounds { bytes: 10_000, pixels: 100 };
+
+        let small = Bounds {
+            bytes: 10_000,
+            pixels: 100,
+        };
+
         for (bytes, bounds) in [
             (&bytes[..bytes.len() / 2], Bounds::LOCAL),
             (&bytes[..], small),
-            (&bytes[..], Bounds { bytes: 10, pixels: 10_000 }),
+            (
+                &bytes[..],
+                Bounds {
+                    bytes: 10,
+                    pixels: 10_000,
+                },
+            ),
             (&png(16_385, 1), Bounds::LOCAL),
             (b"GIF89a".as_slice(), Bounds::LOCAL),
             (&[], Bounds::LOCAL),

@@ -1,7 +1,9 @@
-//! Rows as they were encoded, appended to a file, so that an interrupted run goes on where it stopped.
+//! Rows as they were encoded, appended to a file, so that an interrupted run goes on where it
+//! stopped.
 //!
-//! A record is the row's number (u32), its numbers (f32) and the beginning of their SHA-256 (8 bytes), little-endian.
-//! A record that is cut or altered ends the file: it and all after it are encoded again.
+//! A record is the row's number (u32), its numbers (f32) and the beginning of their SHA-256 (8
+//! bytes), little-endian. A record that is cut or altered ends the file: it and all after it are
+//! encoded again.
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{Read, Seek, SeekFrom, Write};
@@ -27,25 +29,45 @@ pub struct Journal {
 }
 
 impl Journal {
-    /// Opens the journal of a task, or begins it; gives the rows that are in it already. A file that another task with
-    /// another `key` left at `path` is begun anew.
+    /// Opens the journal of a task, or begins it; gives the rows that are in it already. A file
+    /// that another task with another `key` left at `path` is begun anew.
     ///
     /// # Errors
     /// [`Error::Io`], also when another process is at the same task.
     pub fn open(path: &Path, key: &str, width: usize) -> Result<(Self, NumberedRows), Error> {
-        let io = |cause| Error::Io { file: path.to_owned(), cause };
+        let io = |cause| Error::Io {
+            file: path.to_owned(),
+            cause,
+        };
+
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder).map_err(io)?;
         }
-        let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path).map_err(io)?;
+
+        let file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .open(path)
+            .map_err(io)?;
+
         match file.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
-                return Err(io(std::io::Error::other("another process is encoding this; wait for it, or stop it")));
+                return Err(io(std::io::Error::other(
+                    "another process is encoding this; wait for it, or stop it",
+                )));
             }
             Err(TryLockError::Error(cause)) => return Err(io(cause)),
         }
-        let mut journal = Self { path: path.to_owned(), file, width };
+
+        let mut journal = Self {
+            path: path.to_owned(),
+            file,
+            width,
+        };
+
         let header = [MAGIC.as_slice(), &Sha256::digest(format!("{key}\n{width}"))].concat();
         let mut found = vec![0; HEADER_BYTES];
         let is_ours = journal.file.read_exact(&mut found).is_ok() && found == header;
@@ -55,10 +77,12 @@ impl Journal {
             journal.file.write_all(&header).map_err(io)?;
             return Ok((journal, Vec::new()));
         }
+
         let rows = journal.rows().map_err(io)?;
         let end = HEADER_BYTES + rows.len() * journal.record_bytes();
         journal.file.set_len(end as u64).map_err(io)?;
         journal.file.seek(SeekFrom::End(0)).map_err(io)?;
+
         Ok((journal, rows))
     }
 
@@ -66,7 +90,10 @@ impl Journal {
     ///
     /// # Errors
     /// [`Error::Io`].
-    pub fn append<'a>(&mut self, rows: impl Iterator<Item = (usize, &'a [f32])>) -> Result<(), Error> {
+    pub fn append<'a>(
+        &mut self,
+        rows: impl Iterator<Item = (usize, &'a [f32])>,
+    ) -> Result<(), Error> {
         let mut bytes = Vec::new();
         for (row, numbers) in rows {
             let begin = bytes.len();
@@ -75,7 +102,11 @@ impl Journal {
             let check = Sha256::digest(&bytes[begin..]);
             bytes.extend(&check[..CHECK_BYTES]);
         }
-        self.file.write_all(&bytes).map_err(|cause| Error::Io { file: self.path.clone(), cause })
+
+        self.file.write_all(&bytes).map_err(|cause| Error::Io {
+            file: self.path.clone(),
+            cause,
+        })
     }
 
     /// Removes the file, once its rows are safe elsewhere.
@@ -83,7 +114,10 @@ impl Journal {
     /// # Errors
     /// [`Error::Io`].
     pub fn finish(self) -> Result<(), Error> {
-        std::fs::remove_file(&self.path).map_err(|cause| Error::Io { file: self.path.clone(), cause })
+        std::fs::remove_file(&self.path).map_err(|cause| Error::Io {
+            file: self.path.clone(),
+            cause,
+        })
     }
 
     fn record_bytes(&self) -> usize {
@@ -100,13 +134,22 @@ impl Journal {
                 Err(error) if error.kind() == std::io::ErrorKind::UnexpectedEof => return Ok(rows),
                 Err(error) => return Err(error),
             }
+
             let (content, check) = record.split_at(record.len() - CHECK_BYTES);
             if &Sha256::digest(content)[..CHECK_BYTES] != check {
                 return Ok(rows);
             }
+
             let words: Vec<[u8; 4]> = content.as_chunks::<4>().0.to_vec();
             let row = u32::from_le_bytes(words[0]) as usize;
-            rows.push((row, words[1..].iter().map(|word| f32::from_le_bytes(*word)).collect()));
+
+            rows.push((
+                row,
+                words[1..]
+                    .iter()
+                    .map(|word| f32::from_le_bytes(*word))
+                    .collect(),
+            ));
         }
     }
 }
@@ -115,31 +158,56 @@ impl Journal {
 mod tests {
     use super::*;
 
-    /// Oracle: what was appended, under every cut of the file: whole records survive, a cut one does not.
+    /// Oracle: what was appended, under every cut of the file: whole records survive, a cut one
+    /// does not.
     #[test]
     fn whole_records_survive_any_cut() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a/rows");
-        let rows = [(0usize, vec![1.0f32, 2.0]), (2, vec![3.0, f32::MIN]), (1, vec![0.0, -0.5])];
+
+        let rows = [
+            (0usize, vec![1.0f32, 2.0]),
+            (2, vec![3.0, f32::MIN]),
+            (1, vec![0.0, -0.5]),
+        ];
+
         let (mut journal, before) = Journal::open(&path, "key", 2).unwrap();
         assert!(before.is_empty());
-        journal.append(rows.iter().map(|(row, numbers)| (*row, numbers.as_slice()))).unwrap();
+
+        journal
+            .append(rows.iter().map(|(row, numbers)| (*row, numbers.as_slice())))
+            .unwrap();
+
         drop(journal);
         let bytes = std::fs::read(&path).unwrap();
         let record = (bytes.len() - HEADER_BYTES) / 3;
         for cut in 0..=bytes.len() {
             std::fs::write(&path, &bytes[..cut]).unwrap();
             let (_journal, found) = Journal::open(&path, "key", 2).unwrap();
-            assert_eq!(found, rows[..cut.saturating_sub(HEADER_BYTES) / record], "cut at {cut}");
+            assert_eq!(
+                found,
+                rows[..cut.saturating_sub(HEADER_BYTES) / record],
+                "cut at {cut}"
+            );
         }
+
         let mut altered = bytes.clone();
         altered[HEADER_BYTES + record + 5] ^= 1;
         std::fs::write(&path, altered).unwrap();
         let (mut journal, found) = Journal::open(&path, "key", 2).unwrap();
+
         assert_eq!(found, rows[..1]);
-        journal.append([(5usize, [9.0f32, 9.0].as_slice())].into_iter()).unwrap();
+
+        journal
+            .append([(5usize, [9.0f32, 9.0].as_slice())].into_iter())
+            .unwrap();
+
         drop(journal);
-        assert_eq!(Journal::open(&path, "key", 2).unwrap().1, [rows[0].clone(), (5, vec![9.0, 9.0])]);
+
+        assert_eq!(
+            Journal::open(&path, "key", 2).unwrap().1,
+            [rows[0].clone(), (5, vec![9.0, 9.0])]
+        );
     }
 
     /// Oracle: another task's rows are not ours, and a task that runs already is not begun twice.
@@ -148,12 +216,18 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rows");
         let (mut journal, _) = Journal::open(&path, "one", 1).unwrap();
-        journal.append([(0usize, [1.0f32].as_slice())].into_iter()).unwrap();
+        journal
+            .append([(0usize, [1.0f32].as_slice())].into_iter())
+            .unwrap();
+
         assert!(Journal::open(&path, "one", 1).is_err(), "locked");
+
         drop(journal);
         assert!(Journal::open(&path, "two", 1).unwrap().1.is_empty());
+
         let (journal, rows) = Journal::open(&path, "two", 1).unwrap();
         assert!(rows.is_empty());
+
         journal.finish().unwrap();
         assert!(!path.exists());
     }

@@ -1,8 +1,9 @@
 //! Encoders: images to features, several layers in one pass.
 //!
-//! - An image is decoded, resized and cropped in 8 bit, normalised, run, and each layer pooled to one row.
-//! - What an [`Encoder`] does is written into the [`FeatureSource`] of what it makes, word for word, so that an encoder
-//!   can be built again from a source and its model alone.
+//! - An image is decoded, resized and cropped in 8 bit, normalised, run, and each layer pooled to
+//!   one row.
+//! - What an [`Encoder`] does is written into the [`FeatureSource`] of what it makes, word for
+//!   word, so that an encoder can be built again from a source and its model alone.
 
 mod builtin;
 mod decode;
@@ -40,22 +41,36 @@ use network::Network;
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     #[error("{}: {cause}", file.display())]
-    Io { file: PathBuf, cause: std::io::Error },
+    Io {
+        file: PathBuf,
+        cause: std::io::Error,
+    },
     #[error("{image}: {problem}")]
     BadImage { image: String, problem: String },
     #[error("{what} '{given}': {problem}")]
-    Option { what: &'static str, given: String, problem: String },
+    Option {
+        what: &'static str,
+        given: String,
+        problem: String,
+    },
     #[error("{}: {problem}", file.display())]
     Model { file: PathBuf, problem: String },
     #[error("the runtime '{runtime}' failed: {problem}")]
-    Runtime { runtime: &'static str, problem: String },
+    Runtime {
+        runtime: &'static str,
+        problem: String,
+    },
     #[error(
         "this program was built without the runtime '{runtime}'; build it with \
          `cargo install --path . --features full` (or `cargo build --release --features full`)"
     )]
     NotBuilt { runtime: &'static str },
     #[error("layer '{layer}' gave {value} in column {column}; a feature must be finite")]
-    NotFinite { layer: String, column: usize, value: f32 },
+    NotFinite {
+        layer: String,
+        column: usize,
+        value: f32,
+    },
     #[error("room '{room}' has no images; import it from a recording with images")]
     NoImages { room: String },
     #[error("every image of room '{room}' is bad")]
@@ -113,92 +128,160 @@ impl Encoder {
             id: source.encoder,
             preparation: builtin::preparation(),
             network: Network::Builtin,
-            layers: vec![Layer { name: source.layer, base: source.base, norm: source.norm, pooling: builtin::POOLING }],
+            layers: vec![Layer {
+                name: source.layer,
+                base: source.base,
+                norm: source.norm,
+                pooling: builtin::POOLING,
+            }],
             dims: vec![BUILTIN_DIM],
             window: 1,
             size: Some((64, 48)),
         }
     }
 
-    /// Raw pixels, the paper's baseline: the image at 320×240, in means over 16×12 patches, 0 to 1, by channel.
+    /// Raw pixels, the paper's baseline: the image at 320×240, in means over 16×12 patches, 0 to 1,
+    /// by channel.
     pub fn pixels() -> Self {
-        let pooling = Pooling::Grid { columns: 16, rows: 12, skip: 0 };
+        let pooling = Pooling::Grid {
+            columns: 16,
+            rows: 12,
+            skip: 0,
+        };
+
         Self {
             id: PIXELS.to_owned(),
             preparation: Preparation {
-                resize: Resize::Whole { width: 320, height: 240 },
+                resize: Resize::Whole {
+                    width: 320,
+                    height: 240,
+                },
                 divisor: 255.0,
                 ..Preparation::default()
             },
             network: Network::Pixels,
-            layers: vec![Layer { name: PIXELS.to_owned(), base: "name".to_owned(), norm: "none".to_owned(), pooling }],
+            layers: vec![Layer {
+                name: PIXELS.to_owned(),
+                base: "name".to_owned(),
+                norm: "none".to_owned(),
+                pooling,
+            }],
             dims: vec![3 * 16 * 12],
             window: 1,
             size: Some((320, 240)),
         }
     }
 
-    /// An ONNX model. It is run once on a grey image, so that wrong names and shapes are found at once.
+    /// An ONNX model. It is run once on a grey image, so that wrong names and shapes are found at
+    /// once.
     ///
     /// # Errors
     /// [`Error::Model`], [`Error::NotBuilt`], [`Error::Runtime`].
     pub fn model(task: ModelTask, runtime: &Runtime) -> Result<Self, Error> {
-        let ModelTask { file, preparation, layers, window } = task;
+        let ModelTask {
+            file,
+            preparation,
+            layers,
+            window,
+        } = task;
         let (network, id, size) = network::open(&file, &preparation, &layers, window, runtime)?;
-        let mut encoder = Self { id, preparation, network, layers, dims: Vec::new(), window, size };
+
+        let mut encoder = Self {
+            id,
+            preparation,
+            network,
+            layers,
+            dims: Vec::new(),
+            window,
+            size,
+        };
+
         let (width, height) = size.unwrap_or((64, 64));
-        let grey = RgbImage { width, height, bytes: vec![127; width * height * 3] };
+        let grey = RgbImage {
+            width,
+            height,
+            bytes: vec![127; width * height * 3],
+        };
+
         // Two clips, so that a layer whose first axis is not the batch is found.
         let outputs = encoder.outputs(&[vec![&grey; window], vec![&grey; window]])?;
-        let seen = pooling::Seen { width, height, window };
+
+        let seen = pooling::Seen {
+            width,
+            height,
+            window,
+        };
+
         for (layer, output) in encoder.layers.iter_mut().zip(&outputs) {
-            let problem = |problem: String| Error::Model { file: file.clone(), problem };
+            let problem = |problem: String| Error::Model {
+                file: file.clone(),
+                problem,
+            };
+
             let one = output.index_axis(Axis(0), 0);
             layer.pooling = layer.pooling.for_rank(one.ndim());
             let row = layer.pooling.pool(one, seen);
             let row = row.map_err(|error| problem(format!("layer '{}': {error}", layer.name)))?;
             encoder.dims.push(row.len());
         }
+
         Ok(encoder)
     }
 
-    /// Builds the encoder that made a source again. `models` are those at hand: `builtin`, `pixels`, or ONNX files; none
-    /// of them may be the one.
+    /// Builds the encoder that made a source again. `models` are those at hand: `builtin`,
+    /// `pixels`, or ONNX files; none of them may be the one.
     ///
     /// # Errors
-    /// As [`Encoder::model`], and [`Error::Option`] for a source that does not say how images were prepared.
-    pub fn of_source(source: &FeatureSource, models: &[String], runtime: &Runtime) -> Result<Option<Self>, Error> {
+    /// As [`Encoder::model`], and [`Error::Option`] for a source that does not say how images were
+    /// prepared.
+    pub fn of_source(
+        source: &FeatureSource,
+        models: &[String],
+        runtime: &Runtime,
+    ) -> Result<Option<Self>, Error> {
         for model in models {
             let plain = match model.as_str() {
                 "builtin" => Some(Self::builtin()),
                 PIXELS => Some(Self::pixels()),
                 _ => None,
             };
+
             if let Some(encoder) = plain {
                 if encoder.sources("")[0].is_like(source) {
                     return Ok(Some(encoder));
                 }
                 continue;
             }
+
             let file = Path::new(model);
             if model_file::identity(file)? != source.encoder {
                 continue;
             }
+
             let (preparation, window) = Preparation::parse(&source.preprocess)?;
+
             let layer = Layer {
                 name: source.layer.clone(),
                 base: source.base.clone(),
                 norm: source.norm.clone(),
                 pooling: source.pooling.parse()?,
             };
-            let task = ModelTask { file: file.to_owned(), preparation, layers: vec![layer], window };
+
+            let task = ModelTask {
+                file: file.to_owned(),
+                preparation,
+                layers: vec![layer],
+                window,
+            };
+
             return Self::model(task, runtime).map(Some);
         }
+
         Ok(None)
     }
 
-    /// What its layers make, in order; each is called `PREFIX-LAYER-POOLING`, or just the prefix if there is one layer
-    /// and it has no name of its own.
+    /// What its layers make, in order; each is called `PREFIX-LAYER-POOLING`, or just the prefix if
+    /// there is one layer and it has no name of its own.
     pub fn sources(&self, prefix: &str) -> Vec<FeatureSource> {
         let made = |(layer, &dim): (&Layer, &usize)| FeatureSource {
             name: feature_name(prefix, layer, &self.network),
@@ -210,6 +293,7 @@ impl Encoder {
             preprocess: self.preparation.describe(self.window),
             dim,
         };
+
         self.layers.iter().zip(&self.dims).map(made).collect()
     }
 
@@ -233,7 +317,8 @@ impl Encoder {
         &self.dims
     }
 
-    /// The size (width, height) of an image of 4:3 that is prepared without being resized: render at this.
+    /// The size (width, height) of an image of 4:3 that is prepared without being resized: render
+    /// at this.
     pub fn render_size(&self) -> (usize, usize) {
         match self.preparation.resize {
             Resize::Whole { width, height } => (width, height),
@@ -260,61 +345,109 @@ impl Encoder {
         if clips.is_empty() {
             return Ok(rows);
         }
+
         if matches!(self.network, Network::Builtin) {
             for (mut row, clip) in rows.outer_iter_mut().zip(clips) {
                 row.assign(&ndarray::aview1(&encode_builtin(clip[0])));
             }
             return Ok(rows);
         }
+
         let outputs = self.outputs(clips)?;
         let runtime = self.network.runtime();
-        let seen = pooling::Seen { width: clips[0][0].width, height: clips[0][0].height, window: self.window };
+
+        let seen = pooling::Seen {
+            width: clips[0][0].width,
+            height: clips[0][0].height,
+            window: self.window,
+        };
+
         let mut from = 0;
         for ((layer, &dim), output) in self.layers.iter().zip(&self.dims).zip(&outputs) {
             for (mut row, one) in rows.outer_iter_mut().zip(output.outer_iter()) {
                 let pooled = layer.pooling.pool(one, seen);
-                let pooled = pooled.map_err(|error| Error::Runtime { runtime, problem: error.to_string() })?;
+                let pooled = pooled.map_err(|error| Error::Runtime {
+                    runtime,
+                    problem: error.to_string(),
+                })?;
+
                 if pooled.len() != dim {
-                    let problem = format!("layer '{}' gave {} columns, expected {dim}", layer.name, pooled.len());
+                    let problem = format!(
+                        "layer '{}' gave {} columns, expected {dim}",
+                        layer.name,
+                        pooled.len()
+                    );
                     return Err(Error::Runtime { runtime, problem });
                 }
+
                 if let Some(column) = pooled.iter().position(|value| !value.is_finite()) {
-                    return Err(Error::NotFinite { layer: layer.name.clone(), column, value: pooled[column] });
+                    return Err(Error::NotFinite {
+                        layer: layer.name.clone(),
+                        column,
+                        value: pooled[column],
+                    });
                 }
-                row.slice_mut(ndarray::s![from..from + dim]).assign(&ndarray::aview1(&pooled));
+
+                row.slice_mut(ndarray::s![from..from + dim])
+                    .assign(&ndarray::aview1(&pooled));
             }
+
             from += dim;
         }
+
         Ok(rows)
     }
 
     /// What the network gives for clips, by layer, clips along the first axis.
     fn outputs(&self, clips: &[Vec<&RgbImage>]) -> Result<Vec<ArrayD<f32>>, Error> {
-        let (width, height) = (clips[0][0].width, clips[0][0].height);
-        if clips.iter().flatten().any(|image| (image.width, image.height) != (width, height)) {
-            let problem = "images of several sizes in one batch; give a --resize that fixes the size".to_owned();
-            return Err(Error::BadImage { image: "batch".to_owned(), problem });
-        }
-        if let Some((wanted_width, wanted_height)) = self.size.filter(|&size| size != (width, height)) {
+        let width = clips[0][0].width;
+        let height = clips[0][0].height;
+        if clips
+            .iter()
+            .flatten()
+            .any(|image| (image.width, image.height) != (width, height))
+        {
+            let problem =
+                "images of several sizes in one batch; give a --resize that fixes the size"
+                    .to_owned();
             return Err(Error::BadImage {
-                image: format!("image of {width}×{height} pixels"),
-                problem: format!("the encoder takes {wanted_width}x{wanted_height}; give a --resize or --crop to that"),
+                image: "batch".to_owned(),
+                problem,
             });
         }
+
+        if let Some((wanted_width, wanted_height)) =
+            self.size.filter(|&size| size != (width, height))
+        {
+            return Err(Error::BadImage {
+                image: format!("image of {width}×{height} pixels"),
+                problem: format!(
+                    "the encoder takes {wanted_width}x{wanted_height}; give a --resize or --crop to that"
+                ),
+            });
+        }
+
         let mut numbers = Vec::with_capacity(clips.len() * self.window * 3 * width * height);
         for clip in clips {
             for image in clip {
                 normalised(&self.preparation, image, &mut numbers);
             }
         }
+
         let shape = IxDyn(&[clips.len(), self.window, 3, height, width]);
-        let frames = ArrayD::from_shape_vec(shape, numbers)
-            .map_err(|error| Error::Runtime { runtime: self.runtime(), problem: error.to_string() })?;
+        let frames = ArrayD::from_shape_vec(shape, numbers).map_err(|error| Error::Runtime {
+            runtime: self.runtime(),
+            problem: error.to_string(),
+        })?;
+
         let outputs = match &self.network {
             Network::Builtin => Vec::new(),
             Network::Pixels => vec![frames.index_axis_move(Axis(1), 0)],
-            Network::Model { runner, clip_axis, .. } => runner.run(network::laid_out(frames, *clip_axis))?,
+            Network::Model {
+                runner, clip_axis, ..
+            } => runner.run(network::laid_out(frames, *clip_axis))?,
         };
+
         for (layer, output) in self.layers.iter().zip(&outputs) {
             if output.shape().first() != Some(&clips.len()) {
                 let problem = format!(
@@ -324,9 +457,14 @@ impl Encoder {
                     output.shape(),
                     clips.len()
                 );
-                return Err(Error::Runtime { runtime: self.runtime(), problem });
+
+                return Err(Error::Runtime {
+                    runtime: self.runtime(),
+                    problem,
+                });
             }
         }
+
         Ok(outputs)
     }
 }
@@ -335,11 +473,26 @@ impl Encoder {
 fn feature_name(prefix: &str, layer: &Layer, network: &Network) -> String {
     let name = match network {
         Network::Builtin | Network::Pixels => prefix.to_owned(),
-        Network::Model { .. } if layer.pooling == Pooling::Vector => format!("{prefix}-{}", layer.name),
+        Network::Model { .. } if layer.pooling == Pooling::Vector => {
+            format!("{prefix}-{}", layer.name)
+        }
         Network::Model { .. } => format!("{prefix}-{}-{}", layer.name, layer.pooling.short()),
     };
-    let plain: String = name.chars().map(|c| if is_plain_name(&format!("a{c}")) { c } else { '-' }).collect();
-    plain.trim_start_matches(|c: char| !c.is_ascii_alphanumeric()).to_owned()
+
+    let plain: String = name
+        .chars()
+        .map(|c| {
+            if is_plain_name(&format!("a{c}")) {
+                c
+            } else {
+                '-'
+            }
+        })
+        .collect();
+
+    plain
+        .trim_start_matches(|c: char| !c.is_ascii_alphanumeric())
+        .to_owned()
 }
 
 /// The identity of an encoder: `builtin`, `pixels`, or an ONNX file that can be read.
@@ -375,7 +528,11 @@ pub fn declared_size(file: &Path) -> Result<Option<(usize, usize)>, Error> {
 /// # Errors
 /// [`Error::Option`].
 pub fn parse_crop(text: &str) -> Result<Option<(usize, usize)>, Error> {
-    if text == "none" { Ok(None) } else { preparation::size("crop", text).map(Some) }
+    if text == "none" {
+        Ok(None)
+    } else {
+        preparation::size("crop", text).map(Some)
+    }
 }
 
 /// Reads `R,G,B`, or one number for all three.

@@ -97,33 +97,78 @@ pub(super) struct ModelFile {
 
 impl ModelFile {
     pub fn read(file: &Path) -> Result<Self, Error> {
-        let wrong = |problem: String| Error::Model { file: file.to_owned(), problem };
-        let bytes = std::fs::read(file).map_err(|cause| Error::Io { file: file.to_owned(), cause })?;
+        let wrong = |problem: String| Error::Model {
+            file: file.to_owned(),
+            problem,
+        };
+
+        let bytes = std::fs::read(file).map_err(|cause| Error::Io {
+            file: file.to_owned(),
+            cause,
+        })?;
         let model = ModelProto::decode(bytes.as_slice());
         let graph = model.ok().and_then(|model| model.graph);
         let graph = graph.ok_or_else(|| wrong("is no ONNX model; was it truncated?".to_owned()))?;
+
         if graph.initializer.iter().any(|tensor| tensor.location != 0) {
             let inline = "onnx.save(onnx.load(\"FILE.onnx\"), \"WHOLE.onnx\")";
-            return Err(wrong(format!("keeps weights in another file; put them into this one, in Python: {inline}")));
+            return Err(wrong(format!(
+                "keeps weights in another file; put them into this one, in Python: {inline}"
+            )));
         }
-        let weights: HashSet<&str> = graph.initializer.iter().map(|tensor| tensor.name.as_str()).collect();
-        let inputs: Vec<&ValueInfoProto> =
-            graph.input.iter().filter(|input| !weights.contains(input.name.as_str())).collect();
+
+        let weights: HashSet<&str> = graph
+            .initializer
+            .iter()
+            .map(|tensor| tensor.name.as_str())
+            .collect();
+        let inputs: Vec<&ValueInfoProto> = graph
+            .input
+            .iter()
+            .filter(|input| !weights.contains(input.name.as_str()))
+            .collect();
+
         let [input] = inputs.as_slice() else {
             let names: Vec<&str> = inputs.iter().map(|input| input.name.as_str()).collect();
-            return Err(wrong(format!("has {} inputs ({}), expected one image", names.len(), names.join(", "))));
+            return Err(wrong(format!(
+                "has {} inputs ({}), expected one image",
+                names.len(),
+                names.join(", ")
+            )));
         };
+
         let tensor = input.kind.as_ref().and_then(|kind| kind.tensor.as_ref());
         if tensor.is_some_and(|tensor| tensor.element != FLOAT) {
-            return Err(wrong("takes numbers that are not float32; export it so that its input is float32".to_owned()));
+            return Err(wrong(
+                "takes numbers that are not float32; export it so that its input is float32"
+                    .to_owned(),
+            ));
         }
+
         let shape = tensor.and_then(|tensor| tensor.shape.as_ref());
         let input = shape.map_or_else(Vec::new, |shape| {
-            shape.dim.iter().map(|dim| usize::try_from(dim.value).ok().filter(|&size| size > 0)).collect()
+            shape
+                .dim
+                .iter()
+                .map(|dim| usize::try_from(dim.value).ok().filter(|&size| size > 0))
+                .collect()
         });
+
         let outputs = graph.output.into_iter().map(|output| output.name).collect();
-        let inner = graph.node.into_iter().flat_map(|node| node.output).collect();
-        Ok(Self { id: id_of(file, &bytes), bytes, input, outputs, inner })
+
+        let inner = graph
+            .node
+            .into_iter()
+            .flat_map(|node| node.output)
+            .collect();
+
+        Ok(Self {
+            id: id_of(file, &bytes),
+            bytes,
+            input,
+            outputs,
+            inner,
+        })
     }
 
     /// The size (width, height) of its images, where the file fixes it.
@@ -134,26 +179,57 @@ impl ModelFile {
         }
     }
 
-    /// The file with more of its inner values declared as outputs, for a runtime that gives only those.
+    /// The file with more of its inner values declared as outputs, for a runtime that gives only
+    /// those.
     ///
-    /// In protobuf a message that is written in several parts is their sum, so that outputs can be appended.
-    #[cfg_attr(not(feature = "onnxruntime"), allow(dead_code, reason = "only that runtime needs it"))]
+    /// In protobuf a message that is written in several parts is their sum, so that outputs can be
+    /// appended.
+    #[cfg_attr(
+        not(feature = "onnxruntime"),
+        allow(dead_code, reason = "only that runtime needs it")
+    )]
     pub fn with_outputs(&self, names: &[String]) -> Vec<u8> {
-        let named = |name: &String| ValueInfoProto { name: name.clone(), kind: None };
-        let output = names.iter().filter(|name| !self.outputs.contains(name)).map(named).collect();
-        let more = ModelProto { graph: Some(GraphProto { output, ..GraphProto::default() }) };
+        let named = |name: &String| ValueInfoProto {
+            name: name.clone(),
+            kind: None,
+        };
+        let output = names
+            .iter()
+            .filter(|name| !self.outputs.contains(name))
+            .map(named)
+            .collect();
+
+        let more = ModelProto {
+            graph: Some(GraphProto {
+                output,
+                ..GraphProto::default()
+            }),
+        };
+
         [self.bytes.as_slice(), &more.encode_to_vec()].concat()
     }
 }
 
 /// The identity of a model's file.
 pub(super) fn identity(file: &Path) -> Result<String, Error> {
-    let bytes = std::fs::read(file).map_err(|cause| Error::Io { file: file.to_owned(), cause })?;
+    let bytes = std::fs::read(file).map_err(|cause| Error::Io {
+        file: file.to_owned(),
+        cause,
+    })?;
     Ok(id_of(file, &bytes))
 }
 
 fn id_of(file: &Path, bytes: &[u8]) -> String {
-    let stem = file.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-    let digest: String = Sha256::digest(bytes).iter().take(8).map(|byte| format!("{byte:02x}")).collect();
+    let stem = file
+        .file_stem()
+        .map(|stem| stem.to_string_lossy().into_owned())
+        .unwrap_or_default();
+
+    let digest: String = Sha256::digest(bytes)
+        .iter()
+        .take(8)
+        .map(|byte| format!("{byte:02x}"))
+        .collect();
+
     format!("{stem}@{digest}")
 }

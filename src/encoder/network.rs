@@ -1,4 +1,5 @@
-//! What runs between a prepared image and a layer's output: nothing, or an ONNX model in one of two runtimes.
+//! What runs between a prepared image and a layer's output: nothing, or an ONNX model in one of two
+//! runtimes.
 
 use std::path::{Path, PathBuf};
 
@@ -87,46 +88,80 @@ pub(super) fn open(
 ) -> Result<Opened, Error> {
     preparation.check()?;
     let model = ModelFile::read(file)?;
-    let wrong = |problem: String| Error::Model { file: file.to_owned(), problem };
+
+    let wrong = |problem: String| Error::Model {
+        file: file.to_owned(),
+        problem,
+    };
+
     let names: Vec<String> = layers.iter().map(|layer| layer.name.clone()).collect();
     if names.is_empty() {
         return Err(wrong("no layer was asked for".to_owned()));
     }
+
     for (position, name) in names.iter().enumerate() {
         if !model.outputs.contains(name) && !model.inner.contains(name) {
             let known = model.outputs.join(", ");
-            return Err(wrong(format!("has no layer '{name}'; its outputs are {known}")));
+            return Err(wrong(format!(
+                "has no layer '{name}'; its outputs are {known}"
+            )));
         }
+
         if names[..position].contains(name) {
             return Err(wrong(format!("layer '{name}' was asked for twice")));
         }
     }
+
     let clip_axis = clip_axis(&model.input, window).map_err(&wrong)?;
     let mut shape = model.input.clone();
+
     if let (Some(wanted), Some(given)) = (model.image_size(), preparation.size())
         && wanted != given
     {
-        let ((width, height), (w, h)) = (wanted, given);
-        return Err(wrong(format!("wants images of {width}x{height}, --resize and --crop give {w}x{h}")));
+        let (width, height) = wanted;
+        let (w, h) = given;
+
+        return Err(wrong(format!(
+            "wants images of {width}x{height}, --resize and --crop give {w}x{h}"
+        )));
     }
+
     let size = preparation.size().or(model.image_size());
     if let Some((width, height)) = size {
         let rank = shape.len();
-        (shape[rank - 2], shape[rank - 1]) = (Some(height), Some(width));
+        shape[rank - 2] = Some(height);
+        shape[rank - 1] = Some(width);
     }
+
     if let Some(axis) = clip_axis {
         shape[axis] = Some(window);
     }
+
     let kind = runtime.kind;
     if !kind.is_built() {
-        return Err(Error::NotBuilt { runtime: kind.name() });
+        return Err(Error::NotBuilt {
+            runtime: kind.name(),
+        });
     }
+
     let id = model.id.clone();
     let runner = runner(file, model, &names, &shape, runtime)?;
-    Ok((Network::Model { runner, kind, clip_axis }, id, size))
+
+    Ok((
+        Network::Model {
+            runner,
+            kind,
+            clip_axis,
+        },
+        id,
+        size,
+    ))
 }
 
-#[cfg_attr(not(feature = "onnxruntime"), allow(unused_variables, reason = "each runtime takes a part"))]
+#[cfg_attr(
+    not(feature = "onnxruntime"),
+    allow(unused_variables, reason = "each runtime takes a part")
+)]
 fn runner(
     file: &Path,
     model: ModelFile,
@@ -138,33 +173,45 @@ fn runner(
         #[cfg(feature = "onnx")]
         RuntimeKind::Tract => Ok(Box::new(super::tract::Tract::open(file, names, shape)?)),
         #[cfg(feature = "onnxruntime")]
-        RuntimeKind::OnnxRuntime => {
-            Ok(Box::new(super::onnxruntime::OnnxRuntime::open(file, &model, names, shape, runtime)?))
-        }
+        RuntimeKind::OnnxRuntime => Ok(Box::new(super::onnxruntime::OnnxRuntime::open(
+            file, &model, names, shape, runtime,
+        )?)),
         #[allow(unreachable_patterns, reason = "reached where a runtime was not built")]
-        other => Err(Error::NotBuilt { runtime: other.name() }),
+        other => Err(Error::NotBuilt {
+            runtime: other.name(),
+        }),
     }
 }
 
-/// Where a model's input (batch, 3, height, width), (batch, 3, clip, height, width) or (batch, clip, 3, height, width)
-/// counts the images of a clip.
+/// Where a model's input (batch, 3, height, width), (batch, 3, clip, height, width) or (batch,
+/// clip, 3, height, width) counts the images of a clip.
 fn clip_axis(input: &[Option<usize>], window: usize) -> Result<Option<usize>, String> {
     let colours = |axis: usize| matches!(input[axis], None | Some(3));
     let (axis, fixed) = match input.len() {
         4 if colours(1) && window == 1 => return Ok(None),
-        4 if colours(1) => return Err(format!("takes single images, not clips of {window}; leave out --window")),
+        4 if colours(1) => {
+            return Err(format!(
+                "takes single images, not clips of {window}; leave out --window"
+            ));
+        }
         5 if input[2] == Some(3) => (1, input[1]),
         5 if input[1] == Some(3) => (2, input[2]),
         _ => {
-            let shape: Vec<String> = input.iter().map(|size| size.map_or("?".to_owned(), |n| n.to_string())).collect();
+            let shape: Vec<String> = input
+                .iter()
+                .map(|size| size.map_or("?".to_owned(), |n| n.to_string()))
+                .collect();
             return Err(format!(
                 "has an input of shape [{}]; expected [batch, 3, height, width], or five axes with a clip",
                 shape.join(", ")
             ));
         }
     };
+
     match fixed {
-        Some(length) if length != window => Err(format!("takes clips of {length} images; give --window {length}")),
+        Some(length) if length != window => Err(format!(
+            "takes clips of {length} images; give --window {length}"
+        )),
         _ => Ok(Some(axis)),
     }
 }
@@ -174,7 +221,10 @@ pub(super) fn laid_out(frames: ArrayD<f32>, clip_axis: Option<usize>) -> ArrayD<
     match clip_axis {
         None => frames.index_axis_move(Axis(1), 0),
         Some(1) => frames,
-        Some(_) => frames.permuted_axes(vec![0, 2, 1, 3, 4]).as_standard_layout().into_owned(),
+        Some(_) => frames
+            .permuted_axes(vec![0, 2, 1, 3, 4])
+            .as_standard_layout()
+            .into_owned(),
     }
 }
 
@@ -189,9 +239,21 @@ mod tests {
         assert_eq!(clip_axis(&[n, Some(3), Some(240), Some(320)], 1), Ok(None));
         assert_eq!(clip_axis(&[n, Some(3), n, n], 1), Ok(None));
         assert_eq!(clip_axis(&[n, Some(16), Some(3), n, n], 16), Ok(Some(1)));
+
         assert_eq!(clip_axis(&[n, Some(3), n, n, n], 8), Ok(Some(2)));
-        assert!(clip_axis(&[n, Some(3), n, n], 4).unwrap_err().contains("single images"));
-        assert!(clip_axis(&[n, Some(16), Some(3), n, n], 8).unwrap_err().contains("--window 16"));
+
+        assert!(
+            clip_axis(&[n, Some(3), n, n], 4)
+                .unwrap_err()
+                .contains("single images")
+        );
+
+        assert!(
+            clip_axis(&[n, Some(16), Some(3), n, n], 8)
+                .unwrap_err()
+                .contains("--window 16")
+        );
+
         assert!(clip_axis(&[n, Some(10)], 1).is_err());
         assert!(clip_axis(&[n, Some(1), n, n], 1).is_err(), "grey");
     }
@@ -199,9 +261,16 @@ mod tests {
     /// Oracle: by hand: with two images a clip, channels move before images.
     #[test]
     fn channels_and_images_change_places() {
-        let frames = ArrayD::from_shape_fn(vec![1, 2, 3, 1, 1], |index| (10 * index[1] + index[2]) as f32);
+        let frames = ArrayD::from_shape_fn(vec![1, 2, 3, 1, 1], |index| {
+            (10 * index[1] + index[2]) as f32
+        });
         let moved = laid_out(frames, Some(2));
+
         assert_eq!(moved.shape(), [1, 3, 2, 1, 1]);
-        assert_eq!(moved.into_raw_vec_and_offset().0, [0.0, 10.0, 1.0, 11.0, 2.0, 12.0]);
+
+        assert_eq!(
+            moved.into_raw_vec_and_offset().0,
+            [0.0, 10.0, 1.0, 11.0, 2.0, 12.0]
+        );
     }
 }

@@ -33,31 +33,56 @@ impl OnnxRuntime {
         shape: &[Option<usize>],
         runtime: &Runtime,
     ) -> Result<Self, Error> {
-        let wrong = |problem: String| Error::Model { file: file.to_owned(), problem };
+        let wrong = |problem: String| Error::Model {
+            file: file.to_owned(),
+            problem,
+        };
+
         let environment = environment(runtime.library.as_deref())?;
         let builder = Session::builder(environment).map_err(|error| failed(&error))?;
-        let mut builder = builder.with_intra_threads(runtime.threads).map_err(|error| failed(&error))?;
+        let mut builder = builder
+            .with_intra_threads(runtime.threads)
+            .map_err(|error| failed(&error))?;
         let session = if names.iter().all(|name| model.outputs.contains(name)) {
             builder.commit_from_file(file)
         } else {
             builder.commit_from_memory(&model.with_outputs(names))
         };
-        let session = session.map_err(|error| wrong(format!("cannot be run by {NAME}: {error}")))?;
+
+        let session =
+            session.map_err(|error| wrong(format!("cannot be run by {NAME}: {error}")))?;
         let batch = shape.first().copied().flatten();
-        Ok(Self { session: Mutex::new(session), names: names.to_vec(), batch })
+
+        Ok(Self {
+            session: Mutex::new(session),
+            names: names.to_vec(),
+            batch,
+        })
     }
 
     fn batch(&self, input: ndarray::ArrayViewD<'_, f32>) -> Result<Vec<ArrayD<f32>>, Error> {
         let input = input.as_standard_layout();
         let tensor = TensorRef::from_array_view(&input).map_err(|error| failed(&error))?;
+
         // A panic while the lock was held leaves the session as it was: it is only read.
         let mut session = self.session.lock().unwrap_or_else(PoisonError::into_inner);
-        let outputs = session.run(ort::inputs![tensor]).map_err(|error| failed(&error))?;
+        let outputs = session
+            .run(ort::inputs![tensor])
+            .map_err(|error| failed(&error))?;
+
         let array = |name: &String| {
-            let missing = || Error::Runtime { runtime: NAME, problem: format!("gave no output '{name}'") };
+            let missing = || Error::Runtime {
+                runtime: NAME,
+                problem: format!("gave no output '{name}'"),
+            };
             let output = outputs.get(name).ok_or_else(missing)?;
-            Ok(output.try_extract_array::<f32>().map_err(|error| failed(&error))?.to_owned())
+
+            Ok(output
+                .try_extract_array::<f32>()
+                .map_err(|error| failed(&error))?
+                .to_owned())
         };
+
         self.names.iter().map(array).collect()
     }
 }
@@ -68,18 +93,31 @@ impl Runner for OnnxRuntime {
             return self.batch(input.view());
         };
         if batch != 1 {
-            let problem = format!("the model takes batches of {batch} only; give --batch {batch}, or export it with 1");
-            return Err(Error::Runtime { runtime: NAME, problem });
+            let problem = format!(
+                "the model takes batches of {batch} only; give --batch {batch}, or export it with 1"
+            );
+            return Err(Error::Runtime {
+                runtime: NAME,
+                problem,
+            });
         }
+
         let clips = 0..input.shape()[0];
         let each: Vec<_> = clips
             .map(|clip| self.batch(input.slice_axis(Axis(0), Slice::from(clip..clip + 1))))
             .collect::<Result<_, _>>()?;
+
         let joined = |output: usize| {
-            let parts: Vec<_> = each.iter().map(|outputs: &Vec<ArrayD<f32>>| outputs[output].view()).collect();
-            ndarray::concatenate(Axis(0), &parts)
-                .map_err(|error| Error::Runtime { runtime: NAME, problem: error.to_string() })
+            let parts: Vec<_> = each
+                .iter()
+                .map(|outputs: &Vec<ArrayD<f32>>| outputs[output].view())
+                .collect();
+            ndarray::concatenate(Axis(0), &parts).map_err(|error| Error::Runtime {
+                runtime: NAME,
+                problem: error.to_string(),
+            })
         };
+
         (0..self.names.len()).map(joined).collect()
     }
 }
@@ -87,21 +125,38 @@ impl Runner for OnnxRuntime {
 fn environment(library: Option<&Path>) -> Result<&'static Environment, Error> {
     let help = "`pip install onnxruntime` brings the library, onnxruntime/capi/libonnxruntime.so.*; name it with \
                 --onnxruntime FILE or ORT_DYLIB_PATH";
-    let failed = |problem: String| Error::Runtime { runtime: RuntimeKind::OnnxRuntime.name(), problem };
-    let library = library.ok_or_else(|| failed(format!("its shared library was not named; {help}")))?;
+
+    let failed = |problem: String| Error::Runtime {
+        runtime: RuntimeKind::OnnxRuntime.name(),
+        problem,
+    };
+    let library =
+        library.ok_or_else(|| failed(format!("its shared library was not named; {help}")))?;
+
     if !library.is_file() {
         return Err(failed(format!("{} is no file; {help}", library.display())));
     }
+
     let load = || {
         let builder = ort::init_from(library).map_err(|error| error.to_string())?;
-        builder.with_name("seese3").with_telemetry(false).build().map_err(|error| error.to_string())
+        builder
+            .with_name("seese3")
+            .with_telemetry(false)
+            .build()
+            .map_err(|error| error.to_string())
     };
-    LOADED
-        .get_or_init(load)
-        .as_ref()
-        .map_err(|problem| failed(format!("{} cannot be loaded: {problem}; {help}", library.display())))
+
+    LOADED.get_or_init(load).as_ref().map_err(|problem| {
+        failed(format!(
+            "{} cannot be loaded: {problem}; {help}",
+            library.display()
+        ))
+    })
 }
 
 fn failed<T: std::fmt::Display>(error: &T) -> Error {
-    Error::Runtime { runtime: NAME, problem: error.to_string() }
+    Error::Runtime {
+        runtime: NAME,
+        problem: error.to_string(),
+    }
 }

@@ -1,7 +1,8 @@
 //! How a layer's output becomes one row.
 //!
-//! An output is a vector (C), tokens (N, C) or a map (C, H, W). Grids are means over cells as PyTorch's
-//! `adaptive_avg_pool2d` cuts them, laid out channel by channel, rows of cells within: (C, rows, columns).
+//! An output is a vector (C), tokens (N, C) or a map (C, H, W). Grids are means over cells as
+//! PyTorch's `adaptive_avg_pool2d` cuts them, laid out channel by channel, rows of cells within:
+//! (C, rows, columns).
 
 use std::fmt;
 use std::str::FromStr;
@@ -22,7 +23,8 @@ pub enum Pooling {
         /// Tokens that are no patches: the class token and registers.
         skip: usize,
     },
-    /// Means over cells of the map, or of the patch tokens after the first `skip`, laid out in the image's shape.
+    /// Means over cells of the map, or of the patch tokens after the first `skip`, laid out in the
+    /// image's shape.
     Grid {
         /// Cells across.
         columns: usize,
@@ -48,7 +50,11 @@ impl Pooling {
         match self {
             Self::Vector | Self::Cls => self,
             Self::Mean { .. } => Self::Mean { skip },
-            Self::Grid { columns, rows, .. } => Self::Grid { columns, rows, skip },
+            Self::Grid { columns, rows, .. } => Self::Grid {
+                columns,
+                rows,
+                skip,
+            },
         }
     }
 
@@ -60,41 +66,77 @@ impl Pooling {
     /// The row of one image's output.
     pub(super) fn pool(self, output: ArrayViewD<'_, f32>, seen: Seen) -> Result<Vec<f32>, Problem> {
         let shape = output.shape().to_vec();
-        let wrong = || Problem::Shape { pooling: self, shape: shape.clone() };
-        if let (2, Self::Cls | Self::Mean { skip: 1.. } | Self::Grid { skip: 1.., .. }) = (output.ndim(), self) {
-            let skip = if let Self::Mean { skip } | Self::Grid { skip, .. } = self { skip } else { 1 };
-            let after = shape[0].checked_sub(skip).and_then(|patches| seen.patches(patches));
+        let wrong = || Problem::Shape {
+            pooling: self,
+            shape: shape.clone(),
+        };
+
+        if let (2, Self::Cls | Self::Mean { skip: 1.. } | Self::Grid { skip: 1.., .. }) =
+            (output.ndim(), self)
+        {
+            let skip = if let Self::Mean { skip } | Self::Grid { skip, .. } = self {
+                skip
+            } else {
+                1
+            };
+            let after = shape[0]
+                .checked_sub(skip)
+                .and_then(|patches| seen.patches(patches));
+
             if seen.patches(shape[0]).is_some() && after.is_none() {
                 return Err(Problem::NoPrefix { tokens: shape[0] });
             }
         }
+
         match (self, output.ndim()) {
-            (Self::Vector, 1) => Ok(output.into_dimensionality::<Ix1>().map_err(|_| wrong())?.to_vec()),
-            (Self::Cls, 2) if shape[0] > 0 => {
-                Ok(output.into_dimensionality::<Ix2>().map_err(|_| wrong())?.row(0).to_vec())
-            }
+            (Self::Vector, 1) => Ok(output
+                .into_dimensionality::<Ix1>()
+                .map_err(|_| wrong())?
+                .to_vec()),
+            (Self::Cls, 2) if shape[0] > 0 => Ok(output
+                .into_dimensionality::<Ix2>()
+                .map_err(|_| wrong())?
+                .row(0)
+                .to_vec()),
             (Self::Mean { skip }, 2) if skip < shape[0] => {
                 let tokens = output.into_dimensionality::<Ix2>().map_err(|_| wrong())?;
                 let patches = tokens.slice_move(ndarray::s![skip.., ..]).reversed_axes();
                 Ok(grid(patches.insert_axis(Axis(1)), 1, 1))
             }
-            (Self::Grid { columns, rows, skip }, 2) if skip < shape[0] => {
+            (
+                Self::Grid {
+                    columns,
+                    rows,
+                    skip,
+                },
+                2,
+            ) if skip < shape[0] => {
                 let (times, height, width) = seen.patches(shape[0] - skip).ok_or_else(wrong)?;
                 let tokens = output.into_dimensionality::<Ix2>().map_err(|_| wrong())?;
                 let patches = tokens.slice_move(ndarray::s![skip.., ..]);
+
                 let mean = |c: usize, place: usize| {
-                    let sum: f64 = (0..times).map(|t| f64::from(patches[(t * height * width + place, c)])).sum();
+                    let sum: f64 = (0..times)
+                        .map(|t| f64::from(patches[(t * height * width + place, c)]))
+                        .sum();
                     (sum / times as f64) as f32
                 };
-                let map = Array3::from_shape_fn((shape[1], height, width), |(c, y, x)| mean(c, y * width + x));
+                let map = Array3::from_shape_fn((shape[1], height, width), |(c, y, x)| {
+                    mean(c, y * width + x)
+                });
+
                 Ok(grid(map.view(), columns, rows))
             }
-            (Self::Mean { .. }, 3) if shape[1] * shape[2] > 0 => {
-                Ok(grid(output.into_dimensionality::<Ix3>().map_err(|_| wrong())?, 1, 1))
-            }
-            (Self::Grid { columns, rows, .. }, 3) if shape[1] * shape[2] > 0 => {
-                Ok(grid(output.into_dimensionality::<Ix3>().map_err(|_| wrong())?, columns, rows))
-            }
+            (Self::Mean { .. }, 3) if shape[1] * shape[2] > 0 => Ok(grid(
+                output.into_dimensionality::<Ix3>().map_err(|_| wrong())?,
+                1,
+                1,
+            )),
+            (Self::Grid { columns, rows, .. }, 3) if shape[1] * shape[2] > 0 => Ok(grid(
+                output.into_dimensionality::<Ix3>().map_err(|_| wrong())?,
+                columns,
+                rows,
+            )),
             _ => Err(wrong()),
         }
     }
@@ -109,15 +151,21 @@ pub(super) struct Seen {
 }
 
 impl Seen {
-    /// How many times, rows and columns a number of patch tokens has: square patches, time first. A clip's tokens stand
-    /// for two images each, for one, or for all of them.
+    /// How many times, rows and columns a number of patch tokens has: square patches, time first. A
+    /// clip's tokens stand for two images each, for one, or for all of them.
     fn patches(self, tokens: usize) -> Option<(usize, usize, usize)> {
-        let times = if self.window > 1 { vec![self.window / 2, self.window, 1] } else { vec![1] };
+        let times = if self.window > 1 {
+            vec![self.window / 2, self.window, 1]
+        } else {
+            vec![1]
+        };
+
         times.into_iter().find_map(|times| {
             let area = tokens.is_multiple_of(times).then(|| tokens / times)?;
             let columns = (area * self.width / self.height).isqrt();
             let rows = area.checked_div(columns)?;
             let fits = columns * rows == area && columns * self.height == rows * self.width;
+
             fits.then_some((times, rows, columns))
         })
     }
@@ -131,13 +179,15 @@ fn grid(map: ArrayView3<'_, f32>, columns: usize, rows: usize) -> Vec<f32> {
     for channel in map.outer_iter() {
         for down in 0..rows {
             for across in 0..columns {
-                let (ys, xs) = (cell(down, rows, height), cell(across, columns, width));
+                let ys = cell(down, rows, height);
+                let xs = cell(across, columns, width);
                 let part = channel.slice(ndarray::s![ys, xs]);
                 let sum: f64 = part.iter().map(|&value| f64::from(value)).sum();
                 row.push((sum / part.len() as f64) as f32);
             }
         }
     }
+
     row
 }
 
@@ -165,41 +215,64 @@ impl fmt::Display for Pooling {
                 f.write_str("mean")?;
                 *skip
             }
-            Self::Grid { columns, rows, skip } => {
+            Self::Grid {
+                columns,
+                rows,
+                skip,
+            } => {
                 write!(f, "grid{columns}x{rows}")?;
                 *skip
             }
         };
-        if skip > 0 { write!(f, "@{skip}") } else { Ok(()) }
+
+        if skip > 0 {
+            write!(f, "@{skip}")
+        } else {
+            Ok(())
+        }
     }
 }
 
 impl FromStr for Pooling {
     type Err = Error;
 
-    /// `vector`, `cls`, `mean` or `gridCxR` (columns × rows); `@N` after it leaves out the first N tokens.
+    /// `vector`, `cls`, `mean` or `gridCxR` (columns × rows); `@N` after it leaves out the first N
+    /// tokens.
     fn from_str(text: &str) -> Result<Self, Error> {
         let wrong = || Error::Option {
             what: "pooling",
             given: text.to_owned(),
-            problem: format!("is not cls, mean, or gridCxR with 1 to {MOST_CELLS} columns and rows"),
+            problem: format!(
+                "is not cls, mean, or gridCxR with 1 to {MOST_CELLS} columns and rows"
+            ),
         };
+
         let (word, skip) = match text.split_once('@') {
             Some((word, skip)) => (word, skip.parse().map_err(|_| wrong())?),
             None => (text, 0),
         };
+
         let pooling = match word {
             "vector" => Self::Vector,
             "cls" => Self::Cls,
             "mean" => Self::Mean { skip },
             _ => {
                 let cells = |text: &str| text.parse().ok().filter(|n| (1..=MOST_CELLS).contains(n));
-                let grid = word.strip_prefix("grid").and_then(|grid| grid.split_once('x'));
-                let (columns, rows) =
-                    grid.and_then(|(columns, rows)| Some((cells(columns)?, cells(rows)?))).ok_or_else(wrong)?;
-                Self::Grid { columns, rows, skip }
+                let grid = word
+                    .strip_prefix("grid")
+                    .and_then(|grid| grid.split_once('x'));
+                let (columns, rows) = grid
+                    .and_then(|(columns, rows)| Some((cells(columns)?, cells(rows)?)))
+                    .ok_or_else(wrong)?;
+
+                Self::Grid {
+                    columns,
+                    rows,
+                    skip,
+                }
             }
         };
+
         Ok(pooling)
     }
 }
@@ -209,17 +282,32 @@ mod tests {
     use super::*;
     use ndarray::{Array2, ArrayD};
 
-    const SQUARE: Seen = Seen { width: 14, height: 14, window: 1 };
+    const SQUARE: Seen = Seen {
+        width: 14,
+        height: 14,
+        window: 1,
+    };
 
     fn map(channels: usize, height: usize, width: usize) -> ArrayD<f32> {
-        Array3::from_shape_fn((channels, height, width), |(c, y, x)| (100 * c + 10 * y + x) as f32).into_dyn()
+        Array3::from_shape_fn((channels, height, width), |(c, y, x)| {
+            (100 * c + 10 * y + x) as f32
+        })
+        .into_dyn()
     }
 
-    /// Oracle: PyTorch's definition by hand. Three rows in two cells overlap in the middle one: rows 0–1 and 1–2.
+    /// Oracle: PyTorch's definition by hand. Three rows in two cells overlap in the middle one:
+    /// rows 0–1 and 1–2.
     #[test]
     fn cells_overlap_where_the_map_does_not_divide() {
-        let pool = |text: &str, output: ArrayD<f32>| text.parse::<Pooling>().unwrap().pool(output.view(), SQUARE);
-        assert_eq!(pool("grid1x2", map(2, 3, 1)).unwrap(), [5.0, 15.0, 105.0, 115.0]);
+        let pool = |text: &str, output: ArrayD<f32>| {
+            text.parse::<Pooling>().unwrap().pool(output.view(), SQUARE)
+        };
+
+        assert_eq!(
+            pool("grid1x2", map(2, 3, 1)).unwrap(),
+            [5.0, 15.0, 105.0, 115.0]
+        );
+
         assert_eq!(pool("grid2x1", map(1, 2, 2)).unwrap(), [5.0, 6.0]);
         assert_eq!(pool("mean", map(2, 2, 2)).unwrap(), [5.5, 105.5]);
     }
@@ -228,35 +316,71 @@ mod tests {
     #[test]
     fn tokens_after_the_prefix_are_a_square() {
         let tokens = || Array2::from_shape_fn((5, 2), |(n, c)| (10 * c + n) as f32).into_dyn();
-        let pool = |text: &str| text.parse::<Pooling>().unwrap().pool(tokens().view(), SQUARE);
+        let pool = |text: &str| {
+            text.parse::<Pooling>()
+                .unwrap()
+                .pool(tokens().view(), SQUARE)
+        };
+
         assert_eq!(pool("cls").unwrap(), [0.0, 10.0]);
         assert_eq!(pool("mean@1").unwrap(), [2.5, 12.5]);
         assert_eq!(pool("mean").unwrap(), [2.0, 12.0]);
-        assert_eq!(pool("grid2x2@1").unwrap(), [1.0, 2.0, 3.0, 4.0, 11.0, 12.0, 13.0, 14.0]);
+
+        assert_eq!(
+            pool("grid2x2@1").unwrap(),
+            [1.0, 2.0, 3.0, 4.0, 11.0, 12.0, 13.0, 14.0]
+        );
+
         assert_eq!(pool("grid2x1@1").unwrap(), [2.0, 3.0, 12.0, 13.0]);
         assert!(pool("grid2x2").is_err(), "five tokens are no square");
         assert!(pool("mean@5").is_err(), "no token is left");
+
         let patches = Array2::<f32>::zeros((16, 2)).into_dyn();
         for word in ["cls", "mean@1", "grid2x2@1"] {
-            let problem = word.parse::<Pooling>().unwrap().pool(patches.view(), SQUARE).unwrap_err().to_string();
+            let problem = word
+                .parse::<Pooling>()
+                .unwrap()
+                .pool(patches.view(), SQUARE)
+                .unwrap_err()
+                .to_string();
+
             assert!(problem.contains("--prefix-tokens 0"), "{word}: {problem}");
         }
-        assert!("cls".parse::<Pooling>().unwrap().pool(map(1, 2, 2).view(), SQUARE).is_err());
+
+        assert!(
+            "cls"
+                .parse::<Pooling>()
+                .unwrap()
+                .pool(map(1, 2, 2).view(), SQUARE)
+                .is_err()
+        );
     }
 
-    /// Oracle: by hand. 576 tokens are 32×18 of a wide image and 24×24 of a square one; a clip's come in times.
+    /// Oracle: by hand. 576 tokens are 32×18 of a wide image and 24×24 of a square one; a clip's
+    /// come in times.
     #[test]
     fn tokens_lie_in_the_images_shape() {
-        let seen = |width, height, window| Seen { width, height, window };
+        let seen = |width, height, window| Seen {
+            width,
+            height,
+            window,
+        };
+
         assert_eq!(seen(512, 288, 1).patches(576), Some((1, 18, 32)));
         assert_eq!(seen(384, 384, 1).patches(576), Some((1, 24, 24)));
         assert_eq!(seen(512, 384, 1).patches(768), Some((1, 24, 32)));
         assert_eq!(seen(384, 384, 16).patches(8 * 576), Some((8, 24, 24)));
+
         assert_eq!(seen(224, 224, 1).patches(257), None);
         assert_eq!(seen(512, 384, 1).patches(576), None);
+
         let wide = Array2::from_shape_fn((8, 1), |(n, _)| n as f32).into_dyn();
         let halves: Pooling = "grid2x1".parse().unwrap();
-        assert_eq!(halves.pool(wide.view(), seen(32, 16, 1)).unwrap(), [2.5, 4.5], "four across, two down");
+        assert_eq!(
+            halves.pool(wide.view(), seen(32, 16, 1)).unwrap(),
+            [2.5, 4.5],
+            "four across, two down"
+        );
     }
 
     /// Oracle: the words of the documentation.
@@ -265,7 +389,10 @@ mod tests {
         for word in ["vector", "cls", "mean", "mean@5", "grid2x2", "grid16x12@1"] {
             assert_eq!(word.parse::<Pooling>().unwrap().to_string(), word);
         }
-        for wrong in ["", "max", "grid", "grid0x2", "grid2", "mean@", "grid65x1", "mean@x"] {
+
+        for wrong in [
+            "", "max", "grid", "grid0x2", "grid2", "mean@", "grid65x1", "mean@x",
+        ] {
             assert!(wrong.parse::<Pooling>().is_err(), "{wrong}");
         }
     }

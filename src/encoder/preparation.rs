@@ -1,7 +1,7 @@
 //! What is done to an image before a network sees it: resize, crop, normalise.
 //!
-//! Resizing is an antialiased convolution in 8 bit, as Pillow does it; cropping is central. Then, in f32,
-//! (v / divisor − mean) / deviation for each channel, v in 0 to 255.
+//! Resizing is an antialiased convolution in 8 bit, as Pillow does it; cropping is central. Then,
+//! in f32, (v / divisor − mean) / deviation for each channel, v in 0 to 255.
 
 use fast_image_resize::images::{Image, ImageRef};
 use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
@@ -92,19 +92,26 @@ impl Preparation {
             Resize::Shortest(edge) if image.width <= image.height => {
                 (edge, edge.saturating_mul(image.height) / image.width.max(1))
             }
-            Resize::Shortest(edge) => (edge.saturating_mul(image.width) / image.height.max(1), edge),
+            Resize::Shortest(edge) => {
+                (edge.saturating_mul(image.width) / image.height.max(1), edge)
+            }
         };
+
         if width.max(height) > LARGEST && self.resize != Resize::None {
             return Err(Error::BadImage {
                 image: format!("image of {}×{} pixels", image.width, image.height),
-                problem: format!("would be resized to {width}×{height}, over the limit of {LARGEST} a side"),
+                problem: format!(
+                    "would be resized to {width}×{height}, over the limit of {LARGEST} a side"
+                ),
             });
         }
+
         let resized = if (width, height) == (image.width, image.height) {
             image
         } else {
             resized(&image, width, height, self.filter)?
         };
+
         match self.crop {
             Some((width, height)) if (width, height) != (resized.width, resized.height) => {
                 cropped(&resized, width, height)
@@ -113,7 +120,8 @@ impl Preparation {
         }
     }
 
-    /// In words, with their own hash: what [`Preparation::parse`] reads. `window` is the number of images a clip.
+    /// In words, with their own hash: what [`Preparation::parse`] reads. `window` is the number of
+    /// images a clip.
     pub fn describe(&self, window: usize) -> String {
         let text = self.text(window);
         format!("{text} sha256={}", digest(&text))
@@ -125,7 +133,11 @@ impl Preparation {
             Resize::Whole { width, height } => format!("{width}x{height}"),
             Resize::Shortest(edge) => format!("shortest:{edge}"),
         };
-        let crop = self.crop.map_or("none".to_owned(), |(width, height)| format!("{width}x{height}"));
+
+        let crop = self.crop.map_or("none".to_owned(), |(width, height)| {
+            format!("{width}x{height}")
+        });
+
         let three = |[r, g, b]: [f32; 3]| format!("{r},{g},{b}");
         format!(
             "resize={resize} filter={} crop={crop} divisor={} mean={} std={} window={window}",
@@ -136,24 +148,33 @@ impl Preparation {
         )
     }
 
-    /// Reads what [`Preparation::describe`] wrote: the preparation, and the number of images a clip.
+    /// Reads what [`Preparation::describe`] wrote: the preparation, and the number of images a
+    /// clip.
     ///
     /// # Errors
     /// [`Error::Option`] if it was not written so, or was altered.
     pub fn parse(text: &str) -> Result<(Self, usize), Error> {
-        let wrong =
-            |problem: &str| Error::Option { what: "preprocess", given: text.to_owned(), problem: problem.to_owned() };
+        let wrong = |problem: &str| Error::Option {
+            what: "preprocess",
+            given: text.to_owned(),
+            problem: problem.to_owned(),
+        };
+
         let mut preparation = Self::default();
         let mut window = None;
         for word in text.split(' ') {
-            let (key, value) = word.split_once('=').ok_or_else(|| wrong("does not say how images were prepared"))?;
+            let (key, value) = word
+                .split_once('=')
+                .ok_or_else(|| wrong("does not say how images were prepared"))?;
             match key {
                 "resize" => preparation.resize = value.parse()?,
                 "filter" => preparation.filter = value.parse()?,
                 "crop" if value == "none" => preparation.crop = None,
                 "crop" => preparation.crop = Some(size("crop", value)?),
                 "divisor" => {
-                    preparation.divisor = value.parse().map_err(|_| wrong("has a divisor that is no number"))?
+                    preparation.divisor = value
+                        .parse()
+                        .map_err(|_| wrong("has a divisor that is no number"))?
                 }
                 "mean" => preparation.mean = three("mean", value)?,
                 "std" => preparation.deviation = three("std", value)?,
@@ -162,10 +183,12 @@ impl Preparation {
                 _ => return Err(wrong("has a word that means nothing to this program")),
             }
         }
+
         let window = window.ok_or_else(|| wrong("does not say how many images a clip has"))?;
         if preparation.describe(window) != text {
             return Err(wrong("does not have its own hash; it was altered"));
         }
+
         Ok((preparation, window))
     }
 
@@ -175,21 +198,35 @@ impl Preparation {
     /// [`Error::Option`].
     pub fn check(&self) -> Result<(), Error> {
         let usable = |value: f32| value.is_finite() && value != 0.0;
+
         let wrong = |what: &'static str, problem: &str| {
-            Err(Error::Option { what, given: self.text(1), problem: problem.to_owned() })
+            Err(Error::Option {
+                what,
+                given: self.text(1),
+                problem: problem.to_owned(),
+            })
         };
+
         if !usable(self.divisor) {
             return wrong("divisor", "must be finite and not 0");
         }
-        if !self.deviation.iter().all(|&value| usable(value)) || !self.mean.iter().all(|value| value.is_finite()) {
+
+        if !self.deviation.iter().all(|&value| usable(value))
+            || !self.mean.iter().all(|value| value.is_finite())
+        {
             return wrong("mean, std", "must be finite, std not 0");
         }
+
         Ok(())
     }
 }
 
 fn digest(text: &str) -> String {
-    Sha256::digest(text).iter().take(8).map(|byte| format!("{byte:02x}")).collect()
+    Sha256::digest(text)
+        .iter()
+        .take(8)
+        .map(|byte| format!("{byte:02x}"))
+        .collect()
 }
 
 impl Filter {
@@ -206,13 +243,14 @@ impl std::str::FromStr for Filter {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self, Error> {
-        [Self::Bilinear, Self::Bicubic, Self::Lanczos3].into_iter().find(|filter| filter.name() == text).ok_or_else(
-            || Error::Option {
+        [Self::Bilinear, Self::Bicubic, Self::Lanczos3]
+            .into_iter()
+            .find(|filter| filter.name() == text)
+            .ok_or_else(|| Error::Option {
                 what: "filter",
                 given: text.to_owned(),
                 problem: "is not bilinear, bicubic or lanczos3".to_owned(),
-            },
-        )
+            })
     }
 }
 
@@ -223,6 +261,7 @@ impl std::str::FromStr for Resize {
         if text == "none" {
             return Ok(Self::None);
         }
+
         if let Some(edge) = text.strip_prefix("shortest:") {
             return match edge.parse() {
                 Ok(edge) if (1..=LARGEST).contains(&edge) => Ok(Self::Shortest(edge)),
@@ -233,6 +272,7 @@ impl std::str::FromStr for Resize {
                 }),
             };
         }
+
         let (width, height) = size("resize", text)?;
         Ok(Self::Whole { width, height })
     }
@@ -240,8 +280,15 @@ impl std::str::FromStr for Resize {
 
 /// `WIDTHxHEIGHT`, pixels.
 pub(super) fn size(what: &'static str, text: &str) -> Result<(usize, usize), Error> {
-    let number = |text: &str| text.parse::<usize>().ok().filter(|edge| (1..=LARGEST).contains(edge));
-    let both = text.split_once('x').and_then(|(width, height)| Some((number(width)?, number(height)?)));
+    let number = |text: &str| {
+        text.parse::<usize>()
+            .ok()
+            .filter(|edge| (1..=LARGEST).contains(edge))
+    };
+    let both = text
+        .split_once('x')
+        .and_then(|(width, height)| Some((number(width)?, number(height)?)));
+
     both.ok_or_else(|| Error::Option {
         what,
         given: text.to_owned(),
@@ -255,29 +302,54 @@ pub(super) fn three(what: &'static str, text: &str) -> Result<[f32; 3], Error> {
     match numbers.as_deref() {
         Some(&[all]) => Ok([all; 3]),
         Some(&[r, g, b]) => Ok([r, g, b]),
-        _ => Err(Error::Option { what, given: text.to_owned(), problem: "is not three numbers R,G,B".to_owned() }),
+        _ => Err(Error::Option {
+            what,
+            given: text.to_owned(),
+            problem: "is not three numbers R,G,B".to_owned(),
+        }),
     }
 }
 
-fn resized(image: &RgbImage, width: usize, height: usize, filter: Filter) -> Result<RgbImage, Error> {
+fn resized(
+    image: &RgbImage,
+    width: usize,
+    height: usize,
+    filter: Filter,
+) -> Result<RgbImage, Error> {
     let bad = |problem: String| Error::BadImage {
         image: format!("image of {}×{} pixels", image.width, image.height),
         problem: format!("cannot be resized to {width}×{height}: {problem}"),
     };
+
     if width * height == 0 || image.width * image.height == 0 {
         return Err(bad("there is nothing in it".to_owned()));
     }
-    let from = ImageRef::new(image.width as u32, image.height as u32, &image.bytes, PixelType::U8x3)
-        .map_err(|error| bad(error.to_string()))?;
+
+    let from = ImageRef::new(
+        image.width as u32,
+        image.height as u32,
+        &image.bytes,
+        PixelType::U8x3,
+    )
+    .map_err(|error| bad(error.to_string()))?;
+
     let mut to = Image::new(width as u32, height as u32, PixelType::U8x3);
+
     let filter = match filter {
         Filter::Bilinear => FilterType::Bilinear,
         Filter::Bicubic => FilterType::CatmullRom,
         Filter::Lanczos3 => FilterType::Lanczos3,
     };
     let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(filter));
-    Resizer::new().resize(&from, &mut to, &options).map_err(|error| bad(error.to_string()))?;
-    Ok(RgbImage { width, height, bytes: to.into_vec() })
+    Resizer::new()
+        .resize(&from, &mut to, &options)
+        .map_err(|error| bad(error.to_string()))?;
+
+    Ok(RgbImage {
+        width,
+        height,
+        bytes: to.into_vec(),
+    })
 }
 
 fn cropped(image: &RgbImage, width: usize, height: usize) -> Result<RgbImage, Error> {
@@ -287,21 +359,42 @@ fn cropped(image: &RgbImage, width: usize, height: usize) -> Result<RgbImage, Er
             problem: format!("is smaller than the crop of {width}×{height}"),
         });
     }
-    let (left, top) = ((image.width - width) / 2, (image.height - height) / 2);
+
+    let left = (image.width - width) / 2;
+    let top = (image.height - height) / 2;
     let line = |row: usize| {
         let from = ((top + row) * image.width + left) * 3;
         &image.bytes[from..from + width * 3]
     };
-    Ok(RgbImage { width, height, bytes: (0..height).flat_map(line).copied().collect() })
+
+    Ok(RgbImage {
+        width,
+        height,
+        bytes: (0..height).flat_map(line).copied().collect(),
+    })
 }
 
 /// Appends an image's numbers, normalised, channel by channel: red plane, green plane, blue plane.
 pub fn normalised(preparation: &Preparation, image: &RgbImage, numbers: &mut Vec<f32>) {
-    let Preparation { divisor, mean, deviation, .. } = preparation;
+    let Preparation {
+        divisor,
+        mean,
+        deviation,
+        ..
+    } = preparation;
+
     for channel in 0..3 {
-        let (mean, deviation) = (mean[channel], deviation[channel]);
-        let table: [f32; 256] = std::array::from_fn(|value| (value as f32 / divisor - mean) / deviation);
-        numbers.extend(image.bytes[channel..].iter().step_by(3).map(|&value| table[usize::from(value)]));
+        let mean = mean[channel];
+        let deviation = deviation[channel];
+        let table: [f32; 256] =
+            std::array::from_fn(|value| (value as f32 / divisor - mean) / deviation);
+
+        numbers.extend(
+            image.bytes[channel..]
+                .iter()
+                .step_by(3)
+                .map(|&value| table[usize::from(value)]),
+        );
     }
 }
 
@@ -310,45 +403,113 @@ mod tests {
     use super::*;
 
     fn ramp(width: usize, height: usize) -> RgbImage {
-        let bytes = (0..width * height).flat_map(|i| [(i % width) as u8, (i / width) as u8, 7]).collect();
-        RgbImage { width, height, bytes }
+        let bytes = (0..width * height)
+            .flat_map(|i| [(i % width) as u8, (i / width) as u8, 7])
+            .collect();
+        RgbImage {
+            width,
+            height,
+            bytes,
+        }
     }
 
-    /// Oracle: by hand. 641×480 with its shorter edge at 240 is 320×240 (cut, not rounded); a centre crop of 100×50
-    /// begins at ((320 − 100) / 2, (240 − 50) / 2).
+    /// Oracle: by hand. 641×480 with its shorter edge at 240 is 320×240 (cut, not rounded); a
+    /// centre crop of 100×50 begins at ((320 − 100) / 2, (240 − 50) / 2).
     #[test]
     fn sizes_are_cut_and_crops_are_central() {
-        let preparation =
-            Preparation { resize: Resize::Shortest(240), crop: Some((100, 50)), ..Preparation::default() };
+        let preparation = Preparation {
+            resize: Resize::Shortest(240),
+            crop: Some((100, 50)),
+            ..Preparation::default()
+        };
         let found = preparation.pixels(ramp(641, 480)).unwrap();
+
         assert_eq!((found.width, found.height), (100, 50));
-        let uncropped = Preparation { crop: None, ..preparation }.pixels(ramp(641, 480)).unwrap();
+
+        let uncropped = Preparation {
+            crop: None,
+            ..preparation
+        }
+        .pixels(ramp(641, 480))
+        .unwrap();
+
         assert_eq!((uncropped.width, uncropped.height), (320, 240));
         assert_eq!(found.pixel(0, 0), uncropped.pixel(110, 95));
-        let tall = Preparation { resize: Resize::Shortest(10), ..Preparation::default() }.pixels(ramp(20, 45)).unwrap();
+
+        let tall = Preparation {
+            resize: Resize::Shortest(10),
+            ..Preparation::default()
+        }
+        .pixels(ramp(20, 45))
+        .unwrap();
+
         assert_eq!((tall.width, tall.height), (10, 22));
     }
 
-    /// Oracle: an image that has the size already is not touched, and one too small for its crop is refused.
+    /// Oracle: an image that has the size already is not touched, and one too small for its crop is
+    /// refused.
     #[test]
     fn nothing_is_done_that_need_not_be() {
-        let preparation = Preparation { resize: "30x20".parse().unwrap(), ..Preparation::default() };
+        let preparation = Preparation {
+            resize: "30x20".parse().unwrap(),
+            ..Preparation::default()
+        };
+
         assert_eq!(preparation.pixels(ramp(30, 20)).unwrap(), ramp(30, 20));
-        let crop = Preparation { crop: Some((31, 20)), ..Preparation::default() };
+
+        let crop = Preparation {
+            crop: Some((31, 20)),
+            ..Preparation::default()
+        };
+
         assert!(crop.pixels(ramp(30, 20)).is_err());
-        let strip = RgbImage { width: 1, height: 100_000, bytes: vec![0; 300_000] };
-        let shortest = Preparation { resize: Resize::Shortest(256), crop: Some((224, 224)), ..Preparation::default() };
-        assert!(shortest.pixels(strip).unwrap_err().to_string().contains("over the limit"), "a bomb");
-        let empty = RgbImage { width: 0, height: 0, bytes: Vec::new() };
+
+        let strip = RgbImage {
+            width: 1,
+            height: 100_000,
+            bytes: vec![0; 300_000],
+        };
+
+        let shortest = Preparation {
+            resize: Resize::Shortest(256),
+            crop: Some((224, 224)),
+            ..Preparation::default()
+        };
+
+        assert!(
+            shortest
+                .pixels(strip)
+                .unwrap_err()
+                .to_string()
+                .contains("over the limit"),
+            "a bomb"
+        );
+
+        let empty = RgbImage {
+            width: 0,
+            height: 0,
+            bytes: Vec::new(),
+        };
+
         assert!(preparation.pixels(empty).is_err());
     }
 
     /// Oracle: the formula by hand, and planes in the order red, green, blue.
     #[test]
     fn channels_are_normalised_each_by_its_own_numbers() {
-        let preparation =
-            Preparation { divisor: 2.0, mean: [1.0, 2.0, 3.0], deviation: [1.0, 2.0, 4.0], ..Preparation::default() };
-        let image = RgbImage { width: 2, height: 1, bytes: vec![2, 4, 6, 10, 20, 30] };
+        let preparation = Preparation {
+            divisor: 2.0,
+            mean: [1.0, 2.0, 3.0],
+            deviation: [1.0, 2.0, 4.0],
+            ..Preparation::default()
+        };
+
+        let image = RgbImage {
+            width: 2,
+            height: 1,
+            bytes: vec![2, 4, 6, 10, 20, 30],
+        };
+
         let mut numbers = Vec::new();
         normalised(&preparation, &image, &mut numbers);
         assert_eq!(numbers, [0.0, 4.0, 0.0, 4.0, 0.0, 3.0]);
@@ -365,10 +526,18 @@ mod tests {
             mean: [0.485, 0.456, 0.406],
             deviation: [0.229, 0.224, 0.225],
         };
+
         let text = preparation.describe(16);
         assert_eq!(Preparation::parse(&text).unwrap(), (preparation, 16));
         assert!(Preparation::parse(&text.replace("bicubic", "bilinear")).is_err());
-        for wrong in ["unspecified", "resize=0x5", "filter=box", "mean=1,2", "resize=shortest:99999"] {
+
+        for wrong in [
+            "unspecified",
+            "resize=0x5",
+            "filter=box",
+            "mean=1,2",
+            "resize=shortest:99999",
+        ] {
             assert!(Preparation::parse(wrong).is_err(), "{wrong}");
         }
     }

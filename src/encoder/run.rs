@@ -1,5 +1,5 @@
-//! A whole room through an encoder: images are decoded while others are run, rows are journalled as they come, and
-//! memory does not grow with the number of images but by their rows.
+//! A whole room through an encoder: images are decoded while others are run, rows are journalled as
+//! they come, and memory does not grow with the number of images but by their rows.
 
 use std::collections::BTreeMap;
 
@@ -59,8 +59,8 @@ pub struct Kept<'a> {
 /// Encodes every frame on the threads of the pool that calls; `done` hears how many are done.
 ///
 /// # Errors
-/// [`Error::BadImage`] or [`Error::Io`] for the first image that cannot be read, unless those are skipped;
-/// [`Error::Runtime`]; [`Error::Cancelled`].
+/// [`Error::BadImage`] or [`Error::Io`] for the first image that cannot be read, unless those are
+/// skipped; [`Error::Runtime`]; [`Error::Cancelled`].
 pub fn encode_room(
     task: &Task<'_>,
     encoder: &Encoder,
@@ -68,34 +68,77 @@ pub fn encode_room(
     done: &(dyn Fn(usize) + Sync),
 ) -> Result<Encoded, Error> {
     let frame_count = task.timeline.frame_count;
-    let before = kept.as_mut().map(|kept| std::mem::take(&mut kept.before)).unwrap_or_default();
-    let mut rows: BTreeMap<usize, Vec<f32>> = before.into_iter().filter(|(row, _)| *row < frame_count).collect();
+
+    let before = kept
+        .as_mut()
+        .map(|kept| std::mem::take(&mut kept.before))
+        .unwrap_or_default();
+    let mut rows: BTreeMap<usize, Vec<f32>> = before
+        .into_iter()
+        .filter(|(row, _)| *row < frame_count)
+        .collect();
+
     let resumed = rows.len();
     done(resumed);
-    let open: Vec<usize> = (0..frame_count).filter(|row| !rows.contains_key(row)).collect();
+    let open: Vec<usize> = (0..frame_count)
+        .filter(|row| !rows.contains_key(row))
+        .collect();
     let mut chunks = open.chunks(task.batch.max(1));
+
     let mut bad = Vec::new();
-    let mut ready = chunks.next().map(|chunk| prepare(task, encoder, chunk)).transpose()?;
+
+    let mut ready = chunks
+        .next()
+        .map(|chunk| prepare(task, encoder, chunk))
+        .transpose()?;
+
     while let Some(clips) = ready.take() {
         task.cancel.check()?;
         let next = chunks.next();
-        let (encoded, prepared) =
-            rayon::join(|| clips.encode(encoder), || next.map(|chunk| prepare(task, encoder, chunk)).transpose());
+        let (encoded, prepared) = rayon::join(
+            || clips.encode(encoder),
+            || next.map(|chunk| prepare(task, encoder, chunk)).transpose(),
+        );
         let encoded = encoded?;
+
         if let Some(kept) = &mut kept {
-            kept.journal.append(clips.good.iter().copied().zip(encoded.outer_iter().map(row_of)))?;
+            kept.journal.append(
+                clips
+                    .good
+                    .iter()
+                    .copied()
+                    .zip(encoded.outer_iter().map(row_of)),
+            )?;
         }
-        rows.extend(clips.good.iter().copied().zip(encoded.outer_iter().map(|row| row.to_vec())));
+
+        rows.extend(
+            clips
+                .good
+                .iter()
+                .copied()
+                .zip(encoded.outer_iter().map(|row| row.to_vec())),
+        );
+
         bad.extend(clips.bad);
         done(rows.len() + bad.len());
         ready = prepared?;
     }
+
     let good: Vec<usize> = rows.keys().copied().collect();
     let width = encoder.dims().iter().sum();
     let numbers = rows.into_values().flatten().collect();
-    let rows = Array2::from_shape_vec((good.len(), width), numbers)
-        .map_err(|error| Error::Runtime { runtime: encoder.runtime(), problem: error.to_string() })?;
-    Ok(Encoded { rows, good, bad, resumed })
+    let rows =
+        Array2::from_shape_vec((good.len(), width), numbers).map_err(|error| Error::Runtime {
+            runtime: encoder.runtime(),
+            problem: error.to_string(),
+        })?;
+
+    Ok(Encoded {
+        rows,
+        good,
+        bad,
+        resumed,
+    })
 }
 
 /// A row of a matrix in standard layout.
@@ -114,20 +157,40 @@ struct Clips {
 
 impl Clips {
     fn encode(&self, encoder: &Encoder) -> Result<Array2<f32>, Error> {
-        let clips: Vec<Vec<&RgbImage>> =
-            self.frames.iter().map(|frames| frames.iter().map(|frame| &self.images[frame]).collect()).collect();
+        let clips: Vec<Vec<&RgbImage>> = self
+            .frames
+            .iter()
+            .map(|frames| frames.iter().map(|frame| &self.images[frame]).collect())
+            .collect();
         encoder.encode(&clips)
     }
 }
 
 fn prepare(task: &Task<'_>, encoder: &Encoder, anchors: &[usize]) -> Result<Clips, Error> {
-    let frames: Vec<Vec<usize>> = anchors.iter().map(|&row| clip(task.timeline, row, encoder.window())).collect();
+    let frames: Vec<Vec<usize>> = anchors
+        .iter()
+        .map(|&row| clip(task.timeline, row, encoder.window()))
+        .collect();
     let mut wanted: Vec<usize> = frames.iter().flatten().copied().collect();
     wanted.sort_unstable();
+
     wanted.dedup();
-    let read = |row: usize| (row, (task.image)(row).and_then(|image| encoder.prepare(image)));
+
+    let read = |row: usize| {
+        (
+            row,
+            (task.image)(row).and_then(|image| encoder.prepare(image)),
+        )
+    };
     let read: Vec<(usize, Result<RgbImage, Error>)> = wanted.into_par_iter().map(read).collect();
-    let mut clips = Clips { images: BTreeMap::new(), frames: Vec::new(), good: Vec::new(), bad: Vec::new() };
+
+    let mut clips = Clips {
+        images: BTreeMap::new(),
+        frames: Vec::new(),
+        good: Vec::new(),
+        bad: Vec::new(),
+    };
+
     let mut problems = BTreeMap::new();
     for (row, image) in read {
         match image {
@@ -137,20 +200,32 @@ fn prepare(task: &Task<'_>, encoder: &Encoder, anchors: &[usize]) -> Result<Clip
             Err(error) => return Err(error),
         }
     }
+
     for (&anchor, frames) in anchors.iter().zip(frames) {
         match problems.get(&anchor) {
             Some(problem) => clips.bad.push((anchor, problem.clone())),
             None => {
                 let good = |frame: &usize| clips.images.contains_key(frame);
+
                 // Where another frame of the clip is bad, the nearest good one stands in for it.
                 let stand_in = |frame: usize| {
-                    frames.iter().copied().filter(good).min_by_key(|other| other.abs_diff(frame)).unwrap_or(anchor)
+                    frames
+                        .iter()
+                        .copied()
+                        .filter(good)
+                        .min_by_key(|other| other.abs_diff(frame))
+                        .unwrap_or(anchor)
                 };
-                clips.frames.push(frames.iter().map(|&frame| stand_in(frame)).collect());
+
+                clips
+                    .frames
+                    .push(frames.iter().map(|&frame| stand_in(frame)).collect());
+
                 clips.good.push(anchor);
             }
         }
     }
+
     Ok(clips)
 }
 
@@ -163,23 +238,31 @@ fn is_of_the_image(error: &Error) -> bool {
     }
 }
 
-/// The frames of the clip around an anchor: the anchor is in the middle (of an even number, after it); at the ends of
-/// a sequence its first or last frame stands in for those that are missing.
+/// The frames of the clip around an anchor: the anchor is in the middle (of an even number, after
+/// it); at the ends of a sequence its first or last frame stands in for those that are missing.
 fn clip(timeline: &Timeline, anchor: usize, window: usize) -> Vec<usize> {
     let joined = |row: usize| timeline.joins(FrameId(anchor as u32), FrameId(row as u32));
     let mut frames = Vec::with_capacity(window);
     for place in 0..window {
-        let (before, after) = ((window / 2).saturating_sub(place), place.saturating_sub(window / 2));
+        let before = (window / 2).saturating_sub(place);
+        let after = place.saturating_sub(window / 2);
         let mut frame = anchor;
         for _ in 0..before.max(after) {
-            let next = if before > 0 { frame.checked_sub(1) } else { Some(frame + 1) };
+            let next = if before > 0 {
+                frame.checked_sub(1)
+            } else {
+                Some(frame + 1)
+            };
+
             match next.filter(|&row| row < timeline.frame_count && joined(row)) {
                 Some(next) => frame = next,
                 None => break,
             }
         }
+
         frames.push(frame);
     }
+
     frames
 }
 
@@ -190,11 +273,17 @@ mod tests {
     /// Oracle: by hand, on two sequences of three frames.
     #[test]
     fn clips_stay_in_their_sequence() {
-        let timeline = Timeline { frame_count: 6, sequences: vec![0, 0, 0, 1, 1, 1], held_out: Vec::new() };
+        let timeline = Timeline {
+            frame_count: 6,
+            sequences: vec![0, 0, 0, 1, 1, 1],
+            held_out: Vec::new(),
+        };
+
         assert_eq!(clip(&timeline, 1, 1), [1]);
         assert_eq!(clip(&timeline, 1, 3), [0, 1, 2]);
         assert_eq!(clip(&timeline, 2, 3), [1, 2, 2]);
         assert_eq!(clip(&timeline, 3, 4), [3, 3, 3, 4]);
+
         assert_eq!(clip(&timeline, 5, 5), [3, 4, 5, 5, 5]);
     }
 
@@ -204,62 +293,118 @@ mod tests {
 
     fn image(row: usize) -> Result<RgbImage, Error> {
         if row == 3 {
-            return Err(Error::BadImage { image: "frame 3".to_owned(), problem: "is cut".to_owned() });
+            return Err(Error::BadImage {
+                image: "frame 3".to_owned(),
+                problem: "is cut".to_owned(),
+            });
         }
-        let bytes = (0..64 * 48 * 3).map(|i| ((i * (row + 1)) % 251) as u8).collect();
-        Ok(RgbImage { width: 64, height: 48, bytes })
+
+        let bytes = (0..64 * 48 * 3)
+            .map(|i| ((i * (row + 1)) % 251) as u8)
+            .collect();
+
+        Ok(RgbImage {
+            width: 64,
+            height: 48,
+            bytes,
+        })
     }
 
-    /// Oracle: the encoder called on each image alone; and that a second run asks only for what the first had not done.
+    /// Oracle: the encoder called on each image alone; and that a second run asks only for what the
+    /// first had not done.
     #[test]
     fn an_interrupted_run_goes_on_and_gives_the_same_rows() {
-        let (timeline, encoder) = (Timeline::unbroken(8), Encoder::builtin());
+        let timeline = Timeline::unbroken(8);
+        let encoder = Encoder::builtin();
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rows");
+
         let width = encoder.dims()[0];
         let cancel = Cancellation::default();
         let asked = std::sync::Mutex::new(Vec::new());
+
         let counting = |row: usize| {
             asked.lock().unwrap().push(row);
             if row >= 5 {
                 cancel.cancel()
             }
+
             image(row)
         };
-        let task = |image, on_bad| Task { timeline: &timeline, image, batch: 2, on_bad, cancel: &cancel };
+
+        let task = |image, on_bad| Task {
+            timeline: &timeline,
+            image,
+            batch: 2,
+            on_bad,
+            cancel: &cancel,
+        };
+
         let (mut journal, before) = Journal::open(&path, "k", width).unwrap();
-        let first = encode_room(&task(&counting, OnBadImage::Skip), &encoder, kept(&mut journal, before), &|_| ());
+        let first = encode_room(
+            &task(&counting, OnBadImage::Skip),
+            &encoder,
+            kept(&mut journal, before),
+            &|_| (),
+        );
+
         assert!(matches!(first, Err(Error::Cancelled(_))));
+
         drop(journal);
         asked.lock().unwrap().clear();
         let (mut journal, before) = Journal::open(&path, "k", width).unwrap();
         let done = before.len();
+
         assert!(done >= 2, "something was journalled");
+
         let go_on = Cancellation::default();
+
         let again = |row: usize| {
             asked.lock().unwrap().push(row);
             image(row)
         };
-        let task = Task { timeline: &timeline, image: &again, batch: 2, on_bad: OnBadImage::Skip, cancel: &go_on };
+
+        let task = Task {
+            timeline: &timeline,
+            image: &again,
+            batch: 2,
+            on_bad: OnBadImage::Skip,
+            cancel: &go_on,
+        };
+
         let found = encode_room(&task, &encoder, kept(&mut journal, before), &|_| ()).unwrap();
         assert_eq!(found.resumed, done);
         assert_eq!(asked.lock().unwrap().len(), 8 - done);
         assert_eq!(found.good, [0, 1, 2, 4, 5, 6, 7]);
+
         assert_eq!(found.bad.len(), 1);
         assert!(found.bad[0].1.contains("frame 3: is cut"));
+
         for (row, &frame) in found.rows.outer_iter().zip(&found.good) {
-            assert_eq!(row.to_vec(), super::super::encode_builtin(&image(frame).unwrap()));
+            assert_eq!(
+                row.to_vec(),
+                super::super::encode_builtin(&image(frame).unwrap())
+            );
         }
     }
 
-    /// Oracle: by hand. Of clips of three around frames 2, 3 and 4, with frame 3 bad, only frame 3 is left out.
+    /// Oracle: by hand. Of clips of three around frames 2, 3 and 4, with frame 3 bad, only frame 3
+    /// is left out.
     #[test]
     fn a_bad_image_costs_its_own_frame_alone() {
         let timeline = Timeline::unbroken(8);
         let mut encoder = Encoder::builtin();
         encoder.window = 3;
         let cancel = Cancellation::default();
-        let task = Task { timeline: &timeline, image: &image, batch: 8, on_bad: OnBadImage::Skip, cancel: &cancel };
+
+        let task = Task {
+            timeline: &timeline,
+            image: &image,
+            batch: 8,
+            on_bad: OnBadImage::Skip,
+            cancel: &cancel,
+        };
+
         let clips = prepare(&task, &encoder, &[2, 3, 4]).unwrap();
         assert_eq!((clips.good, clips.bad.len()), (vec![2, 4], 1));
         assert_eq!(clips.frames, [[1, 2, 2], [4, 4, 5]]);
@@ -268,11 +413,21 @@ mod tests {
     /// Oracle: the definition of stopping at a bad image: it is named, and nothing is given.
     #[test]
     fn a_bad_image_stops_the_run_by_name() {
-        let (timeline, encoder) = (Timeline::unbroken(8), Encoder::builtin());
+        let timeline = Timeline::unbroken(8);
+        let encoder = Encoder::builtin();
         let folder = tempfile::tempdir().unwrap();
-        let (mut journal, before) = Journal::open(&folder.path().join("rows"), "k", encoder.dims()[0]).unwrap();
+        let (mut journal, before) =
+            Journal::open(&folder.path().join("rows"), "k", encoder.dims()[0]).unwrap();
+
         let cancel = Cancellation::default();
-        let task = Task { timeline: &timeline, image: &image, batch: 3, on_bad: OnBadImage::Stop, cancel: &cancel };
+        let task = Task {
+            timeline: &timeline,
+            image: &image,
+            batch: 3,
+            on_bad: OnBadImage::Stop,
+            cancel: &cancel,
+        };
+
         let error = encode_room(&task, &encoder, kept(&mut journal, before), &|_| ()).unwrap_err();
         assert_eq!(error.to_string(), "frame 3: is cut");
     }

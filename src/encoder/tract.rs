@@ -1,5 +1,5 @@
-//! Models in tract: pure Rust. The plan is made for one clip, since an open batch is 2 to 6 times slower; a batch is
-//! spread over the threads of the pool that calls.
+//! Models in tract: pure Rust. The plan is made for one clip, since an open batch is 2 to 6 times
+//! slower; a batch is spread over the threads of the pool that calls.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -7,7 +7,8 @@ use std::sync::Arc;
 use ndarray::{ArrayD, ArrayViewD, Axis};
 use rayon::prelude::*;
 use tract_onnx::prelude::{
-    Datum, Framework, InferenceFact, InferenceModelExt, IntoRunnable, Tensor, TypedRunnableModel, tvec,
+    Datum, Framework, InferenceFact, InferenceModelExt, IntoRunnable, Tensor, TypedRunnableModel,
+    tvec,
 };
 
 use super::Error;
@@ -21,31 +22,63 @@ pub(super) struct Tract {
 
 impl Tract {
     pub fn open(file: &Path, names: &[String], shape: &[Option<usize>]) -> Result<Self, Error> {
-        let wrong = |problem: String| Error::Model { file: file.to_owned(), problem };
-        let open = || "has an open input size; give --resize WIDTHxHEIGHT, which this runtime needs".to_owned();
+        let wrong = |problem: String| Error::Model {
+            file: file.to_owned(),
+            problem,
+        };
+
+        let open = || {
+            "has an open input size; give --resize WIDTHxHEIGHT, which this runtime needs"
+                .to_owned()
+        };
+
         let fixed: Option<Vec<usize>> = shape.iter().skip(1).copied().collect();
         let fixed = fixed.ok_or_else(|| wrong(open()))?;
         let shape: Vec<usize> = std::iter::once(1).chain(fixed).collect();
-        let model = tract_onnx::onnx().model_for_path(file).and_then(|mut model| {
-            model.select_outputs_by_name(names)?;
-            model.set_input_fact(0, InferenceFact::dt_shape(f32::datum_type(), shape.as_slice()))?;
-            model.into_optimized()?.into_runnable()
-        });
+
+        let model = tract_onnx::onnx()
+            .model_for_path(file)
+            .and_then(|mut model| {
+                model.select_outputs_by_name(names)?;
+
+                model.set_input_fact(
+                    0,
+                    InferenceFact::dt_shape(f32::datum_type(), shape.as_slice()),
+                )?;
+
+                model.into_optimized()?.into_runnable()
+            });
+
         let model = model.map_err(|error| wrong(format!("cannot be run by tract: {error:#}")))?;
-        Ok(Self { model, names: names.to_vec() })
+        Ok(Self {
+            model,
+            names: names.to_vec(),
+        })
     }
 
     fn one(&self, clip: ArrayViewD<'_, f32>) -> Result<Vec<ArrayD<f32>>, Error> {
-        let failed = |problem: String| Error::Runtime { runtime: "tract", problem };
+        let failed = |problem: String| Error::Runtime {
+            runtime: "tract",
+            problem,
+        };
+
         let numbers: Vec<f32> = clip.iter().copied().collect();
-        let input = Tensor::from_shape(clip.shape(), &numbers).map_err(|error| failed(format!("{error:#}")))?;
-        let outputs = self.model.run(tvec!(input.into())).map_err(|error| failed(format!("{error:#}")))?;
+        let input = Tensor::from_shape(clip.shape(), &numbers)
+            .map_err(|error| failed(format!("{error:#}")))?;
+        let outputs = self
+            .model
+            .run(tvec!(input.into()))
+            .map_err(|error| failed(format!("{error:#}")))?;
+
         let array = |output: &tract_onnx::prelude::TValue| {
             let numbers = output.to_plain_array_view::<f32>();
             let numbers = numbers.map_err(|error| failed(format!("{error:#}")))?;
             let shape = numbers.shape().to_vec();
-            ArrayD::from_shape_vec(shape, numbers.iter().copied().collect()).map_err(|error| failed(error.to_string()))
+
+            ArrayD::from_shape_vec(shape, numbers.iter().copied().collect())
+                .map_err(|error| failed(error.to_string()))
         };
+
         outputs.iter().map(array).collect()
     }
 }
@@ -57,14 +90,23 @@ impl Runner for Tract {
             .into_par_iter()
             .map(|clip| self.one(input.slice_axis(Axis(0), ndarray::Slice::from(clip..clip + 1))))
             .collect::<Result<_, _>>()?;
+
         let count = self.names.len();
+
         let joined = |output: usize| {
             let parts: Vec<_> = each.iter().map(|outputs| outputs[output].view()).collect();
             ndarray::concatenate(Axis(0), &parts).map_err(|_| {
-                let problem = format!("layer '{}' has no axis that counts images", self.names[output]);
-                Error::Runtime { runtime: "tract", problem }
+                let problem = format!(
+                    "layer '{}' has no axis that counts images",
+                    self.names[output]
+                );
+                Error::Runtime {
+                    runtime: "tract",
+                    problem,
+                }
             })
         };
+
         (0..count).map(joined).collect()
     }
 }

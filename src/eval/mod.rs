@@ -34,19 +34,32 @@ pub enum Error {
         "'{navigator}' is fitted on pairs that are not tested, and the split '{split}' leaves none here; \
          take its in-sample variant, or another split"
     )]
-    NothingToFitOn { navigator: String, split: pairs::Split },
+    NothingToFitOn {
+        navigator: String,
+        split: pairs::Split,
+    },
     #[error("no candidate frame is left for source frame {source_frame}")]
     NoCandidates { source_frame: room::FrameId },
     #[error("no predictions were given")]
     NoPredictions,
     #[error("prediction {position}: {problem}")]
-    Prediction { position: usize, problem: Box<Error> },
+    Prediction {
+        position: usize,
+        problem: Box<Error>,
+    },
     #[error("the retrieved frame {frame} is not a candidate under the split '{split}'")]
-    NotACandidate { frame: room::FrameId, split: pairs::Split },
+    NotACandidate {
+        frame: room::FrameId,
+        split: pairs::Split,
+    },
     #[error("the retrieved frame {frame} is excluded with its source")]
     Excluded { frame: room::FrameId },
     #[error("({source_frame}, {target_frame}) is no test pair under the split '{split}'")]
-    NotATestPair { source_frame: room::FrameId, target_frame: room::FrameId, split: pairs::Split },
+    NotATestPair {
+        source_frame: room::FrameId,
+        target_frame: room::FrameId,
+        split: pairs::Split,
+    },
     #[error("predictions must be all latents or all retrieved frames, not a mixture")]
     MixedPredictions,
 }
@@ -60,9 +73,16 @@ pub const MAX_THRESHOLDS: usize = 32;
 /// Refuses an ε that no error can be under, or that is not a number.
 pub fn check_thresholds(thresholds: &[f64]) -> Result<(), Error> {
     if thresholds.is_empty() || thresholds.len() > MAX_THRESHOLDS {
-        return Err(Error::ThresholdCount { count: thresholds.len(), most: MAX_THRESHOLDS });
+        return Err(Error::ThresholdCount {
+            count: thresholds.len(),
+            most: MAX_THRESHOLDS,
+        });
     }
-    match thresholds.iter().find(|value| !(**value > 0.0 && **value <= MAX_THRESHOLD)) {
+
+    match thresholds
+        .iter()
+        .find(|value| !(**value > 0.0 && **value <= MAX_THRESHOLD))
+    {
         Some(&value) => Err(Error::Threshold { value }),
         None => Ok(()),
     }

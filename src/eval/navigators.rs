@@ -11,7 +11,8 @@ use crate::cancel::Cancellation;
 use crate::geometry::{Pose, body_twist};
 use crate::index::Exclusion;
 use crate::navigation::{
-    self, Ground, Leg, Metric, Mode, Navigator, Plan, Refit, Search, Space, Start, StepKind, Stepper, walk,
+    self, Ground, Leg, Metric, Mode, Navigator, Plan, Refit, Search, Space, Start, StepKind,
+    Stepper, walk,
 };
 use crate::pairs::{Pair, Split};
 use crate::room::{FrameId, Timeline};
@@ -19,8 +20,9 @@ use crate::room::{FrameId, Timeline};
 /// One way to choose the next frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NavigatorKind {
-    /// ĝ = g: stay. It retrieves the source itself, also where another frame looks exactly the same, so that its
-    /// Hit@ε is P(‖ΔP‖ < ε), whatever the encoder; with the source excluded, the frame that looks most like it.
+    /// ĝ = g: stay. It retrieves the source itself, also where another frame looks exactly the
+    /// same, so that its Hit@ε is P(‖ΔP‖ < ε), whatever the encoder; with the source excluded, the
+    /// frame that looks most like it.
     Identity,
     /// A candidate drawn at random.
     Random,
@@ -39,33 +41,52 @@ impl NavigatorKind {
         let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
         let steps = StepKind::all().into_iter();
         let steps = steps.flat_map(|step| Metric::ALL.map(|metric| (step, metric)));
-        let steps = steps.filter(|&(step, metric)| metric != Metric::Calibrated || step == homogeneous);
+        let steps =
+            steps.filter(|&(step, metric)| metric != Metric::Calibrated || step == homogeneous);
         let steps = steps.map(|(step, metric)| Self::Step(step, metric));
-        [Self::Identity, Self::Random, Self::Oracle].into_iter().chain(steps).collect()
+
+        [Self::Identity, Self::Random, Self::Oracle]
+            .into_iter()
+            .chain(steps)
+            .collect()
     }
 
-    /// The rows of the table for an adapter: the baselines, the three readings, its correctors, the refits on raw
-    /// motions, and inverse Poincaré under the other metrics that it has.
+    /// The rows of the table for an adapter: the baselines, the three readings, its correctors, the
+    /// refits on raw motions, and inverse Poincaré under the other metrics that it has.
     pub fn table(adapter: &Adapter) -> Vec<Self> {
         let full = |step: StepKind| Self::Step(step, Metric::Full);
         let corrector = |kind: CorrectorKind| full(StepKind::Corrector(kind));
-        let refit = |in_sample: bool| full(StepKind::Refit(Refit { z_scored: false, intercept: false, in_sample }));
+
+        let refit = |in_sample: bool| {
+            full(StepKind::Refit(Refit {
+                z_scored: false,
+                intercept: false,
+                in_sample,
+            }))
+        };
+
         let affine = StepKind::InversePoincare(Reading::Affine);
         let gated = adapter.motion_of_coordinates().is_err();
         let others = [Metric::RowSpace, Metric::Whitened, Metric::Motion];
-        let others = others.into_iter().filter(|&metric| !(gated && metric == Metric::Motion));
+        let others = others
+            .into_iter()
+            .filter(|&metric| !(gated && metric == Metric::Motion));
+
         let mut rows = vec![Self::Identity, Self::Random, Self::Oracle];
         rows.extend(Reading::ALL.map(|reading| full(StepKind::InversePoincare(reading))));
         rows.extend(adapter.correctors().map(|known| corrector(known.kind())));
         rows.extend([refit(false), refit(true)]);
+
         rows.extend(others.map(|metric| Self::Step(affine, metric)));
         let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
         let calibrated = adapter.error_covariance().filter(|_| !gated);
         rows.extend(calibrated.map(|_| Self::Step(homogeneous, Metric::Calibrated)));
+
         rows
     }
 
-    /// Its name in tables, JSON and on the wire: the way to step, and `+METRIC` unless that is the paper's.
+    /// Its name in tables, JSON and on the wire: the way to step, and `+METRIC` unless that is the
+    /// paper's.
     pub fn name(self) -> String {
         match self {
             Self::Identity => "identity".to_owned(),
@@ -114,34 +135,49 @@ pub struct Protocol {
 }
 
 impl Protocol {
-    /// The rows that a table of this protocol has in a room: those that were asked for, or the adapter's own.
+    /// The rows that a table of this protocol has in a room: those that were asked for, or the
+    /// adapter's own.
     ///
     /// # Errors
-    /// [`Error::NothingToFitOn`] for a refit without pairs of its own, [`Error::Navigation`] for no step at all.
+    /// [`Error::NothingToFitOn`] for a refit without pairs of its own, [`Error::Navigation`] for no
+    /// step at all.
     pub fn rows(&self, navigator: &Navigator) -> Result<Vec<NavigatorKind>, Error> {
         if self.steps == 0 {
-            return Err(navigation::Error::Steps { actual: 0, most: u32::MAX }.into());
+            return Err(navigation::Error::Steps {
+                actual: 0,
+                most: u32::MAX,
+            }
+            .into());
         }
+
         let can_fit = self.can_fit(navigator.room().timeline());
         let unfitted = |kind: &NavigatorKind| {
-            matches!(kind, NavigatorKind::Step(StepKind::Refit(refit), _) if !refit.in_sample) && !can_fit
+            matches!(kind, NavigatorKind::Step(StepKind::Refit(refit), _) if !refit.in_sample)
+                && !can_fit
         };
+
         if self.navigators.is_empty() {
             let table = NavigatorKind::table(navigator.adapter());
             return Ok(table.into_iter().filter(|kind| !unfitted(kind)).collect());
         }
+
         match self.navigators.iter().find(|kind| unfitted(kind)) {
-            Some(kind) => Err(Error::NothingToFitOn { navigator: kind.name(), split: self.split }),
+            Some(kind) => Err(Error::NothingToFitOn {
+                navigator: kind.name(),
+                split: self.split,
+            }),
             None => Ok(self.navigators.clone()),
         }
     }
 
-    /// Whether there are pairs apart from those that are tested: a refit that is not in sample needs some.
+    /// Whether there are pairs apart from those that are tested: a refit that is not in sample
+    /// needs some.
     fn can_fit(&self, timeline: &Timeline) -> bool {
         self.split != Split::Whole && self.split.train_pairs(timeline, self.stride).is_ok()
     }
 
-    /// The paper's protocol at a stride: time split, source included, one step, ε of 0.1, 0.2, 0.3 and 0.5.
+    /// The paper's protocol at a stride: time split, source included, one step, ε of 0.1, 0.2, 0.3
+    /// and 0.5.
     pub fn paper(stride: u32) -> Self {
         Self {
             split: Split::Time,
@@ -182,7 +218,8 @@ pub struct Report {
     pub protocol: Protocol,
 }
 
-/// Evaluates every navigator of the protocol on the room's test pairs; `progress` hears of each one begun.
+/// Evaluates every navigator of the protocol on the room's test pairs; `progress` hears of each one
+/// begun.
 ///
 /// # Errors
 /// [`Error`], when the room is too short, a threshold is no threshold, or the work is cancelled.
@@ -197,24 +234,39 @@ pub fn evaluate(
     check_thresholds(&protocol.thresholds)?;
     let timeline = navigator.room().timeline();
     let navigators = protocol.rows(navigator)?;
+
     let bench = Bench {
         poses: navigator.room().poses(),
         adapter: navigator.adapter(),
         latents: navigator.latents(),
         test: protocol.split.test_pairs(timeline, protocol.stride)?,
-        train: protocol.split.train_pairs(timeline, protocol.stride).unwrap_or_default(),
+        train: protocol
+            .split
+            .train_pairs(timeline, protocol.stride)
+            .unwrap_or_default(),
         candidates: protocol.split.candidates(timeline),
         protocol,
         cancel,
     };
+
     let mut rows = Vec::with_capacity(navigators.len());
     for (position, &kind) in navigators.iter().enumerate() {
         cancel.check()?;
         progress(position, kind);
         rows.push(bench.row(kind)?);
     }
-    let protocol = Protocol { navigators, ..protocol.clone() };
-    Ok(Report { rows, n: bench.test.len(), candidate_count: bench.candidates.len(), protocol })
+
+    let protocol = Protocol {
+        navigators,
+        ..protocol.clone()
+    };
+
+    Ok(Report {
+        rows,
+        n: bench.test.len(),
+        candidate_count: bench.candidates.len(),
+        protocol,
+    })
 }
 
 /// What every row is computed from.
@@ -236,8 +288,14 @@ impl Bench<'_> {
             NavigatorKind::Random => Ok(self.row_of_frames(kind, &self.random_frames()?)),
             NavigatorKind::Oracle => Ok(self.row_of_frames(kind, &self.nearest_poses()?)),
             NavigatorKind::Step(step, metric) => {
-                let ground = Ground { latents: self.latents, poses: self.poses, train: &self.train, test: &self.test };
+                let ground = Ground {
+                    latents: self.latents,
+                    poses: self.poses,
+                    train: &self.train,
+                    test: &self.test,
+                };
                 let stepper = Stepper::new(step, self.adapter, ground)?;
+
                 let search = Search::exact(metric, self.adapter, self.latents, &self.candidates)?;
                 let space = Space {
                     adapter: self.adapter,
@@ -246,27 +304,56 @@ impl Bench<'_> {
                     poses: self.poses,
                     search: &search,
                 };
-                let mut predicted = Array2::zeros((self.test.len(), self.adapter.coordinate_count()));
+
+                let mut predicted =
+                    Array2::zeros((self.test.len(), self.adapter.coordinate_count()));
                 let mut retrieved = Vec::with_capacity(self.test.len());
                 for (&pair, mut row) in self.test.iter().zip(predicted.outer_iter_mut()) {
-                    let Some(end) = self.walked(space, pair)?.pop() else { continue };
+                    let Some(end) = self.walked(space, pair)?.pop() else {
+                        continue;
+                    };
                     row.assign(&end.latent.slice(s![..self.adapter.coordinate_count()]));
+
                     retrieved.push(end.neighbours[0].frame);
                 }
+
                 Ok(self.scored(kind, &predicted, &retrieved))
             }
         }
     }
 
     fn walked(&self, space: Space<'_>, pair: Pair) -> Result<Vec<navigation::Step>, Error> {
-        let Protocol { steps, mode, exclude_source, .. } = *self.protocol;
+        let Protocol {
+            steps,
+            mode,
+            exclude_source,
+            ..
+        } = *self.protocol;
+
         let [source, target] = [pair.source, pair.target].map(|frame| self.poses[frame.row()]);
         let latent = self.latents.row(pair.source.row()).to_owned();
-        let start = Start { latent, frame: Some(pair.source), pose: Some(source) };
-        let leg = Leg { motion: body_twist(&source, &target), goal: Some(target) };
-        let plan = Plan { mode, steps, hit_count: 1, exclude_source };
+        let start = Start {
+            latent,
+            frame: Some(pair.source),
+            pose: Some(source),
+        };
+
+        let leg = Leg {
+            motion: body_twist(&source, &target),
+            goal: Some(target),
+        };
+
+        let plan = Plan {
+            mode,
+            steps,
+            hit_count: 1,
+            exclude_source,
+        };
+
         walk(space, &start, leg, plan, self.cancel).map_err(|error| match error {
-            navigation::Error::NoCandidates { .. } => Error::NoCandidates { source_frame: pair.source },
+            navigation::Error::NoCandidates { .. } => Error::NoCandidates {
+                source_frame: pair.source,
+            },
             other => other.into(),
         })
     }
@@ -276,20 +363,34 @@ impl Bench<'_> {
             let sources: Vec<FrameId> = self.test.iter().map(|pair| pair.source).collect();
             return Ok(self.row_of_frames(NavigatorKind::Identity, &sources));
         }
+
         let search = Search::exact(Metric::Full, self.adapter, self.latents, &self.candidates)?;
         let mut retrieved = Vec::with_capacity(self.test.len());
         for pair in &self.test {
             self.cancel.check()?;
-            let nearest = search.nearest(self.latents.row(pair.source.row()), 1, self.exclusion(pair.source));
-            let found = nearest.first().ok_or(Error::NoCandidates { source_frame: pair.source })?;
+
+            let nearest = search.nearest(
+                self.latents.row(pair.source.row()),
+                1,
+                self.exclusion(pair.source),
+            );
+            let found = nearest.first().ok_or(Error::NoCandidates {
+                source_frame: pair.source,
+            })?;
+
             retrieved.push(found.frame);
         }
+
         let here = self.coordinates_of(self.test.iter().map(|pair| pair.source));
         Ok(self.scored(NavigatorKind::Identity, &here, &retrieved))
     }
 
     fn row_of_frames(&self, kind: NavigatorKind, retrieved: &[FrameId]) -> Row {
-        self.scored(kind, &self.coordinates_of(retrieved.iter().copied()), retrieved)
+        self.scored(
+            kind,
+            &self.coordinates_of(retrieved.iter().copied()),
+            retrieved,
+        )
     }
 
     fn scored(&self, kind: NavigatorKind, predicted: &Array2<f64>, retrieved: &[FrameId]) -> Row {
@@ -298,7 +399,12 @@ impl Bench<'_> {
             name: kind.name(),
             n: self.test.len(),
             latent: Some(LatentScores::of(targets.view(), predicted.view())),
-            retrieval: RetrievalScores::of(&self.test, retrieved, self.poses, &self.protocol.thresholds),
+            retrieval: RetrievalScores::of(
+                &self.test,
+                retrieved,
+                self.poses,
+                &self.protocol.thresholds,
+            ),
         }
     }
 
@@ -309,6 +415,7 @@ impl Bench<'_> {
             let allowed = self.allowed(pair.source)?;
             Ok(allowed[random.random_range(0..allowed.len())])
         };
+
         self.test.iter().map(draw).collect()
     }
 
@@ -316,10 +423,21 @@ impl Bench<'_> {
         let mut nearest = Vec::with_capacity(self.test.len());
         for &pair in &self.test {
             self.cancel.check()?;
-            let errors = self.allowed(pair.source)?.into_iter().map(|f| (twist_error(pair, f, self.poses), f));
+
+            let errors = self
+                .allowed(pair.source)?
+                .into_iter()
+                .map(|f| (twist_error(pair, f, self.poses), f));
             let best = errors.min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-            nearest.push(best.ok_or(Error::NoCandidates { source_frame: pair.source })?.1);
+
+            nearest.push(
+                best.ok_or(Error::NoCandidates {
+                    source_frame: pair.source,
+                })?
+                .1,
+            );
         }
+
         Ok(nearest)
     }
 
@@ -328,15 +446,25 @@ impl Bench<'_> {
         let exclusion = self.exclusion(source);
         let open = |frame: &FrameId| !exclusion.is_some_and(|exclusion| exclusion.covers(*frame));
         let allowed: Vec<FrameId> = self.candidates.iter().copied().filter(open).collect();
-        if allowed.is_empty() { Err(Error::NoCandidates { source_frame: source }) } else { Ok(allowed) }
+        if allowed.is_empty() {
+            Err(Error::NoCandidates {
+                source_frame: source,
+            })
+        } else {
+            Ok(allowed)
+        }
     }
 
     fn exclusion(&self, centre: FrameId) -> Option<Exclusion> {
-        self.protocol.exclude_source.map(|radius| Exclusion { centre, radius })
+        self.protocol
+            .exclude_source
+            .map(|radius| Exclusion { centre, radius })
     }
 
     fn coordinates_of(&self, frames: impl Iterator<Item = FrameId>) -> Array2<f64> {
-        let coordinates = self.latents.slice(s![.., ..self.adapter.coordinate_count()]);
+        let coordinates = self
+            .latents
+            .slice(s![.., ..self.adapter.coordinate_count()]);
         coordinates.select(Axis(0), &frames.map(FrameId::row).collect::<Vec<_>>())
     }
 }

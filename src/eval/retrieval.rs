@@ -8,8 +8,15 @@ use crate::room::FrameId;
 use crate::scores::{Rate, mean, median};
 
 /// Joint bars of translation, metres, and rotation, degrees, as hloc and ACE report them.
-const POSE_BARS: [(f64, f64); 7] =
-    [(0.01, 1.0), (0.02, 2.0), (0.05, 5.0), (0.1, 5.0), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0)];
+const POSE_BARS: [(f64, f64); 7] = [
+    (0.01, 1.0),
+    (0.02, 2.0),
+    (0.05, 5.0),
+    (0.1, 5.0),
+    (0.25, 2.0),
+    (0.5, 5.0),
+    (5.0, 10.0),
+];
 
 /// Share of pairs within a distance and an angle.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -45,13 +52,19 @@ impl RetrievalScores {
     /// Scores one retrieved frame a pair; frames must be of the room whose `poses` are given.
     pub fn of(pairs: &[Pair], retrieved: &[FrameId], poses: &[Pose], thresholds: &[f64]) -> Self {
         let n = pairs.len();
-        let twist_errors: Vec<f64> =
-            pairs.iter().zip(retrieved).map(|(&pair, &frame)| twist_error(pair, frame, poses)).collect();
+
+        let twist_errors: Vec<f64> = pairs
+            .iter()
+            .zip(retrieved)
+            .map(|(&pair, &frame)| twist_error(pair, frame, poses))
+            .collect();
+
         let pose_errors: Vec<PoseError> = pairs
             .iter()
             .zip(retrieved)
             .map(|(pair, frame)| PoseError::between(&poses[frame.row()], &poses[pair.target.row()]))
             .collect();
+
         let rate = |count: usize| Rate::of(count, n);
         let recall = |(translation_m, rotation_deg): (f64, f64)| PoseRecall {
             translation_m,
@@ -59,20 +72,50 @@ impl RetrievalScores {
             rate: rate(
                 pose_errors
                     .iter()
-                    .filter(|e| e.translation_m < translation_m && e.rotation_rad < rotation_deg.to_radians())
+                    .filter(|e| {
+                        e.translation_m < translation_m
+                            && e.rotation_rad < rotation_deg.to_radians()
+                    })
                     .count(),
             ),
         };
+
         Self {
-            top1: rate(pairs.iter().zip(retrieved).filter(|(pair, frame)| pair.target == **frame).count()),
+            top1: rate(
+                pairs
+                    .iter()
+                    .zip(retrieved)
+                    .filter(|(pair, frame)| pair.target == **frame)
+                    .count(),
+            ),
             hits: thresholds
                 .iter()
-                .map(|&epsilon| (epsilon, rate(twist_errors.iter().filter(|&&error| error < epsilon).count())))
+                .map(|&epsilon| {
+                    (
+                        epsilon,
+                        rate(
+                            twist_errors
+                                .iter()
+                                .filter(|&&error| error < epsilon)
+                                .count(),
+                        ),
+                    )
+                })
                 .collect(),
             twist_error_mean: mean(&twist_errors),
             twist_error_median: median(&twist_errors),
-            translation_m_median: median(&pose_errors.iter().map(|e| e.translation_m).collect::<Vec<_>>()),
-            rotation_rad_median: median(&pose_errors.iter().map(|e| e.rotation_rad).collect::<Vec<_>>()),
+            translation_m_median: median(
+                &pose_errors
+                    .iter()
+                    .map(|e| e.translation_m)
+                    .collect::<Vec<_>>(),
+            ),
+            rotation_rad_median: median(
+                &pose_errors
+                    .iter()
+                    .map(|e| e.rotation_rad)
+                    .collect::<Vec<_>>(),
+            ),
             pose_recalls: POSE_BARS.into_iter().map(recall).collect(),
         }
     }
@@ -92,7 +135,8 @@ pub fn twist_error(pair: Pair, frame: FrameId, poses: &[Pose]) -> f64 {
 pub struct LatentScores {
     /// Mean squared error over pairs and columns.
     pub mse: f64,
-    /// R² over all columns together, weighted by their variance: what the paper's figures are consistent with.
+    /// R² over all columns together, weighted by their variance: what the paper's figures are
+    /// consistent with.
     pub r2: f64,
     /// Mean of the columns' R².
     pub r2_uniform: f64,
@@ -104,16 +148,39 @@ impl LatentScores {
         // Latents that deviate by less than 1e-9 do not vary: it is rounding.
         let still = targets.nrows() as f64 * 1e-18;
         let mut column_r2 = Vec::with_capacity(targets.ncols());
-        let (mut residual, mut total) = (0.0, 0.0);
+        let mut residual = 0.0;
+        let mut total = 0.0;
+
         for (target, predicted) in targets.axis_iter(Axis(1)).zip(predicted.axis_iter(Axis(1))) {
             let mean = target.sum() / target.len() as f64;
-            let column_residual: f64 = target.iter().zip(&predicted).map(|(t, p)| (t - p) * (t - p)).sum();
+
+            let column_residual: f64 = target
+                .iter()
+                .zip(&predicted)
+                .map(|(t, p)| (t - p) * (t - p))
+                .sum();
+
             let column_total: f64 = target.iter().map(|t| (t - mean) * (t - mean)).sum();
-            column_r2.push(if column_total > still { 1.0 - column_residual / column_total } else { f64::NAN });
+            column_r2.push(if column_total > still {
+                1.0 - column_residual / column_total
+            } else {
+                f64::NAN
+            });
+
             residual += column_residual;
             total += column_total;
         }
-        let r2 = if total > still { 1.0 - residual / total } else { f64::NAN };
-        Self { mse: residual / targets.len() as f64, r2, r2_uniform: mean(&column_r2) }
+
+        let r2 = if total > still {
+            1.0 - residual / total
+        } else {
+            f64::NAN
+        };
+
+        Self {
+            mse: residual / targets.len() as f64,
+            r2,
+            r2_uniform: mean(&column_r2),
+        }
     }
 }

@@ -49,7 +49,10 @@ impl Course {
             Self::Blocks => row.is_multiple_of(2) && !Self::is_gap(*row, frame_count),
             Self::Time => *row < frame_count * 4 / 5,
         };
-        (0..frame_count).filter(keep).map(|row| FrameId(row as u32)).collect()
+        (0..frame_count)
+            .filter(keep)
+            .map(|row| FrameId(row as u32))
+            .collect()
     }
 
     /// The frames that are followed, none of them mapped.
@@ -58,7 +61,10 @@ impl Course {
             Self::Interleaved | Self::Blocks => row % 2 == 1,
             Self::Time => *row >= frame_count * 4 / 5,
         };
-        (0..frame_count).filter(keep).map(|row| FrameId(row as u32)).collect()
+        (0..frame_count)
+            .filter(keep)
+            .map(|row| FrameId(row as u32))
+            .collect()
     }
 
     /// Whether the frames beside a followed one are mapped.
@@ -106,19 +112,44 @@ pub enum Begin {
     Unknown,
 }
 
-/// Follows stretches one after the other, as if no frame lay in between, so many nanoseconds from row to row.
-pub fn follow(tracker: &Tracker, stretches: &[Stretch<'_>], period_ns: i64, begin: Begin) -> Followed {
-    let first = stretches.first().and_then(|stretch| Some(stretch.poses[stretch.frames.first()?.row()]));
+/// Follows stretches one after the other, as if no frame lay in between, so many nanoseconds from
+/// row to row.
+pub fn follow(
+    tracker: &Tracker,
+    stretches: &[Stretch<'_>],
+    period_ns: i64,
+    begin: Begin,
+) -> Followed {
+    let first = stretches
+        .first()
+        .and_then(|stretch| Some(stretch.poses[stretch.frames.first()?.row()]));
     let start = first.map(|pose| Belief::known(pose, 1e-3, 1e-3));
     let mut state: State = tracker.start(start.filter(|_| begin == Begin::Known));
-    let (mut truth, mut numbers, mut updates) = (Trajectory::default(), Vec::new(), Vec::new());
+
+    let mut truth = Trajectory::default();
+    let mut numbers = Vec::new();
+    let mut updates = Vec::new();
     let mut number: u64 = 0;
-    for Stretch { latents, poses, frames } in stretches {
+
+    for Stretch {
+        latents,
+        poses,
+        frames,
+    } in stretches
+    {
         for (place, frame) in frames.iter().enumerate() {
             // As many numbers on as rows; one on from stretch to stretch.
-            number += place.checked_sub(1).map_or(1, |before| u64::from(frame.0 - frames[before].0));
+            number += place
+                .checked_sub(1)
+                .map_or(1, |before| u64::from(frame.0 - frames[before].0));
+
             let time_ns = number as i64 * period_ns;
-            let observation = Observation { time_ns, sequence: number, latent: latents.row(frame.row()).to_owned() };
+            let observation = Observation {
+                time_ns,
+                sequence: number,
+                latent: latents.row(frame.row()).to_owned(),
+            };
+
             // Latents of the tracker's own adapter, in order: none is refused.
             if let Ok(update) = tracker.observe(&mut state, &observation) {
                 truth.times_ns.push(time_ns);
@@ -128,77 +159,138 @@ pub fn follow(tracker: &Tracker, stretches: &[Stretch<'_>], period_ns: i64, begi
             }
         }
     }
-    Followed { truth, numbers, updates }
+
+    Followed {
+        truth,
+        numbers,
+        updates,
+    }
 }
 
 impl Followed {
     /// `map_from_camera` of the frames where a place was known, with the places of those frames.
     pub fn map_path(&self) -> (Trajectory, Vec<usize>) {
-        let known = self.updates.iter().enumerate().filter_map(|(at, update)| Some((at, update.place?.pose)));
+        let known = self
+            .updates
+            .iter()
+            .enumerate()
+            .filter_map(|(at, update)| Some((at, update.place?.pose)));
         let (places, poses): (Vec<usize>, Vec<Pose>) = known.unzip();
         let times_ns = places.iter().map(|&at| self.truth.times_ns[at]).collect();
+
         (Trajectory { times_ns, poses }, places)
     }
 
     /// `odom_from_camera`, laid on the true first pose.
     pub fn odom_path(&self) -> Trajectory {
         let first = self.truth.poses.first().copied().unwrap_or_default();
-        let poses = self.updates.iter().map(|update| first * update.odom.pose).collect();
-        Trajectory { times_ns: self.truth.times_ns.clone(), poses }
+        let poses = self
+            .updates
+            .iter()
+            .map(|update| first * update.odom.pose)
+            .collect();
+
+        Trajectory {
+            times_ns: self.truth.times_ns.clone(),
+            poses,
+        }
     }
 
     /// The squared Mahalanobis lengths of the errors of places.
     pub fn place_surprises(&self) -> Vec<f64> {
-        self.updates.iter().zip(&self.truth.poses).filter_map(place_surprise).collect()
+        self.updates
+            .iter()
+            .zip(&self.truth.poses)
+            .filter_map(place_surprise)
+            .collect()
     }
 
     /// The same, of frames whose neighbours on the way are mapped or not.
-    pub fn place_surprises_where(&self, is_mapped: impl Fn(usize) -> bool, wanted: bool) -> Vec<f64> {
+    pub fn place_surprises_where(
+        &self,
+        is_mapped: impl Fn(usize) -> bool,
+        wanted: bool,
+    ) -> Vec<f64> {
         let frames = self.updates.iter().zip(&self.truth.poses).enumerate();
-        frames.filter(|(at, _)| is_mapped(*at) == wanted).filter_map(|(_, frame)| place_surprise(frame)).collect()
+        frames
+            .filter(|(at, _)| is_mapped(*at) == wanted)
+            .filter_map(|(_, frame)| place_surprise(frame))
+            .collect()
     }
 
-    /// The squared Mahalanobis lengths of the errors of read motions, with the lengths of the motions read.
+    /// The squared Mahalanobis lengths of the errors of read motions, with the lengths of the
+    /// motions read.
     pub fn motion_surprises(&self) -> Vec<(f64, f64)> {
         let of = |(update, truth): (&Update, &Pose)| {
-            let keyframe = &self.truth.poses[self.numbers.binary_search(&update.keyframe_sequence).ok()?];
+            let keyframe =
+                &self.truth.poses[self.numbers.binary_search(&update.keyframe_sequence).ok()?];
             let error = body_twist(keyframe, truth).to_vector() - update.motion.to_vector();
             let moved = update.motion.norm() > 0.0;
             moved.then_some(())?;
-            Some((update.motion.norm(), squared_length(&error, &update.motion_covariance)?))
+
+            Some((
+                update.motion.norm(),
+                squared_length(&error, &update.motion_covariance)?,
+            ))
         };
-        self.updates.iter().zip(&self.truth.poses).filter_map(of).collect()
+
+        self.updates
+            .iter()
+            .zip(&self.truth.poses)
+            .filter_map(of)
+            .collect()
     }
 
     /// The share of frames with a status.
     pub fn share(&self, status: Status) -> f64 {
-        let count = self.updates.iter().filter(|update| update.status == status).count();
+        let count = self
+            .updates
+            .iter()
+            .filter(|update| update.status == status)
+            .count();
         count as f64 / self.updates.len() as f64
     }
 
-    /// Frames until the place was known and right to half a metre and 15 degrees; none if that never was.
+    /// Frames until the place was known and right to half a metre and 15 degrees; none if that
+    /// never was.
     pub fn frames_to_relocalise(&self) -> Option<usize> {
         let right = |(update, truth): (&Update, &Pose)| {
-            let error = update.place.map(|place| crate::geometry::PoseError::between(&place.pose, truth));
+            let error = update
+                .place
+                .map(|place| crate::geometry::PoseError::between(&place.pose, truth));
             update.status == Status::Tracking
-                && error.is_some_and(|error| error.translation_m <= 0.5 && error.rotation_rad <= 15_f64.to_radians())
+                && error.is_some_and(|error| {
+                    error.translation_m <= 0.5 && error.rotation_rad <= 15_f64.to_radians()
+                })
         };
-        self.updates.iter().zip(&self.truth.poses).position(right).map(|at| at + 1)
+
+        self.updates
+            .iter()
+            .zip(&self.truth.poses)
+            .position(right)
+            .map(|at| at + 1)
     }
 }
 
 fn place_surprise((update, truth): (&Update, &Pose)) -> Option<f64> {
     let place = update.place?;
-    squared_length(&log(&place.pose.inv_mul(truth)).to_vector(), &place.covariance)
+    squared_length(
+        &log(&place.pose.inv_mul(truth)).to_vector(),
+        &place.covariance,
+    )
 }
 
 /// eᵀ Σ⁻¹ e.
-fn squared_length(error: &nalgebra::Vector6<f64>, covariance: &nalgebra::Matrix6<f64>) -> Option<f64> {
+fn squared_length(
+    error: &nalgebra::Vector6<f64>,
+    covariance: &nalgebra::Matrix6<f64>,
+) -> Option<f64> {
     Some(error.dot(&covariance.cholesky()?.solve(error)))
 }
 
-/// What the covariances of corrected places have to be multiplied with so that those of all places are what their errors
-/// are, followed in rooms that the adapter's errors were measured in. None where no place was found.
+/// What the covariances of corrected places have to be multiplied with so that those of all places
+/// are what their errors are, followed in rooms that the adapter's errors were measured in. None
+/// where no place was found.
 ///
 /// # Errors
 /// [`Error`] of making the maps.
@@ -207,32 +299,50 @@ pub fn place_factor(adapter: &Arc<Adapter>, lessons: &[Lesson<'_>]) -> Result<Op
     for lesson in lessons {
         let room = Arc::new(lesson.room.clone());
         let navigator = Navigator::new(room, lesson.features, adapter.clone(), IndexKind::Exact)?;
-        let map = Map::new(Arc::new(navigator), &Course::Blocks.mapped(lesson.room.frame_count()))?;
+        let map = Map::new(
+            Arc::new(navigator),
+            &Course::Blocks.mapped(lesson.room.frame_count()),
+        )?;
         trackers.push(Tracker::new(vec![Arc::new(map)], Settings::of(adapter))?);
     }
+
     let mut best: Option<(f64, f64)> = None;
     for step in 0..PLACE_FACTORS {
         let factor = LEAST_PLACE_FACTOR * PLACE_FACTOR_STEP.powi(step);
         let mut surprises = Vec::new();
-        trackers = trackers.into_iter().map(|tracker| tracker.with_place_factor(factor)).collect();
+
+        trackers = trackers
+            .into_iter()
+            .map(|tracker| tracker.with_place_factor(factor))
+            .collect();
+
         for (tracker, lesson) in trackers.iter().zip(lessons) {
             let frames = Course::Blocks.followed(lesson.room.frame_count());
             let latents = tracker.maps()[0].navigator().latents();
-            let stretch = Stretch { latents, poses: lesson.room.poses(), frames: &frames };
+            let stretch = Stretch {
+                latents,
+                poses: lesson.room.poses(),
+                frames: &frames,
+            };
+
             surprises.extend(follow(tracker, &[stretch], 1, Begin::Known).place_surprises());
         }
+
         if let Some(off) = imbalance(&mut surprises)
             && best.is_none_or(|(_, least)| off < least)
         {
             best = Some((factor, off));
         }
     }
+
     Ok(best.map(|(factor, _)| factor))
 }
 
 /// The shares of squared lengths within [`ELLIPSOIDS`].
 pub fn coverage(surprises: &[f64]) -> [f64; 2] {
-    ELLIPSOIDS.map(|limit| surprises.iter().filter(|&&x| x <= limit).count() as f64 / surprises.len() as f64)
+    ELLIPSOIDS.map(|limit| {
+        surprises.iter().filter(|&&x| x <= limit).count() as f64 / surprises.len() as f64
+    })
 }
 
 #[cfg(test)]
@@ -243,12 +353,24 @@ mod tests {
     #[test]
     fn what_is_followed_is_not_mapped() {
         for course in Course::ALL {
-            let (mapped, followed) = (course.mapped(400), course.followed(400));
-            assert!(followed.iter().all(|frame| !mapped.contains(frame)), "{}", course.name());
-            assert!(mapped.len() >= 160 && followed.len() >= 80, "{}", course.name());
+            let mapped = course.mapped(400);
+            let followed = course.followed(400);
+            assert!(
+                followed.iter().all(|frame| !mapped.contains(frame)),
+                "{}",
+                course.name()
+            );
+
+            assert!(
+                mapped.len() >= 160 && followed.len() >= 80,
+                "{}",
+                course.name()
+            );
         }
+
         assert!(
-            !Course::Blocks.mapped(400).contains(&FrameId(40)) && Course::Blocks.mapped(400).contains(&FrameId(38))
+            !Course::Blocks.mapped(400).contains(&FrameId(40))
+                && Course::Blocks.mapped(400).contains(&FrameId(38))
         );
     }
 

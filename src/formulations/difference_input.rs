@@ -3,7 +3,9 @@
 use nalgebra::Vector6;
 use ndarray::{Array2, ArrayView2};
 
-use crate::adapter::{At, Network, Objective, Real, Samples, Seeded, Siamese, TENSOR_NAMES, TargetScale, Widths};
+use crate::adapter::{
+    At, Network, Objective, Real, Samples, Seeded, Siamese, TENSOR_NAMES, TargetScale, Widths,
+};
 use crate::geometry::Twist;
 
 /// φ and W, used as W φ(z₂ − z₁).
@@ -24,7 +26,11 @@ impl<T: Real> DifferenceInput<T> {
     pub fn motions(&self, features: [ArrayView2<'_, f32>; 2], scale: &TargetScale) -> Vec<Twist> {
         let [from, to] = features.map(|rows| rows.mapv(|x| T::of(f64::from(x))));
         let normalised = self.0.embed(to - from).dot(&self.0.motion_matrix().t());
-        normalised.outer_iter().map(|row| scale.twist(&Vector6::from_fn(|c, _| row[c].f64()))).collect()
+
+        normalised
+            .outer_iter()
+            .map(|row| scale.twist(&Vector6::from_fn(|c, _| row[c].f64())))
+            .collect()
     }
 }
 
@@ -54,9 +60,16 @@ impl<T: Real> Objective<T> for DifferenceInput<T> {
         let forward = self.0.phi.forward(rows.differences(&rows.features));
         let predicted = forward.latents.dot(&self.0.motion.t());
         let (loss, d_predicted) = at.config.loss.value(predicted.view(), rows.targets.view());
+
         let mut gradient = self.zeros_like();
         gradient.0.motion += &d_predicted.t().dot(&forward.latents);
-        self.0.phi.backward_whole(&forward, &d_predicted.dot(&self.0.motion), &mut gradient.0.phi);
+
+        self.0.phi.backward_whole(
+            &forward,
+            &d_predicted.dot(&self.0.motion),
+            &mut gradient.0.phi,
+        );
+
         (loss, gradient)
     }
 }

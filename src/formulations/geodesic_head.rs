@@ -1,4 +1,5 @@
-//! C: a head makes a pose of the difference of two latents; trained on the motion in the body frame.
+//! C: a head makes a pose of the difference of two latents; trained on the motion in the body
+//! frame.
 
 use ndarray::{Array2, ArrayView2};
 
@@ -19,7 +20,10 @@ pub struct GeodesicHead<T> {
 impl<T: Real> GeodesicHead<T> {
     pub(crate) fn random(widths: Widths, random: &mut Seeded) -> Self {
         let phi = Phi::random(widths, random);
-        Self { phi, head: Dense::random(&[widths.latent, HEAD_HIDDEN, POSE_NUMBERS], random) }
+        Self {
+            phi,
+            head: Dense::random(&[widths.latent, HEAD_HIDDEN, POSE_NUMBERS], random),
+        }
     }
 
     /// The initial weights of a seed, PyTorch's.
@@ -29,24 +33,41 @@ impl<T: Real> GeodesicHead<T> {
 
     /// The motions between features (n, d), each in its source's body frame.
     pub fn motions(&self, features: [ArrayView2<'_, f32>; 2]) -> Vec<Twist> {
-        let latents = features.map(|rows| self.phi.forward(rows.mapv(|x| T::of(f64::from(x)))).latents);
+        let latents =
+            features.map(|rows| self.phi.forward(rows.mapv(|x| T::of(f64::from(x)))).latents);
         let [from, to] = latents;
         let poses = self.head.forward(to - from).output;
-        poses.outer_iter().map(|row| log(&HeadPose::of(row).pose)).collect()
+
+        poses
+            .outer_iter()
+            .map(|row| log(&HeadPose::of(row).pose))
+            .collect()
     }
 }
 
 impl<T: Real> Network<T> for GeodesicHead<T> {
     fn names(&self) -> Vec<String> {
-        Phi::<T>::NAMES.map(|name| format!("phi.{name}")).into_iter().chain(self.head.names("head")).collect()
+        Phi::<T>::NAMES
+            .map(|name| format!("phi.{name}"))
+            .into_iter()
+            .chain(self.head.names("head"))
+            .collect()
     }
 
     fn parameters(&self) -> Vec<&Array2<T>> {
-        self.phi.parameters().into_iter().chain(self.head.parameters()).collect()
+        self.phi
+            .parameters()
+            .into_iter()
+            .chain(self.head.parameters())
+            .collect()
     }
 
     fn parameters_mut(&mut self) -> Vec<&mut Array2<T>> {
-        self.phi.parameters_mut().into_iter().chain(self.head.parameters_mut()).collect()
+        self.phi
+            .parameters_mut()
+            .into_iter()
+            .chain(self.head.parameters_mut())
+            .collect()
     }
 }
 
@@ -62,16 +83,27 @@ impl<T: Real> Objective<T> for GeodesicHead<T> {
         let forward = self.phi.forward(rows.features.clone());
         let head = self.head.forward(rows.differences(&forward.latents));
         let mut d_numbers = Array2::zeros(head.output.dim());
-        let (mut loss, share) = (0.0, (batch.len() as f64).recip());
-        for ((&pair, row), mut into) in batch.iter().zip(head.output.outer_iter()).zip(d_numbers.outer_iter_mut()) {
+
+        let mut loss = 0.0;
+        let share = (batch.len() as f64).recip();
+        for ((&pair, row), mut into) in batch
+            .iter()
+            .zip(head.output.outer_iter())
+            .zip(d_numbers.outer_iter_mut())
+        {
             let pose = HeadPose::of(row);
             let (value, gradient) = pose_loss(&pose.pose, &exp(&samples.twists()[pair]));
             loss += value * share;
-            into.iter_mut().zip(pose.backward(&(gradient * share))).for_each(|(into, d)| *into = T::of(d));
+            into.iter_mut()
+                .zip(pose.backward(&(gradient * share)))
+                .for_each(|(into, d)| *into = T::of(d));
         }
+
         let mut gradient = self.zeros_like();
         let d_differences = self.head.backward(&head, &d_numbers, &mut gradient.head);
-        self.phi.backward(&forward, &rows.scattered(&d_differences), &mut gradient.phi);
+        self.phi
+            .backward(&forward, &rows.scattered(&d_differences), &mut gradient.phi);
+
         (loss, gradient)
     }
 }

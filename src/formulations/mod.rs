@@ -5,7 +5,8 @@
 //! - C: M = head(φ(z₂) − φ(z₁)), a pose, trained on the motion in the body frame.
 //! - D: W φ(z₂ − z₁), trained on z-scored twists.
 //!
-//! All are scored by the twist in the body frame of the first camera. They are compared, not served.
+//! All are scored by the twist in the body frame of the first camera. They are compared, not
+//! served.
 
 mod difference_input;
 mod geodesic_head;
@@ -41,8 +42,13 @@ pub enum Formulation {
 
 impl Formulation {
     /// The adapter, then the paper's four.
-    pub const ALL: [Self; 5] =
-        [Self::Poincare, Self::Unanchored, Self::Absolute, Self::GeodesicHead, Self::DifferenceInput];
+    pub const ALL: [Self; 5] = [
+        Self::Poincare,
+        Self::Unanchored,
+        Self::Absolute,
+        Self::GeodesicHead,
+        Self::DifferenceInput,
+    ];
 
     /// Its name in tables and on the command line.
     pub fn name(self) -> &'static str {
@@ -69,40 +75,77 @@ pub fn learn(
     progress: &mut dyn FnMut(EpochProgress),
 ) -> Result<Vec<MotionScores>, training::Error> {
     if formulation == Formulation::Poincare {
-        // Under what only the adapter knows, it would not be compared but favoured: the others refuse it.
+        // Under what only the adapter knows, it would not be compared but favoured: the others
+        // refuse it.
         return Ok(training::learn(lessons, recipe, progress)?.1.room_tests);
     }
+
     recipe.check()?;
     check_lessons(lessons)?;
     let plain = TrainConfig::default();
-    let TrainConfig { standardise, charts, loss, .. } = recipe.config;
+
+    let TrainConfig {
+        standardise,
+        charts,
+        loss,
+        ..
+    } = recipe.config;
+
     if (standardise, charts, loss) != (plain.standardise, plain.charts, plain.loss) {
         return Err(training::Error::NotPlain);
     }
+
     let tests = test_pairs(lessons, recipe)?;
     let samples = training::samples(lessons, recipe)?;
-    let TrainConfig { hidden, latent, seed, .. } = recipe.config;
-    let widths = Widths { feature: samples.feature_dim(), hidden, latent };
+
+    let TrainConfig {
+        hidden,
+        latent,
+        seed,
+        ..
+    } = recipe.config;
+    let widths = Widths {
+        feature: samples.feature_dim(),
+        hidden,
+        latent,
+    };
+
     let mut random = Seeded::new(seed);
     let config = &recipe.config;
-    let mut run = Run { lessons, tests: &tests, samples: &samples, config };
+
+    let mut run = Run {
+        lessons,
+        tests: &tests,
+        samples: &samples,
+        config,
+    };
+
     Ok(match formulation {
         Formulation::Unanchored => {
             let start = UnanchoredMotion(WorldPose::random(widths, &mut random));
-            run.scores(start, &mut random, progress, |network, ends| network.0.motion(ends))?
+            run.scores(start, &mut random, progress, |network, ends| {
+                network.0.motion(ends)
+            })?
         }
         Formulation::Absolute => {
             let start = AbsolutePose(WorldPose::random(widths, &mut random));
-            run.scores(start, &mut random, progress, |network, ends| network.0.motion(ends))?
+            run.scores(start, &mut random, progress, |network, ends| {
+                network.0.motion(ends)
+            })?
         }
         Formulation::GeodesicHead => {
             let start = GeodesicHead::random(widths, &mut random);
-            run.scores(start, &mut random, progress, |network, ends| network.motions(ends.features))?
+            run.scores(start, &mut random, progress, |network, ends| {
+                network.motions(ends.features)
+            })?
         }
         Formulation::Poincare | Formulation::DifferenceInput => {
             let start = DifferenceInput::random(widths, &mut random);
             let scale = samples.scale();
-            run.scores(start, &mut random, progress, |network, ends| network.motions(ends.features, scale))?
+
+            run.scores(start, &mut random, progress, |network, ends| {
+                network.motions(ends.features, scale)
+            })?
         }
     })
 }
@@ -136,11 +179,25 @@ impl Run<'_> {
                 let rows: Vec<usize> = pairs.iter().map(end).collect();
                 lesson.features.rows().select(ndarray::Axis(0), &rows)
             };
-            let (sources, targets) = (rows(|pair| pair.source.row()), rows(|pair| pair.target.row()));
-            let poses: Vec<Pose> = pairs.iter().map(|pair| lesson.room.poses()[pair.source.row()]).collect();
-            let ends = Ends { features: [sources.view(), targets.view()], sources: &poses };
-            MotionScores::of(&motions(lesson.room.poses(), pairs), &predict(&network, ends))
+            let sources = rows(|pair| pair.source.row());
+
+            let targets = rows(|pair| pair.target.row());
+
+            let poses: Vec<Pose> = pairs
+                .iter()
+                .map(|pair| lesson.room.poses()[pair.source.row()])
+                .collect();
+            let ends = Ends {
+                features: [sources.view(), targets.view()],
+                sources: &poses,
+            };
+
+            MotionScores::of(
+                &motions(lesson.room.poses(), pairs),
+                &predict(&network, ends),
+            )
         };
+
         Ok(self.lessons.iter().zip(self.tests).map(score).collect())
     }
 }

@@ -15,7 +15,15 @@ pub struct WorldPose<T> {
 
 impl<T: Real> WorldPose<T> {
     pub(crate) fn random(widths: Widths, random: &mut Seeded) -> Self {
-        Self { psi: Phi::random(Widths { latent: POSE_NUMBERS, ..widths }, random) }
+        Self {
+            psi: Phi::random(
+                Widths {
+                    latent: POSE_NUMBERS,
+                    ..widths
+                },
+                random,
+            ),
+        }
     }
 
     /// The initial weights of a seed, PyTorch's.
@@ -26,11 +34,21 @@ impl<T: Real> WorldPose<T> {
     /// The motions between the ends, each in its source's body frame.
     pub fn motion(&self, ends: Ends<'_>) -> Vec<Twist> {
         let poses = |end: usize| {
-            let rows = self.psi.forward(ends.features[end].mapv(|x| T::of(f64::from(x)))).latents;
-            rows.outer_iter().map(|row| HeadPose::of(row).pose).collect::<Vec<_>>()
+            let rows = self
+                .psi
+                .forward(ends.features[end].mapv(|x| T::of(f64::from(x))))
+                .latents;
+            rows.outer_iter()
+                .map(|row| HeadPose::of(row).pose)
+                .collect::<Vec<_>>()
         };
-        let (from, to) = (poses(0), poses(1));
-        let motion = |((from, to), source): ((&Pose, &Pose), &Pose)| body_motion(&(to * from.inverse()), source);
+
+        let from = poses(0);
+        let to = poses(1);
+        let motion = |((from, to), source): ((&Pose, &Pose), &Pose)| {
+            body_motion(&(to * from.inverse()), source)
+        };
+
         from.iter().zip(&to).zip(ends.sources).map(motion).collect()
     }
 
@@ -48,20 +66,35 @@ impl<T: Real> WorldPose<T> {
     ) -> (f64, Self) {
         let rows = samples.batch(batch, at);
         let forward = self.psi.forward(rows.features.clone());
-        let heads: Vec<HeadPose> =
-            forward.latents.outer_iter().map(|row: ArrayView1<'_, T>| HeadPose::of(row)).collect();
+        let heads: Vec<HeadPose> = forward
+            .latents
+            .outer_iter()
+            .map(|row: ArrayView1<'_, T>| HeadPose::of(row))
+            .collect();
+
         let mut d_rows = Array2::<T>::zeros(forward.latents.dim());
-        let (mut loss, share) = (0.0, (batch.len() as f64).recip());
+        let mut loss = 0.0;
+        let share = (batch.len() as f64).recip();
         for (&pair, slots) in batch.iter().zip(rows.slots()) {
             let (value, gradients) = losses(pair, slots.map(|slot| &heads[slot]));
             loss += value * share;
+
             for (slot, gradient) in slots.into_iter().zip(gradients) {
                 let numbers = heads[slot].backward(&(gradient * share));
-                d_rows.row_mut(slot).iter_mut().zip(numbers).for_each(|(into, d)| *into += T::of(d));
+                d_rows
+                    .row_mut(slot)
+                    .iter_mut()
+                    .zip(numbers)
+                    .for_each(|(into, d)| *into += T::of(d));
             }
         }
-        let mut gradient = Self { psi: self.psi.zeros() };
-        self.psi.backward_whole(&forward, &d_rows, &mut gradient.psi);
+
+        let mut gradient = Self {
+            psi: self.psi.zeros(),
+        };
+        self.psi
+            .backward_whole(&forward, &d_rows, &mut gradient.psi);
+
         (loss, gradient)
     }
 }
@@ -84,12 +117,16 @@ impl<T: Real> Objective<T> for UnanchoredMotion<T> {
     fn gradient(&self, samples: &Samples<T>, batch: &[usize], at: At<'_>) -> (f64, Self) {
         let losses = |pair: usize, [from, to]: [&HeadPose; 2]| {
             let [source, target] = samples.pair(pair).map(|row| samples.pose(row));
-            // E = T₁ T₂⁻¹ P₂ P₁⁻¹. A motion δ on the right of T₁ is Ad(T₁) δ on the left of E, of T₂ its negative.
+
+            // E = T₁ T₂⁻¹ P₂ P₁⁻¹. A motion δ on the right of T₁ is Ad(T₁) δ on the left of E, of
+            // T₂ its negative.
             let error = from.pose * to.pose.inverse() * target * source.inverse();
             let (loss, gradient) = squared_log(&error);
             let moved = adjoint(&from.pose).transpose() * gradient;
+
             (loss, [moved, -moved])
         };
+
         let (loss, gradient) = self.0.through_psi(samples, batch, at, losses);
         (loss, Self(gradient))
     }
@@ -110,6 +147,7 @@ impl<T: Real> Objective<T> for AbsolutePose<T> {
             (at_source + at_target, [d_source, d_target])
         };
         let (loss, gradient) = self.0.through_psi(samples, batch, at, losses);
+
         (loss, Self(gradient))
     }
 }

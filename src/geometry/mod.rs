@@ -3,9 +3,10 @@
 //! The conventions of the whole crate, fixed here once:
 //! - A [`Pose`] is `world_from_camera`: it takes camera coordinates to world coordinates. Metres.
 //! - Camera axes: x right, y down, z forward.
-//! - A [`Twist`] is ordered (v, ω), the paper's order. GTSAM and sophus-rs use (ω, v): swap when borrowing.
-//! - The motion between two frames is the twist in the body frame of the first camera:
-//!   ΔP = log(P₁⁻¹ P₂), v in metres, ω in radians with |ω| ≤ π.
+//! - A [`Twist`] is ordered (v, ω), the paper's order. GTSAM and sophus-rs use (ω, v): swap when
+//!   borrowing.
+//! - The motion between two frames is the twist in the body frame of the first camera: ΔP =
+//!   log(P₁⁻¹ P₂), v in metres, ω in radians with |ω| ≤ π.
 //! - v is the translation part of the logarithm, V(ω)⁻¹ t, not the translation t itself.
 
 mod pose_error;

@@ -16,6 +16,7 @@ impl PoseError {
     pub fn between(world_from_found: &Pose, world_from_true: &Pose) -> Self {
         let found_from_true = world_from_found.inv_mul(world_from_true);
         let quaternion = found_from_true.rotation.quaternion();
+
         Self {
             translation_m: found_from_true.translation.vector.norm(),
             rotation_rad: 2.0 * quaternion.imag().norm().atan2(quaternion.w.abs()),
@@ -32,8 +33,13 @@ mod tests {
     #[test]
     fn a_quarter_turn_five_metres_away() {
         let found = Pose::new(Vector3::new(1.0, 0.0, 0.0), Vector3::zeros());
-        let truth = Pose::new(Vector3::new(4.0, 4.0, 0.0), Vector3::new(0.0, std::f64::consts::FRAC_PI_2, 0.0));
+
+        let truth = Pose::new(
+            Vector3::new(4.0, 4.0, 0.0),
+            Vector3::new(0.0, std::f64::consts::FRAC_PI_2, 0.0),
+        );
         let error = PoseError::between(&found, &truth);
+
         assert!((error.translation_m - 5.0).abs() < 1e-12);
         assert!((error.rotation_rad - std::f64::consts::FRAC_PI_2).abs() < 1e-12);
     }

@@ -17,10 +17,17 @@ pub fn nearest_rotation(matrix: &Matrix3<f64>) -> Option<NearestRotation> {
     if !matrix.iter().all(|x| x.is_finite()) || matrix.determinant() <= 1e-9 {
         return None;
     }
+
     let svd = matrix.svd(true, true);
     let rotation = svd.u? * svd.v_t?;
-    let deviation = (matrix * matrix.transpose() - Matrix3::identity()).abs().max();
-    Some(NearestRotation { rotation: Rotation3::from_matrix_unchecked(rotation), deviation })
+    let deviation = (matrix * matrix.transpose() - Matrix3::identity())
+        .abs()
+        .max();
+
+    Some(NearestRotation {
+        rotation: Rotation3::from_matrix_unchecked(rotation),
+        deviation,
+    })
 }
 
 #[cfg(test)]
@@ -28,7 +35,8 @@ mod tests {
     use super::*;
     use nalgebra::Vector3;
 
-    /// Oracle: by hand, a rotation scaled by 1.001 is nearest to the rotation itself, and RRᵀ − I = (1.001² − 1) I.
+    /// Oracle: by hand, a rotation scaled by 1.001 is nearest to the rotation itself, and RRᵀ − I =
+    /// (1.001² − 1) I.
     #[test]
     fn a_scaled_rotation_projects_to_the_rotation() {
         let expected = Rotation3::new(Vector3::new(0.3, -0.8, 0.1));

@@ -6,7 +6,8 @@ use nalgebra::{Isometry3, Matrix3, Matrix6, Translation3, UnitQuaternion, Vector
 
 use super::{PI_MARGIN_RAD, Pose};
 
-/// Below this angle, radians, coefficients with a removable singularity are taken from their series.
+/// Below this angle, radians, coefficients with a removable singularity are taken from their
+/// series.
 const SERIES_ANGLE_RAD: f64 = 0.2;
 
 /// An element of se(3): a camera motion, in the body frame of the camera it starts from.
@@ -21,13 +22,17 @@ pub struct Twist {
 impl Twist {
     /// The six numbers as (v, ω).
     pub fn to_vector(self) -> Vector6<f64> {
-        let (v, w) = (self.linear, self.angular);
+        let v = self.linear;
+        let w = self.angular;
         Vector6::new(v.x, v.y, v.z, w.x, w.y, w.z)
     }
 
     /// The twist of six numbers ordered (v, ω).
     pub fn from_vector(xi: &Vector6<f64>) -> Self {
-        Self { linear: xi.fixed_rows::<3>(0).into(), angular: xi.fixed_rows::<3>(3).into() }
+        Self {
+            linear: xi.fixed_rows::<3>(0).into(),
+            angular: xi.fixed_rows::<3>(3).into(),
+        }
     }
 
     /// ‖(v, ω)‖₂, metres and radians mixed as in the paper's Hit@ε.
@@ -37,23 +42,35 @@ impl Twist {
 
     /// This motion done `count` times: exp(ξ)ⁿ = exp(nξ).
     pub fn times(self, count: usize) -> Self {
-        Self { linear: self.linear * count as f64, angular: self.angular * count as f64 }
+        Self {
+            linear: self.linear * count as f64,
+            angular: self.angular * count as f64,
+        }
     }
 
     /// This motion cut into `parts` equal ones: exp(ξ/n)ⁿ = exp(ξ).
     pub fn divided(self, parts: u32) -> Self {
         let share = f64::from(parts).recip();
-        Self { linear: self.linear * share, angular: self.angular * share }
+        Self {
+            linear: self.linear * share,
+            angular: self.angular * share,
+        }
     }
 
     /// A share of this motion: exp(sξ).
     pub fn scaled(self, share: f64) -> Self {
-        Self { linear: self.linear * share, angular: self.angular * share }
+        Self {
+            linear: self.linear * share,
+            angular: self.angular * share,
+        }
     }
 
     /// The motion back: exp(−ξ) = exp(ξ)⁻¹.
     pub fn reversed(self) -> Self {
-        Self { linear: -self.linear, angular: -self.angular }
+        Self {
+            linear: -self.linear,
+            angular: -self.angular,
+        }
     }
 
     /// Whether all six numbers are finite.
@@ -67,7 +84,8 @@ impl Twist {
     }
 }
 
-/// The motion that a twist generates in unit time, exp: se(3) → SE(3). Any length of twist is allowed.
+/// The motion that a twist generates in unit time, exp: se(3) → SE(3). Any length of twist is
+/// allowed.
 ///
 /// Source: SeeSE3, Eq. 1 read backwards; t = V(ω) v with V = I + b ω̂ + c ω̂².
 pub fn exp(twist: &Twist) -> Pose {
@@ -75,15 +93,41 @@ pub fn exp(twist: &Twist) -> Pose {
     let (b, c) = if angle < SERIES_ANGLE_RAD {
         let x = angle * angle;
         (
-            series(x, &[1.0 / 2.0, -1.0 / 24.0, 1.0 / 720.0, -1.0 / 40_320.0, 1.0 / 3_628_800.0]),
-            series(x, &[1.0 / 6.0, -1.0 / 120.0, 1.0 / 5_040.0, -1.0 / 362_880.0, 1.0 / 39_916_800.0]),
+            series(
+                x,
+                &[
+                    1.0 / 2.0,
+                    -1.0 / 24.0,
+                    1.0 / 720.0,
+                    -1.0 / 40_320.0,
+                    1.0 / 3_628_800.0,
+                ],
+            ),
+            series(
+                x,
+                &[
+                    1.0 / 6.0,
+                    -1.0 / 120.0,
+                    1.0 / 5_040.0,
+                    -1.0 / 362_880.0,
+                    1.0 / 39_916_800.0,
+                ],
+            ),
         )
     } else {
-        ((1.0 - angle.cos()) / (angle * angle), (angle - angle.sin()) / (angle * angle * angle))
+        (
+            (1.0 - angle.cos()) / (angle * angle),
+            (angle - angle.sin()) / (angle * angle * angle),
+        )
     };
+
     let hat = twist.angular.cross_matrix();
     let v_matrix = Matrix3::identity() + hat * b + hat * hat * c;
-    Isometry3::from_parts(Translation3::from(v_matrix * twist.linear), UnitQuaternion::from_scaled_axis(twist.angular))
+
+    Isometry3::from_parts(
+        Translation3::from(v_matrix * twist.linear),
+        UnitQuaternion::from_scaled_axis(twist.angular),
+    )
 }
 
 /// The shortest twist that generates a motion, log: SE(3) → se(3), |ω| ≤ π.
@@ -94,17 +138,31 @@ pub fn exp(twist: &Twist) -> Pose {
 pub fn log(motion: &Pose) -> Twist {
     let angular = rotation_vector(&motion.rotation);
     let angle = angular.norm();
+
     let c = if angle < SERIES_ANGLE_RAD {
-        let coefficients = [1.0 / 12.0, 1.0 / 720.0, 1.0 / 30_240.0, 1.0 / 1_209_600.0, 1.0 / 47_900_160.0];
+        let coefficients = [
+            1.0 / 12.0,
+            1.0 / 720.0,
+            1.0 / 30_240.0,
+            1.0 / 1_209_600.0,
+            1.0 / 47_900_160.0,
+        ];
+
         series(angle * angle, &coefficients)
     } else {
-        // 1 − (θ/2) cot(θ/2), with the cotangent written so that it is 0, not a rounding error, at π.
+        // 1 − (θ/2) cot(θ/2), with the cotangent written so that it is 0, not a rounding error, at
+        // π.
         let half = 0.5 * angle;
         (1.0 - half * half.cos() / half.sin()) / (angle * angle)
     };
+
     let hat = angular.cross_matrix();
     let v_inverse = Matrix3::identity() - hat * 0.5 + hat * hat * c;
-    Twist { linear: v_inverse * motion.translation.vector, angular }
+
+    Twist {
+        linear: v_inverse * motion.translation.vector,
+        angular,
+    }
 }
 
 /// The motion from the first camera to the second in the first one's body frame, log(P₁⁻¹ P₂).
@@ -120,30 +178,60 @@ pub fn adjoint(b_from_a: &Pose) -> Matrix6<f64> {
     let mut ad = Matrix6::zeros();
     ad.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);
     ad.fixed_view_mut::<3, 3>(3, 3).copy_from(&rotation);
+
     let coupling = b_from_a.translation.vector.cross_matrix() * rotation;
     ad.fixed_view_mut::<3, 3>(0, 3).copy_from(&coupling);
+
     ad
 }
 
-/// The inverse left Jacobian of SE(3) at a twist, on (v, ω): log(exp(δ) exp(ξ)) = ξ + J_l⁻¹(ξ) δ to first order in δ.
+/// The inverse left Jacobian of SE(3) at a twist, on (v, ω): log(exp(δ) exp(ξ)) = ξ + J_l⁻¹(ξ) δ to
+/// first order in δ.
 ///
-/// The inverse right Jacobian, J_r⁻¹(ξ) with log(exp(ξ) exp(δ)) = ξ + J_r⁻¹(ξ) δ, is J_l⁻¹(−ξ). |ω| < π.
+/// The inverse right Jacobian, J_r⁻¹(ξ) with log(exp(ξ) exp(δ)) = ξ + J_r⁻¹(ξ) δ, is J_l⁻¹(−ξ). |ω|
+/// < π.
 ///
 /// Source: T. Barfoot, State Estimation for Robotics, the closed form of Q.
 pub fn left_jacobian_inverse(twist: &Twist) -> Matrix6<f64> {
-    let (rho, phi) = (twist.linear.cross_matrix(), twist.angular.cross_matrix());
+    let rho = twist.linear.cross_matrix();
+    let phi = twist.angular.cross_matrix();
     let angle = twist.angular.norm();
     let x = angle * angle;
+
     let (first, second, third, inverse) = if angle < SERIES_ANGLE_RAD {
         (
-            series(x, &[1.0 / 6.0, -1.0 / 120.0, 1.0 / 5_040.0, -1.0 / 362_880.0]),
-            series(x, &[1.0 / 24.0, -1.0 / 720.0, 1.0 / 40_320.0, -1.0 / 3_628_800.0]),
-            series(x, &[1.0 / 120.0, -1.0 / 2_520.0, 1.0 / 120_960.0, -1.0 / 9_979_200.0]),
-            series(x, &[1.0 / 12.0, 1.0 / 720.0, 1.0 / 30_240.0, 1.0 / 1_209_600.0, 1.0 / 47_900_160.0]),
+            series(
+                x,
+                &[1.0 / 6.0, -1.0 / 120.0, 1.0 / 5_040.0, -1.0 / 362_880.0],
+            ),
+            series(
+                x,
+                &[1.0 / 24.0, -1.0 / 720.0, 1.0 / 40_320.0, -1.0 / 3_628_800.0],
+            ),
+            series(
+                x,
+                &[
+                    1.0 / 120.0,
+                    -1.0 / 2_520.0,
+                    1.0 / 120_960.0,
+                    -1.0 / 9_979_200.0,
+                ],
+            ),
+            series(
+                x,
+                &[
+                    1.0 / 12.0,
+                    1.0 / 720.0,
+                    1.0 / 30_240.0,
+                    1.0 / 1_209_600.0,
+                    1.0 / 47_900_160.0,
+                ],
+            ),
         )
     } else {
         let (sine, cosine) = angle.sin_cos();
         let half = 0.5 * angle;
+
         (
             (angle - sine) / (x * angle),
             (x + 2.0 * cosine - 2.0) / (2.0 * x * x),
@@ -151,33 +239,46 @@ pub fn left_jacobian_inverse(twist: &Twist) -> Matrix6<f64> {
             (1.0 - half * half.cos() / half.sin()) / x,
         )
     };
-    let (both, turned) = (phi * rho, rho * phi);
+
+    let both = phi * rho;
+    let turned = rho * phi;
     let q = rho * 0.5
         + (both + turned + phi * turned) * first
         + (phi * both + turned * phi - phi * turned * 3.0) * second
         + (phi * turned * phi + phi * phi * turned) * third;
+
     let rotation = Matrix3::identity() - phi * 0.5 + phi * phi * inverse;
     let mut jacobian = Matrix6::zeros();
     jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);
     jacobian.fixed_view_mut::<3, 3>(3, 3).copy_from(&rotation);
-    jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&(-rotation * q * rotation));
+
+    jacobian
+        .fixed_view_mut::<3, 3>(0, 3)
+        .copy_from(&(-rotation * q * rotation));
+
     jacobian
 }
 
 /// Axis times angle, radians, |ω| ≤ π. Accurate at every angle because atan2 never cancels.
 fn rotation_vector(rotation: &UnitQuaternion<f64>) -> Vector3<f64> {
-    let (w, v) = (rotation.w, rotation.imag());
+    let w = rotation.w;
+    let v = rotation.imag();
     let (w, v) = if w < 0.0 { (-w, -v) } else { (w, v) };
     let sine = v.norm();
+
     if sine == 0.0 {
         return v * 2.0;
     }
+
     v * (2.0 * sine.atan2(w) / sine)
 }
 
 /// Horner's rule for Σ coefficient_i xⁱ.
 fn series(x: f64, coefficients: &[f64]) -> f64 {
-    coefficients.iter().rev().fold(0.0, |sum, coefficient| sum * x + coefficient)
+    coefficients
+        .iter()
+        .rev()
+        .fold(0.0, |sum, coefficient| sum * x + coefficient)
 }
 
 #[cfg(test)]
@@ -187,19 +288,27 @@ mod tests {
     use proptest::prelude::*;
 
     fn twists(angle_limit: f64) -> impl Strategy<Value = Twist> {
-        (prop::array::uniform3(-2.0..2.0f64), prop::array::uniform3(-1.0..1.0f64), 0.0..angle_limit).prop_filter_map(
-            "axis of no length",
-            |(linear, axis, angle)| {
-                let axis = Vector3::from(axis).try_normalize(1e-3)?;
-                Some(Twist { linear: linear.into(), angular: axis * angle })
-            },
+        (
+            prop::array::uniform3(-2.0..2.0f64),
+            prop::array::uniform3(-1.0..1.0f64),
+            0.0..angle_limit,
         )
+            .prop_filter_map("axis of no length", |(linear, axis, angle)| {
+                let axis = Vector3::from(axis).try_normalize(1e-3)?;
+                Some(Twist {
+                    linear: linear.into(),
+                    angular: axis * angle,
+                })
+            })
     }
 
     /// ξ̂ as the 4×4 matrix of the definition.
     fn hat(twist: &Twist) -> Matrix4<f64> {
         let mut matrix = Matrix4::zeros();
-        matrix.fixed_view_mut::<3, 3>(0, 0).copy_from(&twist.angular.cross_matrix());
+        matrix
+            .fixed_view_mut::<3, 3>(0, 0)
+            .copy_from(&twist.angular.cross_matrix());
+
         matrix.fixed_view_mut::<3, 1>(0, 3).copy_from(&twist.linear);
         matrix
     }
@@ -235,8 +344,8 @@ mod tests {
         }
     }
 
-    /// Oracle: a half turn about z that ends two metres up y comes from v = V⁻¹t = (π/2)·(2, 0, 0) by hand:
-    /// the camera runs along a half circle of radius 1, whose length is π.
+    /// Oracle: a half turn about z that ends two metres up y comes from v = V⁻¹t = (π/2)·(2, 0, 0)
+    /// by hand: the camera runs along a half circle of radius 1, whose length is π.
     #[test]
     fn a_half_turn_has_the_half_circle_as_its_logarithm() {
         let motion = Isometry3::from_parts(
@@ -244,6 +353,7 @@ mod tests {
             UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI),
         );
         let twist = log(&motion);
+
         assert!((twist.linear - Vector3::new(std::f64::consts::PI, 0.0, 0.0)).norm() < 1e-12);
         assert!(!twist.is_unique_logarithm());
     }

@@ -1,4 +1,5 @@
-//! The exact scan: every frame is looked at. The reference, and the fastest up to some 10,000 frames.
+//! The exact scan: every frame is looked at. The reference, and the fastest up to some 10,000
+//! frames.
 
 use ndarray::ArrayView2;
 
@@ -14,10 +15,18 @@ pub struct ExactIndex {
 }
 
 impl ExactIndex {
-    /// Indexes the rows of `latents` (n, k) that `frames` names; a row that no frame names cannot be found.
+    /// Indexes the rows of `latents` (n, k) that `frames` names; a row that no frame names cannot
+    /// be found.
     pub fn new(latents: ArrayView2<'_, f64>, frames: &[FrameId]) -> Self {
-        let values = frames.iter().flat_map(|frame| latents.row(frame.row()).to_vec()).collect();
-        Self { width: latents.ncols(), values, frames: frames.to_vec() }
+        let values = frames
+            .iter()
+            .flat_map(|frame| latents.row(frame.row()).to_vec())
+            .collect();
+        Self {
+            width: latents.ncols(),
+            values,
+            frames: frames.to_vec(),
+        }
     }
 }
 
@@ -28,15 +37,26 @@ impl Index for ExactIndex {
             if exclusion.is_some_and(|exclusion| exclusion.covers(frame)) {
                 continue;
             }
-            let found = Neighbour { frame, distance: distance(row, query) };
+
+            let found = Neighbour {
+                frame,
+                distance: distance(row, query),
+            };
+
             let full = best.len() == k;
-            if full && best.last().is_none_or(|worst| by_distance_then_frame(&found, worst).is_ge()) {
+            if full
+                && best
+                    .last()
+                    .is_none_or(|worst| by_distance_then_frame(&found, worst).is_ge())
+            {
                 continue;
             }
+
             let at = best.partition_point(|other| by_distance_then_frame(other, &found).is_lt());
             best.insert(at, found);
             best.truncate(k);
         }
+
         best
     }
 

@@ -1,9 +1,10 @@
 //! The approximate index of the crate `hnsw_rs` behind the exact index's contract.
 //!
 //! - Built serially: a parallel build differs from run to run and loses points.
-//! - Even a serial build leaves some points that no search reaches. They are found when the index is built and
-//!   scanned exactly with every query.
-//! - Distances are computed again in f64 from the latents, so an answer's numbers do not depend on the index.
+//! - Even a serial build leaves some points that no search reaches. They are found when the index
+//!   is built and scanned exactly with every query.
+//! - Distances are computed again in f64 from the latents, so an answer's numbers do not depend on
+//!   the index.
 
 use std::collections::BTreeSet;
 
@@ -22,14 +23,19 @@ pub struct HnswParameters {
     pub links: u8,
     /// Candidates kept while building.
     pub build_effort: usize,
-    /// Candidates kept while searching. A wanted latent lies off the path of the frames' latents: there, 64 candidates
-    /// missed one nearest frame of ten that 256 found (the contract's 900 synthetic latents).
+    /// Candidates kept while searching. A wanted latent lies off the path of the frames' latents:
+    /// there, 64 candidates missed one nearest frame of ten that 256 found (the contract's 900
+    /// synthetic latents).
     pub search_effort: usize,
 }
 
 impl Default for HnswParameters {
     fn default() -> Self {
-        Self { links: 16, build_effort: 200, search_effort: 256 }
+        Self {
+            links: 16,
+            build_effort: 200,
+            search_effort: 256,
+        }
     }
 }
 
@@ -44,8 +50,8 @@ pub struct Audit {
     pub recall: f64,
     /// How many neighbours were asked for.
     pub k: usize,
-    /// How many queries were asked: points halfway between two latents half the room apart, off the frames' path as
-    /// wanted latents are.
+    /// How many queries were asked: points halfway between two latents half the room apart, off the
+    /// frames' path as wanted latents are.
     pub queries: usize,
 }
 
@@ -61,7 +67,11 @@ pub struct HnswIndex {
 
 impl HnswIndex {
     /// Indexes the rows of `latents` (n, k) that `frames` names.
-    pub fn new(latents: ArrayView2<'_, f64>, frames: &[FrameId], parameters: HnswParameters) -> Self {
+    pub fn new(
+        latents: ArrayView2<'_, f64>,
+        frames: &[FrameId],
+        parameters: HnswParameters,
+    ) -> Self {
         let graph = Hnsw::new(
             usize::from(parameters.links.max(2)),
             frames.len().max(1),
@@ -69,10 +79,16 @@ impl HnswIndex {
             parameters.build_effort.max(1),
             DistL2 {},
         );
-        let rows: Vec<Vec<f64>> = frames.iter().map(|frame| latents.row(frame.row()).to_vec()).collect();
+
+        let rows: Vec<Vec<f64>> = frames
+            .iter()
+            .map(|frame| latents.row(frame.row()).to_vec())
+            .collect();
+
         for (position, row) in rows.iter().enumerate() {
             graph.insert((&single(row), position));
         }
+
         let mut index = Self {
             graph,
             exact: ExactIndex::new(latents, frames),
@@ -81,24 +97,41 @@ impl HnswIndex {
             unreachable: Vec::new(),
             parameters,
         };
-        index.unreachable = (0..index.latents.len()).filter(|&position| !index.reaches(position)).collect();
+
+        index.unreachable = (0..index.latents.len())
+            .filter(|&position| !index.reaches(position))
+            .collect();
+
         index
     }
 
-    /// Recall of the `k` nearest against the exact scan, asked from every `stride`-th latent of the index.
+    /// Recall of the `k` nearest against the exact scan, asked from every `stride`-th latent of the
+    /// index.
     pub fn audit(&self, k: usize, stride: usize) -> Audit {
         let count = self.latents.len();
         let halfway = |position: usize| -> Vec<f64> {
             let far = &self.latents[(position + count / 2) % count];
-            self.latents[position].iter().zip(far).map(|(a, b)| 0.5 * (a + b)).collect()
+            self.latents[position]
+                .iter()
+                .zip(far)
+                .map(|(a, b)| 0.5 * (a + b))
+                .collect()
         };
+
         let queries: Vec<Vec<f64>> = (0..count).step_by(stride.max(1)).map(halfway).collect();
+
         let share = |query: &Vec<f64>| {
             let truth = self.exact.nearest(query, k, None);
             let limit = truth.last().map_or(0.0, |last| last.distance);
-            let found = self.nearest(query, k, None).iter().filter(|hit| hit.distance <= limit).count();
+            let found = self
+                .nearest(query, k, None)
+                .iter()
+                .filter(|hit| hit.distance <= limit)
+                .count();
+
             found as f64 / truth.len().max(1) as f64
         };
+
         Audit {
             unreachable: self.unreachable.len(),
             frame_count: self.frames.len(),
@@ -110,32 +143,51 @@ impl HnswIndex {
 
     fn reaches(&self, position: usize) -> bool {
         let effort = self.parameters.search_effort;
-        let found = self.graph.search(&single(&self.latents[position]), effort, effort);
+        let found = self
+            .graph
+            .search(&single(&self.latents[position]), effort, effort);
+
         found.iter().any(|hit| hit.d_id == position)
     }
 }
 
 impl Index for HnswIndex {
     fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbour> {
-        let wanted = k.saturating_add(exclusion.map_or(0, |exclusion| exclusion.most())).min(self.frames.len());
-        let found = self.graph.search(&single(query), wanted, self.parameters.search_effort.max(wanted));
-        let positions: BTreeSet<usize> =
-            found.iter().map(|hit| hit.d_id).chain(self.unreachable.iter().copied()).collect();
+        let wanted = k
+            .saturating_add(exclusion.map_or(0, |exclusion| exclusion.most()))
+            .min(self.frames.len());
+        let found = self.graph.search(
+            &single(query),
+            wanted,
+            self.parameters.search_effort.max(wanted),
+        );
+
+        let positions: BTreeSet<usize> = found
+            .iter()
+            .map(|hit| hit.d_id)
+            .chain(self.unreachable.iter().copied())
+            .collect();
+
         let mut neighbours: Vec<Neighbour> = positions
             .into_iter()
-            .filter(|&position| !exclusion.is_some_and(|exclusion| exclusion.covers(self.frames[position])))
+            .filter(|&position| {
+                !exclusion.is_some_and(|exclusion| exclusion.covers(self.frames[position]))
+            })
             .map(|position| Neighbour {
                 frame: self.frames[position],
                 distance: distance(&self.latents[position], query),
             })
             .collect();
+
         neighbours.sort_by(by_distance_then_frame);
         neighbours.truncate(k);
+
         if neighbours.len() < k.min(self.frames.len()) {
-            // The search landed in a part of the graph that is cut off from the rest: the contract promises every
-            // frame that is left.
+            // The search landed in a part of the graph that is cut off from the rest: the contract
+            // promises every frame that is left.
             return self.exact.nearest(query, k, exclusion);
         }
+
         neighbours
     }
 

@@ -1,7 +1,8 @@
 //! Nearest neighbours of a latent among a room's frames: exact by default, HNSW as an option.
 //!
-//! Every index keeps one contract (`tests/index_contract.rs`): answers are ordered by L2 distance, then by frame;
-//! an excluded frame is never returned; fewer than `k` are returned only when fewer are left.
+//! Every index keeps one contract (`tests/index_contract.rs`): answers are ordered by L2 distance,
+//! then by frame; an excluded frame is never returned; fewer than `k` are returned only when fewer
+//! are left.
 
 mod exact;
 mod hnsw;
@@ -57,10 +58,16 @@ pub trait Index: Send + Sync {
 
 /// Orders neighbours as every answer is ordered.
 fn by_distance_then_frame(a: &Neighbour, b: &Neighbour) -> std::cmp::Ordering {
-    a.distance.total_cmp(&b.distance).then(a.frame.cmp(&b.frame))
+    a.distance
+        .total_cmp(&b.distance)
+        .then(a.frame.cmp(&b.frame))
 }
 
 /// L2 distance, summed in order of the columns.
 fn distance(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(x, y)| (x - y) * (x - y)).sum::<f64>().sqrt()
+    a.iter()
+        .zip(b)
+        .map(|(x, y)| (x - y) * (x - y))
+        .sum::<f64>()
+        .sqrt()
 }

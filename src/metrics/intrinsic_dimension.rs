@@ -1,6 +1,7 @@
 //! M2: of how many dimensions is the surface that the features lie on?
 //!
-//! Distances are taken directly, in f64: expanding ‖x‖² − 2xy + ‖y‖² loses duplicates and gives garbage.
+//! Distances are taken directly, in f64: expanding ‖x‖² − 2xy + ‖y‖² loses duplicates and gives
+//! garbage.
 
 use ndarray::{ArrayView2, Axis};
 use rayon::prelude::*;
@@ -59,10 +60,12 @@ pub struct IntrinsicDimension {
     pub dropped: usize,
 }
 
-/// The intrinsic dimension of rows (n, d); rows at most `gap` apart are no neighbours, 0 for none but the row itself.
+/// The intrinsic dimension of rows (n, d); rows at most `gap` apart are no neighbours, 0 for none
+/// but the row itself.
 ///
 /// # Errors
-/// [`Error::TooFewRows`] when fewer than 21 rows are left, [`Error::TooFewCandidates`] when the gap leaves too few.
+/// [`Error::TooFewRows`] when fewer than 21 rows are left, [`Error::TooFewCandidates`] when the gap
+/// leaves too few.
 ///
 /// Source: SeeSE3, M2; the paper states neither gap nor K.
 pub fn intrinsic_dimension(
@@ -75,30 +78,62 @@ pub fn intrinsic_dimension(
         Duplicates::DropRows => (0..all.nrows()).collect(),
         Duplicates::KeepFirst => {
             let mut seen = std::collections::HashSet::new();
-            let bits = |row: usize| all.row(row).iter().map(|x| (x + 0.0).to_bits()).collect::<Vec<_>>();
-            (0..all.nrows()).filter(|&row| seen.insert(bits(row))).collect()
+
+            let bits = |row: usize| {
+                all.row(row)
+                    .iter()
+                    .map(|x| (x + 0.0).to_bits())
+                    .collect::<Vec<_>>()
+            };
+
+            (0..all.nrows())
+                .filter(|&row| seen.insert(bits(row)))
+                .collect()
         }
     };
+
     let points = all.select(Axis(0), &kept);
     let nearest = |row: usize| -> Result<Vec<f64>, Error> {
         let here = points.row(row);
         let mut squares: Vec<f64> = (0..points.nrows())
             .filter(|&other| other != row && other.abs_diff(row) > gap)
-            .map(|other| here.iter().zip(points.row(other)).map(|(x, y)| (x - y) * (x - y)).sum())
+            .map(|other| {
+                here.iter()
+                    .zip(points.row(other))
+                    .map(|(x, y)| (x - y) * (x - y))
+                    .sum()
+            })
             .collect();
+
         if squares.len() < MLE_NEIGHBOURS {
-            return Err(Error::TooFewCandidates { frame: kept[row], k: MLE_NEIGHBOURS, exclusion: gap });
+            return Err(Error::TooFewCandidates {
+                frame: kept[row],
+                k: MLE_NEIGHBOURS,
+                exclusion: gap,
+            });
         }
+
         squares.select_nth_unstable_by(MLE_NEIGHBOURS - 1, f64::total_cmp);
         squares.truncate(MLE_NEIGHBOURS);
         squares.sort_by(f64::total_cmp);
+
         Ok(squares.into_iter().map(f64::sqrt).collect())
     };
-    let distances: Vec<Vec<f64>> = (0..points.nrows()).into_par_iter().map(nearest).collect::<Result<_, _>>()?;
+
+    let distances: Vec<Vec<f64>> = (0..points.nrows())
+        .into_par_iter()
+        .map(nearest)
+        .collect::<Result<_, _>>()?;
     let usable: Vec<&Vec<f64>> = distances.iter().filter(|row| row[0] > 0.0).collect();
+
     if usable.len() <= MLE_NEIGHBOURS {
-        return Err(Error::TooFewRows { kept: usable.len(), rows: all.nrows(), needed: MLE_NEIGHBOURS + 1 });
+        return Err(Error::TooFewRows {
+            kept: usable.len(),
+            rows: all.nrows(),
+            needed: MLE_NEIGHBOURS + 1,
+        });
     }
+
     Ok(IntrinsicDimension {
         two_nn: two_nn(&usable),
         mle_biased: mle(&usable, MLE_NEIGHBOURS as f64 - 1.0),
@@ -113,19 +148,44 @@ fn two_nn(distances: &[&Vec<f64>]) -> TwoNn {
     logs.sort_by(f64::total_cmp);
     let count = logs.len();
     let used = (count as f64 * (1.0 - DISCARDED)) as usize;
+
     let likelihood = (count as f64 - 1.0) / logs.iter().sum::<f64>();
     let share = |i: usize| -(1.0 - (i + 1) as f64 / count as f64).ln();
     let used_logs = &logs[..used];
     let square: f64 = used_logs.iter().map(|x| x * x).sum();
-    let linear = used_logs.iter().enumerate().map(|(i, x)| x * share(i)).sum::<f64>() / square;
+
+    let linear = used_logs
+        .iter()
+        .enumerate()
+        .map(|(i, x)| x * share(i))
+        .sum::<f64>()
+        / square;
+
     let tail = (count - used) as f64 * used_logs.last().copied().unwrap_or(f64::NAN);
     let censored = (used as f64 - 1.0) / (used_logs.iter().sum::<f64>() + tail);
-    TwoNn { linear, censored, likelihood }
+
+    TwoNn {
+        linear,
+        censored,
+        likelihood,
+    }
 }
 
 fn mle(distances: &[&Vec<f64>], factor: f64) -> Mle {
-    let of = |row: &&Vec<f64>| factor / row.iter().map(|r| (row[row.len() - 1] / r).ln()).sum::<f64>();
+    let of = |row: &&Vec<f64>| {
+        factor
+            / row
+                .iter()
+                .map(|r| (row[row.len() - 1] / r).ln())
+                .sum::<f64>()
+    };
+
     let each: Vec<f64> = distances.iter().map(of).collect();
     let inverse: Vec<f64> = each.iter().map(|m| 1.0 / m).collect();
-    Mle { harmonic: 1.0 / mean(&inverse), mean: mean(&each), median: median(&each) }
+
+    Mle {
+        harmonic: 1.0 / mean(&inverse),
+        mean: mean(&each),
+        median: median(&each),
+    }
 }

@@ -14,15 +14,34 @@ use crate::{pairs, ridge};
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum Error {
     #[error("{frames} frames at stride {stride} need {needed} frames, the room has {have}")]
-    TooFewFrames { frames: usize, stride: usize, needed: usize, have: usize },
-    #[error("frame {frame} has fewer than {k} candidates that are more than {exclusion} frames away")]
-    TooFewCandidates { frame: usize, k: usize, exclusion: usize },
+    TooFewFrames {
+        frames: usize,
+        stride: usize,
+        needed: usize,
+        have: usize,
+    },
+    #[error(
+        "frame {frame} has fewer than {k} candidates that are more than {exclusion} frames away"
+    )]
+    TooFewCandidates {
+        frame: usize,
+        k: usize,
+        exclusion: usize,
+    },
     #[error("{what} must be at least {least}, got {given}")]
-    TooSmall { what: &'static str, least: usize, given: usize },
+    TooSmall {
+        what: &'static str,
+        least: usize,
+        given: usize,
+    },
     #[error("row {row} of the features is zero; it has no direction")]
     NoDirection { row: usize },
     #[error("{kept} of {rows} rows are left without duplicates; {needed} are needed")]
-    TooFewRows { kept: usize, rows: usize, needed: usize },
+    TooFewRows {
+        kept: usize,
+        rows: usize,
+        needed: usize,
+    },
     #[error(transparent)]
     Pairs(#[from] pairs::Error),
     #[error(transparent)]

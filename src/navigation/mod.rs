@@ -1,9 +1,10 @@
-//! From a frame and a motion to the frames that follow: inverse Poincaré navigation in any number of steps.
+//! From a frame and a motion to the frames that follow: inverse Poincaré navigation in any number
+//! of steps.
 //!
-//! - A step in latent space is ĝ = g + W⁺ΔP in one of three readings ([`Reading`], A-16), or what another [`Stepper`]
-//!   says; the frame nearest to ĝ is looked for under a [`Metric`].
-//! - Open loop takes all steps from the source; snap goes on from each retrieved frame; closed loop does so too and
-//!   plans the rest of the way anew (A-22).
+//! - A step in latent space is ĝ = g + W⁺ΔP in one of three readings ([`Reading`], A-16), or what
+//!   another [`Stepper`] says; the frame nearest to ĝ is looked for under a [`Metric`].
+//! - Open loop takes all steps from the source; snap goes on from each retrieved frame; closed loop
+//!   does so too and plans the rest of the way anew (A-22).
 
 mod multi_step;
 mod navigator;
@@ -45,8 +46,14 @@ pub enum Error {
     Pairs(#[from] pairs::Error),
     #[error(transparent)]
     Cancelled(#[from] cancel::Cancelled),
-    #[error("room '{room}' has {frame_count} frames, its features have {rows} rows; every frame needs one")]
-    FeatureRows { room: room::RoomId, frame_count: usize, rows: usize },
+    #[error(
+        "room '{room}' has {frame_count} frames, its features have {rows} rows; every frame needs one"
+    )]
+    FeatureRows {
+        room: room::RoomId,
+        frame_count: usize,
+        rows: usize,
+    },
     #[error("steps must be 1 to {most} in all, got {actual}")]
     Steps { actual: u64, most: u32 },
     #[error("hit_count must be 1 to {most}, got {actual}")]
@@ -55,7 +62,9 @@ pub enum Error {
     HitsInAll { actual: u64, most: u64 },
     #[error("displacement has no twist; give at least one")]
     NoTwist,
-    #[error("displacement {position} has a number that is not finite or a translation over {MAX_TRANSLATION_M:e} m")]
+    #[error(
+        "displacement {position} has a number that is not finite or a translation over {MAX_TRANSLATION_M:e} m"
+    )]
     TwistNotFinite { position: usize },
     #[error(
         "displacement {position} turns by {angle_rad:.6} rad; a motion must turn by less than π ({:.6}), \
@@ -63,7 +72,9 @@ pub enum Error {
         std::f64::consts::PI
     )]
     TwistBeyondPi { position: usize, angle_rad: f64 },
-    #[error("{what} needs a source whose pose is known: use a frame of the room, or give source_pose")]
+    #[error(
+        "{what} needs a source whose pose is known: use a frame of the room, or give source_pose"
+    )]
     PoseNeeded { what: &'static str },
     #[error("no frame is left to retrieve: the room has {frame_count}, all are excluded")]
     NoCandidates { frame_count: usize },
@@ -74,8 +85,13 @@ fn check_twist(twist: geometry::Twist, position: usize) -> Result<(), Error> {
     if !twist.is_finite() || twist.linear.norm() > MAX_TRANSLATION_M {
         return Err(Error::TwistNotFinite { position });
     }
+
     if !twist.is_unique_logarithm() {
-        return Err(Error::TwistBeyondPi { position, angle_rad: twist.angular.norm() });
+        return Err(Error::TwistBeyondPi {
+            position,
+            angle_rad: twist.angular.norm(),
+        });
     }
+
     Ok(())
 }

@@ -16,7 +16,8 @@ pub enum Mode {
     OpenLoop,
     /// Each step starts from the latent of the frame that the last one retrieved.
     Snap,
-    /// As [`Mode::Snap`], with the motion left to the goal planned anew from the retrieved frame's pose.
+    /// As [`Mode::Snap`], with the motion left to the goal planned anew from the retrieved frame's
+    /// pose.
     ClosedLoop,
 }
 
@@ -40,7 +41,8 @@ pub struct Plan {
     pub steps: u32,
     /// Frames retrieved for each step, at least 1.
     pub hit_count: usize,
-    /// Whether the frame that a step starts from may not be retrieved, and how many rows to each side of it.
+    /// Whether the frame that a step starts from may not be retrieved, and how many rows to each
+    /// side of it.
     pub exclude_source: Option<u32>,
 }
 
@@ -91,41 +93,72 @@ pub struct Leg {
 /// Walks a leg.
 ///
 /// # Errors
-/// [`Error::PoseNeeded`] for a closed loop from a start without a pose, [`Error::NoCandidates`], [`Error::Adapter`],
-/// [`Error::Cancelled`].
+/// [`Error::PoseNeeded`] for a closed loop from a start without a pose, [`Error::NoCandidates`],
+/// [`Error::Adapter`], [`Error::Cancelled`].
 ///
 /// Source: SeeSE3, sec. 2.7, multi-step navigation.
-pub fn walk(space: Space<'_>, start: &Start, leg: Leg, plan: Plan, cancel: &Cancellation) -> Result<Vec<Step>, Error> {
+pub fn walk(
+    space: Space<'_>,
+    start: &Start,
+    leg: Leg,
+    plan: Plan,
+    cancel: &Cancellation,
+) -> Result<Vec<Step>, Error> {
     let goal = match (plan.mode, leg.goal) {
-        (Mode::ClosedLoop, None) => return Err(Error::PoseNeeded { what: "a closed loop" }),
+        (Mode::ClosedLoop, None) => {
+            return Err(Error::PoseNeeded {
+                what: "a closed loop",
+            });
+        }
         (Mode::ClosedLoop, goal) => goal,
         _ => None,
     };
+
     let mut at = start.clone();
     let mut steps = Vec::new();
     for done in 0..plan.steps {
         cancel.check()?;
+
         let (part, parts) = match (goal, at.pose) {
             (Some(goal), Some(pose)) => (body_twist(&pose, &goal), plan.steps - done),
             _ => (leg.motion, plan.steps),
         };
+
         let share = f64::from(plan.steps).recip();
-        let step = space.stepper.step(space.adapter, at.latent.view(), part.divided(parts), share)?;
+        let step =
+            space
+                .stepper
+                .step(space.adapter, at.latent.view(), part.divided(parts), share)?;
         let latent = &at.latent + &step;
-        let exclusion = plan.exclude_source.zip(at.frame).map(|(radius, centre)| Exclusion { centre, radius });
-        let neighbours = space.search.nearest(latent.view(), plan.hit_count, exclusion);
+
+        let exclusion = plan
+            .exclude_source
+            .zip(at.frame)
+            .map(|(radius, centre)| Exclusion { centre, radius });
+        let neighbours = space
+            .search
+            .nearest(latent.view(), plan.hit_count, exclusion);
+
         let Some(first) = neighbours.first() else {
-            return Err(Error::NoCandidates { frame_count: space.poses.len() });
+            return Err(Error::NoCandidates {
+                frame_count: space.poses.len(),
+            });
         };
+
         at = match plan.mode {
-            Mode::OpenLoop => Start { latent: latent.clone(), ..at },
+            Mode::OpenLoop => Start {
+                latent: latent.clone(),
+                ..at
+            },
             Mode::Snap | Mode::ClosedLoop => Start {
                 latent: space.latents.row(first.frame.row()).to_owned(),
                 frame: Some(first.frame),
                 pose: Some(space.poses[first.frame.row()]),
             },
         };
+
         steps.push(Step { latent, neighbours });
     }
+
     Ok(steps)
 }

@@ -36,7 +36,8 @@ pub enum Displacement {
     TargetPose(Pose),
 }
 
-/// Which pairs of the room a refit is fitted on: the training pairs, or the test pairs for an in-sample refit.
+/// Which pairs of the room a refit is fitted on: the training pairs, or the test pairs for an
+/// in-sample refit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FitOn {
     /// How frames are kept apart.
@@ -64,7 +65,8 @@ pub struct Query {
     pub fit_on: FitOn,
     /// Frames for each step.
     pub hit_count: u32,
-    /// Whether the frame that a step starts from may not be retrieved, and how many rows to each side of it.
+    /// Whether the frame that a step starts from may not be retrieved, and how many rows to each
+    /// side of it.
     pub exclude_source: Option<u32>,
 }
 
@@ -75,13 +77,18 @@ pub struct Limits {
     pub steps: u32,
     /// Frames for each step.
     pub hits: u32,
-    /// Frames in all: what keeps an answer under the 4 MiB that gRPC clients read unless told otherwise.
+    /// Frames in all: what keeps an answer under the 4 MiB that gRPC clients read unless told
+    /// otherwise.
     pub hits_in_all: u64,
 }
 
 impl Default for Limits {
     fn default() -> Self {
-        Self { steps: 1_000, hits: 1_000, hits_in_all: 10_000 }
+        Self {
+            steps: 1_000,
+            hits: 1_000,
+            hits_in_all: 10_000,
+        }
     }
 }
 
@@ -89,30 +96,48 @@ impl Query {
     /// Checks what can be checked without a room.
     ///
     /// # Errors
-    /// [`Error::Steps`], [`Error::HitCount`], [`Error::HitsInAll`], [`Error::NoTwist`], [`Error::TwistNotFinite`] or
-    /// [`Error::TwistBeyondPi`].
+    /// [`Error::Steps`], [`Error::HitCount`], [`Error::HitsInAll`], [`Error::NoTwist`],
+    /// [`Error::TwistNotFinite`] or [`Error::TwistBeyondPi`].
     pub fn check(&self, limits: Limits) -> Result<(), Error> {
         let motions = match &self.displacement {
             Displacement::Twists(twists) => {
                 if twists.is_empty() {
                     return Err(Error::NoTwist);
                 }
-                twists.iter().enumerate().try_for_each(|(position, &twist)| check_twist(twist, position))?;
+
+                twists
+                    .iter()
+                    .enumerate()
+                    .try_for_each(|(position, &twist)| check_twist(twist, position))?;
+
                 twists.len() as u64
             }
             Displacement::TargetFrame(_) | Displacement::TargetPose(_) => 1,
         };
+
         let actual = u64::from(self.steps).saturating_mul(motions);
         if actual == 0 || actual > u64::from(limits.steps) {
-            return Err(Error::Steps { actual, most: limits.steps });
+            return Err(Error::Steps {
+                actual,
+                most: limits.steps,
+            });
         }
+
         if self.hit_count == 0 || self.hit_count > limits.hits {
-            return Err(Error::HitCount { actual: self.hit_count, most: limits.hits });
+            return Err(Error::HitCount {
+                actual: self.hit_count,
+                most: limits.hits,
+            });
         }
+
         let in_all = actual.saturating_mul(u64::from(self.hit_count));
         if in_all > limits.hits_in_all {
-            return Err(Error::HitsInAll { actual: in_all, most: limits.hits_in_all });
+            return Err(Error::HitsInAll {
+                actual: in_all,
+                most: limits.hits_in_all,
+            });
         }
+
         Ok(())
     }
 }

@@ -23,18 +23,25 @@ pub enum Metric {
     RowSpace,
     /// Mahalanobis, under the covariance of the room's latents.
     Whitened,
-    /// L2 of σ ⊙ W g: the length of the motion that the adapter sees between two latents, in the metres and radians
-    /// that Hit@ε is in. Not for charts under a gate.
+    /// L2 of σ ⊙ W g: the length of the motion that the adapter sees between two latents, in the
+    /// metres and radians that Hit@ε is in. Not for charts under a gate.
     Motion,
-    /// Mahalanobis of σ ⊙ W g, under the second moment of the adapter's errors in rooms that it did not learn from: the
-    /// candidate under which the error of the wanted motion is least surprising. It belongs to the homogeneous reading,
-    /// whose imagined latent is ΔP away by W. Ours, not the paper's. Not for charts under a gate.
+    /// Mahalanobis of σ ⊙ W g, under the second moment of the adapter's errors in rooms that it did
+    /// not learn from: the candidate under which the error of the wanted motion is least
+    /// surprising. It belongs to the homogeneous reading, whose imagined latent is ΔP away by W.
+    /// Ours, not the paper's. Not for charts under a gate.
     Calibrated,
 }
 
 impl Metric {
     /// Every metric.
-    pub const ALL: [Self; 5] = [Self::Full, Self::RowSpace, Self::Whitened, Self::Motion, Self::Calibrated];
+    pub const ALL: [Self; 5] = [
+        Self::Full,
+        Self::RowSpace,
+        Self::Whitened,
+        Self::Motion,
+        Self::Calibrated,
+    ];
 
     /// Its name in tables and on the wire.
     pub fn name(self) -> &'static str {
@@ -76,21 +83,39 @@ impl Projection {
         let coordinates = adapter.coordinate_count();
         let matrix = match metric {
             Metric::Full => None,
-            Metric::RowSpace => Some(blocks(&adapter.motion_matrices().into_iter().map(row_basis).collect::<Vec<_>>())),
+            Metric::RowSpace => Some(blocks(
+                &adapter
+                    .motion_matrices()
+                    .into_iter()
+                    .map(row_basis)
+                    .collect::<Vec<_>>(),
+            )),
             Metric::Motion => Some(adapter.motion_of_coordinates()?),
             Metric::Calibrated => {
                 let covariance = adapter.error_covariance().ok_or(Error::NotCalibrated)?;
+
                 // Σ = L Lᵀ: the length of L⁻¹x is Mahalanobis' of x.
                 let lower = covariance.cholesky().ok_or(Error::ErrorCovariance)?.l();
                 let inverse = lower.try_inverse().ok_or(Error::ErrorCovariance)?;
-                Some(Array2::from_shape_fn((6, 6), |at| inverse[at]).dot(&adapter.motion_of_coordinates()?))
+
+                Some(
+                    Array2::from_shape_fn((6, 6), |at| inverse[at])
+                        .dot(&adapter.motion_of_coordinates()?),
+                )
             }
             Metric::Whitened if coordinates > MOST_WHITENED => {
-                return Err(Error::WhitenedColumns { actual: coordinates, most: MOST_WHITENED });
+                return Err(Error::WhitenedColumns {
+                    actual: coordinates,
+                    most: MOST_WHITENED,
+                });
             }
             Metric::Whitened => Some(whitening(latents.slice(s![.., ..coordinates]))),
         };
-        Ok(Self { coordinates, matrix })
+
+        Ok(Self {
+            coordinates,
+            matrix,
+        })
     }
 
     fn rows(&self, latents: ArrayView2<'_, f64>) -> Array2<f64> {
@@ -112,35 +137,53 @@ impl Projection {
 
 /// An orthonormal basis of the rows of W, shape (6, k).
 fn row_basis(w: ArrayView2<'_, f64>) -> Array2<f64> {
-    let svd = DMatrix::from_fn(w.ncols(), w.nrows(), |row, column| w[(column, row)]).svd(true, false);
-    let basis = svd.u.unwrap_or_else(|| DMatrix::zeros(w.ncols(), w.nrows()));
+    let svd =
+        DMatrix::from_fn(w.ncols(), w.nrows(), |row, column| w[(column, row)]).svd(true, false);
+    let basis = svd
+        .u
+        .unwrap_or_else(|| DMatrix::zeros(w.ncols(), w.nrows()));
+
     Array2::from_shape_fn(w.dim(), |(row, column)| basis[(column, row)])
 }
 
 /// The matrices along the diagonal of a larger one.
 fn blocks(parts: &[Array2<f64>]) -> Array2<f64> {
-    let (rows, columns) = (parts.iter().map(Array2::nrows).sum(), parts.iter().map(Array2::ncols).sum());
+    let rows = parts.iter().map(Array2::nrows).sum();
+    let columns = parts.iter().map(Array2::ncols).sum();
     let mut matrix = Array2::zeros((rows, columns));
-    let (mut row, mut column) = (0, 0);
+    let mut row = 0;
+
+    let mut column = 0;
     for part in parts {
-        let (bottom, right) = (row + part.nrows(), column + part.ncols());
-        matrix.slice_mut(s![row..bottom, column..right]).assign(part);
-        (row, column) = (bottom, right);
+        let bottom = row + part.nrows();
+        let right = column + part.ncols();
+        matrix
+            .slice_mut(s![row..bottom, column..right])
+            .assign(part);
+
+        row = bottom;
+        column = right;
     }
+
     matrix
 }
 
-/// Λ^(−1/2) Qᵀ of the rows' population covariance Q Λ Qᵀ; directions in which the rows do not vary are left out.
+/// Λ^(−1/2) Qᵀ of the rows' population covariance Q Λ Qᵀ; directions in which the rows do not vary
+/// are left out.
 fn whitening(rows: ArrayView2<'_, f64>) -> Array2<f64> {
     let count = rows.nrows().max(1) as f64;
     let centred = &rows - &(rows.sum_axis(Axis(0)) / count);
     let covariance = centred.t().dot(&centred) / count;
-    let eigen = SymmetricEigen::new(DMatrix::from_fn(rows.ncols(), rows.ncols(), |i, j| covariance[(i, j)]));
+    let eigen = SymmetricEigen::new(DMatrix::from_fn(rows.ncols(), rows.ncols(), |i, j| {
+        covariance[(i, j)]
+    }));
     let largest = eigen.eigenvalues.iter().copied().fold(0.0, f64::max);
+
     let weight = |value: f64| match value > largest * RANK_TOLERANCE * RANK_TOLERANCE {
         true => value.sqrt().recip(),
         false => 0.0,
     };
+
     Array2::from_shape_fn((rows.ncols(), rows.ncols()), |(row, column)| {
         weight(eigen.eigenvalues[row]) * eigen.eigenvectors[(column, row)]
     })
@@ -157,8 +200,8 @@ impl Search {
     /// An exact search among `candidates`, frames whose latents are rows of `latents`.
     ///
     /// # Errors
-    /// [`Error::NotCalibrated`], [`Error::GatedMotion`] or [`Error::WhitenedColumns`] when the metric needs what the
-    /// adapter lacks.
+    /// [`Error::NotCalibrated`], [`Error::GatedMotion`] or [`Error::WhitenedColumns`] when the
+    /// metric needs what the adapter lacks.
     pub fn exact(
         metric: Metric,
         adapter: &Adapter,
@@ -167,7 +210,12 @@ impl Search {
     ) -> Result<Self, Error> {
         let projection = Projection::new(metric, adapter, latents)?;
         let index = Box::new(ExactIndex::new(projection.rows(latents).view(), candidates));
-        Ok(Self { projection, index, audit: None })
+
+        Ok(Self {
+            projection,
+            index,
+            audit: None,
+        })
     }
 
     /// A search among all frames.
@@ -184,15 +232,27 @@ impl Search {
         let IndexKind::Hnsw(parameters) = kind else {
             return Self::exact(metric, adapter, latents, &frames);
         };
+
         let projection = Projection::new(metric, adapter, latents)?;
         let index = HnswIndex::new(projection.rows(latents).view(), &frames, parameters);
         let audit = Some(index.audit(10, frames.len().div_ceil(200)));
-        Ok(Self { projection, index: Box::new(index), audit })
+
+        Ok(Self {
+            projection,
+            index: Box::new(index),
+            audit,
+        })
     }
 
     /// The `k` frames nearest to a latent.
-    pub fn nearest(&self, latent: ArrayView1<'_, f64>, k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbour> {
-        self.index.nearest(&self.projection.one(latent), k, exclusion)
+    pub fn nearest(
+        &self,
+        latent: ArrayView1<'_, f64>,
+        k: usize,
+        exclusion: Option<Exclusion>,
+    ) -> Vec<Neighbour> {
+        self.index
+            .nearest(&self.projection.one(latent), k, exclusion)
     }
 
     /// What was measured of an approximate index; none for the exact scan.
@@ -206,35 +266,48 @@ mod tests {
     use super::*;
 
     fn wave(rows: usize, columns: usize) -> Array2<f64> {
-        Array2::from_shape_fn((rows, columns), |(i, j)| (((i * columns + j) as f64).powi(2) * 0.37).sin())
+        Array2::from_shape_fn((rows, columns), |(i, j)| {
+            (((i * columns + j) as f64).powi(2) * 0.37).sin()
+        })
     }
 
-    /// Oracle: the definition of Mahalanobis' distance, (a − b)ᵀ C⁻¹ (a − b), by nalgebra's general inverse.
+    /// Oracle: the definition of Mahalanobis' distance, (a − b)ᵀ C⁻¹ (a − b), by nalgebra's general
+    /// inverse.
     #[test]
     fn whitened_distances_are_mahalanobis() {
         let rows = wave(40, 5);
         let white = rows.dot(&whitening(rows.view()).t());
         let matrix = DMatrix::from_fn(40, 5, |i, j| rows[(i, j)]);
         let centred = DMatrix::from_fn(40, 5, |i, j| matrix[(i, j)] - matrix.column(j).mean());
-        let inverse = (centred.transpose() * &centred / 40.0).try_inverse().unwrap();
+        let inverse = (centred.transpose() * &centred / 40.0)
+            .try_inverse()
+            .unwrap();
+
         for (a, b) in [(0, 1), (3, 17), (39, 2)] {
             let difference = (matrix.row(a) - matrix.row(b)).transpose();
             let expected = (difference.transpose() * &inverse * &difference)[(0, 0)];
             let found = (&white.row(a) - &white.row(b)).mapv(|x| x * x).sum();
-            assert!((found - expected).abs() < 1e-9 * expected, "{found} {expected}");
+
+            assert!(
+                (found - expected).abs() < 1e-9 * expected,
+                "{found} {expected}"
+            );
         }
     }
 
     /// Oracle: the projector W⁺W, whose distances are those in the basis.
     #[test]
     fn row_space_distances_are_those_of_the_projector() {
-        let (w, rows) = (wave(6, 20), wave(3, 20));
+        let w = wave(6, 20);
+        let rows = wave(3, 20);
         let matrix = DMatrix::from_fn(6, 20, |i, j| w[(i, j)]);
         let projector = matrix.clone().pseudo_inverse(1e-12).unwrap() * matrix;
+
         let basis = row_basis(w.view());
         let difference = &rows.row(0) - &rows.row(1);
         let expected = (projector * DMatrix::from_fn(20, 1, |i, _| difference[i])).norm();
         let found = basis.dot(&difference).mapv(|x| x * x).sum().sqrt();
+
         assert!((found - expected).abs() < 1e-12);
     }
 

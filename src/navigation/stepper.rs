@@ -25,12 +25,13 @@ pub enum StepKind {
 /// A variant of the refit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Refit {
-    /// Whether motions are z-scored by the adapter's μ and σ first; it changes what the penalty weighs.
+    /// Whether motions are z-scored by the adapter's μ and σ first; it changes what the penalty
+    /// weighs.
     pub z_scored: bool,
     /// Whether a constant step is fitted too; then zero motion moves the latent.
     pub intercept: bool,
-    /// Whether it is fitted on the very pairs that it is tested on, the likely protocol of the paper and a leak;
-    /// else on the room's training pairs.
+    /// Whether it is fitted on the very pairs that it is tested on, the likely protocol of the
+    /// paper and a leak; else on the room's training pairs.
     pub in_sample: bool,
 }
 
@@ -39,8 +40,18 @@ impl StepKind {
     pub fn all() -> Vec<Self> {
         let readings = Reading::ALL.map(Self::InversePoincare);
         let correctors = CorrectorKind::ALL.map(Self::Corrector);
-        let refit = |bits: u8| Refit { z_scored: bits & 2 != 0, intercept: bits & 4 != 0, in_sample: bits & 1 != 0 };
-        readings.into_iter().chain(correctors).chain((0..8).map(|bits| Self::Refit(refit(bits)))).collect()
+
+        let refit = |bits: u8| Refit {
+            z_scored: bits & 2 != 0,
+            intercept: bits & 4 != 0,
+            in_sample: bits & 1 != 0,
+        };
+
+        readings
+            .into_iter()
+            .chain(correctors)
+            .chain((0..8).map(|bits| Self::Refit(refit(bits))))
+            .collect()
     }
 
     /// Its name in tables, JSON and on the wire.
@@ -53,7 +64,11 @@ impl StepKind {
             Self::Corrector(CorrectorKind::Mlp2) => "corrector-mlp-2",
             Self::Corrector(CorrectorKind::Mlp3) => "corrector-mlp-3",
             Self::Corrector(CorrectorKind::Attention) => "corrector-attention",
-            Self::Refit(Refit { z_scored, intercept, in_sample }) => match (z_scored, intercept, in_sample) {
+            Self::Refit(Refit {
+                z_scored,
+                intercept,
+                in_sample,
+            }) => match (z_scored, intercept, in_sample) {
                 (false, false, false) => "ridge-refit",
                 (false, false, true) => "ridge-refit-in-sample",
                 (true, false, false) => "ridge-refit-z-scored",
@@ -105,7 +120,8 @@ impl Stepper {
     /// Fits what has to be fitted.
     ///
     /// # Errors
-    /// [`Error::Adapter`] when the adapter lacks the corrector, [`Error::Refit`] without a pair to fit on.
+    /// [`Error::Adapter`] when the adapter lacks the corrector, [`Error::Refit`] without a pair to
+    /// fit on.
     pub fn new(kind: StepKind, adapter: &Adapter, ground: Ground<'_>) -> Result<Self, Error> {
         match kind {
             StepKind::InversePoincare(reading) => Ok(Self::InversePoincare(reading)),
@@ -114,28 +130,51 @@ impl Stepper {
                 adapter.corrected_step(kind, still.view(), Twist::default())?;
                 Ok(Self::Corrector(kind))
             }
-            StepKind::Refit(Refit { z_scored, intercept, in_sample }) => {
+            StepKind::Refit(Refit {
+                z_scored,
+                intercept,
+                in_sample,
+            }) => {
                 let pairs = if in_sample { ground.test } else { ground.train };
-                let intercept = if intercept { Intercept::Fitted } else { Intercept::None };
+
+                let intercept = if intercept {
+                    Intercept::Fitted
+                } else {
+                    Intercept::None
+                };
+
                 let twists: Vec<Array1<f64>> = pairs
                     .iter()
-                    .map(|pair| body_twist(&ground.poses[pair.source.row()], &ground.poses[pair.target.row()]))
+                    .map(|pair| {
+                        body_twist(
+                            &ground.poses[pair.source.row()],
+                            &ground.poses[pair.target.row()],
+                        )
+                    })
                     .map(|twist| input(adapter, twist, z_scored, 1.0))
                     .collect();
+
                 let inputs = Array2::from_shape_fn((twists.len(), 6), |at| twists[at.0][at.1]);
-                let steps = Array2::from_shape_fn((pairs.len(), adapter.coordinate_count()), |(row, column)| {
-                    let Pair { source, target } = pairs[row];
-                    ground.latents[(target.row(), column)] - ground.latents[(source.row(), column)]
-                });
+
+                let steps = Array2::from_shape_fn(
+                    (pairs.len(), adapter.coordinate_count()),
+                    |(row, column)| {
+                        let Pair { source, target } = pairs[row];
+                        ground.latents[(target.row(), column)]
+                            - ground.latents[(source.row(), column)]
+                    },
+                );
+
                 let fit = Ridge::fit(inputs.view(), steps.view(), REFIT_ALPHA, intercept)?;
                 Ok(Self::Refit { fit, z_scored })
             }
         }
     }
 
-    /// The latent step of a motion from `latent`. `mean_share` is the share of what does not depend on the motion (μ in
-    /// the affine reading, a refit's intercept) that this step takes: 1 for a whole motion, 1/S for one of S equal
-    /// parts. A corrector takes each part for a motion of its own.
+    /// The latent step of a motion from `latent`. `mean_share` is the share of what does not depend
+    /// on the motion (μ in the affine reading, a refit's intercept) that this step takes: 1 for a
+    /// whole motion, 1/S for one of S equal parts. A corrector takes each part for a motion of its
+    /// own.
     ///
     /// # Errors
     /// [`Error::Adapter`] when the adapter lacks the corrector.
@@ -150,9 +189,14 @@ impl Stepper {
             Self::InversePoincare(reading) => Ok(adapter.step(latent, twist, *reading, mean_share)),
             Self::Corrector(kind) => Ok(adapter.corrected_step(*kind, latent, twist)?),
             Self::Refit { fit, z_scored } => {
-                let moved = fit.coefficients.dot(&input(adapter, twist, *z_scored, mean_share));
+                let moved = fit
+                    .coefficients
+                    .dot(&input(adapter, twist, *z_scored, mean_share));
+
                 let mut step = Array1::zeros(adapter.latent_dim());
-                step.slice_mut(s![..moved.len()]).assign(&(moved + &fit.intercept * mean_share));
+                step.slice_mut(s![..moved.len()])
+                    .assign(&(moved + &fit.intercept * mean_share));
+
                 Ok(step)
             }
         }
@@ -163,6 +207,11 @@ impl Stepper {
 fn input(adapter: &Adapter, twist: Twist, z_scored: bool, mean_share: f64) -> Array1<f64> {
     let scale = adapter.scale();
     let motion = twist.to_vector();
-    let input = if z_scored { (motion - scale.mean * mean_share).component_div(&scale.deviation) } else { motion };
+    let input = if z_scored {
+        (motion - scale.mean * mean_share).component_div(&scale.deviation)
+    } else {
+        motion
+    };
+
     Array1::from_iter(input.iter().copied())
 }

@@ -4,7 +4,8 @@ use nalgebra::{Cholesky, Matrix6, Vector6};
 
 use crate::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
 
-/// A pose and the covariance of its error δ in its own body frame: true = pose · exp(δ), on (v, ω), metres and radians.
+/// A pose and the covariance of its error δ in its own body frame: true = pose · exp(δ), on (v, ω),
+/// metres and radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Belief {
     /// `parent_from_camera`.
@@ -18,52 +19,81 @@ pub struct Belief {
 pub struct Innovation {
     /// log(pose⁻¹ measured).
     pub twist: Vector6<f64>,
-    /// Its squared Mahalanobis length under the sum of both covariances: χ² with six degrees of freedom if both are right.
+    /// Its squared Mahalanobis length under the sum of both covariances: χ² with six degrees of
+    /// freedom if both are right.
     pub squared_length: f64,
 }
 
 impl Belief {
     /// A pose that is known to `translation_m` and `rotation_rad`, standard deviations by axis.
     pub fn known(pose: Pose, translation_m: f64, rotation_rad: f64) -> Self {
-        let (v, w) = (translation_m * translation_m, rotation_rad * rotation_rad);
-        Self { pose, covariance: Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w)) }
+        let v = translation_m * translation_m;
+        let w = rotation_rad * rotation_rad;
+
+        Self {
+            pose,
+            covariance: Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w)),
+        }
     }
 
-    /// After a motion read with an error of covariance `noise` in the twist's own six numbers: true = exp(motion + r).
+    /// After a motion read with an error of covariance `noise` in the twist's own six numbers: true
+    /// = exp(motion + r).
     ///
-    /// Source: P' = Ad P Adᵀ + J_r Q J_rᵀ with Ad of exp(−ξ); Barfoot, State Estimation for Robotics, ch. 8.
+    /// Source: P' = Ad P Adᵀ + J_r Q J_rᵀ with Ad of exp(−ξ); Barfoot, State Estimation for
+    /// Robotics, ch. 8.
     #[must_use]
     pub fn moved(&self, motion: Twist, noise: &Matrix6<f64>) -> Self {
         let back = adjoint(&exp(&motion.reversed()));
         let carried = back * self.covariance * back.transpose();
+
         // J_r(ξ) is J_l(−ξ); its inverse always has one for |ω| < π.
-        let right = left_jacobian_inverse(&motion.reversed()).try_inverse().unwrap_or_else(Matrix6::identity);
+        let right = left_jacobian_inverse(&motion.reversed())
+            .try_inverse()
+            .unwrap_or_else(Matrix6::identity);
         let covariance = symmetric(&(carried + right * noise * right.transpose()));
-        Self { pose: self.pose * exp(&motion), covariance }
+
+        Self {
+            pose: self.pose * exp(&motion),
+            covariance,
+        }
     }
 
-    /// How far a measured pose is from this one. None when the covariances' sum is not positive definite.
+    /// How far a measured pose is from this one. None when the covariances' sum is not positive
+    /// definite.
     pub fn innovation(&self, measured: &Belief) -> Option<Innovation> {
         let twist = log(&self.pose.inv_mul(&measured.pose)).to_vector();
         let sum = Cholesky::new(self.covariance + measured.covariance)?;
-        Some(Innovation { twist, squared_length: twist.dot(&sum.solve(&twist)) })
+
+        Some(Innovation {
+            twist,
+            squared_length: twist.dot(&sum.solve(&twist)),
+        })
     }
 
-    /// Both together, by Kalman's gain, first order in the innovation; this belief where their sum is not positive
-    /// definite. The covariance is Joseph's form: positive definite whatever the rounding.
+    /// Both together, by Kalman's gain, first order in the innovation; this belief where their sum
+    /// is not positive definite. The covariance is Joseph's form: positive definite whatever the
+    /// rounding.
     #[must_use]
     pub fn corrected(&self, measured: &Belief) -> Self {
-        let Some(sum) = Cholesky::new(self.covariance + measured.covariance) else { return *self };
+        let Some(sum) = Cholesky::new(self.covariance + measured.covariance) else {
+            return *self;
+        };
         let gain = self.covariance * sum.inverse();
+
         let twist = log(&self.pose.inv_mul(&measured.pose)).to_vector();
         let step = Twist::from_vector(&(gain * twist));
         let rest = Matrix6::identity() - gain;
-        let joseph = rest * self.covariance * rest.transpose() + gain * measured.covariance * gain.transpose();
-        Self { pose: self.pose * exp(&step), covariance: symmetric(&joseph) }
+        let joseph = rest * self.covariance * rest.transpose()
+            + gain * measured.covariance * gain.transpose();
+
+        Self {
+            pose: self.pose * exp(&step),
+            covariance: symmetric(&joseph),
+        }
     }
 
-    /// The covariance in the order and frame of `geometry_msgs/PoseWithCovariance`: x, y, z, then rotations about x, y,
-    /// z, about the parent's fixed axes. Row-major, metres and radians.
+    /// The covariance in the order and frame of `geometry_msgs/PoseWithCovariance`: x, y, z, then
+    /// rotations about x, y, z, about the parent's fixed axes. Row-major, metres and radians.
     ///
     /// Source: ROS REP-103; δ_parent = R δ_body for both halves, to first order.
     pub fn ros_covariance(&self) -> Matrix6<f64> {
@@ -71,6 +101,7 @@ impl Belief {
         let mut turn = Matrix6::zeros();
         turn.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);
         turn.fixed_view_mut::<3, 3>(3, 3).copy_from(&rotation);
+
         symmetric(&(turn * self.covariance * turn.transpose()))
     }
 
@@ -94,7 +125,10 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     fn twist(v: [f64; 3], w: [f64; 3]) -> Twist {
-        Twist { linear: Vector3::from(v), angular: Vector3::from(w) }
+        Twist {
+            linear: Vector3::from(v),
+            angular: Vector3::from(w),
+        }
     }
 
     /// A normal deviate by the sum of twelve uniform ones: mean 0, variance 1.
@@ -114,39 +148,52 @@ mod tests {
         let motion = twist([0.5, -0.2, 0.8], [0.1, 0.6, -0.2]);
         let noise = Matrix6::from_diagonal(&Vector6::new(4e-4, 1e-4, 9e-4, 1e-4, 4e-4, 2e-4));
         let found = start.moved(motion, &noise);
+
         let count = 10_000;
         let mut sum = Matrix6::zeros();
         for _ in 0..count {
-            let from = start.pose * exp(&Twist::from_vector(&drawn(&mut random, &start.covariance)));
+            let from =
+                start.pose * exp(&Twist::from_vector(&drawn(&mut random, &start.covariance)));
             let read = motion.to_vector() + drawn(&mut random, &noise);
             let end = from * exp(&Twist::from_vector(&read));
             let error = log(&found.pose.inv_mul(&end)).to_vector();
             sum += error * error.transpose() / f64::from(count);
         }
+
         let worst = (sum - found.covariance).amax() / found.covariance.amax();
-        assert!(worst < 0.05, "off by {worst}: {sum} against {}", found.covariance);
+        assert!(
+            worst < 0.05,
+            "off by {worst}: {sum} against {}",
+            found.covariance
+        );
     }
 
-    /// Oracle: by hand. Two equally sure poses along one axis meet in the middle with half the variance; the squared
-    /// length of a 2 m innovation with variances 1 + 1 is 2.
+    /// Oracle: by hand. Two equally sure poses along one axis meet in the middle with half the
+    /// variance; the squared length of a 2 m innovation with variances 1 + 1 is 2.
     #[test]
     fn two_equally_sure_poses_meet_in_the_middle() {
         let ours = Belief::known(Pose::identity(), 1.0, 0.1);
         let theirs = Belief::known(Pose::translation(2.0, 0.0, 0.0), 1.0, 0.1);
         let met = ours.corrected(&theirs);
+
         assert!((met.pose.translation.vector - Vector3::x()).norm() < 1e-12);
         assert!((met.covariance - ours.covariance * 0.5).amax() < 1e-12);
         assert!((ours.innovation(&theirs).unwrap().squared_length - 2.0).abs() < 1e-12);
         assert!((ours.position_deviation_m() - 1.0).abs() < 1e-12);
     }
 
-    /// Oracle: ROS's definition, by hand: a camera turned a quarter about z that is unsure along its own x is unsure
-    /// along the parent's y; its unsure roll about x is one about y.
+    /// Oracle: ROS's definition, by hand: a camera turned a quarter about z that is unsure along
+    /// its own x is unsure along the parent's y; its unsure roll about x is one about y.
     #[test]
     fn covariances_for_ros_are_about_the_parents_axes() {
         let turn = Pose::rotation(Vector3::z() * std::f64::consts::FRAC_PI_2);
         let covariance = Matrix6::from_diagonal(&Vector6::new(4.0, 1.0, 1.0, 0.9, 0.1, 0.1));
-        let found = Belief { pose: turn, covariance }.ros_covariance();
+        let found = Belief {
+            pose: turn,
+            covariance,
+        }
+        .ros_covariance();
+
         let expected = Matrix6::from_diagonal(&Vector6::new(1.0, 4.0, 1.0, 0.1, 0.9, 0.1));
         assert!((found - expected).amax() < 1e-12, "{found}");
     }
@@ -160,11 +207,18 @@ mod tests {
         for step in 0..5_000 {
             let motion = Twist::from_vector(&Vector6::from_fn(|_, _| 0.3 * normal(&mut random)));
             belief = belief.moved(motion, &noise);
+
             if step % 7 == 0 {
-                belief =
-                    belief.corrected(&Belief { pose: belief.pose, covariance: Matrix6::from_diagonal_element(1e-9) });
+                belief = belief.corrected(&Belief {
+                    pose: belief.pose,
+                    covariance: Matrix6::from_diagonal_element(1e-9),
+                });
             }
-            assert!(Cholesky::new(belief.covariance).is_some(), "after {step} steps");
+
+            assert!(
+                Cholesky::new(belief.covariance).is_some(),
+                "after {step} steps"
+            );
         }
     }
 }

@@ -42,26 +42,63 @@ impl Map {
     /// The frames `mapped` of a room, in order.
     ///
     /// # Errors
-    /// [`Error::NotCalibrated`], [`Error::SmallMap`] when no frame has another one that is not beside it in time.
+    /// [`Error::NotCalibrated`], [`Error::SmallMap`] when no frame has another one that is not
+    /// beside it in time.
     pub fn new(navigator: Arc<Navigator>, mapped: &[FrameId]) -> Result<Self, Error> {
-        let calibration = navigator.adapter().calibration().ok_or(Error::NotCalibrated)?.clone();
+        let calibration = navigator
+            .adapter()
+            .calibration()
+            .ok_or(Error::NotCalibrated)?
+            .clone();
+
         let columns = s![.., ..navigator.adapter().coordinate_count()];
-        let white = calibration.flicker().whitened(navigator.latents().slice(columns));
+        let white = calibration
+            .flicker()
+            .whitened(navigator.latents().slice(columns));
         let index = ExactIndex::new(white.view(), mapped);
+
         let every = mapped.len().div_ceil(SAMPLED).max(1);
         let apart = mapped.iter().step_by(every).filter_map(|&centre| {
             let row = white.row(centre.row()).to_vec();
-            Some(index.nearest(&row, 1, Some(Exclusion { centre, radius: BESIDE })).first()?.distance)
+            Some(
+                index
+                    .nearest(
+                        &row,
+                        1,
+                        Some(Exclusion {
+                            centre,
+                            radius: BESIDE,
+                        }),
+                    )
+                    .first()?
+                    .distance,
+            )
         });
+
         let typical = crate::scores::median(&apart.collect::<Vec<_>>());
         if !(typical.is_finite() && typical > 0.0) {
-            return Err(Error::SmallMap { room: navigator.room().id().clone(), frames: mapped.len() });
+            return Err(Error::SmallMap {
+                room: navigator.room().id().clone(),
+                frames: mapped.len(),
+            });
         }
+
         let extent_m = extent(&navigator, mapped);
+
         // Sums of sound covariances by positive factors are sound.
-        let motion = own_errors::motion_errors(&navigator, &calibration, mapped).map_err(|_| Error::NotCalibrated)?;
+        let motion = own_errors::motion_errors(&navigator, &calibration, mapped)
+            .map_err(|_| Error::NotCalibrated)?;
         let anchor_factor = own_errors::anchor_factor(&navigator, &calibration, mapped, &white);
-        Ok(Self { navigator, calibration, index, typical, extent_m, motion, anchor_factor })
+
+        Ok(Self {
+            navigator,
+            calibration,
+            index,
+            typical,
+            extent_m,
+            motion,
+            anchor_factor,
+        })
     }
 
     /// The room and its adapter.
@@ -83,30 +120,48 @@ impl Map {
     pub fn sighting(&self, latent: ArrayView1<'_, f64>, k: usize) -> Sighting {
         let adapter = self.navigator.adapter();
         let coordinates = latent.slice(s![..adapter.coordinate_count()]);
-        let white = self.calibration.flicker().whitened(coordinates.insert_axis(Axis(0)));
+        let white = self
+            .calibration
+            .flicker()
+            .whitened(coordinates.insert_axis(Axis(0)));
         let nearest = self.index.nearest(&white.row(0).to_vec(), k.max(1), None);
+
         // A map has frames, or it would not have a typical distance.
-        let best = nearest.first().copied().unwrap_or(Neighbour { frame: FrameId(0), distance: f64::INFINITY });
+        let best = nearest.first().copied().unwrap_or(Neighbour {
+            frame: FrameId(0),
+            distance: f64::INFINITY,
+        });
         let errors = self.calibration.anchor_errors(best.distance);
+
         let latents = self.navigator.latents();
         let stored = latents.row(best.frame.row());
         let step = adapter.displacement(stored, latent).scaled(errors.gain);
         let pose = self.navigator.room().poses()[best.frame.row()] * exp(&step);
+
         let apart = best.distance / self.typical;
         Sighting {
             nearest,
             out_of_distribution: apart / self.calibration.measured().foreign,
             is_sure: apart <= self.calibration.measured().sure,
-            anchor: Belief { pose, covariance: errors.covariance * self.anchor_factor },
+            anchor: Belief {
+                pose,
+                covariance: errors.covariance * self.anchor_factor,
+            },
         }
     }
 }
 
 fn extent(navigator: &Navigator, mapped: &[FrameId]) -> f64 {
-    let positions = mapped.iter().map(|frame| navigator.room().poses()[frame.row()].translation.vector);
-    let (mut low, mut high) = (nalgebra::Vector3::repeat(f64::INFINITY), nalgebra::Vector3::repeat(f64::NEG_INFINITY));
+    let positions = mapped
+        .iter()
+        .map(|frame| navigator.room().poses()[frame.row()].translation.vector);
+
+    let mut low = nalgebra::Vector3::repeat(f64::INFINITY);
+    let mut high = nalgebra::Vector3::repeat(f64::NEG_INFINITY);
     for position in positions {
-        (low, high) = (low.inf(&position), high.sup(&position));
+        low = low.inf(&position);
+        high = high.sup(&position);
     }
+
     (high - low).norm()
 }

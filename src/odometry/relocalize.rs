@@ -17,7 +17,8 @@ pub struct Relocalized {
     pub rooms: Vec<RoomMatch>,
     /// The second room's distance over the best one's; infinite with one room.
     pub margin: f64,
-    /// Whether the best room is not to be relied on: another looks nearly as near, or none looks near.
+    /// Whether the best room is not to be relied on: another looks nearly as near, or none looks
+    /// near.
     pub ambiguous: bool,
     /// Why, in words, if it is.
     pub reason: String,
@@ -36,7 +37,8 @@ pub struct RoomMatch {
     pub last: Sighting,
 }
 
-/// Ranks rooms by views of one camera that hardly moved, the newest last; at least one. Changes nothing.
+/// Ranks rooms by views of one camera that hardly moved, the newest last; at least one. Changes
+/// nothing.
 ///
 /// # Errors
 /// [`Error::NoMap`], [`Error::NoView`], [`Error::Adapters`], [`Error::Cancelled`].
@@ -48,31 +50,60 @@ pub fn relocalize(
 ) -> Result<Relocalized, Error> {
     let first = maps.first().ok_or(Error::NoMap)?;
     let last = latents.last().ok_or(Error::NoView)?;
-    if maps.iter().any(|map| !Arc::ptr_eq(map.navigator().adapter(), first.navigator().adapter())) {
+
+    if maps
+        .iter()
+        .any(|map| !Arc::ptr_eq(map.navigator().adapter(), first.navigator().adapter()))
+    {
         return Err(Error::Adapters);
     }
+
     let mut rooms = Vec::with_capacity(maps.len());
     for (place, map) in maps.iter().enumerate() {
         cancel.check().map_err(|_| Error::Cancelled)?;
         let newest = map.sighting(last.view(), hit_count);
-        let (mut distance, mut foreign) = (newest.nearest[0].distance, newest.out_of_distribution);
+        let mut distance = newest.nearest[0].distance;
+        let mut foreign = newest.out_of_distribution;
+
         for latent in &latents[..latents.len() - 1] {
             cancel.check().map_err(|_| Error::Cancelled)?;
             let sighting = map.sighting(latent.view(), 1);
             distance += sighting.nearest[0].distance;
             foreign += sighting.out_of_distribution;
         }
+
         let count = latents.len() as f64;
-        let (distance, out_of_distribution) = (distance / count, foreign / count);
-        rooms.push(RoomMatch { map: place, distance, out_of_distribution, last: newest });
+        let distance = distance / count;
+        let out_of_distribution = foreign / count;
+
+        rooms.push(RoomMatch {
+            map: place,
+            distance,
+            out_of_distribution,
+            last: newest,
+        });
     }
+
     rooms.sort_by(|a, b| a.distance.total_cmp(&b.distance).then(a.map.cmp(&b.map)));
-    let margin = rooms.get(1).map_or(f64::INFINITY, |second| second.distance / rooms[0].distance);
-    let (alike, far) = (margin.recip() > ROOM_RATIO || margin.is_nan(), rooms[0].out_of_distribution > 1.0);
+    let margin = rooms
+        .get(1)
+        .map_or(f64::INFINITY, |second| second.distance / rooms[0].distance);
+    let alike = margin.recip() > ROOM_RATIO || margin.is_nan();
+
+    let far = rooms[0].out_of_distribution > 1.0;
     let reason = match (far, alike) {
-        (true, _) => format!("the best room is {:.2} times as far as its limit", rooms[0].out_of_distribution),
+        (true, _) => format!(
+            "the best room is {:.2} times as far as its limit",
+            rooms[0].out_of_distribution
+        ),
         (false, true) => format!("the second room is only {margin:.2} times as far as the best"),
         (false, false) => String::new(),
     };
-    Ok(Relocalized { rooms, margin, ambiguous: alike || far, reason })
+
+    Ok(Relocalized {
+        rooms,
+        margin,
+        ambiguous: alike || far,
+        reason,
+    })
 }

@@ -65,8 +65,8 @@ pub struct Keyframe {
     pub odom: Belief,
     /// `map_from_camera` there, if it is believed: what anchors are weighed against.
     pub place: Option<Belief>,
-    /// `map_from_camera` with the covariance that its errors have: what is told, also of a place that is not believed
-    /// any more.
+    /// `map_from_camera` with the covariance that its errors have: what is told, also of a place
+    /// that is not believed any more.
     pub told: Option<Belief>,
 }
 

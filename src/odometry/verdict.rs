@@ -10,16 +10,29 @@ const UNSEEN: u32 = 10;
 
 impl Tracker {
     /// The status after a frame; `place` is what is believed of where it was taken.
-    pub(super) fn status(&self, state: &State, place: Option<&Belief>, sighting: &Sighting) -> (Status, String) {
+    pub(super) fn status(
+        &self,
+        state: &State,
+        place: Option<&Belief>,
+        sighting: &Sighting,
+    ) -> (Status, String) {
         if let Chain::Lost { count } = state.chain {
             let why = match (sighting.out_of_distribution > 1.0, count) {
                 (true, _) => "the frames do not look like the room".to_owned(),
                 (false, 0) => "the view jumped, or nothing is sure of the room yet".to_owned(),
-                (false, count) => format!("{count} of {REGAINED} frames in a row look like the room again"),
+                (false, count) => {
+                    format!("{count} of {REGAINED} frames in a row look like the room again")
+                }
             };
+
             return (Status::Lost, why);
         }
-        let agreed = state.candidate.as_ref().map_or(0, |candidate| candidate.agreed);
+
+        let agreed = state
+            .candidate
+            .as_ref()
+            .map_or(0, |candidate| candidate.agreed);
+
         let Some(place) = place else {
             let why = match self.settings.fuse {
                 true => format!("{agreed} of {AGREEING} anchors agree on a place"),
@@ -27,21 +40,34 @@ impl Tracker {
             };
             return (Status::Relocalizing, why);
         };
-        let (deviation, extent) =
-            (place.position_deviation_m(), state.room.map_or(0.0, |room| self.maps[room].extent_m()));
+
+        let deviation = place.position_deviation_m();
+        let extent = state.room.map_or(0.0, |room| self.maps[room].extent_m());
         if deviation > extent {
             return (
                 Status::Lost,
-                format!("the position is known to {deviation:.1} m, the room is {extent:.1} m wide"),
+                format!(
+                    "the position is known to {deviation:.1} m, the room is {extent:.1} m wide"
+                ),
             );
         }
+
         if agreed > 0 {
-            let why = format!("{agreed} of {AGREEING} anchors speak for another place than the one that is believed");
+            let why = format!(
+                "{agreed} of {AGREEING} anchors speak for another place than the one that is believed"
+            );
             return (Status::Degraded, why);
         }
+
         match state.unseen {
-            0..UNSEEN => (Status::Tracking, "recent frames look like mapped places".to_owned()),
-            unseen => (Status::Degraded, format!("no mapped place for {unseen} frames")),
+            0..UNSEEN => (
+                Status::Tracking,
+                "recent frames look like mapped places".to_owned(),
+            ),
+            unseen => (
+                Status::Degraded,
+                format!("no mapped place for {unseen} frames"),
+            ),
         }
     }
 }

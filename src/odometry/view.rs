@@ -15,7 +15,8 @@ use crate::navigation::Source;
 ///
 /// Source: SeeSE3, sec. 2.4.
 pub fn motion(adapter: &Adapter, first: &View, second: &View) -> Result<Twist, Error> {
-    let (first, second) = (first.latent(adapter)?, second.latent(adapter)?);
+    let first = first.latent(adapter)?;
+    let second = second.latent(adapter)?;
     Ok(adapter.motion(first.view(), second.view()))
 }
 

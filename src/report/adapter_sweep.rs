@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 use super::columns::{Column, parquet_file};
 use crate::scores::{MotionScores, deviation, mean, mean_of_known};
 
-/// One run: what decided it, and what it reached. R² is null where it has no meaning or the run failed.
+/// One run: what decided it, and what it reached. R² is null where it has no meaning or the run
+/// failed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SweepRow {
     /// Names everything that decides the run's numbers.
@@ -53,6 +54,7 @@ impl SweepRow {
         self.n = test.n;
         self.overall = known(test.overall);
         self.translation = known(test.translation);
+
         self.rotation = known(test.rotation);
         self.direction = known(test.direction);
         self.magnitude = known(test.magnitude);
@@ -61,7 +63,13 @@ impl SweepRow {
 
     /// What a grid varies: runs of one protocol that differ in room and seed alone share it.
     fn configuration(&self) -> (usize, usize, String, String, String) {
-        (self.geo_dim, self.charts, self.lr.to_string(), self.loss.clone(), self.features.clone())
+        (
+            self.geo_dim,
+            self.charts,
+            self.lr.to_string(),
+            self.loss.clone(),
+            self.features.clone(),
+        )
     }
 }
 
@@ -70,11 +78,17 @@ impl SweepRow {
 /// # Errors
 /// What the library says, in words.
 pub fn sweep_parquet(rows: &[SweepRow]) -> Result<Vec<u8>, String> {
-    let text = |of: fn(&SweepRow) -> &str| Column::Text(rows.iter().map(|row| of(row).to_owned()).collect());
-    let whole = |of: fn(&SweepRow) -> u64| Column::Whole(rows.iter().map(|row| of(row) as i64).collect());
+    let text = |of: fn(&SweepRow) -> &str| {
+        Column::Text(rows.iter().map(|row| of(row).to_owned()).collect())
+    };
+
+    let whole =
+        |of: fn(&SweepRow) -> u64| Column::Whole(rows.iter().map(|row| of(row) as i64).collect());
     let real = |of: fn(&SweepRow) -> f64| Column::Real(rows.iter().map(of).collect());
-    let known =
-        |of: fn(&SweepRow) -> Option<f64>| Column::Real(rows.iter().map(|row| of(row).unwrap_or(f64::NAN)).collect());
+    let known = |of: fn(&SweepRow) -> Option<f64>| {
+        Column::Real(rows.iter().map(|row| of(row).unwrap_or(f64::NAN)).collect())
+    };
+
     parquet_file(&[
         ("key", text(|row| &row.key)),
         ("room", text(|row| &row.room)),
@@ -108,16 +122,28 @@ pub fn sweep_parquet(rows: &[SweepRow]) -> Result<Vec<u8>, String> {
     ])
 }
 
-/// Best R², and the share of rooms above 0 and 0.3, by recording format and features: the paper's success table (sec. 2.7).
-/// Of each room the best run counts, chosen by its test score, as the paper's "Max R²" is.
+/// Best R², and the share of rooms above 0 and 0.3, by recording format and features: the paper's
+/// success table (sec. 2.7). Of each room the best run counts, chosen by its test score, as the
+/// paper's "Max R²" is.
 pub fn success_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     let mut groups: BTreeMap<(String, String), BTreeMap<String, f64>> = BTreeMap::new();
     for row in rows.iter().filter(|row| row.failure.is_empty()) {
-        let best = groups.entry((row.format.clone(), row.features.clone())).or_default();
+        let best = groups
+            .entry((row.format.clone(), row.features.clone()))
+            .or_default();
         let of_room = best.entry(row.room.clone()).or_insert(f64::NEG_INFINITY);
         *of_room = of_room.max(row.overall.unwrap_or(f64::NEG_INFINITY));
     }
-    let head = ["recorded as", "features", "rooms", "max R²", "% > 0", "% > 0.3"];
+
+    let head = [
+        "recorded as",
+        "features",
+        "rooms",
+        "max R²",
+        "% > 0",
+        "% > 0.3",
+    ];
+
     let mut lines = vec![head.map(str::to_owned).to_vec()];
     for ((format, features), rooms) in groups {
         let best: Vec<f64> = rooms.into_values().collect();
@@ -125,45 +151,68 @@ pub fn success_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
             format,
             features,
             best.len().to_string(),
-            format!("{:.3}", best.iter().copied().fold(f64::NEG_INFINITY, f64::max)),
+            format!(
+                "{:.3}",
+                best.iter().copied().fold(f64::NEG_INFINITY, f64::max)
+            ),
             percent(&best, 0.0),
             percent(&best, 0.3),
         ]);
     }
+
     lines
 }
 
-/// By recording format, over all features: frames and test pairs a room, the share of rooms whose best run is above 0,
-/// the best run: the paper's difficulty table (sec. 2.7).
+/// By recording format, over all features: frames and test pairs a room, the share of rooms whose
+/// best run is above 0, the best run: the paper's difficulty table (sec. 2.7).
 pub fn difficulty_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     let mut groups: BTreeMap<&str, BTreeMap<&str, (usize, usize, f64)>> = BTreeMap::new();
     for row in rows.iter().filter(|row| row.failure.is_empty()) {
         let rooms = groups.entry(&row.format).or_default();
-        let (_, pairs, best) = rooms.entry(&row.room).or_insert((row.frames, 0, f64::NEG_INFINITY));
+        let (_, pairs, best) = rooms
+            .entry(&row.room)
+            .or_insert((row.frames, 0, f64::NEG_INFINITY));
         *pairs = row.n.max(*pairs);
+
         *best = best.max(row.overall.unwrap_or(f64::NEG_INFINITY));
     }
-    let head = ["recorded as", "rooms", "frames", "test pairs", "% > 0", "best R²"];
+
+    let head = [
+        "recorded as",
+        "rooms",
+        "frames",
+        "test pairs",
+        "% > 0",
+        "best R²",
+    ];
+
     let mut lines = vec![head.map(str::to_owned).to_vec()];
     for (format, rooms) in groups {
-        let column = |of: fn(&(usize, usize, f64)) -> f64| rooms.values().map(of).collect::<Vec<_>>();
+        let column =
+            |of: fn(&(usize, usize, f64)) -> f64| rooms.values().map(of).collect::<Vec<_>>();
         let best = column(|room| room.2);
+
         lines.push(vec![
             format.to_owned(),
             rooms.len().to_string(),
             format!("{:.0}", mean(&column(|room| room.0 as f64))),
             format!("{:.0}", mean(&column(|room| room.1 as f64))),
             percent(&best, 0.0),
-            format!("{:.3}", best.iter().copied().fold(f64::NEG_INFINITY, f64::max)),
+            format!(
+                "{:.3}",
+                best.iter().copied().fold(f64::NEG_INFINITY, f64::max)
+            ),
         ]);
     }
+
     lines
 }
 
-/// By part of the motion: best R², the share of runs above 0 and 0.5, and the deviation over seeds, averaged over
-/// configurations and rooms that have several: the paper's sweep table.
+/// By part of the motion: best R², the share of runs above 0 and 0.5, and the deviation over seeds,
+/// averaged over configurations and rooms that have several: the paper's sweep table.
 pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     type Part = fn(&SweepRow) -> Option<f64>;
+
     let parts: [(&str, Part); 5] = [
         ("overall", |row| row.overall),
         ("rotation", |row| row.rotation),
@@ -171,27 +220,48 @@ pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
         ("direction", |row| row.direction),
         ("magnitude", |row| row.magnitude),
     ];
-    let head = ["part", "runs", "best R²", "% > 0", "% > 0.5", "sd over seeds", "mean R²"];
+
+    let head = [
+        "part",
+        "runs",
+        "best R²",
+        "% > 0",
+        "% > 0.5",
+        "sd over seeds",
+        "mean R²",
+    ];
+
     let mut lines = vec![head.map(str::to_owned).to_vec()];
     for (name, part) in parts {
         let values: Vec<f64> = rows.iter().filter_map(part).collect();
         let mut by_configuration: BTreeMap<_, Vec<f64>> = BTreeMap::new();
         for row in rows {
-            let seeds = by_configuration.entry((row.room.clone(), row.configuration())).or_default();
+            let seeds = by_configuration
+                .entry((row.room.clone(), row.configuration()))
+                .or_default();
             seeds.extend(part(row));
         }
-        let spreads: Vec<f64> =
-            by_configuration.values().filter(|seeds| seeds.len() > 1).map(|seeds| deviation(seeds)).collect();
+
+        let spreads: Vec<f64> = by_configuration
+            .values()
+            .filter(|seeds| seeds.len() > 1)
+            .map(|seeds| deviation(seeds))
+            .collect();
+
         lines.push(vec![
             name.to_owned(),
             values.len().to_string(),
-            format!("{:.3}", values.iter().copied().fold(f64::NEG_INFINITY, f64::max)),
+            format!(
+                "{:.3}",
+                values.iter().copied().fold(f64::NEG_INFINITY, f64::max)
+            ),
             percent(&values, 0.0),
             percent(&values, 0.5),
             format!("{:.3}", mean_of_known(&spreads)),
             format!("{:.3}", mean(&values)),
         ]);
     }
+
     lines
 }
 
@@ -199,17 +269,45 @@ pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
 pub fn configurations_rows(rows: &[SweepRow], most: usize) -> Vec<Vec<String>> {
     let mut by_configuration: BTreeMap<_, Vec<f64>> = BTreeMap::new();
     for row in rows {
-        by_configuration.entry(row.configuration()).or_default().extend(row.overall);
+        by_configuration
+            .entry(row.configuration())
+            .or_default()
+            .extend(row.overall);
     }
-    let mut ranked: Vec<_> = by_configuration.into_iter().filter(|(_, values)| !values.is_empty()).collect();
+
+    let mut ranked: Vec<_> = by_configuration
+        .into_iter()
+        .filter(|(_, values)| !values.is_empty())
+        .collect();
     ranked.sort_by(|a, b| mean_of_known(&b.1).total_cmp(&mean_of_known(&a.1)));
-    let head = ["features", "geo_dim", "K", "lr", "loss", "runs", "mean R²", "sd"];
+
+    let head = [
+        "features", "geo_dim", "K", "lr", "loss", "runs", "mean R²", "sd",
+    ];
     let mut lines = vec![head.map(str::to_owned).to_vec()];
+
     for ((geo_dim, charts, lr, loss, features), values) in ranked.into_iter().take(most) {
-        let (runs, middle) = (values.len().to_string(), format!("{:.3}", mean_of_known(&values)));
-        let spread = if values.len() > 1 { format!("{:.3}", deviation(&values)) } else { String::new() };
-        lines.push(vec![features, geo_dim.to_string(), charts.to_string(), lr, loss, runs, middle, spread]);
+        let runs = values.len().to_string();
+        let middle = format!("{:.3}", mean_of_known(&values));
+
+        let spread = if values.len() > 1 {
+            format!("{:.3}", deviation(&values))
+        } else {
+            String::new()
+        };
+
+        lines.push(vec![
+            features,
+            geo_dim.to_string(),
+            charts.to_string(),
+            lr,
+            loss,
+            runs,
+            middle,
+            spread,
+        ]);
     }
+
     lines
 }
 
@@ -259,11 +357,28 @@ mod tests {
     /// Oracle: by hand. A room counts by its best run, a failed run by nothing.
     #[test]
     fn rooms_count_by_their_best_run() {
-        let rows = [row("a", 0, Some(-1.0)), row("a", 1, Some(0.4)), row("b", 0, Some(-0.5)), row("b", 1, None)];
-        assert_eq!(success_rows(&rows)[1], ["tum", "f", "2", "0.400", "50", "50"]);
-        assert_eq!(difficulty_rows(&rows)[1], ["tum", "2", "200", "40", "50", "0.400"]);
+        let rows = [
+            row("a", 0, Some(-1.0)),
+            row("a", 1, Some(0.4)),
+            row("b", 0, Some(-0.5)),
+            row("b", 1, None),
+        ];
+
+        assert_eq!(
+            success_rows(&rows)[1],
+            ["tum", "f", "2", "0.400", "50", "50"]
+        );
+
+        assert_eq!(
+            difficulty_rows(&rows)[1],
+            ["tum", "2", "200", "40", "50", "0.400"]
+        );
+
         // The seeds of room a deviate by 1.4/√2; room b has one that counts.
-        assert_eq!(parts_rows(&rows)[1], ["overall", "3", "0.400", "33", "0", "0.990", "-0.367"]);
+        assert_eq!(
+            parts_rows(&rows)[1],
+            ["overall", "3", "0.400", "33", "0", "0.990", "-0.367"]
+        );
     }
 
     /// Oracle: the format's magic at both ends; `.ci/claims.py` has pandas read a file.

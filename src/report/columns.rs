@@ -27,7 +27,9 @@ impl Column {
             Self::Whole(_) => (Physical::INT64, ConvertedType::NONE),
             Self::Real(_) => (Physical::DOUBLE, ConvertedType::NONE),
         };
-        let builder = Type::primitive_type_builder(name, physical).with_repetition(Repetition::REQUIRED);
+        let builder =
+            Type::primitive_type_builder(name, physical).with_repetition(Repetition::REQUIRED);
+
         builder.with_converted_type(converted).build()
     }
 }
@@ -45,16 +47,31 @@ fn written(columns: &[(&str, Column)]) -> Result<Vec<u8>, ParquetError> {
     for (name, column) in columns {
         fields.push(Arc::new(column.schema(name)?));
     }
-    let schema = Arc::new(Type::group_type_builder("runs").with_fields(fields).build()?);
+
+    let schema = Arc::new(
+        Type::group_type_builder("runs")
+            .with_fields(fields)
+            .build()?,
+    );
+
     let mut file = Vec::new();
-    let mut writer = SerializedFileWriter::new(&mut file, schema, Arc::new(WriterProperties::builder().build()))?;
+    let mut writer = SerializedFileWriter::new(
+        &mut file,
+        schema,
+        Arc::new(WriterProperties::builder().build()),
+    )?;
     let mut group = writer.next_row_group()?;
+
     for (_, column) in columns {
-        let Some(mut into) = group.next_column()? else { break };
+        let Some(mut into) = group.next_column()? else {
+            break;
+        };
         match column {
             Column::Text(values) => {
-                let values: Vec<ByteArray> = values.iter().map(|value| value.as_str().into()).collect();
-                into.typed::<ByteArrayType>().write_batch(&values, None, None)?;
+                let values: Vec<ByteArray> =
+                    values.iter().map(|value| value.as_str().into()).collect();
+                into.typed::<ByteArrayType>()
+                    .write_batch(&values, None, None)?;
             }
             Column::Whole(values) => {
                 into.typed::<Int64Type>().write_batch(values, None, None)?;
@@ -63,9 +80,12 @@ fn written(columns: &[(&str, Column)]) -> Result<Vec<u8>, ParquetError> {
                 into.typed::<DoubleType>().write_batch(values, None, None)?;
             }
         }
+
         into.close()?;
     }
+
     group.close()?;
     writer.close()?;
+
     Ok(file)
 }

@@ -53,55 +53,95 @@ pub fn curves_svg(curves: &Curves) -> Result<String, String> {
         let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
         draw(&root, curves).map_err(|error| error.to_string())?;
     }
+
     Ok(svg)
 }
 
-fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, curves: &Curves) -> Result<(), Box<dyn std::error::Error>> {
+fn draw(
+    root: &DrawingArea<SVGBackend<'_>, Shift>,
+    curves: &Curves,
+) -> Result<(), Box<dyn std::error::Error>> {
     root.fill(&WHITE)?;
     let (plot, legend) = root.split_horizontally(LEGEND_X);
+
     let values = |axis: usize| {
-        curves.series.iter().flat_map(|s| &s.points).map(move |p| p[axis]).filter(|value| value.is_finite())
+        curves
+            .series
+            .iter()
+            .flat_map(|s| &s.points)
+            .map(move |p| p[axis])
+            .filter(|value| value.is_finite())
     };
-    let (mut x_range, mut y_range) = (range(values(0)), range(values(1)));
+
+    let mut x_range = range(values(0));
+    let mut y_range = range(values(1));
     if curves.diagonal {
         // One scale for both, or the diagonal would not be in sight.
         let both = x_range.start.min(y_range.start)..x_range.end.max(y_range.end);
-        (x_range, y_range) = (both.clone(), both);
+        x_range = both.clone();
+        y_range = both;
     }
+
     let mut chart = ChartBuilder::on(&plot)
         .caption(&curves.title, ("sans-serif", 20))
         .margin(12)
         .x_label_area_size(42)
         .y_label_area_size(56)
         .build_cartesian_2d(x_range.clone(), y_range.clone())?;
-    chart.configure_mesh().light_line_style(WHITE).x_desc(&curves.x).y_desc(&curves.y).draw()?;
+
+    chart
+        .configure_mesh()
+        .light_line_style(WHITE)
+        .x_desc(&curves.x)
+        .y_desc(&curves.y)
+        .draw()?;
+
     if curves.diagonal {
         chart.draw_series(LineSeries::new(
             [(x_range.start, x_range.start), (x_range.end, x_range.end)],
             BLACK.mix(0.3),
         ))?;
     }
+
     for (place, (series, colour)) in curves.series.iter().zip(COLOURS.iter().cycle()).enumerate() {
-        let points: Vec<(f64, f64)> =
-            series.points.iter().filter(|p| p.iter().all(|value| value.is_finite())).map(|p| (p[0], p[1])).collect();
+        let points: Vec<(f64, f64)> = series
+            .points
+            .iter()
+            .filter(|p| p.iter().all(|value| value.is_finite()))
+            .map(|p| (p[0], p[1]))
+            .collect();
+
         if series.joined {
-            chart.draw_series(LineSeries::new(points.iter().copied(), colour.stroke_width(2)))?;
+            chart.draw_series(LineSeries::new(
+                points.iter().copied(),
+                colour.stroke_width(2),
+            ))?;
         }
+
         chart.draw_series(points.iter().map(|&at| Circle::new(at, 3, colour.filled())))?;
         let at = 60 + 22 * i32::try_from(place).unwrap_or(0);
         legend.draw(&Circle::new((8, at + 7), 4, colour.filled()))?;
-        legend.draw(&Text::new(series.name.clone(), (20, at), ("sans-serif", 13)))?;
+
+        legend.draw(&Text::new(
+            series.name.clone(),
+            (20, at),
+            ("sans-serif", 13),
+        ))?;
     }
+
     root.present()?;
     Ok(())
 }
 
 /// A little more than the values span.
 fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
-    let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
+    let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
+        (low.min(v), high.max(v))
+    });
     if low > high {
         return 0.0..1.0;
     }
+
     let margin = if high > low { 0.06 * (high - low) } else { 0.5 };
     low - margin..high + margin
 }
@@ -110,17 +150,34 @@ fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
 mod tests {
     use super::*;
 
-    /// Oracle: SVG's own words: a circle for every point that is a number (and one a series for the legend), labels as given.
+    /// Oracle: SVG's own words: a circle for every point that is a number (and one a series for the
+    /// legend), labels as given.
     #[test]
     fn every_point_is_drawn() {
         let points = vec![[0.0, 1.0], [1.0, 2.0], [2.0, f64::NAN]];
-        let series = vec![Series { name: "grows".to_owned(), points, joined: true }];
-        let curves =
-            Curves { title: "T".to_owned(), x: "rooms".to_owned(), y: "hits".to_owned(), series, diagonal: false };
+        let series = vec![Series {
+            name: "grows".to_owned(),
+            points,
+            joined: true,
+        }];
+
+        let curves = Curves {
+            title: "T".to_owned(),
+            x: "rooms".to_owned(),
+            y: "hits".to_owned(),
+            series,
+            diagonal: false,
+        };
+
         let svg = curves_svg(&curves).unwrap();
         assert_eq!(svg.matches("<circle").count(), 2 + 1);
         assert!(svg.contains("grows") && svg.contains("rooms") && svg.contains("hits"));
-        let empty = Curves { series: Vec::new(), ..curves };
+
+        let empty = Curves {
+            series: Vec::new(),
+            ..curves
+        };
+
         assert!(curves_svg(&empty).unwrap().contains("<svg"));
     }
 }

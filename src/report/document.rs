@@ -1,4 +1,5 @@
-//! A report of sections, tables and pictures, as Markdown beside its pictures and as one HTML file that holds them.
+//! A report of sections, tables and pictures, as Markdown beside its pictures and as one HTML file
+//! that holds them.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -46,7 +47,10 @@ pub struct Picture {
 impl Section {
     /// A section with nothing in it yet.
     pub fn new(title: impl Into<String>) -> Self {
-        Self { title: title.into(), blocks: Vec::new() }
+        Self {
+            title: title.into(),
+            blocks: Vec::new(),
+        }
     }
 
     /// Adds a paragraph.
@@ -61,17 +65,24 @@ impl Section {
 
     /// Adds a picture.
     pub fn picture(&mut self, name: impl Into<String>, bytes: Vec<u8>, caption: impl Into<String>) {
-        self.blocks.push(Block::Picture(Picture { name: name.into(), bytes, caption: caption.into() }));
+        self.blocks.push(Block::Picture(Picture {
+            name: name.into(),
+            bytes,
+            caption: caption.into(),
+        }));
     }
 }
 
 impl Document {
     /// Every picture.
     pub fn pictures(&self) -> impl Iterator<Item = &Picture> {
-        self.sections.iter().flat_map(|section| &section.blocks).filter_map(|block| match block {
-            Block::Picture(picture) => Some(picture),
-            _ => None,
-        })
+        self.sections
+            .iter()
+            .flat_map(|section| &section.blocks)
+            .filter_map(|block| match block {
+                Block::Picture(picture) => Some(picture),
+                _ => None,
+            })
     }
 
     /// As Markdown; pictures are looked for in `folder`, relative to the file.
@@ -79,18 +90,25 @@ impl Document {
         let mut text = format!("# {}\n", self.title);
         for section in &self.sections {
             text.push_str(&format!("\n## {}\n", section.title));
+
             for block in &section.blocks {
                 text.push('\n');
+
                 match block {
                     Block::Text(paragraph) => text.push_str(&format!("{paragraph}\n")),
                     Block::Table(rows) => text.push_str(&markdown_table(rows)),
                     Block::Picture(Picture { name, caption, .. }) => {
-                        let path = if folder.is_empty() { name.clone() } else { format!("{folder}/{name}") };
+                        let path = if folder.is_empty() {
+                            name.clone()
+                        } else {
+                            format!("{folder}/{name}")
+                        };
                         text.push_str(&format!("![{caption}]({path})\n"));
                     }
                 }
             }
         }
+
         text
     }
 
@@ -99,13 +117,26 @@ impl Document {
         let mut body = format!("<h1>{}</h1>\n", escaped(&self.title));
         for section in &self.sections {
             body.push_str(&format!("<h2>{}</h2>\n", escaped(&section.title)));
+
             for block in &section.blocks {
                 match block {
-                    Block::Text(paragraph) => body.push_str(&format!("<p>{}</p>\n", escaped(paragraph))),
+                    Block::Text(paragraph) => {
+                        body.push_str(&format!("<p>{}</p>\n", escaped(paragraph)))
+                    }
                     Block::Table(rows) => body.push_str(&html_table(rows)),
-                    Block::Picture(Picture { name, bytes, caption }) => {
-                        let kind = if name.ends_with(".svg") { "svg+xml" } else { "png" };
-                        let (data, caption) = (STANDARD.encode(bytes), escaped(caption));
+                    Block::Picture(Picture {
+                        name,
+                        bytes,
+                        caption,
+                    }) => {
+                        let kind = if name.ends_with(".svg") {
+                            "svg+xml"
+                        } else {
+                            "png"
+                        };
+
+                        let data = STANDARD.encode(bytes);
+                        let caption = escaped(caption);
                         body.push_str(&format!(
                             "<figure><img alt=\"{caption}\" src=\"data:image/{kind};base64,{data}\">\
                              <figcaption>{caption}</figcaption></figure>\n"
@@ -114,6 +145,7 @@ impl Document {
                 }
             }
         }
+
         let title = escaped(&self.title);
         format!(
             "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{title}</title>\
@@ -132,22 +164,43 @@ fn markdown_table(rows: &[Vec<String>]) -> String {
         let cells: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|")).collect();
         format!("| {} |\n", cells.join(" | "))
     };
-    let Some((head, rest)) = rows.split_first() else { return String::new() };
-    let rule: Vec<String> = (0..head.len()).map(|column| if column == 0 { "---" } else { "---:" }.to_owned()).collect();
-    [line(head), line(&rule)].into_iter().chain(rest.iter().map(|row| line(row))).collect()
+
+    let Some((head, rest)) = rows.split_first() else {
+        return String::new();
+    };
+    let rule: Vec<String> = (0..head.len())
+        .map(|column| if column == 0 { "---" } else { "---:" }.to_owned())
+        .collect();
+
+    [line(head), line(&rule)]
+        .into_iter()
+        .chain(rest.iter().map(|row| line(row)))
+        .collect()
 }
 
 fn html_table(rows: &[Vec<String>]) -> String {
     let line = |cells: &[String], tag: &str| {
-        let cells: String = cells.iter().map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();
+        let cells: String = cells
+            .iter()
+            .map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell)))
+            .collect();
         format!("<tr>{cells}</tr>\n")
     };
-    let body: String = rows.iter().enumerate().map(|(i, row)| line(row, if i == 0 { "th" } else { "td" })).collect();
+
+    let body: String = rows
+        .iter()
+        .enumerate()
+        .map(|(i, row)| line(row, if i == 0 { "th" } else { "td" }))
+        .collect();
+
     format!("<table>\n{body}</table>\n")
 }
 
 fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
+        .replace('"', "&quot;")
 }
 
 #[cfg(test)]
@@ -157,21 +210,47 @@ mod tests {
     fn document() -> Document {
         let mut section = Section::new("R² < 0?");
         section.text("5 > 3 & so on");
-        section.table(vec![vec!["a|b".to_owned(), "n".to_owned()], vec!["x".to_owned(), "1".to_owned()]]);
+
+        section.table(vec![
+            vec!["a|b".to_owned(), "n".to_owned()],
+            vec!["x".to_owned(), "1".to_owned()],
+        ]);
+
         section.picture("p.svg", b"<svg/>".to_vec(), "A \"curve\"");
-        Document { title: "T".to_owned(), sections: vec![section] }
+
+        Document {
+            title: "T".to_owned(),
+            sections: vec![section],
+        }
     }
 
     /// Oracle: the two formats by hand.
     #[test]
     fn a_document_is_written_in_both_formats() {
         let markdown = document().markdown("pictures");
-        assert!(markdown.contains("| a\\|b | n |\n| --- | ---: |\n| x | 1 |"), "{markdown}");
-        assert!(markdown.contains("![A \"curve\"](pictures/p.svg)"), "{markdown}");
+        assert!(
+            markdown.contains("| a\\|b | n |\n| --- | ---: |\n| x | 1 |"),
+            "{markdown}"
+        );
+
+        assert!(
+            markdown.contains("![A \"curve\"](pictures/p.svg)"),
+            "{markdown}"
+        );
+
         let html = document().html();
-        assert!(html.contains("<h2>R² &lt; 0?</h2>") && html.contains("<p>5 &gt; 3 &amp; so on</p>"), "{html}");
+        assert!(
+            html.contains("<h2>R² &lt; 0?</h2>") && html.contains("<p>5 &gt; 3 &amp; so on</p>"),
+            "{html}"
+        );
+
         // echo -n '<svg/>' | base64
-        assert!(html.contains("data:image/svg+xml;base64,PHN2Zy8+") && html.contains("A &quot;curve&quot;"), "{html}");
+        assert!(
+            html.contains("data:image/svg+xml;base64,PHN2Zy8+")
+                && html.contains("A &quot;curve&quot;"),
+            "{html}"
+        );
+
         assert!(!html.contains("p.svg"), "nothing outside is needed");
     }
 }

@@ -17,22 +17,45 @@ pub struct FormulationScores {
 
 /// A line a formulation: R² by part, mean ± sample deviation over seeds.
 pub fn formulations_table(scores: &[FormulationScores]) -> String {
-    let head = ["formulation", "overall", "transl.", "rotation", "direct.", "magnit."];
+    let head = [
+        "formulation",
+        "overall",
+        "transl.",
+        "rotation",
+        "direct.",
+        "magnit.",
+    ];
+
     let mut lines = vec![head.map(str::to_owned).to_vec()];
     for score in scores {
         let column = |of: fn(&MotionScores) -> f64| score.runs.iter().map(of).collect::<Vec<f64>>();
         let overall = column(|run| run.overall);
-        let spread = if overall.len() > 1 { format!(" ± {:.3}", deviation(&overall)) } else { String::new() };
+        let spread = if overall.len() > 1 {
+            format!(" ± {:.3}", deviation(&overall))
+        } else {
+            String::new()
+        };
+
         let parts = [
             column(|run| run.translation),
             column(|run| run.rotation),
             column(|run| run.direction),
             column(|run| run.magnitude),
         ];
-        let mut cells = vec![score.name.to_owned(), format!("{:.3}{spread}", mean_of_known(&overall))];
-        cells.extend(parts.iter().map(|part| format!("{:.3}", mean_of_known(part))));
+
+        let mut cells = vec![
+            score.name.to_owned(),
+            format!("{:.3}{spread}", mean_of_known(&overall)),
+        ];
+        cells.extend(
+            parts
+                .iter()
+                .map(|part| format!("{:.3}", mean_of_known(part))),
+        );
+
         lines.push(cells);
     }
+
     aligned(&lines)
 }
 
@@ -45,5 +68,6 @@ pub fn formulations_json(scores: &[FormulationScores]) -> Value {
             "runs": score.runs.iter().map(motion_json).collect::<Vec<_>>(),
         })
     };
+
     json!({ "formulations": scores.iter().map(entry).collect::<Vec<_>>() })
 }

@@ -9,7 +9,10 @@ use crate::scores::{MotionScores, Rate, deviation, mean};
 
 /// The record of `seese3 train`: one entry a seed, and the protocol they share.
 pub fn training_json(runs: &[TrainingRun], adapter: &str, revision: u64) -> Value {
-    let protocol = runs.first().map_or(Value::Null, |run| protocol_json(&run.record));
+    let protocol = runs
+        .first()
+        .map_or(Value::Null, |run| protocol_json(&run.record));
+
     let runs: Vec<Value> = runs.iter().map(run_json).collect();
     json!({ "runs": runs, "adapter": { "name": adapter, "revision": revision }, "protocol": protocol })
 }
@@ -29,9 +32,14 @@ fn run_json(run: &TrainingRun) -> Value {
 /// R² by part: mean and sample deviation over runs.
 pub(super) fn parts_json(runs: &[MotionScores]) -> Value {
     let part = |figure: fn(&MotionScores) -> f64| {
-        let values: Vec<f64> = runs.iter().map(figure).filter(|value| !value.is_nan()).collect();
+        let values: Vec<f64> = runs
+            .iter()
+            .map(figure)
+            .filter(|value| !value.is_nan())
+            .collect();
         json!({ "mean": mean(&values), "sd": deviation(&values) })
     };
+
     json!({
         "overall": part(|run| run.overall),
         "translation": part(|run| run.translation),
@@ -58,13 +66,23 @@ pub(super) fn motion_json(scores: &MotionScores) -> Value {
 }
 
 fn protocol_json(record: &TrainingRecord) -> Value {
-    let rooms: Vec<Value> =
-        record.rooms.iter().map(|(room, revision)| json!({ "room": room.as_str(), "revision": revision })).collect();
-    let calibrated_on: Vec<&str> = record.calibrated_on.iter().map(|(room, _)| room.as_str()).collect();
+    let rooms: Vec<Value> = record
+        .rooms
+        .iter()
+        .map(|(room, revision)| json!({ "room": room.as_str(), "revision": revision }))
+        .collect();
+
+    let calibrated_on: Vec<&str> = record
+        .calibrated_on
+        .iter()
+        .map(|(room, _)| room.as_str())
+        .collect();
+
     let range = match &record.pairs {
         PairPlan::Stride(_) => Value::Null,
         PairPlan::Range(range) => json!([range.low, range.high]),
     };
+
     json!({
         "preset": record.preset,
         "split": record.split.name(),
@@ -92,21 +110,30 @@ fn protocol_json(record: &TrainingRecord) -> Value {
     })
 }
 
-/// The record of `seese3 evaluate`; `context` says which room, features and adapter, and joins the protocol.
+/// The record of `seese3 evaluate`; `context` says which room, features and adapter, and joins the
+/// protocol.
 pub fn evaluation_json(report: &Report, context: Map<String, Value>) -> Value {
     let mut protocol = Map::new();
     protocol.insert("split".to_owned(), json!(report.protocol.split.name()));
     protocol.insert("stride".to_owned(), json!(report.protocol.stride));
     protocol.insert("n".to_owned(), json!(report.n));
+
     protocol.insert("candidates".to_owned(), json!(report.candidate_count));
-    protocol.insert("source_excluded".to_owned(), json!(report.protocol.exclude_source.is_some()));
+
+    protocol.insert(
+        "source_excluded".to_owned(),
+        json!(report.protocol.exclude_source.is_some()),
+    );
+
     protocol.insert("thresholds".to_owned(), json!(report.protocol.thresholds));
     protocol.insert("seed".to_owned(), json!(report.protocol.seed));
     protocol.insert("steps".to_owned(), json!(report.protocol.steps));
     protocol.insert("mode".to_owned(), json!(report.protocol.mode.name()));
+
     protocol.insert("index".to_owned(), json!("exact"));
     protocol.extend(context);
     let rows: Vec<Value> = report.rows.iter().map(row_json).collect();
+
     json!({ "navigators": rows, "protocol": protocol })
 }
 
@@ -115,17 +142,28 @@ fn row_json(row: &Row) -> Value {
     object.insert("name".to_owned(), json!(row.name));
     object.insert("n".to_owned(), json!(row.n));
     object.insert("mse".to_owned(), json!(row.latent.map(|latent| latent.mse)));
+
     object.insert("r2".to_owned(), json!(row.latent.map(|latent| latent.r2)));
-    object.insert("r2_uniform".to_owned(), json!(row.latent.map(|latent| latent.r2_uniform)));
+
+    object.insert(
+        "r2_uniform".to_owned(),
+        json!(row.latent.map(|latent| latent.r2_uniform)),
+    );
+
     if let Value::Object(retrieval) = retrieval_json(&row.retrieval) {
         object.extend(retrieval);
     }
+
     Value::Object(object)
 }
 
 fn retrieval_json(scores: &RetrievalScores) -> Value {
-    let hits: Map<String, Value> =
-        scores.hits.iter().map(|(epsilon, rate)| (epsilon.to_string(), rate_json(rate))).collect();
+    let hits: Map<String, Value> = scores
+        .hits
+        .iter()
+        .map(|(epsilon, rate)| (epsilon.to_string(), rate_json(rate)))
+        .collect();
+
     let recalls: Vec<Value> = scores
         .pose_recalls
         .iter()
@@ -137,6 +175,7 @@ fn retrieval_json(scores: &RetrievalScores) -> Value {
             })
         })
         .collect();
+
     json!({
         "top1": scores.top1.rate,
         "top1_interval": rate_json(&scores.top1),

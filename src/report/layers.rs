@@ -46,14 +46,25 @@ pub fn layers_table(scores: &[LayerScores]) -> String {
             layers.push(&score.features);
         }
     }
+
     let column = |of: fn(&LayerScores) -> f64| -> Vec<f64> {
-        let by_layer =
-            |layer: &&str| mean(&scores.iter().filter(|score| score.features == **layer).map(of).collect::<Vec<_>>());
+        let by_layer = |layer: &&str| {
+            mean(
+                &scores
+                    .iter()
+                    .filter(|score| score.features == **layer)
+                    .map(of)
+                    .collect::<Vec<_>>(),
+            )
+        };
+
         layers.iter().map(by_layer).collect()
     };
+
     let highest = |value: f64| value;
     let near_six = |value: f64| -(value - 6.0).abs();
     type Merit = fn(f64) -> f64;
+
     let columns: [(Vec<f64>, Merit); 5] = [
         (column(|score| score.m1), highest),
         (column(|score| score.m2_two_nn), near_six),
@@ -61,57 +72,118 @@ pub fn layers_table(scores: &[LayerScores]) -> String {
         (column(|score| score.m3_r2), highest),
         (column(|score| score.m4_r2), highest),
     ];
+
     let spread = column(|score| score.m4_deviation);
-    let mut lines = vec![["features", "columns", "M1", "TwoNN", "MLE", "M3 R²", "M4 R²"].map(str::to_owned).to_vec()];
+
+    let mut lines = vec![
+        [
+            "features", "columns", "M1", "TwoNN", "MLE", "M3 R²", "M4 R²",
+        ]
+        .map(str::to_owned)
+        .to_vec(),
+    ];
+
     for (row, layer) in layers.iter().enumerate() {
-        let dim = scores.iter().find(|score| score.features == **layer).map_or(0, |score| score.dim);
+        let dim = scores
+            .iter()
+            .find(|score| score.features == **layer)
+            .map_or(0, |score| score.dim);
         let mut cells = vec![(*layer).to_owned(), dim.to_string()];
+
         for (values, merit) in &columns {
-            let best = values.iter().copied().map(merit).fold(f64::NEG_INFINITY, f64::max);
+            let best = values
+                .iter()
+                .copied()
+                .map(merit)
+                .fold(f64::NEG_INFINITY, f64::max);
             let star = if merit(values[row]) >= best { "*" } else { " " };
             cells.push(format!("{:.3}{star}", values[row]));
         }
+
         if spread[row].is_finite() {
             let last = cells.pop().unwrap_or_default();
-            cells.push(format!("{} ± {:.3}{}", last[..last.len() - 1].trim(), spread[row], &last[last.len() - 1..]));
+            cells.push(format!(
+                "{} ± {:.3}{}",
+                last[..last.len() - 1].trim(),
+                spread[row],
+                &last[last.len() - 1..]
+            ));
         }
+
         lines.push(cells);
     }
+
     aligned(&lines)
 }
 
-/// A line an encoder, by its layer of the highest mean test R² of the adapters: what becomes of checkpoints of one encoder.
-/// The shape of the paper's ablation table (sec. 2.7).
+/// A line an encoder, by its layer of the highest mean test R² of the adapters: what becomes of
+/// checkpoints of one encoder. The shape of the paper's ablation table (sec. 2.7).
 pub fn encoders_table(scores: &[LayerScores]) -> String {
     type Layer<'a> = (&'a str, Vec<&'a LayerScores>);
+
     let mut by_encoder: Vec<(&str, Vec<Layer<'_>>)> = Vec::new();
     for score in scores {
-        let at = match by_encoder.iter().position(|(encoder, _)| *encoder == score.encoder) {
+        let at = match by_encoder
+            .iter()
+            .position(|(encoder, _)| *encoder == score.encoder)
+        {
             Some(at) => at,
             None => {
                 by_encoder.push((&score.encoder, Vec::new()));
                 by_encoder.len() - 1
             }
         };
+
         let layers = &mut by_encoder[at].1;
-        match layers.iter_mut().find(|(features, _)| *features == score.features) {
+        match layers
+            .iter_mut()
+            .find(|(features, _)| *features == score.features)
+        {
             Some((_, rooms)) => rooms.push(score),
             None => layers.push((&score.features, vec![score])),
         }
     }
+
     let over = |rooms: &[&LayerScores], of: fn(&LayerScores) -> f64| {
         mean(&rooms.iter().map(|score| of(score)).collect::<Vec<_>>())
     };
-    let head = ["encoder", "best layer", "M1", "overall", "transl.", "rotation", "sd"];
+
+    let head = [
+        "encoder",
+        "best layer",
+        "M1",
+        "overall",
+        "transl.",
+        "rotation",
+        "sd",
+    ];
+
     let mut lines = vec![head.map(str::to_owned).to_vec()];
     for (encoder, layers) in &by_encoder {
-        let best = layers.iter().max_by(|a, b| over(&a.1, |s| s.m4_r2).total_cmp(&over(&b.1, |s| s.m4_r2)));
-        let Some((features, rooms)) = best else { continue };
-        let figures: [fn(&LayerScores) -> f64; 5] =
-            [|s| s.m1, |s| s.m4_r2, |s| s.m4_translation, |s| s.m4_rotation, |s| s.m4_deviation];
+        let best = layers
+            .iter()
+            .max_by(|a, b| over(&a.1, |s| s.m4_r2).total_cmp(&over(&b.1, |s| s.m4_r2)));
+        let Some((features, rooms)) = best else {
+            continue;
+        };
+
+        let figures: [fn(&LayerScores) -> f64; 5] = [
+            |s| s.m1,
+            |s| s.m4_r2,
+            |s| s.m4_translation,
+            |s| s.m4_rotation,
+            |s| s.m4_deviation,
+        ];
+
         let cells = figures.map(|of| format!("{:.3}", over(rooms, of)));
-        lines.push([(*encoder).to_owned(), (*features).to_owned()].into_iter().chain(cells).collect());
+        lines.push(
+            [(*encoder).to_owned(), (*features).to_owned()]
+                .into_iter()
+                .chain(cells)
+                .collect(),
+        );
     }
+
     aligned(&lines)
 }
 
@@ -129,6 +201,7 @@ pub fn layers_json(scores: &[LayerScores]) -> Value {
             "m4": { "r2": score.m4_r2, "translation": score.m4_translation, "rotation": score.m4_rotation, "deviation": score.m4_deviation, "runs": score.m4_runs },
         })
     };
+
     json!({ "layers": scores.iter().map(entry).collect::<Vec<_>>() })
 }
 
@@ -136,7 +209,8 @@ pub fn layers_json(scores: &[LayerScores]) -> Value {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand. Means over two rooms; the dimension nearest to 6 is the best, not the highest.
+    /// Oracle: by hand. Means over two rooms; the dimension nearest to 6 is the best, not the
+    /// highest.
     #[test]
     fn the_best_of_each_metric_has_a_star() {
         let score = |features: &str, m1: f64, dimension: f64, r2: f64| LayerScores {
@@ -155,12 +229,29 @@ mod tests {
             m4_deviation: 0.1,
             m4_runs: vec![r2],
         };
-        let scores = [score("a", 0.2, 5.5, -1.0), score("a", 0.4, 5.5, 0.0), score("b", 0.5, 9.0, -2.0)];
+
+        let scores = [
+            score("a", 0.2, 5.5, -1.0),
+            score("a", 0.4, 5.5, 0.0),
+            score("b", 0.5, 9.0, -2.0),
+        ];
         let table = layers_table(&scores);
         let lines: Vec<&str> = table.lines().collect();
+
         assert_eq!(lines.len(), 3);
-        assert!(lines[1].contains("0.300 ") && lines[1].contains("5.500*") && lines[1].contains("-0.500*"), "{table}");
+
+        assert!(
+            lines[1].contains("0.300 ")
+                && lines[1].contains("5.500*")
+                && lines[1].contains("-0.500*"),
+            "{table}"
+        );
+
         assert!(lines[1].contains("-0.500 ± 0.100*"), "{table}");
-        assert!(lines[2].contains("0.500*") && lines[2].contains("9.000 "), "{table}");
+
+        assert!(
+            lines[2].contains("0.500*") && lines[2].contains("9.000 "),
+            "{table}"
+        );
     }
 }

@@ -18,19 +18,26 @@ mod table;
 mod theory;
 mod trajectory;
 
-pub use adapter_sweep::{SweepRow, configurations_rows, difficulty_rows, parts_rows, success_rows, sweep_parquet};
+pub use adapter_sweep::{
+    SweepRow, configurations_rows, difficulty_rows, parts_rows, success_rows, sweep_parquet,
+};
 pub use columns::{Column, parquet_file};
 pub use cross_room::{
-    CrossRoomRun, cross_room_json, cross_room_table, room_difference_text, room_mean_json, room_mean_text, rooms_table,
-    scaling_table,
+    CrossRoomRun, cross_room_json, cross_room_table, room_difference_text, room_mean_json,
+    room_mean_text, rooms_table, scaling_table,
 };
 pub use curves::{Curves, Series, curves_svg};
 pub use document::{Block, Document, Picture, Section};
 pub use formulations::{FormulationScores, formulations_json, formulations_table};
 pub use json::{evaluation_json, training_json};
 pub use layers::{LayerScores, encoders_table, layers_json, layers_table};
-pub use odometry::{Foreign, Relocalisation, TrackedRoom, coverage_table, foreign_text, odometry_json, odometry_table};
-pub use path_errors::{APE_FORMULA, PathErrors, PathProtocol, RPE_FORMULA, path_errors_json, path_errors_table};
+pub use odometry::{
+    Foreign, Relocalisation, TrackedRoom, coverage_table, foreign_text, odometry_json,
+    odometry_table,
+};
+pub use path_errors::{
+    APE_FORMULA, PathErrors, PathProtocol, RPE_FORMULA, path_errors_json, path_errors_table,
+};
 pub use plot::{PathPlot, path_svg};
 pub use probe::{AtStride, ProbeScores, probe_table};
 pub use recording::Recording;

@@ -1,7 +1,8 @@
-//! The paper's own numbers, to stand beside ours. Encoders and rooms differ: they are context, not a target.
+//! The paper's own numbers, to stand beside ours. Encoders and rooms differ: they are context, not
+//! a target.
 
-/// Alternatives on DINOv2-B, layer 7, three scenes, 15 seeds (sec. 2.5): name, overall, translation, rotation, direction,
-/// magnitude.
+/// Alternatives on DINOv2-B, layer 7, three scenes, 15 seeds (sec. 2.5): name, overall,
+/// translation, rotation, direction, magnitude.
 pub const ALTERNATIVES: [(&str, [f64; 5]); 5] = [
     ("poincare", [0.61, 0.63, 0.59, 0.41, 0.60]),
     ("a-unanchored", [-6.82, -0.66, -12.98, -0.97, -0.99]),
@@ -10,18 +11,34 @@ pub const ALTERNATIVES: [(&str, [f64; 5]); 5] = [
     ("d-difference-input", [0.48, 0.44, 0.53, 0.08, -0.08]),
 ];
 
-/// Navigation with DINOv2, layer 7, three scenes (sec. 2.6): name, MSE, R², Top-1, Hit@0.1, 0.2, 0.3, 0.5.
+/// Navigation with DINOv2, layer 7, three scenes (sec. 2.6): name, MSE, R², Top-1, Hit@0.1, 0.2,
+/// 0.3, 0.5.
 pub const NAVIGATION: [(&str, [f64; 7]); 6] = [
     ("identity", [0.578, -0.323, 0.0, 0.090, 0.204, 0.302, 0.523]),
-    ("inverse-poincare-affine", [0.350, 0.199, 0.041, 0.252, 0.479, 0.628, 0.741]),
-    ("corrector-linear", [0.254, 0.414, 0.020, 0.141, 0.263, 0.342, 0.415]),
-    ("corrector-mlp-2", [0.280, 0.355, 0.029, 0.185, 0.342, 0.410, 0.473]),
-    ("corrector-mlp-3", [0.219, 0.498, 0.051, 0.261, 0.451, 0.532, 0.581]),
-    ("corrector-attention", [0.258, 0.407, 0.018, 0.167, 0.323, 0.383, 0.422]),
+    (
+        "inverse-poincare-affine",
+        [0.350, 0.199, 0.041, 0.252, 0.479, 0.628, 0.741],
+    ),
+    (
+        "corrector-linear",
+        [0.254, 0.414, 0.020, 0.141, 0.263, 0.342, 0.415],
+    ),
+    (
+        "corrector-mlp-2",
+        [0.280, 0.355, 0.029, 0.185, 0.342, 0.410, 0.473],
+    ),
+    (
+        "corrector-mlp-3",
+        [0.219, 0.498, 0.051, 0.261, 0.451, 0.532, 0.581],
+    ),
+    (
+        "corrector-attention",
+        [0.258, 0.407, 0.018, 0.167, 0.323, 0.383, 0.422],
+    ),
 ];
 
-/// Rooms of 31 in which zero-shot navigation and the ridge-refit beat Identity at Hit@0.1 (sec. 2.7): encoder, zero-shot,
-/// refit.
+/// Rooms of 31 in which zero-shot navigation and the ridge-refit beat Identity at Hit@0.1 (sec.
+/// 2.7): encoder, zero-shot, refit.
 pub const CROSS_ROOM: [(&str, &str, &str); 3] = [
     ("DINOv2", "19/30 (63 %)", "29/31 (94 %)"),
     ("DUSt3R", "17/29 (59 %)", "26/29 (90 %)"),
@@ -35,13 +52,29 @@ pub struct Recordings {
     pub rooms: usize,
 }
 
-const TWELVE_SCENES: Recordings = Recordings { name: "12-Scenes", rooms: 10 };
-const SCANNET: Recordings = Recordings { name: "ScanNet", rooms: 707 };
-const ARKIT_SCENES: Recordings = Recordings { name: "ARKitScenes", rooms: 133 };
-const TUM: Recordings = Recordings { name: "TUM RGB-D", rooms: 17 };
-const SEVEN_SCENES: Recordings = Recordings { name: "7-Scenes", rooms: 46 };
+const TWELVE_SCENES: Recordings = Recordings {
+    name: "12-Scenes",
+    rooms: 10,
+};
+const SCANNET: Recordings = Recordings {
+    name: "ScanNet",
+    rooms: 707,
+};
+const ARKIT_SCENES: Recordings = Recordings {
+    name: "ARKitScenes",
+    rooms: 133,
+};
+const TUM: Recordings = Recordings {
+    name: "TUM RGB-D",
+    rooms: 17,
+};
+const SEVEN_SCENES: Recordings = Recordings {
+    name: "7-Scenes",
+    rooms: 46,
+};
 
-/// Rooms in which an adapter succeeds (Table 2): recordings, encoder, largest R², % of rooms above 0, above 0.3.
+/// Rooms in which an adapter succeeds (Table 2): recordings, encoder, largest R², % of rooms above
+/// 0, above 0.3.
 pub const SUCCESS: [(Recordings, &str, [f64; 3]); 15] = [
     (TWELVE_SCENES, "V-JEPA", [0.803, 100.0, 70.0]),
     (TWELVE_SCENES, "DUSt3R", [0.789, 90.0, 80.0]),

@@ -3,13 +3,16 @@
 use serde_json::{Map, Value, json};
 
 use super::table::aligned;
-use crate::trajectory::{Alignment, Error, Matches, Relation, RpePairs, Statistics, Trajectory, ape, rpe};
+use crate::trajectory::{
+    Alignment, Error, Matches, Relation, RpePairs, Statistics, Trajectory, ape, rpe,
+};
 
 /// E of the absolute error.
 pub const APE_FORMULA: &str = "APE: E_i = est_i⁻¹ ref_i after alignment; translation ‖t(E)‖ in metres, rotation ∠E in \
                                radians, full ‖E − I‖_F; poses world_from_camera";
 /// E of the relative error.
-pub const RPE_FORMULA: &str = "RPE: E_i = (ref_i⁻¹ ref_j)⁻¹ (est_i⁻¹ est_j), j = i + Δ poses; no alignment";
+pub const RPE_FORMULA: &str =
+    "RPE: E_i = (ref_i⁻¹ ref_j)⁻¹ (est_i⁻¹ est_j), j = i + Δ poses; no alignment";
 
 /// How paths are compared.
 #[derive(Debug, Clone, Copy)]
@@ -48,7 +51,8 @@ impl PathErrors {
         matches: &Matches,
         protocol: PathProtocol,
     ) -> Result<Self, Error> {
-        let (of_reference, of_estimate) = (reference.select(&matches.reference), estimate.select(&matches.estimate));
+        let of_reference = reference.select(&matches.reference);
+        let of_estimate = estimate.select(&matches.estimate);
         let mut absolute = Vec::new();
         for alignment in Alignment::ALL {
             let errors = match alignment.apply(&of_reference, &of_estimate) {
@@ -57,19 +61,37 @@ impl PathErrors {
                     for (statistics, relation) in by_relation.iter_mut().zip(Relation::ALL) {
                         *statistics = Statistics::of(&ape(&of_reference, &aligned, relation)?);
                     }
+
                     Ok(by_relation)
                 }
                 Err(error) => Err(error),
             };
+
             absolute.push((alignment, errors));
         }
+
         let relative = Relation::ALL
-            .map(|relation| rpe(&of_reference, &of_estimate, relation, protocol.delta, protocol.pairs))
+            .map(|relation| {
+                rpe(
+                    &of_reference,
+                    &of_estimate,
+                    relation,
+                    protocol.delta,
+                    protocol.pairs,
+                )
+            })
             .into_iter()
             .map(|errors| errors.map(|errors| Statistics::of(&errors)))
             .collect::<Result<Vec<_>, Error>>()
             .map(|found| [found[0], found[1], found[2]]);
-        let distinct = |places: &[usize]| places.iter().collect::<std::collections::BTreeSet<_>>().len();
+
+        let distinct = |places: &[usize]| {
+            places
+                .iter()
+                .collect::<std::collections::BTreeSet<_>>()
+                .len()
+        };
+
         Ok(Self {
             matched: matches.reference.len(),
             unmatched_reference: reference.len() - distinct(&matches.reference),
@@ -81,15 +103,23 @@ impl PathErrors {
     }
 
     fn rows(&self) -> Vec<(String, &Result<[Statistics; 3], Error>)> {
-        let absolute = self.absolute.iter().map(|(alignment, errors)| (format!("APE {}", alignment.name()), errors));
-        absolute.chain([(format!("RPE Δ {}", self.protocol.delta), &self.relative)]).collect()
+        let absolute = self
+            .absolute
+            .iter()
+            .map(|(alignment, errors)| (format!("APE {}", alignment.name()), errors));
+        absolute
+            .chain([(format!("RPE Δ {}", self.protocol.delta), &self.relative)])
+            .collect()
     }
 }
 
 /// A line an error and relation: root mean square, mean, median, deviation, least, largest.
 pub fn path_errors_table(errors: &PathErrors) -> String {
-    let head = ["error", "part", "rmse", "mean", "median", "sd", "least", "largest", "n"];
+    let head = [
+        "error", "part", "rmse", "mean", "median", "sd", "least", "largest", "n",
+    ];
     let mut lines = vec![head.map(str::to_owned).to_vec()];
+
     let mut undefined = String::new();
     for (name, found) in errors.rows() {
         match found {
@@ -99,13 +129,24 @@ pub fn path_errors_table(errors: &PathErrors) -> String {
                     let numbers = [s.rmse, s.mean, s.median, s.deviation, s.least, s.largest];
                     let cells = numbers.map(|number| format!("{number:.6}"));
                     let start = [name.clone(), relation.name().to_owned()];
-                    lines.push(start.into_iter().chain(cells).chain([s.count.to_string()]).collect());
+
+                    lines.push(
+                        start
+                            .into_iter()
+                            .chain(cells)
+                            .chain([s.count.to_string()])
+                            .collect(),
+                    );
                 }
             }
             Err(why) => undefined.push_str(&format!("{name}: none, {why}\n")),
         }
     }
-    format!("{}{undefined}{APE_FORMULA}\n{RPE_FORMULA}\n", aligned(&lines))
+
+    format!(
+        "{}{undefined}{APE_FORMULA}\n{RPE_FORMULA}\n",
+        aligned(&lines)
+    )
 }
 
 /// The same as JSON.
@@ -114,16 +155,24 @@ pub fn path_errors_json(errors: &PathErrors) -> Value {
         json!({ "rmse": s.rmse, "mean": s.mean, "median": s.median, "std": s.deviation, "min": s.least,
             "max": s.largest, "sse": s.sum_of_squares, "n": s.count })
     };
+
     let parts = |found: &Result<[Statistics; 3], Error>| match found {
         Ok(found) => {
-            let named =
-                Relation::ALL.iter().zip(found).map(|(relation, s)| (relation.name().to_owned(), statistics(s)));
+            let named = Relation::ALL
+                .iter()
+                .zip(found)
+                .map(|(relation, s)| (relation.name().to_owned(), statistics(s)));
             Value::Object(named.collect::<Map<_, _>>())
         }
         Err(why) => json!({ "undefined": why.to_string() }),
     };
-    let absolute: Map<String, Value> =
-        errors.absolute.iter().map(|(alignment, found)| (alignment.name().to_owned(), parts(found))).collect();
+
+    let absolute: Map<String, Value> = errors
+        .absolute
+        .iter()
+        .map(|(alignment, found)| (alignment.name().to_owned(), parts(found)))
+        .collect();
+
     json!({
         "matched": errors.matched,
         "unmatched_reference": errors.unmatched_reference,

@@ -37,6 +37,7 @@ pub fn path_svg(plot: &PathPlot) -> Result<String, String> {
         let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
         draw(&root, plot).map_err(|error| error.to_string())?;
     }
+
     Ok(svg)
 }
 
@@ -45,48 +46,84 @@ type Drawn = Result<(), Box<dyn std::error::Error>>;
 fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, plot: &PathPlot) -> Drawn {
     root.fill(&WHITE)?;
     let (x_range, y_range) = ranges(plot);
+
     let mut chart = ChartBuilder::on(root)
         .caption(&plot.title, ("sans-serif", 20))
         .margin(12)
         .x_label_area_size(40)
         .y_label_area_size(50)
         .build_cartesian_2d(x_range, y_range)?;
-    chart.configure_mesh().light_line_style(WHITE).x_desc("x, metres").y_desc("y, metres").draw()?;
+
+    chart
+        .configure_mesh()
+        .light_line_style(WHITE)
+        .x_desc("x, metres")
+        .y_desc("y, metres")
+        .draw()?;
+
     let entry = |colour: RGBColor| move |(x, y)| Circle::new((x + 10, y), 5, colour.filled());
     chart
-        .draw_series(plot.map.iter().map(|at| Circle::new((at[0], at[1]), 2, MAP_COLOUR.filled())))?
+        .draw_series(
+            plot.map
+                .iter()
+                .map(|at| Circle::new((at[0], at[1]), 2, MAP_COLOUR.filled())),
+        )?
         .label("frames of the map")
         .legend(entry(MAP_COLOUR));
+
     let way = |steps: &[[f64; 3]]| -> Vec<(f64, f64)> {
-        std::iter::once(&plot.source).chain(steps).map(|at| (at[0], at[1])).collect()
+        std::iter::once(&plot.source)
+            .chain(steps)
+            .map(|at| (at[0], at[1]))
+            .collect()
     };
+
     let arrow = |at: &[f64; 3]| {
         let (sin, cos) = at[2].sin_cos();
         vec![(at[0], at[1]), (at[0] + 0.12 * cos, at[1] + 0.12 * sin)]
     };
-    for (label, steps, colour) in
-        [("requested", &plot.requested, REQUESTED_COLOUR), ("retrieved frames", &plot.retrieved, RETRIEVED_COLOUR)]
-    {
+
+    for (label, steps, colour) in [
+        ("requested", &plot.requested, REQUESTED_COLOUR),
+        ("retrieved frames", &plot.retrieved, RETRIEVED_COLOUR),
+    ] {
         chart.draw_series(LineSeries::new(way(steps), colour.stroke_width(2)))?;
-        chart.draw_series(steps.iter().map(|at| PathElement::new(arrow(at), colour.stroke_width(3))))?;
+
+        chart.draw_series(
+            steps
+                .iter()
+                .map(|at| PathElement::new(arrow(at), colour.stroke_width(3))),
+        )?;
+
         chart
-            .draw_series(steps.iter().map(|at| Circle::new((at[0], at[1]), 5, colour.filled())))?
+            .draw_series(
+                steps
+                    .iter()
+                    .map(|at| Circle::new((at[0], at[1]), 5, colour.filled())),
+            )?
             .label(label)
             .legend(entry(colour));
     }
-    for (label, at, colour) in [("source", &plot.source, SOURCE_COLOUR), ("target", &plot.target, TARGET_COLOUR)] {
+
+    for (label, at, colour) in [
+        ("source", &plot.source, SOURCE_COLOUR),
+        ("target", &plot.target, TARGET_COLOUR),
+    ] {
         chart.draw_series([PathElement::new(arrow(at), colour.stroke_width(3))])?;
+
         chart
             .draw_series([TriangleMarker::new((at[0], at[1]), 9, colour.filled())])?
             .label(label)
             .legend(entry(colour));
     }
+
     chart
         .configure_series_labels()
         .position(SeriesLabelPosition::LowerLeft)
         .background_style(WHITE.mix(0.85))
         .border_style(MAP_COLOUR)
         .draw()?;
+
     root.present()?;
     Ok(())
 }
@@ -94,17 +131,35 @@ fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, plot: &PathPlot) -> Drawn {
 /// Ranges that hold every point, with the same scale on both axes.
 fn ranges(plot: &PathPlot) -> (std::ops::Range<f64>, std::ops::Range<f64>) {
     let places = [plot.source, plot.target];
-    let posed = plot.requested.iter().chain(&plot.retrieved).chain(&places).map(|at| [at[0], at[1]]);
+    let posed = plot
+        .requested
+        .iter()
+        .chain(&plot.retrieved)
+        .chain(&places)
+        .map(|at| [at[0], at[1]]);
+
     let points: Vec<[f64; 2]> = plot.map.iter().copied().chain(posed).collect();
     let span = |axis: usize| {
-        let low = points.iter().map(|at| at[axis]).fold(f64::INFINITY, f64::min);
-        let high = points.iter().map(|at| at[axis]).fold(f64::NEG_INFINITY, f64::max);
+        let low = points
+            .iter()
+            .map(|at| at[axis])
+            .fold(f64::INFINITY, f64::min);
+
+        let high = points
+            .iter()
+            .map(|at| at[axis])
+            .fold(f64::NEG_INFINITY, f64::max);
+
         ((low + high) / 2.0, (high - low).max(0.5) / 2.0 + 0.25)
     };
-    let ((x, half_x), (y, half_y)) = (span(0), span(1));
+
+    let (x, half_x) = span(0);
+    let (y, half_y) = span(1);
+
     // The drawn area is about 830 by 600.
     let aspect = 830.0 / 600.0;
     let half_y = half_y.max(half_x / aspect);
     let half_x = half_y * aspect;
+
     (x - half_x..x + half_x, y - half_y..y + half_y)
 }

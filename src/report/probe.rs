@@ -16,7 +16,8 @@ pub struct AtStride {
     pub runs: Vec<MotionScores>,
 }
 
-/// What was measured of a room, or of several rooms learned together; what was not asked for is absent.
+/// What was measured of a room, or of several rooms learned together; what was not asked for is
+/// absent.
 #[derive(Debug, Clone)]
 pub struct ProbeScores {
     /// The room, or the rooms in words.
@@ -32,7 +33,8 @@ pub struct ProbeScores {
 }
 
 impl ProbeScores {
-    /// `{"m1": {"value": …}, "m2": {"twonn": …, "mle": …}, "m3": {"r2": …}, "m4": {"r2": …}}` with what they mean.
+    /// `{"m1": {"value": …}, "m2": {"twonn": …, "mle": …}, "m3": {"r2": …}, "m4": {"r2": …}}` with
+    /// what they mean.
     pub fn json(&self) -> Value {
         let mut object = Map::new();
         object.insert("room".to_owned(), json!(self.room));
@@ -42,20 +44,35 @@ impl ProbeScores {
         if let Some((dimension, gap, duplicates)) = &self.m2 {
             object.insert("m2".to_owned(), m2_json(dimension, *gap, *duplicates));
         }
+
         for (name, strides) in [("m3", &self.m3), ("m4", &self.m4)] {
             if let Some(first) = strides.first() {
                 let mut entry = stride_json(first);
-                let all: Vec<Value> = strides.iter().map(|at| Value::Object(stride_json(at))).collect();
+
+                let all: Vec<Value> = strides
+                    .iter()
+                    .map(|at| Value::Object(stride_json(at)))
+                    .collect();
                 entry.insert("strides".to_owned(), json!(all));
+
                 object.insert(name.to_owned(), Value::Object(entry));
             }
         }
+
         Value::Object(object)
     }
 }
 
 fn m1_json(value: f64, options: &MutualKnn) -> Value {
-    let &MutualKnn { frames, stride, k, exclusion, counted, bound } = options;
+    let &MutualKnn {
+        frames,
+        stride,
+        k,
+        exclusion,
+        counted,
+        bound,
+    } = options;
+
     json!({
         "value": value,
         "frames": frames,
@@ -68,7 +85,9 @@ fn m1_json(value: f64, options: &MutualKnn) -> Value {
 }
 
 fn m2_json(dimension: &IntrinsicDimension, gap: usize, duplicates: Duplicates) -> Value {
-    let mle = |mle: &Mle| json!({ "harmonic": mle.harmonic, "mean": mle.mean, "median": mle.median });
+    let mle =
+        |mle: &Mle| json!({ "harmonic": mle.harmonic, "mean": mle.mean, "median": mle.median });
+
     json!({
         "twonn": dimension.two_nn.linear,
         "mle": dimension.mle_biased.harmonic,
@@ -88,53 +107,104 @@ fn stride_json(at: &AtStride) -> Map<String, Value> {
     let mut entry = Map::new();
     entry.insert("stride".to_owned(), json!(at.stride));
     entry.insert("r2".to_owned(), json!(mean_of_known(&overall)));
+
     if at.runs.len() > 1 {
         entry.insert("sd".to_owned(), json!(deviation(&overall)));
         entry.insert("by_part".to_owned(), parts_json(&at.runs));
     }
-    entry.insert("n".to_owned(), json!(at.runs.first().map_or(0, |run| run.n)));
-    entry.insert("runs".to_owned(), json!(at.runs.iter().map(motion_json).collect::<Vec<_>>()));
+
+    entry.insert(
+        "n".to_owned(),
+        json!(at.runs.first().map_or(0, |run| run.n)),
+    );
+
+    entry.insert(
+        "runs".to_owned(),
+        json!(at.runs.iter().map(motion_json).collect::<Vec<_>>()),
+    );
+
     entry
 }
 
 /// A line a room and metric.
 pub fn probe_table(scores: &[ProbeScores]) -> String {
-    let head = ["room", "metric", "value", "sd", "transl.", "rotation", "direct.", "magnit.", "n"];
+    let head = [
+        "room", "metric", "value", "sd", "transl.", "rotation", "direct.", "magnit.", "n",
+    ];
     let mut lines = vec![head.map(str::to_owned).to_vec()];
+
     for score in scores {
         let mut line = |metric: String, values: &[String]| {
-            lines.push([score.room.clone(), metric].into_iter().chain(values.iter().cloned()).collect());
+            lines.push(
+                [score.room.clone(), metric]
+                    .into_iter()
+                    .chain(values.iter().cloned())
+                    .collect(),
+            );
         };
+
         if let Some((value, options)) = &score.m1 {
             let absent = || "".to_owned();
-            let cells = [format!("{value:.3}"), absent(), absent(), absent(), absent(), absent()];
-            line("M1".to_owned(), &[cells.as_slice(), &[options.frames.to_string()]].concat());
+            let cells = [
+                format!("{value:.3}"),
+                absent(),
+                absent(),
+                absent(),
+                absent(),
+                absent(),
+            ];
+
+            line(
+                "M1".to_owned(),
+                &[cells.as_slice(), &[options.frames.to_string()]].concat(),
+            );
         }
+
         if let Some((dimension, ..)) = &score.m2 {
-            line("M2 TwoNN".to_owned(), &[format!("{:.3}", dimension.two_nn.linear)]);
-            line("M2 MLE".to_owned(), &[format!("{:.3}", dimension.mle_biased.harmonic)]);
+            line(
+                "M2 TwoNN".to_owned(),
+                &[format!("{:.3}", dimension.two_nn.linear)],
+            );
+
+            line(
+                "M2 MLE".to_owned(),
+                &[format!("{:.3}", dimension.mle_biased.harmonic)],
+            );
         }
+
         for (name, strides) in [("M3", &score.m3), ("M4", &score.m4)] {
             for at in strides.iter() {
                 line(format!("{name} s{}", at.stride), &stride_cells(at));
             }
         }
     }
+
     aligned(&lines)
 }
 
 fn stride_cells(at: &AtStride) -> Vec<String> {
     let column = |figure: fn(&MotionScores) -> f64| at.runs.iter().map(figure).collect::<Vec<_>>();
     let overall = column(|run| run.overall);
-    let spread = if at.runs.len() > 1 { format!("{:.3}", deviation(&overall)) } else { String::new() };
+    let spread = if at.runs.len() > 1 {
+        format!("{:.3}", deviation(&overall))
+    } else {
+        String::new()
+    };
+
     let parts = [
         column(|run| run.translation),
         column(|run| run.rotation),
         column(|run| run.direction),
         column(|run| run.magnitude),
     ];
+
     let mut cells = vec![format!("{:.3}", mean_of_known(&overall)), spread];
-    cells.extend(parts.iter().map(|part| format!("{:.3}", mean_of_known(part))));
+    cells.extend(
+        parts
+            .iter()
+            .map(|part| format!("{:.3}", mean_of_known(part))),
+    );
+
     cells.push(at.runs.first().map_or(0, |run| run.n).to_string());
     cells
 }

@@ -1,4 +1,5 @@
-//! Poses, transforms and images as an MCAP file, which Foxglove and other viewers open: JSON messages of Foxglove's schemas.
+//! Poses, transforms and images as an MCAP file, which Foxglove and other viewers open: JSON
+//! messages of Foxglove's schemas.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -27,14 +28,26 @@ impl Recording {
     pub fn new() -> Result<Self, McapError> {
         let options = WriteOptions::new().compression(None).library("seese3");
         let writer = options.create(Cursor::new(Vec::new()))?;
-        Ok(Self { writer, schemas: BTreeMap::new(), channels: BTreeMap::new(), sequence: 0 })
+
+        Ok(Self {
+            writer,
+            schemas: BTreeMap::new(),
+            channels: BTreeMap::new(),
+            sequence: 0,
+        })
     }
 
     /// `frame_from_camera` as foxglove.PoseInFrame.
     ///
     /// # Errors
     /// As the library says.
-    pub fn pose(&mut self, topic: &str, time_ns: i64, frame: &str, pose: &Pose) -> Result<(), McapError> {
+    pub fn pose(
+        &mut self,
+        topic: &str,
+        time_ns: i64,
+        frame: &str,
+        pose: &Pose,
+    ) -> Result<(), McapError> {
         let message = json!({ "timestamp": time(time_ns), "frame_id": frame,
             "pose": { "position": vector(pose), "orientation": quaternion(pose) } });
         self.message("foxglove.PoseInFrame", topic, time_ns, &message)
@@ -44,7 +57,13 @@ impl Recording {
     ///
     /// # Errors
     /// As the library says.
-    pub fn transform(&mut self, time_ns: i64, parent: &str, child: &str, pose: &Pose) -> Result<(), McapError> {
+    pub fn transform(
+        &mut self,
+        time_ns: i64,
+        parent: &str,
+        child: &str,
+        pose: &Pose,
+    ) -> Result<(), McapError> {
         let message = json!({ "timestamp": time(time_ns), "parent_frame_id": parent, "child_frame_id": child,
             "translation": vector(pose), "rotation": quaternion(pose) });
         self.message("foxglove.FrameTransform", "/tf", time_ns, &message)
@@ -55,10 +74,19 @@ impl Recording {
     /// # Errors
     /// As the library says.
     pub fn image(&mut self, time_ns: i64, frame: &str, file: &[u8]) -> Result<(), McapError> {
-        let format = if file.starts_with(&[0x89, b'P', b'N', b'G']) { "png" } else { "jpeg" };
-        let message =
-            json!({ "timestamp": time(time_ns), "frame_id": frame, "format": format, "data": STANDARD.encode(file) });
-        self.message("foxglove.CompressedImage", "/camera/image", time_ns, &message)
+        let format = if file.starts_with(&[0x89, b'P', b'N', b'G']) {
+            "png"
+        } else {
+            "jpeg"
+        };
+        let message = json!({ "timestamp": time(time_ns), "frame_id": frame, "format": format, "data": STANDARD.encode(file) });
+
+        self.message(
+            "foxglove.CompressedImage",
+            "/camera/image",
+            time_ns,
+            &message,
+        )
     }
 
     /// The file.
@@ -70,26 +98,49 @@ impl Recording {
         Ok(self.writer.into_inner().into_inner())
     }
 
-    fn message(&mut self, schema: &'static str, topic: &str, time_ns: i64, message: &Value) -> Result<(), McapError> {
+    fn message(
+        &mut self,
+        schema: &'static str,
+        topic: &str,
+        time_ns: i64,
+        message: &Value,
+    ) -> Result<(), McapError> {
         let channel_id = self.channel(schema, topic)?;
         self.sequence += 1;
+
         // The format counts from the epoch; times before it are at it.
         let log_time = u64::try_from(time_ns).unwrap_or(0);
-        let header = MessageHeader { channel_id, sequence: self.sequence, log_time, publish_time: log_time };
-        self.writer.write_to_known_channel(&header, message.to_string().as_bytes())
+        let header = MessageHeader {
+            channel_id,
+            sequence: self.sequence,
+            log_time,
+            publish_time: log_time,
+        };
+
+        self.writer
+            .write_to_known_channel(&header, message.to_string().as_bytes())
     }
 
     fn channel(&mut self, schema: &'static str, topic: &str) -> Result<u16, McapError> {
         if let Some(&id) = self.channels.get(topic) {
             return Ok(id);
         }
+
         let schema_id = match self.schemas.get(schema) {
             Some(&id) => id,
-            None => self.writer.add_schema(schema, "jsonschema", schema_of(schema).to_string().as_bytes())?,
+            None => self.writer.add_schema(
+                schema,
+                "jsonschema",
+                schema_of(schema).to_string().as_bytes(),
+            )?,
         };
+
         self.schemas.insert(schema, schema_id);
-        let id = self.writer.add_channel(schema_id, topic, "json", &BTreeMap::new())?;
+        let id = self
+            .writer
+            .add_channel(schema_id, topic, "json", &BTreeMap::new())?;
         self.channels.insert(topic.to_owned(), id);
+
         Ok(id)
     }
 }
@@ -114,18 +165,21 @@ fn schema_of(name: &str) -> Value {
     let text = json!({ "type": "string" });
     let object = |fields: Value| json!({ "type": "object", "properties": fields });
     let time = object(json!({ "sec": { "type": "integer" }, "nsec": { "type": "integer" } }));
+
     let vector = object(json!({ "x": number, "y": number, "z": number }));
     let quaternion = object(json!({ "x": number, "y": number, "z": number, "w": number }));
+
     let mut schema = match name {
         "foxglove.PoseInFrame" => object(json!({ "timestamp": time, "frame_id": text,
             "pose": object(json!({ "position": vector, "orientation": quaternion })) })),
-        "foxglove.FrameTransform" => {
-            object(json!({ "timestamp": time, "parent_frame_id": text, "child_frame_id": text,
-            "translation": vector, "rotation": quaternion }))
-        }
+        "foxglove.FrameTransform" => object(
+            json!({ "timestamp": time, "parent_frame_id": text, "child_frame_id": text,
+            "translation": vector, "rotation": quaternion }),
+        ),
         _ => object(json!({ "timestamp": time, "frame_id": text, "format": text,
             "data": { "type": "string", "contentEncoding": "base64" } })),
     };
+
     schema["title"] = name.into();
     schema
 }
@@ -139,21 +193,57 @@ mod tests {
     fn what_is_recorded_is_read_again() {
         let mut recording = Recording::new().unwrap();
         let pose = Pose::translation(1.0, 2.0, 3.0);
-        recording.pose("/pose", 1_500_000_000, "map", &pose).unwrap();
-        recording.transform(1_500_000_000, "map", "odom", &pose).unwrap();
-        recording.pose("/pose", 2_000_000_000, "map", &pose).unwrap();
-        recording.image(2_000_000_000, "camera", &[0x89, b'P', b'N', b'G']).unwrap();
+        recording
+            .pose("/pose", 1_500_000_000, "map", &pose)
+            .unwrap();
+
+        recording
+            .transform(1_500_000_000, "map", "odom", &pose)
+            .unwrap();
+
+        recording
+            .pose("/pose", 2_000_000_000, "map", &pose)
+            .unwrap();
+
+        recording
+            .image(2_000_000_000, "camera", &[0x89, b'P', b'N', b'G'])
+            .unwrap();
+
         let file = recording.finish().unwrap();
-        let messages: Vec<_> = mcap::MessageStream::new(&file).unwrap().map(Result::unwrap).collect();
+        let messages: Vec<_> = mcap::MessageStream::new(&file)
+            .unwrap()
+            .map(Result::unwrap)
+            .collect();
+
         assert_eq!(messages.len(), 4);
-        let names: Vec<&str> =
-            messages.iter().map(|message| message.channel.schema.as_ref().unwrap().name.as_str()).collect();
-        assert_eq!(names.iter().filter(|&&name| name == "foxglove.PoseInFrame").count(), 2);
+
+        let names: Vec<&str> = messages
+            .iter()
+            .map(|message| message.channel.schema.as_ref().unwrap().name.as_str())
+            .collect();
+
+        assert_eq!(
+            names
+                .iter()
+                .filter(|&&name| name == "foxglove.PoseInFrame")
+                .count(),
+            2
+        );
+
         let first: Value = serde_json::from_slice(&messages[0].data).unwrap();
         assert_eq!(first["timestamp"], json!({ "sec": 1, "nsec": 500_000_000 }));
-        assert_eq!((&first["frame_id"], &first["pose"]["position"]["z"]), (&json!("map"), &json!(3.0)));
+
+        assert_eq!(
+            (&first["frame_id"], &first["pose"]["position"]["z"]),
+            (&json!("map"), &json!(3.0))
+        );
+
         assert_eq!(messages[0].log_time, 1_500_000_000);
+
         let last: Value = serde_json::from_slice(&messages[3].data).unwrap();
-        assert_eq!((&last["format"], &last["data"]), (&json!("png"), &json!("iVBORw==")));
+        assert_eq!(
+            (&last["format"], &last["data"]),
+            (&json!("png"), &json!("iVBORw=="))
+        );
     }
 }

@@ -6,12 +6,34 @@ use crate::scores::{Rate, deviation, mean};
 
 /// Hit@ε by navigator with 95 % intervals, then medians and joint recalls.
 pub fn evaluation_table(report: &Report) -> String {
-    let mut head: Vec<String> = ["navigator", "n", "MSE", "R²", "Top-1"].map(str::to_owned).to_vec();
-    head.extend(report.protocol.thresholds.iter().map(|epsilon| format!("Hit@{epsilon} [95 %]")));
+    let mut head: Vec<String> = ["navigator", "n", "MSE", "R²", "Top-1"]
+        .map(str::to_owned)
+        .to_vec();
+
+    head.extend(
+        report
+            .protocol
+            .thresholds
+            .iter()
+            .map(|epsilon| format!("Hit@{epsilon} [95 %]")),
+    );
+
     let mut lines = vec![head];
     lines.extend(report.rows.iter().map(hit_cells));
-    let mut second =
-        vec![["navigator", "median m", "median °", "5 cm 5°", "10 cm 5°", "50 cm 5°"].map(str::to_owned).to_vec()];
+
+    let mut second = vec![
+        [
+            "navigator",
+            "median m",
+            "median °",
+            "5 cm 5°",
+            "10 cm 5°",
+            "50 cm 5°",
+        ]
+        .map(str::to_owned)
+        .to_vec(),
+    ];
+
     second.extend(report.rows.iter().map(pose_cells));
     format!("{}\n{}", aligned(&lines), aligned(&second))
 }
@@ -25,6 +47,7 @@ fn hit_cells(row: &Row) -> Vec<String> {
         latent(row.latent.map(|latent| latent.r2)),
         format!("{:.3}", row.retrieval.top1.rate),
     ];
+
     cells.extend(row.retrieval.hits.iter().map(|(_, rate)| interval(rate)));
     cells
 }
@@ -35,12 +58,14 @@ fn pose_cells(row: &Row) -> Vec<String> {
         format!("{:.3}", row.retrieval.translation_m_median),
         format!("{:.2}", row.retrieval.rotation_rad_median.to_degrees()),
     ];
+
     let shown = [(0.05, 5.0), (0.1, 5.0), (0.5, 5.0)];
     for recall in &row.retrieval.pose_recalls {
         if shown.contains(&(recall.translation_m, recall.rotation_deg)) {
             cells.push(format!("{:.3}", recall.rate.rate));
         }
     }
+
     cells
 }
 
@@ -50,11 +75,25 @@ fn interval(rate: &Rate) -> String {
 
 /// R² by component, one line a seed, and their mean ± sample deviation when there are several.
 pub fn training_table(runs: &[TrainingRun]) -> String {
-    let head = ["seed", "overall", "transl.", "rotation", "direct.", "magnit.", "train R²", "mean R²", "Hit@0.1", "s"];
+    let head = [
+        "seed",
+        "overall",
+        "transl.",
+        "rotation",
+        "direct.",
+        "magnit.",
+        "train R²",
+        "mean R²",
+        "Hit@0.1",
+        "s",
+    ];
+
     let mut lines = vec![head.map(str::to_owned).to_vec()];
+
     let numbers = |run: &TrainingRun| {
         let test = &run.record.test;
         let hit = run.hit_rate.rate;
+
         [
             test.overall,
             test.translation,
@@ -67,11 +106,13 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
             run.seconds,
         ]
     };
+
     for run in runs {
         let mut cells = vec![run.record.config.seed.to_string()];
         cells.extend(numbers(run).iter().map(|value| format!("{value:.3}")));
         lines.push(cells);
     }
+
     if runs.len() > 1 {
         for (label, of) in [("mean", mean as fn(&[f64]) -> f64), ("± sd", deviation)] {
             let mut cells = vec![label.to_owned()];
@@ -79,28 +120,43 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
                 let values: Vec<f64> = runs.iter().map(|run| numbers(run)[column]).collect();
                 format!("{:.3}", of(&values))
             }));
+
             lines.push(cells);
         }
     }
+
     aligned(&lines)
 }
 
 /// Columns as wide as their widest cell; the first to the left, the others to the right.
 pub fn aligned(lines: &[Vec<String>]) -> String {
     let columns = lines.iter().map(Vec::len).max().unwrap_or(0);
+
     let width = |column: usize| {
-        lines.iter().filter_map(|line| line.get(column)).map(|cell| cell.chars().count()).max().unwrap_or(0)
+        lines
+            .iter()
+            .filter_map(|line| line.get(column))
+            .map(|cell| cell.chars().count())
+            .max()
+            .unwrap_or(0)
     };
+
     let widths: Vec<usize> = (0..columns).map(width).collect();
     let mut text = String::new();
     for line in lines {
         for (column, cell) in line.iter().enumerate() {
             let padding = " ".repeat(widths[column] - cell.chars().count());
-            let cell = if column == 0 { format!("{cell}{padding}") } else { format!("  {padding}{cell}") };
+            let cell = if column == 0 {
+                format!("{cell}{padding}")
+            } else {
+                format!("  {padding}{cell}")
+            };
             text.push_str(&cell);
         }
+
         text.truncate(text.trim_end().len());
         text.push('\n');
     }
+
     text
 }

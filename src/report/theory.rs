@@ -18,13 +18,24 @@ pub fn theory_table_rows(checks: &[Check]) -> Vec<Vec<String>> {
         let measured = number(check.measured);
         let verdict = if check.holds() { "" } else { "NOT KEPT" };
         let what = format!("{}: {}", check.theorem, check.what);
-        lines.push(vec![what, measured, bound_text(check.bound), verdict.to_owned()]);
+
+        lines.push(vec![
+            what,
+            measured,
+            bound_text(check.bound),
+            verdict.to_owned(),
+        ]);
     }
+
     lines
 }
 
 fn number(value: f64) -> String {
-    if value != 0.0 && value.abs() < 1e-3 { format!("{value:.1e}") } else { format!("{value:.4}") }
+    if value != 0.0 && value.abs() < 1e-3 {
+        format!("{value:.1e}")
+    } else {
+        format!("{value:.4}")
+    }
 }
 
 fn bound_text(bound: Bound) -> String {
@@ -48,5 +59,6 @@ pub fn theory_json(checks: &[Check]) -> Value {
             "holds": check.holds(),
         })
     };
+
     json!({ "checks": checks.iter().map(entry).collect::<Vec<_>>() })
 }

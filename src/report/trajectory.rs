@@ -10,12 +10,22 @@ use crate::geometry::Pose;
 pub fn tum_trajectory(timestamps_ns: &[i64], poses: &[Pose]) -> String {
     let mut text = String::from("# timestamp tx ty tz qx qy qz qw\n");
     for (time, pose) in timestamps_ns.iter().zip(poses) {
-        let (t, q) = (pose.translation.vector, pose.rotation.coords);
-        let (sign, time) = (if *time < 0 { "-" } else { "" }, time.unsigned_abs());
-        let (seconds, rest) = (time / 1_000_000_000, time % 1_000_000_000);
+        let t = pose.translation.vector;
+        let q = pose.rotation.coords;
+        let sign = if *time < 0 { "-" } else { "" };
+        let time = time.unsigned_abs();
+        let seconds = time / 1_000_000_000;
+
+        let rest = time % 1_000_000_000;
+
         // Writing to a string cannot fail.
-        let _ = writeln!(text, "{sign}{seconds}.{rest:09} {} {} {} {} {} {} {}", t.x, t.y, t.z, q.x, q.y, q.z, q.w);
+        let _ = writeln!(
+            text,
+            "{sign}{seconds}.{rest:09} {} {} {} {} {} {} {}",
+            t.x, t.y, t.z, q.x, q.y, q.z, q.w
+        );
     }
+
     text
 }
 
@@ -24,10 +34,14 @@ pub fn kitti_trajectory(poses: &[Pose]) -> String {
     let mut text = String::new();
     for pose in poses {
         let matrix = pose.to_homogeneous();
-        let numbers: Vec<String> = (0..12).map(|i| matrix[(i / 4, i % 4)].to_string()).collect();
+        let numbers: Vec<String> = (0..12)
+            .map(|i| matrix[(i / 4, i % 4)].to_string())
+            .collect();
+
         // Writing to a string cannot fail.
         let _ = writeln!(text, "{}", numbers.join(" "));
     }
+
     text
 }
 
@@ -44,11 +58,28 @@ mod tests {
         let pose = Pose::from_parts(Translation3::new(1.0, -2.0, 0.5), turn);
         let text = tum_trajectory(&[1_700_000_000_000_000_001], &[pose]);
         let line = text.lines().nth(1).unwrap();
-        assert!(line.starts_with("1700000000.000000001 1 -2 0.5 0 0 0.7071"), "{line}");
+
+        assert!(
+            line.starts_with("1700000000.000000001 1 -2 0.5 0 0 0.7071"),
+            "{line}"
+        );
+
         let kitti = kitti_trajectory(&[pose]);
-        let numbers: Vec<f64> = kitti.split_whitespace().map(|word| word.parse().unwrap()).collect();
+        let numbers: Vec<f64> = kitti
+            .split_whitespace()
+            .map(|word| word.parse().unwrap())
+            .collect();
+
         let expected = [0.0, -1.0, 0.0, 1.0, 1.0, 0.0, 0.0, -2.0, 0.0, 0.0, 1.0, 0.5];
-        assert!(numbers.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-15) && numbers.len() == 12, "{kitti}");
+        assert!(
+            numbers
+                .iter()
+                .zip(expected)
+                .all(|(a, b)| (a - b).abs() < 1e-15)
+                && numbers.len() == 12,
+            "{kitti}"
+        );
+
         assert!(tum_trajectory(&[-500_000_000], &[pose]).contains("\n-0.500000000 "));
     }
 }

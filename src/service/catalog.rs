@@ -23,14 +23,25 @@ impl CatalogService for Handlers {
         &self,
         request: Request<pb::ListRoomsRequest>,
     ) -> Result<Response<pb::ListRoomsResponse>, Status> {
-        let pb::ListRoomsRequest { page_size, page_token } = request.into_inner();
+        let pb::ListRoomsRequest {
+            page_size,
+            page_token,
+        } = request.into_inner();
+
         let snapshot = self.snapshot()?;
         let (page, next_page_token) = page(snapshot.rooms(), page_size, &page_token)?;
         let rooms = page.into_iter().map(room).collect();
-        Ok(Response::new(pb::ListRoomsResponse { rooms, next_page_token }))
+
+        Ok(Response::new(pb::ListRoomsResponse {
+            rooms,
+            next_page_token,
+        }))
     }
 
-    async fn get_room(&self, request: Request<pb::GetRoomRequest>) -> Result<Response<pb::GetRoomResponse>, Status> {
+    async fn get_room(
+        &self,
+        request: Request<pb::GetRoomRequest>,
+    ) -> Result<Response<pb::GetRoomResponse>, Status> {
         let snapshot = self.snapshot()?;
         let room = room(snapshot.room(&request.into_inner().room)?);
         Ok(Response::new(pb::GetRoomResponse { room: Some(room) }))
@@ -40,11 +51,19 @@ impl CatalogService for Handlers {
         &self,
         request: Request<pb::ListAdaptersRequest>,
     ) -> Result<Response<pb::ListAdaptersResponse>, Status> {
-        let pb::ListAdaptersRequest { page_size, page_token } = request.into_inner();
+        let pb::ListAdaptersRequest {
+            page_size,
+            page_token,
+        } = request.into_inner();
+
         let snapshot = self.snapshot()?;
         let (page, next_page_token) = page(snapshot.adapters(), page_size, &page_token)?;
         let adapters = page.into_iter().map(|stored| adapter(stored)).collect();
-        Ok(Response::new(pb::ListAdaptersResponse { adapters, next_page_token }))
+
+        Ok(Response::new(pb::ListAdaptersResponse {
+            adapters,
+            next_page_token,
+        }))
     }
 
     async fn get_adapter(
@@ -53,39 +72,64 @@ impl CatalogService for Handlers {
     ) -> Result<Response<pb::GetAdapterResponse>, Status> {
         let snapshot = self.snapshot()?;
         let adapter = adapter(snapshot.adapter(&request.into_inner().adapter)?);
-        Ok(Response::new(pb::GetAdapterResponse { adapter: Some(adapter) }))
+
+        Ok(Response::new(pb::GetAdapterResponse {
+            adapter: Some(adapter),
+        }))
     }
 }
 
 /// A page of entries by name and the token of the next: the last name of this one.
-fn page<'a, T>(all: &'a BTreeMap<String, T>, size: i32, token: &str) -> Result<(Vec<&'a T>, String), Error> {
+fn page<'a, T>(
+    all: &'a BTreeMap<String, T>,
+    size: i32,
+    token: &str,
+) -> Result<(Vec<&'a T>, String), Error> {
     let size = match usize::try_from(size) {
         Ok(0) => PAGE,
         Ok(size) => size.min(LARGEST_PAGE),
-        Err(_) => return Err(Error::invalid("page_size", format!("must not be negative, got {size}"))),
+        Err(_) => {
+            return Err(Error::invalid(
+                "page_size",
+                format!("must not be negative, got {size}"),
+            ));
+        }
     };
+
     let after = if token.is_empty() {
         Bound::Unbounded
     } else if crate::room::is_plain_name(token) {
         Bound::Excluded(token)
     } else {
-        return Err(Error::invalid("page_token", "is not one that this server gave; begin with the first page"));
+        return Err(Error::invalid(
+            "page_token",
+            "is not one that this server gave; begin with the first page",
+        ));
     };
+
     let mut rest = all.range::<str, _>((after, Bound::Unbounded));
     let page: Vec<(&String, &T)> = rest.by_ref().take(size).collect();
     let next = match (rest.next(), page.last()) {
         (Some(_), Some((name, _))) => (*name).clone(),
         _ => String::new(),
     };
+
     Ok((page.into_iter().map(|(_, entry)| entry).collect(), next))
 }
 
 fn room(served: &ServedRoom) -> pb::Room {
     let provenance = served.room.provenance();
     pb::Room {
-        revision: Some(pb::Revision { name: served.room.id().to_string(), revision: served.revision }),
+        revision: Some(pb::Revision {
+            name: served.room.id().to_string(),
+            revision: served.revision,
+        }),
         frame_count: served.room.frame_count() as u32,
-        adapters: served.navigators.iter().map(|navigator| navigator.adapter.name.clone()).collect(),
+        adapters: served
+            .navigators
+            .iter()
+            .map(|navigator| navigator.adapter.name.clone())
+            .collect(),
         features: served.sources.iter().map(convert::source_to_wire).collect(),
         format: provenance.format.clone(),
         licence: provenance.licence.clone(),
@@ -95,14 +139,25 @@ fn room(served: &ServedRoom) -> pb::Room {
 }
 
 fn revisions(rooms: &[(crate::room::RoomId, u64)]) -> Vec<pb::Revision> {
-    rooms.iter().map(|(room, revision)| pb::Revision { name: room.to_string(), revision: *revision }).collect()
+    rooms
+        .iter()
+        .map(|(room, revision)| pb::Revision {
+            name: room.to_string(),
+            revision: *revision,
+        })
+        .collect()
 }
 
 fn adapter(stored: &StoredAdapter) -> pb::Adapter {
-    let (adapter, record) = (&stored.adapter, &stored.record);
+    let adapter = &stored.adapter;
+    let record = &stored.record;
     let scale = adapter.scale();
+
     pb::Adapter {
-        revision: Some(pb::Revision { name: stored.name.clone(), revision: stored.revision }),
+        revision: Some(pb::Revision {
+            name: stored.name.clone(),
+            revision: stored.revision,
+        }),
         source: Some(convert::source_to_wire(adapter.source())),
         latent_dim: adapter.latent_dim() as u32,
         training_rooms: revisions(&record.rooms),
@@ -114,7 +169,9 @@ fn adapter(stored: &StoredAdapter) -> pb::Adapter {
         train: Some(convert::scores_to_wire(&record.train)),
         train_mean_r2: Some(record.train_mean_r2).filter(|r2| r2.is_finite()),
         target_mean: Some(convert::twist_to_wire(&Twist::from_vector(&scale.mean))),
-        target_deviation: Some(convert::twist_to_wire(&Twist::from_vector(&scale.deviation))),
+        target_deviation: Some(convert::twist_to_wire(&Twist::from_vector(
+            &scale.deviation,
+        ))),
         singular_values: adapter.inverse().singular_values().to_vec(),
         created: stored.created.clone(),
         charts: adapter.network().chart_count() as u32,
@@ -134,18 +191,23 @@ mod tests {
     fn pages_cover_everything_once() {
         let all: BTreeMap<String, usize> = (0..25).map(|i| (format!("{i:03}"), i)).collect();
         for size in [1, 7, 24, 25, 26] {
-            let (mut seen, mut token) = (Vec::new(), String::new());
+            let mut seen = Vec::new();
+            let mut token = String::new();
             loop {
                 let (entries, next) = page(&all, size, &token).unwrap();
                 assert!(entries.len() <= size as usize);
+
                 seen.extend(entries.into_iter().copied());
                 if next.is_empty() {
                     break;
                 }
+
                 token = next;
             }
+
             assert_eq!(seen, (0..25).collect::<Vec<_>>(), "pages of {size}");
         }
+
         assert!(page(&all, -1, "").is_err());
         assert!(page(&all, 1, "no such").is_err());
     }

@@ -24,13 +24,21 @@ type Events = mpsc::Sender<Result<pb::EvaluateResponse, Status>>;
 impl EvaluationService for Handlers {
     type EvaluateStream = Pin<Box<dyn Stream<Item = Result<pb::EvaluateResponse, Status>> + Send>>;
 
-    async fn evaluate(&self, request: Request<pb::EvaluateRequest>) -> Result<Response<Self::EvaluateStream>, Status> {
+    async fn evaluate(
+        &self,
+        request: Request<pb::EvaluateRequest>,
+    ) -> Result<Response<Self::EvaluateStream>, Status> {
         let snapshot = self.snapshot()?;
         let budget = self.workers.budget(request.metadata());
-        let (served, protocol) = protocol(&snapshot, request.into_inner(), self.config.limits.steps)?;
+        let (served, protocol) =
+            protocol(&snapshot, request.into_inner(), self.config.limits.steps)?;
+
         let (events, stream) = mpsc::channel(16);
-        let run = self.clone().run_evaluation(served, protocol, budget, events);
+        let run = self
+            .clone()
+            .run_evaluation(served, protocol, budget, events);
         tokio::spawn(run.instrument(tracing::Span::current()));
+
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }
 
@@ -38,38 +46,65 @@ impl EvaluationService for Handlers {
         &self,
         request: Request<pb::ScorePredictionsRequest>,
     ) -> Result<Response<pb::ScorePredictionsResponse>, Status> {
-        let (snapshot, most) = (self.snapshot()?, self.config.predictions);
+        let snapshot = self.snapshot()?;
+        let most = self.config.predictions;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
-        let answer = self.workers.run(budget, move |cancel| score(&snapshot, request, most, cancel)).await?;
+
+        let answer = self
+            .workers
+            .run(budget, move |cancel| {
+                score(&snapshot, request, most, cancel)
+            })
+            .await?;
+
         Ok(Response::new(answer))
     }
 }
 
 impl Handlers {
     /// Sends progress and the report, or the error; stops when nobody listens any more.
-    async fn run_evaluation(self, served: Arc<ServedNavigator>, protocol: Protocol, budget: Duration, events: Events) {
+    async fn run_evaluation(
+        self,
+        served: Arc<ServedNavigator>,
+        protocol: Protocol,
+        budget: Duration,
+        events: Events,
+    ) {
         let heard = events.clone();
         let total = protocol.navigators.len() as u32;
+
         let work = move |cancel: &Cancellation| {
             let report = evaluate(&served.navigator, &protocol, cancel, &mut |done, kind| {
-                let progress = pb::EvaluationProgress { done: done as u32, total, navigator: kind.name() };
+                let progress = pb::EvaluationProgress {
+                    done: done as u32,
+                    total,
+                    navigator: kind.name(),
+                };
                 let event = pb::evaluate_response::Event::Progress(progress);
+
                 // A listener that is slow misses progress; it must never hold a thread.
                 let _ = events.try_send(Ok(pb::EvaluateResponse { event: Some(event) }));
             })?;
+
             Ok(report_to_wire(&served, &report))
         };
+
         let finished = tokio::select! {
             finished = self.workers.run(budget, work) => finished,
             () = heard.closed() => return,
         };
+
         if let Err(error) = &finished {
             tracing::warn!(grpc_status = i32::from(error.code()), %error, "the evaluation ended without a report");
         }
+
         let last = finished
-            .map(|report| pb::EvaluateResponse { event: Some(pb::evaluate_response::Event::Report(report)) })
+            .map(|report| pb::EvaluateResponse {
+                event: Some(pb::evaluate_response::Event::Report(report)),
+            })
             .map_err(Status::from);
+
         // As above: without a listener there is nobody to tell.
         let _ = heard.send(last).await;
     }
@@ -93,9 +128,12 @@ fn protocol(
         steps,
         mode,
     } = request;
+
     let served = snapshot.navigator(&room, &adapter)?.clone();
     let record = &served.adapter.record;
-    let (split, stride) = (convert::split(&split)?.unwrap_or(record.split), stride.unwrap_or(record.stride));
+    let split = convert::split(&split)?.unwrap_or(record.split);
+    let stride = stride.unwrap_or(record.stride);
+
     let navigators = convert::navigators(&navigators)?;
     let protocol = Protocol {
         split,
@@ -107,16 +145,28 @@ fn protocol(
         mode: convert::mode_of(mode)?,
         navigators,
     };
+
     if protocol.steps == 0 || protocol.steps > most_steps {
-        return Err(Error::invalid("steps", format!("must be 1 to {most_steps}, got {}", protocol.steps)));
+        return Err(Error::invalid(
+            "steps",
+            format!("must be 1 to {most_steps}, got {}", protocol.steps),
+        ));
     }
+
     let navigators = protocol.rows(&served.navigator)?;
-    Ok((served, Protocol { navigators, ..protocol }))
+    Ok((
+        served,
+        Protocol {
+            navigators,
+            ..protocol
+        },
+    ))
 }
 
 fn report_to_wire(served: &ServedNavigator, report: &crate::eval::Report) -> pb::EvaluationReport {
     let record = &served.adapter.record;
     let in_room = served.trained_on.is_some();
+
     pb::EvaluationReport {
         room: Some(convert::room_revision(served)),
         adapter: Some(convert::adapter_revision(served)),
@@ -132,7 +182,10 @@ fn report_to_wire(served: &ServedNavigator, report: &crate::eval::Report) -> pb:
             && (record.split != report.protocol.split
                 || [Split::Whole, Split::Pairs].contains(&record.split)
                 || served.trained_on == Some(TrainedOn::OtherFrames)),
-        calibrated_here: record.calibrated_on.iter().any(|(room, _)| room == served.navigator.room().id()),
+        calibrated_here: record
+            .calibrated_on
+            .iter()
+            .any(|(room, _)| room == served.navigator.room().id()),
         navigators: report.rows.iter().map(convert::row_to_wire).collect(),
     }
 }
@@ -143,27 +196,44 @@ fn score(
     most: usize,
     cancel: &Cancellation,
 ) -> Result<pb::ScorePredictionsResponse, Error> {
-    let pb::ScorePredictionsRequest { room, adapter, predictions, split, exclude_source, exclude_radius, thresholds } =
-        request;
+    let pb::ScorePredictionsRequest {
+        room,
+        adapter,
+        predictions,
+        split,
+        exclude_source,
+        exclude_radius,
+        thresholds,
+    } = request;
+
     let served = snapshot.navigator(&room, &adapter)?;
+
     if predictions.len() > most {
-        let problem = format!("needs 1 to {most} in one request, got {}", predictions.len());
+        let problem = format!(
+            "needs 1 to {most} in one request, got {}",
+            predictions.len()
+        );
         return Err(Error::invalid("predictions", problem));
     }
+
     let scope = PredictionScope {
         split: convert::split(&split)?,
         exclude_source: convert::exclusion(exclude_source, exclude_radius)?,
         thresholds: convert::thresholds(thresholds)?,
     };
+
     let predictions = predictions
         .into_iter()
         .enumerate()
         .map(|(position, given)| convert::prediction(position, given))
         .collect::<Result<Vec<_>, _>>()?;
     let row = score_predictions(&served.navigator, &predictions, &scope, cancel)?;
+
     let frame_count = served.navigator.room().frame_count();
-    let candidate_count =
-        scope.split.map_or(frame_count, |split| split.candidates(served.navigator.room().timeline()).len());
+    let candidate_count = scope.split.map_or(frame_count, |split| {
+        split.candidates(served.navigator.room().timeline()).len()
+    });
+
     Ok(pb::ScorePredictionsResponse {
         room: Some(convert::room_revision(served)),
         adapter: Some(convert::adapter_revision(served)),

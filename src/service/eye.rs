@@ -1,4 +1,5 @@
-//! Images that callers send instead of features: decoded within bounds and encoded as the adapter's features were.
+//! Images that callers send instead of features: decoded within bounds and encoded as the adapter's
+//! features were.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -49,13 +50,29 @@ pub fn open(
     adapters: &BTreeMap<String, Arc<StoredAdapter>>,
 ) -> Result<BTreeMap<String, Arc<Eye>>, RunError> {
     let mut eyes = BTreeMap::new();
-    let Some(ImageEncoders { models, runtime, bounds }) = encoders else { return Ok(eyes) };
+    let Some(ImageEncoders {
+        models,
+        runtime,
+        bounds,
+    }) = encoders
+    else {
+        return Ok(eyes);
+    };
+
     for model in models {
-        let id = encoder::identity(model).map_err(|problem| RunError::Model { model: model.clone(), problem })?;
-        if adapters.values().all(|adapter| adapter.adapter.source().encoder != id) {
+        let id = encoder::identity(model).map_err(|problem| RunError::Model {
+            model: model.clone(),
+            problem,
+        })?;
+
+        if adapters
+            .values()
+            .all(|adapter| adapter.adapter.source().encoder != id)
+        {
             tracing::warn!(model, id, "no adapter's features were made by this encoder");
         }
     }
+
     // Adapters of one source share an encoder.
     let mut opened: Vec<(&FeatureSource, Arc<Eye>)> = Vec::new();
     for (name, adapter) in adapters {
@@ -64,30 +81,61 @@ pub fn open(
             eyes.insert(name.clone(), eye.clone());
             continue;
         }
-        let encoder = Encoder::of_source(source, models, runtime)
-            .map_err(|problem| RunError::Encoder { adapter: name.clone(), problem })?;
+
+        let encoder =
+            Encoder::of_source(source, models, runtime).map_err(|problem| RunError::Encoder {
+                adapter: name.clone(),
+                problem,
+            })?;
+
         match encoder {
             Some(encoder) if encoder.window() > 1 => {
-                tracing::warn!(adapter = name, "its features are of clips; single images cannot be sent for it");
+                tracing::warn!(
+                    adapter = name,
+                    "its features are of clips; single images cannot be sent for it"
+                );
             }
             Some(encoder) if encoder.dims() == [source.dim] => {
-                tracing::info!(adapter = name, encoder = encoder.id(), runtime = encoder.runtime(), "takes images");
-                let eye = Arc::new(Eye { encoder, bounds: *bounds });
+                tracing::info!(
+                    adapter = name,
+                    encoder = encoder.id(),
+                    runtime = encoder.runtime(),
+                    "takes images"
+                );
+
+                let eye = Arc::new(Eye {
+                    encoder,
+                    bounds: *bounds,
+                });
                 opened.push((source, eye.clone()));
+
                 eyes.insert(name.clone(), eye);
             }
             Some(encoder) => {
                 let problem = encoder::Error::Option {
                     what: "encoder",
                     given: encoder.id().to_owned(),
-                    problem: format!("gives {:?} columns, the adapter takes {}", encoder.dims(), source.dim),
+                    problem: format!(
+                        "gives {:?} columns, the adapter takes {}",
+                        encoder.dims(),
+                        source.dim
+                    ),
                 };
-                return Err(RunError::Encoder { adapter: name.clone(), problem });
+
+                return Err(RunError::Encoder {
+                    adapter: name.clone(),
+                    problem,
+                });
             }
             None => {
-                tracing::warn!(adapter = name, encoder = source.encoder, "no --encoder is its own; no images for it")
+                tracing::warn!(
+                    adapter = name,
+                    encoder = source.encoder,
+                    "no --encoder is its own; no images for it"
+                )
             }
         }
     }
+
     Ok(eyes)
 }

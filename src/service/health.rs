@@ -1,7 +1,8 @@
-//! The standard health service, `grpc.health.v1`: Check and Watch, for the server, each service and each room.
+//! The standard health service, `grpc.health.v1`: Check and Watch, for the server, each service and
+//! each room.
 //!
-//! Names: `""`, the services' full names, `rooms/NAME`. Watch of a name that is not known says SERVICE_UNKNOWN and
-//! stays open, as the specification wants.
+//! Names: `""`, the services' full names, `rooms/NAME`. Watch of a name that is not known says
+//! SERVICE_UNKNOWN and stays open, as the specification wants.
 
 use std::pin::Pin;
 
@@ -39,8 +40,10 @@ pub fn service(phase: watch::Receiver<Phase>) -> HealthServer<HealthOf> {
 /// The status of a name, or none if it is not known.
 fn status(phase: &Phase, name: &str) -> Option<ServingStatus> {
     let has_room = |snapshot: &super::Snapshot| {
-        name.strip_prefix("rooms/").is_some_and(|room| snapshot.rooms().contains_key(room))
+        name.strip_prefix("rooms/")
+            .is_some_and(|room| snapshot.rooms().contains_key(room))
     };
+
     let known = SERVICES.contains(&name);
     match phase {
         Phase::Serving(snapshot) if known || has_room(snapshot) => Some(ServingStatus::Serving),
@@ -54,41 +57,61 @@ fn status(phase: &Phase, name: &str) -> Option<ServingStatus> {
 impl Health for HealthOf {
     type WatchStream = Pin<Box<dyn Stream<Item = Result<HealthCheckResponse, Status>> + Send>>;
 
-    async fn check(&self, request: Request<HealthCheckRequest>) -> Result<Response<HealthCheckResponse>, Status> {
+    async fn check(
+        &self,
+        request: Request<HealthCheckRequest>,
+    ) -> Result<Response<HealthCheckResponse>, Status> {
         let name = request.into_inner().service;
         match status(&self.0.borrow(), &name) {
-            Some(status) => Ok(Response::new(HealthCheckResponse { status: status.into() })),
+            Some(status) => Ok(Response::new(HealthCheckResponse {
+                status: status.into(),
+            })),
             None => Err(Status::not_found(format!("service '{name}' is not known"))),
         }
     }
 
-    async fn watch(&self, request: Request<HealthCheckRequest>) -> Result<Response<Self::WatchStream>, Status> {
+    async fn watch(
+        &self,
+        request: Request<HealthCheckRequest>,
+    ) -> Result<Response<Self::WatchStream>, Status> {
         let name = request.into_inner().service;
         let mut phase = self.0.clone();
         let (changes, stream) = mpsc::channel(4);
+
         tokio::spawn(async move {
             let mut last = None;
             loop {
                 let (now, stopping) = {
                     let phase = phase.borrow_and_update();
                     let stopping = matches!(*phase, Phase::Draining(_) | Phase::Stopping);
-                    (status(&phase, &name).unwrap_or(ServingStatus::ServiceUnknown), stopping)
+
+                    (
+                        status(&phase, &name).unwrap_or(ServingStatus::ServiceUnknown),
+                        stopping,
+                    )
                 };
+
                 if last.replace(now) != Some(now)
-                    && changes.send(Ok(HealthCheckResponse { status: now.into() })).await.is_err()
+                    && changes
+                        .send(Ok(HealthCheckResponse { status: now.into() }))
+                        .await
+                        .is_err()
                 {
                     return;
                 }
+
                 // A watcher must not keep a server that was told to stop.
                 if stopping {
                     return;
                 }
+
                 tokio::select! {
                     changed = phase.changed() => if changed.is_err() { return },
                     () = changes.closed() => return,
                 }
             }
         });
+
         Ok(Response::new(Box::pin(ReceiverStream::new(stream))))
     }
 }
@@ -97,14 +120,20 @@ impl Health for HealthOf {
 mod tests {
     use super::*;
 
-    /// Oracle: the promise and the specification: every service that exists is NOT_SERVING until all is
-    /// loaded, and after the server was told to stop; a room is not known before it is loaded.
+    /// Oracle: the promise and the specification: every service that exists is NOT_SERVING
+    /// until all is loaded, and after the server was told to stop; a room is not known before it is
+    /// loaded.
     #[test]
     fn nothing_serves_before_it_is_loaded() {
         for phase in [Phase::Loading, Phase::Stopping] {
             for name in SERVICES {
-                assert_eq!(status(&phase, name), Some(ServingStatus::NotServing), "{name:?}");
+                assert_eq!(
+                    status(&phase, name),
+                    Some(ServingStatus::NotServing),
+                    "{name:?}"
+                );
             }
+
             assert_eq!(status(&phase, "rooms/kitchen"), None);
         }
     }

@@ -24,11 +24,22 @@ impl LocalizationService for Handlers {
         Ok(Response::new(self.relocalized(request).await?))
     }
 
-    async fn localize(&self, request: Request<pb::LocalizeRequest>) -> Result<Response<pb::LocalizeResponse>, Status> {
-        let (snapshot, most) = (self.snapshot()?, self.config.limits.hits);
+    async fn localize(
+        &self,
+        request: Request<pb::LocalizeRequest>,
+    ) -> Result<Response<pb::LocalizeResponse>, Status> {
+        let snapshot = self.snapshot()?;
+        let most = self.config.limits.hits;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
-        let answer = self.workers.run(budget, move |cancel| answer(&snapshot, request, most, cancel)).await?;
+
+        let answer = self
+            .workers
+            .run(budget, move |cancel| {
+                answer(&snapshot, request, most, cancel)
+            })
+            .await?;
+
         Ok(Response::new(answer))
     }
 }
@@ -39,38 +50,65 @@ fn answer(
     most: u32,
     cancel: &Cancellation,
 ) -> Result<pb::LocalizeResponse, Error> {
-    let pb::LocalizeRequest { rooms, adapter, view, hit_count, thresholds } = request;
+    let pb::LocalizeRequest {
+        rooms,
+        adapter,
+        view,
+        hit_count,
+        thresholds,
+    } = request;
+
     let thresholds = convert::thresholds(thresholds)?;
     let k = hit_count.unwrap_or(1);
     if k == 0 || k > most {
-        return Err(Error::invalid("hit_count", format!("must be 1 to {most}, got {k}")));
+        return Err(Error::invalid(
+            "hit_count",
+            format!("must be 1 to {most}, got {k}"),
+        ));
     }
+
     let served = rooms_under(snapshot, &rooms, &adapter)?;
     let first = &served[0];
     let source = convert::source("view", view, &first.adapter, snapshot)?;
     if matches!(source, Source::Frame(_)) && served.len() != 1 {
-        return Err(Error::invalid("view.frame_id", "is a frame of one room; name that room alone in rooms"));
+        return Err(Error::invalid(
+            "view.frame_id",
+            "is a frame of one room; name that room alone in rooms",
+        ));
     }
-    let start = first.navigator.start(&source, None).map_err(|error| match error {
-        E::Adapter(problem) => view_error(&problem).within("view"),
-        E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => {
-            Error::NotFound { field: "view.frame_id".to_owned(), name: frame.to_string() }
-        }
-        other => Error::from(other),
-    })?;
+
+    let start = first
+        .navigator
+        .start(&source, None)
+        .map_err(|error| match error {
+            E::Adapter(problem) => view_error(&problem).within("view"),
+            E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => Error::NotFound {
+                field: "view.frame_id".to_owned(),
+                name: frame.to_string(),
+            },
+            other => Error::from(other),
+        })?;
+
     let navigators = served.iter().map(|served| served.navigator.as_ref());
     let places = localize(navigators, start.latent.view(), k as usize, cancel)?;
-    let revision = |room: &str| served.iter().find(|served| served.navigator.room().id().as_str() == room);
+
+    let revision = |room: &str| {
+        served
+            .iter()
+            .find(|served| served.navigator.room().id().as_str() == room)
+    };
+
     let place = |place: &crate::localization::Place| {
         let served = revision(place.room.as_str()).ok_or(Error::Internal)?;
         Ok(pb::Place {
             room: Some(convert::room_revision(served)),
             hit: Some(convert::hit_to_wire(&place.hit, served.navigator.room())),
-            error: start
-                .pose
-                .map(|truth| convert::error_to_wire(&StepError::of(&truth, &place.hit.pose, &truth), &thresholds)),
+            error: start.pose.map(|truth| {
+                convert::error_to_wire(&StepError::of(&truth, &place.hit.pose, &truth), &thresholds)
+            }),
         })
     };
+
     Ok(pb::LocalizeResponse {
         adapter: Some(convert::adapter_revision(first)),
         places: places.iter().map(place).collect::<Result<_, Error>>()?,
@@ -85,42 +123,77 @@ pub(super) fn rooms_under(
     adapter: &str,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
     for (position, room) in rooms.iter().enumerate() {
-        snapshot.room(room).map_err(|error| error.named(&format!("rooms[{position}]")))?;
+        snapshot
+            .room(room)
+            .map_err(|error| error.named(&format!("rooms[{position}]")))?;
+
         if rooms[..position].contains(room) {
             return Err(Error::invalid("rooms", format!("'{room}' is named twice")));
         }
     }
+
     let adapter = match (adapter, rooms) {
         ("", [room]) => snapshot.navigator(room, "")?.adapter.name.clone(),
         ("", _) => only_adapter_of(snapshot, rooms)?,
         (name, _) => snapshot.adapter(name)?.name.clone(),
     };
+
     if rooms.is_empty() {
         let all = snapshot.rooms().values().flat_map(|room| &room.navigators);
-        let fitting: Vec<_> = all.filter(|served| served.adapter.name == adapter).cloned().collect();
+        let fitting: Vec<_> = all
+            .filter(|served| served.adapter.name == adapter)
+            .cloned()
+            .collect();
+
         return if fitting.is_empty() {
-            Err(Error::Precondition(format!("no room has the features of adapter '{adapter}'")))
+            Err(Error::Precondition(format!(
+                "no room has the features of adapter '{adapter}'"
+            )))
         } else {
             Ok(fitting)
         };
     }
-    rooms.iter().map(|room| Ok(snapshot.navigator(room, &adapter)?.clone())).collect()
+
+    rooms
+        .iter()
+        .map(|room| Ok(snapshot.navigator(room, &adapter)?.clone()))
+        .collect()
 }
 
 /// The one adapter that fits all the rooms: distances under two adapters do not compare.
 fn only_adapter_of(snapshot: &Snapshot, rooms: &[String]) -> Result<String, Error> {
-    let answered = snapshot.rooms().iter().filter(|(_, room)| !room.navigators.is_empty()).map(|(name, _)| name);
-    let asked: Vec<&String> = if rooms.is_empty() { answered.collect() } else { rooms.iter().collect() };
+    let answered = snapshot
+        .rooms()
+        .iter()
+        .filter(|(_, room)| !room.navigators.is_empty())
+        .map(|(name, _)| name);
+    let asked: Vec<&String> = if rooms.is_empty() {
+        answered.collect()
+    } else {
+        rooms.iter().collect()
+    };
+
     let mut fitting: Vec<&String> = snapshot.adapters().keys().collect();
     for room in asked {
         let served = snapshot.room(room)?;
-        fitting.retain(|name| served.navigators.iter().any(|navigator| navigator.adapter.name == **name));
+        fitting.retain(|name| {
+            served
+                .navigators
+                .iter()
+                .any(|navigator| navigator.adapter.name == **name)
+        });
     }
+
     match fitting.as_slice() {
         [only] => Ok((*only).clone()),
         several => {
             let names: Vec<&str> = several.iter().map(|name| name.as_str()).collect();
-            let problem = format!("is required: {} adapters fit all these rooms ({})", names.len(), names.join(", "));
+            let problem = format!(
+                "is required: {} adapters fit all these rooms ({})",
+                names.len(),
+                names.join(", ")
+            );
+
             Err(Error::invalid("adapter", problem))
         }
     }

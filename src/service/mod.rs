@@ -1,7 +1,8 @@
 //! The gRPC service: package `seese3.v1`, standard health and reflection.
 //!
 //! - A request keeps the [`Snapshot`] it began with; a snapshot never changes.
-//! - Work that computes runs on blocking threads, a bounded number at a time; a panic there costs one request.
+//! - Work that computes runs on blocking threads, a bounded number at a time; a panic there costs
+//!   one request.
 //! - Deadlines and callers that went away stop the work between its pieces.
 
 mod catalog;
@@ -106,11 +107,21 @@ pub enum RunError {
     #[error("store '{location}' has no room; import one first")]
     NoRoom { location: String },
     #[error("adapter '{adapter}' does not serve room '{room}': {problem}")]
-    Navigator { adapter: String, room: String, problem: crate::navigation::Error },
+    Navigator {
+        adapter: String,
+        room: String,
+        problem: crate::navigation::Error,
+    },
     #[error("adapter '{adapter}' cannot be given images: {problem}")]
-    Encoder { adapter: String, problem: crate::encoder::Error },
+    Encoder {
+        adapter: String,
+        problem: crate::encoder::Error,
+    },
     #[error("--encoder {model}: {problem}")]
-    Model { model: String, problem: crate::encoder::Error },
+    Model {
+        model: String,
+        problem: crate::encoder::Error,
+    },
     #[error("the server failed: {0}")]
     Transport(#[from] tonic::transport::Error),
     #[error("the reflection service cannot be made: {0}")]
@@ -147,7 +158,8 @@ impl Handlers {
     }
 }
 
-/// Serves a store until `shutdown` completes. Health answers from the first moment, NOT_SERVING until all is loaded.
+/// Serves a store until `shutdown` completes. Health answers from the first moment, NOT_SERVING
+/// until all is loaded.
 ///
 /// # Errors
 /// [`RunError`]; a store that is damaged ends the server before it serves.
@@ -160,6 +172,7 @@ pub async fn run(
     let (phase, watched) = watch::channel(Phase::Loading);
     let (stop, stopped) = oneshot::channel::<()>();
     let workers = Workers::new(&config);
+
     let handlers = Handlers {
         phase: watched.clone(),
         workers: workers.clone(),
@@ -170,8 +183,10 @@ pub async fn run(
         // An error means the sender is gone: the server is to stop all the same.
         let _ = stopped.await;
     })?;
+
     tokio::pin!(server, shutdown);
     let loading = snapshot::load(store, config.index, config.encoders);
+
     let loaded = tokio::select! {
         loaded = loading => loaded?,
         ended = &mut server => return ended,
@@ -180,24 +195,37 @@ pub async fn run(
             return Ok(());
         }
     };
+
     let loaded = Arc::new(loaded);
-    tracing::info!(rooms = loaded.room_count(), adapters = loaded.adapter_count(), "serving");
+    tracing::info!(
+        rooms = loaded.room_count(),
+        adapters = loaded.adapter_count(),
+        "serving"
+    );
+
     phase.send_replace(Phase::Serving(loaded.clone()));
+
     tokio::select! {
         ended = &mut server => return ended,
         () = &mut shutdown => {}
     }
+
     tracing::info!(bound_s = config.drain.as_secs_f64(), "draining");
     phase.send_replace(Phase::Draining(loaded));
+
     // An error means the server has ended already.
     let _ = stop.send(());
     if let Ok(ended) = tokio::time::timeout(config.drain, &mut server).await {
         return ended;
     }
+
     tracing::warn!("the drain bound passed; requests still in flight are given up");
     workers.halt();
+
     // Their callers are answered, unless they do not even read that.
-    tokio::time::timeout(LAST_WORDS, server).await.unwrap_or(Ok(()))
+    tokio::time::timeout(LAST_WORDS, server)
+        .await
+        .unwrap_or(Ok(()))
 }
 
 fn server(
@@ -207,13 +235,17 @@ fn server(
     stopped: impl Future<Output = ()> + Send,
 ) -> Result<impl Future<Output = Result<(), RunError>> + Send, RunError> {
     let most = handlers.config.message_bytes;
+
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
+
     let failed = |error: tonic_reflection::server::Error| RunError::Reflection(error.to_string());
-    let (v1, v1alpha) = (reflection().build_v1().map_err(failed)?, reflection().build_v1alpha().map_err(failed)?);
+    let v1 = reflection().build_v1().map_err(failed)?;
+    let v1alpha = reflection().build_v1alpha().map_err(failed)?;
+
     let router = Server::builder()
         .http2_keepalive_interval(Some(Duration::from_secs(30)))
         .http2_keepalive_timeout(Some(Duration::from_secs(20)))
@@ -223,10 +255,17 @@ fn server(
         .add_service(v1)
         .add_service(v1alpha)
         .add_service(NavigationServiceServer::new(handlers.clone()).max_decoding_message_size(most))
-        .add_service(LocalizationServiceServer::new(handlers.clone()).max_decoding_message_size(most))
+        .add_service(
+            LocalizationServiceServer::new(handlers.clone()).max_decoding_message_size(most),
+        )
         .add_service(OdometryServiceServer::new(handlers.clone()).max_decoding_message_size(most))
         .add_service(CatalogServiceServer::new(handlers.clone()).max_decoding_message_size(most))
         .add_service(EvaluationServiceServer::new(handlers).max_decoding_message_size(most));
+
     let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
-    Ok(async move { Ok(router.serve_with_incoming_shutdown(incoming, stopped).await?) })
+    Ok(async move {
+        Ok(router
+            .serve_with_incoming_shutdown(incoming, stopped)
+            .await?)
+    })
 }

@@ -12,11 +12,22 @@ use crate::proto::v1::navigation_service_server::NavigationService;
 
 #[tonic::async_trait]
 impl NavigationService for Handlers {
-    async fn navigate(&self, request: Request<pb::NavigateRequest>) -> Result<Response<pb::NavigateResponse>, Status> {
-        let (snapshot, limits) = (self.snapshot()?, self.config.limits);
+    async fn navigate(
+        &self,
+        request: Request<pb::NavigateRequest>,
+    ) -> Result<Response<pb::NavigateResponse>, Status> {
+        let snapshot = self.snapshot()?;
+        let limits = self.config.limits;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
-        let answer = self.workers.run(budget, move |cancel| navigate(&snapshot, request, limits, cancel)).await?;
+
+        let answer = self
+            .workers
+            .run(budget, move |cancel| {
+                navigate(&snapshot, request, limits, cancel)
+            })
+            .await?;
+
         Ok(Response::new(answer))
     }
 
@@ -33,21 +44,38 @@ impl NavigationService for Handlers {
         &self,
         request: Request<pb::BatchNavigateRequest>,
     ) -> Result<Response<pb::BatchNavigateResponse>, Status> {
-        let (snapshot, limits, most) = (self.snapshot()?, self.config.limits, self.config.batch);
+        let snapshot = self.snapshot()?;
+        let limits = self.config.limits;
+        let most = self.config.batch;
         let budget = self.workers.budget(request.metadata());
+
         let pb::BatchNavigateRequest { requests } = request.into_inner();
         if requests.is_empty() || requests.len() > most {
-            return Err(Error::invalid("requests", format!("needs 1 to {most}, got {}", requests.len())).into());
+            return Err(Error::invalid(
+                "requests",
+                format!("needs 1 to {most}, got {}", requests.len()),
+            )
+            .into());
         }
-        let in_all = requests.iter().map(hits_asked_for).fold(0, u64::saturating_add);
+
+        let in_all = requests
+            .iter()
+            .map(hits_asked_for)
+            .fold(0, u64::saturating_add);
+
         if in_all > limits.hits_in_all {
-            let problem = format!("ask for {in_all} frames together, over the limit of {}", limits.hits_in_all);
+            let problem = format!(
+                "ask for {in_all} frames together, over the limit of {}",
+                limits.hits_in_all
+            );
             return Err(Error::invalid("requests", problem).into());
         }
+
         let work = move |cancel: &Cancellation| {
             let mut results = Vec::with_capacity(requests.len());
             for request in requests {
                 cancel.check()?;
+
                 results.push(match navigate(&snapshot, request, limits, cancel) {
                     Ok(response) => pb::batch_navigate_result::Result::Response(response),
                     Err(Error::Cancelled) => return Err(Error::Cancelled),
@@ -57,20 +85,33 @@ impl NavigationService for Handlers {
                     }),
                 });
             }
+
             Ok(results)
         };
+
         let results = self.workers.run(budget, work).await?;
-        let results = results.into_iter().map(|result| pb::BatchNavigateResult { result: Some(result) }).collect();
+        let results = results
+            .into_iter()
+            .map(|result| pb::BatchNavigateResult {
+                result: Some(result),
+            })
+            .collect();
+
         Ok(Response::new(pb::BatchNavigateResponse { results }))
     }
 }
 
 /// How many frames a request asks for; each question is checked again when it is answered.
 fn hits_asked_for(request: &pb::NavigateRequest) -> u64 {
-    let motions = match request.displacement.as_ref().and_then(|given| given.displacement.as_ref()) {
+    let motions = match request
+        .displacement
+        .as_ref()
+        .and_then(|given| given.displacement.as_ref())
+    {
         Some(pb::displacement::Displacement::Twists(list)) => list.twists.len() as u64,
         _ => 1,
     };
+
     let steps = u64::from(request.steps.unwrap_or(1)).saturating_mul(motions);
     steps.saturating_mul(u64::from(request.hit_count.unwrap_or(1)))
 }
@@ -85,6 +126,7 @@ fn navigate(
     let (query, thresholds) = convert::query(request, &served.adapter, snapshot)?;
     let answer = served.navigator.answer(&query, limits, cancel)?;
     let room = served.navigator.room();
+
     Ok(pb::NavigateResponse {
         room: Some(convert::room_revision(served)),
         adapter: Some(convert::adapter_revision(served)),
@@ -95,7 +137,9 @@ fn navigate(
         mode: convert::mode_to_wire(query.mode).into(),
         reading: convert::reading_to_wire(query.step).into(),
         navigator: convert::navigator_to_wire(&query),
-        displacement: answer.displacement.map(|twist| convert::twist_to_wire(&twist)),
+        displacement: answer
+            .displacement
+            .map(|twist| convert::twist_to_wire(&twist)),
         exact: served.navigator.audit().is_none(),
     })
 }

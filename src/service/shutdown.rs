@@ -7,6 +7,7 @@ pub async fn shutdown_signal() {
             std::future::pending::<()>().await;
         }
     };
+
     #[cfg(unix)]
     let terminated = async {
         match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
@@ -16,6 +17,7 @@ pub async fn shutdown_signal() {
             Err(_) => std::future::pending::<()>().await,
         }
     };
+
     #[cfg(not(unix))]
     let terminated = std::future::pending::<()>();
     tokio::select! {

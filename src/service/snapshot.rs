@@ -98,7 +98,11 @@ impl Snapshot {
         if name.is_empty() {
             return Err(Error::invalid("room", "is required"));
         }
-        self.rooms.get(name).ok_or_else(|| Error::NotFound { field: "room".to_owned(), name: name.to_owned() })
+
+        self.rooms.get(name).ok_or_else(|| Error::NotFound {
+            field: "room".to_owned(),
+            name: name.to_owned(),
+        })
     }
 
     /// An adapter by name.
@@ -106,102 +110,189 @@ impl Snapshot {
         if name.is_empty() {
             return Err(Error::invalid("adapter", "is required"));
         }
-        self.adapters.get(name).ok_or_else(|| Error::NotFound { field: "adapter".to_owned(), name: name.to_owned() })
+
+        self.adapters.get(name).ok_or_else(|| Error::NotFound {
+            field: "adapter".to_owned(),
+            name: name.to_owned(),
+        })
     }
 
     /// A room under the adapter of that name, or under its default if the name is empty.
     pub fn navigator(&self, room: &str, adapter: &str) -> Result<&Arc<ServedNavigator>, Error> {
         let served = self.room(room)?;
         if adapter.is_empty() {
-            return served
-                .navigators
-                .first()
-                .ok_or_else(|| Error::Precondition(format!("no adapter fits room '{room}'; train one")));
+            return served.navigators.first().ok_or_else(|| {
+                Error::Precondition(format!("no adapter fits room '{room}'; train one"))
+            });
         }
+
         let wanted = self.adapter(adapter)?;
-        served.navigators.iter().find(|navigator| navigator.adapter.name == wanted.name).ok_or_else(|| {
-            let source = &wanted.adapter.source().name;
-            Error::Precondition(format!("room '{room}' has no features '{source}', which adapter '{adapter}' needs"))
-        })
+        served
+            .navigators
+            .iter()
+            .find(|navigator| navigator.adapter.name == wanted.name)
+            .ok_or_else(|| {
+                let source = &wanted.adapter.source().name;
+                Error::Precondition(format!(
+                    "room '{room}' has no features '{source}', which adapter '{adapter}' needs"
+                ))
+            })
     }
 }
 
 /// Loads every room and adapter of a store and makes their navigators, off the serving threads.
-pub async fn load(store: Store, index: IndexKind, encoders: Option<ImageEncoders>) -> Result<Snapshot, RunError> {
+pub async fn load(
+    store: Store,
+    index: IndexKind,
+    encoders: Option<ImageEncoders>,
+) -> Result<Snapshot, RunError> {
     let runtime = tokio::runtime::Handle::current();
-    let loading = tokio::task::spawn_blocking(move || runtime.block_on(load_all(&store, index, encoders.as_ref())));
-    loading.await.map_err(|error| RunError::Loading(error.to_string()))?
+    let loading = tokio::task::spawn_blocking(move || {
+        runtime.block_on(load_all(&store, index, encoders.as_ref()))
+    });
+
+    loading
+        .await
+        .map_err(|error| RunError::Loading(error.to_string()))?
 }
 
-async fn load_all(store: &Store, index: IndexKind, encoders: Option<&ImageEncoders>) -> Result<Snapshot, RunError> {
-    let (mut adapters, mut shared) = (BTreeMap::new(), BTreeMap::new());
+async fn load_all(
+    store: &Store,
+    index: IndexKind,
+    encoders: Option<&ImageEncoders>,
+) -> Result<Snapshot, RunError> {
+    let mut adapters = BTreeMap::new();
+    let mut shared = BTreeMap::new();
     for name in store.adapter_names().await? {
         let stored = store.load_adapter(&name, None).await?;
         // One for all rooms: maps of one adapter are told by it.
         shared.insert(name.clone(), Arc::new(stored.adapter.clone()));
         adapters.insert(name, Arc::new(stored));
     }
+
     let eyes = eye::open(encoders, &adapters)?;
     let mut rooms = BTreeMap::new();
     for summary in store.rooms().await? {
         let stored = store.load_room(&summary.room, None).await?;
         let room = Arc::new(stored.room);
         let mut fitting: Vec<&Arc<StoredAdapter>> = adapters.values().collect();
+
         let rank = |a: &StoredAdapter| {
             let learned_here = a.record.rooms.iter().any(|(name, _)| name == room.id());
             (learned_here, a.created.clone(), a.name.clone())
         };
         fitting.sort_by_key(|adapter| std::cmp::Reverse(rank(adapter)));
+
         let mut navigators = Vec::new();
         for adapter in fitting {
             let source = adapter.adapter.source();
-            let Some(features) = stored.features.iter().find(|features| features.source().is_like(source)) else {
+            let Some(features) = stored
+                .features
+                .iter()
+                .find(|features| features.source().is_like(source))
+            else {
                 continue;
             };
-            let Some(computing) = shared.get(&adapter.name) else { continue };
+
+            let Some(computing) = shared.get(&adapter.name) else {
+                continue;
+            };
             let navigator = Navigator::new(room.clone(), features, computing.clone(), index);
             let navigator = navigator.map_err(|problem| RunError::Navigator {
                 adapter: adapter.name.clone(),
                 room: room.id().to_string(),
                 problem,
             })?;
+
             log_audit(&navigator, &adapter.name);
-            let trained = adapter.record.rooms.iter().find(|(name, _)| name == room.id());
+
+            let trained = adapter
+                .record
+                .rooms
+                .iter()
+                .find(|(name, _)| name == room.id());
+
             let trained_on = match trained {
                 None => None,
-                Some((name, revision)) if store.same_frames(name.as_str(), *revision, stored.revision).await? => {
+                Some((name, revision))
+                    if store
+                        .same_frames(name.as_str(), *revision, stored.revision)
+                        .await? =>
+                {
                     Some(TrainedOn::TheseFrames)
                 }
                 Some(_) => Some(TrainedOn::OtherFrames),
             };
-            let (adapter, room_revision) = (adapter.clone(), stored.revision);
+
+            let adapter = adapter.clone();
+            let room_revision = stored.revision;
             let navigator = Arc::new(navigator);
-            let (map, content) = (map(&navigator), content(&navigator));
-            let served = ServedNavigator { navigator, map, content, adapter, room_revision, trained_on };
+            let map = map(&navigator);
+
+            let content = content(&navigator);
+            let served = ServedNavigator {
+                navigator,
+                map,
+                content,
+                adapter,
+                room_revision,
+                trained_on,
+            };
+
             navigators.push(Arc::new(served));
         }
-        let sources = stored.features.iter().map(|features| features.source().clone()).collect();
-        let served = ServedRoom { room, revision: stored.revision, created: stored.created, sources, navigators };
+
+        let sources = stored
+            .features
+            .iter()
+            .map(|features| features.source().clone())
+            .collect();
+
+        let served = ServedRoom {
+            room,
+            revision: stored.revision,
+            created: stored.created,
+            sources,
+            navigators,
+        };
+
         rooms.insert(summary.room, served);
     }
+
     if rooms.is_empty() {
-        return Err(RunError::NoRoom { location: store.location().to_owned() });
+        return Err(RunError::NoRoom {
+            location: store.location().to_owned(),
+        });
     }
-    Ok(Snapshot { rooms, adapters, eyes })
+
+    Ok(Snapshot {
+        rooms,
+        adapters,
+        eyes,
+    })
 }
 
-/// What answers are computed from, hashed: names and revisions of two stores may be the same by chance.
+/// What answers are computed from, hashed: names and revisions of two stores may be the same by
+/// chance.
 fn content(navigator: &Navigator) -> [u8; 32] {
     let mut digest = Sha256::new();
+
     let poses = navigator.room().poses().iter().flat_map(|pose| {
-        let (t, q) = (pose.translation.vector, pose.rotation.coords);
+        let t = pose.translation.vector;
+        let q = pose.rotation.coords;
         [t.x, t.y, t.z, q.x, q.y, q.z, q.w]
     });
-    poses.chain(navigator.latents().iter().copied()).for_each(|x| digest.update(x.to_le_bytes()));
+    poses
+        .chain(navigator.latents().iter().copied())
+        .for_each(|x| digest.update(x.to_le_bytes()));
+
     let adapter = navigator.adapter();
     for parameter in adapter.network().parameters() {
-        parameter.iter().for_each(|x| digest.update(x.to_le_bytes()));
+        parameter
+            .iter()
+            .for_each(|x| digest.update(x.to_le_bytes()));
     }
+
     digest.update(format!("{:?} {:?}", adapter.scale(), adapter.calibration()));
     digest.finalize().into()
 }
@@ -216,10 +307,14 @@ fn log_audit(navigator: &Navigator, adapter: &str) {
     }
 }
 
-/// All frames of a room as a map; none where cameras cannot be followed, which the log says if it is the room's fault.
+/// All frames of a room as a map; none where cameras cannot be followed, which the log says if it
+/// is the room's fault.
 fn map(navigator: &Arc<Navigator>) -> Option<Arc<Map>> {
     navigator.adapter().calibration()?;
-    let frames: Vec<FrameId> = (0..navigator.room().frame_count() as u32).map(FrameId).collect();
+    let frames: Vec<FrameId> = (0..navigator.room().frame_count() as u32)
+        .map(FrameId)
+        .collect();
+
     match Map::new(navigator.clone(), &frames) {
         Ok(map) => Some(Arc::new(map)),
         Err(error) => {

@@ -32,14 +32,23 @@ pub enum Error {
 impl Error {
     /// A field that has to change.
     pub fn invalid(field: impl Into<String>, problem: impl ToString) -> Self {
-        Self::Invalid { field: field.into(), problem: problem.to_string() }
+        Self::Invalid {
+            field: field.into(),
+            problem: problem.to_string(),
+        }
     }
 
     /// The same error with its field inside another.
     pub fn within(self, parent: &str) -> Self {
         match self {
-            Self::Invalid { field, problem } => Self::Invalid { field: format!("{parent}.{field}"), problem },
-            Self::NotFound { field, name } => Self::NotFound { field: format!("{parent}.{field}"), name },
+            Self::Invalid { field, problem } => Self::Invalid {
+                field: format!("{parent}.{field}"),
+                problem,
+            },
+            Self::NotFound { field, name } => Self::NotFound {
+                field: format!("{parent}.{field}"),
+                name,
+            },
             other => other,
         }
     }
@@ -47,8 +56,14 @@ impl Error {
     /// The same error about a field of another name.
     pub fn named(self, name: &str) -> Self {
         match self {
-            Self::Invalid { problem, .. } => Self::Invalid { field: name.to_owned(), problem },
-            Self::NotFound { name: missing, .. } => Self::NotFound { field: name.to_owned(), name: missing },
+            Self::Invalid { problem, .. } => Self::Invalid {
+                field: name.to_owned(),
+                problem,
+            },
+            Self::NotFound { name: missing, .. } => Self::NotFound {
+                field: name.to_owned(),
+                name: missing,
+            },
             other => other,
         }
     }
@@ -85,6 +100,7 @@ impl From<Error> for Status {
     fn from(error: Error) -> Self {
         let mut details = ErrorDetails::new();
         details.set_error_info(error.reason(), DOMAIN, std::collections::HashMap::new());
+
         match &error {
             Error::Invalid { field, problem } => {
                 details.add_bad_request_violation(brief(field), brief(problem));
@@ -97,6 +113,7 @@ impl From<Error> for Status {
             }
             _ => {}
         }
+
         Self::with_error_details(error.code(), brief(&error.to_string()), details)
     }
 }
@@ -104,10 +121,17 @@ impl From<Error> for Status {
 /// One line of bounded length: what a caller sent may be neither, and metadata must be small.
 pub fn brief(text: &str) -> String {
     const MOST: usize = 300;
-    let mut line: String = text.chars().take(MOST).map(|c| if c.is_control() { ' ' } else { c }).collect();
+
+    let mut line: String = text
+        .chars()
+        .take(MOST)
+        .map(|c| if c.is_control() { ' ' } else { c })
+        .collect();
+
     if text.chars().nth(MOST).is_some() {
         line.push('…');
     }
+
     line
 }
 
@@ -120,13 +144,20 @@ impl From<cancel::Cancelled> for Error {
 impl From<navigation::Error> for Error {
     fn from(error: navigation::Error) -> Self {
         use navigation::Error as E;
+
         let field = match &error {
             E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => {
-                return Self::NotFound { field: "source.frame_id".to_owned(), name: frame.to_string() };
+                return Self::NotFound {
+                    field: "source.frame_id".to_owned(),
+                    name: frame.to_string(),
+                };
             }
             E::TargetFrame(room::Error::UnknownFrame { frame, .. }) => {
                 let field = "displacement.target_frame_id".to_owned();
-                return Self::NotFound { field, name: frame.to_string() };
+                return Self::NotFound {
+                    field,
+                    name: frame.to_string(),
+                };
             }
             E::Cancelled(_) => return Self::Cancelled,
             E::FeatureRows { .. } | E::Features(_) => return Self::Internal,
@@ -146,6 +177,7 @@ impl From<navigation::Error> for Error {
             E::PoseNeeded { .. } => "source_pose",
             E::NoCandidates { .. } => "exclude_radius",
         };
+
         Self::invalid(field, error)
     }
 }
@@ -153,21 +185,27 @@ impl From<navigation::Error> for Error {
 /// What is wrong with a feature or a latent; the field is relative to the view that holds it.
 pub fn view_error(error: &adapter::Error) -> Error {
     use adapter::Error as E;
+
     let field = match error {
-        E::LatentDim { .. } | E::LatentRange { .. } | E::Gate { .. } | E::NotFinite { what: "latent", .. } => {
-            "latent.values"
-        }
+        E::LatentDim { .. }
+        | E::LatentRange { .. }
+        | E::Gate { .. }
+        | E::NotFinite { what: "latent", .. } => "latent.values",
         E::FeatureSource { .. } => "feature.source_name",
         _ => "feature.values",
     };
+
     Error::invalid(field, error)
 }
 
 impl From<eval::Error> for Error {
     fn from(error: eval::Error) -> Self {
         use eval::Error as E;
+
         let field = match &error {
-            E::Cancelled(_) | E::Navigation(navigation::Error::Cancelled(_)) => return Self::Cancelled,
+            E::Cancelled(_) | E::Navigation(navigation::Error::Cancelled(_)) => {
+                return Self::Cancelled;
+            }
             E::Navigation(navigation::Error::Adapter(
                 adapter::Error::NoCorrector { .. }
                 | adapter::Error::NotCalibrated
@@ -175,22 +213,31 @@ impl From<eval::Error> for Error {
                 | adapter::Error::WhitenedColumns { .. },
             ))
             | E::Adapter(
-                adapter::Error::NotCalibrated | adapter::Error::GatedMotion | adapter::Error::WhitenedColumns { .. },
+                adapter::Error::NotCalibrated
+                | adapter::Error::GatedMotion
+                | adapter::Error::WhitenedColumns { .. },
             ) => "navigators",
-            E::Navigation(navigation::Error::Refit(_)) => return Self::Precondition(error.to_string()),
+            E::Navigation(navigation::Error::Refit(_)) => {
+                return Self::Precondition(error.to_string());
+            }
             E::Navigation(_) | E::Adapter(_) | E::Odometry(_) => return Self::Internal,
             E::Room(_) => "room",
-            E::Pairs(pairs::Error::ZeroStride | pairs::Error::NoPairs { .. } | pairs::Error::EmptyRange { .. }) => {
-                "stride"
-            }
+            E::Pairs(
+                pairs::Error::ZeroStride
+                | pairs::Error::NoPairs { .. }
+                | pairs::Error::EmptyRange { .. },
+            ) => "stride",
             E::Pairs(pairs::Error::NoDatasetSplit) => "split",
             E::Threshold { .. } | E::ThresholdCount { .. } => "thresholds",
             E::NoCandidates { .. } => "exclude_radius",
             E::NothingToFitOn { .. } => "navigators",
             E::NoPredictions | E::MixedPredictions => "predictions",
             E::NotACandidate { .. } | E::NotATestPair { .. } | E::Excluded { .. } => "predictions",
-            E::Prediction { position, problem } => return Self::invalid(format!("predictions[{position}]"), problem),
+            E::Prediction { position, problem } => {
+                return Self::invalid(format!("predictions[{position}]"), problem);
+            }
         };
+
         Self::invalid(field, error)
     }
 }

@@ -47,27 +47,41 @@ where
     fn call(&mut self, request: Request<Body>) -> Self::Future {
         let begun = Instant::now();
         let id = request_id(request.headers().get(REQUEST_ID));
-        let span = tracing::info_span!("request", id = id.to_str().unwrap_or_default(), method = request.uri().path());
+        let span = tracing::info_span!(
+            "request",
+            id = id.to_str().unwrap_or_default(),
+            method = request.uri().path()
+        );
+
         // The service that was polled ready answers; its clone stays for the next request.
         let ready = self.0.clone();
         let mut inner = std::mem::replace(&mut self.0, ready);
+
         let answered = async move {
             let mut response = inner.call(request).await?;
             let headers = response.headers_mut();
-            let code = headers.get("grpc-status").and_then(|code| code.to_str().ok()).unwrap_or("0").to_owned();
+            let code = headers
+                .get("grpc-status")
+                .and_then(|code| code.to_str().ok())
+                .unwrap_or("0")
+                .to_owned();
+
             headers.insert(REQUEST_ID, id);
             let ms = begun.elapsed().as_secs_f64() * 1e3;
             tracing::info!(grpc_status = code, ms, "answered");
+
             Ok(response)
         };
+
         Box::pin(answered.instrument(span))
     }
 }
 
 /// The caller's id if it is short and printable, else a new one.
 fn request_id(given: Option<&HeaderValue>) -> HeaderValue {
-    let fits =
-        |id: &&HeaderValue| !id.is_empty() && id.len() <= LONGEST_ID && id.as_bytes().iter().all(u8::is_ascii_graphic);
+    let fits = |id: &&HeaderValue| {
+        !id.is_empty() && id.len() <= LONGEST_ID && id.as_bytes().iter().all(u8::is_ascii_graphic)
+    };
     match given.filter(fits) {
         Some(id) => id.clone(),
         None => HeaderValue::from_str(&format!("{:016x}", rand::random::<u64>()))
@@ -85,6 +99,7 @@ mod tests {
         assert_eq!(given("robot-7/42"), "robot-7/42");
         assert_ne!(given("a b"), "a b");
         assert_eq!(given(&"x".repeat(129)).len(), 16);
+
         assert_ne!(request_id(None), request_id(None));
     }
 }

@@ -1,4 +1,5 @@
-//! Where answers are computed: blocking threads, a bounded number at a time, with the caller's deadline.
+//! Where answers are computed: blocking threads, a bounded number at a time, with the caller's
+//! deadline.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -48,59 +49,88 @@ impl Workers {
         requested(metadata).map_or(self.longest, |deadline| deadline.min(self.longest))
     }
 
-    /// Runs `work` on a blocking thread. It is told to stop when the budget is spent or the caller goes away; its
-    /// thread is free for others only once it has stopped.
+    /// Runs `work` on a blocking thread. It is told to stop when the budget is spent or the caller
+    /// goes away; its thread is free for others only once it has stopped.
     ///
     /// # Errors
-    /// [`Error::Busy`], [`Error::Deadline`], [`Error::Loading`] if the server gave it up, [`Error::Internal`] if it
-    /// panicked, or its own.
+    /// [`Error::Busy`], [`Error::Deadline`], [`Error::Loading`] if the server gave it up,
+    /// [`Error::Internal`] if it panicked, or its own.
     pub async fn run<T: Send + 'static>(
         &self,
         budget: Duration,
         work: impl FnOnce(&Cancellation) -> Result<T, Error> + Send + 'static,
     ) -> Result<T, Error> {
-        let admitted = self.admitted.clone().try_acquire_owned().map_err(|_| Error::Busy)?;
+        let admitted = self
+            .admitted
+            .clone()
+            .try_acquire_owned()
+            .map_err(|_| Error::Busy)?;
+
         let cancel = Arc::new(Cancellation::default());
         let guard = CancelOnDrop(cancel.clone());
+
         let computed = async {
-            let thread = self.threads.clone().acquire_owned().await.map_err(|_| Error::Internal)?;
+            let thread = self
+                .threads
+                .clone()
+                .acquire_owned()
+                .await
+                .map_err(|_| Error::Internal)?;
+
             let span = tracing::Span::current();
             let task = tokio::task::spawn_blocking(move || {
-                let (_thread, _admitted) = (thread, admitted);
+                let _thread = thread;
+                let _admitted = admitted;
                 span.in_scope(|| work(&cancel))
             });
+
             task.await.unwrap_or_else(|error| {
                 tracing::error!(%error, "a request panicked");
                 Err(Error::Internal)
             })
         };
+
         let mut halted = self.halted.subscribe();
         let result = tokio::select! {
             result = tokio::time::timeout(budget, computed) => result.unwrap_or(Err(Error::Deadline)),
             _ = halted.wait_for(|halted| *halted) => Err(Error::Loading),
         };
+
         drop(guard);
         result
     }
 
-    /// Runs short work of a stream on a blocking thread: it waits its turn, for as long as that takes.
+    /// Runs short work of a stream on a blocking thread: it waits its turn, for as long as that
+    /// takes.
     ///
     /// # Errors
     /// [`Error::Loading`] if the server gave it up, [`Error::Internal`] if it panicked.
-    pub async fn run_admitted<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Error> {
+    pub async fn run_admitted<T: Send + 'static>(
+        &self,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, Error> {
         let mut halted = self.halted.subscribe();
+
         let computed = async {
-            let thread = self.threads.clone().acquire_owned().await.map_err(|_| Error::Internal)?;
+            let thread = self
+                .threads
+                .clone()
+                .acquire_owned()
+                .await
+                .map_err(|_| Error::Internal)?;
+
             let span = tracing::Span::current();
             let task = tokio::task::spawn_blocking(move || {
                 let _thread = thread;
                 span.in_scope(work)
             });
+
             task.await.map_err(|error| {
                 tracing::error!(%error, "a request panicked");
                 Error::Internal
             })
         };
+
         tokio::select! {
             result = computed => result,
             _ = halted.wait_for(|halted| *halted) => Err(Error::Loading),
@@ -108,12 +138,13 @@ impl Workers {
     }
 }
 
-/// The time a caller gives, from the header `grpc-timeout`, less a little, so that the answer DEADLINE_EXCEEDED comes
-/// before the transport gives the call up.
+/// The time a caller gives, from the header `grpc-timeout`, less a little, so that the answer
+/// DEADLINE_EXCEEDED comes before the transport gives the call up.
 fn requested(metadata: &MetadataMap) -> Option<Duration> {
     let text = metadata.get("grpc-timeout")?.to_str().ok()?;
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
     let count: u64 = digits.parse().ok().filter(|_| digits.len() <= 8)?;
+
     let given = match unit {
         "H" => Duration::from_secs(count * 3_600),
         "M" => Duration::from_secs(count * 60),
@@ -123,6 +154,7 @@ fn requested(metadata: &MetadataMap) -> Option<Duration> {
         "n" => Duration::from_nanos(count),
         _ => return None,
     };
+
     Some(given - (given / 10).min(Duration::from_millis(10)))
 }
 
@@ -131,7 +163,11 @@ mod tests {
     use super::*;
 
     fn workers(threads: usize, queue: usize) -> Workers {
-        Workers::new(&Config { threads, queue, ..Config::default() })
+        Workers::new(&Config {
+            threads,
+            queue,
+            ..Config::default()
+        })
     }
 
     const LONG: Duration = Duration::from_secs(30);
@@ -140,7 +176,11 @@ mod tests {
     #[tokio::test]
     async fn a_panic_costs_one_request() {
         let workers = workers(1, 0);
-        assert_eq!(workers.run::<()>(LONG, |_| panic!("on purpose")).await, Err(Error::Internal));
+        assert_eq!(
+            workers.run::<()>(LONG, |_| panic!("on purpose")).await,
+            Err(Error::Internal)
+        );
+
         assert_eq!(workers.run(LONG, |_| Ok(7)).await, Ok(7));
     }
 
@@ -149,26 +189,40 @@ mod tests {
     async fn a_deadline_stops_the_work() {
         let workers = workers(1, 1);
         let (told, hears) = tokio::sync::oneshot::channel();
+
         let work = move |cancel: &Cancellation| {
             while cancel.check().is_ok() {
                 std::thread::sleep(Duration::from_millis(1));
             }
+
             let _ = told.send(());
             Ok(())
         };
+
         let begun = std::time::Instant::now();
-        assert_eq!(workers.run(Duration::from_millis(20), work).await, Err(Error::Deadline));
+
+        assert_eq!(
+            workers.run(Duration::from_millis(20), work).await,
+            Err(Error::Deadline)
+        );
+
         hears.await.unwrap();
-        assert!(begun.elapsed() < Duration::from_secs(2), "at the deadline, not later");
+
+        assert!(
+            begun.elapsed() < Duration::from_secs(2),
+            "at the deadline, not later"
+        );
     }
 
-    /// Oracle: the definition of a bounded queue: one thread and no place to wait refuse the second request.
+    /// Oracle: the definition of a bounded queue: one thread and no place to wait refuse the second
+    /// request.
     #[tokio::test]
     async fn a_full_queue_refuses() {
         let workers = workers(1, 0);
         let (release, wait) = std::sync::mpsc::channel::<()>();
         let busy = workers.clone();
         let (begun, begins) = tokio::sync::oneshot::channel();
+
         let first = tokio::spawn(async move {
             busy.run(LONG, move |_| {
                 let _ = begun.send(());
@@ -177,8 +231,10 @@ mod tests {
             })
             .await
         });
+
         begins.await.unwrap();
         assert_eq!(workers.run(LONG, |_| Ok(2)).await, Err(Error::Busy));
+
         release.send(()).unwrap();
         assert_eq!(first.await.unwrap(), Ok(1));
     }
@@ -191,9 +247,11 @@ mod tests {
             metadata.insert("grpc-timeout", text.parse().unwrap());
             requested(&metadata)
         };
+
         assert_eq!(read("2S"), Some(Duration::from_millis(1_990)));
         assert_eq!(read("50m"), Some(Duration::from_millis(45)));
         assert_eq!(read("1H"), Some(Duration::from_millis(3_599_990)));
+
         for nonsense in ["", "S", "5", "123456789S", "-1S", "5x"] {
             assert_eq!(read(nonsense), None, "{nonsense}");
         }

@@ -8,7 +8,9 @@ use super::format::{AdapterBody, TrainingEntry};
 use super::manifest::{self, SCHEMA};
 use super::tensors::{TensorReader, TensorWriter};
 use super::{ATTEMPTS, Error, Kind, Published, Store, calibration, revision_path};
-use crate::adapter::{self, Adapter, Corrector, CorrectorKind, Mixture, Network, TargetScale, TrainingRecord};
+use crate::adapter::{
+    self, Adapter, Corrector, CorrectorKind, Mixture, Network, TargetScale, TrainingRecord,
+};
 use crate::room::is_plain_name;
 
 /// The frame of every twist: the body frame of the source camera.
@@ -36,7 +38,8 @@ pub struct StoredAdapter {
 }
 
 impl Store {
-    /// Publishes an adapter; some of `features` (n, d), the ones it was trained on, become its golden inputs.
+    /// Publishes an adapter; some of `features` (n, d), the ones it was trained on, become its
+    /// golden inputs.
     ///
     /// # Errors
     /// [`Error::Name`], [`Error::Damaged`] if the features do not fit, or as the store fails.
@@ -48,16 +51,24 @@ impl Store {
         features: ArrayView2<'_, f32>,
     ) -> Result<Published, Error> {
         if !is_plain_name(name) {
-            return Err(Error::Name { what: "an adapter", name: name.to_owned() });
+            return Err(Error::Name {
+                what: "an adapter",
+                name: name.to_owned(),
+            });
         }
+
         let folder = Path::from(Kind::Adapter.folder()).join(name);
         let bytes = adapter_file(name, adapter, features)?;
-        let weights = self.write_object(&folder, "weights", "safetensors", bytes).await?;
+        let weights = self
+            .write_object(&folder, "weights", "safetensors", bytes)
+            .await?;
+
         for _ in 0..ATTEMPTS {
             let newest = match self.revisions(&folder).await?.last() {
                 Some(&revision) => Some(self.adapter_body(&folder, revision).await?),
                 None => None,
             };
+
             let body = AdapterBody {
                 schema: SCHEMA,
                 adapter: name.to_owned(),
@@ -69,26 +80,51 @@ impl Store {
                 deviation_ddof: 0,
                 training: TrainingEntry::new(record, adapter),
             };
+
             if let Some(newest) = newest {
-                let same = AdapterBody { revision: newest.revision, created: newest.created.clone(), ..body.clone() };
+                let same = AdapterBody {
+                    revision: newest.revision,
+                    created: newest.created.clone(),
+                    ..body.clone()
+                };
+
                 if same == newest {
                     let manifest = revision_path(&folder, newest.revision).to_string();
-                    return Ok(Published { revision: newest.revision, is_new: false, manifest });
+                    return Ok(Published {
+                        revision: newest.revision,
+                        is_new: false,
+                        manifest,
+                    });
                 }
             }
+
             let manifest = revision_path(&folder, body.revision).to_string();
-            if self.write_manifest(&folder, body.revision, manifest::encode(&manifest, &body)?).await? {
-                return Ok(Published { revision: body.revision, is_new: true, manifest });
+            if self
+                .write_manifest(&folder, body.revision, manifest::encode(&manifest, &body)?)
+                .await?
+            {
+                return Ok(Published {
+                    revision: body.revision,
+                    is_new: true,
+                    manifest,
+                });
             }
         }
-        Err(Error::Contended { name: name.to_owned() })
+
+        Err(Error::Contended {
+            name: name.to_owned(),
+        })
     }
 
     /// Loads an adapter, its newest revision if none is named, and runs its golden vectors.
     ///
     /// # Errors
     /// [`Error::Unknown`], [`Error::UnknownRevision`], [`Error::Damaged`], or as the store fails.
-    pub async fn load_adapter(&self, name: &str, revision: Option<u64>) -> Result<StoredAdapter, Error> {
+    pub async fn load_adapter(
+        &self,
+        name: &str,
+        revision: Option<u64>,
+    ) -> Result<StoredAdapter, Error> {
         let (folder, revision) = self.resolve(Kind::Adapter, name, revision).await?;
         let body = self.adapter_body(&folder, revision).await?;
         if body.twist_frame != TWIST_FRAME || body.deviation_ddof != 0 {
@@ -96,31 +132,49 @@ impl Store {
                 "states twists in the frame '{}' and ddof {}; this program answers for '{TWIST_FRAME}' and 0",
                 body.twist_frame, body.deviation_ddof
             );
-            return Err(Error::Damaged { file: self.shown(&revision_path(&folder, revision)), problem });
+            return Err(Error::Damaged {
+                file: self.shown(&revision_path(&folder, revision)),
+                problem,
+            });
         }
+
         let (file, bytes) = self.read_object(&folder, &body.weights).await?;
-        let damaged = |problem: String| Error::Damaged { file: file.clone(), problem };
+        let damaged = |problem: String| Error::Damaged {
+            file: file.clone(),
+            problem,
+        };
+
         let tensors = TensorReader::new(&file, &bytes)?;
         let calibration = calibration::read(&tensors, &file)?;
         let mixing = body.training.mixing().map_err(&damaged)?;
-        let network = Mixture::from_tensors(body.training.charts, mixing, |name| read_weights(&tensors, name));
+        let network = Mixture::from_tensors(body.training.charts, mixing, |name| {
+            read_weights(&tensors, name)
+        });
         let network = network.map_err(|error| error.within(&file))?;
+
         let scale = TargetScale {
             mean: vector6(&tensors, "target.mean", &file)?,
             deviation: vector6(&tensors, "target.deviation", &file)?,
         };
+
         let error_covariance = match tensors.has(ERROR_COVARIANCE) {
             true => Some(matrix6(&tensors, ERROR_COVARIANCE, &file)?),
             false => None,
         };
+
         let mut correctors = Vec::with_capacity(body.training.correctors.len());
         for name in &body.training.correctors {
-            let kind = CorrectorKind::from_name(name)
-                .ok_or_else(|| damaged(format!("has a corrector '{name}', which means nothing to this program")))?;
+            let kind = CorrectorKind::from_name(name).ok_or_else(|| {
+                damaged(format!(
+                    "has a corrector '{name}', which means nothing to this program"
+                ))
+            })?;
             let read = |tensor: &str| read_weights(&tensors, &corrector_tensor(kind, tensor));
             let corrector = Corrector::from_tensors(kind, network.coordinate_count(), read);
+
             correctors.push(corrector.map_err(|error| error.within(&file))?);
         }
+
         let adapter = Adapter::new(body.source.into(), network, scale)
             .and_then(|adapter| adapter.with_correctors(correctors))
             .and_then(|adapter| match error_covariance {
@@ -132,13 +186,21 @@ impl Store {
                 None => Ok(adapter),
             })
             .map_err(|error| damaged(error.to_string()))?;
+
         check_golden(&adapter, &tensors, &file)?;
         let manifest = self.shown(&revision_path(&folder, revision));
         let record = body.training.record().map_err(|word| Error::Damaged {
             file: manifest,
             problem: format!("{word} means nothing to this program"),
         })?;
-        Ok(StoredAdapter { name: body.adapter, revision, created: body.created, adapter, record })
+
+        Ok(StoredAdapter {
+            name: body.adapter,
+            revision,
+            created: body.created,
+            adapter,
+            record,
+        })
     }
 
     /// The names of all adapters.
@@ -154,6 +216,7 @@ impl Store {
         let file = self.shown(&path);
         let body: AdapterBody = manifest::decode(&file, &self.read(&path).await?)?;
         manifest::check_place(&file, folder, (&body.adapter, body.revision), revision)?;
+
         Ok(body)
     }
 }
@@ -174,7 +237,10 @@ impl WeightError {
     fn within(self, file: &str) -> Error {
         match self {
             Self::File(error) => error,
-            Self::Shape(error) => Error::Damaged { file: file.to_owned(), problem: error.to_string() },
+            Self::Shape(error) => Error::Damaged {
+                file: file.to_owned(),
+                problem: error.to_string(),
+            },
         }
     }
 }
@@ -202,38 +268,93 @@ fn is_norm(name: &str) -> bool {
     name.ends_with("phi.1.weight") || name.contains(".norm") || name.starts_with("norm")
 }
 
-fn adapter_file(name: &str, adapter: &Adapter, features: ArrayView2<'_, f32>) -> Result<Vec<u8>, Error> {
-    let damaged = |problem: String| Error::Damaged { file: name.to_owned(), problem };
+fn adapter_file(
+    name: &str,
+    adapter: &Adapter,
+    features: ArrayView2<'_, f32>,
+) -> Result<Vec<u8>, Error> {
+    let damaged = |problem: String| Error::Damaged {
+        file: name.to_owned(),
+        problem,
+    };
+
     let mut tensors = TensorWriter::default();
-    for (name, array) in adapter.network().names().iter().zip(adapter.network().parameters()) {
+    for (name, array) in adapter
+        .network()
+        .names()
+        .iter()
+        .zip(adapter.network().parameters())
+    {
         tensors.f32(name, &torch_shape(name, array), array.iter().copied());
     }
+
     for corrector in adapter.correctors() {
         for (name, array) in corrector.names().iter().zip(corrector.parameters()) {
-            let (name, shape) = (corrector_tensor(corrector.kind(), name), torch_shape(name, array));
+            let shape = torch_shape(name, array);
+            let name = corrector_tensor(corrector.kind(), name);
             tensors.f32(&name, &shape, array.iter().copied());
         }
     }
+
     tensors.f64("target.mean", &[6], adapter.scale().mean.iter().copied());
-    tensors.f64("target.deviation", &[6], adapter.scale().deviation.iter().copied());
+
+    tensors.f64(
+        "target.deviation",
+        &[6],
+        adapter.scale().deviation.iter().copied(),
+    );
+
     if let Some(covariance) = adapter.error_covariance() {
-        tensors.f64(ERROR_COVARIANCE, &[6, 6], covariance.transpose().iter().copied());
+        tensors.f64(
+            ERROR_COVARIANCE,
+            &[6, 6],
+            covariance.transpose().iter().copied(),
+        );
     }
+
     if let Some(calibration) = adapter.calibration() {
         calibration::write(&mut tensors, calibration);
     }
-    let rows: Vec<usize> = (0..features.nrows()).step_by(features.nrows().div_ceil(GOLDEN_ROWS).max(1)).collect();
+
+    let rows: Vec<usize> = (0..features.nrows())
+        .step_by(features.nrows().div_ceil(GOLDEN_ROWS).max(1))
+        .collect();
     let golden = features.select(ndarray::Axis(0), &rows);
-    let latents = adapter.embed(golden.view()).map_err(|error| damaged(error.to_string()))?;
+    let latents = adapter
+        .embed(golden.view())
+        .map_err(|error| damaged(error.to_string()))?;
+
     let twists = golden_twists(adapter, &latents);
-    tensors.f32("golden.features", &[golden.nrows(), golden.ncols()], golden.iter().copied());
-    tensors.f64("golden.latents", &[latents.nrows(), latents.ncols()], latents.iter().copied());
-    tensors.f64("golden.twists", &[twists.nrows(), 6], twists.iter().copied());
+
+    tensors.f32(
+        "golden.features",
+        &[golden.nrows(), golden.ncols()],
+        golden.iter().copied(),
+    );
+
+    tensors.f64(
+        "golden.latents",
+        &[latents.nrows(), latents.ncols()],
+        latents.iter().copied(),
+    );
+
+    tensors.f64(
+        "golden.twists",
+        &[twists.nrows(), 6],
+        twists.iter().copied(),
+    );
+
     for corrector in adapter.correctors() {
-        let steps = golden_steps(adapter, corrector.kind(), &latents).map_err(|error| damaged(error.to_string()))?;
+        let steps = golden_steps(adapter, corrector.kind(), &latents)
+            .map_err(|error| damaged(error.to_string()))?;
         let name = golden_corrector(corrector.kind());
-        tensors.f64(&name, &[steps.nrows(), steps.ncols()], steps.iter().copied());
+        tensors.f64(
+            &name,
+            &[steps.nrows(), steps.ncols()],
+            steps.iter().copied(),
+        );
     }
+
     tensors.finish(name)
 }
 
@@ -249,39 +370,58 @@ fn golden_corrector(kind: CorrectorKind) -> String {
 }
 
 /// The corrected steps from each golden latent by the motion that it sees from the first.
-fn golden_steps(adapter: &Adapter, kind: CorrectorKind, latents: &Array2<f64>) -> Result<Array2<f64>, adapter::Error> {
+fn golden_steps(
+    adapter: &Adapter,
+    kind: CorrectorKind,
+    latents: &Array2<f64>,
+) -> Result<Array2<f64>, adapter::Error> {
     let mut steps = Array2::zeros(latents.dim());
     for (latent, mut into) in latents.outer_iter().zip(steps.outer_iter_mut()) {
         let twist = adapter.motion(latents.row(0), latent);
         into.assign(&adapter.corrected_step(kind, latent, twist)?);
     }
+
     Ok(steps)
 }
 
 fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Result<(), Error> {
-    let damaged = |problem: String| Error::Damaged { file: file.to_owned(), problem };
+    let damaged = |problem: String| Error::Damaged {
+        file: file.to_owned(),
+        problem,
+    };
+
     let features = tensors.f32("golden.features")?;
     if features.nrows() == 0 {
         return Err(damaged("has no golden inputs".to_owned()));
     }
-    let latents = adapter.embed(features.view()).map_err(|error| damaged(error.to_string()))?;
+
+    let latents = adapter
+        .embed(features.view())
+        .map_err(|error| damaged(error.to_string()))?;
     let twists = golden_twists(adapter, &latents);
+
     let mut checked = Vec::new();
     for corrector in adapter.correctors() {
         let kind = corrector.kind();
-        let steps = golden_steps(adapter, kind, &latents).map_err(|error| damaged(error.to_string()))?;
+        let steps =
+            golden_steps(adapter, kind, &latents).map_err(|error| damaged(error.to_string()))?;
         checked.push((kind.name(), steps, tensors.f64(&golden_corrector(kind))?));
     }
+
     checked.push(("latents", latents, tensors.f64("golden.latents")?));
     checked.push(("twists", twists, tensors.f64("golden.twists")?));
+
     for (what, found, stored) in checked {
-        let near = |(found, stored): (&f64, &f64)| (found - stored).abs() <= GOLDEN_TOLERANCE * stored.abs().max(1.0);
+        let near = |(found, stored): (&f64, &f64)| {
+            (found - stored).abs() <= GOLDEN_TOLERANCE * stored.abs().max(1.0)
+        };
         if found.dim() != stored.dim() || !found.iter().zip(&stored).all(near) {
             return Err(damaged(format!(
                 "its golden inputs do not give its golden {what} on this machine; publish it again"
             )));
         }
     }
+
     Ok(())
 }
 
@@ -293,13 +433,18 @@ fn matrix6(tensors: &TensorReader<'_>, name: &str, file: &str) -> Result<Matrix6
             problem: format!("'{name}' does not have 6 by 6 numbers"),
         });
     }
+
     Ok(Matrix6::from_fn(|row, column| array[(row, column)]))
 }
 
 fn vector6(tensors: &TensorReader<'_>, name: &str, file: &str) -> Result<Vector6<f64>, Error> {
     let array = tensors.f64(name)?;
     if array.dim() != (1, 6) {
-        return Err(Error::Damaged { file: file.to_owned(), problem: format!("'{name}' does not have 6 numbers") });
+        return Err(Error::Damaged {
+            file: file.to_owned(),
+            problem: format!("'{name}' does not have 6 numbers"),
+        });
     }
+
     Ok(Vector6::from_fn(|row, _| array[(0, row)]))
 }

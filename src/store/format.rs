@@ -69,8 +69,8 @@ pub struct AdapterBody {
     /// RFC 3339.
     pub created: String,
     pub source: SourceEntry,
-    /// Weights f32 under PyTorch's names; `target.mean`, `target.deviation` (6,) f64 ordered (v, ω);
-    /// `golden.features`, `golden.latents`, `golden.twists`: run when the adapter is loaded.
+    /// Weights f32 under PyTorch's names; `target.mean`, `target.deviation` (6,) f64 ordered (v,
+    /// ω); `golden.features`, `golden.latents`, `golden.twists`: run when the adapter is loaded.
     pub weights: ObjectRef,
     /// The frame of the twists: always `body` of the source camera.
     pub twist_frame: String,
@@ -114,7 +114,8 @@ pub struct TrainingEntry {
     /// Correctors by name, under `corrector.NAME.` in the weights.
     #[serde(default)]
     pub correctors: Vec<String>,
-    /// Smallest and largest stride, and how many pairs were drawn; absent when all pairs at one stride were taken.
+    /// Smallest and largest stride, and how many pairs were drawn; absent when all pairs at one
+    /// stride were taken.
     #[serde(default)]
     range: Option<(u32, u32, usize)>,
     seed: u64,
@@ -143,15 +144,53 @@ pub struct ScoresEntry {
 
 impl From<&FeatureSource> for SourceEntry {
     fn from(source: &FeatureSource) -> Self {
-        let FeatureSource { name, encoder, layer, base, norm, pooling, preprocess, dim } = source.clone();
-        Self { name, encoder, layer, base, norm, pooling, preprocess, dim }
+        let FeatureSource {
+            name,
+            encoder,
+            layer,
+            base,
+            norm,
+            pooling,
+            preprocess,
+            dim,
+        } = source.clone();
+
+        Self {
+            name,
+            encoder,
+            layer,
+            base,
+            norm,
+            pooling,
+            preprocess,
+            dim,
+        }
     }
 }
 
 impl From<SourceEntry> for FeatureSource {
     fn from(entry: SourceEntry) -> Self {
-        let SourceEntry { name, encoder, layer, base, norm, pooling, preprocess, dim } = entry;
-        Self { name, encoder, layer, base, norm, pooling, preprocess, dim }
+        let SourceEntry {
+            name,
+            encoder,
+            layer,
+            base,
+            norm,
+            pooling,
+            preprocess,
+            dim,
+        } = entry;
+
+        Self {
+            name,
+            encoder,
+            layer,
+            base,
+            norm,
+            pooling,
+            preprocess,
+            dim,
+        }
     }
 }
 
@@ -179,15 +218,37 @@ impl SourceEntry {
 
 impl From<&Provenance> for ProvenanceEntry {
     fn from(provenance: &Provenance) -> Self {
-        let Provenance { format, licence, images_root, worst_rotation_deviation } = provenance.clone();
-        Self { format, licence, images_root, worst_rotation_deviation }
+        let Provenance {
+            format,
+            licence,
+            images_root,
+            worst_rotation_deviation,
+        } = provenance.clone();
+
+        Self {
+            format,
+            licence,
+            images_root,
+            worst_rotation_deviation,
+        }
     }
 }
 
 impl From<ProvenanceEntry> for Provenance {
     fn from(entry: ProvenanceEntry) -> Self {
-        let ProvenanceEntry { format, licence, images_root, worst_rotation_deviation } = entry;
-        Self { format, licence, images_root, worst_rotation_deviation }
+        let ProvenanceEntry {
+            format,
+            licence,
+            images_root,
+            worst_rotation_deviation,
+        } = entry;
+
+        Self {
+            format,
+            licence,
+            images_root,
+            worst_rotation_deviation,
+        }
     }
 }
 
@@ -243,11 +304,16 @@ impl TrainingEntry {
             through_zero,
             seed,
         } = record.config.clone();
+
         Self {
             preset: record.preset.clone(),
             split: record.split.name().to_owned(),
             stride: record.stride,
-            rooms: record.rooms.iter().map(|(room, revision)| (room.to_string(), *revision)).collect(),
+            rooms: record
+                .rooms
+                .iter()
+                .map(|(room, revision)| (room.to_string(), *revision))
+                .collect(),
             epochs,
             batch,
             learning_rate,
@@ -262,8 +328,15 @@ impl TrainingEntry {
             noise,
             average,
             through_zero,
-            calibrated_on: record.calibrated_on.iter().map(|(room, revision)| (room.to_string(), *revision)).collect(),
-            correctors: adapter.correctors().map(|corrector| corrector.kind().name().to_owned()).collect(),
+            calibrated_on: record
+                .calibrated_on
+                .iter()
+                .map(|(room, revision)| (room.to_string(), *revision))
+                .collect(),
+            correctors: adapter
+                .correctors()
+                .map(|corrector| corrector.kind().name().to_owned())
+                .collect(),
             range: match &record.pairs {
                 PairPlan::Stride(_) => None,
                 PairPlan::Range(StrideRange { low, high, count }) => Some((*low, *high, *count)),
@@ -273,7 +346,10 @@ impl TrainingEntry {
             room_tests: record.room_tests.iter().map(Into::into).collect(),
             test: (&record.test).into(),
             train: (&record.train).into(),
-            train_mean_r2: record.train_mean_r2.is_finite().then_some(record.train_mean_r2),
+            train_mean_r2: record
+                .train_mean_r2
+                .is_finite()
+                .then_some(record.train_mean_r2),
         }
     }
 
@@ -284,13 +360,16 @@ impl TrainingEntry {
 
     /// The record, or the word in it that means nothing.
     pub fn record(self) -> Result<TrainingRecord, String> {
-        let split = Split::from_name(&self.split).ok_or_else(|| format!("split '{}'", self.split))?;
+        let split =
+            Split::from_name(&self.split).ok_or_else(|| format!("split '{}'", self.split))?;
         let mixing = self.mixing()?;
         let loss = Loss::from_name(&self.loss).ok_or_else(|| format!("loss '{}'", self.loss))?;
+
         let room = |(name, revision): (String, u64)| match RoomId::new(&name) {
             Ok(room) => Ok((room, revision)),
             Err(_) => Err(format!("room '{name}'")),
         };
+
         Ok(TrainingRecord {
             preset: self.preset,
             split,
@@ -300,7 +379,11 @@ impl TrainingEntry {
                 Some((low, high, count)) => PairPlan::Range(StrideRange { low, high, count }),
             },
             rooms: self.rooms.into_iter().map(room).collect::<Result<_, _>>()?,
-            calibrated_on: self.calibrated_on.into_iter().map(room).collect::<Result<_, _>>()?,
+            calibrated_on: self
+                .calibrated_on
+                .into_iter()
+                .map(room)
+                .collect::<Result<_, _>>()?,
             config: TrainConfig {
                 epochs: self.epochs,
                 batch: self.batch,

@@ -14,25 +14,52 @@ pub struct TensorWriter(BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>);
 
 impl TensorWriter {
     pub fn f32(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = f32>) {
-        self.0.insert(name.to_owned(), (Dtype::F32, shape.to_vec(), values.flat_map(f32::to_le_bytes).collect()));
+        self.0.insert(
+            name.to_owned(),
+            (
+                Dtype::F32,
+                shape.to_vec(),
+                values.flat_map(f32::to_le_bytes).collect(),
+            ),
+        );
     }
 
     pub fn f64(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = f64>) {
-        self.0.insert(name.to_owned(), (Dtype::F64, shape.to_vec(), values.flat_map(f64::to_le_bytes).collect()));
+        self.0.insert(
+            name.to_owned(),
+            (
+                Dtype::F64,
+                shape.to_vec(),
+                values.flat_map(f64::to_le_bytes).collect(),
+            ),
+        );
     }
 
     pub fn i64(&mut self, name: &str, shape: &[usize], values: impl Iterator<Item = i64>) {
-        self.0.insert(name.to_owned(), (Dtype::I64, shape.to_vec(), values.flat_map(i64::to_le_bytes).collect()));
+        self.0.insert(
+            name.to_owned(),
+            (
+                Dtype::I64,
+                shape.to_vec(),
+                values.flat_map(i64::to_le_bytes).collect(),
+            ),
+        );
     }
 
     /// The file's bytes.
     pub fn finish(self, file: &str) -> Result<Vec<u8>, Error> {
-        let damaged = |problem: String| Error::Damaged { file: file.to_owned(), problem };
+        let damaged = |problem: String| Error::Damaged {
+            file: file.to_owned(),
+            problem,
+        };
+
         let mut views = Vec::with_capacity(self.0.len());
         for (name, (dtype, shape, bytes)) in &self.0 {
-            let view = TensorView::new(*dtype, shape.clone(), bytes).map_err(|error| damaged(error.to_string()))?;
+            let view = TensorView::new(*dtype, shape.clone(), bytes)
+                .map_err(|error| damaged(error.to_string()))?;
             views.push((name.clone(), view));
         }
+
         safetensors::serialize(views, None).map_err(|error| damaged(error.to_string()))
     }
 }
@@ -45,8 +72,10 @@ pub struct TensorReader<'a> {
 
 impl<'a> TensorReader<'a> {
     pub fn new(file: &'a str, bytes: &'a [u8]) -> Result<Self, Error> {
-        let tensors = SafeTensors::deserialize(bytes)
-            .map_err(|error| Error::Damaged { file: file.to_owned(), problem: error.to_string() })?;
+        let tensors = SafeTensors::deserialize(bytes).map_err(|error| Error::Damaged {
+            file: file.to_owned(),
+            problem: error.to_string(),
+        })?;
         Ok(Self { file, tensors })
     }
 
@@ -67,19 +96,47 @@ impl<'a> TensorReader<'a> {
     }
 
     /// A tensor as rows: a vector is one row, the last axes of a stack are laid end to end.
-    fn rows<T, const N: usize>(&self, name: &str, dtype: Dtype, read: fn([u8; N]) -> T) -> Result<Array2<T>, Error> {
-        let damaged = |problem: String| Error::Damaged { file: self.file.to_owned(), problem };
-        let tensor = self.tensors.tensor(name).map_err(|_| damaged(format!("has no tensor '{name}'")))?;
+    fn rows<T, const N: usize>(
+        &self,
+        name: &str,
+        dtype: Dtype,
+        read: fn([u8; N]) -> T,
+    ) -> Result<Array2<T>, Error> {
+        let damaged = |problem: String| Error::Damaged {
+            file: self.file.to_owned(),
+            problem,
+        };
+        let tensor = self
+            .tensors
+            .tensor(name)
+            .map_err(|_| damaged(format!("has no tensor '{name}'")))?;
+
         if tensor.dtype() != dtype {
-            return Err(damaged(format!("tensor '{name}' is {:?}, expected {dtype:?}", tensor.dtype())));
+            return Err(damaged(format!(
+                "tensor '{name}' is {:?}, expected {dtype:?}",
+                tensor.dtype()
+            )));
         }
-        let values = tensor.data().as_chunks::<N>().0.iter().map(|bytes| read(*bytes)).collect();
-        let array = ArrayD::from_shape_vec(tensor.shape().to_vec(), values).map_err(|e| damaged(e.to_string()))?;
+
+        let values = tensor
+            .data()
+            .as_chunks::<N>()
+            .0
+            .iter()
+            .map(|bytes| read(*bytes))
+            .collect();
+
+        let array = ArrayD::from_shape_vec(tensor.shape().to_vec(), values)
+            .map_err(|e| damaged(e.to_string()))?;
+
         let shape = match tensor.shape() {
             [] => (1, 1),
             [columns] => (1, *columns),
             [rows, rest @ ..] => (*rows, rest.iter().product()),
         };
-        array.into_shape_with_order(shape).map_err(|error| damaged(error.to_string()))
+
+        array
+            .into_shape_with_order(shape)
+            .map_err(|error| damaged(error.to_string()))
     }
 }

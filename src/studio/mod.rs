@@ -1,6 +1,8 @@
-//! The studio: procedural rooms, ray-cast, so that images with exact poses exist without a data set.
+//! The studio: procedural rooms, ray-cast, so that images with exact poses exist without a data
+//! set.
 //!
-//! - World axes: x and y along the floor, z up, metres; the floor is z = 0 and the room begins at (0, 0).
+//! - World axes: x and y along the floor, z up, metres; the floor is z = 0 and the room begins at
+//!   (0, 0).
 //! - Everything follows from a seed. Images are those of a pinhole camera with square pixels.
 
 mod camera_path;
@@ -43,7 +45,11 @@ struct Light {
 }
 
 impl Light {
-    const PLAIN: Self = Self { lamp: 1.9, lamp_tint: [1.0; 3], sky: 0.30 };
+    const PLAIN: Self = Self {
+        lamp: 1.9,
+        lamp_tint: [1.0; 3],
+        sky: 0.30,
+    };
 }
 
 /// How floor, walls and ceiling look.
@@ -120,16 +126,32 @@ struct Piece {
 }
 
 impl Scene {
-    /// The room of a seed: 4.4 to 6.4 m by 3.8 to 5.2 m, furnished along its walls, a table in the middle.
+    /// The room of a seed: 4.4 to 6.4 m by 3.8 to 5.2 m, furnished along its walls, a table in the
+    /// middle.
     pub fn new(seed: u64) -> Self {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
-        let size =
-            Vector3::new(random.random_range(4.4..6.4), random.random_range(3.8..5.2), random.random_range(2.5..2.9));
+        let size = Vector3::new(
+            random.random_range(4.4..6.4),
+            random.random_range(3.8..5.2),
+            random.random_range(2.5..2.9),
+        );
         let shell = Shell::new(size, &mut random);
+
         let pieces = furniture::furnish(size, &mut random);
-        let lamp =
-            Point3::new(size.x * random.random_range(0.4..0.6), size.y * random.random_range(0.4..0.6), size.z - 0.25);
-        Self { size, shell, pieces, lamp, light: Light::PLAIN }
+
+        let lamp = Point3::new(
+            size.x * random.random_range(0.4..0.6),
+            size.y * random.random_range(0.4..0.6),
+            size.z - 0.25,
+        );
+
+        Self {
+            size,
+            shell,
+            pieces,
+            lamp,
+            light: Light::PLAIN,
+        }
     }
 
     /// Width (x), depth (y) and height (z), metres.
@@ -143,14 +165,28 @@ impl Shell {
         let base = Colour::of_hue(random.random_range(0.0..1.0), 0.22, 0.78);
         let accent = Colour::of_hue(random.random_range(0.0..1.0), 0.45, 0.6);
         let accent_wall = random.random_range(0..4);
-        let wall_colours = std::array::from_fn(|wall| if wall == accent_wall { accent } else { base });
-        let wood = Colour::of_hue(random.random_range(0.05..0.1), 0.55, random.random_range(0.35..0.6));
+        let wall_colours =
+            std::array::from_fn(|wall| if wall == accent_wall { accent } else { base });
+
+        let wood = Colour::of_hue(
+            random.random_range(0.05..0.1),
+            0.55,
+            random.random_range(0.35..0.6),
+        );
+
         let tile = Colour::of_hue(random.random_range(0.0..1.0), 0.15, 0.65);
-        let floor = if random.random_bool(0.6) { Floor::Planks(wood) } else { Floor::Tiles(tile) };
+        let floor = if random.random_bool(0.6) {
+            Floor::Planks(wood)
+        } else {
+            Floor::Tiles(tile)
+        };
+
         let door_wall = random.random_range(0..4);
         let window_wall = (door_wall + random.random_range(1..4)) % 4;
+
         let panels = std::array::from_fn(|wall| {
             let length = if wall % 2 == 0 { size.x } else { size.y };
+
             let feature = if wall == door_wall {
                 Some(PanelKind::Door)
             } else if wall == window_wall {
@@ -158,10 +194,13 @@ impl Shell {
             } else {
                 None
             };
+
             wall_panels(length, feature, random)
         });
+
         let centre = [size.x * 0.5, size.y * 0.5];
         let half = [random.random_range(0.8..1.3), random.random_range(0.6..1.0)];
+
         let rug = Rug {
             low: [centre[0] - half[0], centre[1] - half[1]],
             high: [centre[0] + half[0], centre[1] + half[1]],
@@ -170,7 +209,15 @@ impl Shell {
                 Colour::of_hue(random.random_range(0.0..1.0), 0.3, 0.75),
             ],
         };
-        Self { seed: random.random(), wall_colours, wallpaper: Wallpaper::None, floor, panels, rug }
+
+        Self {
+            seed: random.random(),
+            wall_colours,
+            wallpaper: Wallpaper::None,
+            floor,
+            panels,
+            rug,
+        }
     }
 }
 
@@ -179,19 +226,40 @@ fn wall_panels(length: f64, feature: Option<PanelKind>, random: &mut ChaCha8Rng)
     let mut panels = Vec::new();
     let mut taken = None;
     if let Some(kind) = feature {
-        let (width, low, high) = if kind == PanelKind::Door { (0.9, 0.0, 2.05) } else { (1.5, 0.95, 2.15) };
+        let (width, low, high) = if kind == PanelKind::Door {
+            (0.9, 0.0, 2.05)
+        } else {
+            (1.5, 0.95, 2.15)
+        };
+
         let middle = length * random.random_range(0.35..0.65);
-        let (from, to) = (middle - width / 2.0, middle + width / 2.0);
-        panels.push(Panel { low: [from, low], high: [to, high], kind, seed: random.random() });
+        let from = middle - width / 2.0;
+        let to = middle + width / 2.0;
+
+        panels.push(Panel {
+            low: [from, low],
+            high: [to, high],
+            kind,
+            seed: random.random(),
+        });
+
         taken = Some((from - 0.15, to + 0.15));
     }
+
     for slot in 0..3 {
         let middle = length * (f64::from(slot) + 0.5) / 3.0 + random.random_range(-0.2..0.2);
-        let (width, height) = (random.random_range(0.4..0.9), random.random_range(0.4..0.7));
-        let (from, to) = (middle - width / 2.0, middle + width / 2.0);
-        if taken.is_some_and(|(low, high)| from < high && to > low) || from < 0.1 || to > length - 0.1 {
+        let width = random.random_range(0.4..0.9);
+        let height = random.random_range(0.4..0.7);
+        let from = middle - width / 2.0;
+
+        let to = middle + width / 2.0;
+        if taken.is_some_and(|(low, high)| from < high && to > low)
+            || from < 0.1
+            || to > length - 0.1
+        {
             continue;
         }
+
         let bottom = random.random_range(1.25..1.5);
         panels.push(Panel {
             low: [from, bottom],
@@ -200,5 +268,6 @@ fn wall_panels(length: f64, feature: Option<PanelKind>, random: &mut ChaCha8Rng)
             seed: random.random(),
         });
     }
+
     panels
 }

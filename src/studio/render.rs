@@ -37,12 +37,22 @@ pub struct Camera {
 impl Camera {
     /// A camera of 64×48 pixels that sees 75° across.
     pub fn small() -> Self {
-        Self { width: 64, height: 48, field_of_view_rad: 75f64.to_radians(), sampling: Sampling::Full }
+        Self {
+            width: 64,
+            height: 48,
+            field_of_view_rad: 75f64.to_radians(),
+            sampling: Sampling::Full,
+        }
     }
 
     /// A camera of this size that sees 75° across, with adaptive sampling.
     pub fn sized(width: usize, height: usize) -> Self {
-        Self { width, height, field_of_view_rad: 75f64.to_radians(), sampling: Sampling::Adaptive }
+        Self {
+            width,
+            height,
+            field_of_view_rad: 75f64.to_radians(),
+            sampling: Sampling::Adaptive,
+        }
     }
 
     /// The side of a pixel at distance 1.
@@ -50,12 +60,17 @@ impl Camera {
         2.0 * (self.field_of_view_rad / 2.0).tan() / self.width as f64
     }
 
-    /// The ray through a point of the image, pixels from the top left corner; `scale` is [`Camera::pixel`].
+    /// The ray through a point of the image, pixels from the top left corner; `scale` is
+    /// [`Camera::pixel`].
     fn ray(&self, scale: f64, world_from_camera: &Pose, column: f64, row: f64) -> Ray {
         let x = (column - self.width as f64 / 2.0) * scale;
         let y = (row - self.height as f64 / 2.0) * scale;
         let direction = world_from_camera * Vector3::new(x, y, 1.0).normalize();
-        Ray { origin: world_from_camera.translation.vector.into(), direction }
+
+        Ray {
+            origin: world_from_camera.translation.vector.into(),
+            direction,
+        }
     }
 }
 
@@ -76,34 +91,72 @@ struct Surface {
 pub fn render(scene: &Scene, camera: Camera, world_from_camera: &Pose) -> RgbImage {
     let Camera { width, height, .. } = camera;
     let scale = camera.pixel();
-    let seen = |column: f64, row: f64| scene.seen(&camera.ray(scale, world_from_camera, column, row)).0;
+    let seen = |column: f64, row: f64| {
+        scene
+            .seen(&camera.ray(scale, world_from_camera, column, row))
+            .0
+    };
+
     let inner = |column: usize, row: usize| {
         let mut light = [0.0; 3];
         for sample in 0..SUPERSAMPLING * SUPERSAMPLING {
             let shift = |part: usize| (part as f64 + 0.5) / SUPERSAMPLING as f64;
-            let ray = seen(column as f64 + shift(sample % SUPERSAMPLING), row as f64 + shift(sample / SUPERSAMPLING));
+            let ray = seen(
+                column as f64 + shift(sample % SUPERSAMPLING),
+                row as f64 + shift(sample / SUPERSAMPLING),
+            );
             (0..3).for_each(|c| light[c] += ray[c]);
         }
+
         light.map(|channel| channel / (SUPERSAMPLING * SUPERSAMPLING) as f64)
     };
-    let corners = |row: usize| -> Vec<[f64; 3]> { (0..=width).map(|column| seen(column as f64, row as f64)).collect() };
+
+    let corners = |row: usize| -> Vec<[f64; 3]> {
+        (0..=width)
+            .map(|column| seen(column as f64, row as f64))
+            .collect()
+    };
+
     let mut bytes = Vec::with_capacity(width * height * 3);
-    let mut above = if camera.sampling == Sampling::Adaptive { corners(0) } else { Vec::new() };
+
+    let mut above = if camera.sampling == Sampling::Adaptive {
+        corners(0)
+    } else {
+        Vec::new()
+    };
+
     for row in 0..height {
-        let below = if camera.sampling == Sampling::Adaptive { corners(row + 1) } else { Vec::new() };
+        let below = if camera.sampling == Sampling::Adaptive {
+            corners(row + 1)
+        } else {
+            Vec::new()
+        };
+
         for column in 0..width {
             let light = match camera.sampling {
                 Sampling::Full => inner(column, row),
                 Sampling::Adaptive => {
-                    let around = [above[column], above[column + 1], below[column], below[column + 1]];
+                    let around = [
+                        above[column],
+                        above[column + 1],
+                        below[column],
+                        below[column + 1],
+                    ];
                     calm(&around).unwrap_or_else(|| inner(column, row))
                 }
             };
+
             bytes.extend(light.map(to_srgb));
         }
+
         above = below;
     }
-    RgbImage { width, height, bytes }
+
+    RgbImage {
+        width,
+        height,
+        bytes,
+    }
 }
 
 /// The mean of a pixel's corners, if they agree.
@@ -111,12 +164,15 @@ fn calm(corners: &[[f64; 3]; 4]) -> Option<[f64; 3]> {
     let mut mean = [0.0; 3];
     for (c, value) in mean.iter_mut().enumerate() {
         let of = corners.map(|corner| corner[c].min(1.0));
-        let (low, high) = (of.into_iter().fold(f64::INFINITY, f64::min), of.into_iter().fold(0.0, f64::max));
+        let low = of.into_iter().fold(f64::INFINITY, f64::min);
+        let high = of.into_iter().fold(0.0, f64::max);
         if high - low > CALM {
             return None;
         }
+
         *value = of.iter().sum::<f64>() / 4.0;
     }
+
     Some(mean)
 }
 
@@ -134,10 +190,12 @@ impl Scene {
                 nearest = Some(nearer);
             }
         }
+
         let surface = match nearest {
             Some(touch) => touch.surface(),
             None => self.shell_surface(ray, limit, axis),
         };
+
         self.lit(&surface, ray)
     }
 
@@ -147,15 +205,37 @@ impl Scene {
         let to_lamp = self.lamp - at;
         let distance = to_lamp.norm();
         let facing = normal.dot(&to_lamp).max(0.0) / distance;
-        let shadowed = facing > 0.0 && self.blocked(at + normal * 1e-3, to_lamp / distance, distance - 0.05);
+        let shadowed =
+            facing > 0.0 && self.blocked(at + normal * 1e-3, to_lamp / distance, distance - 0.05);
+
         let light = &self.light;
-        let lamp = if shadowed { 0.0 } else { light.lamp * facing / (0.7 + 0.35 * distance * distance) };
+        let lamp = if shadowed {
+            0.0
+        } else {
+            light.lamp * facing / (0.7 + 0.35 * distance * distance)
+        };
+
         let sky = light.sky + 0.12 * normal.z;
-        let edge = [at.x, self.size.x - at.x, at.y, self.size.y - at.y, at.z, self.size.z - at.z];
-        let corner: f64 = edge.iter().map(|d| 1.0 - 0.35 * (-d.max(0.0) / 0.22).exp()).product();
+
+        let edge = [
+            at.x,
+            self.size.x - at.x,
+            at.y,
+            self.size.y - at.y,
+            at.z,
+            self.size.z - at.z,
+        ];
+
+        let corner: f64 = edge
+            .iter()
+            .map(|d| 1.0 - 0.35 * (-d.max(0.0) / 0.22).exp())
+            .product();
+
         // A surface lies on one edge plane itself: take that one's darkening back.
         let ambient = sky * (corner / 0.65).min(1.0);
-        let lit = |c: usize| surface.colour.0[c] * (ambient + lamp * light.lamp_tint[c] + surface.glow);
+        let lit =
+            |c: usize| surface.colour.0[c] * (ambient + lamp * light.lamp_tint[c] + surface.glow);
+
         Colour(std::array::from_fn(lit))
     }
 
@@ -164,18 +244,28 @@ impl Scene {
         self.pieces.iter().any(|piece| piece.is_met(&ray, distance))
     }
 
-    /// How far it is to floor, ceiling or wall, the first plane that a ray from inside leaves through, and its axis.
+    /// How far it is to floor, ceiling or wall, the first plane that a ray from inside leaves
+    /// through, and its axis.
     fn shell_reach(&self, ray: &Ray) -> (f64, usize) {
-        let (mut distance, mut axis) = (f64::INFINITY, 0);
+        let mut distance = f64::INFINITY;
+        let mut axis = 0;
         for candidate in 0..3 {
             let speed = ray.direction[candidate];
-            let edge = if speed > 0.0 { self.size[candidate] } else { 0.0 };
+            let edge = if speed > 0.0 {
+                self.size[candidate]
+            } else {
+                0.0
+            };
             let reach = (edge - ray.origin[candidate]) / speed;
-            // A ray along a plane never meets it: its reach is infinite or, of either sign, meaningless.
+
+            // A ray along a plane never meets it: its reach is infinite or, of either sign,
+            // meaningless.
             if reach > 0.0 && reach < distance {
-                (distance, axis) = (reach, candidate);
+                distance = reach;
+                axis = candidate;
             }
         }
+
         (distance, axis)
     }
 
@@ -183,6 +273,7 @@ impl Scene {
         let at = ray.origin + ray.direction * distance;
         let mut normal = Vector3::zeros();
         normal[axis] = -ray.direction[axis].signum();
+
         let (colour, glow) = match (axis, ray.direction[axis] > 0.0) {
             (2, false) => (self.floor_colour(at.x, at.y), 0.0),
             (2, true) => self.ceiling_colour(at.x, at.y),
@@ -191,7 +282,13 @@ impl Scene {
             (1, true) => self.wall_colour(2, self.size.x - at.x, at.z),
             (_, _) => self.wall_colour(3, self.size.y - at.y, at.z),
         };
-        Surface { distance, normal, colour, glow }
+
+        Surface {
+            distance,
+            normal,
+            colour,
+            glow,
+        }
     }
 }
 
@@ -206,7 +303,11 @@ impl Piece {
 
     /// Whether a ray meets any box of the piece within `limit`, metres.
     fn is_met(&self, ray: &Ray, limit: f64) -> bool {
-        self.is_near(ray, limit) && self.solids.iter().any(|solid| solid.touch(ray, limit).is_some())
+        self.is_near(ray, limit)
+            && self
+                .solids
+                .iter()
+                .any(|solid| solid.touch(ray, limit).is_some())
     }
 
     /// The nearest box of the piece that a ray meets within `limit`, metres.
@@ -214,11 +315,13 @@ impl Piece {
         if !self.is_near(ray, limit) {
             return None;
         }
+
         let mut nearest: Option<Touch<'_>> = None;
         for solid in &self.solids {
             let limit = nearest.as_ref().map_or(limit, |touch| touch.distance);
             nearest = solid.touch(ray, limit).or(nearest);
         }
+
         nearest
     }
 }
@@ -226,25 +329,43 @@ impl Piece {
 impl Solid {
     /// Where a ray enters the box, if within `limit`, metres.
     fn touch(&self, ray: &Ray, limit: f64) -> Option<Touch<'_>> {
-        let turn_back =
-            |v: Vector3<f64>| Vector3::new(self.cos * v.x + self.sin * v.y, self.cos * v.y - self.sin * v.x, v.z);
-        let (origin, direction) = (turn_back(ray.origin - self.centre), turn_back(ray.direction));
-        let (mut enter, mut leave, mut axis) = (f64::NEG_INFINITY, f64::INFINITY, 0);
+        let turn_back = |v: Vector3<f64>| {
+            Vector3::new(
+                self.cos * v.x + self.sin * v.y,
+                self.cos * v.y - self.sin * v.x,
+                v.z,
+            )
+        };
+
+        let origin = turn_back(ray.origin - self.centre);
+        let direction = turn_back(ray.direction);
+        let mut enter = f64::NEG_INFINITY;
+        let mut leave = f64::INFINITY;
+
+        let mut axis = 0;
         for candidate in 0..3 {
             let inverse = direction[candidate].recip();
-            let (a, b) = (
-                (-self.half[candidate] - origin[candidate]) * inverse,
-                (self.half[candidate] - origin[candidate]) * inverse,
-            );
+            let a = (-self.half[candidate] - origin[candidate]) * inverse;
+            let b = (self.half[candidate] - origin[candidate]) * inverse;
             if a.min(b) > enter {
-                (enter, axis) = (a.min(b), candidate);
+                enter = a.min(b);
+                axis = candidate;
             }
+
             leave = leave.min(a.max(b));
         }
+
         if !(enter > 1e-6 && enter < leave && enter < limit) {
             return None;
         }
-        Some(Touch { solid: self, distance: enter, axis, origin, direction })
+
+        Some(Touch {
+            solid: self,
+            distance: enter,
+            axis,
+            origin,
+            direction,
+        })
     }
 }
 
@@ -259,25 +380,41 @@ struct Touch<'a> {
 
 impl Touch<'_> {
     fn surface(&self) -> Surface {
-        let &Touch { solid, distance, axis, origin, direction } = self;
+        let &Touch {
+            solid,
+            distance,
+            axis,
+            origin,
+            direction,
+        } = self;
+
         let at = origin + direction * distance;
         let mut normal = Vector3::zeros();
         normal[axis] = -direction[axis].signum();
         let front = axis == 1 && normal.y > 0.0;
+
         let (u, v) = match axis {
             0 => (at.y, at.z),
             1 => (at.x, at.z),
             _ => (at.x, at.y),
         };
+
         // Heights are counted from the floor of the piece, so that shelves and boards line up.
         let v = if axis == 2 { v } else { v + solid.half.z };
         let colour = solid.material.colour(u, v, front, solid.seed);
+
         let normal = Vector3::new(
             solid.cos * normal.x - solid.sin * normal.y,
             solid.sin * normal.x + solid.cos * normal.y,
             normal.z,
         );
-        Surface { distance, normal, colour, glow: 0.0 }
+
+        Surface {
+            distance,
+            normal,
+            colour,
+            glow: 0.0,
+        }
     }
 }
 
@@ -285,13 +422,18 @@ impl Touch<'_> {
 mod tests {
     use super::*;
 
-    /// Oracle: geometry by hand. A camera in the middle that looks along x meets the wall at half the room's width.
+    /// Oracle: geometry by hand. A camera in the middle that looks along x meets the wall at half
+    /// the room's width.
     #[test]
     fn the_far_wall_is_half_a_room_away() {
         let mut scene = Scene::new(3);
         scene.pieces.clear();
         let origin = Point3::from(scene.size() / 2.0);
-        let ray = Ray { origin, direction: Vector3::x() };
+        let ray = Ray {
+            origin,
+            direction: Vector3::x(),
+        };
+
         let (reach, axis) = scene.shell_reach(&ray);
         let surface = scene.shell_surface(&ray, reach, axis);
         assert!((surface.distance - scene.size().x / 2.0).abs() < 1e-12);
@@ -301,26 +443,49 @@ mod tests {
     /// Oracle: the definition of deterministic, and that another seed is another room.
     #[test]
     fn a_seed_gives_one_image_and_another_seed_another() {
-        let camera = Camera { width: 16, height: 12, field_of_view_rad: 1.3, sampling: Sampling::Full };
+        let camera = Camera {
+            width: 16,
+            height: 12,
+            field_of_view_rad: 1.3,
+            sampling: Sampling::Full,
+        };
+
         let image = |seed| {
             let scene = Scene::new(seed);
-            render(&scene, camera, &super::super::camera_path(&scene, 1, seed)[0])
+            render(
+                &scene,
+                camera,
+                &super::super::camera_path(&scene, 1, seed)[0],
+            )
         };
+
         assert_eq!(image(5), image(5));
         assert_ne!(image(5), image(6));
     }
 
-    /// Oracle: four rays in every pixel. Where corners agree nothing is missed but what is smaller than a pixel, so the
-    /// two pictures differ by little on the whole.
+    /// Oracle: four rays in every pixel. Where corners agree nothing is missed but what is smaller
+    /// than a pixel, so the two pictures differ by little on the whole.
     #[test]
     fn adaptive_sampling_sees_what_full_sampling_sees() {
         let scene = Scene::new(4);
         let pose = super::super::camera_path(&scene, 1, 4)[0];
         let adaptive = Camera::sized(160, 120);
-        let full = Camera { sampling: Sampling::Full, ..adaptive };
-        let (a, b) = (render(&scene, adaptive, &pose), render(&scene, full, &pose));
-        let mean =
-            a.bytes.iter().zip(&b.bytes).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / a.bytes.len() as f64;
+        let full = Camera {
+            sampling: Sampling::Full,
+            ..adaptive
+        };
+
+        let a = render(&scene, adaptive, &pose);
+        let b = render(&scene, full, &pose);
+
+        let mean = a
+            .bytes
+            .iter()
+            .zip(&b.bytes)
+            .map(|(a, b)| f64::from(a.abs_diff(*b)))
+            .sum::<f64>()
+            / a.bytes.len() as f64;
+
         assert!(mean < 1.5, "mean difference {mean} levels");
     }
 }

@@ -1,4 +1,5 @@
-//! Theorem 5c: what is left when features have been unrolled is the group's own, (J_r⁻¹(X) − I) ξ, led by ½\[X, ξ\].
+//! Theorem 5c: what is left when features have been unrolled is the group's own, (J_r⁻¹(X) − I) ξ,
+//! led by ½\[X, ξ\].
 
 use nalgebra::{Matrix6, SymmetricEigen, Vector6};
 use rand_chacha::ChaCha8Rng;
@@ -12,7 +13,10 @@ pub const C_LIE: f64 = 1.154_700_538_379_251_5;
 
 /// \[X, Y\] = ad_X Y in (v, ω): (ω_X × v_Y − ω_Y × v_X, ω_X × ω_Y).
 pub fn bracket(x: Twist, y: Twist) -> Twist {
-    Twist { linear: x.angular.cross(&y.linear) - y.angular.cross(&x.linear), angular: x.angular.cross(&y.angular) }
+    Twist {
+        linear: x.angular.cross(&y.linear) - y.angular.cross(&x.linear),
+        angular: x.angular.cross(&y.angular),
+    }
 }
 
 pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
@@ -22,21 +26,58 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
     for _ in 0..effort.samples {
         let x = twist_of_length(0.7, random);
         let small = twist_of_length(1e-5, random);
-        exact = exact.max((unrolled_error(x, small) - residual(x, small)).norm() / residual(x, small).norm());
-        let (near, xi) = (twist_of_length(1e-2, random), twist_of_length(1.0, random));
+        exact = exact.max(
+            (unrolled_error(x, small) - residual(x, small)).norm() / residual(x, small).norm(),
+        );
+
+        let near = twist_of_length(1e-2, random);
+        let xi = twist_of_length(1.0, random);
         let half = bracket(near, xi).to_vector() * 0.5;
         leading = leading.max((residual(near, xi) - half).norm() / half.norm());
+
         over = over.max(residual(near, xi).norm() / (0.5 * C_LIE * near.norm() * xi.norm()));
     }
-    let still = |xi: Twist| Twist { angular: nalgebra::Vector3::zeros(), ..xi };
+
+    let still = |xi: Twist| Twist {
+        angular: nalgebra::Vector3::zeros(),
+        ..xi
+    };
+
     let [a, b] = [0, 1].map(|_| twist_of_length(1.0, random));
-    let check = |what, measured, bound| Check { theorem: "5c", what, measured, bound };
+
+    let check = |what, measured, bound| Check {
+        theorem: "5c",
+        what,
+        measured,
+        bound,
+    };
+
     vec![
-        check("log(g₂) − log(g₁) − ξ against (J_r⁻¹(X) − I) ξ, relative, ‖ξ‖ = 1e-5", exact, Bound::AtMost(1e-3)),
-        check("that against ½[X, ξ], relative, ‖X‖ = 0.01", leading, Bound::AtMost(0.05)),
-        check("largest ‖[X, ξ]‖ of unit twists, by ascent", steepest(effort, random), Bound::Equals(C_LIE, 1e-9)),
-        check("largest residual over ½ C_Lie R ‖ξ‖, R = 0.01", over, Bound::AtMost(1.01)),
-        check("two translations: the residual", residual(still(a), still(b)).norm(), Bound::AtMost(1e-15)),
+        check(
+            "log(g₂) − log(g₁) − ξ against (J_r⁻¹(X) − I) ξ, relative, ‖ξ‖ = 1e-5",
+            exact,
+            Bound::AtMost(1e-3),
+        ),
+        check(
+            "that against ½[X, ξ], relative, ‖X‖ = 0.01",
+            leading,
+            Bound::AtMost(0.05),
+        ),
+        check(
+            "largest ‖[X, ξ]‖ of unit twists, by ascent",
+            steepest(effort, random),
+            Bound::Equals(C_LIE, 1e-9),
+        ),
+        check(
+            "largest residual over ½ C_Lie R ‖ξ‖, R = 0.01",
+            over,
+            Bound::AtMost(1.01),
+        ),
+        check(
+            "two translations: the residual",
+            residual(still(a), still(b)).norm(),
+            Bound::AtMost(1e-15),
+        ),
         check(
             "a translation from a turned pose: the residual's rotation",
             Twist::from_vector(&residual(a, still(b))).angular.norm(),
@@ -45,7 +86,8 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
     ]
 }
 
-/// What unrolling by the logarithm itself leaves: log(g₂) − log(g₁) − log(g₁⁻¹g₂), with g₁ = exp(X), g₂ = g₁ exp(ξ).
+/// What unrolling by the logarithm itself leaves: log(g₂) − log(g₁) − log(g₁⁻¹g₂), with g₁ =
+/// exp(X), g₂ = g₁ exp(ξ).
 fn unrolled_error(x: Twist, xi: Twist) -> Vector6<f64> {
     log(&(exp(&x) * exp(&xi))).to_vector() - x.to_vector() - xi.to_vector()
 }
@@ -66,17 +108,23 @@ fn steepest(effort: Effort, random: &mut ChaCha8Rng) -> f64 {
         });
         Matrix6::from_columns(&columns)
     };
+
     let mut best = 0.0f64;
     for _ in 0..effort.samples.min(100) {
         let mut x = twist_of_length(1.0, random).to_vector();
         for _ in 0..200 {
             let matrix = ad(&x);
             let eigen = SymmetricEigen::new(matrix.transpose() * matrix);
-            let xi = eigen.eigenvectors.column(eigen.eigenvalues.imax()).normalize();
+            let xi = eigen
+                .eigenvectors
+                .column(eigen.eigenvalues.imax())
+                .normalize();
             best = best.max((matrix * xi).norm());
+
             x = xi;
         }
     }
+
     best
 }
 
@@ -88,11 +136,21 @@ mod tests {
     /// Oracle: the derivative of Ad(exp(tX)) at 0 is ad X.
     #[test]
     fn the_bracket_is_the_derivative_of_the_adjoint() {
-        let x = Twist { linear: [0.3, -0.1, 0.7].into(), angular: [0.2, 0.5, -0.4].into() };
-        let y = Twist { linear: [-0.6, 0.2, 0.1].into(), angular: [0.9, 0.3, 0.2].into() };
+        let x = Twist {
+            linear: [0.3, -0.1, 0.7].into(),
+            angular: [0.2, 0.5, -0.4].into(),
+        };
+
+        let y = Twist {
+            linear: [-0.6, 0.2, 0.1].into(),
+            angular: [0.9, 0.3, 0.2].into(),
+        };
+
         let h = 1e-5;
-        let moved = |h: f64| adjoint(&exp(&Twist::from_vector(&(x.to_vector() * h)))) * y.to_vector();
+        let moved =
+            |h: f64| adjoint(&exp(&Twist::from_vector(&(x.to_vector() * h)))) * y.to_vector();
         let slope = (moved(h) - moved(-h)) / (2.0 * h);
+
         assert!((slope - bracket(x, y).to_vector()).norm() < 1e-9);
     }
 }

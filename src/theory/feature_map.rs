@@ -20,22 +20,27 @@ pub trait FeatureMap: Sync {
     /// The step that derivatives are taken by.
     fn step(&self) -> f64;
 
-    /// J(g), shape (d, 6): the derivative of f(g exp(ξ)) by ξ = (v, ω) at 0, by central differences.
+    /// J(g), shape (d, 6): the derivative of f(g exp(ξ)) by ξ = (v, ω) at 0, by central
+    /// differences.
     fn jacobian(&self, pose: &Pose) -> DMatrix<f64> {
         let h = self.step();
         let columns: Vec<DVector<f64>> = (0..6)
             .map(|component| {
                 let mut xi = Vector6::zeros();
                 xi[component] = h;
-                let moved = |xi: Vector6<f64>| self.feature(&(pose * exp(&Twist::from_vector(&xi))));
+                let moved =
+                    |xi: Vector6<f64>| self.feature(&(pose * exp(&Twist::from_vector(&xi))));
+
                 (moved(xi) - moved(-xi)) / (2.0 * h)
             })
             .collect();
+
         DMatrix::from_columns(&columns)
     }
 }
 
-/// Sines of random mixtures of position and rotation: smooth, of rank 6 everywhere that was looked at.
+/// Sines of random mixtures of position and rotation: smooth, of rank 6 everywhere that was looked
+/// at.
 #[derive(Debug, Clone)]
 pub struct ConstructedMap {
     weights: DMatrix<f64>,
@@ -43,13 +48,17 @@ pub struct ConstructedMap {
 }
 
 impl ConstructedMap {
-    /// A map to `dim` numbers that depends on the first `coordinates` of x, y, z and the nine entries of R.
+    /// A map to `dim` numbers that depends on the first `coordinates` of x, y, z and the nine
+    /// entries of R.
     pub fn new(dim: usize, coordinates: usize, random: &mut ChaCha8Rng) -> Self {
         let weights = DMatrix::from_fn(dim, 12, |_, column| match column < coordinates {
             true => random.random_range(-0.8..0.8),
             false => 0.0,
         });
-        Self { weights, phases: DVector::from_fn(dim, |_, _| random.random_range(0.0..std::f64::consts::TAU)) }
+        Self {
+            weights,
+            phases: DVector::from_fn(dim, |_, _| random.random_range(0.0..std::f64::consts::TAU)),
+        }
     }
 }
 
@@ -58,8 +67,13 @@ impl FeatureMap for ConstructedMap {
         let rotation = pose.rotation.to_rotation_matrix();
         let numbers = DVector::from_iterator(
             12,
-            pose.translation.vector.iter().copied().chain(rotation.matrix().iter().copied()),
+            pose.translation
+                .vector
+                .iter()
+                .copied()
+                .chain(rotation.matrix().iter().copied()),
         );
+
         (&self.weights * numbers + &self.phases).map(f64::sin)
     }
 
@@ -79,7 +93,14 @@ impl DrawnMap {
     pub fn new(seed: u64, number: u32) -> (Self, Pose) {
         let room = SuiteRoom::new(seed, number);
         let path = room.path(101);
-        (Self { scene: room.scene, camera: Camera::sized(160, 120) }, path[50])
+
+        (
+            Self {
+                scene: room.scene,
+                camera: Camera::sized(160, 120),
+            },
+            path[50],
+        )
     }
 }
 
@@ -89,8 +110,10 @@ const PATCHES: (usize, usize) = (8, 6);
 impl FeatureMap for DrawnMap {
     fn feature(&self, pose: &Pose) -> DVector<f64> {
         let image = render(&self.scene, self.camera, pose);
-        let (across, down) = (image.width / PATCHES.0, image.height / PATCHES.1);
+        let across = image.width / PATCHES.0;
+        let down = image.height / PATCHES.1;
         let mut feature = DVector::zeros(PATCHES.0 * PATCHES.1 * 3);
+
         for y in 0..image.height {
             for x in 0..image.width {
                 let patch = (y / down) * PATCHES.0 + x / across;
@@ -99,6 +122,7 @@ impl FeatureMap for DrawnMap {
                 }
             }
         }
+
         feature / (255.0 * (across * down) as f64)
     }
 

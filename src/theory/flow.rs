@@ -1,5 +1,6 @@
-//! Theorem 7: the flow of an image when the camera turns does not depend on depth, when it moves it goes with 1/Z, and
-//! a scene that is as many times larger looks the same from as many times further.
+//! Theorem 7: the flow of an image when the camera turns does not depend on depth, when it moves it
+//! goes with 1/Z, and a scene that is as many times larger looks the same from as many times
+//! further.
 
 use nalgebra::{Matrix2x6, Point3, Vector2, Vector3, Vector6};
 use rand::RngExt;
@@ -35,12 +36,15 @@ impl Pinhole {
 /// Source: SeeSE3, theorem 7a and b.
 pub fn flow_jacobian(camera: Pinhole, at: Vector2<f64>, depth: f64) -> Matrix2x6<f64> {
     let Pinhole { fx, fy } = camera;
-    let (u, v) = (at.x, at.y);
+    let u = at.x;
+    let v = at.y;
+
     #[rustfmt::skip]
     let jacobian = Matrix2x6::new(
         fx / depth, 0.0, -u / depth, -u * v / fy, fx + u * u / fx, -fx * v / fy,
         0.0, fy / depth, -v / depth, -fy - v * v / fy, u * v / fx, fy * u / fx,
     );
+
     jacobian
 }
 
@@ -52,59 +56,126 @@ fn moved(camera: Pinhole, at: Vector2<f64>, depth: f64, twist: Twist) -> Vector2
 /// The flow of a camera that moves by a body twist, by central differences.
 fn measured(camera: Pinhole, at: Vector2<f64>, depth: f64) -> Matrix2x6<f64> {
     const H: f64 = 1e-5;
+
     let columns: [Vector2<f64>; 6] = std::array::from_fn(|component| {
         let mut xi = Vector6::zeros();
         xi[component] = H;
         let end = |xi: Vector6<f64>| moved(camera, at, depth, Twist::from_vector(&xi));
         (end(xi) - end(-xi)) / (2.0 * H)
     });
+
     Matrix2x6::from_columns(&columns)
 }
 
 pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
-    let (mut sign, mut turning, mut moving, mut scaled) = (0.0f64, 0.0f64, 0.0f64, 0.0f64);
+    let mut sign = 0.0f64;
+    let mut turning = 0.0f64;
+    let mut moving = 0.0f64;
+    let mut scaled = 0.0f64;
+
     for _ in 0..effort.samples {
-        let camera = Pinhole { fx: random.random_range(200.0..600.0), fy: random.random_range(200.0..600.0) };
-        let at = Vector2::new(random.random_range(-300.0..300.0), random.random_range(-200.0..200.0));
-        let (near, far) = (random.random_range(0.5..2.0), random.random_range(2.0..10.0));
+        let camera = Pinhole {
+            fx: random.random_range(200.0..600.0),
+            fy: random.random_range(200.0..600.0),
+        };
+
+        let at = Vector2::new(
+            random.random_range(-300.0..300.0),
+            random.random_range(-200.0..200.0),
+        );
+
+        let near = random.random_range(0.5..2.0);
+        let far = random.random_range(2.0..10.0);
         let [near_flow, far_flow] = [near, far].map(|depth| measured(camera, at, depth));
         let largest = near_flow.amax();
         sign = sign.max((near_flow + flow_jacobian(camera, at, near)).amax() / largest);
-        let part = |flow: &Matrix2x6<f64>, first: usize| flow.fixed_columns::<3>(first).into_owned();
+
+        let part =
+            |flow: &Matrix2x6<f64>, first: usize| flow.fixed_columns::<3>(first).into_owned();
         turning = turning.max((part(&near_flow, 3) - part(&far_flow, 3)).amax() / largest);
-        moving = moving.max((part(&near_flow, 0) * near - part(&far_flow, 0) * far).amax() / largest);
-        let (twist, factor) = (twist_of_length(0.1, random), random.random_range(0.2..5.0));
-        let larger = Twist { linear: twist.linear * factor, ..twist };
+        moving =
+            moving.max((part(&near_flow, 0) * near - part(&far_flow, 0) * far).amax() / largest);
+
+        let twist = twist_of_length(0.1, random);
+        let factor = random.random_range(0.2..5.0);
+        let larger = Twist {
+            linear: twist.linear * factor,
+            ..twist
+        };
         let shift = moved(camera, at, near * factor, larger) - moved(camera, at, near, twist);
+
         scaled = scaled.max(shift.norm());
     }
-    let check = |theorem, what, measured, bound| Check { theorem, what, measured, bound };
+
+    let check = |theorem, what, measured, bound| Check {
+        theorem,
+        what,
+        measured,
+        bound,
+    };
+
     let mut found = vec![
-        check("7", "printed flow plus measured flow, relative: printed = −(camera's)", sign, Bound::AtMost(1e-7)),
-        check("7a", "turning: change of the flow with depth, relative", turning, Bound::AtMost(1e-7)),
-        check("7b", "moving: change of Z · flow with depth, relative", moving, Bound::AtMost(1e-7)),
-        check("7d", "(v, Z) → (λv, λZ): change of the image, pixels", scaled, Bound::AtMost(1e-9)),
+        check(
+            "7",
+            "printed flow plus measured flow, relative: printed = −(camera's)",
+            sign,
+            Bound::AtMost(1e-7),
+        ),
+        check(
+            "7a",
+            "turning: change of the flow with depth, relative",
+            turning,
+            Bound::AtMost(1e-7),
+        ),
+        check(
+            "7b",
+            "moving: change of Z · flow with depth, relative",
+            moving,
+            Bound::AtMost(1e-7),
+        ),
+        check(
+            "7d",
+            "(v, Z) → (λv, λZ): change of the image, pixels",
+            scaled,
+            Bound::AtMost(1e-9),
+        ),
     ];
+
     found.extend(drawn_variation(effort));
     found
 }
 
-/// How much the two halves of a drawn room's Jacobian vary from place to place, as a share of their size.
+/// How much the two halves of a drawn room's Jacobian vary from place to place, as a share of their
+/// size.
 fn drawn_variation(effort: Effort) -> [Check; 2] {
     const PLACES: u32 = 6;
+
     let share = |first: usize| {
         let mut shares = Vec::new();
         for number in 0..PLACES {
             let (room, pose) = DrawnMap::new(effort.seed, number);
-            let aside =
-                pose * Pose::from_parts(Vector3::new(0.15, 0.0, 0.15).into(), nalgebra::UnitQuaternion::identity());
+            let aside = pose
+                * Pose::from_parts(
+                    Vector3::new(0.15, 0.0, 0.15).into(),
+                    nalgebra::UnitQuaternion::identity(),
+                );
+
             let part = |pose: &Pose| room.jacobian(pose).columns(first, 3).into_owned();
-            let (here, there) = (part(&pose), part(&aside));
+            let here = part(&pose);
+            let there = part(&aside);
             shares.push((&there - &here).norm() / here.norm());
         }
+
         crate::scores::mean(&shares)
     };
-    let check = |what, measured| Check { theorem: "7c", what, measured, bound: Bound::Free };
+
+    let check = |what, measured| Check {
+        theorem: "7c",
+        what,
+        measured,
+        bound: Bound::Free,
+    };
+
     [
         check("drawn rooms: relative change of J_ω over 0.2 m", share(3)),
         check("drawn rooms: relative change of J_v over 0.2 m", share(0)),

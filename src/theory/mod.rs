@@ -1,7 +1,9 @@
-//! The paper's theorems as numeric checks: what is measured, and the bound that it has to keep (sec. 2.8).
+//! The paper's theorems as numeric checks: what is measured, and the bound that it has to keep
+//! (sec. 2.8).
 //!
-//! - Feature maps are *constructed* (smooth functions of the pose, known to the last digit) or *drawn*: the colours of
-//!   a studio room's image, averaged over patches. Drawn maps are only nearly smooth: pixels are 8 bits, edges alias.
+//! - Feature maps are *constructed* (smooth functions of the pose, known to the last digit) or
+//!   *drawn*: the colours of a studio room's image, averaged over patches. Drawn maps are only
+//!   nearly smooth: pixels are 8 bits, edges alias.
 //! - Lengths of twists mix metres and radians one to one (A-34: length scale 1 m/rad).
 //! - A check measures; nothing in it is fitted to the bound.
 
@@ -81,7 +83,11 @@ pub struct Effort {
 
 impl Default for Effort {
     fn default() -> Self {
-        Self { seed: 0, poses: 1_024, samples: 200 }
+        Self {
+            seed: 0,
+            poses: 1_024,
+            samples: 200,
+        }
     }
 }
 
@@ -89,17 +95,23 @@ impl Default for Effort {
 ///
 /// # Errors
 /// [`metrics::Error`] when there are too few poses for an intrinsic dimension.
-pub fn checks(effort: Effort, progress: &mut dyn FnMut(&'static str)) -> Result<Vec<Check>, metrics::Error> {
+pub fn checks(
+    effort: Effort,
+    progress: &mut dyn FnMut(&'static str),
+) -> Result<Vec<Check>, metrics::Error> {
     let mut random = ChaCha8Rng::seed_from_u64(effort.seed);
     let mut found = Vec::new();
     progress("intrinsic dimension");
     found.extend(dimension::checks(effort, &mut random)?);
+
     progress("decodability");
     found.extend(decodability::checks(effort, &mut random));
     progress("bracket");
     found.extend(bracket::checks(effort, &mut random));
+
     progress("flow");
     found.extend(flow::checks(effort, &mut random));
+
     Ok(found)
 }
 
@@ -107,12 +119,18 @@ pub fn checks(effort: Effort, progress: &mut dyn FnMut(&'static str)) -> Result<
 mod tests {
     use super::*;
 
-    /// Oracle: the theorems themselves, and Bound by hand; with few samples, since the command takes more.
+    /// Oracle: the theorems themselves, and Bound by hand; with few samples, since the command
+    /// takes more.
     #[test]
     fn every_bound_is_kept() {
-        let effort = Effort { poses: 400, samples: 24, ..Effort::default() };
+        let effort = Effort {
+            poses: 400,
+            samples: 24,
+            ..Effort::default()
+        };
         let found = checks(effort, &mut |_| ()).unwrap();
         let broken: Vec<&Check> = found.iter().filter(|check| !check.holds()).collect();
+
         assert!(broken.is_empty() && found.len() > 20, "{broken:?}");
     }
 

@@ -12,7 +12,8 @@ pub enum Alignment {
     None,
     /// So that the first poses are the same.
     Origin,
-    /// By the rotation and translation that bring positions nearest. Positions alone: orientations may be turned away.
+    /// By the rotation and translation that bring positions nearest. Positions alone: orientations
+    /// may be turned away.
     Se3,
     /// As [`Alignment::Se3`], and by a scale.
     Sim3,
@@ -40,15 +41,28 @@ impl Alignment {
         let similarity = match self {
             Self::None => return Ok(estimate.clone()),
             Self::Origin => {
-                let (Some(first), Some(ours)) = (reference.poses.first(), estimate.poses.first()) else {
+                let (Some(first), Some(ours)) = (reference.poses.first(), estimate.poses.first())
+                else {
                     return Ok(estimate.clone());
                 };
-                Similarity { scale: 1.0, reference_from_estimate: first * ours.inverse() }
+                Similarity {
+                    scale: 1.0,
+                    reference_from_estimate: first * ours.inverse(),
+                }
             }
             Self::Se3 | Self::Sim3 => Similarity::umeyama(reference, estimate, self == Self::Sim3)?,
         };
-        let poses = estimate.poses.iter().map(|pose| similarity.pose(pose)).collect();
-        Ok(Trajectory { times_ns: estimate.times_ns.clone(), poses })
+
+        let poses = estimate
+            .poses
+            .iter()
+            .map(|pose| similarity.pose(pose))
+            .collect();
+
+        Ok(Trajectory {
+            times_ns: estimate.times_ns.clone(),
+            poses,
+        })
     }
 }
 
@@ -62,47 +76,93 @@ pub struct Similarity {
 }
 
 impl Similarity {
-    /// The similarity that brings the estimate's positions nearest to the reference's in the sum of squares.
+    /// The similarity that brings the estimate's positions nearest to the reference's in the sum of
+    /// squares.
     ///
     /// # Errors
     /// [`Error::Unequal`]; [`Error::Degenerate`] when the positions lie on a line.
     ///
-    /// Source: S. Umeyama, Least-squares estimation of transformation parameters between two point patterns, 1991.
-    pub fn umeyama(reference: &Trajectory, estimate: &Trajectory, with_scale: bool) -> Result<Self, Error> {
+    /// Source: S. Umeyama, Least-squares estimation of transformation parameters between two point
+    /// patterns, 1991.
+    pub fn umeyama(
+        reference: &Trajectory,
+        estimate: &Trajectory,
+        with_scale: bool,
+    ) -> Result<Self, Error> {
         let count = reference.len();
         if count != estimate.len() {
-            return Err(Error::Unequal { reference: count, estimate: estimate.len() });
+            return Err(Error::Unequal {
+                reference: count,
+                estimate: estimate.len(),
+            });
         }
-        let positions = |path: &Trajectory| path.poses.iter().map(|p| p.translation.vector).collect::<Vec<_>>();
-        let (y, x) = (positions(reference), positions(estimate));
-        let mean = |points: &[Vector3<f64>]| points.iter().sum::<Vector3<f64>>() / count.max(1) as f64;
-        let (y_mean, x_mean) = (mean(&y), mean(&x));
+
+        let positions = |path: &Trajectory| {
+            path.poses
+                .iter()
+                .map(|p| p.translation.vector)
+                .collect::<Vec<_>>()
+        };
+        let y = positions(reference);
+
+        let x = positions(estimate);
+        let mean =
+            |points: &[Vector3<f64>]| points.iter().sum::<Vector3<f64>>() / count.max(1) as f64;
+        let y_mean = mean(&y);
+
+        let x_mean = mean(&x);
         let mut covariance = Matrix3::zeros();
         for (y, x) in y.iter().zip(&x) {
             covariance += (y - y_mean) * (x - x_mean).transpose() / count as f64;
         }
+
         let svd = covariance.svd(true, true);
         let degenerate = Error::Degenerate { have: count };
+
         // numpy.linalg.matrix_rank's tolerance, as evo asks for it.
         let least = svd.singular_values.max() * 3.0 * f64::EPSILON;
-        if svd.singular_values.iter().filter(|&&value| value > least).count() < 2 {
+        if svd
+            .singular_values
+            .iter()
+            .filter(|&&value| value > least)
+            .count()
+            < 2
+        {
             return Err(degenerate);
         }
-        let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else { return Err(degenerate) };
+
+        let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else {
+            return Err(degenerate);
+        };
+
         let mut signs = Vector3::repeat(1.0);
         if u.determinant() * v_t.determinant() < 0.0 {
             signs[svd.singular_values.imin()] = -1.0;
         }
+
         let rotation = u * Matrix3::from_diagonal(&signs) * v_t;
         let variance = x.iter().map(|x| (x - x_mean).norm_squared()).sum::<f64>() / count as f64;
-        let scale = if with_scale { svd.singular_values.dot(&signs) / variance } else { 1.0 };
-        let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+        let scale = if with_scale {
+            svd.singular_values.dot(&signs) / variance
+        } else {
+            1.0
+        };
+
+        let turn =
+            UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
         let shift = y_mean - rotation * x_mean * scale;
-        Ok(Self { scale, reference_from_estimate: Pose::from_parts(Translation3::from(shift), turn) })
+
+        Ok(Self {
+            scale,
+            reference_from_estimate: Pose::from_parts(Translation3::from(shift), turn),
+        })
     }
 
     fn pose(&self, pose: &Pose) -> Pose {
-        let scaled = Pose::from_parts(Translation3::from(pose.translation.vector * self.scale), pose.rotation);
+        let scaled = Pose::from_parts(
+            Translation3::from(pose.translation.vector * self.scale),
+            pose.rotation,
+        );
         self.reference_from_estimate * scaled
     }
 }

@@ -56,13 +56,21 @@ pub enum RpePairs {
 /// [`Error::Unequal`].
 ///
 /// Source: evo's `APE`.
-pub fn ape(reference: &Trajectory, estimate: &Trajectory, relation: Relation) -> Result<Vec<f64>, Error> {
+pub fn ape(
+    reference: &Trajectory,
+    estimate: &Trajectory,
+    relation: Relation,
+) -> Result<Vec<f64>, Error> {
     check(reference, estimate)?;
     let pairs = estimate.poses.iter().zip(&reference.poses);
-    Ok(pairs.map(|(ours, truth)| relation.of(&ours.inv_mul(truth))).collect())
+
+    Ok(pairs
+        .map(|(ours, truth)| relation.of(&ours.inv_mul(truth)))
+        .collect())
 }
 
-/// The relative pose errors of motions over `delta` poses: E = (ref_i⁻¹ ref_j)⁻¹ (est_i⁻¹ est_j), j = i + Δ.
+/// The relative pose errors of motions over `delta` poses: E = (ref_i⁻¹ ref_j)⁻¹ (est_i⁻¹ est_j), j
+/// = i + Δ.
 ///
 /// # Errors
 /// [`Error::Unequal`], [`Error::NoPairs`].
@@ -80,21 +88,27 @@ pub fn rpe(
     if delta == 0 || delta >= have {
         return Err(Error::NoPairs { have, delta });
     }
+
     let step = match pairs {
         RpePairs::Consecutive => delta,
         RpePairs::All => 1,
     };
+
     let error = |i: usize| {
         let motion = |path: &Trajectory| path.poses[i].inv_mul(&path.poses[i + delta]);
         relation.of(&motion(reference).inv_mul(&motion(estimate)))
     };
+
     Ok((0..have - delta).step_by(step).map(error).collect())
 }
 
 fn check(reference: &Trajectory, estimate: &Trajectory) -> Result<(), Error> {
     match reference.len() == estimate.len() {
         true => Ok(()),
-        false => Err(Error::Unequal { reference: reference.len(), estimate: estimate.len() }),
+        false => Err(Error::Unequal {
+            reference: reference.len(),
+            estimate: estimate.len(),
+        }),
     }
 }
 
@@ -125,7 +139,12 @@ impl Statistics {
         let count = errors.len();
         let sum_of_squares = errors.iter().map(|x| x * x).sum::<f64>();
         let middle = mean(errors);
-        let variance = errors.iter().map(|x| (x - middle) * (x - middle)).sum::<f64>() / count as f64;
+        let variance = errors
+            .iter()
+            .map(|x| (x - middle) * (x - middle))
+            .sum::<f64>()
+            / count as f64;
+
         let none = if count == 0 { f64::NAN } else { 0.0 };
         Self {
             rmse: (sum_of_squares / count as f64).sqrt(),

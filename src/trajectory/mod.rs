@@ -1,4 +1,5 @@
-//! Paths of a camera against the true ones: which poses belong together, alignment, APE and RPE as evo defines them.
+//! Paths of a camera against the true ones: which poses belong together, alignment, APE and RPE as
+//! evo defines them.
 
 mod align;
 mod associate;

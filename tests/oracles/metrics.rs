@@ -2,8 +2,8 @@
 
 use ndarray::Array2;
 use seese3::metrics::{
-    Duplicates, Error, IntrinsicDimension, MutualKnn, feature_neighbours, intrinsic_dimension, mutual_knn,
-    pose_neighbours, ridge_probe,
+    Duplicates, Error, IntrinsicDimension, MutualKnn, feature_neighbours, intrinsic_dimension,
+    mutual_knn, pose_neighbours, ridge_probe,
 };
 use seese3::pairs::Split;
 use seese3::room::{Frames, Provenance, Room, RoomId};
@@ -28,30 +28,57 @@ fn mutual_neighbours_match_brute_force() {
     for (room, folder) in oracle_rooms("mutual_neighbours_match_brute_force") {
         let expected = json(&folder.join("m1_mutual_knn/expected.json"));
         let lists = Tensors::open(&folder.join("m1_mutual_knn/neighbours.safetensors"));
-        let (z, poses) = (features(&folder, room), poses(&folder.join(format!("rooms/{room}/poses.npy"))));
+        let z = features(&folder, room);
+        let poses = poses(&folder.join(format!("rooms/{room}/poses.npy")));
+
         for row in expected[room].as_array().unwrap() {
             let options = options(row);
             let found = mutual_knn(z.view(), &poses, &options).unwrap();
-            near(&format!("{room} {options:?}"), found, number(&row["score"]), 1e-12);
+
+            near(
+                &format!("{room} {options:?}"),
+                found,
+                number(&row["score"]),
+                1e-12,
+            );
+
             if (options.k, options.exclusion) == (10, 10) {
                 let stored = |what: &str| lists.rows(&format!("{room}_s{}_{what}", options.stride));
+
                 let flat = |lists: Vec<Vec<usize>>| {
-                    Array2::from_shape_vec((256, 10), lists.concat().into_iter().map(|i| i as f64).collect()).unwrap()
+                    Array2::from_shape_vec(
+                        (256, 10),
+                        lists.concat().into_iter().map(|i| i as f64).collect(),
+                    )
+                    .unwrap()
                 };
-                assert_eq!(flat(feature_neighbours(z.view(), &options).unwrap()), stored("feature"));
-                assert_eq!(flat(pose_neighbours(&poses, &options).unwrap()), stored("pose"));
+
+                assert_eq!(
+                    flat(feature_neighbours(z.view(), &options).unwrap()),
+                    stored("feature")
+                );
+
+                assert_eq!(
+                    flat(pose_neighbours(&poses, &options).unwrap()),
+                    stored("pose")
+                );
             }
         }
     }
 }
 
-/// Oracle: six frames by hand (the oracle's README), with ties, and an exclusion that leaves too few.
+/// Oracle: six frames by hand (the oracle's README), with ties, and an exclusion that leaves too
+/// few.
 #[test]
 fn six_frames_by_hand() {
     let folder = golden().join("m1_mutual_knn");
     let expected = json(&folder.join("expected.json"));
-    let z =
-        npy::<f64>(&folder.join("tiny_features.npy")).mapv(|x| x as f32).into_dimensionality::<ndarray::Ix2>().unwrap();
+
+    let z = npy::<f64>(&folder.join("tiny_features.npy"))
+        .mapv(|x| x as f32)
+        .into_dimensionality::<ndarray::Ix2>()
+        .unwrap();
+
     let poses = poses(&folder.join("tiny_poses.npy"));
     for row in expected["tiny"].as_array().unwrap() {
         let integer = |key: &str| row[key].as_u64().unwrap() as usize;
@@ -62,58 +89,110 @@ fn six_frames_by_hand() {
             exclusion: integer("exclusion"),
             ..MutualKnn::default()
         };
+
         let found = mutual_knn(z.view(), &poses, &options).unwrap();
         near(&format!("{options:?}"), found, number(&row["score"]), 1e-12);
         let neighbours = feature_neighbours(z.view(), &options).unwrap();
+
         assert_eq!(serde_json::json!(neighbours), row["feature_neighbours"]);
     }
-    let too_few = MutualKnn { frames: 6, stride: 1, k: 2, exclusion: 3, ..MutualKnn::default() };
-    assert!(matches!(mutual_knn(z.view(), &poses, &too_few), Err(Error::TooFewCandidates { .. })));
-    let too_long = MutualKnn { frames: 7, ..too_few };
-    assert!(matches!(mutual_knn(z.view(), &poses, &too_long), Err(Error::TooFewFrames { needed: 7, have: 6, .. })));
+
+    let too_few = MutualKnn {
+        frames: 6,
+        stride: 1,
+        k: 2,
+        exclusion: 3,
+        ..MutualKnn::default()
+    };
+
+    assert!(matches!(
+        mutual_knn(z.view(), &poses, &too_few),
+        Err(Error::TooFewCandidates { .. })
+    ));
+
+    let too_long = MutualKnn {
+        frames: 7,
+        ..too_few
+    };
+
+    assert!(matches!(
+        mutual_knn(z.view(), &poses, &too_long),
+        Err(Error::TooFewFrames {
+            needed: 7,
+            have: 6,
+            ..
+        })
+    ));
 }
 
 fn agrees(what: &str, found: &IntrinsicDimension, expected: &Value) {
     let close = |name: &str, found: f64, expected: &Value| {
         let expected = number(expected);
-        near(&format!("{what} {name}"), found, expected, 1e-9 * expected.abs());
+        near(
+            &format!("{what} {name}"),
+            found,
+            expected,
+            1e-9 * expected.abs(),
+        );
     };
+
     let two = &expected["twonn_formula"];
     close("linear", found.two_nn.linear, &two["linear"]);
     close("censored", found.two_nn.censored, &two["censored_ml"]);
     close("likelihood", found.two_nn.likelihood, &two["ml"]);
-    for (name, mle) in [("biased", &found.mle_biased), ("unbiased", &found.mle_unbiased)] {
+
+    for (name, mle) in [
+        ("biased", &found.mle_biased),
+        ("unbiased", &found.mle_unbiased),
+    ] {
         let mles = &expected["mle_formula"];
         close(name, mle.harmonic, &mles[format!("mle_{name}")]);
         close(name, mle.mean, &mles[format!("mean_{name}")]);
         close(name, mle.median, &mles[format!("median_{name}")]);
     }
+
     assert_eq!(found.used as u64, two["used"].as_u64().unwrap(), "{what}");
 }
 
-/// Oracle: scikit-dimension on exact distances, and the formulas on SciPy's, for known shapes, duplicates and rooms.
+/// Oracle: scikit-dimension on exact distances, and the formulas on SciPy's, for known shapes,
+/// duplicates and rooms.
 #[test]
 fn intrinsic_dimensions_match_scikit_dimension() {
     let folder = golden().join("m2_intrinsic_dimension");
     let expected = json(&folder.join("expected.json"));
     for name in ["gaussian6_in_64", "swiss_roll", "duplicates"] {
-        let points: Array2<f32> = npy(&folder.join(format!("{name}.npy"))).into_dimensionality().unwrap();
+        let points: Array2<f32> = npy(&folder.join(format!("{name}.npy")))
+            .into_dimensionality()
+            .unwrap();
         let found = intrinsic_dimension(points.view(), 0, Duplicates::DropRows).unwrap();
         agrees(name, &found, &expected[name]["temporal_gap_0"]);
+
         if name == "duplicates" {
             let found = intrinsic_dimension(points.view(), 0, Duplicates::KeepFirst).unwrap();
             agrees("unique", &found, &expected[name]["unique_rows_policy"]);
-            assert_eq!(found.dropped as u64, expected[name]["unique_rows_policy"]["removed"].as_u64().unwrap());
+
+            assert_eq!(
+                found.dropped as u64,
+                expected[name]["unique_rows_policy"]["removed"]
+                    .as_u64()
+                    .unwrap()
+            );
         }
     }
+
     for (room, folder) in oracle_rooms("intrinsic_dimensions_match_scikit_dimension") {
         let expected = json(&folder.join("m2_intrinsic_dimension/expected.json"));
         let z = features(&folder, room);
         for gap in [0, 10] {
             let found = intrinsic_dimension(z.view(), gap, Duplicates::DropRows).unwrap();
-            agrees(room, &found, &expected[format!("{room}_all")][format!("temporal_gap_{gap}")]);
+            agrees(
+                room,
+                &found,
+                &expected[format!("{room}_all")][format!("temporal_gap_{gap}")],
+            );
         }
     }
+
     let few = Array2::from_shape_fn((20, 2), |(r, c)| (r * r + c) as f32);
     assert!(intrinsic_dimension(few.view(), 0, Duplicates::DropRows).is_err());
 }
@@ -124,15 +203,31 @@ fn the_ridge_probe_matches_scikit_learn() {
     for (name, folder) in oracle_rooms("the_ridge_probe_matches_scikit_learn") {
         let expected = json(&folder.join("m3_ridge/expected.json"));
         let poses = poses(&folder.join(format!("rooms/{name}/poses.npy")));
-        let frames = Frames { poses, ..Frames::default() };
+        let frames = Frames {
+            poses,
+            ..Frames::default()
+        };
         let room = Room::new(RoomId::new(name).unwrap(), frames, Provenance::default()).unwrap();
+
         let z = features(&folder, name);
         for stride in [10, 20, 40] {
             let found = ridge_probe(z.view(), &room, Split::Time, stride).unwrap();
             let expected = &expected[name][format!("stride_{stride}")]["test"];
             near("overall", found.overall, number(&expected["overall"]), 1e-9);
-            near("translation", found.translation, number(&expected["translation"]), 1e-9);
-            near("rotation", found.rotation, number(&expected["rotation"]), 1e-9);
+
+            near(
+                "translation",
+                found.translation,
+                number(&expected["translation"]),
+                1e-9,
+            );
+
+            near(
+                "rotation",
+                found.rotation,
+                number(&expected["rotation"]),
+                1e-9,
+            );
         }
     }
 }

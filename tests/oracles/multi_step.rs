@@ -13,56 +13,136 @@ use seese3::training::{Lesson, Recipe, error_covariance, learn};
 use crate::navigation::{adapter_of, navigator};
 use crate::support::golden;
 
-/// Oracle: the definition. In an open loop the gate is the source's throughout and a motion's parts are equal, so
-/// that the end does not depend on their number: for a mixture, and for every refit, whose μ and intercept are spread.
+/// Oracle: the definition. In an open loop the gate is the source's throughout and a
+/// motion's parts are equal, so that the end does not depend on their number: for a mixture, and
+/// for every refit, whose μ and intercept are spread.
 #[test]
 fn an_open_loop_ends_at_the_same_latent_in_any_number_of_steps() {
     let folder = golden();
     for charts in [1, 2] {
-        let navigator = navigator(&folder, "synthetic", adapter_of(&folder, "synthetic", charts).into());
-        let pairs = Split::Time.test_pairs(navigator.room().timeline(), 40).unwrap();
-        let refits = StepKind::all().into_iter().filter(|kind| matches!(kind, StepKind::Refit(Refit { .. })));
+        let navigator = navigator(
+            &folder,
+            "synthetic",
+            adapter_of(&folder, "synthetic", charts).into(),
+        );
+        let pairs = Split::Time
+            .test_pairs(navigator.room().timeline(), 40)
+            .unwrap();
+
+        let refits = StepKind::all()
+            .into_iter()
+            .filter(|kind| matches!(kind, StepKind::Refit(Refit { .. })));
+
         let readings = [Reading::Affine, Reading::Homogeneous].map(StepKind::InversePoincare);
         for kind in readings.into_iter().chain(refits) {
-            let stepper = navigator.stepper(kind, FitOn { split: Split::Time, stride: 40 }).unwrap();
+            let stepper = navigator
+                .stepper(
+                    kind,
+                    FitOn {
+                        split: Split::Time,
+                        stride: 40,
+                    },
+                )
+                .unwrap();
+
             for pair in pairs.iter().step_by(7) {
                 let end = |steps: u32| {
                     let poses = navigator.room().poses();
-                    let start = navigator.start(&seese3::navigation::Source::Frame(pair.source), None).unwrap();
+                    let start = navigator
+                        .start(&seese3::navigation::Source::Frame(pair.source), None)
+                        .unwrap();
+
                     let twist = body_twist(&poses[pair.source.row()], &poses[pair.target.row()]);
-                    let leg = Leg { motion: twist, goal: None };
-                    let plan = Plan { mode: Mode::OpenLoop, steps, hit_count: 1, exclude_source: None };
+                    let leg = Leg {
+                        motion: twist,
+                        goal: None,
+                    };
+
+                    let plan = Plan {
+                        mode: Mode::OpenLoop,
+                        steps,
+                        hit_count: 1,
+                        exclude_source: None,
+                    };
+
                     let space = navigator.space(&stepper);
-                    walk(space, &start, leg, plan, &Cancellation::default()).unwrap().pop().unwrap().latent
+                    walk(space, &start, leg, plan, &Cancellation::default())
+                        .unwrap()
+                        .pop()
+                        .unwrap()
+                        .latent
                 };
+
                 let whole: Array1<f64> = end(1);
-                let moved = (&whole - &navigator.latents().row(pair.source.row())).mapv(f64::abs).sum();
-                assert!(moved > 1e-3, "{} in {charts} charts stays where it is", kind.name());
-                let worst = (&end(5) - &whole).mapv(f64::abs).fold(0.0, |a: f64, &b| a.max(b));
-                assert!(worst < 1e-9, "{} in {charts} charts: off by {worst}", kind.name());
+                let moved = (&whole - &navigator.latents().row(pair.source.row()))
+                    .mapv(f64::abs)
+                    .sum();
+
+                assert!(
+                    moved > 1e-3,
+                    "{} in {charts} charts stays where it is",
+                    kind.name()
+                );
+
+                let worst = (&end(5) - &whole)
+                    .mapv(f64::abs)
+                    .fold(0.0, |a: f64, &b| a.max(b));
+
+                assert!(
+                    worst < 1e-9,
+                    "{} in {charts} charts: off by {worst}",
+                    kind.name()
+                );
             }
         }
     }
 }
 
-/// Oracle: the definition by hand, from the public reading of motion: Σ is the mean of r rᵀ over all pairs at the stride,
-/// with r the true twist less the predicted one, whose mean is taken off.
+/// Oracle: the definition by hand, from the public reading of motion: Σ is the mean of r rᵀ over
+/// all pairs at the stride, with r the true twist less the predicted one, whose mean is taken off.
 #[test]
 fn errors_are_the_second_moment_of_the_residuals() {
     let folder = golden();
-    let seen = navigator(&folder, "synthetic", adapter_of(&folder, "synthetic", 1).into());
-    let other = navigator(&folder, "synthetic_b", adapter_of(&folder, "synthetic", 1).into());
+    let seen = navigator(
+        &folder,
+        "synthetic",
+        adapter_of(&folder, "synthetic", 1).into(),
+    );
+
+    let other = navigator(
+        &folder,
+        "synthetic_b",
+        adapter_of(&folder, "synthetic", 1).into(),
+    );
+
     let features = |room: &str| {
         let rows = crate::support::features(&folder, room);
-        seese3::features::Features::new(seese3::features::FeatureSource::imported("oracle", 0), rows).unwrap()
+        seese3::features::Features::new(
+            seese3::features::FeatureSource::imported("oracle", 0),
+            rows,
+        )
+        .unwrap()
     };
-    let (ours, theirs) = (features("synthetic"), features("synthetic_b"));
+
+    let ours = features("synthetic");
+    let theirs = features("synthetic_b");
     let mut recipe = Recipe::of(Preset::PaperBase, Split::Time, 20, 0);
     recipe.config.epochs = 2;
-    let lesson = Lesson { room: seen.room(), revision: 1, features: &ours };
+
+    let lesson = Lesson {
+        room: seen.room(),
+        revision: 1,
+        features: &ours,
+    };
     let (adapter, record) = learn(&[lesson], &recipe, &mut |_| ()).unwrap();
-    let held_out = Lesson { room: other.room(), revision: 1, features: &theirs };
+
+    let held_out = Lesson {
+        room: other.room(),
+        revision: 1,
+        features: &theirs,
+    };
     let found = error_covariance(&adapter, &record, &[held_out]).unwrap();
+
     let poses = other.room().poses();
     let mut expected = Matrix6::zeros();
     let count = poses.len() - 20;
@@ -70,13 +150,16 @@ fn errors_are_the_second_moment_of_the_residuals() {
         let view = |row: usize| View::Feature(theirs.rows().row(row).to_vec());
         let read = motion(&adapter, &view(from), &view(from + 20)).unwrap();
         let truth = body_twist(&poses[from], &poses[from + 20]);
+
         let numbers = |twist: seese3::geometry::Twist| {
-            let (v, w) = (twist.linear, twist.angular);
+            let v = twist.linear;
+            let w = twist.angular;
             Vector6::new(v.x, v.y, v.z, w.x, w.y, w.z)
         };
         let residual = numbers(truth) - (numbers(read) - adapter.scale().mean);
         expected += residual * residual.transpose() / count as f64;
     }
+
     let worst = (found - expected).amax() / expected.amax();
     assert!(worst < 1e-9, "off by {worst}");
 }

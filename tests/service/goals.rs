@@ -9,11 +9,16 @@ use tonic::Code;
 use crate::harness::{feature, features_of, frame, room_of, start};
 
 fn question(source: Option<pb::View>, goal: Goal) -> pb::NavigateToRequest {
-    pb::NavigateToRequest { room: "synthetic".to_owned(), source, goal: Some(goal), ..Default::default() }
+    pb::NavigateToRequest {
+        room: "synthetic".to_owned(),
+        source,
+        goal: Some(goal),
+        ..Default::default()
+    }
 }
 
-/// Oracle: the recorded poses: every step's distance is the one between its frame and the goal, and what is called reached
-/// is within the tolerance.
+/// Oracle: the recorded poses: every step's distance is the one between its frame and the goal, and
+/// what is called reached is within the tolerance.
 #[tokio::test]
 async fn a_goal_is_reached_frame_by_frame() {
     let server = start(Config::default()).await;
@@ -22,25 +27,39 @@ async fn a_goal_is_reached_frame_by_frame() {
     for (from, to) in [(10, 60), (100, 180), (300, 250), (480, 400)] {
         let mut steps = Vec::new();
         let asked = question(frame(from), Goal::GoalFrameId(to));
-        let result = server.client.navigate_to(asked, |step| steps.push(step)).await.unwrap();
+        let result = server
+            .client
+            .navigate_to(asked, |step| steps.push(step))
+            .await
+            .unwrap();
+
         let goal = room.poses()[to as usize];
         for (number, step) in steps.iter().enumerate() {
             assert!(step.current_step as usize >= number && step.navigation_time_ns > 0);
+
             let Some(hit) = &step.current else { continue };
             let pose = pose_from_wire(hit.pose.clone().unwrap(), "synthetic").unwrap();
             let error = PoseError::between(&pose, &goal);
+
             assert!((error.translation_m - step.distance_remaining_m).abs() < 1e-12);
             assert!((error.rotation_rad - step.rotation_remaining_rad).abs() < 1e-12);
         }
+
         assert!(steps[0].current.is_none() && steps[0].current_step == 0);
+
         let last = steps.last().unwrap();
         if result.outcome() == pb::NavigateToOutcome::Reached {
             reached += 1;
-            assert!(last.distance_remaining_m <= 0.25 && last.rotation_remaining_rad <= 15_f64.to_radians());
+
+            assert!(
+                last.distance_remaining_m <= 0.25
+                    && last.rotation_remaining_rad <= 15_f64.to_radians()
+            );
         } else {
             assert!(!result.message.is_empty());
         }
     }
+
     assert!(reached >= 3, "{reached} of 4 goals were reached");
 }
 
@@ -48,8 +67,18 @@ async fn a_goal_is_reached_frame_by_frame() {
 #[tokio::test]
 async fn a_pursuit_ends_at_its_bounds() {
     let server = start(Config::default()).await;
-    let here = server.client.navigate_to(question(frame(10), Goal::GoalFrameId(10)), |_| ()).await.unwrap();
-    assert_eq!(here.outcome(), pb::NavigateToOutcome::Reached, "it is there already");
+    let here = server
+        .client
+        .navigate_to(question(frame(10), Goal::GoalFrameId(10)), |_| ())
+        .await
+        .unwrap();
+
+    assert_eq!(
+        here.outcome(),
+        pb::NavigateToOutcome::Reached,
+        "it is there already"
+    );
+
     let asked = pb::NavigateToRequest {
         max_steps: 1,
         tolerance_m: 1e-6,
@@ -57,32 +86,74 @@ async fn a_pursuit_ends_at_its_bounds() {
         ..question(frame(10), Goal::GoalFrameId(300))
     };
     let spent = server.client.navigate_to(asked, |_| ()).await.unwrap();
+
     assert_ne!(spent.outcome(), pb::NavigateToOutcome::Reached);
+
     let seen = feature(features_of("synthetic").rows().row(40).to_vec());
-    let near = server.client.navigate_to(question(seen, Goal::GoalFrameId(40)), |_| ()).await.unwrap();
-    assert_eq!(near.outcome(), pb::NavigateToOutcome::Reached, "a view is where the frame like it is");
+    let near = server
+        .client
+        .navigate_to(question(seen, Goal::GoalFrameId(40)), |_| ())
+        .await
+        .unwrap();
+
+    assert_eq!(
+        near.outcome(),
+        pb::NavigateToOutcome::Reached,
+        "a view is where the frame like it is"
+    );
+
     for (request, code, word) in [
         (
-            pb::NavigateToRequest { goal: None, ..question(frame(1), Goal::GoalFrameId(2)) },
+            pb::NavigateToRequest {
+                goal: None,
+                ..question(frame(1), Goal::GoalFrameId(2))
+            },
             Code::InvalidArgument,
             "goal",
         ),
-        (question(None, Goal::GoalFrameId(2)), Code::InvalidArgument, "source"),
-        (question(frame(1), Goal::GoalFrameId(99_999)), Code::NotFound, "goal_frame_id"),
-        (question(frame(1), Goal::GoalPose(pb::Pose::default())), Code::InvalidArgument, "goal_pose"),
         (
-            pb::NavigateToRequest { step: f64::NAN, ..question(frame(1), Goal::GoalFrameId(2)) },
+            question(None, Goal::GoalFrameId(2)),
+            Code::InvalidArgument,
+            "source",
+        ),
+        (
+            question(frame(1), Goal::GoalFrameId(99_999)),
+            Code::NotFound,
+            "goal_frame_id",
+        ),
+        (
+            question(frame(1), Goal::GoalPose(pb::Pose::default())),
+            Code::InvalidArgument,
+            "goal_pose",
+        ),
+        (
+            pb::NavigateToRequest {
+                step: f64::NAN,
+                ..question(frame(1), Goal::GoalFrameId(2))
+            },
             Code::InvalidArgument,
             "step",
         ),
         (
-            pb::NavigateToRequest { max_steps: u32::MAX, ..question(frame(1), Goal::GoalFrameId(2)) },
+            pb::NavigateToRequest {
+                max_steps: u32::MAX,
+                ..question(frame(1), Goal::GoalFrameId(2))
+            },
             Code::InvalidArgument,
             "max_steps",
         ),
     ] {
-        let error = server.client.navigate_to(request, |_| ()).await.unwrap_err();
+        let error = server
+            .client
+            .navigate_to(request, |_| ())
+            .await
+            .unwrap_err();
+
         assert_eq!(error.code(), Some(code), "{error}");
-        assert!(error.to_string().contains(word), "{error} does not say {word}");
+
+        assert!(
+            error.to_string().contains(word),
+            "{error} does not say {word}"
+        );
     }
 }

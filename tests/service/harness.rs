@@ -3,7 +3,9 @@
 use std::time::Duration;
 
 use ndarray::Array2;
-use seese3::adapter::{Adapter, PairPlan, Samples, Siamese, TENSOR_NAMES, TrainConfig, TrainingRecord};
+use seese3::adapter::{
+    Adapter, PairPlan, Samples, Siamese, TENSOR_NAMES, TrainConfig, TrainingRecord,
+};
 use seese3::client::Client;
 use seese3::features::{FeatureSource, Features};
 use seese3::pairs::Split;
@@ -28,23 +30,46 @@ pub struct TestServer {
 }
 
 pub fn room_of(name: &str, golden_room: &str) -> Room {
-    let frames = Frames { poses: poses(&golden().join(format!("rooms/{golden_room}/poses.npy"))), ..Frames::default() };
+    let frames = Frames {
+        poses: poses(&golden().join(format!("rooms/{golden_room}/poses.npy"))),
+        ..Frames::default()
+    };
     Room::new(RoomId::new(name).unwrap(), frames, Provenance::default()).unwrap()
 }
 
 pub fn features_of(golden_room: &str) -> Features {
-    Features::new(FeatureSource::imported("oracle", 0), features(&golden(), golden_room)).unwrap()
+    Features::new(
+        FeatureSource::imported("oracle", 0),
+        features(&golden(), golden_room),
+    )
+    .unwrap()
 }
 
 /// The oracle's adapter with the scale of its training pairs.
 pub fn oracle_adapter() -> Adapter {
     let tensors = Tensors::open(&golden().join("m4_adapter/synthetic_k1_trained.safetensors"));
-    let network = Siamese::from_tensors(TENSOR_NAMES.map(|name| tensors.rows(name).mapv(|x| x as f32))).unwrap();
+    let network =
+        Siamese::from_tensors(TENSOR_NAMES.map(|name| tensors.rows(name).mapv(|x| x as f32)))
+            .unwrap();
+
     let room = room_of("a", "synthetic");
-    let pairs = Split::Time.train_pairs(&Timeline::unbroken(room.frame_count()), 40).unwrap();
-    let rows = pairs.iter().map(|p| [p.source.row(), p.target.row()]).collect();
-    let samples = Samples::<f32>::new(features_of("synthetic").rows(), room.poses().to_vec(), rows).unwrap();
-    Adapter::new(features_of("synthetic").source().clone(), network, samples.scale().clone()).unwrap()
+    let pairs = Split::Time
+        .train_pairs(&Timeline::unbroken(room.frame_count()), 40)
+        .unwrap();
+    let rows = pairs
+        .iter()
+        .map(|p| [p.source.row(), p.target.row()])
+        .collect();
+
+    let samples =
+        Samples::<f32>::new(features_of("synthetic").rows(), room.poses().to_vec(), rows).unwrap();
+
+    Adapter::new(
+        features_of("synthetic").source().clone(),
+        network,
+        samples.scale().clone(),
+    )
+    .unwrap()
 }
 
 pub fn record() -> TrainingRecord {
@@ -58,6 +83,7 @@ pub fn record() -> TrainingRecord {
         magnitude: 0.5,
         direction_pairs_dropped: 0,
     };
+
     TrainingRecord {
         preset: "paper-base".to_owned(),
         split: Split::Time,
@@ -79,9 +105,22 @@ pub async fn filled_store() -> (tempfile::TempDir, Store) {
     let folder = tempfile::tempdir().unwrap();
     let store = Store::create(folder.path().to_str().unwrap()).unwrap();
     for name in ["synthetic", "synthetic_b"] {
-        store.publish_room(&room_of(name, name), &[features_of(name)]).await.unwrap();
+        store
+            .publish_room(&room_of(name, name), &[features_of(name)])
+            .await
+            .unwrap();
     }
-    store.publish_adapter("oracle", &oracle_adapter(), &record(), features_of("synthetic").rows()).await.unwrap();
+
+    store
+        .publish_adapter(
+            "oracle",
+            &oracle_adapter(),
+            &record(),
+            features_of("synthetic").rows(),
+        )
+        .await
+        .unwrap();
+
     (folder, store)
 }
 
@@ -99,28 +138,49 @@ pub async fn start_on(folder: tempfile::TempDir, store: Store, config: Config) -
     let ended = tokio::spawn(run(listener, store, config, async {
         let _ = stopped.await;
     }));
-    let client = Client::connect(&address, Duration::from_secs(20)).await.unwrap();
+
+    let client = Client::connect(&address, Duration::from_secs(20))
+        .await
+        .unwrap();
     for _ in 0..1_000 {
         if client.rooms().await.is_ok() {
             break;
         }
+
         assert!(!ended.is_finished(), "the server ended");
+
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
-    TestServer { address, client, stop, ended, folder }
+
+    TestServer {
+        address,
+        client,
+        stop,
+        ended,
+        folder,
+    }
 }
 
 pub fn frame(frame: u32) -> Option<pb::View> {
-    Some(pb::View { view: Some(pb::view::View::FrameId(frame)) })
+    Some(pb::View {
+        view: Some(pb::view::View::FrameId(frame)),
+    })
 }
 
 pub fn feature(values: Vec<f32>) -> Option<pb::View> {
-    let feature = pb::Feature { values, source_name: String::new() };
-    Some(pb::View { view: Some(pb::view::View::Feature(feature)) })
+    let feature = pb::Feature {
+        values,
+        source_name: String::new(),
+    };
+    Some(pb::View {
+        view: Some(pb::view::View::Feature(feature)),
+    })
 }
 
 pub fn latent(values: Vec<f64>) -> Option<pb::View> {
-    Some(pb::View { view: Some(pb::view::View::Latent(pb::Latent { values })) })
+    Some(pb::View {
+        view: Some(pb::view::View::Latent(pb::Latent { values })),
+    })
 }
 
 pub fn feature_row(row: usize) -> Vec<f32> {
@@ -128,16 +188,23 @@ pub fn feature_row(row: usize) -> Vec<f32> {
 }
 
 pub fn by_twist(numbers: [f64; 6]) -> Option<pb::Displacement> {
-    Some(pb::Displacement { displacement: Some(pb::displacement::Displacement::Twist(twist(numbers))) })
+    Some(pb::Displacement {
+        displacement: Some(pb::displacement::Displacement::Twist(twist(numbers))),
+    })
 }
 
 pub fn twist([vx, vy, vz, wx, wy, wz]: [f64; 6]) -> pb::Twist {
     let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
-    pb::Twist { linear: vector(vx, vy, vz), angular: vector(wx, wy, wz) }
+    pb::Twist {
+        linear: vector(vx, vy, vz),
+        angular: vector(wx, wy, wz),
+    }
 }
 
 pub fn to_frame(frame: u32) -> Option<pb::Displacement> {
-    Some(pb::Displacement { displacement: Some(pb::displacement::Displacement::TargetFrameId(frame)) })
+    Some(pb::Displacement {
+        displacement: Some(pb::displacement::Displacement::TargetFrameId(frame)),
+    })
 }
 
 /// From frame 500 to frame 540, one step.

@@ -27,8 +27,18 @@ const ROOM: &str = "drawn";
 fn pictures() -> (Vec<RgbImage>, Frames) {
     let scene = Scene::new(5);
     let poses = camera_path(&scene, FRAMES, 5);
-    let pictures = poses.iter().map(|pose| render(&scene, Camera::small(), pose)).collect();
-    (pictures, Frames { poses, ..Frames::default() })
+    let pictures = poses
+        .iter()
+        .map(|pose| render(&scene, Camera::small(), pose))
+        .collect();
+
+    (
+        pictures,
+        Frames {
+            poses,
+            ..Frames::default()
+        },
+    )
 }
 
 /// A store with a drawn room, its built-in features, and an adapter on them.
@@ -37,37 +47,68 @@ async fn drawn_store() -> (tempfile::TempDir, Store, Vec<RgbImage>) {
     let store = Store::create(folder.path().to_str().unwrap()).unwrap();
     let (pictures, frames) = pictures();
     let encoder = Encoder::builtin();
+
     let clips: Vec<Vec<&RgbImage>> = pictures.iter().map(|picture| vec![picture]).collect();
     let rows: Array2<f32> = encoder.encode(&clips).unwrap();
     let features = Features::new(encoder.sources("builtin").remove(0), rows).unwrap();
     let room = Room::new(RoomId::new(ROOM).unwrap(), frames, Provenance::default()).unwrap();
-    store.publish_room(&room, std::slice::from_ref(&features)).await.unwrap();
+    store
+        .publish_room(&room, std::slice::from_ref(&features))
+        .await
+        .unwrap();
+
     let mut recipe = Recipe::of(Preset::PaperBase, Split::Time, 10, 0);
     recipe.config.epochs = 2;
-    let lesson = Lesson { room: &room, revision: 1, features: &features };
+
+    let lesson = Lesson {
+        room: &room,
+        revision: 1,
+        features: &features,
+    };
     let (adapter, record) = learn(&[lesson], &recipe, &mut |_| ()).unwrap();
-    store.publish_adapter("eyes", &adapter, &record, features.rows()).await.unwrap();
+    store
+        .publish_adapter("eyes", &adapter, &record, features.rows())
+        .await
+        .unwrap();
+
     (folder, store, pictures)
 }
 
 fn with_encoders(models: &[&str]) -> Config {
     let encoders = ImageEncoders {
         models: models.iter().map(|&model| model.to_owned()).collect(),
-        runtime: Runtime { kind: RuntimeKind::Tract, threads: 1, library: None },
-        bounds: Bounds { bytes: 1 << 20, pixels: 10_000 },
+        runtime: Runtime {
+            kind: RuntimeKind::Tract,
+            threads: 1,
+            library: None,
+        },
+        bounds: Bounds {
+            bytes: 1 << 20,
+            pixels: 10_000,
+        },
     };
-    Config { encoders: Some(encoders), ..Config::default() }
+
+    Config {
+        encoders: Some(encoders),
+        ..Config::default()
+    }
 }
 
 fn png(picture: &RgbImage) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
-    let (width, height) = (picture.width as u32, picture.height as u32);
-    PngEncoder::new(&mut bytes).write_image(&picture.bytes, width, height, ExtendedColorType::Rgb8).unwrap();
+    let width = picture.width as u32;
+    let height = picture.height as u32;
+    PngEncoder::new(&mut bytes)
+        .write_image(&picture.bytes, width, height, ExtendedColorType::Rgb8)
+        .unwrap();
+
     bytes.into_inner()
 }
 
 fn image(bytes: Vec<u8>) -> Option<pb::View> {
-    Some(pb::View { view: Some(pb::view::View::Image(bytes)) })
+    Some(pb::View {
+        view: Some(pb::view::View::Image(bytes)),
+    })
 }
 
 async fn served(config: Config) -> (TestServer, Vec<RgbImage>) {
@@ -80,27 +121,50 @@ fn navigate(source: Option<pb::View>) -> pb::NavigateRequest {
         room: ROOM.to_owned(),
         source,
         displacement: Some(pb::Displacement {
-            displacement: Some(pb::displacement::Displacement::Twist(crate::harness::twist([
-                0.1, 0.0, 0.05, 0.0, 0.1, 0.0,
-            ]))),
+            displacement: Some(pb::displacement::Displacement::Twist(
+                crate::harness::twist([0.1, 0.0, 0.05, 0.0, 0.1, 0.0]),
+            )),
         }),
         ..pb::NavigateRequest::default()
     }
 }
 
-/// Oracle: PNG is lossless, so a frame's image is the frame: the same place, the same motion, the same answer.
+/// Oracle: PNG is lossless, so a frame's image is the frame: the same place, the same motion, the
+/// same answer.
 #[tokio::test]
 async fn an_image_is_answered_as_its_frame_is() {
     let (server, pictures) = served(with_encoders(&["builtin"])).await;
-    let request =
-        pb::LocalizeRequest { view: image(png(&pictures[33])), adapter: "eyes".to_owned(), ..Default::default() };
-    let found = server.client.localize(request).await.unwrap().places.remove(0).hit.unwrap();
+    let request = pb::LocalizeRequest {
+        view: image(png(&pictures[33])),
+        adapter: "eyes".to_owned(),
+        ..Default::default()
+    };
+
+    let found = server
+        .client
+        .localize(request)
+        .await
+        .unwrap()
+        .places
+        .remove(0)
+        .hit
+        .unwrap();
+
     assert_eq!(found.frame_id, 33);
+
     near("distance", found.distance, 0.0, 1e-5);
 
-    let by_image = server.client.navigate(navigate(image(png(&pictures[50])))).await.unwrap();
+    let by_image = server
+        .client
+        .navigate(navigate(image(png(&pictures[50]))))
+        .await
+        .unwrap();
+
     let by_frame = server.client.navigate(navigate(frame(50))).await.unwrap();
-    assert_eq!(by_image.steps[0].hits[0].frame_id, by_frame.steps[0].hits[0].frame_id);
+    assert_eq!(
+        by_image.steps[0].hits[0].frame_id,
+        by_frame.steps[0].hits[0].frame_id
+    );
 
     let motion = |first, second| pb::EstimateMotionRequest {
         room: ROOM.to_owned(),
@@ -109,28 +173,56 @@ async fn an_image_is_answered_as_its_frame_is() {
         ..pb::EstimateMotionRequest::default()
     };
     let by_image = motion(image(png(&pictures[20])), image(png(&pictures[30])));
-    let by_image = server.client.estimate_motion(by_image).await.unwrap().motion.unwrap();
-    let by_frame = server.client.estimate_motion(motion(frame(20), frame(30))).await.unwrap().motion.unwrap();
-    let (a, b) = (by_image.linear.unwrap(), by_frame.linear.unwrap());
+
+    let by_image = server
+        .client
+        .estimate_motion(by_image)
+        .await
+        .unwrap()
+        .motion
+        .unwrap();
+
+    let by_frame = server
+        .client
+        .estimate_motion(motion(frame(20), frame(30)))
+        .await
+        .unwrap()
+        .motion
+        .unwrap();
+
+    let a = by_image.linear.unwrap();
+    let b = by_frame.linear.unwrap();
     for (a, b) in [(a.x, b.x), (a.y, b.y), (a.z, b.z)] {
         near("v", a, b, 1e-5);
     }
 }
 
-fn refused<T: std::fmt::Debug>(answer: Result<T, seese3::client::Error>, code: Code, words: &[&str]) {
+fn refused<T: std::fmt::Debug>(
+    answer: Result<T, seese3::client::Error>,
+    code: Code,
+    words: &[&str],
+) {
     let error = answer.unwrap_err();
     assert_eq!(error.code(), Some(code), "{error}");
+
     for word in words {
         assert!(error.to_string().contains(word), "{error}");
     }
 }
 
-/// Oracle: the list of bad visitors: no image, a cut one, one too large, and a server without that encoder.
+/// Oracle: the list of bad visitors: no image, a cut one, one too large, and a server without that
+/// encoder.
 #[tokio::test]
 async fn images_that_cannot_be_answered_are_refused_by_field() {
     let (server, pictures) = served(with_encoders(&["builtin"])).await;
     let whole = png(&pictures[0]);
-    let large = RgbImage { width: 101, height: 100, bytes: vec![9; 101 * 100 * 3] };
+
+    let large = RgbImage {
+        width: 101,
+        height: 100,
+        bytes: vec![9; 101 * 100 * 3],
+    };
+
     for (bytes, word) in [
         (b"not an image".to_vec(), "JPEG"),
         (whole[..whole.len() / 2].to_vec(), "source.image"),
@@ -140,22 +232,48 @@ async fn images_that_cannot_be_answered_are_refused_by_field() {
         let answer = server.client.navigate(navigate(image(bytes))).await;
         refused(answer, Code::InvalidArgument, &["source.image", word]);
     }
-    let request = pb::LocalizeRequest { view: image(Vec::new()), adapter: "eyes".to_owned(), ..Default::default() };
-    refused(server.client.localize(request).await, Code::InvalidArgument, &["view.image"]);
+
+    let request = pb::LocalizeRequest {
+        view: image(Vec::new()),
+        adapter: "eyes".to_owned(),
+        ..Default::default()
+    };
+    refused(
+        server.client.localize(request).await,
+        Code::InvalidArgument,
+        &["view.image"],
+    );
+
     let request = pb::EstimateMotionRequest {
         adapter: "eyes".to_owned(),
         first: image(whole.clone()),
         second: image(b"no".to_vec()),
         ..pb::EstimateMotionRequest::default()
     };
-    refused(server.client.estimate_motion(request).await, Code::InvalidArgument, &["second.image"]);
+    refused(
+        server.client.estimate_motion(request).await,
+        Code::InvalidArgument,
+        &["second.image"],
+    );
 
     for config in [Config::default(), with_encoders(&["pixels"])] {
         let (server, _) = served(config).await;
         let answer = server.client.navigate(navigate(image(whole.clone()))).await;
-        refused(answer, Code::FailedPrecondition, &["builtin-orientations-v1", "--encoder"]);
-        let by_frame = pb::NavigateRequest { displacement: to_frame(20), ..navigate(frame(10)) };
-        assert!(server.client.navigate(by_frame).await.is_ok(), "frames are answered all the same");
+        refused(
+            answer,
+            Code::FailedPrecondition,
+            &["builtin-orientations-v1", "--encoder"],
+        );
+
+        let by_frame = pb::NavigateRequest {
+            displacement: to_frame(20),
+            ..navigate(frame(10))
+        };
+
+        assert!(
+            server.client.navigate(by_frame).await.is_ok(),
+            "frames are answered all the same"
+        );
     }
 }
 
@@ -168,5 +286,9 @@ async fn an_encoder_that_is_not_there_ends_the_server() {
     let config = with_encoders(&[missing.to_str().unwrap()]);
     let ended = seese3::service::run(listener, store, config, std::future::pending()).await;
     let message = ended.unwrap_err().to_string();
-    assert!(message.contains("--encoder") && message.contains("model.onnx"), "{message}");
+
+    assert!(
+        message.contains("--encoder") && message.contains("model.onnx"),
+        "{message}"
+    );
 }

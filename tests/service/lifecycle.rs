@@ -19,57 +19,118 @@ use tonic_health::pb::health_client::HealthClient;
 use crate::harness::{filled_store, question, start};
 
 async fn channel(address: &str) -> Channel {
-    Endpoint::from_shared(format!("http://{address}")).unwrap().connect().await.unwrap()
+    Endpoint::from_shared(format!("http://{address}"))
+        .unwrap()
+        .connect()
+        .await
+        .unwrap()
 }
 
 fn named(service: &str) -> HealthCheckRequest {
-    HealthCheckRequest { service: service.to_owned() }
+    HealthCheckRequest {
+        service: service.to_owned(),
+    }
 }
 
 async fn check(address: &str, service: &str) -> Result<ServingStatus, Code> {
-    let answer = HealthClient::new(channel(address).await).check(named(service)).await;
-    answer.map(|answer| answer.into_inner().status()).map_err(|status| status.code())
+    let answer = HealthClient::new(channel(address).await)
+        .check(named(service))
+        .await;
+    answer
+        .map(|answer| answer.into_inner().status())
+        .map_err(|status| status.code())
 }
 
-/// Oracle: the health protocol's specification: Check of an unknown name is NOT_FOUND, Watch of one says
-/// SERVICE_UNKNOWN and stays open.
+/// Oracle: the health protocol's specification: Check of an unknown name is NOT_FOUND, Watch of one
+/// says SERVICE_UNKNOWN and stays open.
 #[tokio::test]
 async fn health_answers_for_the_server_its_services_and_its_rooms() {
     let server = start(Config::default()).await;
-    for name in ["", "seese3.v1.NavigationService", "seese3.v1.EvaluationService", "rooms/synthetic"] {
-        assert_eq!(check(&server.address, name).await, Ok(ServingStatus::Serving), "{name}");
+    for name in [
+        "",
+        "seese3.v1.NavigationService",
+        "seese3.v1.EvaluationService",
+        "rooms/synthetic",
+    ] {
+        assert_eq!(
+            check(&server.address, name).await,
+            Ok(ServingStatus::Serving),
+            "{name}"
+        );
     }
+
     for name in ["nope", "rooms/nope"] {
-        assert_eq!(check(&server.address, name).await, Err(Code::NotFound), "{name}");
+        assert_eq!(
+            check(&server.address, name).await,
+            Err(Code::NotFound),
+            "{name}"
+        );
     }
+
     let mut client = HealthClient::new(channel(&server.address).await);
-    let mut unknown = client.watch(named("rooms/nope")).await.unwrap().into_inner();
-    assert_eq!(unknown.message().await.unwrap().unwrap().status(), ServingStatus::ServiceUnknown);
+    let mut unknown = client
+        .watch(named("rooms/nope"))
+        .await
+        .unwrap()
+        .into_inner();
+
+    assert_eq!(
+        unknown.message().await.unwrap().unwrap().status(),
+        ServingStatus::ServiceUnknown
+    );
+
     let still_open = tokio::time::timeout(Duration::from_millis(100), unknown.message()).await;
     assert!(still_open.is_err(), "the stream waits");
+
     let mut watched = client.watch(named("")).await.unwrap().into_inner();
-    assert_eq!(watched.message().await.unwrap().unwrap().status(), ServingStatus::Serving);
+    assert_eq!(
+        watched.message().await.unwrap().unwrap().status(),
+        ServingStatus::Serving
+    );
+
     server.stop.send(()).unwrap();
-    assert_eq!(watched.message().await.unwrap().unwrap().status(), ServingStatus::NotServing);
+
+    assert_eq!(
+        watched.message().await.unwrap().unwrap().status(),
+        ServingStatus::NotServing
+    );
+
     let ended = tokio::time::timeout(Duration::from_secs(5), server.ended).await;
-    ended.expect("watchers do not keep a server that was told to stop").unwrap().unwrap();
+    ended
+        .expect("watchers do not keep a server that was told to stop")
+        .unwrap()
+        .unwrap();
 }
 
-/// Oracle: the issue: NOT_SERVING until all is loaded, and a store that is damaged ends the server with its file.
+/// Oracle: the issue: NOT_SERVING until all is loaded, and a store that is damaged ends the server
+/// with its file.
 #[tokio::test]
 async fn a_damaged_store_never_serves() {
     let (folder, store) = filled_store().await;
     let weights = folder.path().join("adapters/oracle/objects");
-    let file = std::fs::read_dir(weights).unwrap().next().unwrap().unwrap().path();
+
+    let file = std::fs::read_dir(weights)
+        .unwrap()
+        .next()
+        .unwrap()
+        .unwrap()
+        .path();
     std::fs::write(&file, b"short").unwrap();
+
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let ended = run(listener, store, Config::default(), std::future::pending()).await;
     let error = ended.unwrap_err().to_string();
-    assert!(error.contains(file.file_name().unwrap().to_str().unwrap()), "{error}");
+
+    assert!(
+        error.contains(file.file_name().unwrap().to_str().unwrap()),
+        "{error}"
+    );
+
     let empty = tempfile::tempdir().unwrap();
     let store = Store::open(empty.path().to_str().unwrap()).unwrap();
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let ended = run(listener, store, Config::default(), std::future::pending()).await;
+
     assert!(matches!(ended, Err(RunError::NoRoom { .. })));
 }
 
@@ -78,7 +139,15 @@ async fn a_damaged_store_never_serves() {
 async fn reflection_lists_the_services_in_both_versions() {
     let server = start(Config::default()).await;
     let channel = channel(&server.address).await;
-    let services = ["Navigation", "Localization", "Odometry", "Catalog", "Evaluation"];
+
+    let services = [
+        "Navigation",
+        "Localization",
+        "Odometry",
+        "Catalog",
+        "Evaluation",
+    ];
+
     macro_rules! listed {
         ($version:ident) => {{
             use tonic_reflection::pb::$version::ServerReflectionRequest;
@@ -90,59 +159,124 @@ async fn reflection_lists_the_services_in_both_versions() {
                 message_request: Some(MessageRequest::ListServices(String::new())),
             };
             let stream = tokio_stream::iter([request]);
-            let mut answers =
-                ServerReflectionClient::new(channel.clone()).server_reflection_info(stream).await.unwrap().into_inner();
-            match answers.next().await.unwrap().unwrap().message_response.unwrap() {
-                MessageResponse::ListServicesResponse(list) => {
-                    list.service.into_iter().map(|service| service.name).collect::<Vec<_>>()
-                }
+            let mut answers = ServerReflectionClient::new(channel.clone())
+                .server_reflection_info(stream)
+                .await
+                .unwrap()
+                .into_inner();
+            match answers
+                .next()
+                .await
+                .unwrap()
+                .unwrap()
+                .message_response
+                .unwrap()
+            {
+                MessageResponse::ListServicesResponse(list) => list
+                    .service
+                    .into_iter()
+                    .map(|service| service.name)
+                    .collect::<Vec<_>>(),
                 other => panic!("{other:?}"),
             }
         }};
     }
+
     for names in [listed!(v1), listed!(v1alpha)] {
         for service in services {
-            assert!(names.contains(&format!("seese3.v1.{service}Service")), "{names:?}");
+            assert!(
+                names.contains(&format!("seese3.v1.{service}Service")),
+                "{names:?}"
+            );
         }
-        assert!(names.contains(&"grpc.health.v1.Health".to_owned()), "{names:?}");
+
+        assert!(
+            names.contains(&"grpc.health.v1.Health".to_owned()),
+            "{names:?}"
+        );
     }
 }
 
-/// Oracle: the definition of a deadline. The work would take minutes; the answer is DEADLINE_EXCEEDED, and the only
-/// thread is free again at once.
+/// Oracle: the definition of a deadline. The work would take minutes; the answer is
+/// DEADLINE_EXCEEDED, and the only thread is free again at once.
 #[tokio::test]
 async fn a_deadline_ends_the_work() {
-    let limits = seese3::navigation::Limits { steps: 4_000_000_000, hits: 1_000, hits_in_all: u64::MAX };
-    let server = start(Config { threads: 1, queue: 4, limits, ..Config::default() }).await;
+    let limits = seese3::navigation::Limits {
+        steps: 4_000_000_000,
+        hits: 1_000,
+        hits_in_all: u64::MAX,
+    };
+
+    let server = start(Config {
+        threads: 1,
+        queue: 4,
+        limits,
+        ..Config::default()
+    })
+    .await;
+
     let mut service = NavigationServiceClient::new(channel(&server.address).await);
-    let endless = pb::NavigateRequest { steps: Some(400_000_000), ..question() };
+
+    let endless = pb::NavigateRequest {
+        steps: Some(400_000_000),
+        ..question()
+    };
     let mut request = Request::new(endless);
-    request.metadata_mut().insert("grpc-timeout", "200m".parse().unwrap());
+    request
+        .metadata_mut()
+        .insert("grpc-timeout", "200m".parse().unwrap());
+
     let begun = Instant::now();
     let status = service.navigate(request).await.unwrap_err();
     assert_eq!(status.code(), Code::DeadlineExceeded, "{status}");
+
     server.client.navigate(question()).await.unwrap();
-    assert!(begun.elapsed() < Duration::from_secs(10), "the thread was given back");
+
+    assert!(
+        begun.elapsed() < Duration::from_secs(10),
+        "the thread was given back"
+    );
 }
 
 /// Oracle: as above, for a stream whose caller goes away.
 #[tokio::test]
 async fn a_caller_that_leaves_an_evaluation_frees_its_thread() {
-    let server = start(Config { threads: 1, queue: 4, ..Config::default() }).await;
+    let server = start(Config {
+        threads: 1,
+        queue: 4,
+        ..Config::default()
+    })
+    .await;
     let mut service = EvaluationServiceClient::new(channel(&server.address).await);
-    let request =
-        pb::EvaluateRequest { room: "synthetic".to_owned(), stride: Some(1), ..pb::EvaluateRequest::default() };
+
+    let request = pb::EvaluateRequest {
+        room: "synthetic".to_owned(),
+        stride: Some(1),
+        ..pb::EvaluateRequest::default()
+    };
+
     // Neither a caller that leaves nor one that never reads keeps the only thread.
     let mut unread = Vec::new();
     for _ in 0..3 {
-        let mut left = service.evaluate(request.clone()).await.unwrap().into_inner();
+        let mut left = service
+            .evaluate(request.clone())
+            .await
+            .unwrap()
+            .into_inner();
+
         assert!(left.message().await.unwrap().is_some());
+
         drop(left);
         unread.push(service.evaluate(request.clone()).await.unwrap());
     }
+
     let begun = Instant::now();
     server.client.navigate(question()).await.unwrap();
-    assert!(begun.elapsed() < Duration::from_secs(10), "the thread was given back");
+
+    assert!(
+        begun.elapsed() < Duration::from_secs(10),
+        "the thread was given back"
+    );
 }
 
 /// Oracle: the promise itself: the caller's id comes back, and one is made for a caller without.
@@ -151,37 +285,91 @@ async fn every_answer_carries_a_request_id() {
     let server = start(Config::default()).await;
     let mut service = NavigationServiceClient::new(channel(&server.address).await);
     let mut request = Request::new(question());
-    request.metadata_mut().insert("x-request-id", "robot-7".parse().unwrap());
-    assert_eq!(service.navigate(request).await.unwrap().metadata().get("x-request-id").unwrap(), "robot-7");
+    request
+        .metadata_mut()
+        .insert("x-request-id", "robot-7".parse().unwrap());
+
+    assert_eq!(
+        service
+            .navigate(request)
+            .await
+            .unwrap()
+            .metadata()
+            .get("x-request-id")
+            .unwrap(),
+        "robot-7"
+    );
+
     let made = service.navigate(question()).await.unwrap();
     assert_eq!(made.metadata().get("x-request-id").unwrap().len(), 16);
 }
 
-/// Oracle: the promise itself: what is in flight when the server is told to stop is answered, and the server ends;
-/// when it does not end in time, the bound does.
+/// Oracle: the promise itself: what is in flight when the server is told to stop is answered, and
+/// the server ends; when it does not end in time, the bound does.
 #[tokio::test]
 async fn stopping_answers_what_is_in_flight_within_a_bound() {
-    let limits = seese3::navigation::Limits { steps: 4_000_000_000, hits: 1_000, hits_in_all: u64::MAX };
-    let server = start(Config { limits, drain: Duration::from_secs(20), ..Config::default() }).await;
+    let limits = seese3::navigation::Limits {
+        steps: 4_000_000_000,
+        hits: 1_000,
+        hits_in_all: u64::MAX,
+    };
+
+    let server = start(Config {
+        limits,
+        drain: Duration::from_secs(20),
+        ..Config::default()
+    })
+    .await;
     let client = server.client.clone();
-    let slow = pb::NavigateRequest { steps: Some(30_000), ..question() };
+
+    let slow = pb::NavigateRequest {
+        steps: Some(30_000),
+        ..question()
+    };
     let in_flight = tokio::spawn(async move { client.navigate(slow).await });
+
     tokio::time::sleep(Duration::from_millis(30)).await;
     server.stop.send(()).unwrap();
     assert_eq!(in_flight.await.unwrap().unwrap().steps.len(), 30_000);
+
     server.ended.await.unwrap().unwrap();
 
-    let stuck = start(Config { limits, drain: Duration::from_millis(200), ..Config::default() }).await;
-    let client = Client::connect(&stuck.address, Duration::from_secs(60)).await.unwrap();
-    let endless = pb::NavigateRequest { steps: Some(400_000_000), ..question() };
+    let stuck = start(Config {
+        limits,
+        drain: Duration::from_millis(200),
+        ..Config::default()
+    })
+    .await;
+    let client = Client::connect(&stuck.address, Duration::from_secs(60))
+        .await
+        .unwrap();
+
+    let endless = pb::NavigateRequest {
+        steps: Some(400_000_000),
+        ..question()
+    };
     let in_flight = tokio::spawn(async move { client.navigate(endless).await });
+
     tokio::time::sleep(Duration::from_millis(50)).await;
     let begun = Instant::now();
     stuck.stop.send(()).unwrap();
     stuck.ended.await.unwrap().unwrap();
+
     assert!(begun.elapsed() < Duration::from_secs(5), "the bound held");
+
     let error = in_flight.await.unwrap().unwrap_err();
-    assert_eq!(error.code(), Some(Code::Unavailable), "the caller is told: {error}");
-    assert!(Client::connect(&stuck.address, Duration::from_secs(1)).await.is_err(), "nobody listens any more");
+    assert_eq!(
+        error.code(),
+        Some(Code::Unavailable),
+        "the caller is told: {error}"
+    );
+
+    assert!(
+        Client::connect(&stuck.address, Duration::from_secs(1))
+            .await
+            .is_err(),
+        "nobody listens any more"
+    );
+
     drop((server.folder, stuck.folder));
 }

@@ -7,8 +7,8 @@ use std::pin::Pin;
 
 use object_store::path::Path;
 use object_store::{
-    CopyOptions, Error, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta, ObjectStore,
-    PutMultipartOptions, PutOptions, PutPayload, PutResult, Result,
+    CopyOptions, Error, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta,
+    ObjectStore, PutMultipartOptions, PutOptions, PutPayload, PutResult, Result,
 };
 use tokio_stream::Stream;
 
@@ -24,7 +24,11 @@ pub struct Dying<S> {
 
 impl<S> Dying<S> {
     pub fn new(inner: S, survives: usize) -> Self {
-        Self { inner, survives, writes: AtomicUsize::new(0) }
+        Self {
+            inner,
+            survives,
+            writes: AtomicUsize::new(0),
+        }
     }
 }
 
@@ -35,19 +39,31 @@ impl<S> fmt::Display for Dying<S> {
 }
 
 fn killed() -> Error {
-    Error::Generic { store: "dying", source: "killed".into() }
+    Error::Generic {
+        store: "dying",
+        source: "killed".into(),
+    }
 }
 
 #[tonic::async_trait]
 impl<S: ObjectStore> ObjectStore for Dying<S> {
-    async fn put_opts(&self, location: &Path, payload: PutPayload, opts: PutOptions) -> Result<PutResult> {
+    async fn put_opts(
+        &self,
+        location: &Path,
+        payload: PutPayload,
+        opts: PutOptions,
+    ) -> Result<PutResult> {
         if self.writes.fetch_add(1, Ordering::Relaxed) >= self.survives {
             return Err(killed());
         }
         self.inner.put_opts(location, payload, opts).await
     }
 
-    async fn put_multipart_opts(&self, _: &Path, _: PutMultipartOptions) -> Result<Box<dyn MultipartUpload>> {
+    async fn put_multipart_opts(
+        &self,
+        _: &Path,
+        _: PutMultipartOptions,
+    ) -> Result<Box<dyn MultipartUpload>> {
         Err(killed())
     }
 
@@ -55,7 +71,10 @@ impl<S: ObjectStore> ObjectStore for Dying<S> {
         self.inner.get_opts(location, options).await
     }
 
-    fn delete_stream(&self, locations: BoxStream<'static, Result<Path>>) -> BoxStream<'static, Result<Path>> {
+    fn delete_stream(
+        &self,
+        locations: BoxStream<'static, Result<Path>>,
+    ) -> BoxStream<'static, Result<Path>> {
         self.inner.delete_stream(locations)
     }
 

@@ -1,4 +1,5 @@
-//! Made-up places that a camera sways in, and an adapter whose errors were measured there: what following is tested with.
+//! Made-up places that a camera sways in, and an adapter whose errors were measured there: what
+//! following is tested with.
 
 use seese3::adapter::{Adapter, Preset, TrainingRecord};
 use seese3::features::{FeatureSource, Features};
@@ -12,32 +13,49 @@ const COLUMNS: usize = 48;
 
 /// A number between -1 and 1 that depends on nothing but its place.
 fn noise(seed: u64, place: usize) -> f64 {
-    let mixed = (seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ place as u64).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    ((mixed ^ (mixed >> 29)).wrapping_mul(0x94d0_49bb_1331_11eb) >> 40) as f64 / f64::from(1 << 23) - 1.0
+    let mixed = (seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ place as u64)
+        .wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    ((mixed ^ (mixed >> 29)).wrapping_mul(0x94d0_49bb_1331_11eb) >> 40) as f64 / f64::from(1 << 23)
+        - 1.0
 }
 
-/// A made-up place: a camera that sways and comes back, and features that tell where it is, with noise, and which place
-/// it is.
+/// A made-up place: a camera that sways and comes back, and features that tell where it is, with
+/// noise, and which place it is.
 pub fn place(name: &str, seed: u64) -> (Room, Features) {
     let phase = |axis: usize| 3.0 * noise(seed, 1_000_000 + axis);
     let sway = |t: usize, axis: usize| (t as f64 / (18.0 + 3.0 * axis as f64) + phase(axis)).sin();
+
     let poses: Vec<Pose> = (0..FRAMES)
         .map(|t| {
-            let position = nalgebra::Vector3::new(0.6 * sway(t, 0), 0.1 * sway(t, 1), 0.8 * sway(t, 2));
-            let turn = nalgebra::Vector3::new(0.05 * sway(t, 3), 0.3 * sway(t, 4), 0.05 * sway(t, 5));
+            let position =
+                nalgebra::Vector3::new(0.6 * sway(t, 0), 0.1 * sway(t, 1), 0.8 * sway(t, 2));
+            let turn =
+                nalgebra::Vector3::new(0.05 * sway(t, 3), 0.3 * sway(t, 4), 0.05 * sway(t, 5));
+
             Pose::new(position, turn)
         })
         .collect();
+
     let features = ndarray::Array2::from_shape_fn((FRAMES, COLUMNS), |(row, column)| {
-        let (t, r) = (poses[row].translation.vector, poses[row].rotation.scaled_axis());
+        let t = poses[row].translation.vector;
+        let r = poses[row].rotation.scaled_axis();
         let numbers = [t.x, t.y, t.z, r.x, r.y, r.z];
         let seen: f64 = (0..6).map(|i| noise(7, column * 6 + i) * numbers[i]).sum();
+
         let which = 2.0 * noise(seed, 2_000_000 + column);
         (seen + which + 0.01 * noise(seed, row * COLUMNS + column)) as f32
     });
-    let frames = Frames { poses, ..Frames::default() };
+
+    let frames = Frames {
+        poses,
+        ..Frames::default()
+    };
     let room = Room::new(RoomId::new(name).unwrap(), frames, Provenance::default()).unwrap();
-    (room, Features::new(FeatureSource::imported("made-up", COLUMNS), features).unwrap())
+
+    (
+        room,
+        Features::new(FeatureSource::imported("made-up", COLUMNS), features).unwrap(),
+    )
 }
 
 /// The places that the adapter learned from.
@@ -50,12 +68,30 @@ pub fn calibrated() -> (Adapter, TrainingRecord) {
     let learned = [served("hall"), served("attic"), place("barn", 3)];
     let mut recipe = Recipe::of(Preset::PaperBase, Split::Whole, 10, 0);
     recipe.config.epochs = 60;
-    let lessons: Vec<Lesson<'_>> =
-        learned.iter().map(|(room, features)| Lesson { room, revision: 1, features }).collect();
+
+    let lessons: Vec<Lesson<'_>> = learned
+        .iter()
+        .map(|(room, features)| Lesson {
+            room,
+            revision: 1,
+            features,
+        })
+        .collect();
+
     let (adapter, record) = learn(&lessons, &recipe, &mut |_| ()).unwrap();
-    let others: Vec<(Room, Features)> = (10..14).map(|seed| place(&format!("other{seed}"), seed)).collect();
-    let lessons: Vec<Lesson<'_>> =
-        others.iter().map(|(room, features)| Lesson { room, revision: 1, features }).collect();
+    let others: Vec<(Room, Features)> = (10..14)
+        .map(|seed| place(&format!("other{seed}"), seed))
+        .collect();
+
+    let lessons: Vec<Lesson<'_>> = others
+        .iter()
+        .map(|(room, features)| Lesson {
+            room,
+            revision: 1,
+            features,
+        })
+        .collect();
+
     let calibration = calibrate(&adapter, &record, &lessons).unwrap();
     (adapter.with_calibration(calibration).unwrap(), record)
 }

@@ -41,8 +41,15 @@ pub struct RelativeOptions {
 
 impl RelativeOptions {
     pub fn protocol(&self) -> PathProtocol {
-        let pairs = if self.all_pairs { RpePairs::All } else { RpePairs::Consecutive };
-        PathProtocol { delta: self.delta as usize, pairs }
+        let pairs = if self.all_pairs {
+            RpePairs::All
+        } else {
+            RpePairs::Consecutive
+        };
+        PathProtocol {
+            delta: self.delta as usize,
+            pairs,
+        }
     }
 }
 
@@ -51,24 +58,38 @@ impl Trajectory {
         if let Some(path) = &self.json {
             check_writable(path)?;
         }
-        let (reference, estimate) = (read_tum_trajectory(&self.reference)?, read_tum_trajectory(&self.estimate)?);
+
+        let reference = read_tum_trajectory(&self.reference)?;
+        let estimate = read_tum_trajectory(&self.estimate)?;
         for (path, file) in [(&reference, &self.reference), (&estimate, &self.estimate)] {
             if path.is_empty() {
                 bail!("{} has no poses", file.display());
             }
         }
-        let files = || format!("{} and {}", self.reference.display(), self.estimate.display());
-        let matches = associate(&reference, &estimate, self.max_difference_ms * 1_000_000).with_context(files)?;
-        let errors = PathErrors::of(&reference, &estimate, &matches, self.relative.protocol()).with_context(files)?;
+
+        let files = || {
+            format!(
+                "{} and {}",
+                self.reference.display(),
+                self.estimate.display()
+            )
+        };
+
+        let matches = associate(&reference, &estimate, self.max_difference_ms * 1_000_000)
+            .with_context(files)?;
+        let errors = PathErrors::of(&reference, &estimate, &matches, self.relative.protocol())
+            .with_context(files)?;
         say(format_args!(
             "{} poses belong together; {} of the reference's and {} of the estimate's to none",
             errors.matched, errors.unmatched_reference, errors.unmatched_estimate
         ));
+
         say(path_errors_table(&errors).trim_end());
         if let Some(path) = &self.json {
             write_json(path, &path_errors_json(&errors))?;
             say(format_args!("wrote {}", path.display()));
         }
+
         Ok(())
     }
 }

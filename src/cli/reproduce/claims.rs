@@ -26,7 +26,10 @@ pub enum Verdict {
 impl Verdict {
     /// Confirmed when it holds everywhere, contradicted when nowhere.
     pub fn of(holds: &[bool]) -> Self {
-        match (holds.iter().all(|&held| held), holds.iter().any(|&held| held)) {
+        match (
+            holds.iter().all(|&held| held),
+            holds.iter().any(|&held| held),
+        ) {
             (true, _) => Self::Confirmed,
             (false, true) => Self::Mixed,
             (false, false) => Self::Contradicted,
@@ -45,10 +48,21 @@ impl Verdict {
 /// A line a claim.
 pub fn section(claims: &[Claim]) -> Section {
     let mut section = Section::new("The paper's claims in these rooms");
-    let mut rows = vec![["claim", "here", "what was found"].map(str::to_owned).to_vec()];
+
+    let mut rows = vec![
+        ["claim", "here", "what was found"]
+            .map(str::to_owned)
+            .to_vec(),
+    ];
+
     for claim in claims {
-        rows.push(vec![claim.claim.to_owned(), claim.verdict.word().to_owned(), claim.found.clone()]);
+        rows.push(vec![
+            claim.claim.to_owned(),
+            claim.verdict.word().to_owned(),
+            claim.found.clone(),
+        ]);
     }
+
     section.table(rows);
     section
 }

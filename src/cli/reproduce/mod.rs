@@ -35,7 +35,8 @@ pub struct Reproduce {
     /// Rooms that are held out: names, or patterns with *
     #[arg(long, required = true)]
     test: Vec<String>,
-    /// Rooms that are learned by themselves, for the tables within a room: names, or patterns with *
+    /// Rooms that are learned by themselves, for the tables within a room: names, or patterns with
+    /// *
     #[arg(long = "in-room", required = true)]
     in_room: Vec<String>,
     /// Features that all rooms have, separated by commas; weight-free ones last, as a control
@@ -69,7 +70,8 @@ type Loaded = (StoredRoom, Features);
 /// What the sections share.
 struct Setting {
     options: Reproduce,
-    /// By features, in the order given: rooms learned together, held out, and learned by themselves.
+    /// By features, in the order given: rooms learned together, held out, and learned by
+    /// themselves.
     sets: Vec<Set>,
 }
 
@@ -90,34 +92,70 @@ impl Reproduce {
         let store = Store::open(&self.store)?;
         let setting = self.loaded(&store).await?;
         let out = &setting.options.out;
-        std::fs::create_dir_all(out).with_context(|| format!("{} cannot be made", out.display()))?;
+        std::fs::create_dir_all(out)
+            .with_context(|| format!("{} cannot be made", out.display()))?;
+
         let progress = bar(9, "reproduce");
         let mut record = Map::new();
         let mut sections = vec![data(&setting)];
         let mut notes = Notes::default();
+
         let mut keep = |name: &str, (section, value): Found, record: &mut Map<String, Value>| {
             record.insert(name.to_owned(), value);
             sections.push(section);
             progress.inc(1);
         };
-        keep("probes", in_room::probes(&setting, &mut notes.claims)?, &mut record);
-        keep("strides", in_room::strides(&setting, &mut notes.claims)?, &mut record);
+        keep(
+            "probes",
+            in_room::probes(&setting, &mut notes.claims)?,
+            &mut record,
+        );
+
+        keep(
+            "strides",
+            in_room::strides(&setting, &mut notes.claims)?,
+            &mut record,
+        );
+
         keep("rooms_alone", success::section(&setting)?, &mut record);
-        keep("formulations", in_room::formulations(&setting, &mut notes.claims)?, &mut record);
-        keep("navigation", in_room::navigation(&setting, &mut notes)?, &mut record);
+
+        keep(
+            "formulations",
+            in_room::formulations(&setting, &mut notes.claims)?,
+            &mut record,
+        );
+
+        keep(
+            "navigation",
+            in_room::navigation(&setting, &mut notes)?,
+            &mut record,
+        );
+
         for found in cross::sections(&setting, &mut notes)? {
             keep(&found.0, found.1, &mut record);
         }
-        keep("pictures", pictures::section(&setting, &notes)?, &mut record);
+
+        keep(
+            "pictures",
+            pictures::section(&setting, &notes)?,
+            &mut record,
+        );
+
         keep("theory", theory()?, &mut record);
         progress.finish_and_clear();
         sections.insert(1, claims::section(&notes.claims));
         record.insert("claims".to_owned(), claims::json(&notes.claims));
+
         record.insert("adapters".to_owned(), notes.publish(&store).await?);
         sections.push(published(&notes));
         record.insert("protocol".to_owned(), setting.protocol());
         record.insert("seconds".to_owned(), json!(begun.elapsed().as_secs_f64()));
-        let document = Document { title: "SeeSE3 reproduced".to_owned(), sections };
+
+        let document = Document {
+            title: "SeeSE3 reproduced".to_owned(),
+            sections,
+        };
+
         write(&setting.options.out, &document, &Value::Object(record))
     }
 
@@ -128,15 +166,34 @@ impl Reproduce {
             let train = load_rooms(store, train, Some(features)).await?;
             let test = load_rooms(store, test, Some(features)).await?;
             let in_room = load_rooms(store, in_room, Some(features)).await?;
-            let twice = train.iter().find(|(room, _)| test.iter().any(|(other, _)| other.room.id() == room.room.id()));
+
+            let twice = train.iter().find(|(room, _)| {
+                test.iter()
+                    .any(|(other, _)| other.room.id() == room.room.id())
+            });
+
             if let Some((room, _)) = twice {
-                bail!("room '{}' is both learned from and held out", room.room.id());
+                bail!(
+                    "room '{}' is both learned from and held out",
+                    room.room.id()
+                );
             }
-            sets.push(Set { features: features.clone(), train, test, in_room });
+
+            sets.push(Set {
+                features: features.clone(),
+                train,
+                test,
+                in_room,
+            });
         }
+
         // Found out now, not when everything was learned.
         for set in &sets {
-            let rooms = set.in_room.iter().map(|(stored, _)| stored.room.id().as_str());
+            let rooms = set
+                .in_room
+                .iter()
+                .map(|(stored, _)| stored.room.id().as_str());
+
             for what in rooms.chain([cross::LONGEST_NAME]) {
                 let name = published_name(what, &set.features);
                 if !is_plain_name(&name) {
@@ -146,23 +203,46 @@ impl Reproduce {
                 }
             }
         }
+
         let rooms = sets.first().map_or(0, |set| set.train.len());
         if let Some(size) = self.sizes.iter().find(|&&size| size == 0 || size > rooms) {
             bail!("--sizes: {size} is not 1 to {rooms}, the rooms to learn from");
         }
+
         if self.aside >= rooms {
-            bail!("--aside must leave rooms to learn from: {} of {rooms}", self.aside);
+            bail!(
+                "--aside must leave rooms to learn from: {} of {rooms}",
+                self.aside
+            );
         }
-        Ok(Setting { options: self, sets })
+
+        Ok(Setting {
+            options: self,
+            sets,
+        })
     }
 }
 
 impl Setting {
     fn protocol(&self) -> Value {
-        let Reproduce { stride, strides, sizes, aside, seeds, epochs, features, .. } = &self.options;
+        let Reproduce {
+            stride,
+            strides,
+            sizes,
+            aside,
+            seeds,
+            epochs,
+            features,
+            ..
+        } = &self.options;
+
         let names = |rooms: &[Loaded]| {
-            rooms.iter().map(|(stored, _)| json!([stored.room.id().as_str(), stored.revision])).collect::<Vec<_>>()
+            rooms
+                .iter()
+                .map(|(stored, _)| json!([stored.room.id().as_str(), stored.revision]))
+                .collect::<Vec<_>>()
         };
+
         let set = &self.sets[0];
         json!({
             "features": features,
@@ -183,29 +263,74 @@ impl Setting {
 fn data(setting: &Setting) -> Section {
     let mut section = Section::new("Rooms and features");
     let set = &setting.sets[0];
-    let mut rows = vec![["rooms", "count", "frames", "recorded as"].map(str::to_owned).to_vec()];
-    for (what, rooms) in [("learned together", &set.train), ("held out", &set.test), ("learned alone", &set.in_room)] {
-        let frames: usize = rooms.iter().map(|(stored, _)| stored.room.frame_count()).sum();
-        let mut formats: Vec<&str> = rooms.iter().map(|(stored, _)| stored.room.provenance().format.as_str()).collect();
+
+    let mut rows = vec![
+        ["rooms", "count", "frames", "recorded as"]
+            .map(str::to_owned)
+            .to_vec(),
+    ];
+
+    for (what, rooms) in [
+        ("learned together", &set.train),
+        ("held out", &set.test),
+        ("learned alone", &set.in_room),
+    ] {
+        let frames: usize = rooms
+            .iter()
+            .map(|(stored, _)| stored.room.frame_count())
+            .sum();
+
+        let mut formats: Vec<&str> = rooms
+            .iter()
+            .map(|(stored, _)| stored.room.provenance().format.as_str())
+            .collect();
         formats.sort_unstable();
+
         formats.dedup();
-        rows.push(vec![what.to_owned(), rooms.len().to_string(), frames.to_string(), formats.join(", ")]);
+
+        rows.push(vec![
+            what.to_owned(),
+            rooms.len().to_string(),
+            frames.to_string(),
+            formats.join(", "),
+        ]);
     }
+
     section.table(rows);
-    let mut rows = vec![["features", "encoder", "layer", "pooling", "columns"].map(str::to_owned).to_vec()];
+
+    let mut rows = vec![
+        ["features", "encoder", "layer", "pooling", "columns"]
+            .map(str::to_owned)
+            .to_vec(),
+    ];
+
     for set in &setting.sets {
         let source = set.train[0].1.source();
-        let (layer, pooling) = (source.layer.clone(), source.pooling.clone());
-        rows.push(vec![set.features.clone(), source.encoder.clone(), layer, pooling, source.dim.to_string()]);
+        let layer = source.layer.clone();
+        let pooling = source.pooling.clone();
+
+        rows.push(vec![
+            set.features.clone(),
+            source.encoder.clone(),
+            layer,
+            pooling,
+            source.dim.to_string(),
+        ]);
     }
+
     section.table(rows);
+
     section.text(
         "None of the paper's encoders was at hand. Its numbers stand beside ours as context: encoders, rooms and sizes \
          differ, and nothing here speaks of the models that were not run.",
     );
+
     if let Some(epochs) = setting.options.epochs {
-        section.text(format!("All training was cut to {epochs} epochs: this is a trial of the command, not a result."));
+        section.text(format!(
+            "All training was cut to {epochs} epochs: this is a trial of the command, not a result."
+        ));
     }
+
     section
 }
 
@@ -218,6 +343,7 @@ fn published(notes: &Notes) -> Section {
          adapters are what `seese3 train` gives for the same room, preset and seed.",
         notes.adapters.len()
     ));
+
     section
 }
 
@@ -232,9 +358,15 @@ fn write(out: &Path, document: &Document, record: &Value) -> anyhow::Result<()> 
     for picture in document.pictures() {
         write_file(&out.join(&picture.name), &picture.bytes)?;
     }
+
     write_file(&out.join("report.md"), document.markdown("").as_bytes())?;
     write_file(&out.join("report.html"), document.html().as_bytes())?;
     write_json(&out.join("record.json"), record)?;
-    say(format_args!("wrote {0}/report.html, {0}/report.md and {0}/record.json", out.display()));
+
+    say(format_args!(
+        "wrote {0}/report.html, {0}/report.md and {0}/record.json",
+        out.display()
+    ));
+
     Ok(())
 }

@@ -35,8 +35,16 @@ impl Learned {
     pub fn new(what: &str, room: &Loaded, adapter: Adapter, record: TrainingRecord) -> Self {
         let features = &room.1;
         let rows = features.rows();
-        let golden = rows.slice(ndarray::s![..rows.nrows().min(GOLDEN), ..]).to_owned();
-        Self { name: published_name(what, &features.source().name), adapter, record, golden }
+        let golden = rows
+            .slice(ndarray::s![..rows.nrows().min(GOLDEN), ..])
+            .to_owned();
+
+        Self {
+            name: published_name(what, &features.source().name),
+            adapter,
+            record,
+            golden,
+        }
     }
 }
 
@@ -49,14 +57,27 @@ impl Notes {
     /// The adapter of `what`, if it was learned.
     pub fn adapter(&self, what: &str, features: &str) -> Option<&Adapter> {
         let name = published_name(what, features);
-        self.adapters.iter().find(|learned| learned.name == name).map(|learned| &learned.adapter)
+        self.adapters
+            .iter()
+            .find(|learned| learned.name == name)
+            .map(|learned| &learned.adapter)
     }
 
     /// Publishes the adapters: name, revision and protocol of each.
     pub async fn publish(&self, store: &Store) -> anyhow::Result<Value> {
         let mut published = Vec::with_capacity(self.adapters.len());
-        for Learned { name, adapter, record, golden } in &self.adapters {
-            let revision = store.publish_adapter(name, adapter, record, golden.view()).await?.revision;
+        for Learned {
+            name,
+            adapter,
+            record,
+            golden,
+        } in &self.adapters
+        {
+            let revision = store
+                .publish_adapter(name, adapter, record, golden.view())
+                .await?
+                .revision;
+
             published.push(json!({
                 "name": name,
                 "revision": revision,
@@ -71,6 +92,7 @@ impl Notes {
                 "calibration_rooms": record.calibrated_on.len(),
             }));
         }
+
         Ok(Value::Array(published))
     }
 }

@@ -45,31 +45,52 @@ impl Formulations {
         if let Some(file) = &self.json {
             check_writable(file)?;
         }
+
         self.protocol.needs_test_pairs()?;
         let store = Store::open(&self.store)?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
         let recipe = self.protocol.recipe(0)?;
         recipe.check()?;
+
         let lessons: Vec<Lesson<'_>> = rooms.iter().map(lesson).collect();
-        let tasks: Vec<(Formulation, u64)> =
-            Formulation::ALL.into_iter().flat_map(|which| (0..self.seeds).map(move |seed| (which, seed))).collect();
+
+        let tasks: Vec<(Formulation, u64)> = Formulation::ALL
+            .into_iter()
+            .flat_map(|which| (0..self.seeds).map(move |seed| (which, seed)))
+            .collect();
         let progress = bar(tasks.len() as u64, "formulations");
+
         let runs: Vec<(Formulation, MotionScores)> = tasks
             .into_par_iter()
             .map(|(which, seed)| {
-                let recipe = Recipe { config: TrainConfig { seed, ..recipe.config.clone() }, ..recipe.clone() };
+                let recipe = Recipe {
+                    config: TrainConfig {
+                        seed,
+                        ..recipe.config.clone()
+                    },
+                    ..recipe.clone()
+                };
+
                 let scores = self.run_of(which, &lessons, &recipe)?;
                 progress.inc(1);
+
                 Ok((which, scores))
             })
             .collect::<anyhow::Result<_>>()?;
+
         progress.finish_and_clear();
+
         let scores: Vec<FormulationScores> = Formulation::ALL
             .map(|which| FormulationScores {
                 name: which.name(),
-                runs: runs.iter().filter(|(of, _)| *of == which).map(|(_, scores)| *scores).collect(),
+                runs: runs
+                    .iter()
+                    .filter(|(of, _)| *of == which)
+                    .map(|(_, scores)| *scores)
+                    .collect(),
             })
             .to_vec();
+
         say(format_args!(
             "{}, features '{}', preset {} with {} epochs, stride {}, split {}; means over rooms ± sd over {} seeds{}; {} \
              test pairs",
@@ -83,23 +104,42 @@ impl Formulations {
             if self.pooled { ", rooms together" } else { "" },
             scores[0].runs.first().map_or(0, |run| run.n),
         ));
+
         say(formulations_table(&scores).trim_end());
         if let Some(file) = &self.json {
             write_json(file, &formulations_json(&scores))?;
             say(format_args!("wrote {}", file.display()));
         }
+
         Ok(())
     }
 
     /// Means over rooms of one seed.
-    fn run_of(&self, which: Formulation, lessons: &[Lesson<'_>], recipe: &Recipe) -> anyhow::Result<MotionScores> {
+    fn run_of(
+        &self,
+        which: Formulation,
+        lessons: &[Lesson<'_>],
+        recipe: &Recipe,
+    ) -> anyhow::Result<MotionScores> {
         if self.pooled {
-            return Ok(MotionScores::mean(&learn(which, lessons, recipe, &mut |_| ())?));
+            return Ok(MotionScores::mean(&learn(
+                which,
+                lessons,
+                recipe,
+                &mut |_| (),
+            )?));
         }
+
         let mut scores = Vec::with_capacity(lessons.len());
         for lesson in lessons {
-            scores.extend(learn(which, std::slice::from_ref(lesson), recipe, &mut |_| ())?);
+            scores.extend(learn(
+                which,
+                std::slice::from_ref(lesson),
+                recipe,
+                &mut |_| (),
+            )?);
         }
+
         Ok(MotionScores::mean(&scores))
     }
 }

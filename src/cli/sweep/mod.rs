@@ -18,7 +18,8 @@ pub struct Sweep {
 enum Over {
     /// M1 to M4 over the layers of a features set, the best by each
     Layers(layers::Layers),
-    /// Adapters over latent sizes, charts, learning rates, losses and seeds: resumable, in shards, a row a run
+    /// Adapters over latent sizes, charts, learning rates, losses and seeds: resumable, in shards,
+    /// a row a run
     Adapters(adapters::Adapters),
     /// The adapter beside the paper's alternatives A to D
     Formulations(formulations::Formulations),

@@ -3,7 +3,9 @@
 mod incoming;
 mod outgoing;
 
-pub use incoming::{exclusion, mode_of, navigators, pose, prediction, query, source, split, thresholds};
+pub use incoming::{
+    exclusion, mode_of, navigators, pose, prediction, query, source, split, thresholds,
+};
 pub use outgoing::*;
 
 /// The child frame of every pose.

@@ -14,7 +14,11 @@ use crate::room::Room;
 use crate::scores::{MotionScores, Rate};
 
 pub fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
-    pb::Vector3 { x: vector.x, y: vector.y, z: vector.z }
+    pb::Vector3 {
+        x: vector.x,
+        y: vector.y,
+        z: vector.z,
+    }
 }
 
 /// Row by row.
@@ -23,7 +27,10 @@ pub fn matrix_to_wire(matrix: &nalgebra::Matrix6<f64>) -> Vec<f64> {
 }
 
 pub fn twist_to_wire(twist: &Twist) -> pb::Twist {
-    pb::Twist { linear: Some(vector_to_wire(&twist.linear)), angular: Some(vector_to_wire(&twist.angular)) }
+    pb::Twist {
+        linear: Some(vector_to_wire(&twist.linear)),
+        angular: Some(vector_to_wire(&twist.angular)),
+    }
 }
 
 pub fn pose_to_wire(pose: &Pose, room: &str) -> pb::Pose {
@@ -32,7 +39,12 @@ pub fn pose_to_wire(pose: &Pose, room: &str) -> pb::Pose {
         parent_frame: world_frame(room),
         child_frame: CAMERA.to_owned(),
         position: Some(vector_to_wire(&pose.translation.vector)),
-        orientation: Some(pb::Quaternion { w: q.w, x: q.i, y: q.j, z: q.k }),
+        orientation: Some(pb::Quaternion {
+            w: q.w,
+            x: q.i,
+            y: q.j,
+            z: q.k,
+        }),
     }
 }
 
@@ -42,18 +54,31 @@ pub fn hit_to_wire(hit: &Hit, room: &Room) -> pb::Hit {
         frame_id: frame.0,
         distance: hit.neighbour.distance,
         pose: Some(pose_to_wire(&hit.pose, room.id().as_str())),
-        frame_name: room.frame_names().get(frame.row()).cloned().unwrap_or_default(),
+        frame_name: room
+            .frame_names()
+            .get(frame.row())
+            .cloned()
+            .unwrap_or_default(),
         timestamp_ns: room.timestamps_ns().get(frame.row()).copied(),
     }
 }
 
-pub fn step_to_wire(number: usize, step: &AnswerStep, room: &Room, thresholds: &[f64]) -> pb::NavigationStep {
+pub fn step_to_wire(
+    number: usize,
+    step: &AnswerStep,
+    room: &Room,
+    thresholds: &[f64],
+) -> pb::NavigationStep {
     pb::NavigationStep {
         step: number as u32,
         hits: step.hits.iter().map(|hit| hit_to_wire(hit, room)).collect(),
-        requested_pose: step.requested_pose.map(|pose| pose_to_wire(&pose, room.id().as_str())),
+        requested_pose: step
+            .requested_pose
+            .map(|pose| pose_to_wire(&pose, room.id().as_str())),
         error: step.error.map(|error| error_to_wire(&error, thresholds)),
-        latent: Some(pb::Latent { values: step.latent.to_vec() }),
+        latent: Some(pb::Latent {
+            values: step.latent.to_vec(),
+        }),
     }
 }
 
@@ -64,7 +89,10 @@ pub fn error_to_wire(error: &StepError, thresholds: &[f64]) -> pb::PoseError {
         twist_norm: error.twist,
         hits: thresholds
             .iter()
-            .map(|&threshold| pb::ThresholdHit { threshold, hit: error.twist < threshold })
+            .map(|&threshold| pb::ThresholdHit {
+                threshold,
+                hit: error.twist < threshold,
+            })
             .collect(),
     }
 }
@@ -72,10 +100,16 @@ pub fn error_to_wire(error: &StepError, thresholds: &[f64]) -> pb::PoseError {
 /// The ways to step that an adapter has, by name.
 pub fn navigator_names(adapter: &Adapter) -> Vec<String> {
     let has = |step: &StepKind| match step {
-        StepKind::Corrector(kind) => adapter.correctors().any(|corrector| corrector.kind() == *kind),
+        StepKind::Corrector(kind) => adapter
+            .correctors()
+            .any(|corrector| corrector.kind() == *kind),
         StepKind::InversePoincare(_) | StepKind::Refit(_) => true,
     };
-    StepKind::all().into_iter().filter(has).map(|step| step.name().to_owned()).collect()
+    StepKind::all()
+        .into_iter()
+        .filter(has)
+        .map(|step| step.name().to_owned())
+        .collect()
 }
 
 /// The navigator of a question, by name.
@@ -102,16 +136,41 @@ pub fn mode_to_wire(mode: Mode) -> pb::Mode {
 }
 
 pub fn room_revision(navigator: &ServedNavigator) -> pb::Revision {
-    pb::Revision { name: navigator.navigator.room().id().to_string(), revision: navigator.room_revision }
+    pb::Revision {
+        name: navigator.navigator.room().id().to_string(),
+        revision: navigator.room_revision,
+    }
 }
 
 pub fn adapter_revision(navigator: &ServedNavigator) -> pb::Revision {
-    pb::Revision { name: navigator.adapter.name.clone(), revision: navigator.adapter.revision }
+    pb::Revision {
+        name: navigator.adapter.name.clone(),
+        revision: navigator.adapter.revision,
+    }
 }
 
 pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
-    let FeatureSource { name, encoder, layer, base, norm, pooling, preprocess, dim } = source.clone();
-    pb::FeatureSource { name, encoder, layer, pooling, preprocess, dim: dim as u32, base, norm }
+    let FeatureSource {
+        name,
+        encoder,
+        layer,
+        base,
+        norm,
+        pooling,
+        preprocess,
+        dim,
+    } = source.clone();
+
+    pb::FeatureSource {
+        name,
+        encoder,
+        layer,
+        pooling,
+        preprocess,
+        dim: dim as u32,
+        base,
+        norm,
+    }
 }
 
 pub fn scores_to_wire(scores: &MotionScores) -> pb::MotionScores {
@@ -123,21 +182,39 @@ pub fn scores_to_wire(scores: &MotionScores) -> pb::MotionScores {
         rotation: known(scores.rotation),
         direction: known(scores.direction),
         magnitude: known(scores.magnitude),
-        still_components: if scores.n == 0 { 0 } else { scores.still_components() as u32 },
+        still_components: if scores.n == 0 {
+            0
+        } else {
+            scores.still_components() as u32
+        },
     }
 }
 
 pub fn row_to_wire(row: &Row) -> pb::NavigatorScores {
-    let RetrievalScores { top1, hits, translation_m_median, rotation_rad_median, pose_recalls, .. } = &row.retrieval;
+    let RetrievalScores {
+        top1,
+        hits,
+        translation_m_median,
+        rotation_rad_median,
+        pose_recalls,
+        ..
+    } = &row.retrieval;
+
     pb::NavigatorScores {
         name: row.name.clone(),
         n: row.n as u32,
         mse: row.latent.map(|latent| latent.mse),
-        r2: row.latent.map(|latent| latent.r2).filter(|r2| r2.is_finite()),
+        r2: row
+            .latent
+            .map(|latent| latent.r2)
+            .filter(|r2| r2.is_finite()),
         top1: Some(rate_to_wire(top1)),
         hits: hits
             .iter()
-            .map(|(threshold, rate)| pb::HitRate { threshold: *threshold, rate: Some(rate_to_wire(rate)) })
+            .map(|(threshold, rate)| pb::HitRate {
+                threshold: *threshold,
+                rate: Some(rate_to_wire(rate)),
+            })
             .collect(),
         translation_m_median: *translation_m_median,
         rotation_rad_median: *rotation_rad_median,
@@ -153,5 +230,9 @@ pub fn row_to_wire(row: &Row) -> pb::NavigatorScores {
 }
 
 fn rate_to_wire(rate: &Rate) -> pb::Rate {
-    pb::Rate { rate: rate.rate, low: rate.low, high: rate.high }
+    pb::Rate {
+        rate: rate.rate,
+        low: rate.low,
+        high: rate.high,
+    }
 }

@@ -44,32 +44,58 @@ pub struct Overtaken {
 
 impl Handlers {
     /// Answers a stream's messages until it ends, goes wrong, or the server is told to stop.
-    pub(super) async fn follow(&self, mut requests: Streaming<pb::TrackRequest>) -> Result<Answers, Status> {
+    pub(super) async fn follow(
+        &self,
+        mut requests: Streaming<pb::TrackRequest>,
+    ) -> Result<Answers, Status> {
         let snapshot = self.snapshot()?;
         let first = tokio::time::timeout(self.config.longest, requests.message()).await;
+
         let config = match first.map_err(|_| Error::Deadline)?? {
-            Some(pb::TrackRequest { message: Some(Message::Config(config)) }) => config,
-            _ => return Err(Error::invalid("config", "must be the first message of a stream").into()),
+            Some(pb::TrackRequest {
+                message: Some(Message::Config(config)),
+            }) => config,
+            _ => {
+                return Err(
+                    Error::invalid("config", "must be the first message of a stream").into(),
+                );
+            }
         };
-        let place = self.streams.clone().try_acquire_owned().map_err(|_| Error::Busy)?;
+
+        let place = self
+            .streams
+            .clone()
+            .try_acquire_owned()
+            .map_err(|_| Error::Busy)?;
+
         let key = self.config.token_key.clone();
-        let session = self.workers.run(self.config.longest, move |_| Session::open(&snapshot, config, &key)).await?;
+        let session = self
+            .workers
+            .run(self.config.longest, move |_| {
+                Session::open(&snapshot, config, &key)
+            })
+            .await?;
+
         // One waits here, one is read ahead; what is behind them waits with the sender.
         let (sender, frames) = mpsc::channel(1);
         let (answers, stream) = mpsc::channel(UNREAD);
         tokio::spawn(read(requests, sender, session.newest_wins()));
         let handlers = self.clone();
+
         let run = async move {
             let mut phase = handlers.phase.clone();
             tokio::select! {
                 () = handlers.answer_all(session, frames, &answers) => {}
                 () = told_to_stop(&mut phase) => {
-                    // The token of the last answer goes on elsewhere. A listener that does not read is not waited for.
+                    // The token of the last answer goes on elsewhere. A listener that does not read
+                    // is not waited for.
                     let _ = answers.try_send(Err(Error::Loading.into()));
                 }
             }
+
             drop(place);
         };
+
         tokio::spawn(run.instrument(tracing::Span::current()));
         Ok(Box::pin(ReceiverStream::new(stream)))
     }
@@ -83,12 +109,19 @@ impl Handlers {
         if answers.send(Ok(session.started())).await.is_err() {
             return;
         }
-        while let Some(Came { since, message, overtaken }) = frames.recv().await {
+
+        while let Some(Came {
+            since,
+            message,
+            overtaken,
+        }) = frames.recv().await
+        {
             if let Some(frames) = overtaken
                 && answers.send(Ok(session.superseded(frames))).await.is_err()
             {
                 return;
             }
+
             let answer = match message {
                 Ok(message) => match self.handled(session, message, since).await {
                     Ok((back, answer)) => {
@@ -102,6 +135,7 @@ impl Handlers {
                 },
                 Err(status) => Err(status),
             };
+
             let ends = answer.is_err();
             if answers.send(answer).await.is_err() || ends {
                 return;
@@ -122,8 +156,12 @@ impl Handlers {
                     Message::Frame(frame) => session.take(frame, since.elapsed()),
                     Message::SetInitialPose(given) => Ok(session.put(given)),
                     Message::Reset(_) => Ok(session.reset()),
-                    Message::Config(_) => Err(Error::invalid("config", "may only be the first message of a stream")),
+                    Message::Config(_) => Err(Error::invalid(
+                        "config",
+                        "may only be the first message of a stream",
+                    )),
                 };
+
                 (session, answer)
             })
             .await
@@ -133,12 +171,19 @@ impl Handlers {
 /// Completes once the server does not serve any more.
 async fn told_to_stop(phase: &mut watch::Receiver<Phase>) {
     // An error means the server is gone. The guard that is returned must not live on.
-    let _ = phase.wait_for(|phase| !matches!(phase, Phase::Serving(_))).await.map(drop);
+    let _ = phase
+        .wait_for(|phase| !matches!(phase, Phase::Serving(_)))
+        .await
+        .map(drop);
 }
 
-/// Reads messages as they come, one ahead; where the newest frame wins, further, as long as each overtakes the one before.
-/// Ends with the stream, or when nobody asks for its messages any more.
-async fn read(mut requests: Streaming<pb::TrackRequest>, sender: mpsc::Sender<Came>, newest_wins: bool) {
+/// Reads messages as they come, one ahead; where the newest frame wins, further, as long as each
+/// overtakes the one before. Ends with the stream, or when nobody asks for its messages any more.
+async fn read(
+    mut requests: Streaming<pb::TrackRequest>,
+    sender: mpsc::Sender<Came>,
+    newest_wins: bool,
+) {
     let mut waiting: Option<Came> = None;
     loop {
         let may_read = waiting.is_none() || newest_wins;
@@ -176,7 +221,9 @@ async fn read(mut requests: Streaming<pb::TrackRequest>, sender: mpsc::Sender<Ca
 
 fn message_of(next: Result<pb::TrackRequest, Status>) -> Result<Message, Status> {
     match next? {
-        pb::TrackRequest { message: Some(message) } => Ok(message),
+        pb::TrackRequest {
+            message: Some(message),
+        } => Ok(message),
         pb::TrackRequest { message: None } => {
             Err(Error::invalid("message", "is required: a frame, set_initial_pose or reset").into())
         }
@@ -185,13 +232,24 @@ fn message_of(next: Result<pb::TrackRequest, Status>) -> Result<Message, Status>
 
 /// Has a later frame take the place of one that waits; gives that one back when the other is none.
 fn overtake(before: Came, came: &mut Came) -> Option<Came> {
-    let (Ok(Message::Frame(old)), Ok(Message::Frame(new))) = (&before.message, &came.message) else {
+    let (Ok(Message::Frame(old)), Ok(Message::Frame(new))) = (&before.message, &came.message)
+    else {
         return Some(before);
     };
+
     if new.timestamp_ns <= old.timestamp_ns || new.sequence <= old.sequence {
         return Some(before);
     }
-    let frames = before.overtaken.map_or(0, |overtaken| overtaken.frames).saturating_add(1);
-    came.overtaken = Some(Overtaken { timestamp_ns: old.timestamp_ns, sequence: old.sequence, frames });
+
+    let frames = before
+        .overtaken
+        .map_or(0, |overtaken| overtaken.frames)
+        .saturating_add(1);
+    came.overtaken = Some(Overtaken {
+        timestamp_ns: old.timestamp_ns,
+        sequence: old.sequence,
+        frames,
+    });
+
     None
 }

@@ -35,19 +35,28 @@ impl TokenKey {
     /// What is wrong with it, in words.
     pub fn new(secret: &[u8]) -> Result<Self, String> {
         if secret.len() < LEAST_KEY_BYTES {
-            return Err(format!("has {} bytes; a secret has at least {LEAST_KEY_BYTES}", secret.len()));
+            return Err(format!(
+                "has {} bytes; a secret has at least {LEAST_KEY_BYTES}",
+                secret.len()
+            ));
         }
+
         Ok(Self::of(secret))
     }
 
     fn of(secret: &[u8]) -> Self {
-        // Secrets of every length become 32 bytes; the id is another hash, and gives nothing of the key away.
+        // Secrets of every length become 32 bytes; the id is another hash, and gives nothing of the
+        // key away.
         let hash = |what: &[u8]| Sha256::digest([what, secret].concat());
         let mut id = [0; KEY_ID];
         id.copy_from_slice(&hash(b"seese3 token key id ")[..KEY_ID]);
         let mut block = [0; 64];
         block[..32].copy_from_slice(&hash(b"seese3 token key "));
-        Self { mac: <Hmac<Sha256> as Mac>::new(&block.into()), id }
+
+        Self {
+            mac: <Hmac<Sha256> as Mac>::new(&block.into()),
+            id,
+        }
     }
 
     /// A key that nobody else has: its tokens end with this server.
@@ -60,7 +69,13 @@ impl TokenKey {
     /// A state as a token.
     pub fn seal(&self, state: &[u8]) -> Vec<u8> {
         let mut token = [MAGIC.as_slice(), &self.id, state].concat();
-        let seal = self.mac.clone().chain_update(&token).finalize().into_bytes();
+        let seal = self
+            .mac
+            .clone()
+            .chain_update(&token)
+            .finalize()
+            .into_bytes();
+
         token.extend_from_slice(&seal);
         token
     }
@@ -72,18 +87,31 @@ impl TokenKey {
     pub fn open<'a>(&self, field: &str, token: &'a [u8]) -> Result<&'a [u8], Error> {
         let begins = MAGIC.len() + KEY_ID;
         if token.len() < begins + SEAL || &token[..MAGIC.len()] != MAGIC {
-            return Err(Error::invalid(field, "is no resume token of this version; start without one"));
+            return Err(Error::invalid(
+                field,
+                "is no resume token of this version; start without one",
+            ));
         }
+
         if token[MAGIC.len()..begins] != self.id {
             let problem = "was sealed by a server with another key; servers that share streams share --token-key-file";
             return Err(Error::invalid(field, problem));
         }
+
         let (sealed, seal) = token.split_at(token.len() - SEAL);
+
         // In constant time.
-        let genuine = self.mac.clone().chain_update(sealed).verify_slice(seal).is_ok();
+        let genuine = self
+            .mac
+            .clone()
+            .chain_update(sealed)
+            .verify_slice(seal)
+            .is_ok();
+
         if !genuine {
             return Err(Error::invalid(field, "was altered; start without one"));
         }
+
         Ok(&sealed[begins..])
     }
 }
@@ -102,16 +130,26 @@ mod tests {
         let state = b"where the camera was".as_slice();
         let token = key().seal(state);
         assert_eq!(key().open("t", &token).unwrap(), state);
+
         for place in 0..token.len() {
             for bit in 0..8 {
                 let mut altered = token.clone();
                 altered[place] ^= 1 << bit;
-                assert!(key().open("t", &altered).is_err(), "byte {place}, bit {bit}");
+
+                assert!(
+                    key().open("t", &altered).is_err(),
+                    "byte {place}, bit {bit}"
+                );
             }
         }
+
         for length in 0..token.len() {
-            assert!(key().open("t", &token[..length]).is_err(), "cut to {length}");
+            assert!(
+                key().open("t", &token[..length]).is_err(),
+                "cut to {length}"
+            );
         }
+
         assert!(key().open("t", &[token.as_slice(), b"x"].concat()).is_err());
     }
 
@@ -119,7 +157,10 @@ mod tests {
     #[test]
     fn another_keys_token_is_refused() {
         let other = TokenKey::new(b"another secret, as long").unwrap();
-        let error = other.open("resume_token", &key().seal(b"state")).unwrap_err();
+        let error = other
+            .open("resume_token", &key().seal(b"state"))
+            .unwrap_err();
+
         assert!(format!("{error:?}").contains("another key"), "{error:?}");
         assert!(TokenKey::new(b"too short").is_err());
     }
