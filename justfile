@@ -1,25 +1,37 @@
 # `just check` is the developer's habit and all of CI.
 
-check: test lean lint doc e2e
+check: test lean lint doc hygiene e2e
 
 test:
-    cargo test --features full
+    cargo test --workspace --features full
 
-# What differs without the features: a model is answered with the line that builds them in.
+# The tests that need the folder of large inputs, SEESE3_SHARED or ../shared.
+large:
+    cargo test --workspace --features full -- --ignored
+
+# What differs without the features: a model is answered with the line that builds them in; and the server builds without
+# the laboratory.
 lean:
-    cargo test --test cli_rooms --test encoders
+    cargo test --test commands rooms::
+    cargo check --no-default-features
 
 # Formatting, warnings, protos, deployment files.
 lint:
     cargo fmt --check
-    cargo clippy --all-targets -- -D warnings
-    cargo clippy --all-targets --features full -- -D warnings
+    cargo clippy --workspace --all-targets -- -D warnings
+    cargo clippy --workspace --all-targets --features full -- -D warnings
     buf lint proto
     hadolint deploy/Dockerfile
     .ci/lint-unit
 
 doc:
-    RUSTDOCFLAGS="-D warnings" cargo doc --no-deps --features full
+    RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps --features full
+
+# Licences and sources of dependencies, dependencies that nothing uses, typing errors.
+hygiene:
+    .ci/licenses
+    cargo machete
+    typos
 
 # The demo and, where the folder of large inputs is, the real room, as a user runs them.
 e2e:

@@ -3,20 +3,27 @@
 //! With the folder of large inputs (`SEESE3_SHARED`, else `../shared`) and `--features full`;
 //! onnxruntime where ORT_DYLIB_PATH names its library. The peer of a whole room is the runtime
 //! alone on images that are ready.
+#![allow(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::too_many_lines,
+    reason = "a failed step is a failed run here, and a case may be long"
+)]
 
 use std::hint::black_box;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use seese3::cancel::Cancellation;
 use seese3::encoder::{
     Encoder, Layer, ModelTask, OnBadImage, Runtime, RuntimeKind, Task, encode_room, read_image,
     recipe,
 };
-use seese3::image::RgbImage;
-use seese3::room::Timeline;
-use seese3::studio::{Camera, SuiteRoom, render};
+use seese3_core::cancel::Cancellation;
+use seese3_core::image::RgbImage;
+use seese3_core::room::Timeline;
+use seese3_lab::studio::{Camera, SuiteRoom, render};
 
 const FRAMES: usize = 64;
 const BATCH: usize = 8;

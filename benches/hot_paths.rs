@@ -3,6 +3,13 @@
 //!
 //! No targets: each group has a simpler peer beside it, so that what is read is a ratio of the same
 //! run.
+#![allow(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::too_many_lines,
+    reason = "a failed step is a failed run here, and a case may be long"
+)]
 
 use std::hint::black_box;
 use std::sync::Arc;
@@ -11,18 +18,18 @@ use std::time::Duration;
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
-use seese3::adapter::{Adapter, Mixture, Samples, Siamese, TrainConfig, Trainer, Widths};
-use seese3::cancel::Cancellation;
-use seese3::client::Client;
-use seese3::features::{FeatureSource, Features};
-use seese3::geometry::{Twist, exp};
-use seese3::index::{ExactIndex, HnswIndex, HnswParameters, Index};
-use seese3::navigation::{
-    Displacement, FitOn, IndexKind, Limits, Metric, Mode, Navigator, Query, Reading, Source,
-    SourceAt, StepKind,
+use seese3_client::Client;
+use seese3_client::proto::v1 as pb;
+use seese3_core::adapter::{Adapter, Mixture, Samples, Siamese, TrainConfig, Trainer, Widths};
+use seese3_core::cancel::Cancellation;
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::{Twist, exp};
+use seese3_core::index::{ExactIndex, HnswIndex, HnswParameters, Index};
+use seese3_core::navigation::{
+    Displacement, FitOn, IndexKind, Limits, Mode, Navigator, Query, Reading, RetrievalMetric,
+    Source, SourceAt, StepKind,
 };
-use seese3::proto::v1 as pb;
-use seese3::room::{FrameId, Frames, Provenance, Room, RoomId};
+use seese3_core::room::{FrameId, Frames, Provenance, Room, RoomId};
 
 const DIM: usize = 768;
 
@@ -113,9 +120,9 @@ fn query(steps: u32) -> Query {
         steps,
         mode: Mode::OpenLoop,
         step: StepKind::InversePoincare(Reading::Homogeneous),
-        metric: Metric::Full,
+        metric: RetrievalMetric::Full,
         fit_on: FitOn {
-            split: seese3::pairs::Split::Time,
+            split: seese3_core::splits::Split::Time,
             stride: 40,
         },
         hit_count: 10,
@@ -300,18 +307,18 @@ async fn serve(folder: &str) -> (Client, tonic::transport::Channel) {
         .await
         .unwrap();
 
-    let record = seese3::adapter::TrainingRecord {
+    let record = seese3_core::adapter::TrainingRecord {
         preset: "bench".to_owned(),
-        split: seese3::pairs::Split::Time,
+        split: seese3_core::splits::Split::Time,
         stride: 40,
-        pairs: seese3::adapter::PairPlan::Stride(40),
+        pairs: seese3_core::adapter::PairPlan::Stride(40),
         rooms: vec![(room.id().clone(), 1)],
         calibrated_on: Vec::new(),
         config: TrainConfig::default(),
         pair_count: 100,
         room_tests: Vec::new(),
-        test: seese3::scores::MotionScores::of(&twists(9), &twists(9)),
-        train: seese3::scores::MotionScores::of(&twists(9), &twists(9)),
+        test: seese3_core::motion_scores::MotionScores::of(&twists(9), &twists(9)),
+        train: seese3_core::motion_scores::MotionScores::of(&twists(9), &twists(9)),
         train_mean_r2: 0.0,
     };
 

@@ -3,25 +3,32 @@
 //!
 //! `cargo bench --bench streams -- [STREAMS] [HZ] [SECONDS]`; 1,000 at 10 Hz for 20 s if nothing is
 //! said. Clients and server share the machine.
+#![allow(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::too_many_lines,
+    reason = "a failed step is a failed run here, and a case may be long"
+)]
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
-use seese3::adapter::{Adapter, Preset};
-use seese3::client::Client;
-use seese3::features::{FeatureSource, Features};
-use seese3::geometry::{Pose, Twist, exp};
-use seese3::pairs::Split;
-use seese3::proto::v1 as pb;
-use seese3::proto::v1::odometry_service_server::{OdometryService, OdometryServiceServer};
-use seese3::proto::v1::track_request::Message;
-use seese3::proto::v1::track_response::Answer;
-use seese3::room::{Frames, Provenance, Room, RoomId};
 use seese3::service::{Config, run};
 use seese3::store::Store;
-use seese3::training::{Lesson, Recipe, calibrate, learn};
+use seese3_client::Client;
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::odometry_service_server::{OdometryService, OdometryServiceServer};
+use seese3_client::proto::v1::track_request::Message;
+use seese3_client::proto::v1::track_response::Answer;
+use seese3_core::adapter::{Adapter, Preset};
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::{Pose, Twist, exp};
+use seese3_core::room::{Frames, Provenance, Room, RoomId};
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan, calibrate, train_adapter};
 use tokio::net::TcpListener;
 use tokio_stream::{Stream, StreamExt, wrappers::ReceiverStream};
 
@@ -72,21 +79,21 @@ fn room(name: &str, seed: u64) -> (Room, Features) {
     )
 }
 
-fn adapter(rooms: &[(Room, Features)]) -> (Adapter, seese3::adapter::TrainingRecord) {
-    let lessons: Vec<Lesson<'_>> = rooms
+fn adapter(rooms: &[(Room, Features)]) -> (Adapter, seese3_core::adapter::TrainingRecord) {
+    let room_data: Vec<RoomData<'_>> = rooms
         .iter()
-        .map(|(room, features)| Lesson {
+        .map(|(room, features)| RoomData {
             room,
             revision: 1,
             features,
         })
         .collect();
 
-    let recipe = Recipe::of(Preset::PaperBase, Split::Whole, 20, 0);
-    let (adapter, record) = learn(&lessons[..1], &recipe, &mut |_| ()).unwrap();
-    let calibration = calibrate(&adapter, &record, &lessons[1..]).unwrap();
+    let plan = TrainingPlan::of(Preset::PaperBase, Split::Whole, 20, 0);
+    let (adapter, record) = train_adapter(&room_data[..1], &plan, &mut |_| ()).unwrap();
+    let calibration = calibrate(&adapter, &record, &room_data[1..]).unwrap();
 
-    (adapter.with_calibration(calibration).unwrap(), record)
+    (adapter.with_error_model(calibration).unwrap(), record)
 }
 
 /// Answers every message with as many bytes as a tracker's answer has.

@@ -1,11 +1,11 @@
-//! The program: reads the command line, runs a command, says in one line what went wrong.
+//! The program: parses the command line, runs the command, and reports an error in one line.
 
 use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser;
 
-/// How long work that does not hear that it is over may keep the program.
+/// How long blocking work that cannot be cancelled may delay the exit.
 const LAST_WORK: Duration = Duration::from_secs(1);
 
 fn main() -> ExitCode {
@@ -20,6 +20,8 @@ fn main() -> ExitCode {
     };
 
     let result = runtime.block_on(seese3::cli::run(cli));
+
+    // Dropping the runtime would wait without limit for blocking tasks that are still running.
     runtime.shutdown_timeout(LAST_WORK);
 
     match result {

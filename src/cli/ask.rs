@@ -1,4 +1,4 @@
-//! `seese3 navigate`, `localize`, `motion` and `catalog`: questions to a running server.
+//! `seese3 navigate`, `localize`, `motion` and `catalog`: requests to a running server.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -7,38 +7,38 @@ use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 
 use super::say;
-use crate::client::Client;
 use crate::datasets::read_features;
-use crate::navigation::Mode;
-use crate::proto::v1 as pb;
+use seese3_client::Client;
+use seese3_client::proto::v1 as pb;
+use seese3_core::navigation::Mode;
 
 #[derive(Debug, Args)]
 pub struct Server {
-    /// The server, HOST:PORT
+    /// The server's address, HOST:PORT
     #[arg(long, env = "SEESE3_SERVER", default_value = "127.0.0.1:50051")]
     server: String,
-    /// The deadline of a call, seconds
+    /// Deadline of each call, seconds, 1 to 86400; streams (`track`) have none
     #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     deadline: u64,
 }
 
 impl Server {
-    /// Connects.
+    /// Connects to the server, with the deadline for every later call.
     pub async fn connect(&self) -> anyhow::Result<Client> {
         Ok(Client::connect(&self.server, Duration::from_secs(self.deadline)).await?)
     }
 }
 
-/// A row of a NumPy file of features, or an image.
+/// A view from outside the room: one row of a NumPy file of features, or an image file.
 #[derive(Debug, Args)]
 struct FeatureRow {
-    /// A JPEG or PNG file, for a server that was started with --encoder
+    /// A JPEG or PNG file; the server must have been started with --encoder
     #[arg(long, value_name = "FILE", conflicts_with_all = ["feature", "row"])]
     image: Option<PathBuf>,
-    /// A NumPy file of features, (n, d)
+    /// A NumPy file of features, shape (n, d); --row chooses one
     #[arg(long, value_name = "FILE", requires = "row")]
     feature: Option<PathBuf>,
-    /// Which row of it
+    /// The row of the --feature file, counted from 0
     #[arg(long)]
     row: Option<usize>,
 }
@@ -61,12 +61,14 @@ fn feature_view(file: &Path, row: usize) -> anyhow::Result<pb::View> {
     let features = read_features(file)?;
     if row >= features.nrows() {
         bail!(
-            "{} has {} rows, there is no row {row}",
+            "{} has {} rows; --row {row} is out of range (rows are counted from 0)",
             file.display(),
             features.nrows()
         );
     }
 
+    // A NumPy file does not say which encoder made it, so the source name stays empty and the
+    // server can only check the width.
     let feature = pb::Feature {
         values: features.row(row).to_vec(),
         source_name: String::new(),
@@ -94,53 +96,53 @@ fn frame_view(frame: u32) -> pb::View {
 pub struct Navigate {
     #[command(flatten)]
     server: Server,
-    /// The room
+    /// Name of the room to navigate in
     #[arg(long)]
     room: String,
-    /// The adapter; the newest that fits the room, if none is named
+    /// Name of the adapter; if empty, the newest one that fits the room
     #[arg(long, default_value = "")]
     adapter: String,
-    /// The frame to start from
+    /// Start at this frame of the room (its row, counted from 0)
     #[arg(long, conflicts_with_all = ["feature", "image"])]
     from: Option<u32>,
     #[command(flatten)]
     feature: FeatureRow,
-    /// The frame to go to
+    /// Go to this frame of the room: the motion is computed from the recorded poses
     #[arg(long, conflicts_with = "twist")]
     to: Option<u32>,
-    /// The motion: vx,vy,vz,wx,wy,wz in metres and radians, in the camera's frame (x right, y down,
-    /// z forward)
+    /// The motion as vx,vy,vz,wx,wy,wz (se(3) twist), metres and radians, in the body frame of the
+    /// start camera (x right, y down, z forward)
     #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
     twist: Option<Vec<f64>>,
-    /// Equal parts of the motion
+    /// Number of equal steps that the motion is divided into
     #[arg(long, default_value_t = 1)]
     steps: u32,
-    /// How the steps hang together
+    /// Where each step starts from
     #[arg(long, value_enum, default_value_t = ModeName::OpenLoop)]
     mode: ModeName,
-    /// How the training motions' mean and deviation enter the inverse; homogeneous if nothing is
-    /// given
+    /// How the mean μ and deviation σ of the training motions enter the inverse of W; the server
+    /// takes homogeneous if neither this nor --navigator is given
     #[arg(long, value_enum, conflicts_with = "navigator")]
     reading: Option<ReadingName>,
-    /// How to step, by name, instead of inverse Poincaré: corrector-mlp-3, ridge-refit,
-    /// inverse-poincare-affine+motion, …
+    /// Navigator by name, instead of inverse Poincaré: corrector-mlp-3, ridge-refit,
+    /// inverse-poincare-affine+motion, …; if empty, inverse Poincaré in the given --reading
     #[arg(long, default_value = "")]
     navigator: String,
-    /// Frames for each step
+    /// Number of nearest frames returned for each step
     #[arg(long, default_value_t = 1)]
     hits: u32,
-    /// The frame that a step starts from may not be retrieved
+    /// Never retrieve the frame that a step starts from
     #[arg(long)]
     exclude_source: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum ModeName {
-    /// Steps are added up in latent space
+    /// All steps are added up in latent space, without feedback
     OpenLoop,
-    /// Each step starts from the retrieved frame
+    /// Each step starts from the frame that the previous step retrieved
     Snap,
-    /// As snap, with the rest of the way planned anew
+    /// As snap, and the remaining motion to the goal is replanned from the retrieved frame's pose
     ClosedLoop,
 }
 
@@ -165,6 +167,8 @@ impl Navigate {
     pub async fn run(self) -> anyhow::Result<()> {
         use pb::displacement::Displacement;
 
+        // A navigation starts from exactly one view. Clap refuses two of them together; here it
+        // remains to check that there is one.
         let source = match (self.from, self.feature.view()?) {
             (Some(frame), _) => frame_view(frame),
             (None, Some(view)) => view,
@@ -185,6 +189,8 @@ impl Navigate {
             ModeName::ClosedLoop => pb::Mode::ClosedLoop,
         };
 
+        // An unspecified reading leaves the choice to the server: homogeneous, unless --navigator
+        // already names one.
         let reading = match self.reading {
             None => pb::Reading::Unspecified,
             Some(ReadingName::Affine) => pb::Reading::Affine,
@@ -192,6 +198,8 @@ impl Navigate {
             Some(ReadingName::Literal) => pb::Reading::Literal,
         };
 
+        // Fields left at their defaults are filled in by the server, the thresholds of Hit@ε
+        // among them.
         let request = pb::NavigateRequest {
             room: self.room,
             adapter: self.adapter,
@@ -230,7 +238,8 @@ fn twist(numbers: &[f64]) -> anyhow::Result<pb::Twist> {
     })
 }
 
-/// Prints the steps of a navigation.
+/// Prints a navigation: the revisions used, the whole motion, and each step's nearest frames. Also
+/// used by `seese3 demo`.
 pub fn say_navigation(answer: &pb::NavigateResponse) {
     let room = revision(answer.room.as_ref());
     let adapter = revision(answer.adapter.as_ref());
@@ -244,6 +253,8 @@ pub fn say_navigation(answer: &pb::NavigateResponse) {
     }
 
     for step in &answer.steps {
+        // The best hit carries the step's number and its pose error; the other hits are listed
+        // below it.
         for (rank, hit) in step.hits.iter().enumerate() {
             let label = if rank == 0 {
                 format!("step {}", step.step)
@@ -274,6 +285,8 @@ fn error_text(error: &pb::PoseError) -> String {
         })
         .collect();
 
+    // ‖Δ‖ is the norm of the difference between the wanted and the retrieved motion, metres and
+    // radians mixed: what Hit@ε compares with ε.
     format!(
         "  error {:.3} m {:.2}°, ‖Δ‖ {:.3} ({})",
         error.translation_m,
@@ -314,18 +327,20 @@ fn revision(revision: Option<&pb::Revision>) -> String {
 pub struct Localize {
     #[command(flatten)]
     server: Server,
-    /// A room to look in; all if none is named; may be given several times
+    /// A room to search; all rooms that the adapter fits if none is named; may be given several
+    /// times
     #[arg(long = "room")]
     rooms: Vec<String>,
-    /// The adapter; needed when several fit
+    /// Name of the adapter; may be omitted when only one fits all the rooms
     #[arg(long, default_value = "")]
     adapter: String,
-    /// A frame of the one room that is named
+    /// Use this frame as the view; exactly one --room must be given, and the frame is one of its
+    /// rows
     #[arg(long, conflicts_with_all = ["feature", "image"])]
     frame: Option<u32>,
     #[command(flatten)]
     feature: FeatureRow,
-    /// Places in all
+    /// Number of frames returned, over all rooms, best first
     #[arg(long, default_value_t = 5)]
     hits: u32,
 }
@@ -355,11 +370,12 @@ impl Localize {
             answer.room_count
         ));
 
+        // Only a view that is itself a frame of the room has a recorded pose, and hence an error.
         for place in &answer.places {
             let hit = place
                 .hit
                 .as_ref()
-                .context("the server sent a place without a hit")?;
+                .context("the server's answer has a place without a frame")?;
             say(format_args!(
                 "{}{}",
                 hit_text(hit),
@@ -375,13 +391,13 @@ impl Localize {
 pub struct Motion {
     #[command(flatten)]
     server: Server,
-    /// The adapter; may be left out when a room is named or the server has only one
+    /// Name of the adapter; may be omitted when a room is named or the server has only one adapter
     #[arg(long, default_value = "")]
     adapter: String,
-    /// The room of the frames
+    /// Name of the room that --frames belong to
     #[arg(long, default_value = "")]
     room: String,
-    /// Two frames of the room, A,B
+    /// Two frames of the room, A,B (rows, counted from 0); the motion is from A to B
     #[arg(
         long,
         value_delimiter = ',',
@@ -389,19 +405,21 @@ pub struct Motion {
         conflicts_with = "features"
     )]
     frames: Option<Vec<u32>>,
-    /// Two JPEG or PNG files, A,B, for a server that was started with --encoder
+    /// Two JPEG or PNG files, A,B; the server must have been started with --encoder
     #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "features"])]
     images: Option<Vec<PathBuf>>,
-    /// A NumPy file of features, (n, d)
+    /// A NumPy file of features, shape (n, d); --rows chooses two
     #[arg(long, value_name = "FILE", requires = "rows")]
     features: Option<PathBuf>,
-    /// Two rows of that file, A,B
+    /// Two rows of the --features file, A,B, counted from 0
     #[arg(long, value_delimiter = ',', value_name = "A,B")]
     rows: Option<Vec<usize>>,
 }
 
 impl Motion {
     pub async fn run(self) -> anyhow::Result<()> {
+        // Both views come from one kind of input: frames of a room, rows of a feature file, or
+        // image files.
         let (first, second) = match (self.frames.as_deref(), &self.features, self.rows.as_deref()) {
             (Some(&[a, b]), _, _) => (frame_view(a), frame_view(b)),
             (None, Some(file), Some(&[a, b])) => (feature_view(file, a)?, feature_view(file, b)?),
@@ -440,6 +458,8 @@ impl Motion {
             motion_text(motion)
         ));
 
+        // The true motion is only known when both views are frames of the room, whose poses were
+        // recorded.
         if let (Some(truth), Some(error)) = (&answer.true_motion, &answer.error) {
             say(format_args!(
                 "truth  {}{}",
@@ -478,6 +498,8 @@ impl Catalog {
         }
 
         for adapter in client.adapters().await? {
+            // An adapter trained with --split whole has no test pairs, so its test R² is
+            // undefined.
             let r2 = adapter
                 .test
                 .and_then(|test| test.overall)

@@ -1,7 +1,6 @@
-//! `seese3 cross-room`: learn from some rooms, navigate in others.
+//! `seese3 cross-room`: train on some rooms, navigate zero-shot in others.
 
 use std::path::PathBuf;
-use std::sync::Arc;
 
 use anyhow::{Context, bail};
 use clap::Args;
@@ -10,68 +9,75 @@ use super::ask::ModeName;
 use super::evaluate::navigators_named;
 use super::progress::bar;
 use super::protocol::{ProtocolOptions, SplitName};
-use super::rooms::{lesson, load_rooms, room_words};
+use super::rooms::{data, load_rooms, room_words};
 use super::{check_writable, say, write_json};
-use crate::adapter::{Adapter, Reading, TrainConfig, TrainingRecord};
-use crate::eval::{NavigatorKind, Protocol, check_thresholds};
-use crate::features::Features;
-use crate::generalisation::{nested_choice, outcomes};
-use crate::navigation::{Metric, Refit, StepKind};
-use crate::pairs::Split;
-use crate::report::{CrossRoomRun, cross_room_json, cross_room_table, rooms_table, scaling_table};
 use crate::store::{Store, StoredRoom};
-use crate::training::{Lesson, Recipe, error_covariance, learn};
+use seese3_core::adapter::Reading;
+use seese3_core::eval::{Protocol, check_thresholds};
+use seese3_core::features::Features;
+use seese3_core::navigation::NavigatorKind;
+use seese3_core::navigation::{Refit, RetrievalMetric, StepKind};
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan};
+use seese3_lab::experiments::cross_room::{
+    CrossRoomPlan, CrossRoomProgress, CrossRoomRun, nested_choice, train_and_test,
+};
+use seese3_lab::report::{cross_room_json, cross_room_table, rooms_table, scaling_table};
 
 #[derive(Debug, Args)]
 pub struct CrossRoom {
-    /// The store
+    /// The store: a folder, or a bucket by its URL
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// Rooms to learn from: names, or patterns with *
+    /// Training rooms: names, or patterns with *; may be given several times
     #[arg(long, required = true)]
     train: Vec<String>,
-    /// Rooms that are held out: names, or patterns with *
+    /// Held-out rooms to evaluate in: names, or patterns with *; may be given several times
     #[arg(long, required = true)]
     test: Vec<String>,
-    /// Which of their features; may be left out when the first room has one
+    /// Name of the feature set, the same for every room; may be omitted when the first training
+    /// room has only one
     #[arg(long)]
     features: Option<String>,
-    /// How many rooms to take, those kept aside among them, separated by commas: the scaling curve;
-    /// all of them if nothing is given
+    /// Room counts of the scaling curve, separated by commas; each count includes the --calibration-rooms
+    /// rooms. All rooms of --train if omitted
     #[arg(long, value_delimiter = ',')]
     sizes: Vec<usize>,
-    /// Of the rooms to learn from, so many are kept aside to measure the adapter's errors in, for
-    /// +calibrated
-    #[arg(long, default_value_t = 0)]
-    aside: usize,
-    /// Adapters of each size, from --seed on
+    /// Number of rooms, out of each count, that are not trained on but used to measure the
+    /// adapter's errors for +calibrated navigators
+    #[arg(long, alias = "aside", default_value_t = 0)]
+    calibration_rooms: usize,
+    /// Number of adapters trained per room count, with seeds --seed, --seed + 1, …; 1 to 1000
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000))]
     seeds: u64,
-    /// Of weights, order and drawn pairs, and of which rooms a smaller size takes
+    /// First seed, at most 1000000: decides initial weights, drawn pairs and their order, and which
+    /// rooms each count takes
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=1_000_000))]
     seed: u64,
     #[command(flatten)]
     protocol: ProtocolOptions,
-    /// Which frames of a held-out room are asked for and looked among
+    /// Split of the held-out rooms: which pairs are tested, and among which frames answers are
+    /// searched
     #[arg(long, value_enum, default_value_t = SplitName::Whole)]
     test_split: SplitName,
-    /// Navigators by name, separated by commas; identity, inverse Poincaré and ridge-refits if
-    /// nothing is given
+    /// Navigators by name, separated by commas; if omitted: identity, inverse Poincaré (affine and
+    /// homogeneous; with --calibration-rooms also +calibrated) and the ridge refits that the test split allows
     #[arg(long, value_delimiter = ',')]
     navigators: Vec<String>,
-    /// The navigator that others are compared with
+    /// Navigator that the others' Hit@ε is compared with
     #[arg(long, default_value = "inverse-poincare-affine")]
     baseline: String,
-    /// ε of Hit@ε
+    /// ε of Hit@ε: the largest ‖ΔP_target − ΔP_retrieved‖ that counts as a hit, metres and radians
+    /// mixed
     #[arg(long, default_value_t = 0.1)]
     threshold: f64,
-    /// The source frame may not be retrieved
+    /// Never retrieve the source frame
     #[arg(long)]
     exclude_source: bool,
-    /// Show every room
+    /// Also print a table with one line per held-out room
     #[arg(long)]
     rooms: bool,
-    /// Write all of it here as JSON
+    /// Write all runs, with scores by room, to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
@@ -79,6 +85,10 @@ pub struct CrossRoom {
 type Loaded = (StoredRoom, Features);
 
 impl CrossRoom {
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one command, from its arguments to what it prints"
+    )]
     pub async fn run(self) -> anyhow::Result<()> {
         if let Some(file) = &self.json {
             check_writable(file)?;
@@ -87,51 +97,65 @@ impl CrossRoom {
         let store = Store::open(&self.store)?;
         let train = load_rooms(&store, &self.train, self.features.as_deref()).await?;
         let source = train[0].1.source().name.clone();
+
+        // All rooms are loaded with one feature set, that of the first training room: an adapter
+        // only fits the features it was trained on.
         let test = load_rooms(&store, &self.test, Some(&source)).await?;
         let shared = |(room, _): &&Loaded| {
             test.iter()
                 .any(|(other, _)| other.room.id() == room.room.id())
         };
 
+        // A room on both sides would turn zero-shot transfer into memorisation.
         if let Some((room, _)) = train.iter().find(shared) {
             bail!(
-                "room '{}' is both learned from and held out",
+                "room '{}' is both learned from and held out; leave it out of one",
                 room.room.id()
             );
         }
 
+        // Everything that can be refused is checked before the first adapter is trained.
         let sizes = self.sizes(train.len())?;
         let protocol = self.test_protocol()?;
         check_thresholds(&protocol.thresholds)?;
-        let recipe = self.protocol.recipe(self.seed)?;
+        let plan = self.protocol.plan(self.seed)?;
         let progress = bar(
-            (sizes.len() as u64) * self.seeds * (recipe.config.epochs + test.len()) as u64,
+            (sizes.len() as u64) * self.seeds * (plan.config.epochs + test.len()) as u64,
             "rooms",
         );
 
+        let held_out: Vec<RoomData<'_>> = test.iter().map(data).collect();
         let mut runs = Vec::new();
         for &size in &sizes {
             for seed in self.seed..self.seed + self.seeds {
-                let chosen = nested_choice(size, train.len(), seed);
-                let chosen: Vec<&Loaded> = chosen.into_iter().map(|room| &train[room]).collect();
+                // With one seed, the rooms of a smaller count are among those of a larger one, so
+                // that the curve shows the effect of adding rooms.
+                let chosen: Vec<RoomData<'_>> = nested_choice(size, train.len(), seed)
+                    .into_iter()
+                    .map(|room| data(&train[room]))
+                    .collect();
 
-                let recipe = Recipe {
-                    config: TrainConfig {
-                        seed,
-                        ..recipe.config.clone()
+                let result = train_and_test(
+                    &chosen,
+                    &held_out,
+                    &CrossRoomPlan {
+                        training: &plan.with_seed(seed),
+                        calibration_rooms: self.calibration_rooms,
+                        protocol: &protocol,
                     },
-                    ..recipe.clone()
-                };
-
-                let (adapter, record) = self.learned(&chosen, &recipe, &|| progress.inc(1))?;
-                let lessons: Vec<Lesson<'_>> = test.iter().map(lesson).collect();
-                let found = outcomes(&Arc::new(adapter), &lessons, &protocol, &|| progress.inc(1));
-                runs.push(run_of(found, &record, seed));
+                    &CrossRoomProgress {
+                        epoch: &|| progress.inc(1),
+                        room: &|| progress.inc(1),
+                    },
+                )?;
+                runs.push(result.run);
             }
         }
 
         progress.finish_and_clear();
 
+        // Some held-out rooms may be skipped, for instance as too short for the stride. A run
+        // that skipped all of them has nothing to report.
         if let Some((room, why)) = runs
             .iter()
             .find(|run| run.outcomes.is_empty())
@@ -140,17 +164,18 @@ impl CrossRoom {
             bail!("no held-out room could be evaluated; room '{room}': {why}");
         }
 
-        self.say(&train, &test, &recipe, &runs)?;
+        self.say(&train, &test, &plan, &runs)?;
 
+        // The protocol is written beside the scores, which mean little without it.
         if let Some(file) = &self.json {
             let mut record = cross_room_json(&runs, &self.baseline);
             record["features"] = source.into();
-            record["stride"] = recipe.stride.into();
-            record["preset"] = recipe.preset.name().into();
+            record["stride"] = plan.stride.into();
+            record["preset"] = plan.preset.name().into();
 
-            record["epochs"] = recipe.config.epochs.into();
-            record["learning_rate"] = recipe.config.learning_rate.into();
-            record["split"] = recipe.split.name().into();
+            record["epochs"] = plan.config.epochs.into();
+            record["learning_rate"] = plan.config.learning_rate.into();
+            record["split"] = plan.split.name().into();
             record["source_excluded"] = self.exclude_source.into();
 
             record["test_split"] = protocol.split.name().into();
@@ -169,11 +194,13 @@ impl CrossRoom {
             self.sizes.clone()
         };
 
+        // A count includes the calibration rooms, and at least one room has to be left for
+        // training.
         for &size in &sizes {
-            if size <= self.aside || size > rooms {
+            if size <= self.calibration_rooms || size > rooms {
                 bail!(
-                    "of {size} rooms (--sizes, or all) {} are kept aside: sizes must be over --aside and at most {rooms}",
-                    self.aside
+                    "--sizes: {size} rooms must be more than --calibration-rooms, {}, and at most {rooms}",
+                    self.calibration_rooms
                 );
             }
         }
@@ -182,7 +209,7 @@ impl CrossRoom {
     }
 
     fn test_protocol(&self) -> anyhow::Result<Protocol> {
-        let full = |step: StepKind| NavigatorKind::Step(step, Metric::Full);
+        let full = |step: StepKind| NavigatorKind::Step(step, RetrievalMetric::Full);
         let refit = |in_sample: bool| {
             full(StepKind::Refit(Refit {
                 z_scored: false,
@@ -191,22 +218,27 @@ impl CrossRoom {
             }))
         };
 
-        let inverse = |reading: Reading, metric: Metric| {
+        let inverse = |reading: Reading, metric: RetrievalMetric| {
             NavigatorKind::Step(StepKind::InversePoincare(reading), metric)
         };
 
+        // The default table: the baseline that stays where it is, inverse Poincaré, and the
+        // refits that the test split can fit.
         let mut navigators = navigators_named(&self.navigators)?;
         if navigators.is_empty() {
             navigators = vec![NavigatorKind::Identity];
 
             navigators.extend(
                 [Reading::Affine, Reading::Homogeneous]
-                    .map(|reading| inverse(reading, Metric::Full)),
+                    .map(|reading| inverse(reading, RetrievalMetric::Full)),
             );
 
-            if self.aside > 0 {
-                navigators.push(inverse(Reading::Homogeneous, Metric::Calibrated));
+            if self.calibration_rooms > 0 {
+                navigators.push(inverse(Reading::Homogeneous, RetrievalMetric::Calibrated));
             }
+
+            // A refit is fitted on training pairs of the held-out room, which the split `whole`
+            // does not set apart. The in-sample refit takes the test pairs instead.
             if self.test_split != SplitName::Whole {
                 navigators.push(refit(false));
             }
@@ -214,14 +246,18 @@ impl CrossRoom {
             navigators.push(refit(true));
         }
 
+        // Refuse what no held-out room could answer; otherwise every room would be skipped after
+        // the training.
         for kind in &navigators {
             match kind {
                 NavigatorKind::Step(StepKind::Corrector(_), _) => {
-                    bail!("--navigators: no correctors are trained here")
+                    bail!("--navigators: this command trains no correctors; leave them out")
                 }
-                NavigatorKind::Step(_, Metric::Calibrated) if self.aside == 0 => {
+                NavigatorKind::Step(_, RetrievalMetric::Calibrated)
+                    if self.calibration_rooms == 0 =>
+                {
                     bail!(
-                        "--navigators: '{}' needs rooms to measure errors in; give --aside",
+                        "--navigators: '{}' needs calibration rooms; give --calibration-rooms N",
                         kind.name()
                     );
                 }
@@ -229,7 +265,7 @@ impl CrossRoom {
                     if !refit.in_sample && self.test_split == SplitName::Whole =>
                 {
                     bail!(
-                        "--navigators: '{}' has nothing to be fitted on under --test-split whole",
+                        "--navigators: '{}' has no pairs to be fitted on under --test-split whole",
                         kind.name()
                     );
                 }
@@ -245,53 +281,31 @@ impl CrossRoom {
             )
         })?;
 
+        // The tables need both rows: wins are counted against Identity, differences against the
+        // baseline.
         for needed in [NavigatorKind::Identity, baseline] {
             if !navigators.contains(&needed) {
                 navigators.push(needed);
             }
         }
 
+        // Each test motion is taken in a single open-loop step, as in the paper.
         Ok(Protocol {
             split: self.test_split.into(),
             thresholds: vec![self.threshold],
+            // Radius 0: only the source frame itself is excluded, not its neighbours in time.
             exclude_source: self.exclude_source.then_some(0),
             mode: ModeName::OpenLoop.into(),
             navigators,
-            ..Protocol::paper(self.protocol.recipe(self.seed)?.stride)
+            ..Protocol::paper(self.protocol.plan(self.seed)?.stride)
         })
-    }
-
-    /// An adapter of all rooms but the last ones, which its errors are measured in.
-    fn learned(
-        &self,
-        rooms: &[&Loaded],
-        recipe: &Recipe,
-        epoch: &dyn Fn(),
-    ) -> anyhow::Result<(Adapter, TrainingRecord)> {
-        let (learned, aside) = rooms.split_at(rooms.len() - self.aside);
-        let learned: Vec<Lesson<'_>> = learned.iter().map(|room| lesson(room)).collect();
-        let aside: Vec<Lesson<'_>> = aside.iter().map(|room| lesson(room)).collect();
-        let (mut adapter, mut record) = learn(&learned, recipe, &mut |_| epoch())?;
-
-        if !aside.is_empty() {
-            adapter = adapter
-                .clone()
-                .with_error_covariance(error_covariance(&adapter, &record, &aside)?)?;
-
-            record.calibrated_on = aside
-                .iter()
-                .map(|lesson| (lesson.room.id().clone(), lesson.revision))
-                .collect();
-        }
-
-        Ok((adapter, record))
     }
 
     fn say(
         &self,
         train: &[Loaded],
         test: &[Loaded],
-        recipe: &Recipe,
+        plan: &TrainingPlan,
         runs: &[CrossRoomRun],
     ) -> anyhow::Result<()> {
         say(format_args!(
@@ -299,11 +313,11 @@ impl CrossRoom {
              {}, source {}",
             room_words(train),
             train[0].1.source().name,
-            recipe.preset.name(),
-            recipe.config.epochs,
-            recipe.split,
+            plan.preset.name(),
+            plan.config.epochs,
+            plan.split,
             room_words(test),
-            recipe.stride,
+            plan.stride,
             Split::from(self.test_split),
             if self.exclude_source {
                 "excluded"
@@ -318,15 +332,17 @@ impl CrossRoom {
             }
         }
 
+        // With several room counts or seeds, the scaling curve comes first: one line per run.
         if runs.len() > 1 {
             say(scaling_table(runs, &self.baseline, self.threshold).trim_end());
         }
 
+        // Only the last run is printed by navigator and by room; the JSON file has every run.
         let last = runs.last().context("no run")?;
         say(format_args!(
-            "the last run: {} rooms learned from, {} to measure errors in, seed {}:",
-            last.learned.len(),
-            last.aside.len(),
+            "the last run: {} training rooms, {} calibration rooms, seed {}:",
+            last.training_rooms.len(),
+            last.calibration_rooms.len(),
             last.seed
         ));
 
@@ -336,37 +352,5 @@ impl CrossRoom {
         }
 
         Ok(())
-    }
-}
-
-fn names(rooms: &[(crate::room::RoomId, u64)]) -> Vec<String> {
-    rooms.iter().map(|(room, _)| room.to_string()).collect()
-}
-
-fn run_of(
-    found: Vec<
-        Result<
-            crate::generalisation::RoomOutcome,
-            (crate::room::RoomId, crate::generalisation::Error),
-        >,
-    >,
-    record: &TrainingRecord,
-    seed: u64,
-) -> CrossRoomRun {
-    let mut evaluated = Vec::new();
-    let mut skipped = Vec::new();
-    for outcome in found {
-        match outcome {
-            Ok(outcome) => evaluated.push(outcome),
-            Err((room, why)) => skipped.push((room.to_string(), why.to_string())),
-        }
-    }
-
-    CrossRoomRun {
-        learned: names(&record.rooms),
-        aside: names(&record.calibrated_on),
-        seed,
-        outcomes: evaluated,
-        skipped,
     }
 }

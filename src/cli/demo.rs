@@ -1,4 +1,4 @@
-//! `seese3 demo`: the whole idea in one command, on a room that is drawn on the spot.
+//! `seese3 demo`: the whole pipeline in one command, on a room that is rendered on the spot.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,47 +12,55 @@ use tokio::net::TcpListener;
 
 use super::ask::say_navigation;
 use super::progress::bar;
-use super::train::{default_name, say_published, train_seeds};
+use super::train::{default_name, say_published, train_with_progress};
 use super::{say, write_file};
-use crate::adapter::{Adapter, Preset};
-use crate::cancel::Cancellation;
-use crate::client::Client;
 use crate::encoder::{BUILTIN_DIM, builtin_source, encode_builtin};
-use crate::eval::{NavigatorKind, Protocol, evaluate};
-use crate::features::Features;
-use crate::navigation::{IndexKind, Navigator, StepKind};
-use crate::pairs::Split;
-use crate::proto::v1 as pb;
-use crate::report::{PathPlot, evaluation_table, path_svg, training_table};
-use crate::room::{Frames, Provenance, Room, RoomId, Timeline};
 use crate::service;
 use crate::store::{Store, StoredRoom};
-use crate::studio::{Camera, Scene, camera_path, render};
-use crate::training::Recipe;
+use seese3_client::proto::v1 as pb;
+use seese3_client::{Client, convert};
+use seese3_core::adapter::{Adapter, Preset};
+use seese3_core::cancel::Cancellation;
+use seese3_core::eval::{Protocol, evaluate};
+use seese3_core::features::Features;
+use seese3_core::navigation::NavigatorKind;
+use seese3_core::navigation::{IndexKind, Navigator, StepKind};
+use seese3_core::room::{Frames, Provenance, Room, RoomId, Timeline};
+use seese3_core::splits::Split;
+use seese3_core::training::TrainingPlan;
+use seese3_lab::experiments::seeds::SeededTraining;
+use seese3_lab::report::{PathPlot, evaluation_table, path_svg, training_table};
+use seese3_lab::studio::{Camera, Scene, camera_path, render};
 
 const ROOM: &str = "studio";
 const FEATURES: &str = "builtin";
 const STRIDE: u32 = 40;
 const STEPS: u32 = 4;
-/// How often the server is asked before it is given up, every 50 ms.
+/// How many times the server is asked, 50 ms apart, while it loads its store: 60 s in all.
 const LOADING_POLLS: u32 = 1_200;
 const MOST_FRAMES: usize = 100_000;
 
 #[derive(Debug, Args)]
 pub struct Demo {
-    /// Where the store and the picture are written
+    /// Folder that the store and the picture are written to; created if it does not exist
     #[arg(long, default_value = "demo-output")]
     out: PathBuf,
-    /// Of the room, the camera's path and the training
+    /// Seed of the room, the camera path and the training, 0 to 2³² − 1
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
-    /// Images to draw
+    /// Number of images to render, at most 100000
     #[arg(long, default_value_t = 2_000)]
     frames: usize,
 }
 
 impl Demo {
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one command, from its arguments to what it prints"
+    )]
     pub async fn run(self) -> anyhow::Result<()> {
+        // The last 20 % of the path must hold at least one test pair. A path too short for that
+        // would only fail after rendering and training.
         Split::Time
             .test_pairs(&Timeline::unbroken(self.frames), STRIDE)
             .context("--frames")?;
@@ -66,6 +74,8 @@ impl Demo {
 
         let store_path = self.out.join("store");
         let location = store_path.to_str().context("--out is not valid UTF-8")?;
+
+        // Creating the store first lets an unusable --out fail before anything is rendered.
         let store = Store::create(location)?;
 
         say(format_args!(
@@ -83,8 +93,10 @@ impl Demo {
         ));
 
         say("2. Training a Poincaré adapter on the first 80 % of the path (preset paper-range)");
-        let recipe = Recipe::of(Preset::PaperRange, Split::Time, STRIDE, self.seed);
+        let plan = TrainingPlan::of(Preset::PaperRange, Split::Time, STRIDE, self.seed);
 
+        // `train_seeds` takes rooms as the store returns them. This one is put together from what
+        // was just published, instead of being loaded again.
         let stored = StoredRoom {
             room,
             revision: published.revision,
@@ -93,9 +105,9 @@ impl Demo {
         };
         let rooms = [(stored, features)];
 
-        let (adapter, runs) = train_seeds(&rooms, &recipe, 1)?;
+        let SeededTraining { adapter, runs } = train_with_progress(&rooms, &plan, 1)?;
         say(training_table(&runs).trim_end());
-        let name = default_name(&rooms, &recipe);
+        let name = default_name(&rooms, &plan);
         let adapter_published = store
             .publish_adapter(&name, &adapter, &runs[0].record, rooms[0].1.rows())
             .await?;
@@ -105,6 +117,7 @@ impl Demo {
             "3. Navigating the last 20 %, which the adapter never saw, {STRIDE} frames ahead"
         ));
 
+        // The adapter was trained on the first 80 % of the path; the table scores it on the rest.
         let [(stored, features)] = rooms;
         let room = Arc::new(stored.room);
         say(score(&room, &features, adapter)?.trim_end());
@@ -118,6 +131,7 @@ impl Demo {
 
         say("Files written:");
 
+        // Listing the files shows what a store consists of.
         for folder in [
             store_path.join("rooms").join(ROOM),
             store_path.join("adapters").join(&name),
@@ -146,12 +160,14 @@ impl Demo {
     }
 }
 
-/// A room of the studio and its features by the built-in encoder.
+/// Renders a room along a camera path and encodes every image with the built-in encoder.
 fn draw(frame_count: usize, seed: u64) -> anyhow::Result<(Room, Features)> {
     let scene = Scene::new(seed);
     let poses = camera_path(&scene, frame_count, seed);
     let progress = bar(frame_count as u64, "drawing");
 
+    // Every image is encoded as soon as it is rendered and then dropped, so that memory holds
+    // features only.
     let rows: Vec<Vec<f32>> = poses
         .par_iter()
         .map(|pose| {
@@ -184,6 +200,9 @@ fn draw(frame_count: usize, seed: u64) -> anyhow::Result<(Room, Features)> {
 
 fn score(room: &Arc<Room>, features: &Features, adapter: Adapter) -> anyhow::Result<String> {
     let navigator = Navigator::new(room.clone(), features, Arc::new(adapter), IndexKind::Exact)?;
+
+    // A refit fitted on the test pairs themselves would be the best row of the table without
+    // showing anything about navigation.
     let leaks = |kind: &NavigatorKind| matches!(kind, NavigatorKind::Step(StepKind::Refit(refit), _) if refit.in_sample);
     let navigators = NavigatorKind::table(navigator.adapter())
         .into_iter()
@@ -204,8 +223,8 @@ fn score(room: &Arc<Room>, features: &Features, adapter: Adapter) -> anyhow::Res
     Ok(evaluation_table(&report))
 }
 
-/// Starts a server on a free loopback port, asks it for a navigation, draws the answer, and stops
-/// it.
+/// Starts a server on a free loopback port, sends it one navigation, draws the answer to `picture`,
+/// and stops the server.
 async fn serve_and_ask(
     store: &Store,
     room: &Arc<Room>,
@@ -217,13 +236,16 @@ async fn serve_and_ask(
         .context("cannot listen on a loopback port")?;
     let address = listener.local_addr()?.to_string();
 
+    // The server runs in this process, on the code of `seese3 serve`, until `stop` is sent or
+    // dropped.
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
     let mut server = tokio::spawn(service::run(
         listener,
         store.clone(),
         service::Config::default(),
         async {
-            // An error means the demo has failed: the server is to stop all the same.
+            // An error means that the demo failed and dropped the sender: the server stops all the
+            // same.
             let _ = stopped.await;
         },
     ));
@@ -231,7 +253,7 @@ async fn serve_and_ask(
     say(format_args!("   listening on {address}"));
 
     let answer = tokio::select! {
-        // A server that ends before it answers says why.
+        // If the server ends first, its error explains why there is no answer.
         ended = &mut server => {
             ended??;
             anyhow::bail!("the server ended before it answered");
@@ -248,7 +270,7 @@ async fn serve_and_ask(
         picture.display()
     ));
 
-    // An error means the server has ended already; its own result follows.
+    // Sending fails only if the server has already ended; then the next line returns its error.
     let _ = stop.send(());
     server.await??;
     say("   server stopped");
@@ -256,7 +278,8 @@ async fn serve_and_ask(
     Ok(())
 }
 
-/// The frame that the example starts from: five sixths into the held-out part, whatever is there.
+/// The frame that the example starts from: five sixths of the way through the held-out frames that
+/// still have a frame STRIDE later.
 fn example_source(frame_count: usize) -> u32 {
     let held_out = Split::Time
         .candidates(&Timeline::unbroken(frame_count))
@@ -266,7 +289,7 @@ fn example_source(frame_count: usize) -> u32 {
     frame_count - held_out + (held_out - STRIDE) * 5 / 6
 }
 
-/// Every file under a folder, in order.
+/// Every file under a folder, recursively, in sorted order.
 fn files_under(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).with_context(|| folder.display().to_string())? {
@@ -282,7 +305,8 @@ fn files_under(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// A 4-step closed loop in the held-out part to the frame 40 later.
+/// Asks the server for a closed loop of STEPS steps, from the example frame to the frame STRIDE
+/// later. Retries while the server is still loading its store.
 async fn ask(
     address: &str,
     adapter: &str,
@@ -291,6 +315,8 @@ async fn ask(
     let client = Client::connect(address, Duration::from_secs(30)).await?;
     let source = example_source(frame_count);
 
+    // The goal is given as a frame of the room, whose pose the server knows and the closed loop
+    // steers to.
     let request = pb::NavigateRequest {
         room: ROOM.to_owned(),
         adapter: adapter.to_owned(),
@@ -309,7 +335,8 @@ async fn ask(
 
     for _ in 0..LOADING_POLLS {
         match client.navigate(request.clone()).await {
-            // The server is still loading its store.
+            // The port accepts connections before the store is loaded; until then every call is
+            // UNAVAILABLE.
             Err(error) if error.code() == Some(tonic::Code::Unavailable) => {
                 tokio::time::sleep(Duration::from_millis(50)).await;
             }
@@ -321,13 +348,15 @@ async fn ask(
 }
 
 fn plot_of(room: &Room, answer: &pb::NavigateResponse) -> anyhow::Result<PathPlot> {
-    let place = |pose: &crate::geometry::Pose| {
+    // The picture is the room from above: x and y of a position in metres, and the optical axis's
+    // heading in that plane, radians.
+    let place = |pose: &seese3_core::geometry::Pose| {
         let at = pose.translation.vector;
         let view = pose.rotation * nalgebra::Vector3::z();
         [at.x, at.y, view.y.atan2(view.x)]
     };
     let wire_place = |pose: Option<&pb::Pose>| -> anyhow::Result<[f64; 3]> {
-        let pose = service::pose_from_wire(pose.context("the server sent no pose")?.clone(), ROOM)?;
+        let pose = convert::pose(pose.context("the server sent no pose")?)?;
         Ok(place(&pose))
     };
 

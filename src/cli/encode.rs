@@ -1,4 +1,4 @@
-//! `seese3 encode`: the images of a stored room to features.
+//! `seese3 encode`: computes features from the images of a stored room.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -9,48 +9,50 @@ use clap::Args;
 use super::encoder::{EncoderOptions, RuntimeOptions};
 use super::progress::bar;
 use super::say;
-use crate::cancel::Cancellation;
 use crate::encoder::{Encoded, Encoder, Journal, Kept, OnBadImage, Task, encode_room, read_image};
-use crate::features::{FeatureSource, Features};
-use crate::geometry::Pose;
-use crate::room::{Room, is_plain_name};
 use crate::store::{Store, StoredRoom};
+use seese3_core::cancel::Cancellation;
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::Pose;
+use seese3_core::room::{Room, is_plain_name};
 
-/// Bad images that are named one by one; the rest are counted.
+/// The number of unreadable images that are listed one by one; beyond that they are only counted.
 const NAMED: usize = 20;
 
 #[derive(Debug, Args)]
 pub struct Encode {
-    /// The store
+    /// The store: a folder, or a bucket by its URL
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// The room, imported from a recording with images
+    /// Name of the room; it must have been imported from a recording with images
     #[arg(long)]
     room: String,
-    /// An ONNX file, or `pixels` or `builtin`, which need none
+    /// The encoder: an ONNX file, or `pixels` or `builtin`, which need no model file
     #[arg(long)]
     model: String,
     #[command(flatten)]
     encoder: EncoderOptions,
     #[command(flatten)]
     runtime: RuntimeOptions,
-    /// Images a run of the model
+    /// Frames per run of the model, 1 to 4096
     #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=4_096))]
     batch: u32,
-    /// Where the images are now, instead of where they were when the room was imported
+    /// Folder that the room's image paths start from, if the images were moved since the import
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
-    /// What the features' names begin with; the model's name if nothing is given
+    /// Prefix of the feature names, PREFIX-LAYER-POOLING; the model's file name without extension
+    /// if omitted
     #[arg(long = "as", value_name = "PREFIX")]
     prefix: Option<String>,
-    /// Leave out frames whose image cannot be read, instead of stopping: the room loses them, with
-    /// all their features
+    /// Drop frames whose image cannot be read, instead of stopping. The room's new revision is
+    /// without these frames, in all its features
     #[arg(long)]
     skip_bad: bool,
-    /// Encode again what the room has already
+    /// Encode even if the room already has these features, and discard an unfinished run
     #[arg(long)]
     again: bool,
-    /// Where rows are kept until the room is whole; a folder of the store if none is given
+    /// Folder for the journal, which keeps encoded rows until the room is complete, so that an
+    /// interrupted run can resume; STORE/unfinished if omitted, required for a bucket
     #[arg(long, value_name = "DIR")]
     journal: Option<PathBuf>,
 }
@@ -62,10 +64,14 @@ impl Encode {
         let store = Store::open(&self.store)?;
         let stored = store.load_room(&self.room, None).await?;
 
+        // Names and the image folder are checked first, so that a long run does not fail at its
+        // end.
         let sources = encoder.sources(&self.prefix());
         check_names(&sources)?;
         let root = images_root(&stored.room, self.images.as_deref())?;
 
+        // Features count as present only if encoder, layer and preprocessing agree too. A set of
+        // the same name that was made differently is replaced.
         if !self.again && sources.iter().all(|source| has(&stored, source)) {
             let names: Vec<&str> = sources.iter().map(|source| source.name.as_str()).collect();
             let room = &self.room;
@@ -78,16 +84,7 @@ impl Encode {
             return Ok(());
         }
 
-        for source in sources
-            .iter()
-            .filter(|source| stored.features(&source.name).is_some() && !has(&stored, source))
-        {
-            say(format_args!(
-                "replaces features '{}', which were made otherwise",
-                source.name
-            ));
-        }
-
+        say_replaced(&stored, &sources);
         say(format_args!(
             "encoder {} by {}, {}",
             encoder.id(),
@@ -95,12 +92,16 @@ impl Encode {
             sources[0].preprocess
         ));
 
+        // The journal keeps the rows of an interrupted run. Its key covers everything that
+        // decides them, so that rows of another model or of changed images are never mixed in.
         let key = key(&stored, &encoder, &root);
         let path = self.journal_path(&key)?;
         if self.again && path.exists() {
             std::fs::remove_file(&path).with_context(|| path.display().to_string())?;
         }
 
+        // Opening locks the journal, so that two processes cannot encode the same room into it at
+        // once.
         let (mut journal, before) = Journal::open(&path, &key, encoder.dims().iter().sum())?;
         let begun = Instant::now();
 
@@ -123,6 +124,8 @@ impl Encode {
             });
         }
 
+        // Another process may have published the room in the meantime. The rows belong to the
+        // frames that were encoded, so these must not have changed.
         let newest = store.load_room(&self.room, None).await?;
         if !same_poses(&newest.room, &stored.room) {
             bail!(
@@ -135,21 +138,11 @@ impl Encode {
 
         let (room, features) = whole(newest, &sources, &encoded)?;
         let published = store.publish_room(&room, &features).await?;
+
+        // The rows are safe in the store, so the journal is no longer needed.
         journal.finish()?;
-        let fresh = encoded.good.len() - encoded.resumed.min(encoded.good.len());
-        let rate = fresh as f64 / seconds;
-        say(format_args!(
-            "encoded {fresh} frames in {seconds:.1} s ({rate:.0} a second), {} were done before",
-            encoded.resumed
-        ));
 
-        for source in &sources {
-            say(format_args!(
-                "features '{}': {} columns",
-                source.name, source.dim
-            ));
-        }
-
+        say_encoded(&encoded, &sources, seconds);
         let revision = published.revision;
         let location = store.location();
         say(format_args!(
@@ -173,11 +166,13 @@ impl Encode {
         let folder = match &self.journal {
             Some(folder) => folder.clone(),
             None if self.store.contains("://") => {
-                bail!("--journal DIR is required for a store that is no folder")
+                bail!("--journal DIR is required for a store in a bucket")
             }
             None => Path::new(&self.store).join("unfinished"),
         };
 
+        // Another encoder, room revision or image folder gives another key, and hence a journal
+        // of its own.
         Ok(folder.join(format!(
             "{}-{}.rows",
             self.room,
@@ -211,6 +206,9 @@ impl Encode {
         };
 
         let progress = bar(room.frame_count() as u64, "encoding");
+
+        // Decoding, encoding and tract all run on this pool, so that --threads limits them
+        // together.
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(self.runtime.threads())
             .build()?;
@@ -223,7 +221,38 @@ impl Encode {
     }
 }
 
-/// Where a room's images are.
+/// Prints which stored features are replaced: those of the same name that were made differently.
+fn say_replaced(stored: &StoredRoom, sources: &[FeatureSource]) {
+    for source in sources
+        .iter()
+        .filter(|source| stored.features(&source.name).is_some() && !has(stored, source))
+    {
+        say(format_args!(
+            "replaces features '{}', made with another encoder, layer or preprocessing",
+            source.name
+        ));
+    }
+}
+
+/// Prints how many frames were encoded, how fast, and into which features.
+fn say_encoded(encoded: &Encoded, sources: &[FeatureSource], seconds: f64) {
+    // Resumed rows cost no time in this run and would inflate the rate.
+    let fresh = encoded.good.len() - encoded.resumed.min(encoded.good.len());
+    let rate = fresh as f64 / seconds;
+    say(format_args!(
+        "encoded {fresh} frames in {seconds:.1} s ({rate:.0} a second), {} were done before",
+        encoded.resumed
+    ));
+
+    for source in sources {
+        say(format_args!(
+            "features '{}': {} columns",
+            source.name, source.dim
+        ));
+    }
+}
+
+/// The folder that the room's image paths start from: `given`, or where the images were at import.
 fn images_root(room: &Room, given: Option<&Path>) -> anyhow::Result<PathBuf> {
     if room.images().is_empty() {
         bail!(crate::encoder::Error::NoImages {
@@ -238,7 +267,7 @@ fn images_root(room: &Room, given: Option<&Path>) -> anyhow::Result<PathBuf> {
 
     if !root.is_dir() {
         bail!(
-            "{} is no folder; say with --images DIR where the images are now",
+            "{} is not a folder; give the folder of the images with --images DIR",
             root.display()
         );
     }
@@ -246,20 +275,23 @@ fn images_root(room: &Room, given: Option<&Path>) -> anyhow::Result<PathBuf> {
     Ok(root)
 }
 
-/// Whether a room has features of that name, made like that.
+/// Whether the room has features of this name that were made in the same way.
 pub fn has(stored: &StoredRoom, source: &FeatureSource) -> bool {
     stored
         .features(&source.name)
         .is_some_and(|set| set.source() == source)
 }
 
-/// All that decides the rows of a run.
+/// A text that covers everything that decides the rows of a run: room, revision, images with their
+/// sizes and times, runtime, and sources.
 fn key(stored: &StoredRoom, encoder: &Encoder, root: &Path) -> String {
     let room = &stored.room;
     let sources = encoder.sources("");
 
-    // A file that was written anew has another time or size.
+    // A file that was rewritten has another size or modification time.
     let state = |image: &String| {
+        // An image inside a container is written FILE@OFFSET+LENGTH; the state is that of the
+        // container.
         let file = image
             .rsplit_once('@')
             .map_or(image.as_str(), |(file, _)| file);
@@ -282,7 +314,8 @@ fn key(stored: &StoredRoom, encoder: &Encoder, root: &Path) -> String {
     )
 }
 
-/// Refuses names that features cannot have, before anything is encoded.
+/// Rejects layers whose features would have no valid or no distinct name, before anything is
+/// encoded.
 pub fn check_names(sources: &[FeatureSource]) -> anyhow::Result<()> {
     for (position, FeatureSource { name, layer, .. }) in sources.iter().enumerate() {
         if !is_plain_name(name) {
@@ -301,7 +334,8 @@ pub fn check_names(sources: &[FeatureSource]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Whether two rooms have the same frames.
+/// Whether two rooms have the same number of frames and the same poses, up to 1e-9 in each entry of
+/// the homogeneous matrices.
 pub fn same_poses(a: &Room, b: &Room) -> bool {
     let near = |(a, b): (&Pose, &Pose)| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-9;
     a.frame_count() == b.frame_count() && a.poses().iter().zip(b.poses()).all(near)
@@ -317,13 +351,14 @@ fn say_bad(room: &Room, encoded: &Encoded) {
 
     if !encoded.bad.is_empty() {
         say(format_args!(
-            "left out {} frames in all; the room's new revision is without them",
+            "left out {} frames in all; the room's new revision does not have them",
             encoded.bad.len()
         ));
     }
 }
 
-/// The columns of each layer.
+/// Splits encoded rows (n, Σ d), in which the layers stand side by side, into one feature set (n,
+/// d) per source.
 pub fn by_layer(
     sources: &[FeatureSource],
     rows: &ndarray::Array2<f32>,
@@ -342,7 +377,8 @@ pub fn by_layer(
     Ok(features)
 }
 
-/// The room with its new features; without the bad frames, if there were any.
+/// The room and its new feature sets. If frames were dropped, the room and all its feature sets are
+/// without them.
 fn whole(
     stored: StoredRoom,
     sources: &[FeatureSource],
@@ -353,6 +389,8 @@ fn whole(
         return Ok((stored.room, features));
     }
 
+    // Without the bad frames it is a room of other poses, to which the store carries nothing
+    // over. The older features are therefore cut to the same frames and published again.
     let frames = stored.room.frames().select(&encoded.good);
     let provenance = stored.room.provenance().clone();
     let room = Room::new(stored.room.id().clone(), frames, provenance)?;

@@ -1,4 +1,4 @@
-//! Options that say which encoder is meant, shared by the commands that run one.
+//! The options that choose and configure an encoder, shared by the commands that run one.
 
 use std::path::{Path, PathBuf};
 
@@ -6,29 +6,29 @@ use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 
 use crate::encoder::{
-    self, Encoder, Filter, Layer, ModelTask, Pooling, Preparation, Recipe, Resize, Runtime,
+    self, Encoder, EncoderRecipe, Filter, Layer, ModelTask, Pooling, Preparation, Resize, Runtime,
     RuntimeKind,
 };
 
-/// How models are run.
+/// Which runtime runs ONNX models, and on how many threads.
 #[derive(Debug, Clone, Args)]
 pub struct RuntimeOptions {
-    /// What runs ONNX models: tract needs nothing, onnxruntime is faster
+    /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
     #[arg(long, value_enum, default_value_t = RuntimeName::Tract, env = "SEESE3_RUNTIME")]
     runtime: RuntimeName,
-    /// The shared library of onnxruntime
+    /// Path of the shared library of onnxruntime
     #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
     library: Option<PathBuf>,
-    /// Threads; all cores if 0
+    /// Number of threads; 0 takes all cores
     #[arg(long, default_value_t = 0)]
     threads: usize,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum RuntimeName {
-    /// Pure Rust
+    /// Pure Rust, needs no library
     Tract,
-    /// The library, loaded when a model is opened
+    /// A shared library, loaded when a model is opened
     Onnxruntime,
 }
 
@@ -42,7 +42,7 @@ impl From<RuntimeName> for RuntimeKind {
 }
 
 impl RuntimeOptions {
-    /// As the library wants it.
+    /// The options in the form that the library takes.
     pub fn runtime(&self) -> Runtime {
         Runtime {
             kind: self.runtime.into(),
@@ -51,7 +51,7 @@ impl RuntimeOptions {
         }
     }
 
-    /// How many threads are meant.
+    /// The number of threads, with 0 resolved to the number of cores.
     pub fn threads(&self) -> usize {
         if self.threads > 0 {
             self.threads
@@ -61,58 +61,72 @@ impl RuntimeOptions {
     }
 }
 
-/// How images are prepared, and which layers are kept.
+/// How images are preprocessed, and which layers are kept and how they are pooled.
 #[derive(Debug, Clone, Args)]
 pub struct EncoderOptions {
-    /// How images are prepared for the model, by the name that `seese3 encoders` lists
+    /// Preprocessing and layer defaults of a well-known encoder, by a name that `seese3 encoders`
+    /// lists; the options below override single values
     #[arg(long)]
     recipe: Option<String>,
-    /// Layers to keep, separated by commas; all declared outputs if `all`
+    /// Layers to keep, by output name, separated by commas; `all` keeps every output that the model
+    /// declares
     #[arg(long, value_delimiter = ',', default_value = "all")]
     layers: Vec<String>,
-    /// How a layer becomes one row: cls, mean, grid2x2, grid4x4 or any gridCOLUMNSxROWS; the
-    /// recipe's, else mean
+    /// Pooling of a layer's output to one row: cls, mean, grid2x2, grid4x4 or any gridCOLUMNSxROWS;
+    /// the recipe's if omitted, else mean
     #[arg(long)]
     pool: Option<String>,
-    /// Tokens before the patches: the class token and registers; the recipe's, else 0
+    /// Number of tokens before the patch tokens (class token and registers), which pooling skips;
+    /// the recipe's if omitted, else 0
     #[arg(long, value_name = "N")]
     prefix_tokens: Option<usize>,
-    /// What layer numbers count from: 0, 1, or name
+    /// What layer numbers count from: 0, 1, or `name` for unnumbered layers; only recorded with the
+    /// features; the recipe's if omitted, else name
     #[arg(long)]
     base: Option<String>,
-    /// Whether the encoder's last norm is in the layers: none or final
+    /// Whether the layers include the encoder's final norm: none or final; only recorded with the
+    /// features; the recipe's if omitted, else unspecified
     #[arg(long)]
     norm: Option<String>,
-    /// Images a clip, around the frame that is meant
+    /// Images per clip, 1 to 256, centred on the frame that is encoded; the recipe's if omitted,
+    /// else 1
     #[arg(long, value_name = "T", value_parser = clap::value_parser!(u32).range(1..=256))]
     window: Option<u32>,
-    /// WIDTHxHEIGHT of the whole image, shortest:PIXELS, or none
+    /// Resize: WIDTHxHEIGHT of the whole image, shortest:PIXELS for the shorter edge, or none; if
+    /// omitted the recipe's, else the input size that the model declares, else none
     #[arg(long)]
     resize: Option<String>,
-    /// Of the resize: bilinear, bicubic or lanczos3
+    /// Resize filter: bilinear, bicubic or lanczos3; the recipe's if omitted, else bilinear
     #[arg(long)]
     filter: Option<String>,
-    /// WIDTHxHEIGHT of a central crop, or none
+    /// Central crop after the resize, WIDTHxHEIGHT pixels, or none; the recipe's if omitted, else
+    /// none
     #[arg(long)]
     crop: Option<String>,
-    /// Pixel values 0 to 255 are divided by this
+    /// Normalisation, first step: pixel values 0 to 255 are divided by this; the recipe's if
+    /// omitted, else 1
     #[arg(long)]
     divisor: Option<f32>,
-    /// Then this is subtracted, R,G,B
+    /// Normalisation, second step: this mean is subtracted, R,G,B or one number; the recipe's if
+    /// omitted, else 0
     #[arg(long, value_name = "R,G,B")]
     mean: Option<String>,
-    /// Then divided by this, R,G,B
+    /// Normalisation, last step: divided by this deviation, R,G,B or one number; the recipe's if
+    /// omitted, else 1
     #[arg(long, value_name = "R,G,B")]
     std: Option<String>,
 }
 
 impl EncoderOptions {
-    /// Opens `builtin`, `pixels` or the model in a file.
+    /// Opens the encoder: `builtin`, `pixels`, or the ONNX model in a file.
     pub fn open(&self, model: &str, runtime: &Runtime) -> anyhow::Result<Encoder> {
+        // These two encoders are fixed. An option that they would ignore is refused, so that
+        // nobody takes it for applied.
         match model {
             "builtin" | "pixels" if !self.is_plain() => {
                 bail!(
-                    "'{model}' is one fixed encoder; leave out --layers, --pool, --recipe, --resize and their like"
+                    "'{model}' is one fixed encoder; leave out --layers, --pool, --recipe, \
+                    --resize and the other options for models"
                 )
             }
             "builtin" => return Ok(Encoder::builtin()),
@@ -122,6 +136,8 @@ impl EncoderOptions {
 
         let file = Path::new(model);
 
+        // From here on the model is an ONNX file, which needs a runtime that this program was
+        // built with.
         if !runtime.kind.is_built() {
             return Err(encoder::Error::NotBuilt {
                 runtime: runtime.kind.name(),
@@ -130,18 +146,20 @@ impl EncoderOptions {
         }
 
         if !file.is_file() {
-            bail!("{model} is no file; give an ONNX file, `pixels` or `builtin`");
+            bail!("{model} is not a file; give an ONNX file, `pixels` or `builtin`");
         }
 
         let recipe = self.recipe()?;
         let preparation = self.preparation(recipe, file)?;
 
+        // `all` stands for the outputs that the file declares, in its order.
         let names = if self.layers == ["all"] {
             encoder::declared_outputs(file)?
         } else {
             self.layers.clone()
         };
 
+        // For each setting an option wins over the recipe, and the recipe over the default.
         let skip = self
             .prefix_tokens
             .unwrap_or(recipe.map_or(0, |recipe| recipe.prefix_tokens));
@@ -158,13 +176,15 @@ impl EncoderOptions {
                 .unwrap_or_else(|| recipe.unwrap_or(otherwise).to_owned())
         };
 
+        // `base` and `norm` only describe the layer for later readers; they do not change its
+        // numbers.
         let layer = |name: &String| Layer {
             name: name.clone(),
             base: word(&self.base, recipe.map(|recipe| recipe.base), "name"),
             norm: word(
                 &self.norm,
                 recipe.map(|recipe| recipe.norm),
-                crate::features::UNSPECIFIED,
+                seese3_core::features::UNSPECIFIED,
             ),
             pooling: pooling.after(skip),
         };
@@ -187,7 +207,7 @@ impl EncoderOptions {
         )?)
     }
 
-    /// Whether nothing was asked for.
+    /// Whether every option was left at its default.
     fn is_plain(&self) -> bool {
         // Destructured with no `..`, so that a new option breaks the build here.
         let Self {
@@ -212,7 +232,7 @@ impl EncoderOptions {
         layers == &["all"] && words.iter().all(|word| word.is_none()) && numbers == [false; 3]
     }
 
-    fn recipe(&self) -> anyhow::Result<Option<&'static Recipe>> {
+    fn recipe(&self) -> anyhow::Result<Option<&'static EncoderRecipe>> {
         let Some(name) = &self.recipe else {
             return Ok(None);
         };
@@ -230,8 +250,15 @@ impl EncoderOptions {
             .with_context(|| format!("there is no recipe '{name}'; there are {}", known()))
     }
 
-    fn preparation(&self, recipe: Option<&Recipe>, file: &Path) -> anyhow::Result<Preparation> {
+    fn preparation(
+        &self,
+        recipe: Option<&EncoderRecipe>,
+        file: &Path,
+    ) -> anyhow::Result<Preparation> {
         let says = self.divisor.is_some() || self.mean.is_some() || self.std.is_some();
+
+        // There is no default normalisation: a wrong one gives features that look plausible and
+        // are wrong. Either a recipe or explicit numbers are required.
         let mut preparation = match recipe {
             Some(recipe) => recipe.preparation.clone(),
             None if !says => bail!(
@@ -240,6 +267,8 @@ impl EncoderOptions {
                 file.display()
             ),
             None => {
+                // Without a recipe, the whole image is resized to the input size that the model
+                // declares, whatever its aspect ratio.
                 let size = encoder::declared_size(file)?;
                 let resize = size.map_or(Resize::None, |(width, height)| Resize::Whole {
                     width,
@@ -253,6 +282,7 @@ impl EncoderOptions {
             }
         };
 
+        // Each option replaces one value of the recipe and leaves the others.
         if let Some(resize) = &self.resize {
             preparation.resize = resize.parse()?;
         }

@@ -1,4 +1,4 @@
-//! `seese3 encoders`: what can be encoded with, and how.
+//! `seese3 encoders`: the known encoders and how their images are prepared.
 
 use clap::Args;
 
@@ -7,12 +7,14 @@ use crate::encoder::{RECIPES, RuntimeKind};
 
 #[derive(Debug, Args)]
 pub struct Encoders {
-    /// One recipe in full
+    /// Show only this recipe, with its script for the ONNX export
     name: Option<String>,
 }
 
 impl Encoders {
     pub fn run(self) -> anyhow::Result<()> {
+        // With a name, one recipe is printed with its export script; without, all of them without
+        // scripts.
         let chosen: Vec<_> = RECIPES
             .iter()
             .filter(|recipe| self.name.as_ref().is_none_or(|name| name == recipe.name))
@@ -29,13 +31,9 @@ impl Encoders {
 
         if self.name.is_none() {
             say("Without a model:");
-            say(
-                "  pixels    raw pixels: the image at 320x240 in means over 16x12 patches, 576 columns",
-            );
+            say("  pixels    raw pixels at 320x240, averaged over 16x12 patches, 576 columns");
 
-            say(
-                "  builtin   gradient orientations and coarse colour, no weights, 528 columns; a stand-in",
-            );
+            say("  builtin   gradient orientations and colour, weight-free stand-in, 528 columns");
 
             say("");
             say(
@@ -77,6 +75,7 @@ impl Encoders {
             say("");
         }
 
+        // Both runtimes are cargo features, so a build may lack either.
         let built = |kind: RuntimeKind| {
             if kind.is_built() {
                 "built in"

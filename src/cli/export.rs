@@ -1,4 +1,4 @@
-//! `seese3 export`: a stored room for other programs.
+//! `seese3 export`: writes a stored room in a format that other programs read.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use clap::{Args, Subcommand};
 
 use super::{check_writable, say, write_file};
 use crate::datasets::write_numpy;
-use crate::report::{kitti_trajectory, tum_trajectory};
+use crate::export::{kitti_trajectory, tum_trajectory};
 use crate::store::{Store, StoredRoom};
 
 #[derive(Debug, Args)]
@@ -18,26 +18,27 @@ pub struct Export {
 
 #[derive(Debug, Subcommand)]
 enum Format {
-    /// A folder of poses.npy, timestamps.npy, frame_ids.npy, features_NAME.npy and bundle.json
+    /// A folder with poses.npy, timestamps.npy, frame_ids.npy, features_NAME.npy and bundle.json
     Numpy(From),
-    /// A trajectory file, "timestamp tx ty tz qx qy qz qw"
+    /// A TUM trajectory file, "timestamp tx ty tz qx qy qz qw" per line: seconds, metres,
+    /// world_from_camera
     Tum(Timed),
-    /// A trajectory file of 3x4 matrices
+    /// A KITTI trajectory file: the first three rows of world_from_camera per line, metres
     Kitti(From),
 }
 
 #[derive(Debug, Args)]
 struct From {
-    /// The store
+    /// The store: a folder, or a bucket by its URL
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// The room
+    /// Name of the room
     #[arg(long)]
     room: String,
-    /// Which revision; the newest if none is given
+    /// Revision of the room; the newest if omitted
     #[arg(long)]
     revision: Option<u64>,
-    /// Where to write: a folder for numpy, a file for the others
+    /// Output path: a folder for numpy, a file for the other formats
     #[arg(long)]
     out: PathBuf,
 }
@@ -46,7 +47,8 @@ struct From {
 struct Timed {
     #[command(flatten)]
     from: From,
-    /// Frames a second, for a room without timestamps
+    /// Frames per second, 0.001 to 1000000: makes timestamps for a room that has none, starting at
+    /// 0
     #[arg(long)]
     rate: Option<f64>,
 }
@@ -64,6 +66,9 @@ impl Export {
             }
             Format::Tum(Timed { from, rate }) => {
                 let stored = from.load().await?;
+
+                // The format needs a time per pose. Recorded times are never overridden; a room
+                // without them gets evenly spaced ones.
                 let times = match (stored.room.timestamps_ns(), rate) {
                     ([], Some(rate)) if (1e-3..=1e6).contains(&rate) => {
                         (0..stored.room.frame_count())

@@ -1,4 +1,4 @@
-//! `seese3 health`: whether a server serves.
+//! `seese3 health`: whether a server is ready to answer.
 
 use anyhow::bail;
 use clap::Args;
@@ -10,7 +10,7 @@ use super::say;
 pub struct Health {
     #[command(flatten)]
     server: Server,
-    /// A service's full name or rooms/NAME; the whole server if empty
+    /// What to check: a gRPC service's full name, or rooms/NAME; the whole server if empty
     #[arg(long, default_value = "")]
     name: String,
 }
@@ -18,7 +18,7 @@ pub struct Health {
 impl Health {
     pub async fn run(self) -> anyhow::Result<()> {
         if !self.server.connect().await?.serves(&self.name).await? {
-            bail!("the server does not serve yet, or no more");
+            bail!("the server is not serving: it is still loading, or shutting down");
         }
 
         say("serving");

@@ -1,4 +1,4 @@
-//! `seese3 import`: a recording on disk into a store.
+//! `seese3 import`: reads a recording from disk and publishes it as a room in a store.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -10,11 +10,11 @@ use super::encode::same_poses;
 use super::progress::bar;
 use super::say;
 use crate::datasets::{self, Dropped, Reader, Recording, SevenScenes, Unusable};
-use crate::features::{FeatureSource, Features};
-use crate::room::{Provenance, Room, RoomId};
 use crate::store::{Store, check_features};
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::room::{Frames, Provenance, Room, RoomId};
 
-/// Dropped frames that are named one by one; the rest are counted.
+/// The number of dropped frames that are listed one by one; beyond that they are only counted.
 const NAMED: usize = 20;
 
 #[derive(Debug, Args)]
@@ -45,7 +45,7 @@ enum Format {
 
 #[derive(Debug, Args)]
 struct Plain {
-    /// What to read
+    /// The folder or file to read
     path: PathBuf,
     #[command(flatten)]
     to: Destination,
@@ -55,10 +55,11 @@ struct Plain {
 struct Seven {
     /// The scene's folder, or one sequence's
     path: PathBuf,
-    /// One sequence, for instance seq-01; all of them make one room if none is named
+    /// One sequence, for instance seq-01; if omitted, all sequences of the scene make one room
     #[arg(long)]
     sequence: Option<String>,
-    /// A file of 4x4 numbers, rgb_from_depth in metres: poses become those of the colour camera
+    /// A text file with a 4x4 matrix, rgb_from_depth in metres: poses of the depth camera are
+    /// converted to those of the colour camera
     #[arg(long, value_name = "FILE")]
     rgb_from_depth: Option<PathBuf>,
     #[command(flatten)]
@@ -67,14 +68,14 @@ struct Seven {
 
 #[derive(Debug, Args)]
 struct Numpy {
-    /// A folder of poses.npy and, where there are, timestamps.npy, frame_ids.npy and
-    /// features_NAME.npy
+    /// A folder of poses.npy and, optionally, timestamps.npy, frame_ids.npy and features_NAME.npy
     #[arg(required_unless_present = "poses", conflicts_with_all = ["poses", "timestamps"])]
     path: Option<PathBuf>,
-    /// Poses, world_from_camera, (n, 4, 4) f64 or f32, metres
+    /// NumPy file of poses, world_from_camera, shape (n, 4, 4), f64 or f32, metres; instead of a
+    /// folder
     #[arg(long)]
     poses: Option<PathBuf>,
-    /// Timestamps (n,), int64 nanoseconds or float seconds
+    /// NumPy file of timestamps, shape (n,), int64 nanoseconds or float seconds; only with --poses
     #[arg(long)]
     timestamps: Option<PathBuf>,
     #[command(flatten)]
@@ -83,26 +84,27 @@ struct Numpy {
 
 #[derive(Debug, Args)]
 struct Destination {
-    /// The store: a folder, made if it is not there
+    /// The store: a folder, created if it does not exist, or a bucket by its URL
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// The room's name in the store; made from the path if none is given
+    /// Name of the room in the store; derived from the path if omitted
     #[arg(long, visible_alias = "room")]
     name: Option<String>,
     /// Keep every K-th usable frame of each sequence
     #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// Refuse the recording if a frame is unusable, instead of dropping that frame
+    /// Fail if a frame is unusable, instead of dropping that frame
     #[arg(long)]
     strict: bool,
-    /// Publish a new revision of a room that has other frames in the store; its features do not
-    /// carry over
+    /// Publish a new revision even if the store has a room of this name with other frames; the
+    /// features of those frames are not carried over
     #[arg(long)]
     replace: bool,
-    /// Features of the usable frames, NAME=FILE.npy, shape (n, d); may be given several times
+    /// Features of all usable frames, NAME=FILE.npy, shape (n, d), one row per frame before
+    /// --every; may be given several times
     #[arg(long = "features", value_name = "NAME=FILE")]
     features: Vec<String>,
-    /// The terms under which the recording may be used, kept with the room
+    /// Licence of the recording, stored with the room
     #[arg(long, default_value = "")]
     licence: String,
 }
@@ -112,6 +114,8 @@ impl Import {
         match self.format {
             Format::Scannet(Plain { path, to }) => {
                 let recording = to.read(|reader| {
+                    // A .sens file holds a whole scan; otherwise an exporter has unpacked it into
+                    // a folder.
                     if path.is_file() {
                         datasets::read_sens(&path, reader)
                     } else {
@@ -154,6 +158,7 @@ impl Import {
                 timestamps,
                 to,
             }) => {
+                // Arrays come either as a folder with fixed file names or as single files.
                 let recording = match (&path, &poses) {
                     (Some(folder), _) => datasets::read_numpy(folder)?,
                     (None, Some(file)) => {
@@ -166,6 +171,7 @@ impl Import {
                     (None, None) => bail!("a folder or --poses FILE is required"),
                 };
 
+                // Single files have no folder that the room could be named after.
                 if path.is_none() && to.name.is_none() {
                     bail!("--name NAME is required");
                 }
@@ -182,7 +188,8 @@ impl Import {
 }
 
 impl Destination {
-    /// Refuses to put other frames in the place of a room's, unless that is asked for.
+    /// Refuses to replace a room of the same name by one with other frames, unless --replace was
+    /// given.
     async fn check_same(&self, store: &Store, room: &Room) -> anyhow::Result<()> {
         let before = match store.load_room(room.id().as_str(), None).await {
             Ok(before) => before.room,
@@ -190,6 +197,8 @@ impl Destination {
             Err(error) => return Err(error.into()),
         };
 
+        // Features belong to frames: new frames would silently lose the features that were
+        // computed for the old ones.
         if self.replace || same_poses(&before, room) {
             return Ok(());
         }
@@ -204,7 +213,8 @@ impl Destination {
         );
     }
 
-    /// Reads with a progress bar.
+    /// Reads a recording with a progress bar, dropping or refusing unusable frames as --strict
+    /// says.
     fn read(
         &self,
         read: impl FnOnce(&mut Reader<'_>) -> Result<Recording, datasets::Error>,
@@ -217,6 +227,7 @@ impl Destination {
             Unusable::Drop
         };
 
+        // Only the reader knows how many frames there are, so the bar gets its length from it.
         let mut tell = |done: usize, total: usize| {
             progress.set_length(total as u64);
             progress.set_position(done as u64);
@@ -230,37 +241,15 @@ impl Destination {
         Ok(recording)
     }
 
-    async fn publish(
+    /// The room of a recording. An exported bundle states its name, format and licence: the original
+    /// format is kept, and --licence and --name win over the stated ones.
+    fn room(
         &self,
         format: &str,
         path: &Path,
-        mut recording: Recording,
-    ) -> anyhow::Result<()> {
-        let read_count = recording.frames.poses.len();
-
-        for given in &self.features {
-            recording.features.push(read_features(given)?);
-        }
-
-        for set in &recording.features {
-            let rows = set.rows().nrows();
-            let unusable = recording.dropped.len();
-            if rows != read_count {
-                let name = &set.source().name;
-                bail!(
-                    "features '{name}' have {rows} rows, the recording has {read_count} usable frames \
-                     ({unusable} dropped)"
-                );
-            }
-        }
-
-        let kept = recording.every(self.every as usize);
-        let features = recording
-            .features
-            .iter()
-            .map(|set| set.select(&kept))
-            .collect::<Vec<_>>();
-
+        recording: &Recording,
+        frames: Frames,
+    ) -> anyhow::Result<Room> {
         let stated = &recording.stated;
         let either = |given: &str, stated: &str| {
             if given.is_empty() {
@@ -269,7 +258,6 @@ impl Destination {
                 given.to_owned()
             }
         };
-
         let provenance = Provenance {
             format: either(&stated.format, format),
             licence: either(&self.licence, &stated.licence),
@@ -277,19 +265,24 @@ impl Destination {
             worst_rotation_deviation: recording.worst_rotation_deviation,
         };
 
+        // The name given wins, then the bundle's own, then one derived from the path.
         let name = match &self.name {
             Some(name) => name.clone(),
             None if !stated.name.is_empty() => stated.name.clone(),
             None => name_from(format, path).context("--name NAME is required")?,
         };
         let id = RoomId::new(&name).context("give another name with --name")?;
-        let room = Room::new(id, recording.frames.select(&kept), provenance)?;
+        Ok(Room::new(id, frames, provenance)?)
+    }
 
-        check_features(&room, &features)?;
-        let store = Store::create(&self.store)?;
-        self.check_same(&store, &room).await?;
-        let published = store.publish_room(&room, &features).await?;
-
+    /// Prints what was read.
+    fn say_read(
+        &self,
+        room: &Room,
+        features: &[Features],
+        recording: &Recording,
+        read_count: usize,
+    ) {
         let times = if room.timestamps_ns().is_empty() {
             "without timestamps"
         } else {
@@ -307,13 +300,13 @@ impl Destination {
             room.frame_count()
         ));
 
-        say_frames(&room);
+        say_frames(room);
         let deviation = recording.worst_rotation_deviation;
         say(format_args!(
             "rotations: at most {deviation:.1e} off SO(3), projected"
         ));
 
-        for set in &features {
+        for set in features {
             say(format_args!(
                 "features '{}': {} columns",
                 set.source().name,
@@ -322,7 +315,56 @@ impl Destination {
         }
 
         say_dropped(&recording.dropped);
+    }
 
+    async fn publish(
+        &self,
+        format: &str,
+        path: &Path,
+        mut recording: Recording,
+    ) -> anyhow::Result<()> {
+        let read_count = recording.frames.poses.len();
+
+        // Feature files have one row per usable frame. They are checked against that count before
+        // --every thins both.
+        for given in &self.features {
+            recording.features.push(read_features(given)?);
+        }
+
+        for set in &recording.features {
+            let rows = set.rows().nrows();
+            let unusable = recording.dropped.len();
+            if rows != read_count {
+                let name = &set.source().name;
+                bail!(
+                    "features '{name}' have {rows} rows, the recording has {read_count} usable frames \
+                     ({unusable} dropped)"
+                );
+            }
+        }
+
+        // Frames and features keep the same rows; counting starts anew in each sequence.
+        let kept = recording.every(self.every as usize);
+        let features = recording
+            .features
+            .iter()
+            .map(|set| set.select(&kept))
+            .collect::<Vec<_>>();
+
+        let frames = recording.frames.select(&kept);
+        let room = self.room(format, path, &recording, frames)?;
+
+        // The last checks come before the first write: a refused import leaves the store as it
+        // was.
+        check_features(&room, &features)?;
+        let store = Store::create(&self.store)?;
+        self.check_same(&store, &room).await?;
+        let published = store.publish_room(&room, &features).await?;
+
+        self.say_read(&room, &features, &recording, read_count);
+
+        // Publishing the same content again makes no new revision, so an import can safely be
+        // repeated.
         let state = if published.is_new {
             "published"
         } else {
@@ -340,9 +382,10 @@ impl Destination {
     }
 }
 
-/// A room's name from where it lies: 12-Scenes and 7-Scenes repeat theirs, so that the folder above
-/// belongs to it.
+/// A room's name from its path. Folder names of 12-Scenes rooms and 7-Scenes sequences repeat, so
+/// the name of the parent folder is put before them.
 fn name_from(format: &str, path: &Path) -> Option<String> {
+    // A path such as `.` only has a name once it is resolved.
     let path = path.canonicalize().ok()?;
     let stem = if path.is_file() {
         path.file_stem()
@@ -363,12 +406,13 @@ fn name_from(format: &str, path: &Path) -> Option<String> {
     }
 }
 
-/// Says what the frames bring with them.
+/// Prints the facts about the frames that limit their use: sequences, the recording's own split,
+/// gaps in the numbering, and images.
 fn say_frames(room: &Room) {
     let timeline = room.timeline();
     if let Some(most) = timeline.sequences.iter().max() {
         say(format_args!(
-            "sequences: up to number {most}; no pair of frames joins two of them"
+            "sequences: up to number {most}; a pair of frames never spans two of them"
         ));
     }
 
@@ -385,6 +429,7 @@ fn say_frames(room: &Room) {
         ));
     }
 
+    // Where the recording skipped frames, a stride of k rows spans more time than elsewhere.
     let gaps = room
         .frame_numbers()
         .windows(2)
@@ -408,6 +453,7 @@ fn say_dropped(dropped: &[Dropped]) {
         say(format_args!("dropped {}: {}", frame.name, frame.reason));
     }
 
+    // A long list is cut after the first NAMED frames; the counts by reason cover all of them.
     let mut counts = BTreeMap::new();
     for frame in dropped {
         *counts.entry(frame.reason).or_insert(0) += 1;

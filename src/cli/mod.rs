@@ -1,30 +1,42 @@
-//! The command line. One file a command; each reads its arguments, calls the library and prints.
+//! The command line: one file per command. Each reads its arguments, calls the library and prints
+//! the results.
 
 mod ask;
+#[cfg(feature = "lab")]
 mod cross_room;
+#[cfg(feature = "lab")]
 mod demo;
 mod encode;
 mod encoder;
 mod encoders;
+#[cfg(feature = "lab")]
 mod evaluate;
 mod export;
 mod health;
 mod import;
+#[cfg(feature = "lab")]
 mod probe;
 mod progress;
+#[cfg(feature = "lab")]
 mod protocol;
+#[cfg(feature = "lab")]
 mod reproduce;
+#[cfg(feature = "lab")]
 mod rooms;
 mod serve;
+#[cfg(feature = "lab")]
 mod studio;
+#[cfg(feature = "lab")]
 mod sweep;
+#[cfg(feature = "lab")]
 mod theory;
 mod track;
+#[cfg(feature = "lab")]
 mod train;
 
 use clap::{Parser, Subcommand};
 
-/// Latent navigation over gRPC: learn a room, serve it, navigate it.
+/// Latent navigation over gRPC: train on a room's images, serve the room, navigate in it
 #[derive(Debug, Parser)]
 #[command(version, about, propagate_version = true)]
 pub struct Cli {
@@ -34,67 +46,86 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// See the whole idea work: a room is drawn, learned, served and navigated
+    #[cfg(feature = "lab")]
+    /// Show the whole pipeline on a synthetic room: render, train, serve and navigate
     Demo(demo::Demo),
-    /// Read a recording into a store
+    /// Read a recording from disk and publish it as a room in a store
     Import(import::Import),
-    /// Give a stored room to other programs
+    /// Write a stored room in a format that other programs read
     Export(export::Export),
-    /// Turn a room's images into features
+    /// Encode a room's images as features
     Encode(encode::Encode),
-    /// List the encoders that are known, with their preprocessing
+    /// List the known encoder recipes, with their preprocessing and layers
     Encoders(encoders::Encoders),
-    /// Draw a suite of rooms and encode it
+    #[cfg(feature = "lab")]
+    /// Render a suite of synthetic rooms and encode their images
     Studio(studio::Studio),
-    /// Learn an adapter from a room's features and publish it
+    #[cfg(feature = "lab")]
+    /// Train an adapter on the features of one or more rooms and publish it
     Train(train::Train),
+    #[cfg(feature = "lab")]
     /// Score navigators on held-out motions: Hit@ε with baselines and intervals
     Evaluate(evaluate::Evaluate),
-    /// Measure how much of SE(3) features hold: M1 to M4
+    #[cfg(feature = "lab")]
+    /// Measure how much SE(3) structure features carry: M1 mutual k-NN, M2 intrinsic dimension, M3
+    /// ridge probe, M4 trained adapter
     Probe(probe::Probe),
-    /// Learn from some rooms, navigate in others: zero-shot, against Identity, by how many rooms
-    /// were learned from
+    #[cfg(feature = "lab")]
+    /// Train on some rooms and navigate zero-shot in others: scores against Identity, by the number
+    /// of training rooms
     CrossRoom(cross_room::CrossRoom),
-    /// Score many features at once
+    #[cfg(feature = "lab")]
+    /// Compare many layers, adapter configurations or formulations in one run
     Sweep(sweep::Sweep),
-    /// Run the paper's tables and figures on given rooms and write one report
+    #[cfg(feature = "lab")]
+    /// Reproduce the paper's tables and figures on given rooms and write one report
     Reproduce(reproduce::Reproduce),
-    /// Check the paper's theorems numerically: measured against bound
+    #[cfg(feature = "lab")]
+    /// Check the paper's theorems numerically: the measured value against the bound
     Theory(theory::Theory),
-    /// Answer over gRPC until told to stop
+    /// Answer over gRPC until SIGTERM or Ctrl-C
     Serve(serve::Serve),
-    /// Ask a server for the frames that a motion leads to
+    /// Ask a server for the frames that a camera motion leads to
     Navigate(ask::Navigate),
-    /// Ask a server where a view was seen
+    /// Ask a server for the frames of its rooms that look most like a view
     Localize(ask::Localize),
-    /// Ask a server for the motion between two views
+    /// Ask a server for the camera motion between two views
     Motion(ask::Motion),
-    /// Have a server follow a camera whose features are in a file
+    /// Track a camera with a server, from a file of features or a folder of images
     Track(track::Track),
-    /// List what a server answers for
+    /// List the rooms and adapters of a server
     Catalog(ask::Catalog),
-    /// Succeed if a server serves, for containers and supervisors
+    /// Exit successfully if a server is serving, for containers and supervisors
     Health(health::Health),
 }
 
-/// Runs a command; what it finds goes to standard output, what goes wrong into the error.
+/// Runs a command. Results go to standard output; a failure is returned as the error.
 ///
 /// # Errors
-/// What went wrong, in one line, with what to change.
+/// When the command fails: one line that says what went wrong and what to change.
 pub async fn run(cli: Cli) -> anyhow::Result<()> {
     match cli.command {
         Command::Import(arguments) => arguments.run().await,
         Command::Export(arguments) => arguments.run().await,
         Command::Encode(arguments) => arguments.run().await,
         Command::Encoders(arguments) => arguments.run(),
+        #[cfg(feature = "lab")]
         Command::Studio(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
         Command::Train(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
         Command::Evaluate(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
         Command::Demo(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
         Command::Probe(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
         Command::CrossRoom(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
         Command::Sweep(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
         Command::Reproduce(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
         Command::Theory(arguments) => arguments.run(),
         Command::Serve(arguments) => arguments.run().await,
         Command::Navigate(arguments) => arguments.run().await,
@@ -106,13 +137,15 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
     }
 }
 
-/// Prints a line to standard output; a reader that went away is no error of ours.
+/// Prints a line to standard output. A closed pipe (`seese3 … | head`) is not an error, so failed
+/// writes are ignored.
 fn say(line: impl std::fmt::Display) {
     use std::io::Write;
     let _ = writeln!(std::io::stdout(), "{line}");
 }
 
-/// Refuses a file whose folder is not there, before long work is done for it.
+/// Rejects an output file whose folder does not exist, before any long computation is started for
+/// it.
 fn check_writable(path: &std::path::Path) -> anyhow::Result<()> {
     let folder = path
         .parent()
@@ -129,10 +162,12 @@ fn check_writable(path: &std::path::Path) -> anyhow::Result<()> {
     }
 }
 
-/// Writes a file whole or not at all.
+/// Writes a file atomically: readers see either the old file or the complete new one.
 fn write_file(path: &std::path::Path, content: &[u8]) -> anyhow::Result<()> {
     use anyhow::Context;
 
+    // The content goes into a neighbouring file first: renaming within one folder replaces the
+    // target in a single step.
     let mut partial = path.as_os_str().to_owned();
     partial.push(".partial");
     let partial = std::path::PathBuf::from(partial);
@@ -142,7 +177,7 @@ fn write_file(path: &std::path::Path, content: &[u8]) -> anyhow::Result<()> {
     std::fs::rename(&partial, path).with_context(|| format!("{} cannot be written", path.display()))
 }
 
-/// Writes JSON, indented, with a line end.
+/// Writes indented JSON, with a newline at the end.
 fn write_json(path: &std::path::Path, value: &serde_json::Value) -> anyhow::Result<()> {
     write_file(path, format!("{value:#}\n").as_bytes())
 }

@@ -1,4 +1,4 @@
-//! `seese3 probe`: how much of SE(3) features hold, M1 to M4.
+//! `seese3 probe`: how much SE(3) structure features carry, metrics M1 to M4 of the paper.
 
 use std::path::PathBuf;
 
@@ -9,96 +9,102 @@ use serde_json::json;
 
 use super::progress::bar;
 use super::protocol::ProtocolOptions;
-use super::rooms::{lesson, load_rooms, room_words};
+use super::rooms::{data, load_rooms, room_words};
 use super::{check_writable, say, write_json};
-use crate::adapter::TrainConfig;
-use crate::features::Features;
-use crate::metrics::{
-    Bound, Counted, Duplicates, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe,
-};
-use crate::report::{AtStride, ProbeScores, probe_table};
-use crate::scores::MotionScores;
 use crate::store::{Store, StoredRoom};
-use crate::training::{Lesson, Recipe, learn};
+use seese3_core::features::Features;
+use seese3_core::motion_scores::MotionScores;
+use seese3_core::training::{RoomData, TrainingPlan};
+use seese3_lab::experiments::probe::{
+    DimensionProtocol, ProbeProtocol, ProbeScores, probe, probe_adapters,
+};
+use seese3_lab::probes::{Bound, Counted, Duplicates, MutualKnn};
+use seese3_lab::report::{probe_json, probe_table};
 
 #[derive(Debug, Args)]
 pub struct Probe {
-    /// The store
+    /// The store: a folder, or a bucket by its URL
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// The room; names, or patterns with *; may be given several times
+    /// Rooms to probe: names, or patterns with *; may be given several times
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// Which of its features; may be left out when the room has one
+    /// Name of the feature set, the same for every room; may be omitted when the first room has
+    /// only one
     #[arg(long)]
     features: Option<String>,
-    /// What to measure, separated by commas
-    #[arg(long, value_enum, value_delimiter = ',', default_values_t = [Metric::M1, Metric::M2, Metric::M3, Metric::M4])]
-    metrics: Vec<Metric>,
-    /// Strides of M3 and M4, separated by commas, instead of --stride; the first is the headline
+    /// Metrics to compute, separated by commas; all if omitted
+    #[arg(long, value_enum, value_delimiter = ',', default_values_t = [MetricName::M1, MetricName::M2, MetricName::M3, MetricName::M4])]
+    metrics: Vec<MetricName>,
+    /// Strides of M3 and M4, separated by commas, instead of --stride; the first one is the
+    /// headline
     #[arg(long = "sweep-strides", value_delimiter = ',')]
     sweep: Vec<u32>,
-    /// Seeds of M4, from 0 on
+    /// Number of adapters that M4 trains per stride, with seeds 0, 1, …; 1 to 1000
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1_000))]
     seeds: u64,
-    /// Beside one adapter a room, one for all rooms together
+    /// For M4, also train one adapter on all rooms together, beside one per room
     #[arg(long)]
     pooled: bool,
     #[command(flatten)]
     protocol: ProtocolOptions,
-    /// Frames that M1 compares
+    /// M1: number of frames compared
     #[arg(long, default_value_t = 256)]
     m1_frames: usize,
-    /// Stride of M1
+    /// M1: step between compared frames, in frames of the room
     #[arg(long, default_value_t = 1)]
     m1_stride: usize,
-    /// Neighbours of M1
+    /// M1: number of nearest neighbours, k
     #[arg(long, default_value_t = 10)]
     m1_k: usize,
-    /// How near frames are no neighbours, in M1
+    /// M1: frames within this temporal distance do not count as neighbours
     #[arg(long, default_value_t = 10)]
     m1_exclusion: usize,
-    /// What --m1-exclusion counts
+    /// M1: the unit of --m1-exclusion
     #[arg(long, value_enum, default_value_t = CountedName::Sampled)]
     m1_counts: CountedName,
-    /// A frame that is just --m1-exclusion away may be a neighbour
+    /// M1: let a frame at exactly the distance --m1-exclusion count as a neighbour
     #[arg(long)]
     m1_exclusive: bool,
-    /// Frames to each side that are no neighbours, in M2; 0 is the paper's, which measures the path
-    /// rather than the room
+    /// M2: frames to each side that do not count as neighbours. The paper uses 0, which measures
+    /// the dimension of the camera path rather than that of the room
     #[arg(long, default_value_t = 0)]
     m2_gap: usize,
-    /// Of rows that are the same keep the first, in M2, instead of dropping all that have a twin
+    /// M2: of identical rows keep the first, instead of dropping every row that has a duplicate
     #[arg(long)]
     m2_keep_first: bool,
-    /// Write all of it here as JSON
+    /// Write all scores and their settings to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Metric {
-    /// Mutual k-NN
+enum MetricName {
+    /// Mutual k-NN: whether neighbours by feature are neighbours by pose
     M1,
-    /// Intrinsic dimension
+    /// Intrinsic dimension of the features, by TwoNN and MLE
     M2,
-    /// Ridge
+    /// Ridge probe: test R² of a linear map from feature differences to motions
     M3,
-    /// Adapter
+    /// Trained adapter: test R² of its motions
     M4,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum CountedName {
-    /// The frames that are compared
+    /// Compared frames, that is, every --m1-stride-th frame
     Sampled,
-    /// The frames of the room
+    /// Frames of the room
     Native,
 }
 
 type Loaded = (StoredRoom, Features);
 
 impl Probe {
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one command, from its arguments to what it prints"
+    )]
     pub async fn run(self) -> anyhow::Result<()> {
         if let Some(file) = &self.json {
             check_writable(file)?;
@@ -106,19 +112,25 @@ impl Probe {
 
         let store = Store::open(&self.store)?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
-        if self.metrics.contains(&Metric::M3) || self.metrics.contains(&Metric::M4) {
+
+        // M3 and M4 are scored on test pairs; M1 and M2 need no split.
+        if self.metrics.contains(&MetricName::M3) || self.metrics.contains(&MetricName::M4) {
             self.protocol.needs_test_pairs()?;
         }
 
-        let base = self.protocol.recipe(0)?;
-        let recipes = self.recipes(&base)?;
-        let pooled = self.pooled && self.metrics.contains(&Metric::M4);
+        // Seed 0 is a placeholder: `probe_adapters` sets the seed of each run.
+        let base = self.protocol.plan(0)?;
+        let plans = self.plans(&base)?;
+        let pooled = self.pooled && self.metrics.contains(&MetricName::M4);
         let progress = bar((rooms.len() + usize::from(pooled)) as u64, "probing");
-        let (mut scores, skipped) = self.probed(&rooms, &recipes, &progress)?;
+        let protocol = self.probe_protocol(&plans);
+        let (mut scores, skipped) = probed(&rooms, &protocol, &progress)?;
 
+        // One more row: a single adapter trained on all rooms, its test scores averaged over the
+        // rooms.
         if pooled {
-            let lessons: Vec<Lesson<'_>> = rooms.iter().map(lesson).collect();
-            let m4 = self.adapters(&lessons, &recipes)?;
+            let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
+            let m4 = probe_adapters(&room_data, &protocol)?;
             let room = format!("{} together", room_words(&rooms));
 
             scores.push(ProbeScores {
@@ -146,16 +158,19 @@ impl Probe {
             .iter()
             .for_each(|why| say(format_args!("skipped: {why}")));
 
-        for (score, (dimension, gap, _)) in scores
+        // M2 depends on the gap and on how duplicates were treated, so these are printed with it.
+        for (score, (dimension, options)) in scores
             .iter()
             .filter_map(|score| Some((score, score.m2.as_ref()?)))
         {
             say(format_args!(
-                "M2 of {}: {} rows used, {} dropped as duplicates, gap {gap}",
-                score.room, dimension.used, dimension.dropped
+                "M2 of {}: {} rows used, {} dropped as duplicates, gap {}",
+                score.room, dimension.used, dimension.dropped, options.gap
             ));
         }
 
+        // R² of a component that is constant over the test pairs would divide by a variance of
+        // zero.
         let still = scores
             .iter()
             .flat_map(|score| score.m3.iter().chain(&score.m4))
@@ -171,10 +186,11 @@ impl Probe {
         }
 
         if let Some(file) = &self.json {
+            // One room keeps the flat layout {m1, m2, …}; several rooms become a list.
             let mut record = match scores.as_slice() {
-                [one] => one.json(),
+                [one] => probe_json(one),
                 several => {
-                    json!({ "rooms": several.iter().map(ProbeScores::json).collect::<Vec<_>>() })
+                    json!({ "rooms": several.iter().map(probe_json).collect::<Vec<_>>() })
                 }
             };
             record["skipped"] = json!(skipped);
@@ -190,63 +206,29 @@ impl Probe {
         Ok(())
     }
 
-    /// Every room that can be probed, and why the others cannot.
-    fn probed(
-        &self,
-        rooms: &[Loaded],
-        recipes: &[Recipe],
-        progress: &indicatif::ProgressBar,
-    ) -> anyhow::Result<(Vec<ProbeScores>, Vec<String>)> {
-        let one = |room: &Loaded| {
-            let what = || {
-                format!(
-                    "room '{}', features '{}'",
-                    room.0.room.id(),
-                    room.1.source().name
-                )
-            };
-
-            let scores = self.scores(room, recipes).with_context(what);
-            progress.inc(1);
-
-            scores
-        };
-
-        let probed: Vec<anyhow::Result<ProbeScores>> = rooms.par_iter().map(one).collect();
-        let mut scores = Vec::with_capacity(probed.len());
-        let mut skipped = Vec::new();
-        for result in probed {
-            match result {
-                Ok(found) => scores.push(found),
-                Err(error) if rooms.len() > 1 => skipped.push(format!("{error:#}")),
-                Err(error) => return Err(error),
-            }
-        }
-
-        if let (true, Some(first)) = (scores.is_empty(), skipped.first()) {
-            bail!("no room could be probed; the first says: {first}");
-        }
-
-        Ok((scores, skipped))
-    }
-
-    /// One recipe a stride.
-    fn recipes(&self, base: &Recipe) -> anyhow::Result<Vec<Recipe>> {
+    /// One training recipe per stride: those of --sweep-strides, or the base recipe alone.
+    fn plans(&self, base: &TrainingPlan) -> anyhow::Result<Vec<TrainingPlan>> {
         match self.sweep.as_slice() {
             [] => Ok(vec![base.clone()]),
             strides => strides
                 .iter()
-                .map(|&stride| self.protocol.at_stride(stride).recipe(0))
+                .map(|&stride| self.protocol.at_stride(stride).plan(0))
                 .collect(),
         }
     }
 
-    fn scores(&self, room: &Loaded, recipes: &[Recipe]) -> anyhow::Result<ProbeScores> {
-        let stored = &room.0.room;
-        let rows = room.1.rows();
-        let wants = |metric: Metric| self.metrics.contains(&metric);
+    /// What was asked for, at every stride of `plans`.
+    fn probe_protocol(&self, plans: &[TrainingPlan]) -> ProbeProtocol {
+        let wants = |metric: MetricName| self.metrics.contains(&metric);
+        let plans_for = |metric: MetricName| {
+            if wants(metric) {
+                plans.to_vec()
+            } else {
+                Vec::new()
+            }
+        };
 
-        let knn = MutualKnn {
+        let mutual_knn = MutualKnn {
             frames: self.m1_frames,
             stride: self.m1_stride,
             k: self.m1_k,
@@ -261,78 +243,64 @@ impl Probe {
                 Bound::Inclusive
             },
         };
-
-        let duplicates = if self.m2_keep_first {
-            Duplicates::KeepFirst
-        } else {
-            Duplicates::DropRows
+        let dimension = DimensionProtocol {
+            gap: self.m2_gap,
+            duplicates: if self.m2_keep_first {
+                Duplicates::KeepFirst
+            } else {
+                Duplicates::DropRows
+            },
         };
 
-        let m1 = wants(Metric::M1)
-            .then(|| mutual_knn(rows, stored.poses(), &knn))
-            .transpose()
-            .context("M1")?;
-
-        let m2 = wants(Metric::M2)
-            .then(|| intrinsic_dimension(rows, self.m2_gap, duplicates))
-            .transpose();
-
-        let mut m3 = Vec::new();
-        for recipe in recipes.iter().filter(|_| wants(Metric::M3)) {
-            let run = ridge_probe(rows, stored, recipe.split, recipe.stride).context("M3")?;
-            m3.push(AtStride {
-                stride: recipe.stride,
-                runs: vec![run],
-            });
+        ProbeProtocol {
+            m1: wants(MetricName::M1).then_some(mutual_knn),
+            m2: wants(MetricName::M2).then_some(dimension),
+            m3: plans_for(MetricName::M3),
+            m4: plans_for(MetricName::M4),
+            seeds: self.seeds,
         }
+    }
+}
 
-        let m4 = if wants(Metric::M4) {
-            self.adapters(&[lesson(room)], recipes).context("M4")?
-        } else {
-            Vec::new()
+/// The scores of every room that can be probed, and one line per skipped room that says why. A
+/// single room that cannot be probed is an error.
+fn probed(
+    rooms: &[Loaded],
+    protocol: &ProbeProtocol,
+    progress: &indicatif::ProgressBar,
+) -> anyhow::Result<(Vec<ProbeScores>, Vec<String>)> {
+    let one = |room: &Loaded| {
+        let what = || {
+            format!(
+                "room '{}', features '{}'",
+                room.0.room.id(),
+                room.1.source().name
+            )
         };
 
-        Ok(ProbeScores {
-            room: stored.id().to_string(),
-            m1: m1.map(|value| (value, knn)),
-            m2: m2
-                .context("M2")?
-                .map(|dimension| (dimension, self.m2_gap, duplicates)),
-            m3,
-            m4,
-        })
+        let scores = probe(&data(room), protocol).with_context(what);
+        progress.inc(1);
+
+        scores
+    };
+
+    // Rooms are probed in parallel; collecting keeps their order.
+    let probed: Vec<anyhow::Result<ProbeScores>> = rooms.par_iter().map(one).collect();
+    let mut scores = Vec::with_capacity(probed.len());
+    let mut skipped = Vec::new();
+
+    // Among several rooms, one that cannot be probed is skipped with its reason.
+    for result in probed {
+        match result {
+            Ok(found) => scores.push(found),
+            Err(error) if rooms.len() > 1 => skipped.push(format!("{error:#}")),
+            Err(error) => return Err(error),
+        }
     }
 
-    /// Test scores of one adapter a seed, at every stride: means over rooms.
-    fn adapters(
-        &self,
-        lessons: &[Lesson<'_>],
-        recipes: &[Recipe],
-    ) -> anyhow::Result<Vec<AtStride>> {
-        let at = |recipe: &Recipe| {
-            let run = |seed: u64| {
-                let recipe = Recipe {
-                    config: TrainConfig {
-                        seed,
-                        ..recipe.config.clone()
-                    },
-                    ..recipe.clone()
-                };
-
-                Ok(learn(lessons, &recipe, &mut |_| ())?.1.test)
-            };
-
-            let runs = (0..self.seeds)
-                .into_par_iter()
-                .map(run)
-                .collect::<anyhow::Result<_>>()?;
-
-            Ok(AtStride {
-                stride: recipe.stride,
-                runs,
-            })
-        };
-
-        recipes.iter().map(at).collect()
+    if let (true, Some(first)) = (scores.is_empty(), skipped.first()) {
+        bail!("no room could be probed; the first says: {first}");
     }
+
+    Ok((scores, skipped))
 }

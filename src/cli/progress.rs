@@ -1,10 +1,10 @@
-//! A progress bar on a terminal, nothing in a pipe.
+//! A progress bar on a terminal, and nothing in a pipe.
 
 use std::io::IsTerminal;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-/// A bar over `steps` on standard error if that is a terminal.
+/// A bar over `steps` steps, on standard error; hidden if that is not a terminal.
 pub fn bar(steps: u64, what: &'static str) -> ProgressBar {
     let target = if std::io::stderr().is_terminal() {
         ProgressDrawTarget::stderr()

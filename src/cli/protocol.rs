@@ -1,89 +1,94 @@
-//! What a training protocol is made of, on the command line.
+//! The options of a training protocol, shared by the commands that train.
 
 use anyhow::Context;
 use clap::{Args, ValueEnum};
 
-use crate::adapter::{Loss, Mixing, PairPlan, Preset};
-use crate::pairs::{Split, StrideRange};
-use crate::training::Recipe;
+use seese3_core::adapter::{Loss, Mixing, PairPlan, Preset};
+use seese3_core::splits::{Split, StrideRange};
+use seese3_core::training::TrainingPlan;
 
-/// A preset, and what is to be different from it.
+/// A preset, and options that override single settings of it.
 #[derive(Debug, Clone, Args)]
 pub struct ProtocolOptions {
-    /// The protocol
+    /// Training protocol that supplies every setting not given below
     #[arg(long, value_enum, default_value_t = PresetName::PaperBase)]
     preset: PresetName,
-    /// Frames from source to target
+    /// Frames from the source to the target of a test pair, 1 to 100000; also of a training pair
+    /// unless these are drawn from a range of strides
     #[arg(long, default_value_t = 40)]
     stride: u32,
-    /// How frames are kept apart for testing; `pairs` leaks on purpose
+    /// How training and test pairs are kept apart
     #[arg(long, value_enum, default_value_t = SplitName::Time)]
     split: SplitName,
-    /// Passes over the pairs, instead of the preset's
+    /// Number of epochs, 1 to 100000; the preset's if omitted
     #[arg(long)]
     epochs: Option<usize>,
-    /// Draw training pairs with strides LOW-HIGH, instead of the preset's
+    /// Draw training pairs with strides LOW-HIGH in frames, for instance 10-40; the preset's if
+    /// omitted
     #[arg(long, value_name = "LOW-HIGH")]
     strides: Option<String>,
-    /// How many pairs are drawn from a range of strides
+    /// Number of training pairs drawn from the range of strides, 1 to 10000000; the preset's if
+    /// omitted, 30000 where it has none
     #[arg(long)]
     pairs: Option<usize>,
-    /// Learning rate
+    /// Learning rate; the preset's if omitted (1e-3, steady 3e-4)
     #[arg(long)]
     lr: Option<f64>,
-    /// Decoupled decay of every weight
+    /// Decoupled weight decay (AdamW) of every parameter; the preset's if omitted (0.01)
     #[arg(long)]
     weight_decay: Option<f64>,
-    /// Pairs in a step of the optimiser
+    /// Pairs per optimiser step; the preset's if omitted (512)
     #[arg(long)]
     batch: Option<usize>,
-    /// Columns between the two layers of φ
+    /// Width of φ's hidden layer; the preset's if omitted (64)
     #[arg(long)]
     hidden: Option<usize>,
-    /// Columns of a chart's latent
+    /// Latent dimension of each chart, the paper's geo_dim, at least 6; the preset's if omitted
+    /// (20)
     #[arg(long)]
     geo_dim: Option<usize>,
-    /// Charts that a gate mixes, the paper's K
+    /// Number of charts, the paper's K, 1 to 16; the preset's if omitted (1)
     #[arg(long)]
     charts: Option<usize>,
-    /// How charts are mixed
+    /// How several charts are combined; the preset's if omitted (gate)
     #[arg(long, value_enum)]
     mixing: Option<MixingName>,
-    /// What is minimised
+    /// Training loss on z-scored motions; the preset's if omitted (mse)
     #[arg(long, value_enum)]
     loss: Option<LossName>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum PresetName {
-    /// All pairs at one stride, 10 epochs
+    /// The paper's base protocol: all training pairs at one stride, 10 epochs
     PaperBase,
-    /// 30,000 pairs with strides 10 to 40, 200 epochs
+    /// The paper's range protocol: 30,000 pairs with strides 10 to 40, 200 epochs
     PaperRange,
-    /// Ours, for rooms never seen: strides 1 to 40, 1,000 steps on z-scored features with noise,
-    /// averaged weights
+    /// Not from the paper, for rooms outside the training set: 17 epochs of 30,000 pairs with
+    /// strides 1 to 40 (about 1,000 steps), z-scored features with noise, averaged weights
     Steady,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum SplitName {
-    /// The first 80 % of the frames train
+    /// The first 80 % of the frames train, the rest test
     Time,
-    /// Blocks of 50 frames
+    /// Every fifth block of 50 frames tests, the others train
     Blocks,
-    /// By source frame: leaks on purpose, to check an implementation
+    /// Every fifth source frame gives a test pair. Training and test pairs share frames: only for
+    /// checking an implementation, not for measuring generalisation
     Pairs,
-    /// The recording's own, where it has one
+    /// The recording's own split, if it has one
     Dataset,
-    /// Every pair trains and tests: for rooms that are learned from, or held out, as a whole
+    /// Every pair both trains and tests: for rooms that are training or held-out rooms as a whole
     Whole,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum MixingName {
-    /// By a gate that is learned with them, the paper's
+    /// By a gate that is trained with the charts, as in the paper
     Gate,
-    /// Evenly: an ensemble of adapters, each learned for its share of the epochs
+    /// By their plain average: an ensemble of adapters, each trained for its share of the epochs
     Even,
 }
 
@@ -98,11 +103,11 @@ impl From<MixingName> for Mixing {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum LossName {
-    /// Mean squared error, the paper's
+    /// Mean squared error over all six components, as in the paper
     Mse,
-    /// One minus the cosine of the six numbers
+    /// One minus the cosine between predicted and true motion, as vectors of six numbers
     Cosine,
-    /// Mean squared error of the rotation alone
+    /// Mean squared error of the three rotation components only
     Rotation,
 }
 
@@ -139,17 +144,17 @@ impl From<LossName> for Loss {
 }
 
 impl ProtocolOptions {
-    /// Refuses the split that sets nothing apart, where test pairs are what is asked for.
+    /// Rejects `--split whole`, which has no test pairs, for commands that score on test pairs.
     pub fn needs_test_pairs(&self) -> anyhow::Result<()> {
         anyhow::ensure!(
             self.split != SplitName::Whole,
-            "--split whole sets no test pairs apart; take another split"
+            "--split whole has no test pairs; choose another split"
         );
 
         Ok(())
     }
 
-    /// Refuses what a grid decides.
+    /// Rejects single values for the settings that a sweep varies over a grid.
     pub fn leaves_to_the_grid(&self) -> anyhow::Result<()> {
         for (given, option, grid) in [
             (self.geo_dim.is_some(), "--geo-dim", "--geo-dims"),
@@ -159,14 +164,14 @@ impl ProtocolOptions {
         ] {
             anyhow::ensure!(
                 !given,
-                "{option} is one of the sweep's own; give {grid}, with commas"
+                "{option} is set by the sweep; give its values to {grid}, separated by commas"
             );
         }
 
         Ok(())
     }
 
-    /// The same at another stride.
+    /// The same options with another stride.
     pub fn at_stride(&self, stride: u32) -> Self {
         Self {
             stride,
@@ -174,16 +179,17 @@ impl ProtocolOptions {
         }
     }
 
-    /// The preset with what was given in its place.
-    pub fn recipe(&self, seed: u64) -> anyhow::Result<Recipe> {
+    /// The preset's training plan, with the given options in place of its settings.
+    pub fn plan(&self, seed: u64) -> anyhow::Result<TrainingPlan> {
         anyhow::ensure!(
             (1..=MAX_STRIDE).contains(&self.stride),
             "--stride must be 1 to {MAX_STRIDE}, got {}",
             self.stride
         );
 
-        let mut recipe = Recipe::of(self.preset.into(), self.split.into(), self.stride, seed);
-        let config = &mut recipe.config;
+        // The preset comes first; every option that was given replaces one of its settings.
+        let mut plan = TrainingPlan::of(self.preset.into(), self.split.into(), self.stride, seed);
+        let config = &mut plan.config;
         let put = |into: &mut usize, given: Option<usize>| given.map_or((), |given| *into = given);
         put(&mut config.epochs, self.epochs);
 
@@ -197,11 +203,13 @@ impl ProtocolOptions {
         config.mixing = self.mixing.map_or(config.mixing, Into::into);
         config.loss = self.loss.map_or(config.loss, Into::into);
 
-        recipe.pairs = self.plan(recipe.pairs)?;
-        Ok(recipe)
+        plan.pairs = self.pair_plan(plan.pairs)?;
+        Ok(plan)
     }
 
-    fn plan(&self, preset: PairPlan) -> anyhow::Result<PairPlan> {
+    fn pair_plan(&self, preset: PairPlan) -> anyhow::Result<PairPlan> {
+        // --strides or --pairs turn a preset with a single stride into pairs drawn at random;
+        // 30,000 is the number that paper-range draws.
         let (low, high, count) = match (&self.strides, &preset) {
             (None, PairPlan::Stride(_)) if self.pairs.is_none() => return Ok(preset),
             (None, PairPlan::Stride(stride)) => (*stride, *stride, 30_000),
@@ -214,7 +222,7 @@ impl ProtocolOptions {
                 let end = |text: &str| {
                     text.trim()
                         .parse()
-                        .with_context(|| format!("--strides: '{text}' is no stride"))
+                        .with_context(|| format!("--strides: '{text}' is not a number of frames"))
                 };
 
                 let count = if let PairPlan::Range(range) = &preset {
@@ -229,7 +237,7 @@ impl ProtocolOptions {
 
         anyhow::ensure!(
             low >= 1 && low <= high && high <= MAX_STRIDE,
-            "--strides: {low}-{high} is no range from 1 to {MAX_STRIDE}"
+            "--strides: {low}-{high} is not a range within 1 to {MAX_STRIDE}"
         );
 
         let count = self.pairs.unwrap_or(count);
@@ -242,8 +250,8 @@ impl ProtocolOptions {
     }
 }
 
-/// The longest stride.
+/// The largest stride that is accepted, in frames.
 const MAX_STRIDE: u32 = 100_000;
 
-/// The most pairs that are drawn.
+/// The largest number of training pairs that is accepted.
 const MAX_PAIRS: usize = 10_000_000;

@@ -1,14 +1,15 @@
-//! Several rooms on the command line: names and patterns.
+//! Options that name several rooms: names and patterns.
 
 use anyhow::bail;
 
-use crate::features::Features;
 use crate::store::{Store, StoredRoom};
-use crate::training::Lesson;
+use seese3_core::features::Features;
+use seese3_core::training::RoomData;
 
-/// The rooms that names and patterns mean, in the order given, each once; a pattern's rooms by
-/// name.
+/// The rooms that the given names and patterns select, each once, in the order given. The rooms of
+/// one pattern are sorted by name.
 pub async fn room_names(store: &Store, given: &[String]) -> anyhow::Result<Vec<String>> {
+    // The store is listed only if there is a pattern to match.
     let known: Vec<String> = match given.iter().any(|name| name.contains('*')) {
         true => store
             .rooms()
@@ -30,8 +31,9 @@ pub async fn room_names(store: &Store, given: &[String]) -> anyhow::Result<Vec<S
             false => vec![pattern.clone()],
         };
 
+        // A pattern without a match is more likely a typing error than an empty set.
         if meant.is_empty() {
-            bail!("no room of the store is called like '{pattern}'");
+            bail!("no room in the store matches '{pattern}'");
         }
 
         for name in meant {
@@ -44,8 +46,8 @@ pub async fn room_names(store: &Store, given: &[String]) -> anyhow::Result<Vec<S
     Ok(names)
 }
 
-/// Loads rooms with one of their features, the same of each; the first room's only one, if none is
-/// named.
+/// Loads rooms, each with the same one of its feature sets: the one named, or else the only one
+/// that the first room has.
 pub async fn load_rooms(
     store: &Store,
     given: &[String],
@@ -53,6 +55,7 @@ pub async fn load_rooms(
 ) -> anyhow::Result<Vec<(StoredRoom, Features)>> {
     let mut rooms: Vec<(StoredRoom, Features)> = Vec::new();
     for name in room_names(store, given).await? {
+        // The first room decides: the others are loaded with the feature set of that name.
         let wanted = features.or_else(|| {
             rooms
                 .first()
@@ -65,16 +68,16 @@ pub async fn load_rooms(
     Ok(rooms)
 }
 
-/// A loaded room as training takes it.
-pub fn lesson((stored, features): &(StoredRoom, Features)) -> Lesson<'_> {
-    Lesson {
+/// A loaded room in the form that training takes.
+pub fn data((stored, features): &(StoredRoom, Features)) -> RoomData<'_> {
+    RoomData {
         room: &stored.room,
         revision: stored.revision,
         features,
     }
 }
 
-/// Rooms in words.
+/// A short description of rooms for a line of output.
 pub fn room_words(rooms: &[(StoredRoom, Features)]) -> String {
     let first = &rooms[0].0;
     match rooms {
@@ -88,11 +91,13 @@ pub fn room_words(rooms: &[(StoredRoom, Features)]) -> String {
     }
 }
 
-/// Whether a name is what a pattern says; * stands for any characters.
+/// Whether a name matches a pattern, in which * stands for any characters, also none.
 fn matches(pattern: &str, name: &str) -> bool {
     match pattern.split_once('*') {
         None => pattern == name,
         Some((before, after)) => name.strip_prefix(before).is_some_and(|rest| {
+            // Try every length for the star's text; the rest of the name has to match the rest of
+            // the pattern.
             rest.char_indices()
                 .map(|(at, _)| at)
                 .chain([rest.len()])

@@ -1,8 +1,9 @@
-//! `seese3 serve`: answer over gRPC until told to stop.
+//! `seese3 serve`: answers over gRPC until SIGTERM or Ctrl-C.
 
 use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::time::Duration;
+use tracing_subscriber::fmt::format::FmtSpan;
 
 use anyhow::Context;
 use clap::{Args, ValueEnum};
@@ -11,24 +12,24 @@ use tokio::net::TcpListener;
 use super::encoder::RuntimeName;
 use super::say;
 use crate::encoder::{Bounds, Runtime};
-use crate::index::HnswParameters;
-use crate::navigation::{IndexKind, Limits};
 use crate::service::{Config, ImageEncoders, TokenKey, run, shutdown_signal};
 use crate::store::Store;
+use seese3_core::index::HnswParameters;
+use seese3_core::navigation::{IndexKind, Limits};
 
 #[derive(Debug, Args)]
 pub struct Serve {
-    /// The store
+    /// The store to serve: a folder, or a bucket by its URL
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// Where to listen; port 0 takes a free one
+    /// Address to listen on, HOST:PORT; port 0 takes a free port
     #[arg(long, env = "SEESE3_LISTEN", default_value = "127.0.0.1:50051")]
     listen: String,
-    /// How frames are searched
+    /// How the nearest frames are searched
     #[arg(long, env = "SEESE3_INDEX", value_enum, default_value_t = IndexName::Exact)]
     index: IndexName,
-    /// Take images instead of features: `builtin`, `pixels`, or the ONNX file that an adapter's
-    /// features were made by; several are divided by commas
+    /// Also accept images instead of features, encoded by these models: `builtin`, `pixels`, or the
+    /// ONNX files that the adapters' features were made with, separated by commas; none if omitted
     #[arg(
         long = "encoder",
         value_name = "MODEL",
@@ -36,56 +37,58 @@ pub struct Serve {
         value_delimiter = ','
     )]
     encoders: Vec<String>,
-    /// What runs ONNX models: tract needs nothing, onnxruntime is faster
+    /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
     #[arg(long, env = "SEESE3_RUNTIME", value_enum, default_value_t = RuntimeName::Tract)]
     runtime: RuntimeName,
-    /// The shared library of onnxruntime
+    /// Path of the shared library of onnxruntime
     #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
     library: Option<std::path::PathBuf>,
-    /// The most pixels of an image that is sent
+    /// Largest accepted image, pixels after decoding
     #[arg(long, env = "SEESE3_MAX_IMAGE_PIXELS", default_value_t = 16_000_000)]
     max_image_pixels: u64,
-    /// The most steps of one navigation
+    /// Largest number of steps in one navigation
     #[arg(long, env = "SEESE3_MAX_STEPS", default_value_t = Limits::default().steps)]
     max_steps: u32,
-    /// The most frames of one step or localisation
+    /// Largest number of frames returned for one step or one localisation
     #[arg(long, env = "SEESE3_MAX_HITS", default_value_t = Limits::default().hits)]
     max_hits: u32,
-    /// The most frames of one answer
+    /// Largest number of frames in one answer (steps times frames per step)
     #[arg(long, env = "SEESE3_MAX_HITS_IN_ALL", default_value_t = Limits::default().hits_in_all)]
     max_hits_in_all: u64,
-    /// The largest message that is read, bytes
+    /// Largest message accepted from a client, bytes; also the size limit of an encoded image
     #[arg(long, env = "SEESE3_MAX_MESSAGE_BYTES", default_value_t = Config::default().message_bytes)]
     max_message_bytes: usize,
-    /// The longest a request may take, seconds
+    /// Time limit of a request, seconds, 1 to 86400, whatever deadline the client sets
     #[arg(long, env = "SEESE3_MAX_REQUEST_SECONDS", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     max_request_seconds: u64,
-    /// How long requests in flight may go on after SIGTERM, seconds
+    /// Time that running requests get to finish after SIGTERM or Ctrl-C, seconds, 0 to 86400
     #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = 10, value_parser = clap::value_parser!(u64).range(0..=86_400))]
     drain_seconds: u64,
-    /// Cameras that are followed at a time
+    /// Largest number of tracking streams at a time; one more is refused
     #[arg(long, env = "SEESE3_MAX_STREAMS", default_value_t = Config::default().streams)]
     max_streams: usize,
-    /// A file whose bytes, 16 or more, seal resume tokens: servers that share it go on with one
-    /// another's streams; without one they end with the server
+    /// File with a secret of at least 16 bytes that signs the resume tokens of tracking streams.
+    /// Servers with the same secret can continue each other's streams; if omitted, the key is
+    /// random and tokens are void once the server ends
     #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_KEY_FILE")]
     token_key_file: Option<PathBuf>,
-    /// Requests computed at a time; the machine's cores if not given
+    /// Requests computed at the same time, and threads of an onnxruntime session, 1 to 1024; the
+    /// number of cores if omitted
     #[arg(long, env = "SEESE3_THREADS", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
-    /// Requests that may wait for a thread
+    /// Requests that may wait for a thread, 0 to 1000000; further ones are refused
     #[arg(long, env = "SEESE3_QUEUE", default_value_t = 1_024, value_parser = clap::value_parser!(u32).range(0..=1_000_000))]
     queue: u32,
-    /// How the log is written, to standard error; RUST_LOG chooses what
+    /// Format of the log, which goes to standard error; RUST_LOG sets what is logged
     #[arg(long, env = "SEESE3_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
     log_format: LogFormat,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum IndexName {
-    /// Every frame is looked at
+    /// Exact: the distance to every frame is computed
     Exact,
-    /// The approximate graph of hnsw_rs, for rooms of 100,000 frames and more
+    /// Approximate HNSW graph (crate hnsw_rs), for rooms of 100,000 frames and more
     Hnsw,
 }
 
@@ -100,6 +103,9 @@ impl Serve {
         start_log(self.log_format);
         let store = Store::open(&self.store)?;
         let defaults = Config::default();
+
+        // One number bounds both the requests computed at a time and the threads of an
+        // onnxruntime session.
         let threads = self.threads.map_or(defaults.threads, usize::from);
 
         let config = Config {
@@ -115,6 +121,7 @@ impl Serve {
                     library: self.library.clone(),
                 },
                 bounds: Bounds {
+                    // An image arrives within a single message, so it cannot be larger than that.
                     bytes: self.max_message_bytes as u64,
                     pixels: self.max_image_pixels,
                 },
@@ -134,9 +141,14 @@ impl Serve {
             ..defaults
         };
 
+        // The port is opened before the store is loaded: health checks are answered at once,
+        // NOT_SERVING until everything is loaded.
         let listener = TcpListener::bind(&self.listen)
             .await
             .with_context(|| format!("cannot listen on {}", self.listen))?;
+
+        // With port 0 the system chose the port; the line on standard output tells scripts which
+        // one.
         let address = listener
             .local_addr()
             .context("the listener has no address")?;
@@ -167,6 +179,8 @@ fn start_log(format: LogFormat) {
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,hnsw_rs=warn"));
     let log = tracing_subscriber::fmt()
         .with_env_filter(filter)
+        // A request is logged once, when its span closes.
+        .with_span_events(FmtSpan::CLOSE)
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal());
 

@@ -1,4 +1,4 @@
-//! `seese3 studio`: a suite of drawn rooms, encoded as they are drawn.
+//! `seese3 studio`: a suite of synthetic rooms, encoded while they are rendered.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -12,22 +12,24 @@ use super::encode::{by_layer, check_names, has, same_poses};
 use super::encoder::{EncoderOptions, RuntimeOptions};
 use super::progress::bar;
 use super::{check_writable, say, write_file};
-use crate::cancel::Cancellation;
 use crate::encoder::{Encoder, Error, OnBadImage, Task, encode_png, encode_room, read_image};
-use crate::features::FeatureSource;
-use crate::image::RgbImage;
-use crate::room::{Frames, Provenance, Room, RoomId, Timeline};
 use crate::store::{Store, StoredRoom};
-use crate::studio::{Camera, SuiteRoom, render};
+use seese3_core::cancel::Cancellation;
+use seese3_core::features::FeatureSource;
+use seese3_core::image::RgbImage;
+use seese3_core::room::{Frames, Provenance, Room, RoomId, Timeline};
+use seese3_lab::studio::{Camera, SuiteRoom, render};
 
-/// Rooms of a contact sheet, and its columns.
+/// The largest number of rooms on a contact sheet; below, its columns and the size of a tile,
+/// pixels.
 const SHEET_ROOMS: u32 = 48;
 const SHEET_COLUMNS: usize = 8;
 const SHEET_SIZE: (usize, usize) = (160, 120);
 
 #[derive(Debug, Args)]
 pub struct Studio {
-    /// Where the rooms go; made if it is not there
+    /// The store to publish the rooms in: a folder, created if it does not exist, or a bucket by
+    /// its URL
     #[arg(
         long,
         env = "SEESE3_STORE",
@@ -35,37 +37,40 @@ pub struct Studio {
         required_unless_present = "sheet"
     )]
     out: Option<String>,
-    /// How many rooms
+    /// Number of rooms, 1 to 100000
     #[arg(long, default_value_t = 231, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     rooms: u32,
-    /// Images a room
+    /// Number of frames per room, 2 to 100000
     #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u32).range(2..=100_000))]
     frames: u32,
-    /// Of the suite; the same seed draws the same rooms
+    /// Seed of the suite; the same seed gives the same rooms
     #[arg(long, default_value_t = 7)]
     seed: u64,
-    /// What encodes the images: an ONNX file, `pixels` or `builtin`
+    /// Encoder of the images: an ONNX file, `pixels` or `builtin`
     #[arg(long, value_name = "MODEL", default_value = "builtin")]
     encode: String,
     #[command(flatten)]
     encoder: EncoderOptions,
     #[command(flatten)]
     runtime: RuntimeOptions,
-    /// Images a run of the model
+    /// Frames per run of the model, 1 to 4096
     #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=4_096))]
     batch: u32,
-    /// What the features' names begin with; the model's name if nothing is given
+    /// Prefix of the feature names, PREFIX-LAYER-POOLING; the model's file name without extension
+    /// if omitted
     #[arg(long = "as", value_name = "PREFIX")]
     prefix: Option<String>,
-    /// Keep the images as PNG files, in the store's folder `images`
+    /// Also keep the images, as PNG files in the folder `images` of the store
     #[arg(long)]
     keep_images: bool,
-    /// Only draw one picture of up to 48 rooms, one image each, into this PNG file
+    /// Instead of publishing rooms, render a contact sheet of up to 48 rooms, one image each, to
+    /// this PNG file
     #[arg(long, value_name = "FILE")]
     sheet: Option<PathBuf>,
 }
 
-/// What drawing and encoding took, summed over threads.
+/// Time spent: rendering summed over threads, microseconds, and wall time of the rooms that were
+/// rendered.
 #[derive(Default)]
 struct Spent {
     drawing_us: AtomicU64,
@@ -79,6 +84,8 @@ impl Studio {
         }
 
         let out = self.out()?;
+
+        // Images are kept as plain files, which only a folder can hold.
         if self.keep_images && out.contains("://") {
             bail!("--keep-images needs a store that is a folder");
         }
@@ -91,6 +98,8 @@ impl Studio {
         let store = Store::create(out)?;
         let sources = encoder.sources(&self.prefix());
         check_names(&sources)?;
+
+        // Rooms are rendered at the encoder's own input size, so that no image has to be resized.
         let (width, height) = encoder.render_size();
 
         say(format_args!(
@@ -107,6 +116,8 @@ impl Studio {
         ));
 
         if drawn > 0 {
+            // Wall time per room, and rendering time summed over threads, which may therefore be
+            // the larger of the two.
             let threads = self.runtime.threads();
             let rooms = f64::from(drawn);
             let drawing = spent.drawing_us.load(Ordering::Relaxed) as f64 / 1e6;
@@ -127,8 +138,8 @@ impl Studio {
         Ok(())
     }
 
-    /// Draws and publishes the rooms that are missing: how many were, how many were there, and what
-    /// it took.
+    /// Renders, encodes and publishes the rooms that the store does not have yet. Returns how many
+    /// were rendered, how many were there, and the time spent.
     async fn draw(
         &self,
         store: &Store,
@@ -144,10 +155,15 @@ impl Studio {
         let mut drawn = 0;
         let mut there = 0;
 
+        // One room after another, the frames of each on all threads, so that memory holds one
+        // room at a time.
         for number in 0..self.rooms {
             let name = self.room_name(number);
             progress.set_message(name.clone());
             let begun = Instant::now();
+
+            // A room follows from seed and number alone. An interrupted command therefore
+            // continues by skipping the rooms that are complete in the store.
             let suite = SuiteRoom::new(self.seed, number);
             let mut room = self.room(&name, &suite)?;
             let before = stored(store, &room).await?;
@@ -155,6 +171,8 @@ impl Studio {
                 .as_ref()
                 .is_some_and(|before| before.room.images() == room.images());
 
+            // A room is complete if it has every feature set, made in the same way, and its
+            // images where they are wanted.
             if before
                 .as_ref()
                 .is_some_and(|before| sources.iter().all(|source| has(before, source)))
@@ -162,7 +180,7 @@ impl Studio {
             {
                 there += 1;
             } else {
-                // What an earlier run kept stays with the room.
+                // Images that an earlier run kept stay with the room.
                 if let Some(before) = before.filter(|_| !self.keep_images) {
                     room = before.room;
                 }
@@ -204,7 +222,8 @@ impl Studio {
         format!("studio{}-{number:04}", self.seed)
     }
 
-    /// The room without its features.
+    /// The room with its camera path and, with --keep-images, the paths of its images; without
+    /// features.
     fn room(&self, name: &str, suite: &SuiteRoom) -> anyhow::Result<Room> {
         let poses = suite.path(self.frames as usize);
 
@@ -219,6 +238,8 @@ impl Studio {
             ..Frames::default()
         };
 
+        // The root is absolute, so that `seese3 encode` finds the images from any working
+        // directory.
         if self.keep_images {
             let out = self.out()?;
             let root = Path::new(out)
@@ -252,6 +273,7 @@ impl Studio {
         let image = |row: usize| -> Result<RgbImage, Error> {
             let begun = Instant::now();
 
+            // An image kept by an earlier run is read back instead of being rendered again.
             let drawn = match drawn_before(room, row, camera)? {
                 Some(kept) => kept,
                 None => render(&suite.scene, camera, &room.poses()[row]),
@@ -265,6 +287,7 @@ impl Studio {
             Ok(drawn)
         };
 
+        // A suite room is one unbroken camera path, so clips may span any of its frames.
         let timeline = Timeline::unbroken(room.frame_count());
         let cancel = Cancellation::default();
         let batch = self.batch as usize;
@@ -306,6 +329,9 @@ impl Studio {
     fn sheet(&self, file: &Path) -> anyhow::Result<()> {
         check_writable(file)?;
         let count = self.rooms.min(SHEET_ROOMS);
+
+        // Images are rendered at twice the tile's size; `tiled` averages 2×2 pixels against
+        // aliasing.
         let camera = Camera::sized(SHEET_SIZE.0 * 2, SHEET_SIZE.1 * 2);
         let frame = self.frames as usize / 2;
 
@@ -334,8 +360,8 @@ impl Studio {
     }
 }
 
-/// The kept image of an earlier run, if it is whole. One of another size would not give the same
-/// features again.
+/// The image that an earlier run kept, or none if there is none that can be read. An image of
+/// another size is an error: it would not give the features that a fresh rendering gives.
 fn drawn_before(room: &Room, row: usize, camera: Camera) -> Result<Option<RgbImage>, Error> {
     let Some(image) = room.images().get(row) else {
         return Ok(None);
@@ -345,7 +371,7 @@ fn drawn_before(room: &Room, row: usize, camera: Camera) -> Result<Option<RgbIma
         Ok(kept) => Err(Error::BadImage {
             image: image.clone(),
             problem: format!(
-                "was kept at {}×{}, this encoder sees {}×{}; draw into another store",
+                "was kept at {}×{}, but this encoder takes {}×{}; render into another store",
                 kept.width, kept.height, camera.width, camera.height
             ),
         }),
@@ -353,7 +379,7 @@ fn drawn_before(room: &Room, row: usize, camera: Camera) -> Result<Option<RgbIma
     }
 }
 
-/// The room as it is in the store, if it is; refused if it has other frames there.
+/// The room as the store has it, or none; an error if the store has other frames under its name.
 async fn stored(store: &Store, room: &Room) -> anyhow::Result<Option<StoredRoom>> {
     let name = room.id().as_str();
     let stored = match store.load_room(name, None).await {
@@ -362,9 +388,12 @@ async fn stored(store: &Store, room: &Room) -> anyhow::Result<Option<StoredRoom>
         Err(error) => return Err(error.into()),
     };
 
+    // The name holds the seed but not the number of frames, so equal names do not mean equal
+    // poses.
     if !same_poses(&stored.room, room) {
         bail!(
-            "room '{name}' is in the store with other frames ({}, this suite has {}); name another store",
+            "room '{name}' is in the store with other frames ({}, this suite has {}); \
+            choose another store",
             stored.room.frame_count(),
             room.frame_count()
         );
@@ -373,7 +402,8 @@ async fn stored(store: &Store, room: &Room) -> anyhow::Result<Option<StoredRoom>
     Ok(Some(stored))
 }
 
-/// Images of one size at half their size, row by row.
+/// A contact sheet: images of one size, each reduced to half its size, row by row in `columns`
+/// columns.
 fn tiled(images: &[RgbImage], columns: usize) -> RgbImage {
     let (width, height) = images
         .first()
@@ -387,6 +417,7 @@ fn tiled(images: &[RgbImage], columns: usize) -> RgbImage {
         bytes: Vec::new(),
     };
 
+    // White, which remains where the last row of tiles is not full.
     sheet.bytes = vec![255; sheet.width * sheet.height * 3];
 
     for (place, image) in images.iter().enumerate() {
@@ -394,6 +425,7 @@ fn tiled(images: &[RgbImage], columns: usize) -> RgbImage {
         let top = place / columns * height;
         for y in 0..height {
             for x in 0..width {
+                // A pixel of the sheet is the mean of 2×2 pixels of the image.
                 let four = [(0, 0), (1, 0), (0, 1), (1, 1)]
                     .map(|(dx, dy)| image.pixel(2 * x + dx, 2 * y + dy));
                 let at = ((top + y) * sheet.width + left + x) * 3;

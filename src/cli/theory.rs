@@ -1,4 +1,4 @@
-//! `seese3 theory`: the paper's theorems, measured.
+//! `seese3 theory`: numerical checks of the paper's theorems.
 
 use std::path::PathBuf;
 
@@ -7,21 +7,21 @@ use clap::Args;
 
 use super::progress::bar;
 use super::{check_writable, say, write_json};
-use crate::report::{theory_json, theory_table};
-use crate::theory::{Effort, checks};
+use seese3_lab::report::{theory_json, theory_table};
+use seese3_lab::theory::{Effort, checks};
 
 #[derive(Debug, Args)]
 pub struct Theory {
-    /// Of everything that is drawn at random
+    /// Seed of everything that is drawn at random
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Poses of an intrinsic dimension
+    /// Number of poses for the intrinsic dimension, 64 to 100000
     #[arg(long, default_value_t = 1_024, value_parser = clap::value_parser!(u32).range(64..=100_000))]
     poses: u32,
-    /// Pairs of poses and directions of the other checks
+    /// Number of sampled pose pairs and directions in the other checks, 8 to 100000
     #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u32).range(8..=100_000))]
     samples: u32,
-    /// Write all of it here as JSON
+    /// Write every check to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
@@ -38,6 +38,7 @@ impl Theory {
             samples: self.samples as usize,
         };
 
+        // One tick per group of checks: intrinsic dimension, decodability, bracket and flow.
         let progress = bar(4, "theory");
         let found = checks(effort, &mut |part| {
             progress.set_message(part);
@@ -51,9 +52,11 @@ impl Theory {
             say(format_args!("wrote {}", file.display()));
         }
 
+        // The table and the file show every check; the exit status tells scripts whether all
+        // bounds hold.
         let broken = found.iter().filter(|check| !check.holds()).count();
         if broken > 0 {
-            bail!("{broken} of {} bounds are not kept", found.len());
+            bail!("{broken} of {} bounds are violated", found.len());
         }
 
         Ok(())

@@ -1,4 +1,4 @@
-//! `seese3 track`: have a server follow a camera whose features or images are in files.
+//! `seese3 track`: tracks a camera with a server, from features or images in files.
 
 use std::path::PathBuf;
 
@@ -10,63 +10,64 @@ use super::ask::Server;
 use super::progress::bar;
 use super::{check_writable, say, write_file};
 use crate::datasets::read_features;
-use crate::geometry::Pose;
-use crate::proto::v1 as pb;
-use crate::proto::v1::track_request::Message;
-use crate::proto::v1::track_response::Answer;
-use crate::report::{Recording, tum_trajectory};
-use crate::service::pose_from_wire;
+use crate::export::{Recording, tum_trajectory};
+use seese3_client::convert;
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::track_request::Message;
+use seese3_client::proto::v1::track_response::Answer;
+use seese3_core::geometry::Pose;
 
-/// Requests that may wait to be sent.
+/// The number of requests that may be buffered before they are sent.
 const WAITING: usize = 32;
 
 #[derive(Debug, Args)]
 pub struct Track {
     #[command(flatten)]
     server: Server,
-    /// The room; without one it is found among all that the adapter fits
+    /// Name of the room; if omitted, the server finds it among all rooms that the adapter fits
     #[arg(long)]
     room: Option<String>,
-    /// The adapter; may be left out when only one fits
+    /// Name of the adapter; if omitted, the newest that can track in the room, or without a room
+    /// the only one that can track
     #[arg(long)]
     adapter: Option<String>,
-    /// A NumPy file of features, (n, d), a row a frame
+    /// A NumPy file of features, shape (n, d), one row per frame
     #[arg(long, value_name = "FILE", required_unless_present = "images")]
     feature: Option<PathBuf>,
-    /// A folder of JPEG or PNG files, a file a frame by name, for a server that was started with
-    /// --encoder
+    /// A folder of JPEG or PNG files, one per frame, in the order of their names; the server must
+    /// have been started with --encoder
     #[arg(long, value_name = "FOLDER", conflicts_with = "feature")]
     images: Option<PathBuf>,
-    /// The first frame
+    /// First frame to send, counted from 0
     #[arg(long, default_value_t = 0)]
     from: usize,
-    /// How many frames; all that follow if nothing is given
+    /// Number of frames to send; all remaining ones if omitted
     #[arg(long)]
     count: Option<usize>,
-    /// Frames a second, for their times
+    /// Frame rate, frames per second: frame i gets the timestamp i / hz seconds
     #[arg(long, default_value_t = 30.0)]
     hz: f64,
-    /// Dead reckoning alone
+    /// Dead reckoning only: never correct the drift by frames of the map
     #[arg(long)]
     no_fusion: bool,
-    /// Go on from the token in this file, which --save-token wrote
+    /// Continue an earlier stream from the resume token in this file, which --save-token wrote
     #[arg(long, value_name = "FILE", conflicts_with_all = ["room", "adapter", "no_fusion"])]
     resume: Option<PathBuf>,
-    /// Write the last answer's resume token here
+    /// Write the resume token of the last answer to this file
     #[arg(long, value_name = "FILE")]
     save_token: Option<PathBuf>,
-    /// Write the camera's path in the room here, as a TUM file
+    /// Write the camera's trajectory in the frame `map`, which is the room's world, as a TUM file
     #[arg(long, value_name = "FILE")]
     tum: Option<PathBuf>,
-    /// Write the camera's path in odom here, as a TUM file
+    /// Write the camera's trajectory in the frame `odom`, continuous but drifting, as a TUM file
     #[arg(long, value_name = "FILE")]
     odom_tum: Option<PathBuf>,
-    /// Write poses and transforms here, as an MCAP file
+    /// Write poses, transforms and images as an MCAP file, which Foxglove opens
     #[arg(long = "mcap", value_name = "FILE")]
     recording: Option<PathBuf>,
 }
 
-/// What came back.
+/// The server's answers, sorted by kind, with the frame names and the last resume token.
 #[derive(Default)]
 struct Heard {
     updates: Vec<pb::TrackUpdate>,
@@ -76,7 +77,12 @@ struct Heard {
 }
 
 impl Track {
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one command, from its arguments to what it prints"
+    )]
     pub async fn run(self) -> anyhow::Result<()> {
+        // An output path that cannot be written is reported before the stream, not after it.
         for path in [&self.save_token, &self.tum, &self.odom_tum, &self.recording]
             .into_iter()
             .flatten()
@@ -98,6 +104,8 @@ impl Track {
         });
 
         let config = self.config()?;
+
+        // The sending task takes the views; the MCAP file needs the image paths again afterwards.
         let images = views.clone();
         let client = self.server.connect().await?;
         let (sender, requests) = tokio::sync::mpsc::channel(WAITING);
@@ -105,17 +113,19 @@ impl Track {
         let from = self.from;
         let hz = self.hz;
 
+        // A task of its own sends the frames while this one reads answers: if nobody read them,
+        // the server would stop accepting frames.
         tokio::spawn(async move {
             let frames =
                 (from..end).map(|row| Some(Message::Frame(frame(row, views[row].view()?, hz))));
 
-            // An image that went away since it was listed ends the stream.
+            // An image that has disappeared since the folder was listed ends the stream early.
             for message in [Some(Message::Config(config))]
                 .into_iter()
                 .chain(frames)
                 .map_while(|message| message)
             {
-                // Nobody listens any more: the error comes with the answers.
+                // The stream is closed; the reading side receives the reason as its error.
                 if sender
                     .send(pb::TrackRequest {
                         message: Some(message),
@@ -137,13 +147,16 @@ impl Track {
             let answer = match answers.message().await {
                 Ok(Some(answer)) => answer,
                 Ok(None) => break,
-                // What came before is kept: with its token another server goes on.
+                // Keep the answers so far: with their last token, another server can continue the
+                // stream.
                 Err(status) => {
-                    ended = Err(crate::client::Error::from(status));
+                    ended = Err(seese3_client::Error::from(status));
                     break;
                 }
             };
 
+            // Every answer carries a token of the tracker's state after it; only the newest is of
+            // use.
             heard.token = answer.resume_token;
 
             match answer.answer {
@@ -157,6 +170,9 @@ impl Track {
         }
 
         progress.finish_and_clear();
+
+        // What was received is printed and written even if the stream broke off; only then is the
+        // error returned.
         self.report(&heard, &images)?;
         ended?;
 
@@ -198,6 +214,7 @@ impl Track {
             }
         }
 
+        // Names give the order of the frames, so they need numbers of equal length.
         files.sort();
         if files.is_empty() {
             bail!("{} has no .jpg, .jpeg or .png file", folder.display());
@@ -214,12 +231,16 @@ impl Track {
                 bail!("{} is empty: it has no token", file.display());
             }
 
+            // A token carries the configuration of its stream, so every other field has to be
+            // empty.
             return Ok(pb::TrackConfig {
                 resume_token,
                 ..pb::TrackConfig::default()
             });
         }
 
+        // Anchors are frames of the map that look like the view; they correct the drift of dead
+        // reckoning.
         let fusion = if self.no_fusion {
             pb::Fusion::None
         } else {
@@ -235,6 +256,7 @@ impl Track {
     }
 
     fn report(&self, heard: &Heard, seen: &[Seen]) -> anyhow::Result<()> {
+        // Only changes of the tracking status are printed, each with its reason.
         let mut before = None;
         for update in &heard.updates {
             if before != Some(update.status()) {
@@ -250,6 +272,8 @@ impl Track {
                 } else {
                     format!(" in {room}")
                 };
+
+                // Sequence numbers start at 1, rows of the input at 0.
                 say(format_args!(
                     "frame {}: {status}{place}: {}",
                     update.sequence - 1,
@@ -272,6 +296,8 @@ impl Track {
 
         for (file, of) in [(&self.tum, map as PoseOf), (&self.odom_tum, odom as PoseOf)] {
             if let Some(file) = file {
+                // Frames without a pose in that frame are left out, for instance in `map` before
+                // the camera has been located.
                 let known = heard
                     .updates
                     .iter()
@@ -300,7 +326,7 @@ impl Track {
     }
 }
 
-/// What the camera saw.
+/// One frame of the input.
 #[derive(Clone)]
 enum Seen {
     Feature(Vec<f32>),
@@ -308,7 +334,7 @@ enum Seen {
 }
 
 impl Seen {
-    /// None when the image cannot be read.
+    /// The view as it is sent; none if the image file cannot be read.
     fn view(&self) -> Option<pb::view::View> {
         match self {
             Self::Feature(values) => Some(pb::view::View::Feature(pb::Feature {
@@ -339,23 +365,17 @@ fn odom(update: &pb::TrackUpdate) -> Option<Pose> {
     plain(update.odom_from_camera.clone())
 }
 
-/// A pose whatever its frames are called.
+/// Converts a pose without checking its frame names, which the caller already knows.
 fn plain(pose: Option<pb::Pose>) -> Option<Pose> {
-    pose_from_wire(
-        pb::Pose {
-            parent_frame: String::new(),
-            child_frame: String::new(),
-            ..pose?
-        },
-        "",
-    )
-    .ok()
+    convert::pose(&pose?).ok()
 }
 
 fn recorded(heard: &Heard, seen: &[Seen]) -> anyhow::Result<Vec<u8>> {
     let names = &heard.names;
     let mut recording = Recording::new()?;
     for update in &heard.updates {
+        // Each frame gives the transforms map → odom → camera, and the pose in map on a topic of
+        // its own.
         let time = update.timestamp_ns;
         if let Some(pose) = odom(update) {
             recording.transform(time, &names.odom, &names.camera, &pose)?;
@@ -367,6 +387,7 @@ fn recorded(heard: &Heard, seen: &[Seen]) -> anyhow::Result<Vec<u8>> {
             recording.pose("/pose", time, &names.map, &pose)?;
         }
 
+        // The sequence number leads back to the input row, and so to the image file.
         let row = usize::try_from(update.sequence)
             .unwrap_or(usize::MAX)
             .saturating_sub(1);

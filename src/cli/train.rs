@@ -1,70 +1,72 @@
-//! `seese3 train`: learn an adapter and publish it.
+//! `seese3 train`: trains an adapter and publishes it.
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::time::Instant;
 
 use anyhow::{Context, bail};
 use clap::Args;
-use rayon::prelude::*;
+
+use seese3_core::adapter::{Adapter, CorrectorKind, TrainingRecord};
+use seese3_core::calibration::{calibrate, check_unseen};
+use seese3_core::features::Features;
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan};
+use seese3_lab::experiments::seeds::{SeededTraining, train_seeds};
+use seese3_lab::report::{training_json, training_table};
 
 use super::progress::bar;
 use super::protocol::ProtocolOptions;
-use super::rooms::{lesson, load_rooms, room_words};
+use super::rooms::{data, load_rooms, room_words};
 use super::{check_writable, say, write_json};
-use crate::adapter::{
-    Adapter, Calibration, CorrectorKind, Measured, Reading, TrainConfig, TrainingRecord,
-};
-use crate::cancel::Cancellation;
-use crate::eval::tracking::place_factor;
-use crate::eval::{NavigatorKind, Protocol, evaluate};
-use crate::features::Features;
-use crate::navigation::{IndexKind, Metric, Navigator, StepKind};
-use crate::pairs::Split;
-use crate::report::{TrainingRun, training_json, training_table};
-use crate::scores::Rate;
 use crate::store::{Published, Store, StoredRoom};
-use crate::training::{Lesson, Recipe, calibrate, check_unseen, error_covariance, learn};
 
-/// The most seeds of one command.
+/// The largest number of seeds in one command.
 const MAX_SEEDS: u64 = 1_000;
 
 #[derive(Debug, Args)]
 pub struct Train {
-    /// The store
+    /// The store: a folder, or a bucket by its URL
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// The rooms to learn from together: names, or patterns with *; may be given several times
+    /// Training rooms: names, or patterns with *; may be given several times; one adapter is
+    /// trained on all of them
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// Which of their features; may be left out when the first room has one
+    /// Name of the feature set, the same for every room; may be omitted when the first room has
+    /// only one
     #[arg(long)]
     features: Option<String>,
     #[command(flatten)]
     protocol: ProtocolOptions,
-    /// Train these after the adapter, as further navigators: linear, mlp-2, mlp-3, attention, or
-    /// all
+    /// Corrector navigators to train after the adapter, separated by commas: linear, mlp-2, mlp-3,
+    /// attention, or all; none if omitted
     #[arg(long, value_delimiter = ',')]
     correctors: Vec<String>,
-    /// Rooms in which the adapter's errors are measured, for navigators with +calibrated, and with
-    /// two or more for tracking and relocalisation: names or patterns, none of them learned from
+    /// Calibration rooms, in which the adapter's errors are measured: names, or patterns with *,
+    /// none of them a training room. One is enough for +calibrated navigators; tracking and
+    /// relocalisation need two or more
     #[arg(long)]
     calibrate_on: Vec<String>,
-    /// Of weights and order, as PyTorch takes it: 32 bits
+    /// Seed of initial weights, drawn pairs and their order, 0 to 2³² − 1; weights and order are
+    /// those of PyTorch's generator
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
-    /// Train this many, from --seed on, and report mean and deviation; the first is published
+    /// Number of adapters to train, with seeds --seed, --seed + 1, …, 1 to 1000: mean and deviation
+    /// of the scores are reported, the first adapter is published
     #[arg(long, default_value_t = 1)]
     seeds: u64,
-    /// The adapter's name in the store
+    /// Name of the adapter in the store; made from the rooms, features and protocol if omitted
     #[arg(long)]
     name: Option<String>,
-    /// Write the scores here as JSON
+    /// Write the scores of every seed to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
 
 impl Train {
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one command, from its arguments to what it prints"
+    )]
     pub async fn run(self) -> anyhow::Result<()> {
         if self.seeds == 0 || self.seeds > MAX_SEEDS {
             bail!("--seeds must be 1 to {MAX_SEEDS}, got {}", self.seeds);
@@ -76,39 +78,48 @@ impl Train {
         let store = Store::open(&self.store)?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
 
-        let recipe = Recipe {
+        let plan = TrainingPlan {
             correctors: correctors(&self.correctors)?,
-            ..self.protocol.recipe(self.seed)?
+            ..self.protocol.plan(self.seed)?
         };
 
         let source = rooms[0].1.source().name.clone();
+
+        // Errors are measured on the features that the adapter is trained on.
         let calibration = match self.calibrate_on.is_empty() {
             true => Vec::new(),
             false => load_rooms(&store, &self.calibrate_on, Some(&source)).await?,
         };
 
+        // Errors in a training room are not representative of other rooms. Refuse such a
+        // calibration room now, not after the training.
         for room in &calibration {
             check_unseen(
-                &lesson(room),
+                &data(room),
                 rooms.iter().map(|(stored, _)| stored.room.id()),
             )?;
         }
 
-        let (mut adapter, mut runs) = train_seeds(&rooms, &recipe, self.seeds)?;
+        // Only the first seed's adapter is calibrated and published; the other seeds show how far
+        // the scores vary.
+        let SeededTraining {
+            mut adapter,
+            mut runs,
+        } = train_with_progress(&rooms, &plan, self.seeds)?;
         if !calibration.is_empty() {
             adapter = calibrated(adapter, &mut runs[0].record, &calibration)?;
         }
 
         let features = &rooms[0].1;
-        let name = self.name.unwrap_or_else(|| default_name(&rooms, &recipe));
+        let name = self.name.unwrap_or_else(|| default_name(&rooms, &plan));
         let record = &runs[0].record;
         let published = store
             .publish_adapter(&name, &adapter, record, features.rows())
             .await?;
 
-        let split = recipe.split;
-        let stride = recipe.stride;
-        let preset = recipe.preset.name();
+        let split = plan.split;
+        let stride = plan.stride;
+        let preset = plan.preset.name();
 
         say(format_args!(
             "{}, features '{}' ({} columns), preset {preset}, stride {stride}, split {split}",
@@ -117,6 +128,8 @@ impl Train {
             features.source().dim,
         ));
 
+        // Under `whole` nothing is held out: the printed scores are in-sample, and the text has
+        // to say so.
         let judged = match split {
             Split::Whole => {
                 "no test pairs; train R², and in-sample Hit@0.1 of inverse Poincaré (affine)"
@@ -134,6 +147,8 @@ impl Train {
         ));
 
         say(training_table(&runs).trim_end());
+
+        // A motion component that is constant over the test pairs has no R².
         let still = record.test.still_components();
         if record.test.n > 0 && still > 0 {
             say(format_args!(
@@ -151,47 +166,21 @@ impl Train {
     }
 }
 
-/// The adapter with its errors measured in rooms, which the record then names.
+/// The adapter with its errors measured in the calibration rooms, which the record then names.
 fn calibrated(
     adapter: Adapter,
     record: &mut TrainingRecord,
     rooms: &[(StoredRoom, Features)],
 ) -> anyhow::Result<Adapter> {
-    let lessons: Vec<Lesson<'_>> = rooms.iter().map(lesson).collect();
-    let covariance = error_covariance(&adapter, record, &lessons)?;
-    let mut adapter = adapter.with_error_covariance(covariance)?;
-    if lessons.len() > 1 {
-        adapter = tracking(adapter, record, &lessons)?;
-    } else {
+    let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
+    let (adapter, report) = calibrate(adapter, record, &room_data)?;
+    if !report.can_track {
         say("one room is too few to tell rooms apart in: the adapter can navigate, not track");
     }
 
-    record.calibrated_on = rooms
-        .iter()
-        .map(|(stored, _)| (stored.room.id().clone(), stored.revision))
-        .collect();
-
+    record.calibrated_on = report.rooms;
     say(format_args!("errors measured in {}", room_words(rooms)));
     Ok(adapter)
-}
-
-/// The adapter with its errors as a tracker needs them: measured pair by pair, then along the ways
-/// of the same rooms.
-fn tracking(
-    adapter: Adapter,
-    record: &TrainingRecord,
-    lessons: &[Lesson<'_>],
-) -> anyhow::Result<Adapter> {
-    let first = calibrate(&adapter, record, lessons)?;
-    let adapter = Arc::new(adapter.with_calibration(first.clone())?);
-    let place = place_factor(&adapter, lessons)?
-        .context("no place was found in the rooms to calibrate on")?;
-    let measured = Measured {
-        place,
-        ..first.measured().clone()
-    };
-
-    Ok(Arc::unwrap_or_clone(adapter).with_calibration(Calibration::new(measured)?)?)
 }
 
 fn correctors(names: &[String]) -> anyhow::Result<Vec<CorrectorKind>> {
@@ -208,110 +197,36 @@ fn correctors(names: &[String]) -> anyhow::Result<Vec<CorrectorKind>> {
     names.iter().map(kind).collect()
 }
 
-/// Trains one adapter a seed, on all cores; the first seed's adapter and every seed's scores.
-pub fn train_seeds(
+/// Trains one adapter per seed under one progress bar, whose loss is that of the seed that reported
+/// last.
+pub fn train_with_progress(
     rooms: &[(StoredRoom, Features)],
-    recipe: &Recipe,
+    plan: &TrainingPlan,
     seeds: u64,
-) -> anyhow::Result<(Adapter, Vec<TrainingRun>)> {
-    let progress = bar(
-        (recipe.config.epochs as u64).saturating_mul(seeds),
-        "training",
-    );
+) -> anyhow::Result<SeededTraining> {
+    let epochs = (plan.config.epochs as u64).saturating_mul(seeds);
+    let progress = bar(epochs, "training");
 
-    let lessons: Vec<Lesson<'_>> = rooms.iter().map(lesson).collect();
-    let trained: Vec<(Adapter, TrainingRun)> = (0..seeds)
-        .into_par_iter()
-        .map(|offset| {
-            let seed = recipe.config.seed + offset;
-            if seed > u64::from(u32::MAX) {
-                bail!("--seed and --seeds reach over 2³²");
-            }
-
-            let begun = Instant::now();
-
-            let recipe = Recipe {
-                config: TrainConfig {
-                    seed,
-                    ..recipe.config.clone()
-                },
-                ..recipe.clone()
-            };
-
-            let (adapter, record) = learn(&lessons, &recipe, &mut |epoch| {
-                progress.set_message(format!("loss {:.4}", epoch.loss));
-                progress.inc(1);
-            })?;
-
-            let seconds = begun.elapsed().as_secs_f64();
-            let hit_rate = hit_rate(rooms, &adapter, &recipe)?;
-
-            Ok((
-                adapter,
-                TrainingRun {
-                    record,
-                    hit_rate,
-                    seconds,
-                },
-            ))
-        })
-        .collect::<anyhow::Result<_>>()?;
+    let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
+    let trained = train_seeds(&room_data, plan, seeds, &|epoch| {
+        progress.set_message(format!("loss {:.4}", epoch.loss));
+        progress.inc(1);
+    })?;
 
     progress.finish_and_clear();
-    let (adapters, runs): (Vec<Adapter>, Vec<TrainingRun>) = trained.into_iter().unzip();
-    let first = adapters.into_iter().next().context("no seed was given")?;
-
-    Ok((first, runs))
+    Ok(trained)
 }
 
-/// Hit@0.1 of inverse Poincaré in the affine reading on the rooms' test pairs together.
-fn hit_rate(
-    rooms: &[(StoredRoom, Features)],
-    adapter: &Adapter,
-    recipe: &Recipe,
-) -> anyhow::Result<Rate> {
-    let adapter = Arc::new(adapter.clone());
-    let kind = NavigatorKind::Step(StepKind::InversePoincare(Reading::Affine), Metric::Full);
-    let protocol = Protocol {
-        split: recipe.split,
-        navigators: vec![kind],
-        ..Protocol::paper(recipe.stride)
-    };
-
-    let mut hits = 0;
-    let mut n = 0;
-    for (stored, features) in rooms {
-        let navigator = Navigator::new(
-            Arc::new(stored.room.clone()),
-            features,
-            adapter.clone(),
-            IndexKind::Exact,
-        )?;
-
-        let report = evaluate(
-            &navigator,
-            &protocol,
-            &Cancellation::default(),
-            &mut |_, _| (),
-        )?;
-        let rate = report.rows[0].retrieval.hits[0].1;
-
-        hits = hits + rate.successes();
-        n = n + rate.n;
-    }
-
-    Ok(Rate::of(hits, n))
-}
-
-/// The name of an adapter that was given none.
-pub fn default_name(rooms: &[(StoredRoom, Features)], recipe: &Recipe) -> String {
-    let Recipe {
+/// The default name of an adapter: rooms, features, preset, stride and split, and the architecture
+/// or loss where it differs from the preset's.
+pub fn default_name(rooms: &[(StoredRoom, Features)], plan: &TrainingPlan) -> String {
+    let TrainingPlan {
         preset,
         split,
         stride,
         config,
         ..
-    } = recipe;
+    } = plan;
 
     let first = rooms[0].0.room.id();
     let features = &rooms[0].1.source().name;
@@ -326,6 +241,8 @@ pub fn default_name(rooms: &[(StoredRoom, Features)], recipe: &Recipe) -> String
         preset.name()
     );
 
+    // Other settings, such as epochs and rates, do not enter the name; adapters that differ only
+    // in them become revisions of one name.
     let plain = preset.config(0);
     if config.charts > 1 {
         name.push_str(&format!(".{}{}", config.mixing.name(), config.charts));
@@ -340,7 +257,7 @@ pub fn default_name(rooms: &[(StoredRoom, Features)], recipe: &Recipe) -> String
     name
 }
 
-/// Says where an adapter lies.
+/// Prints where an adapter was published.
 pub fn say_published(store: &Store, name: &str, published: &Published) {
     let state = if published.is_new {
         "published"

@@ -1,9 +1,10 @@
-//! ARKitScenes: `VIDEO/lowres_wide/VIDEO_TIME.png`, `VIDEO/lowres_wide.traj`.
+//! ARKitScenes: images `VIDEO/lowres_wide/VIDEO_TIME.png`, poses `VIDEO/lowres_wide.traj`.
 //!
-//! A line of the trajectory is a time, an axis times angle (radians) and a translation (metres):
-//! **world-to-camera**, inverted here. About one image in six has a pose. As in the official
-//! loader, a pose's key is its time rounded to milliseconds; an image takes the pose of its own
-//! key, else the nearest under 5 ms away.
+//! A line of the trajectory holds a time in seconds, a rotation vector (axis times angle, radians)
+//! and a translation (metres). This is the **world-to-camera** transform, which is inverted here.
+//! About one image in six has a pose. As in the official loader, poses are looked up by their time
+//! rounded to milliseconds: an image takes the pose of its own millisecond, or else the nearest one
+//! less than 5 ms away.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -13,16 +14,17 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use super::collect::{About, Collected};
 use super::text::{finite_row, nanoseconds, wrong};
 use super::{DropReason, Error, Reader, Recording, entries, read_text};
-use crate::geometry::Pose;
+use seese3_core::geometry::Pose;
 
 const IMAGES: &str = "lowres_wide";
-/// An image's pose must be nearer than this.
+/// The time between an image and its pose must be shorter than this.
 const TOLERANCE_MS: u64 = 5;
 
-/// Reads a video's folder.
+/// Reads the folder of one video.
 ///
 /// # Errors
-/// [`Error`], naming the file or folder.
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
+/// refuses unusable frames and there are some. The message names the file or folder.
 pub fn read_arkitscenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
     let poses = read_trajectory(&folder.join(format!("{IMAGES}.traj")))?;
     let mut images = Vec::new();
@@ -42,11 +44,15 @@ pub fn read_arkitscenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Record
         images.push((time, stem.to_owned()));
     }
 
+    // Names are sorted as text; frames must be in order of time.
     images.sort();
     let mut collected = Collected::default();
     for (done, (timestamp_ns, stem)) in images.iter().enumerate() {
         (reader.progress)(done, images.len());
         let key = milliseconds(*timestamp_ns);
+
+        // Both ends of the range lie just inside the tolerance: a pose exactly 5 ms away does not
+        // count.
         let near = poses.range(key - TOLERANCE_MS as i64 + 1..key + TOLERANCE_MS as i64);
         let Some((_, pose)) = near.min_by_key(|(other, _)| other.abs_diff(key)) else {
             collected.drop(stem.clone(), DropReason::NoPoseWithinTolerance);
@@ -67,7 +73,7 @@ pub fn read_arkitscenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Record
     collected.finish(folder, reader)
 }
 
-/// `world_from_camera` by time in milliseconds.
+/// The poses, `world_from_camera`, by their time in milliseconds.
 fn read_trajectory(file: &Path) -> Result<BTreeMap<i64, Pose>, Error> {
     let text = read_text(file)?;
     let mut poses = BTreeMap::new();
@@ -76,9 +82,11 @@ fn read_trajectory(file: &Path) -> Result<BTreeMap<i64, Pose>, Error> {
         .filter(|(_, row)| !row.trim().is_empty())
     {
         let [_, rx, ry, rz, x, y, z] = finite_row(file, line, row.trim_end())?;
+
+        // The time is taken from the text, because a double would be rounded.
         let word = row.split(' ').next().unwrap_or_default();
         let time = nanoseconds(word)
-            .ok_or_else(|| wrong(file, line, format!("'{word}' is no time in seconds")))?;
+            .ok_or_else(|| wrong(file, line, format!("'{word}' is not a time in seconds")))?;
 
         let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(rx, ry, rz));
         let camera_from_world = Pose::from_parts(Translation3::new(x, y, z), rotation);
@@ -88,7 +96,7 @@ fn read_trajectory(file: &Path) -> Result<BTreeMap<i64, Pose>, Error> {
     Ok(poses)
 }
 
-/// Rounded to the nearest, as `%.3f` rounds seconds.
+/// The time rounded to the nearest millisecond, as `%.3f` rounds seconds.
 fn milliseconds(time_ns: i64) -> i64 {
     (time_ns + 500_000).div_euclid(1_000_000)
 }

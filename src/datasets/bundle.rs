@@ -1,12 +1,14 @@
-//! Folders of NumPy files: what any program can write, and what a room is given back as.
+//! Folders of NumPy files: a format that any program can write, and the one in which rooms are
+//! exported.
 //!
 //! ```text
 //! poses.npy (n, 4, 4)   timestamps.npy (n,) ns   frame_ids.npy (n,)   features_NAME.npy (n, d)
-//! bundle.json           what arrays cannot say: name, licence, images, sequences, split, what made the features
+//! bundle.json           what arrays cannot hold: name, licence, images, sequences, split and the
+//!                       sources of the features
 //! ```
 //!
-//! `import numpy` reads such a folder without its `bundle.json`, `import bundle` with it, so that
-//! an exported room comes back whole.
+//! `import numpy` reads such a folder without its `bundle.json`; `import bundle` reads all of it,
+//! so that an exported room comes back complete.
 
 use std::path::{Path, PathBuf};
 
@@ -19,24 +21,26 @@ use super::numpy::read_numbers;
 use super::{
     Error, Recording, Stated, entries, read_bytes, read_features, read_poses, read_timestamps,
 };
-use crate::features::{FeatureSource, Features};
-use crate::room::Room;
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::room::Room;
 
 const FORMAT: &str = "seese3 bundle 1";
 const SAYS: &str = "bundle.json";
 
-/// `bundle.json`.
+/// The content of `bundle.json`.
 #[derive(Debug, Serialize, Deserialize)]
 struct Bundle {
-    /// [`FORMAT`].
+    /// Always [`FORMAT`].
     format: String,
     name: String,
     /// The format that the room was first read from.
     recorded_as: String,
     licence: String,
-    /// Where images' paths start from; relative to the bundle's folder if relative.
+    /// The folder that the image paths are relative to. If it is relative itself, it starts from
+    /// the bundle's folder.
     images_root: String,
-    /// Whether `frame_ids.npy` are the recording's own numbers, or only rows.
+    /// Whether `frame_ids.npy` holds the recording's own frame numbers; if not, it holds row
+    /// numbers.
     numbered: bool,
     names: Vec<String>,
     images: Vec<String>,
@@ -46,8 +50,8 @@ struct Bundle {
     features: Vec<Made>,
 }
 
-/// What made `features_NAME.npy`.
-#[derive(Debug, Serialize, Deserialize)]
+/// The source of `features_NAME.npy`, see [`FeatureSource`].
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct Made {
     name: String,
     encoder: String,
@@ -58,10 +62,11 @@ struct Made {
     preprocess: String,
 }
 
-/// Reads a folder of NumPy files; only `poses.npy` must be there.
+/// Reads a folder of NumPy files, of which only `poses.npy` is required.
 ///
 /// # Errors
-/// [`Error`], naming the file.
+/// [`Error`] if a file cannot be read, has another shape or type, or if timestamps or frame numbers
+/// are not as many as the poses. The message names the file.
 pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
     let mut recording = read_poses(&folder.join("poses.npy"))?;
     let there = |name: &str| Some(folder.join(name)).filter(|file| file.is_file());
@@ -80,6 +85,7 @@ pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
             .and_then(|name| name.strip_suffix(".npy"));
         let Some(name) = name else { continue };
 
+        // The array does not say what made it, so its source has only a name and a width.
         let file = folder.join(&file_name);
         let rows = read_features(&file)?;
         recording.features.push(checked(
@@ -95,7 +101,8 @@ pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
 /// Reads a folder that [`write_numpy`] wrote.
 ///
 /// # Errors
-/// [`Error`], naming the file.
+/// [`Error`] if a file cannot be read, or if `bundle.json` and the arrays do not match. The message
+/// names the file.
 pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     let file = folder.join(SAYS);
     let malformed = |problem: String| Error::Malformed {
@@ -129,6 +136,8 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
 
     let mut recording = read_numpy(folder)?;
     let frames = &mut recording.frames;
+
+    // `frame_ids.npy` is always written. Without numbers in the recording it only counts the rows.
     if !numbered {
         frames.numbers.clear();
     }
@@ -138,6 +147,8 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     frames.sequences = sequences;
     frames.held_out = held_out;
 
+    // The exported rotations were already projected onto SO(3), so the deviation of the original
+    // recording is in `bundle.json`.
     recording.worst_rotation_deviation = recording
         .worst_rotation_deviation
         .max(worst_rotation_deviation);
@@ -157,8 +168,26 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     };
 
     let read = std::mem::take(&mut recording.features);
+    recording.features = with_sources(read, &features, &file)?;
+
+    Ok(recording)
+}
+
+/// Replaces the placeholder source of every array by the one that `bundle.json` states. Arrays and
+/// list have to match: an array that is not listed is refused, and so is a listed one that is missing.
+fn with_sources(read: Vec<Features>, stated: &[Made], file: &Path) -> Result<Vec<Features>, Error> {
+    let malformed = |problem: String| Error::Malformed {
+        file: file.to_owned(),
+        problem,
+    };
+
+    let mut features: Vec<Features> = Vec::with_capacity(read.len());
     for set in read {
-        let made = features.iter().find(|made| made.name == set.source().name);
+        let array = &set.source().name;
+        let made = stated.iter().find(|made| made.name == *array);
+        let made = made.ok_or_else(|| malformed(format!("does not list features_{array}.npy")))?;
+
+        // Destructured with no `..`, so that a new field breaks the build here.
         let Made {
             name,
             encoder,
@@ -167,49 +196,35 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
             norm,
             pooling,
             preprocess,
-        } = made.ok_or_else(|| {
-            malformed(format!(
-                "says nothing of features_{}.npy",
-                set.source().name
-            ))
-        })?;
-
+        } = made.clone();
         let source = FeatureSource {
-            name: name.clone(),
-            encoder: encoder.clone(),
-            layer: layer.clone(),
-            base: base.clone(),
-            norm: norm.clone(),
-            pooling: pooling.clone(),
-            preprocess: preprocess.clone(),
+            name,
+            encoder,
+            layer,
+            base,
+            norm,
+            pooling,
+            preprocess,
             dim: set.source().dim,
         };
-
-        recording
-            .features
-            .push(checked(source, set.rows().to_owned(), &file)?);
+        features.push(checked(source, set.rows().to_owned(), file)?);
     }
 
-    if let Some(lost) = features.iter().find(|made| {
-        recording
-            .features
-            .iter()
-            .all(|set| set.source().name != made.name)
-    }) {
+    let is_missing = |made: &&Made| features.iter().all(|set| set.source().name != made.name);
+    if let Some(Made { name, .. }) = stated.iter().find(is_missing) {
         return Err(malformed(format!(
-            "names features '{}', but features_{}.npy is missing",
-            lost.name, lost.name
+            "names features '{name}', but features_{name}.npy is missing"
         )));
     }
 
-    Ok(recording)
+    Ok(features)
 }
 
-/// Writes a room and its features into a folder, made if it is not there; `bundle.json` last.
-/// Returns the files.
+/// Writes a room and its features into a folder, which is created if necessary, and returns the
+/// files. `bundle.json` is written last, so a folder without it is not a complete export.
 ///
 /// # Errors
-/// [`Error::Io`]; [`Error::Malformed`] if the folder holds anything already.
+/// [`Error::Io`] if a file cannot be written; [`Error::Malformed`] if the folder is not empty.
 pub fn write_numpy(
     folder: &Path,
     room: &Room,
@@ -221,6 +236,7 @@ pub fn write_numpy(
     };
     std::fs::create_dir_all(folder).map_err(io)?;
 
+    // Arrays that are already there would later be read as a part of this room.
     if !entries(folder)?.is_empty() {
         return Err(Error::Malformed {
             file: folder.to_owned(),
@@ -231,6 +247,7 @@ pub fn write_numpy(
     let n = room.frame_count();
     let mut files = Vec::new();
 
+    // nalgebra stores a matrix by column; the transpose gives the rows that NumPy expects.
     let numbers = room
         .poses()
         .iter()
@@ -251,6 +268,8 @@ pub fn write_numpy(
         )?);
     }
 
+    // The array is always written; `numbered` in `bundle.json` says whether it holds more than row
+    // numbers.
     let ids = if room.frame_numbers().is_empty() {
         (0..n as i64).collect()
     } else {
@@ -346,7 +365,7 @@ where
 }
 
 fn resolved(folder: &Path, root: &str) -> Result<String, Error> {
-    // Where the images are not there any more the path stays as it is said.
+    // If the images are no longer there, the path is kept without being resolved.
     let path = folder.join(root);
     let path = path.canonicalize().unwrap_or(path);
 

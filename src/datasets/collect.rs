@@ -1,11 +1,11 @@
-//! What every format does with a frame: keep it, or drop it by name.
+//! Shared by the formats: checking a pose, and collecting the frames that are kept or dropped.
 
 use std::path::Path;
 
 use nalgebra::{Matrix4, UnitQuaternion};
 
 use super::{DropReason, Dropped, Error, MAX_ROTATION_DEVIATION, Reader, Recording, Unusable};
-use crate::geometry::{Pose, nearest_rotation};
+use seese3_core::geometry::{Pose, nearest_rotation};
 
 pub(super) const LAST_ROW_PROBLEM: &str = "the last row is not 0 0 0 1; is the matrix transposed?";
 
@@ -16,17 +16,18 @@ pub(super) fn deviation_problem(deviation: f64) -> String {
     )
 }
 
-/// What a 4×4 matrix says.
+/// The result of reading a 4×4 matrix as a pose.
 pub(super) enum MatrixPose {
-    /// A pose, and how far its rotation was from SO(3).
+    /// The pose with its rotation projected onto SO(3), and the largest entry of |RRᵀ − I| before
+    /// the projection.
     Pose(Pose, f64),
     NotFinite,
     NotARotation,
-    /// The last row is not (0, 0, 0, 1): transposed, or no pose at all.
+    /// The last row is not (0, 0, 0, 1): the matrix is transposed, or is not a pose at all.
     NotHomogeneous,
 }
 
-/// Reads `world_from_camera` from a homogeneous matrix.
+/// Reads a rigid transform, such as `world_from_camera`, from a homogeneous matrix.
 pub(super) fn pose_of(matrix: &Matrix4<f64>) -> MatrixPose {
     if !matrix.iter().all(|x| x.is_finite()) {
         return MatrixPose::NotFinite;
@@ -35,6 +36,8 @@ pub(super) fn pose_of(matrix: &Matrix4<f64>) -> MatrixPose {
         return MatrixPose::NotHomogeneous;
     }
 
+    // Published rotations carry rounding errors. The nearest rotation replaces them, and the
+    // deviation lets the caller tell rounding from a matrix that is no rotation.
     let Some(nearest) = nearest_rotation(&matrix.fixed_view::<3, 3>(0, 0).into_owned()) else {
         return MatrixPose::NotARotation;
     };
@@ -47,7 +50,8 @@ pub(super) fn pose_of(matrix: &Matrix4<f64>) -> MatrixPose {
     )
 }
 
-/// Refuses columns that are not as long as the poses, before anything is done by rows.
+/// Checks that every column of the frames is empty or as long as the poses, so that it can be
+/// indexed by row afterwards.
 pub(super) fn check_lengths(file: &Path, recording: &Recording) -> Result<(), Error> {
     match recording.frames.unequal() {
         None => Ok(()),
@@ -64,7 +68,8 @@ pub(super) fn check_lengths(file: &Path, recording: &Recording) -> Result<(), Er
     }
 }
 
-/// What a format says of a frame besides its pose; `None` where it says nothing of any frame.
+/// What a format states about a frame besides its pose. Every field becomes a column, so within one
+/// recording it is set for all kept frames or for none.
 #[derive(Debug, Clone, Default)]
 pub(super) struct About {
     pub name: String,
@@ -75,12 +80,12 @@ pub(super) struct About {
     pub held_out: Option<bool>,
 }
 
-/// Frames in the making.
+/// Collects the frames of a recording.
 #[derive(Default)]
 pub(super) struct Collected(Recording);
 
 impl Collected {
-    /// Keeps a frame with a pose that needs no mending.
+    /// Keeps a frame whose pose is already a valid rigid transform.
     pub fn keep(&mut self, about: About, pose: Pose) {
         let About {
             name,
@@ -91,6 +96,8 @@ impl Collected {
             held_out,
         } = about;
 
+        // Extending a column by `None` adds nothing, so a column that the format does not have
+        // stays empty.
         let frames = &mut self.0.frames;
         frames.poses.push(pose);
         frames.names.push(name);
@@ -102,14 +109,17 @@ impl Collected {
         frames.held_out.extend(held_out);
     }
 
-    /// Keeps or drops a frame by its matrix, `world_from_camera`; one that is no pose at all
-    /// refuses the recording.
+    /// Keeps or drops a frame according to its matrix, `world_from_camera`. A matrix in another
+    /// convention is an error that refuses the whole recording.
     pub fn take(&mut self, about: About, matrix: &Matrix4<f64>, file: &Path) -> Result<(), Error> {
         let malformed = |problem: String| Error::Malformed {
             file: file.to_owned(),
             problem,
         };
 
+        // A pose that is not finite or is singular costs only its own frame. A wrong last row or a
+        // rotation far from SO(3) suggests another convention, for instance a transposed matrix,
+        // which would affect every frame.
         match pose_of(matrix) {
             MatrixPose::Pose(_, deviation) if deviation > MAX_ROTATION_DEVIATION => {
                 return Err(malformed(format!(
@@ -132,12 +142,12 @@ impl Collected {
         Ok(())
     }
 
-    /// Leaves a frame out.
+    /// Records that a frame is left out.
     pub fn drop(&mut self, name: String, reason: DropReason) {
         self.0.dropped.push(Dropped { name, reason });
     }
 
-    /// The recording, its images below `root`.
+    /// The complete recording, with image paths relative to `root`.
     pub fn finish(self, root: &Path, reader: &Reader<'_>) -> Result<Recording, Error> {
         let Self(mut recording) = self;
         let folder = root.to_owned();
@@ -155,6 +165,8 @@ impl Collected {
             });
         }
 
+        // The root is stored with the room and used later, so it must not depend on the current
+        // working directory.
         if !recording.frames.images.is_empty() {
             let io = |cause| Error::Io {
                 file: root.to_owned(),

@@ -1,8 +1,8 @@
-//! Recordings on disk, as rooms.
+//! Readers for recordings on disk.
 //!
-//! Whatever a recording's convention, poses leave here as `world_from_camera`, metres, with
-//! rotations on SO(3). Frames are in order of capture. One file a format; what they share is in
-//! `collect`.
+//! Whatever the convention of a recording, the poses returned here are `world_from_camera`, in
+//! metres, with rotations on SO(3), and the frames are in order of capture. Every format has a file
+//! of its own; `collect` holds what they share.
 
 mod arkitscenes;
 mod bundle;
@@ -26,14 +26,16 @@ pub use twelve_scenes::read_twelve_scenes;
 
 use std::path::{Path, PathBuf};
 
-use crate::features::Features;
-use crate::room::{Frames, Timeline};
+use seese3_core::features::Features;
+use seese3_core::room::{Frames, Timeline};
 
-/// A rotation whose |RRᵀ − I| has a larger entry is not taken for a rounded one.
+/// The largest entry of |RRᵀ − I| that is accepted as rounding and projected away. A matrix with a
+/// larger one is refused.
 pub const MAX_ROTATION_DEVIATION: f64 = 1e-2;
 
-/// Why a recording cannot be read. Each names the file.
+/// Why a recording cannot be read. Every message names the file or the folder.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
     #[error("{}: {cause}", file.display())]
     Io {
@@ -69,14 +71,15 @@ pub enum Error {
 /// A frame that was left out.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Dropped {
-    /// The recording's name for it.
+    /// The name of the frame in the recording.
     pub name: String,
-    /// Why.
+    /// Why it was left out.
     pub reason: DropReason,
 }
 
 /// Why a frame was left out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum DropReason {
     #[error("missing_pose_file")]
     MissingPoseFile,
@@ -88,31 +91,31 @@ pub enum DropReason {
     NonFinitePose,
     #[error("not_a_rotation")]
     NotARotation,
-    /// The recorder wrote an identity where it had lost its tracking.
+    /// The pose is exactly the identity, which the recorder writes when tracking is lost.
     #[error("suspect_identity_pose")]
     SuspectIdentityPose,
     #[error("no_pose_within_tolerance")]
     NoPoseWithinTolerance,
 }
 
-/// A recording that was read.
+/// What was read from a recording.
 #[derive(Debug, Clone, Default)]
 pub struct Recording {
     /// The frames that can be used.
     pub frames: Frames,
-    /// The frames that cannot.
+    /// The frames that cannot be used, with the reasons.
     pub dropped: Vec<Dropped>,
-    /// The largest |RRᵀ − I| entry of a rotation before it was projected.
+    /// The largest entry of |RRᵀ − I| over all rotations, before they were projected onto SO(3).
     pub worst_rotation_deviation: f64,
-    /// The folder that images' paths start from; empty if there are no images.
+    /// The folder that the image paths are relative to; empty if there are no images.
     pub images_root: String,
-    /// Features that came with it.
+    /// Features that the recording contains.
     pub features: Vec<Features>,
-    /// The room's name and the terms of use, where the recording says them.
+    /// Name, original format and terms of use, where the recording states them.
     pub stated: Stated,
 }
 
-/// What only a bundle says of itself.
+/// Metadata that only a bundle contains; empty for all other formats.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Stated {
     /// The room's name.
@@ -124,17 +127,18 @@ pub struct Stated {
 }
 
 impl Recording {
-    /// With these times.
+    /// Replaces the timestamps by those in a NumPy file, see [`read_timestamps`].
     ///
     /// # Errors
-    /// [`Error::Malformed`] if they are not as many as the poses.
+    /// [`Error::Io`] or [`Error::Malformed`] if the file cannot be read, or if it does not have one
+    /// timestamp per pose.
     pub fn with_timestamps(mut self, file: &Path) -> Result<Self, Error> {
         self.frames.timestamps_ns = read_timestamps(file)?;
         collect::check_lengths(file, &self)?;
         Ok(self)
     }
 
-    /// Which rows stay when only every `step`-th frame of each sequence is kept.
+    /// The rows that remain when only every `step`-th frame of each sequence is kept.
     pub fn every(&self, step: usize) -> Vec<usize> {
         let frame_count = self.frames.poses.len();
         let timeline = Timeline {
@@ -143,6 +147,7 @@ impl Recording {
             held_out: Vec::new(),
         };
 
+        // Counting starts again with every sequence, so that each one keeps its first frame.
         let mut start = 0;
         let mut rows = Vec::new();
         for row in 0..frame_count {
@@ -161,21 +166,20 @@ impl Recording {
     }
 }
 
-/// What is done with frames that cannot be used.
+/// How frames that cannot be used are treated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unusable {
-    /// Left out, and named.
+    /// They are left out and listed in [`Recording::dropped`].
     Drop,
-    /// The recording is refused.
+    /// The whole recording is refused.
     Refuse,
 }
 
-/// How a recording is read: what becomes of unusable frames, and who hears of (frames read, frames
-/// in all).
+/// Options for reading a recording.
 pub struct Reader<'a> {
-    /// What is done with frames that cannot be used.
+    /// How frames that cannot be used are treated.
     pub unusable: Unusable,
-    /// Hears of progress.
+    /// Called with the number of frames read so far and the total number of frames.
     pub progress: &'a mut dyn FnMut(usize, usize),
 }
 
@@ -195,12 +199,12 @@ fn read_bytes(file: &Path) -> Result<Vec<u8>, Error> {
 fn read_text(file: &Path) -> Result<String, Error> {
     let malformed = |_| Error::Malformed {
         file: file.to_owned(),
-        problem: "is not text".to_owned(),
+        problem: "is not UTF-8 text".to_owned(),
     };
     String::from_utf8(read_bytes(file)?).map_err(malformed)
 }
 
-/// Names in a folder, in order.
+/// The names of all entries of a folder, sorted.
 fn entries(folder: &Path) -> Result<Vec<String>, Error> {
     let io = |cause| Error::Io {
         file: folder.to_owned(),
@@ -225,7 +229,7 @@ fn entries(folder: &Path) -> Result<Vec<String>, Error> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::Pose;
+    use seese3_core::geometry::Pose;
 
     /// Oracle: by hand. Every third frame, counted anew in each sequence.
     #[test]

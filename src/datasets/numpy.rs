@@ -8,13 +8,14 @@ use ndarray_npy::{ViewElement, ViewNpyError, ViewNpyExt};
 
 use super::collect::{LAST_ROW_PROBLEM, MatrixPose, deviation_problem, pose_of};
 use super::{Error, MAX_ROTATION_DEVIATION, Recording, read_bytes};
-use crate::room::Frames;
+use seese3_core::room::Frames;
 
-/// NumPy aligns data to 64 bytes; views need no more than this.
+/// The alignment of the numbers in memory, bytes: no type that is read here needs more. NumPy
+/// aligns them to 64 bytes in a file.
 const ALIGNMENT: usize = 16;
 
-/// A `.npy` file in memory, laid so that its numbers are aligned. Sizes are believed only as far as
-/// bytes are there.
+/// A `.npy` file in memory, placed so that its numbers are aligned. The array is viewed in place,
+/// so a size in the header that exceeds the file is an error, not an allocation.
 struct NpyFile {
     bytes: Vec<u8>,
     start: usize,
@@ -23,6 +24,9 @@ struct NpyFile {
 impl NpyFile {
     fn read(file: &Path) -> Result<Self, Error> {
         let content = read_bytes(file)?;
+
+        // The length of the header stands in bytes 8 and 9 in version 1 of the format, and in bytes
+        // 8 to 11 from version 2 on.
         let header = match content.get(6..12) {
             Some(&[1, _, low, high, _, _]) => 10 + usize::from(u16::from_le_bytes([low, high])),
             Some(&[_, _, a, b, c, d]) => {
@@ -31,11 +35,14 @@ impl NpyFile {
             _ => 0,
         };
 
+        // A `Vec<u8>` may begin at any address. The content is shifted by up to 15 bytes, so that
+        // the numbers behind the header begin at a multiple of `ALIGNMENT`.
         let mut bytes = vec![0; content.len() + ALIGNMENT];
         let start =
             (ALIGNMENT - (bytes.as_ptr() as usize).wrapping_add(header) % ALIGNMENT) % ALIGNMENT;
         bytes[start..start + content.len()].copy_from_slice(&content);
 
+        // Truncating does not reallocate, so the alignment is kept.
         bytes.truncate(start + content.len());
         Ok(Self { bytes, start })
     }
@@ -64,10 +71,11 @@ fn malformed(file: &Path, problem: &str) -> Error {
     }
 }
 
-/// Poses, `world_from_camera`, metres, from an array (n, 4, 4) of f64 or f32.
+/// Reads poses, `world_from_camera`, metres, from an array (n, 4, 4) of f64 or f32.
 ///
 /// # Errors
-/// [`Error::Malformed`] for another shape or type, [`Error::Frame`] for a matrix that is no pose.
+/// [`Error::Io`] if the file cannot be read, [`Error::Malformed`] for another shape or type,
+/// [`Error::Frame`] for a matrix that is not a pose.
 pub fn read_poses(file: &Path) -> Result<Recording, Error> {
     let matrices = NpyFile::read(file)?.floats(file)?;
     let &[count, 4, 4] = matrices.shape() else {
@@ -90,6 +98,8 @@ pub fn read_poses(file: &Path) -> Result<Recording, Error> {
             problem,
         };
 
+        // Unlike in the other formats, a frame is never dropped here: timestamps and features
+        // belong to the poses by row.
         let matrix = Matrix4::from_row_iterator(matrix.iter().copied());
         match pose_of(&matrix) {
             MatrixPose::NotFinite => {
@@ -98,7 +108,7 @@ pub fn read_poses(file: &Path) -> Result<Recording, Error> {
             MatrixPose::NotHomogeneous => return Err(wrong(LAST_ROW_PROBLEM.to_owned())),
             MatrixPose::NotARotation => {
                 return Err(wrong(
-                    "the upper left 3×3 block is no rotation (singular or mirrored)".to_owned(),
+                    "the upper left 3×3 block is not a rotation (singular or mirrored)".to_owned(),
                 ));
             }
             MatrixPose::Pose(_, deviation) if deviation > MAX_ROTATION_DEVIATION => {
@@ -118,10 +128,10 @@ pub fn read_poses(file: &Path) -> Result<Recording, Error> {
     })
 }
 
-/// Features from an array (n, d) of f32 or f64.
+/// Reads features from an array (n, d) of f32 or f64.
 ///
 /// # Errors
-/// [`Error::Malformed`] for another shape or type.
+/// [`Error::Io`] if the file cannot be read, [`Error::Malformed`] for another shape or type.
 pub fn read_features(file: &Path) -> Result<Array2<f32>, Error> {
     let npy = NpyFile::read(file)?;
     let array = match npy.view::<f32>() {
@@ -135,10 +145,10 @@ pub fn read_features(file: &Path) -> Result<Array2<f32>, Error> {
     array.into_dimensionality::<Ix2>().map_err(wrong_shape)
 }
 
-/// Frame numbers from an array (n,) of int64.
+/// Reads frame numbers from an array (n,) of int64 or int32.
 ///
 /// # Errors
-/// [`Error::Malformed`] for another shape or type.
+/// [`Error::Io`] if the file cannot be read, [`Error::Malformed`] for another shape or type.
 pub(super) fn read_numbers(file: &Path) -> Result<Vec<i64>, Error> {
     let npy = NpyFile::read(file)?;
     let array: ArrayD<i64> = match npy.view::<i64>() {
@@ -160,16 +170,19 @@ pub(super) fn read_numbers(file: &Path) -> Result<Vec<i64>, Error> {
     Ok(array.iter().copied().collect())
 }
 
-/// Timestamps, nanoseconds, from an array (n,) of int64 nanoseconds or float seconds.
+/// Reads timestamps, nanoseconds, from an array (n,) of int64 nanoseconds or float seconds.
 ///
 /// # Errors
-/// [`Error::Malformed`] for another shape or type, or a time that is not finite.
+/// [`Error::Io`] if the file cannot be read, [`Error::Malformed`] for another shape or type, or for
+/// a time that is not finite or does not fit into 64 bits of nanoseconds.
 pub fn read_timestamps(file: &Path) -> Result<Vec<i64>, Error> {
     let npy = NpyFile::read(file)?;
     let array: ArrayD<i64> = match npy.view::<i64>() {
         Ok(view) => view.to_owned(),
         Err(ViewNpyError::WrongDescriptor(_)) => {
             let seconds = npy.floats(file)?;
+
+            // An i64 holds nanoseconds up to about 9.2e9 s.
             if let Some(bad) = seconds.iter().find(|x| !x.is_finite() || x.abs() > 9.2e9) {
                 return Err(malformed(file, &format!("time {bad} s is out of range")));
             }
@@ -228,8 +241,8 @@ mod tests {
         }
     }
 
-    /// Oracle: the list of bad visitors: truncated, hostile size, wrong shape, no NumPy
-    /// file at all.
+    /// Oracle: the NumPy format. A size that no file could hold, a truncated file, a wrong shape,
+    /// Python objects, and two files that are not NumPy at all.
     #[test]
     fn hostile_files_are_refused_without_believing_their_sizes() {
         for bytes in [

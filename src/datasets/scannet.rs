@@ -1,8 +1,8 @@
-//! ScanNet as its exporter leaves it: `color/N.jpg`, `pose/N.txt` (or all in one folder),
-//! camera-to-world, metres.
+//! ScanNet scenes as written by its exporter: `color/N.jpg` and `pose/N.txt`, or all files in one
+//! folder; camera-to-world, metres.
 //!
-//! Frames go by number, not by name: 2 before 10. Lost tracking is written as −inf, by one writer
-//! as an identity.
+//! Frames are ordered by number, not by name: 2 comes before 10. Lost tracking is written as −inf,
+//! and by one exporter as an identity matrix.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -13,11 +13,13 @@ use super::collect::{About, Collected};
 use super::text::read_matrix;
 use super::{DropReason, Error, Reader, Recording, entries};
 
-/// Reads an exported scene.
+/// Reads the folder of an exported scene.
 ///
 /// # Errors
-/// [`Error`], naming the file or folder.
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
+/// refuses unusable frames and there are some. The message names the file or folder.
 pub fn read_scannet(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
+    // If there is no such subfolder, its files are in the scene's folder itself.
     let below = |name: &'static str| {
         if folder.join(name).is_dir() {
             format!("{name}/")
@@ -30,10 +32,15 @@ pub fn read_scannet(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording,
     let poses_at = below("pose");
     let images = numbered(&folder.join(&images_at), &["jpg", "png"])?;
     let poses = numbered(&folder.join(&poses_at), &["txt"])?;
+
+    // The numbers of both are needed, so that a frame with only an image or only a pose is reported
+    // as dropped.
     let mut numbers: Vec<i64> = images.keys().chain(poses.keys()).copied().collect();
     numbers.sort_unstable();
 
     numbers.dedup();
+
+    // The first pose of a recording may really be the identity, see `is_suspect`.
     let first_pose = poses.keys().next().copied();
     let mut collected = Collected::default();
     for (done, &number) in numbers.iter().enumerate() {
@@ -74,8 +81,8 @@ pub fn read_scannet(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording,
     collected.finish(folder, reader)
 }
 
-/// Whether a pose is the identity that stands for lost tracking; the first frame may well be the
-/// origin.
+/// Whether a pose is the identity matrix that stands for lost tracking. The first one is never
+/// suspect, since a recording may start at its origin.
 pub(super) fn is_suspect(matrix: &Matrix4<f64>, is_first: bool) -> bool {
     !is_first && *matrix == Matrix4::identity()
 }

@@ -1,15 +1,18 @@
-//! ScanNet's `.sens`: one file of colour and depth images with camera-to-world poses, metres,
+//! ScanNet's `.sens`: one file with colour and depth images and camera-to-world poses, metres,
 //! little-endian.
 //!
 //! ```text
-//! u32 version = 4, u64 length, name, 4 × (4×4 f32): intrinsics, extrinsics of colour and depth
-//! i32 colour compression (1 png, 2 jpeg), i32 depth compression, 4 × u32 sizes, f32 depth shift, u64 frames
-//! each frame: 4×4 f32 pose, u64 colour time, u64 depth time, u64 colour bytes, u64 depth bytes, the bytes
+//! u32 version = 4, u64 length, name,
+//! 4 × (4×4 f32): intrinsics and extrinsics of colour and depth,
+//! i32 colour compression (1 png, 2 jpeg), i32 depth compression,
+//! 4 × u32 sizes, f32 depth shift, u64 number of frames;
+//! each frame: 4×4 f32 pose, u64 colour time, u64 depth time, u64 colour bytes, u64 depth bytes,
+//! the bytes of both images
 //! ```
 //!
-//! Images stay where they are: a frame's image is `FILE@OFFSET+LENGTH`. Times are taken for
-//! microseconds, and only where they grow from frame to frame. Sizes are believed only as far as
-//! the file reaches.
+//! Images are not extracted: the image of a frame is `FILE@OFFSET+LENGTH`, in bytes. Times are
+//! assumed to be microseconds, and are kept only if they increase from frame to frame. Every size
+//! in the file is compared with the bytes that are left before it is used.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -23,15 +26,16 @@ use super::{DropReason, Error, Reader, Recording};
 
 const VERSION: u32 = 4;
 const MATRIX_BYTES: u64 = 64;
-/// Pose, two times, two sizes.
+/// The size of a frame's header: the pose, two times and two sizes.
 const FRAME_HEADER_BYTES: u64 = MATRIX_BYTES + 32;
 const LONGEST_NAME: u64 = 4_096;
 
 /// Reads the frames of a `.sens` file.
 ///
 /// # Errors
-/// [`Error::Malformed`], also when the file ends before its last frame: a part is not taken for the
-/// whole.
+/// [`Error::Malformed`] if the file is not a `.sens` file of version 4, or ends before its last
+/// frame: a truncated file is refused, not read in part. [`Error::Io`] if it cannot be read.
+/// [`Error::NoFrames`] or [`Error::Strict`] if frames cannot be used.
 pub fn read_sens(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
     let mut file = Sens::open(path)?;
     let frame_count = file.header()?;
@@ -48,7 +52,8 @@ pub fn read_sens(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, Erro
         let name = number.to_string();
         let image = Some(format!("{file_name}@{}+{}", frame.offset, frame.bytes));
 
-        // A time so large that this cuts it is no time, and does not grow.
+        // A time beyond the range of nanoseconds saturates. Two saturated times do not increase, so
+        // the check below then discards all times.
         let timestamp_ns = Some(
             i64::try_from(frame.time_us)
                 .unwrap_or(i64::MAX)
@@ -76,6 +81,7 @@ pub fn read_sens(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, Erro
         .unwrap_or(Path::new("."));
     let mut recording = collected.finish(folder, reader)?;
 
+    // Times that do not increase are not a clock; the recording then counts as having none.
     if !recording.frames.timestamps_ns.is_sorted_by(|a, b| a < b) {
         recording.frames.timestamps_ns.clear();
     }
@@ -86,7 +92,7 @@ pub fn read_sens(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, Erro
 struct Frame {
     pose: Matrix4<f64>,
     time_us: u64,
-    /// Of the colour image in the file.
+    /// Where the colour image starts in the file, bytes.
     offset: u64,
     bytes: u64,
 }
@@ -115,7 +121,7 @@ impl<'a> Sens<'a> {
         })
     }
 
-    /// How many frames follow.
+    /// Reads the header and returns the number of frames that follow it.
     fn header(&mut self) -> Result<u64, Error> {
         let version = u32::from_le_bytes(self.array("its version")?);
         if version != VERSION {
@@ -140,11 +146,15 @@ impl<'a> Sens<'a> {
             return Err(self.malformed(problem));
         }
 
+        // The depth compression, the four image sizes and the depth shift are not needed.
         self.skip(4 + 4 * 4 + 4, "its sizes")?;
         let frames = self.number("its number of frames")?;
+
+        // Even a frame without images needs its header, so a number that cannot fit is refused
+        // before any frame is read.
         if frames > (self.size - self.at) / FRAME_HEADER_BYTES {
             let problem = format!(
-                "is truncated: it says {frames} frames, which do not fit into {} bytes",
+                "is truncated: its header states {frames} frames, which do not fit into {} bytes",
                 self.size
             );
             return Err(self.malformed(problem));
@@ -161,10 +171,13 @@ impl<'a> Sens<'a> {
         }
 
         let time_us = self.number(&what)?;
+
+        // The time of the depth image is not used.
         self.number(&what)?;
         let bytes = self.number(&what)?;
         let depth = self.number(&what)?;
 
+        // The images are skipped. Only the position of the colour image is kept.
         let offset = self.at;
         self.skip(bytes, &what)?;
         self.skip(depth, &what)?;
@@ -200,6 +213,7 @@ impl<'a> Sens<'a> {
         self.check(bytes, what)?;
         self.at += bytes;
 
+        // `seek_relative` keeps the read buffer where it can, but takes an i64.
         let moved = match i64::try_from(bytes) {
             Ok(bytes) => self.reader.seek_relative(bytes),
             Err(_) => self.reader.seek(SeekFrom::Start(self.at)).map(|_| ()),

@@ -1,9 +1,9 @@
 //! 7-Scenes: `SCENE/seq-XX/frame-XXXXXX.{color.*,pose.txt}`, poses camera-to-world, metres.
 //!
-//! - The published pose is that of the depth sensor; it is taken for the camera's, as most users of
-//!   the set do, unless a calibration is given.
-//! - A scene's sequences make one room; no pair of frames joins two of them. `TrainSplit.txt` and
-//!   `TestSplit.txt` name sequences as `sequenceN`, for `seq-0N`.
+//! - The published poses are those of the depth sensor. They are used as poses of the colour
+//!   camera, as by most users of the data set, unless a calibration is given.
+//! - All sequences of a scene form one room, but no pair of frames spans two sequences.
+//!   `TrainSplit.txt` and `TestSplit.txt` list the sequence `seq-0N` as `sequenceN`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -11,21 +11,24 @@ use std::path::{Path, PathBuf};
 use super::collect::{About, Collected, MatrixPose, pose_of};
 use super::text::read_matrix;
 use super::{DropReason, Error, MAX_ROTATION_DEVIATION, Reader, Recording, entries, read_text};
-use crate::geometry::Pose;
+use seese3_core::geometry::Pose;
 
 /// What to read of a scene.
 #[derive(Debug, Clone, Default)]
 pub struct SevenScenes {
-    /// One sequence, for instance `seq-01`, instead of all.
+    /// A single sequence, for instance `seq-01`; all of them if `None`.
     pub sequence: Option<String>,
-    /// A file of 4×4 numbers, `rgb_from_depth`, metres: poses become those of the colour camera.
+    /// A text file with the 4×4 matrix `rgb_from_depth`, metres. If it is given, the poses become
+    /// those of the colour camera.
     pub rgb_from_depth: Option<PathBuf>,
 }
 
-/// Reads a scene, or one sequence: the one named, or `folder` itself when it holds frames.
+/// Reads all sequences of a scene, or only one: the chosen one, or `folder` itself if it contains
+/// frames.
 ///
 /// # Errors
-/// [`Error`], naming the file or folder.
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
+/// refuses unusable frames and there are some. The message names the file or folder.
 pub fn read_seven_scenes(
     folder: &Path,
     choice: &SevenScenes,
@@ -38,6 +41,8 @@ pub fn read_seven_scenes(
         .transpose()?;
 
     let (root, sequences) = sequences_of(folder, choice.sequence.as_deref())?;
+
+    // The data set's split assigns whole sequences, so it has no meaning for a single one.
     let held_out = if sequences.len() > 1 {
         dataset_split(&root, &sequences)?
     } else {
@@ -51,6 +56,9 @@ pub fn read_seven_scenes(
         let stem = |name: &String| {
             Some(name.split('.').next()?.to_owned()).filter(|stem| stem.starts_with("frame-"))
         };
+
+        // A stem may have only an image or only a pose. All are collected, so that incomplete
+        // frames are reported as dropped.
         let stems: BTreeSet<String> = files.iter().filter_map(stem).collect();
 
         let images: BTreeMap<&str, &String> = files
@@ -78,6 +86,7 @@ pub fn read_seven_scenes(
         }
     }
 
+    // Frame numbers form a column: if one frame has none, all go without.
     if frames.iter().any(|about| about.number.is_none()) {
         frames.iter_mut().for_each(|about| about.number = None);
     }
@@ -95,6 +104,9 @@ pub fn read_seven_scenes(
     }
 
     let mut recording = collected.finish(&root, reader)?;
+
+    // The calibration is a fixed transform between the two sensors: world_from_rgb =
+    // world_from_depth · depth_from_rgb.
     if let Some(depth_from_rgb) = depth_from_rgb {
         recording
             .frames
@@ -106,7 +118,7 @@ pub fn read_seven_scenes(
     Ok(recording)
 }
 
-/// The frame that a colour image belongs to.
+/// The stem of the frame that a colour image belongs to; `None` for any other file.
 fn image_stem(name: &str) -> Option<&str> {
     let stem = name
         .strip_suffix(".png")
@@ -114,7 +126,7 @@ fn image_stem(name: &str) -> Option<&str> {
     stem.strip_suffix(".color")
 }
 
-/// The scene's folder and the sequences to read of it.
+/// The scene's folder and the names of the sequences to read from it.
 fn sequences_of(folder: &Path, wanted: Option<&str>) -> Result<(PathBuf, Vec<String>), Error> {
     let malformed = |problem: String| Error::Malformed {
         file: folder.to_owned(),
@@ -139,7 +151,10 @@ fn sequences_of(folder: &Path, wanted: Option<&str>) -> Result<(PathBuf, Vec<Str
         return Ok((folder.to_owned(), vec![wanted.to_owned()]));
     }
 
+    // `folder` is a single sequence. Its parent becomes the root, so that names and image paths are
+    // the same as when the whole scene is read.
     if names.iter().any(|name| name.starts_with("frame-")) {
+        // A path such as `.` has neither a parent nor a name until it is resolved.
         let folder = folder.canonicalize().map_err(|cause| Error::Io {
             file: folder.to_owned(),
             cause,
@@ -163,18 +178,19 @@ fn sequences_of(folder: &Path, wanted: Option<&str>) -> Result<(PathBuf, Vec<Str
     Ok((folder.to_owned(), sequences))
 }
 
-/// The sequences that the scene holds out for testing; none if it has no split files.
+/// The sequences that the scene's own split holds out for testing; `None` if it has no split files.
 fn dataset_split(scene: &Path, sequences: &[String]) -> Result<Option<BTreeSet<String>>, Error> {
     let files = ["TrainSplit.txt", "TestSplit.txt"].map(|name| scene.join(name));
     if files.iter().all(|file| !file.is_file()) {
         return Ok(None);
     }
 
+    // Every sequence must be on exactly one side of the split.
     let [train, test] = [split_file(&files[0])?, split_file(&files[1])?];
     if let Some(both) = train.intersection(&test).next() {
         return Err(Error::Malformed {
             file: files[1].clone(),
-            problem: format!("names {both}, as TrainSplit.txt does"),
+            problem: format!("lists {both}, as TrainSplit.txt does"),
         });
     }
 
@@ -183,7 +199,7 @@ fn dataset_split(scene: &Path, sequences: &[String]) -> Result<Option<BTreeSet<S
         .find(|name| !train.contains(*name) && !test.contains(*name))
     {
         let problem = format!(
-            "does not name {unlisted}, nor does TrainSplit.txt; add it, or move the sequence away"
+            "does not list {unlisted}, nor does TrainSplit.txt; add it, or move the sequence away"
         );
         return Err(Error::Malformed {
             file: files[1].clone(),
@@ -219,7 +235,7 @@ fn split_file(file: &Path) -> Result<BTreeSet<String>, Error> {
     lines.map(name).collect()
 }
 
-/// The inverse of the rigid transform in a file.
+/// `depth_from_rgb`: the inverse of the rigid transform `rgb_from_depth` in a file.
 fn calibration(file: &Path) -> Result<Pose, Error> {
     let malformed = |problem: String| Error::Malformed {
         file: file.to_owned(),
@@ -232,7 +248,7 @@ fn calibration(file: &Path) -> Result<Pose, Error> {
             Ok(rgb_from_depth.inverse())
         }
         _ => Err(malformed(
-            "is no rigid transform; expected rgb_from_depth, 4×4, metres".to_owned(),
+            "is not a rigid transform; expected rgb_from_depth, 4×4, metres".to_owned(),
         )),
     }
 }

@@ -1,4 +1,4 @@
-//! Numbers in text files, strictly: what does not parse is named by file and line.
+//! Strict parsing of numbers in text files. Errors name the file and the line.
 
 use std::path::Path;
 
@@ -6,7 +6,8 @@ use nalgebra::Matrix4;
 
 use super::{DropReason, Error, read_text};
 
-/// The sixteen numbers of a pose file, or why there are none.
+/// The 4×4 matrix of a pose file, row by row. The inner error is a reason to drop the frame; the
+/// outer one refuses the recording.
 pub(super) fn read_matrix(file: &Path) -> Result<Result<Matrix4<f64>, DropReason>, Error> {
     if !file.exists() {
         return Ok(Err(DropReason::MissingPoseFile));
@@ -20,6 +21,8 @@ pub(super) fn read_matrix(file: &Path) -> Result<Result<Matrix4<f64>, DropReason
         }
     }
 
+    // Too few numbers mean a truncated file, which costs one frame. Too many mean that this is not
+    // a pose file.
     match numbers.len() {
         16 => Ok(Ok(Matrix4::from_row_slice(&numbers))),
         0..16 => Ok(Err(DropReason::TruncatedPoseFile)),
@@ -30,13 +33,13 @@ pub(super) fn read_matrix(file: &Path) -> Result<Result<Matrix4<f64>, DropReason
     }
 }
 
-/// A number, finite or not.
+/// Parses a number, which may be infinite or NaN.
 pub(super) fn number(file: &Path, line: usize, word: &str) -> Result<f64, Error> {
     word.parse()
-        .map_err(|_| wrong(file, line, format!("'{word}' is no number")))
+        .map_err(|_| wrong(file, line, format!("'{word}' is not a number")))
 }
 
-/// `N` numbers divided by single spaces, all finite.
+/// Parses `N` finite numbers, separated by single spaces.
 pub(super) fn finite_row<const N: usize>(
     file: &Path,
     line: usize,
@@ -59,7 +62,7 @@ pub(super) fn finite_row<const N: usize>(
     Ok(row)
 }
 
-/// Words divided by single spaces, none empty.
+/// Splits a line into words separated by single spaces; none may be empty.
 pub(super) fn spaced<'a>(file: &Path, line: usize, text: &'a str) -> Result<Vec<&'a str>, Error> {
     let words: Vec<&str> = text.split(' ').collect();
     if words
@@ -69,20 +72,20 @@ pub(super) fn spaced<'a>(file: &Path, line: usize, text: &'a str) -> Result<Vec<
         return Err(wrong(
             file,
             line,
-            "columns are divided by single spaces, with none at the ends".to_owned(),
+            "columns must be separated by single spaces, with none at either end".to_owned(),
         ));
     }
 
     Ok(words)
 }
 
-/// Lines that say something: numbered from 1, without `#` comments and empty lines.
+/// The lines with data, numbered from 1. Empty lines and `#` comments are skipped.
 pub(super) fn data_lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
     let says = |(_, line): &(usize, &str)| !line.is_empty() && !line.starts_with('#');
     (1..).zip(text.lines()).filter(says)
 }
 
-/// Nanoseconds from decimal seconds, exactly; digits past the ninth are cut.
+/// Nanoseconds from non-negative decimal seconds, exactly. Digits after the ninth are cut off.
 pub(super) fn nanoseconds(seconds: &str) -> Option<i64> {
     let (whole, part) = seconds.split_once('.').unwrap_or((seconds, ""));
     let digits = |text: &str| text.bytes().all(|byte| byte.is_ascii_digit());
@@ -90,6 +93,8 @@ pub(super) fn nanoseconds(seconds: &str) -> Option<i64> {
         return None;
     }
 
+    // The fraction is padded to nine digits and parsed as an integer: a double has steps of 2.4e-7
+    // s at times since 1970.
     let fraction: String = part.chars().chain("000000000".chars()).take(9).collect();
     whole
         .parse::<i64>()

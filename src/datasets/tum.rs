@@ -1,9 +1,9 @@
-//! TUM RGB-D: `rgb.txt` ("timestamp file"), `groundtruth.txt` ("timestamp tx ty tz qx qy qz qw"),
-//! camera-to-world.
+//! TUM RGB-D: `rgb.txt` ("timestamp file") and `groundtruth.txt`
+//! ("timestamp tx ty tz qx qy qz qw"), camera-to-world.
 //!
-//! An image takes the pose nearest in time, at most 10 ms away, as evo associates. Times are
-//! decimal text and are kept to the nanosecond. Lines are read as strictly as evo reads them, and
-//! more: numbers must be finite.
+//! An image takes the pose nearest in time if it is at most 10 ms away, as evo associates them.
+//! Times are decimal text and are read exactly to the nanosecond. Lines are parsed at least as
+//! strictly as by evo; in addition, all numbers must be finite.
 
 use std::path::Path;
 
@@ -12,18 +12,20 @@ use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use super::collect::{About, Collected};
 use super::text::{data_lines, finite_row, nanoseconds, spaced, wrong};
 use super::{DropReason, Error, Reader, Recording, read_text};
-use crate::geometry::Pose;
-use crate::trajectory::Trajectory;
+use seese3_core::geometry::Pose;
+use seese3_core::trajectory::Trajectory;
 
-/// The farthest that an image's pose may be in time.
+/// The longest time between an image and its pose, nanoseconds.
 const MAX_DIFFERENCE_NS: u64 = 10_000_000;
-/// How far from 1 a written quaternion's norm may be.
+/// How far the norm of a quaternion in the file may be from 1.
 const NORM_TOLERANCE: f64 = 1e-2;
 
-/// Reads a sequence's folder.
+/// Reads the folder of one sequence.
 ///
 /// # Errors
-/// [`Error`], naming the file and line.
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
+/// refuses unusable frames and there are some. The message names the file and the line, or the
+/// folder.
 pub fn read_tum(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
     let poses = read_trajectory(&folder.join("groundtruth.txt"))?;
     let images = read_images(&folder.join("rgb.txt"))?;
@@ -41,6 +43,7 @@ pub fn read_tum(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Err
             continue;
         }
 
+        // The image path also serves as the frame's name.
         let name = image.clone();
         let image = Some(image.clone());
 
@@ -58,33 +61,42 @@ pub fn read_tum(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Err
     collected.finish(folder, reader)
 }
 
-/// Reads a path, "timestamp tx ty tz qx qy qz qw" a line, by time.
+/// Reads a trajectory file with one line "timestamp tx ty tz qx qy qz qw" per pose, and sorts the
+/// poses by time.
 ///
 /// # Errors
-/// [`Error`], naming the file and line.
+/// [`Error`] if the file cannot be read or a line is malformed. The message names the file and the
+/// line.
 pub fn read_tum_trajectory(file: &Path) -> Result<Trajectory, Error> {
     let (times_ns, poses) = read_trajectory(file)?.into_iter().unzip();
     Ok(Trajectory { times_ns, poses })
 }
 
-/// The pose nearest in time, the earlier of two as near.
+/// The pose nearest in time, if it is within the tolerance; of two equally near, the earlier.
 fn nearest(poses: &[(i64, Pose)], timestamp_ns: i64) -> Option<Pose> {
     let after = poses.partition_point(|(time, _)| *time < timestamp_ns);
+
+    // The poses are sorted, so only the last one before the time and the first one from it on can
+    // be nearest.
     let around = poses[after.saturating_sub(1)..].iter().take(2);
     let (time, pose) = around.min_by_key(|(time, _)| time.abs_diff(timestamp_ns))?;
     (time.abs_diff(timestamp_ns) <= MAX_DIFFERENCE_NS).then_some(*pose)
 }
 
-/// Poses by time.
+/// Times, nanoseconds, and poses, `world_from_camera`; sorted by time.
 fn read_trajectory(file: &Path) -> Result<Vec<(i64, Pose)>, Error> {
     let text = read_text(file)?;
     let mut poses = Vec::new();
     for (line, row) in data_lines(&text) {
         let [_, x, y, z, qx, qy, qz, qw] = finite_row(file, line, row)?;
         let time = time(file, line, row)?;
+
+        // The file writes the scalar part last; nalgebra takes it first.
         let quaternion = Quaternion::new(qw, qx, qy, qz);
         let norm = quaternion.norm();
 
+        // A small deviation is rounding and is normalised away below. A large one suggests that the
+        // columns are in another order.
         if (norm - 1.0).abs() > NORM_TOLERANCE {
             return Err(wrong(
                 file,
@@ -101,7 +113,7 @@ fn read_trajectory(file: &Path) -> Result<Vec<(i64, Pose)>, Error> {
     Ok(poses)
 }
 
-/// Images by time.
+/// Times, nanoseconds, and image paths relative to the folder; sorted by time.
 fn read_images(file: &Path) -> Result<Vec<(i64, String)>, Error> {
     let text = read_text(file)?;
     let mut images = Vec::new();
@@ -122,7 +134,8 @@ fn read_images(file: &Path) -> Result<Vec<(i64, String)>, Error> {
     Ok(images)
 }
 
-/// Nanoseconds from seconds in scientific notation, as NumPy writes them; rounded as doubles are.
+/// Nanoseconds from seconds in scientific notation, as NumPy writes them; only as exact as a
+/// double.
 fn scientific(seconds: &str) -> Option<i64> {
     let seconds: f64 = seconds
         .contains(['e', 'E'])
@@ -142,7 +155,7 @@ fn time(file: &Path, line: usize, row: &str) -> Result<i64, Error> {
             wrong(
                 file,
                 line,
-                format!("'{word}' is no time in decimal seconds"),
+                format!("'{word}' is not a time in decimal seconds"),
             )
         })
 }

@@ -1,9 +1,9 @@
 //! 12-Scenes: `HOUSE/ROOM/{info.txt,split.txt,data/frame-XXXXXX.{color.jpg,pose.txt}}`,
 //! camera-to-world, metres.
 //!
-//! - Lost poses hold the text INF.
-//! - `split.txt` has a line a sequence, `sequenceK [frames=N] …`; the first sequence is held out
-//!   for testing.
+//! - The pose file of a frame without tracking contains the text INF.
+//! - `split.txt` has one line per sequence, `sequenceK [frames=N] …`; the first sequence is held
+//!   out for testing.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -12,13 +12,17 @@ use super::collect::{About, Collected};
 use super::text::{read_matrix, wrong};
 use super::{DropReason, Error, Reader, Recording, entries, read_text};
 
-/// Reads a room's folder.
+/// Reads the folder of one room.
 ///
 /// # Errors
-/// [`Error`], naming the file or folder.
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
+/// refuses unusable frames and there are some. The message names the file or folder.
 pub fn read_twelve_scenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
     let lengths = sequence_lengths(&folder.join("split.txt"))?;
     let names = entries(&folder.join("data"))?;
+
+    // The files are grouped by frame number: slot 0 is the image, slot 1 the pose. Other files are
+    // ignored.
     let mut frames: BTreeMap<u32, [Option<&String>; 2]> = BTreeMap::new();
     for name in &names {
         let Some((stem, kind)) = name
@@ -41,6 +45,9 @@ pub fn read_twelve_scenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Reco
     let count = frames.len();
     for (position, (number, [image, pose])) in frames.into_iter().enumerate() {
         (reader.progress)(position, count);
+
+        // The position counts all frames, including those that are dropped below, as `split.txt`
+        // does.
         let sequence = sequence_of(&lengths, position);
 
         let about = About {
@@ -73,7 +80,8 @@ pub fn read_twelve_scenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Reco
     collected.finish(folder, reader)
 }
 
-/// The sequence of a frame by its place among all frames; those past the last belong to it.
+/// The sequence of a frame by its position among all frames. Frames beyond the listed lengths
+/// belong to the last sequence.
 fn sequence_of(lengths: &[usize], position: usize) -> u32 {
     let mut end = 0;
     for (sequence, length) in (0..).zip(lengths) {
@@ -86,7 +94,7 @@ fn sequence_of(lengths: &[usize], position: usize) -> u32 {
     lengths.len().saturating_sub(1) as u32
 }
 
-/// Frames of each sequence.
+/// The number of frames in each sequence.
 fn sequence_lengths(file: &Path) -> Result<Vec<usize>, Error> {
     let text = read_text(file)?;
     let mut lengths = Vec::new();
@@ -106,7 +114,7 @@ fn sequence_lengths(file: &Path) -> Result<Vec<usize>, Error> {
     if lengths.is_empty() {
         return Err(Error::Malformed {
             file: file.to_owned(),
-            problem: "names no sequence".to_owned(),
+            problem: "lists no sequence".to_owned(),
         });
     }
 

@@ -1,22 +1,22 @@
-//! The built-in, weight-free encoder: gradient-orientation histograms and coarse colour.
+//! The built-in encoder without weights: histograms of gradient orientations, and coarse colour.
 //!
-//! It stands in for the encoder that one brings, so that the whole path can be shown without a
-//! model. An 8×6 grid of cells; each cell gives a histogram of 8 gradient orientations and its mean
-//! colour. A pixel votes for the cells and orientations on both sides of it, so that features move
-//! smoothly with the camera.
+//! It stands in for a real encoder, so that the whole pipeline can be shown without a model. The
+//! image is divided into 8×6 cells; each cell gives a histogram of 8 gradient orientations and its
+//! mean colour. A pixel votes for all neighbouring cells and orientations in proportion to how near
+//! they are, so that features change smoothly as the camera moves.
 
 use std::f32::consts::TAU;
 
 use super::{Pooling, Preparation, Resize};
-use crate::features::FeatureSource;
-use crate::image::RgbImage;
+use seese3_core::features::FeatureSource;
+use seese3_core::image::RgbImage;
 
 const COLUMNS: usize = 8;
 const ROWS: usize = 6;
 const ORIENTATIONS: usize = 8;
 const CELL_DIM: usize = ORIENTATIONS + 3;
 
-/// Columns of a feature.
+/// The number of columns of a feature.
 pub const BUILTIN_DIM: usize = COLUMNS * ROWS * CELL_DIM;
 
 pub(super) const POOLING: Pooling = Pooling::Grid {
@@ -25,7 +25,7 @@ pub(super) const POOLING: Pooling = Pooling::Grid {
     skip: 0,
 };
 
-/// The images that the encoder is meant for are small.
+/// The encoder is meant for small images, so each one is resized to 64×48 pixels.
 pub(super) fn preparation() -> Preparation {
     Preparation {
         resize: Resize::Whole {
@@ -36,7 +36,7 @@ pub(super) fn preparation() -> Preparation {
     }
 }
 
-/// What [`encode_builtin`] makes of images of 64×48 pixels.
+/// The source of the features that [`encode_builtin`] computes from images of 64×48 pixels.
 pub fn builtin_source(name: &str) -> FeatureSource {
     FeatureSource {
         name: name.to_owned(),
@@ -50,14 +50,15 @@ pub fn builtin_source(name: &str) -> FeatureSource {
     }
 }
 
-/// The feature of an image at least 3×3 pixels large, shape ([`BUILTIN_DIM`],). A smaller one has
-/// no gradient: its histograms are zero.
+/// The feature of an image, shape ([`BUILTIN_DIM`],). A gradient needs at least 3×3 pixels: the
+/// histograms of a smaller image are zero.
 pub fn encode_builtin(image: &RgbImage) -> Vec<f32> {
     let width = image.width;
     let height = image.height;
     let grey: Vec<f32> = image.bytes.chunks_exact(3).map(luminance).collect();
     let mut feature = vec![0.0; BUILTIN_DIM];
 
+    // The sum of the shares of all pixels in a cell, which is the cell's area in pixels.
     let mut weight = [0.0; COLUMNS * ROWS];
     for y in 0..height {
         for x in 0..width {
@@ -72,6 +73,8 @@ pub fn encode_builtin(image: &RgbImage) -> Vec<f32> {
                 }
             }
 
+            // A central difference needs a neighbour on every side,
+            // so pixels at the border give their colour only.
             if x == 0 || y == 0 || x + 1 == width || y + 1 == height {
                 continue;
             }
@@ -81,11 +84,14 @@ pub fn encode_builtin(image: &RgbImage) -> Vec<f32> {
             let dy = at(x, y + 1) - at(x, y - 1);
             let strength = dx.hypot(dy);
 
+            // The angle of the gradient in units of orientation bins, 0 to 8. Bins are
+            // circular: both `%` catch an angle that was rounded up to the full turn.
             let place =
                 (dy.atan2(dx).rem_euclid(TAU) / TAU * ORIENTATIONS as f32) % ORIENTATIONS as f32;
             let low = place.floor() as usize % ORIENTATIONS;
             let part = place.fract();
 
+            // The vote is split between the two nearest orientations, so that it does not jump.
             for &(cell, share) in &cells {
                 feature[cell * CELL_DIM + low] += strength * share * (1.0 - part);
                 feature[cell * CELL_DIM + (low + 1) % ORIENTATIONS] += strength * share * part;
@@ -93,6 +99,8 @@ pub fn encode_builtin(image: &RgbImage) -> Vec<f32> {
         }
     }
 
+    // Sums become means over the cell, so that features do not depend on the number of pixels. The
+    // square root reduces the dominance of strong edges.
     for (cell, values) in feature.chunks_exact_mut(CELL_DIM).enumerate() {
         let (histogram, colour) = values.split_at_mut(ORIENTATIONS);
         let area = weight[cell].max(1e-6);
@@ -106,10 +114,13 @@ pub fn encode_builtin(image: &RgbImage) -> Vec<f32> {
     feature
 }
 
-/// The four cells around a pixel and its share in each; shares add up to 1, and fall off to the
-/// cells' centres.
+/// The four cells around a pixel, each with the pixel's share in it. Shares are the weights of
+/// bilinear interpolation between the centres of the cells, and add up to 1.
 fn cells_of(x: usize, y: usize, width: usize, height: usize) -> [(usize, f32); 4] {
     let place = |pixel: usize, pixels: usize, cells: usize| {
+        // The pixel's centre in units of cells, counted from the centre
+        // of the first cell. It is clamped, so that a pixel outside the
+        // outermost centres counts for the outermost cell alone.
         let at = ((pixel as f32 + 0.5) * cells as f32 / pixels as f32 - 0.5)
             .clamp(0.0, cells as f32 - 1.0);
         let low = (at.floor() as usize).min(cells - 1);

@@ -1,4 +1,4 @@
-//! Image files to pixels: JPEG and PNG, within bounds, as 8-bit RGB.
+//! Decodes JPEG and PNG files to 8-bit RGB, within limits on their size.
 
 use std::fs::File;
 use std::io::{Cursor, Read, Seek, SeekFrom};
@@ -13,41 +13,43 @@ use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits};
 
 use super::Error;
-use crate::image::RgbImage;
+use seese3_core::image::RgbImage;
 
-/// How large an image may be.
+/// Limits on the size of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Bounds {
-    /// Encoded.
+    /// The largest number of bytes of the encoded image.
     pub bytes: u64,
-    /// Decoded.
+    /// The largest number of pixels of the decoded image.
     pub pixels: u64,
 }
 
-/// The longest side of an image, pixels: a longer one would be resized by way of something much
-/// larger.
+/// The longest side of an image, pixels. Resizing a longer one would need an intermediate image
+/// that is much larger.
 const LONGEST_SIDE: usize = 16_384;
 
-/// The last two bytes of a JPEG; anything may follow them.
+/// The end-of-image marker of a JPEG. Other bytes may follow it in the file.
 const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];
-/// What may be allocated to read a header: colour profiles are compressed, and may be bombs.
+/// The most bytes that may be allocated to read the header of a PNG: a colour profile in it is
+/// compressed, and may be a decompression bomb.
 const HEADER_ALLOC: u64 = 16 << 20;
 
 impl Bounds {
-    /// For files of one's own.
+    /// Limits for the user's own files.
     pub const LOCAL: Self = Self {
         bytes: 256 << 20,
         pixels: 100_000_000,
     };
 }
 
-/// Decodes a JPEG or PNG; `name` is for messages. Alpha is dropped, grey becomes RGB, 16 bits
-/// become 8.
+/// Decodes a JPEG or PNG to 8-bit RGB. Alpha is dropped, grey is repeated in all three channels,
+/// and 16 bits are reduced to 8. `name` identifies the image in error messages.
 ///
 /// # Errors
-/// [`Error::BadImage`], for another format, a file that is not whole, or one out of bounds.
+/// [`Error::BadImage`] if the format is another one, the file is incomplete or damaged, or the
+/// image is over `bounds`.
 pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Error> {
-    // Decoders' messages may go over several lines.
+    // Messages of the decoders may contain line breaks; an error of ours is one line.
     let one_line = |problem: String| problem.split_whitespace().collect::<Vec<_>>().join(" ");
     let bad = |problem: String| Error::BadImage {
         image: name.to_owned(),
@@ -80,12 +82,14 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
         reader
     };
 
+    // The header is read alone first, so that an image over the limits is refused before memory is
+    // allocated for its pixels.
     let (width, height) = read(HEADER_ALLOC)
         .into_dimensions()
         .map_err(|error| bad(error.to_string()))?;
     check_size(width as usize, height as usize, bounds).map_err(bad)?;
 
-    // Sixteen bits, four channels, and as much again for the decoder.
+    // A pixel has at most four channels of 16 bits, 8 bytes; the decoder may use as much again.
     let most = (u64::from(width) * u64::from(height))
         .saturating_mul(16)
         .saturating_add(HEADER_ALLOC);
@@ -118,12 +122,14 @@ fn check_size(width: usize, height: usize, bounds: Bounds) -> Result<(), String>
     Ok(())
 }
 
-/// JPEG, strictly: an image that ends early is not filled up with grey.
+/// Decodes a JPEG strictly: a truncated image is an error and is not filled up with grey.
 fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
     if !bytes.windows(2).rev().any(|marker| marker == END_OF_IMAGE) {
-        return Err("ends before its end marker: it was cut".to_owned());
+        return Err("has no end-of-image marker: the file is truncated".to_owned());
     }
 
+    // The decoder's own limits on size are raised to the largest that the format allows, so that
+    // `check_size` alone decides.
     let options = DecoderOptions::default()
         .set_strict_mode(true)
         .set_max_width(usize::from(u16::MAX))
@@ -134,11 +140,11 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
         .decode_headers()
         .map_err(|error| error.to_string())?;
 
-    let (width, height) = decoder.dimensions().ok_or("says no size")?;
+    let (width, height) = decoder.dimensions().ok_or("does not state its size")?;
     check_size(width, height, bounds)?;
     let bytes = decoder.decode().map_err(|error| error.to_string())?;
     if bytes.len() != width * height * 3 {
-        return Err("has colours that are no RGB".to_owned());
+        return Err("has colours that cannot be converted to RGB".to_owned());
     }
 
     Ok(RgbImage {
@@ -151,13 +157,16 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
 /// Reads and decodes a room's image: a file below `root`, or the part `FILE@OFFSET+LENGTH` of one.
 ///
 /// # Errors
-/// [`Error::Io`] or [`Error::BadImage`].
+/// [`Error::Io`] if the file cannot be read, [`Error::BadImage`] if the part lies outside the file
+/// or the image cannot be decoded within [`Bounds::LOCAL`].
 pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
     let bad = |problem: String| Error::BadImage {
         image: root.join(image).display().to_string(),
         problem,
     };
 
+    // A name that does not end in `@OFFSET+LENGTH` is the name of a whole file, so that '@' may
+    // occur in file names.
     let part = image.rsplit_once('@').and_then(|(file, part)| {
         let (offset, length) = part.split_once('+')?;
         Some((
@@ -186,6 +195,7 @@ pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
         length = part_length;
     }
 
+    // `decode` checks this too, but only after the bytes were read into memory.
     if length > Bounds::LOCAL.bytes {
         return Err(bad(format!(
             "is {length} bytes, over the limit of {}",
@@ -199,10 +209,10 @@ pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
     decode(&path.display().to_string(), &bytes, Bounds::LOCAL)
 }
 
-/// An image as PNG.
+/// Encodes an image as PNG.
 ///
 /// # Errors
-/// [`Error::BadImage`] if its bytes do not fit its size.
+/// [`Error::BadImage`] if the number of its bytes does not fit its width and height.
 pub fn encode_png(picture: &RgbImage) -> Result<Vec<u8>, Error> {
     let mut bytes = Vec::new();
     let encoder = PngEncoder::new(&mut bytes);
@@ -274,7 +284,8 @@ mod tests {
         }
     }
 
-    /// Oracle: the list of bad visitors: cut, too large, too many pixels, another format, nothing.
+    /// Oracle: the definition of `Bounds` and of the two formats: an image that is truncated, over
+    /// a limit, of another format or empty is refused.
     #[test]
     fn bad_images_are_named() {
         let bytes = png(64, 64);

@@ -1,9 +1,9 @@
-//! Rows as they were encoded, appended to a file, so that an interrupted run goes on where it
-//! stopped.
+//! A journal: a file to which rows are appended as they are encoded, so that an interrupted run
+//! continues where it stopped.
 //!
-//! A record is the row's number (u32), its numbers (f32) and the beginning of their SHA-256 (8
-//! bytes), little-endian. A record that is cut or altered ends the file: it and all after it are
-//! encoded again.
+//! A record is the row's number (u32), its numbers (f32), and the first 8 bytes of the SHA-256 of
+//! both, little-endian. Reading ends at the first record that is truncated or altered: that row and
+//! all rows after it are encoded again.
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{Read, Seek, SeekFrom, Write};
@@ -15,13 +15,13 @@ use super::Error;
 
 const MAGIC: &[u8; 16] = b"seese3 rows 1\n\0\0";
 const CHECK_BYTES: usize = 8;
-/// Magic, and the hash of the key.
+/// The magic bytes, and the SHA-256 of the key and the width.
 const HEADER_BYTES: usize = 16 + 32;
 
-/// Rows of features with the frames that they belong to.
+/// Rows of features, each with the number of its frame.
 pub type NumberedRows = Vec<(usize, Vec<f32>)>;
 
-/// See the module.
+/// An open journal, locked against other processes.
 pub struct Journal {
     path: PathBuf,
     file: File,
@@ -29,11 +29,11 @@ pub struct Journal {
 }
 
 impl Journal {
-    /// Opens the journal of a task, or begins it; gives the rows that are in it already. A file
-    /// that another task with another `key` left at `path` is begun anew.
+    /// Opens or creates the journal at `path`, and returns the rows that are in it already. `key`
+    /// identifies the task: a file that was written for another key or width is emptied.
     ///
     /// # Errors
-    /// [`Error::Io`], also when another process is at the same task.
+    /// [`Error::Io`] if the file cannot be read or written, or if another process holds its lock.
     pub fn open(path: &Path, key: &str, width: usize) -> Result<(Self, NumberedRows), Error> {
         let io = |cause| Error::Io {
             file: path.to_owned(),
@@ -52,6 +52,7 @@ impl Journal {
             .open(path)
             .map_err(io)?;
 
+        // Two processes that append to one file would mix their records.
         match file.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
@@ -71,6 +72,9 @@ impl Journal {
         let header = [MAGIC.as_slice(), &Sha256::digest(format!("{key}\n{width}"))].concat();
         let mut found = vec![0; HEADER_BYTES];
         let is_ours = journal.file.read_exact(&mut found).is_ok() && found == header;
+
+        // The file is new, belongs to another task, or
+        // was truncated within its header: start empty.
         if !is_ours {
             journal.file.set_len(0).map_err(io)?;
             journal.file.rewind().map_err(io)?;
@@ -79,6 +83,9 @@ impl Journal {
         }
 
         let rows = journal.rows().map_err(io)?;
+
+        // Truncate the file after its last intact record, since a reader would
+        // stop at the damaged one and miss the records that are appended now.
         let end = HEADER_BYTES + rows.len() * journal.record_bytes();
         journal.file.set_len(end as u64).map_err(io)?;
         journal.file.seek(SeekFrom::End(0)).map_err(io)?;
@@ -86,10 +93,10 @@ impl Journal {
         Ok((journal, rows))
     }
 
-    /// Appends rows.
+    /// Appends rows, each with the number of its frame.
     ///
     /// # Errors
-    /// [`Error::Io`].
+    /// [`Error::Io`] if the file cannot be written.
     pub fn append<'a>(
         &mut self,
         rows: impl Iterator<Item = (usize, &'a [f32])>,
@@ -109,10 +116,10 @@ impl Journal {
         })
     }
 
-    /// Removes the file, once its rows are safe elsewhere.
+    /// Removes the file. To be called once its rows are stored elsewhere.
     ///
     /// # Errors
-    /// [`Error::Io`].
+    /// [`Error::Io`] if the file cannot be removed.
     pub fn finish(self) -> Result<(), Error> {
         std::fs::remove_file(&self.path).map_err(|cause| Error::Io {
             file: self.path.clone(),
@@ -129,6 +136,7 @@ impl Journal {
         let mut record = vec![0; self.record_bytes()];
         let mut rows = Vec::new();
         loop {
+            // A file that ends within a record was interrupted while it was written.
             match reader.read_exact(&mut record) {
                 Ok(()) => {}
                 Err(error) if error.kind() == std::io::ErrorKind::UnexpectedEof => return Ok(rows),
@@ -140,6 +148,7 @@ impl Journal {
                 return Ok(rows);
             }
 
+            // The record's first word is the row's number, all others are its values.
             let words: Vec<[u8; 4]> = content.as_chunks::<4>().0.to_vec();
             let row = u32::from_le_bytes(words[0]) as usize;
 
@@ -210,7 +219,8 @@ mod tests {
         );
     }
 
-    /// Oracle: another task's rows are not ours, and a task that runs already is not begun twice.
+    /// Oracle: the definition: rows of another task are not returned, and a task that is running
+    /// cannot be started a second time.
     #[test]
     fn another_key_begins_anew_and_a_running_task_is_refused() {
         let folder = tempfile::tempdir().unwrap();

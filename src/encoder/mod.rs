@@ -1,9 +1,9 @@
 //! Encoders: images to features, several layers in one pass.
 //!
-//! - An image is decoded, resized and cropped in 8 bit, normalised, run, and each layer pooled to
-//!   one row.
-//! - What an [`Encoder`] does is written into the [`FeatureSource`] of what it makes, word for
-//!   word, so that an encoder can be built again from a source and its model alone.
+//! - An image is decoded, resized and cropped in 8 bit, normalised, and run through a network; the
+//!   output of each layer is pooled to one row.
+//! - All that decides the output of an [`Encoder`] is written into the [`FeatureSource`] of its
+//!   features, so that the encoder can be rebuilt from a source and the model's file alone.
 
 mod builtin;
 mod decode;
@@ -25,20 +25,21 @@ pub use journal::{Journal, NumberedRows};
 pub use network::{Runtime, RuntimeKind};
 pub use pooling::Pooling;
 pub use preparation::{Filter, Preparation, Resize, normalised};
-pub use recipes::{RECIPES, Recipe, recipe};
+pub use recipes::{EncoderRecipe, RECIPES, recipe};
 pub use run::{Encoded, Kept, OnBadImage, Task, encode_room};
 
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, ArrayD, Axis, IxDyn};
 
-use crate::features::FeatureSource;
-use crate::image::RgbImage;
-use crate::room::is_plain_name;
 use network::Network;
+use seese3_core::features::FeatureSource;
+use seese3_core::image::RgbImage;
+use seese3_core::room::is_plain_name;
 
 /// What can go wrong between an image file and a feature.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
     #[error("{}: {cause}", file.display())]
     Io {
@@ -73,35 +74,36 @@ pub enum Error {
     },
     #[error("room '{room}' has no images; import it from a recording with images")]
     NoImages { room: String },
-    #[error("every image of room '{room}' is bad")]
+    #[error("no image of room '{room}' can be read")]
     AllBad { room: String },
     #[error(transparent)]
-    Cancelled(#[from] crate::cancel::Cancelled),
+    Cancelled(#[from] seese3_core::cancel::Cancelled),
 }
 
-/// Which layer of a model is kept, and how it is written down (A-13).
+/// A layer of a model whose output becomes a feature (A-13).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Layer {
     /// The output's name in the model.
     pub name: String,
-    /// What the number in the name counts from: `0`, `1`, or `name` when it is only a name.
+    /// Where the numbering of layers starts: `0` or `1`, or `name` if the name has no number.
     pub base: String,
-    /// Whether the encoder's last norm is in it: `none`, `final` or `unspecified`.
+    /// Whether the encoder's final normalisation layer is included: `none`, `final` or
+    /// `unspecified`.
     pub norm: String,
-    /// How it becomes one row.
+    /// How the output is reduced to one row.
     pub pooling: Pooling,
 }
 
-/// What a model is asked for.
+/// A model, and what an encoder needs to know to run it.
 #[derive(Debug, Clone)]
 pub struct ModelTask {
     /// The ONNX file.
     pub file: PathBuf,
     /// How images are prepared for it.
     pub preparation: Preparation,
-    /// What is kept.
+    /// The layers whose outputs become features.
     pub layers: Vec<Layer>,
-    /// Images a clip, 1 for an image model.
+    /// The number of images in a clip; 1 for a model of single images.
     pub window: usize,
 }
 
@@ -116,7 +118,7 @@ pub struct Encoder {
     layers: Vec<Layer>,
     dims: Vec<usize>,
     window: usize,
-    /// Of every prepared image (width, height), where the preparation or the model fixes it.
+    /// The size (width, height) of prepared images, if the preparation or the model fixes it.
     size: Option<(usize, usize)>,
 }
 
@@ -140,8 +142,8 @@ impl Encoder {
         }
     }
 
-    /// Raw pixels, the paper's baseline: the image at 320×240, in means over 16×12 patches, 0 to 1,
-    /// by channel.
+    /// Raw pixels, the paper's baseline: the image is resized to 320×240 and averaged over 16×12
+    /// patches, each channel alone, values 0 to 1.
     pub fn pixels() -> Self {
         let pooling = Pooling::Grid {
             columns: 16,
@@ -172,11 +174,13 @@ impl Encoder {
         }
     }
 
-    /// An ONNX model. It is run once on a grey image, so that wrong names and shapes are found at
-    /// once.
+    /// Opens an ONNX model. It is run once on two clips of grey images, so that wrong names and
+    /// shapes are found before a room is encoded.
     ///
     /// # Errors
-    /// [`Error::Model`], [`Error::NotBuilt`], [`Error::Runtime`].
+    /// [`Error::Io`] if the file cannot be read, [`Error::Option`] if no image can be prepared with
+    /// the numbers given, [`Error::Model`] if the file does not fit the task, [`Error::NotBuilt`]
+    /// if this program lacks the runtime, [`Error::Runtime`] if the trial run fails.
     pub fn model(task: ModelTask, runtime: &Runtime) -> Result<Self, Error> {
         let ModelTask {
             file,
@@ -196,6 +200,8 @@ impl Encoder {
             size,
         };
 
+        // The trial run gives the rank and width of each output.
+        // Where no size is fixed, a small image is tried.
         let (width, height) = size.unwrap_or((64, 64));
         let grey = RgbImage {
             width,
@@ -203,7 +209,7 @@ impl Encoder {
             bytes: vec![127; width * height * 3],
         };
 
-        // Two clips, so that a layer whose first axis is not the batch is found.
+        // With two clips in it, an output whose first axis is not the batch is noticed.
         let outputs = encoder.outputs(&[vec![&grey; window], vec![&grey; window]])?;
 
         let seen = pooling::Seen {
@@ -219,6 +225,8 @@ impl Encoder {
             };
 
             let one = output.index_axis(Axis(0), 0);
+
+            // An output that is a vector already is not pooled, whatever was asked for.
             layer.pooling = layer.pooling.for_rank(one.ndim());
             let row = layer.pooling.pool(one, seen);
             let row = row.map_err(|error| problem(format!("layer '{}': {error}", layer.name)))?;
@@ -228,12 +236,12 @@ impl Encoder {
         Ok(encoder)
     }
 
-    /// Builds the encoder that made a source again. `models` are those at hand: `builtin`,
-    /// `pixels`, or ONNX files; none of them may be the one.
+    /// Rebuilds the encoder that made `source`. `models` are the candidates: `builtin`, `pixels`,
+    /// or paths of ONNX files. Returns `None` if none of them is that encoder.
     ///
     /// # Errors
-    /// As [`Encoder::model`], and [`Error::Option`] for a source that does not say how images were
-    /// prepared.
+    /// As [`Encoder::model`], and [`Error::Option`] if the source does not say how images were
+    /// prepared or how the layer was pooled.
     pub fn of_source(
         source: &FeatureSource,
         models: &[String],
@@ -246,6 +254,8 @@ impl Encoder {
                 _ => None,
             };
 
+            // The two encoders without a model have no
+            // options, so their whole sources are compared.
             if let Some(encoder) = plain {
                 if encoder.sources("")[0].is_like(source) {
                     return Ok(Some(encoder));
@@ -258,6 +268,8 @@ impl Encoder {
                 continue;
             }
 
+            // The file is the right one; everything else
+            // about the encoder is read back from the source.
             let (preparation, window) = Preparation::parse(&source.preprocess)?;
 
             let layer = Layer {
@@ -280,8 +292,9 @@ impl Encoder {
         Ok(None)
     }
 
-    /// What its layers make, in order; each is called `PREFIX-LAYER-POOLING`, or just the prefix if
-    /// there is one layer and it has no name of its own.
+    /// The sources of the features that its layers give, in order. Each is named
+    /// `PREFIX-LAYER-POOLING`, or `PREFIX-LAYER` if the output is a vector. The encoders without a
+    /// model give the prefix alone.
     pub fn sources(&self, prefix: &str) -> Vec<FeatureSource> {
         let made = |(layer, &dim): (&Layer, &usize)| FeatureSource {
             name: feature_name(prefix, layer, &self.network),
@@ -297,28 +310,29 @@ impl Encoder {
         self.layers.iter().zip(&self.dims).map(made).collect()
     }
 
-    /// Which runtime runs it; none for the built-in ones.
+    /// The name of the runtime that runs it; `none` for the encoders without a model.
     pub fn runtime(&self) -> &'static str {
         self.network.runtime()
     }
 
-    /// The model's identity: its file's name and the beginning of its SHA-256.
+    /// The encoder's identity. For a model it is the file's name without extension, and the
+    /// beginning of the file's SHA-256.
     pub fn id(&self) -> &str {
         &self.id
     }
 
-    /// Images a clip.
+    /// The number of images in a clip.
     pub fn window(&self) -> usize {
         self.window
     }
 
-    /// Columns of each layer's feature.
+    /// The number of columns of each layer's feature.
     pub fn dims(&self) -> &[usize] {
         &self.dims
     }
 
-    /// The size (width, height) of an image of 4:3 that is prepared without being resized: render
-    /// at this.
+    /// The size (width, height) at which to render images so that they need no resizing. The aspect
+    /// ratio is 4:3 where the preparation leaves it open.
     pub fn render_size(&self) -> (usize, usize) {
         match self.preparation.resize {
             Resize::Whole { width, height } => (width, height),
@@ -327,18 +341,21 @@ impl Encoder {
         }
     }
 
-    /// Resizes and crops an image as the encoder wants it, 8 bit.
+    /// Resizes and crops an image for this encoder, in 8 bit.
     ///
     /// # Errors
-    /// [`Error::BadImage`] if it is too small for the crop.
+    /// [`Error::BadImage`] if it is empty, too small for the crop, or would be resized to an image
+    /// over the size limit.
     pub fn prepare(&self, image: RgbImage) -> Result<RgbImage, Error> {
         self.preparation.pixels(image)
     }
 
-    /// Features of prepared clips: a row a clip, the layers' columns side by side.
+    /// Features of prepared clips, shape (clips, sum of [`Encoder::dims`]): one row per clip, with
+    /// the columns of all layers side by side.
     ///
     /// # Errors
-    /// [`Error::Runtime`] or [`Error::NotFinite`].
+    /// [`Error::BadImage`] if images have different sizes or a size that the model does not take,
+    /// [`Error::Runtime`] if the network fails, [`Error::NotFinite`] if a feature is not finite.
     pub fn encode(&self, clips: &[Vec<&RgbImage>]) -> Result<Array2<f32>, Error> {
         let width = self.dims.iter().sum();
         let mut rows = Array2::zeros((clips.len(), width));
@@ -346,6 +363,7 @@ impl Encoder {
             return Ok(rows);
         }
 
+        // The built-in encoder computes whole rows, so that nothing is left to pool.
         if matches!(self.network, Network::Builtin) {
             for (mut row, clip) in rows.outer_iter_mut().zip(clips) {
                 row.assign(&ndarray::aview1(&encode_builtin(clip[0])));
@@ -362,6 +380,7 @@ impl Encoder {
             window: self.window,
         };
 
+        // Each layer fills its own columns of the row, which begin at `from`.
         let mut from = 0;
         for ((layer, &dim), output) in self.layers.iter().zip(&self.dims).zip(&outputs) {
             for (mut row, one) in rows.outer_iter_mut().zip(output.outer_iter()) {
@@ -371,6 +390,7 @@ impl Encoder {
                     problem: error.to_string(),
                 })?;
 
+                // The trial run gave `dim`. Another width would not fit the columns of the layer.
                 if pooled.len() != dim {
                     let problem = format!(
                         "layer '{}' gave {} columns, expected {dim}",
@@ -398,10 +418,12 @@ impl Encoder {
         Ok(rows)
     }
 
-    /// What the network gives for clips, by layer, clips along the first axis.
+    /// The outputs of the network, one array per layer, with the clips along the first axis.
     fn outputs(&self, clips: &[Vec<&RgbImage>]) -> Result<Vec<ArrayD<f32>>, Error> {
         let width = clips[0][0].width;
         let height = clips[0][0].height;
+
+        // The batch becomes one array, so all of its images must have one size.
         if clips
             .iter()
             .flatten()
@@ -422,7 +444,8 @@ impl Encoder {
             return Err(Error::BadImage {
                 image: format!("image of {width}×{height} pixels"),
                 problem: format!(
-                    "the encoder takes {wanted_width}x{wanted_height}; give a --resize or --crop to that"
+                    "the encoder takes {wanted_width}x{wanted_height}; \
+                    give a --resize or --crop to that size"
                 ),
             });
         }
@@ -434,6 +457,8 @@ impl Encoder {
             }
         }
 
+        // Axes: clip, image of the clip, channel, row,
+        // column. Models with another order get it below.
         let shape = IxDyn(&[clips.len(), self.window, 3, height, width]);
         let frames = ArrayD::from_shape_vec(shape, numbers).map_err(|error| Error::Runtime {
             runtime: self.runtime(),
@@ -442,12 +467,15 @@ impl Encoder {
 
         let outputs = match &self.network {
             Network::Builtin => Vec::new(),
+            // Clips of raw pixels have one image, whose
+            // axis is dropped to give maps (clip, 3, H, W).
             Network::Pixels => vec![frames.index_axis_move(Axis(1), 0)],
             Network::Model {
                 runner, clip_axis, ..
             } => runner.run(network::laid_out(frames, *clip_axis))?,
         };
 
+        // Rows are read along the first axis; if that is another one, they would belong to no clip.
         for (layer, output) in self.layers.iter().zip(&outputs) {
             if output.shape().first() != Some(&clips.len()) {
                 let problem = format!(
@@ -469,7 +497,8 @@ impl Encoder {
     }
 }
 
-/// The name of a model's features; characters that names may not have become dashes.
+/// The name under which the features of a layer are stored. Characters that a name may not contain
+/// become dashes.
 fn feature_name(prefix: &str, layer: &Layer, network: &Network) -> String {
     let name = match network {
         Network::Builtin | Network::Pixels => prefix.to_owned(),
@@ -479,6 +508,8 @@ fn feature_name(prefix: &str, layer: &Layer, network: &Network) -> String {
         Network::Model { .. } => format!("{prefix}-{}-{}", layer.name, layer.pooling.short()),
     };
 
+    // A name must begin with a letter or digit; the `a`
+    // in front leaves only the character to be tested.
     let plain: String = name
         .chars()
         .map(|c| {
@@ -495,10 +526,10 @@ fn feature_name(prefix: &str, layer: &Layer, network: &Network) -> String {
         .to_owned()
 }
 
-/// The identity of an encoder: `builtin`, `pixels`, or an ONNX file that can be read.
+/// The identity of an encoder that is given as `builtin`, `pixels` or the path of an ONNX file.
 ///
 /// # Errors
-/// [`Error::Io`] or [`Error::Model`].
+/// [`Error::Io`] if the file cannot be read, [`Error::Model`] if it is not a usable ONNX model.
 pub fn identity(model: &str) -> Result<String, Error> {
     match model {
         "builtin" => Ok(Encoder::builtin().id),
@@ -510,15 +541,15 @@ pub fn identity(model: &str) -> Result<String, Error> {
 /// The layers that a model declares as its outputs, in its order.
 ///
 /// # Errors
-/// [`Error::Io`] or [`Error::Model`].
+/// [`Error::Io`] if the file cannot be read, [`Error::Model`] if it is not a usable ONNX model.
 pub fn declared_outputs(file: &Path) -> Result<Vec<String>, Error> {
     Ok(model_file::ModelFile::read(file)?.outputs)
 }
 
-/// The size (width, height) of a model's images, where its file fixes it.
+/// The size (width, height) of the images that a model takes, if its file fixes it.
 ///
 /// # Errors
-/// [`Error::Io`] or [`Error::Model`].
+/// [`Error::Io`] if the file cannot be read, [`Error::Model`] if it is not a usable ONNX model.
 pub fn declared_size(file: &Path) -> Result<Option<(usize, usize)>, Error> {
     Ok(model_file::ModelFile::read(file)?.image_size())
 }
@@ -526,7 +557,7 @@ pub fn declared_size(file: &Path) -> Result<Option<(usize, usize)>, Error> {
 /// Reads `WIDTHxHEIGHT` or `none`.
 ///
 /// # Errors
-/// [`Error::Option`].
+/// [`Error::Option`] if the text is of another form.
 pub fn parse_crop(text: &str) -> Result<Option<(usize, usize)>, Error> {
     if text == "none" {
         Ok(None)
@@ -538,7 +569,7 @@ pub fn parse_crop(text: &str) -> Result<Option<(usize, usize)>, Error> {
 /// Reads `R,G,B`, or one number for all three.
 ///
 /// # Errors
-/// [`Error::Option`].
+/// [`Error::Option`] if the text is of another form.
 pub fn parse_channels(what: &'static str, text: &str) -> Result<[f32; 3], Error> {
     preparation::three(what, text)
 }

@@ -1,6 +1,6 @@
-//! What an ONNX file says of itself: its input, its outputs, the names inside, and its identity.
+//! Reads an ONNX file: its input, its outputs, the names of its inner values, and its identity.
 //!
-//! Only the few fields of ONNX's protobuf that are needed are read.
+//! Only those few fields of ONNX's protobuf messages are declared here that are needed.
 
 use std::collections::HashSet;
 use std::path::Path;
@@ -38,7 +38,7 @@ struct NodeProto {
 struct TensorProto {
     #[prost(string, tag = "8")]
     name: String,
-    /// 1 for weights in another file.
+    /// 1 if the weights are stored in another file.
     #[prost(int32, tag = "14")]
     location: i32,
 }
@@ -59,7 +59,7 @@ struct TypeProto {
 
 #[derive(Clone, PartialEq, Message)]
 struct TensorType {
-    /// 1 for f32.
+    /// The type of the elements; 1 is f32.
     #[prost(int32, tag = "1")]
     element: i32,
     #[prost(message, optional, tag = "2")]
@@ -78,20 +78,20 @@ struct DimProto {
     value: i64,
 }
 
-/// ONNX's number for f32.
+/// The number by which ONNX denotes the element type f32.
 const FLOAT: i32 = 1;
 
-/// An ONNX file that was read.
+/// An ONNX file that was read and checked: it has one input and holds its own weights.
 pub(super) struct ModelFile {
-    /// The file's name and the beginning of its SHA-256.
+    /// The file's name without extension, `@`, and the first 8 bytes of its SHA-256 in hexadecimal.
     pub id: String,
     /// The whole file.
     pub bytes: Vec<u8>,
-    /// The sizes of its one input, none where they are open.
+    /// The shape of its only input; `None` for an axis whose size is open.
     pub input: Vec<Option<usize>>,
     /// The names of its declared outputs.
     pub outputs: Vec<String>,
-    /// The names of everything its nodes compute.
+    /// The names of all values that its nodes compute.
     pub inner: HashSet<String>,
 }
 
@@ -108,15 +108,19 @@ impl ModelFile {
         })?;
         let model = ModelProto::decode(bytes.as_slice());
         let graph = model.ok().and_then(|model| model.graph);
-        let graph = graph.ok_or_else(|| wrong("is no ONNX model; was it truncated?".to_owned()))?;
+        let graph =
+            graph.ok_or_else(|| wrong("is not an ONNX model; is it cut off?".to_owned()))?;
 
+        // The identity is a hash of this file, so it holds only for weights that are in it.
         if graph.initializer.iter().any(|tensor| tensor.location != 0) {
             let inline = "onnx.save(onnx.load(\"FILE.onnx\"), \"WHOLE.onnx\")";
             return Err(wrong(format!(
-                "keeps weights in another file; put them into this one, in Python: {inline}"
+                "keeps weights in another file; merge them into one file, in Python: {inline}"
             )));
         }
 
+        // A file may list its weights among the inputs;
+        // only the other inputs are given by the caller.
         let weights: HashSet<&str> = graph
             .initializer
             .iter()
@@ -140,11 +144,12 @@ impl ModelFile {
         let tensor = input.kind.as_ref().and_then(|kind| kind.tensor.as_ref());
         if tensor.is_some_and(|tensor| tensor.element != FLOAT) {
             return Err(wrong(
-                "takes numbers that are not float32; export it so that its input is float32"
-                    .to_owned(),
+                "has an input that is not float32; export it with an input of float32".to_owned(),
             ));
         }
 
+        // An axis of open size has a name in place of a number, which
+        // `DimProto` leaves out: it is read as 0 and becomes `None`.
         let shape = tensor.and_then(|tensor| tensor.shape.as_ref());
         let input = shape.map_or_else(Vec::new, |shape| {
             shape
@@ -171,7 +176,7 @@ impl ModelFile {
         })
     }
 
-    /// The size (width, height) of its images, where the file fixes it.
+    /// The size (width, height) of the images that it takes, if the file fixes it.
     pub fn image_size(&self) -> Option<(usize, usize)> {
         match self.input.as_slice() {
             [.., Some(height), Some(width)] if self.input.len() >= 4 => Some((*width, *height)),
@@ -179,11 +184,10 @@ impl ModelFile {
         }
     }
 
-    /// The file with more of its inner values declared as outputs, for a runtime that gives only
-    /// those.
+    /// The file with `names` declared as outputs, for a runtime that returns declared outputs only.
     ///
-    /// In protobuf a message that is written in several parts is their sum, so that outputs can be
-    /// appended.
+    /// When a protobuf message is written in several parts, a reader merges them. The further
+    /// outputs are therefore appended to the file as it is.
     #[cfg_attr(
         not(feature = "onnxruntime"),
         allow(dead_code, reason = "only that runtime needs it")
@@ -210,7 +214,7 @@ impl ModelFile {
     }
 }
 
-/// The identity of a model's file.
+/// The identity of a model's file, which is not parsed.
 pub(super) fn identity(file: &Path) -> Result<String, Error> {
     let bytes = std::fs::read(file).map_err(|cause| Error::Io {
         file: file.to_owned(),

@@ -1,5 +1,5 @@
-//! What runs between a prepared image and a layer's output: nothing, or an ONNX model in one of two
-//! runtimes.
+//! The network that turns prepared images into the outputs of layers: one of the built-in ones, or
+//! an ONNX model in one of two runtimes.
 
 use std::path::{Path, PathBuf};
 
@@ -8,12 +8,12 @@ use ndarray::{ArrayD, Axis};
 use super::model_file::ModelFile;
 use super::{Error, Layer, Preparation};
 
-/// Which program runs a model.
+/// The library that runs a model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RuntimeKind {
-    /// Pure Rust; needs nothing on the system.
+    /// Written in Rust and compiled in; needs no library on the system.
     Tract,
-    /// The onnxruntime library, loaded when it is needed; faster.
+    /// The shared library onnxruntime, loaded when the first model is opened; faster.
     OnnxRuntime,
 }
 
@@ -38,21 +38,21 @@ impl RuntimeKind {
 /// How a model is run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Runtime {
-    /// By which program.
+    /// The library that runs it.
     pub kind: RuntimeKind,
-    /// On how many threads, where the program keeps its own.
+    /// The number of threads, for a library that keeps threads of its own.
     pub threads: usize,
-    /// Where onnxruntime's shared library is.
+    /// The path of onnxruntime's shared library.
     pub library: Option<PathBuf>,
 }
 
 /// A model that is ready to run.
 pub(super) trait Runner: Send + Sync {
-    /// The layers' outputs, images along the first axis of each.
+    /// The outputs of the layers that were asked for, clips along the first axis of each.
     fn run(&self, input: ArrayD<f32>) -> Result<Vec<ArrayD<f32>>, Error>;
 }
 
-/// See the module.
+/// What computes the outputs of layers from prepared images.
 pub(super) enum Network {
     /// [`super::encode_builtin`].
     Builtin,
@@ -61,7 +61,8 @@ pub(super) enum Network {
     Model {
         runner: Box<dyn Runner>,
         kind: RuntimeKind,
-        /// Where the model's input counts the images of a clip; none for an image model.
+        /// The axis of the model's input along which the images of a clip lie; `None` for a model
+        /// of single images.
         clip_axis: Option<usize>,
     },
 }
@@ -75,10 +76,10 @@ impl Network {
     }
 }
 
-/// A model, its identity, and the size (width, height) of its images where that is fixed.
+/// A model, its identity, and the size (width, height) of its images if that is fixed.
 pub(super) type Opened = (Network, String, Option<(usize, usize)>);
 
-/// Opens a model and checks what it is asked for against what its file says.
+/// Opens a model after checking that its file has the layers, the clip length and the image size.
 pub(super) fn open(
     file: &Path,
     preparation: &Preparation,
@@ -99,6 +100,7 @@ pub(super) fn open(
         return Err(wrong("no layer was asked for".to_owned()));
     }
 
+    // A layer may be a declared output or any other value that the graph computes.
     for (position, name) in names.iter().enumerate() {
         if !model.outputs.contains(name) && !model.inner.contains(name) {
             let known = model.outputs.join(", ");
@@ -113,6 +115,9 @@ pub(super) fn open(
     }
 
     let clip_axis = clip_axis(&model.input, window).map_err(&wrong)?;
+
+    // The shape of the model's input. Axes that the file leaves open get the sizes of the prepared
+    // images and of the clips, because tract needs all but the first.
     let mut shape = model.input.clone();
 
     if let (Some(wanted), Some(given)) = (model.image_size(), preparation.size())
@@ -122,7 +127,7 @@ pub(super) fn open(
         let (w, h) = given;
 
         return Err(wrong(format!(
-            "wants images of {width}x{height}, --resize and --crop give {w}x{h}"
+            "takes images of {width}x{height}, but --resize and --crop give {w}x{h}"
         )));
     }
 
@@ -183,10 +188,13 @@ fn runner(
     }
 }
 
-/// Where a model's input (batch, 3, height, width), (batch, 3, clip, height, width) or (batch,
-/// clip, 3, height, width) counts the images of a clip.
+/// The axis along which a model's input counts the images of a clip. An input (batch, 3, height,
+/// width) has none; (batch, 3, clip, height, width) and (batch, clip, 3, height, width) have one.
 fn clip_axis(input: &[Option<usize>], window: usize) -> Result<Option<usize>, String> {
     let colours = |axis: usize| matches!(input[axis], None | Some(3));
+
+    // With five axes, the one of size 3 is the channels and the other one before the height is the
+    // clip. `fixed` is the length of a clip, if the file states it.
     let (axis, fixed) = match input.len() {
         4 if colours(1) && window == 1 => return Ok(None),
         4 if colours(1) => {
@@ -216,7 +224,7 @@ fn clip_axis(input: &[Option<usize>], window: usize) -> Result<Option<usize>, St
     }
 }
 
-/// Clips (batch, clip, 3, height, width) as a model wants them.
+/// Reorders the axes of clips (batch, clip, 3, height, width) to those of the model's input.
 pub(super) fn laid_out(frames: ArrayD<f32>, clip_axis: Option<usize>) -> ArrayD<f32> {
     match clip_axis {
         None => frames.index_axis_move(Axis(1), 0),

@@ -14,14 +14,14 @@ use super::{Error, RuntimeKind};
 
 const NAME: &str = "onnxruntime";
 
-/// What loading the library came to; it is loaded once a process.
+/// The loaded library, or why it could not be loaded. It is loaded once per process.
 static LOADED: OnceLock<Result<Environment, String>> = OnceLock::new();
 
 pub(super) struct OnnxRuntime {
     session: Mutex<Session>,
     /// The outputs that were asked for, in that order.
     names: Vec<String>,
-    /// Clips a run, where the model fixes it.
+    /// The number of clips in one run, if the model fixes it.
     batch: Option<usize>,
 }
 
@@ -43,6 +43,9 @@ impl OnnxRuntime {
         let mut builder = builder
             .with_intra_threads(runtime.threads)
             .map_err(|error| failed(&error))?;
+
+        // onnxruntime returns declared outputs only. For an inner value,
+        // the model is opened from a copy in memory that declares it.
         let session = if names.iter().all(|name| model.outputs.contains(name)) {
             builder.commit_from_file(file)
         } else {
@@ -64,7 +67,7 @@ impl OnnxRuntime {
         let input = input.as_standard_layout();
         let tensor = TensorRef::from_array_view(&input).map_err(|error| failed(&error))?;
 
-        // A panic while the lock was held leaves the session as it was: it is only read.
+        // A poisoned lock is no reason to stop: a run does not change the session.
         let mut session = self.session.lock().unwrap_or_else(PoisonError::into_inner);
         let outputs = session
             .run(ort::inputs![tensor])
@@ -89,6 +92,7 @@ impl OnnxRuntime {
 
 impl Runner for OnnxRuntime {
     fn run(&self, input: ArrayD<f32>) -> Result<Vec<ArrayD<f32>>, Error> {
+        // The whole batch is one run, unless the model was exported with another batch size.
         let Some(batch) = self.batch.filter(|&batch| batch != input.shape()[0]) else {
             return self.batch(input.view());
         };
@@ -102,6 +106,7 @@ impl Runner for OnnxRuntime {
             });
         }
 
+        // A model that was exported with a batch size of 1 is run once for each clip.
         let clips = 0..input.shape()[0];
         let each: Vec<_> = clips
             .map(|clip| self.batch(input.slice_axis(Axis(0), Slice::from(clip..clip + 1))))
@@ -134,7 +139,10 @@ fn environment(library: Option<&Path>) -> Result<&'static Environment, Error> {
         library.ok_or_else(|| failed(format!("its shared library was not named; {help}")))?;
 
     if !library.is_file() {
-        return Err(failed(format!("{} is no file; {help}", library.display())));
+        return Err(failed(format!(
+            "{} is not a file; {help}",
+            library.display()
+        )));
     }
 
     let load = || {
@@ -146,6 +154,7 @@ fn environment(library: Option<&Path>) -> Result<&'static Environment, Error> {
             .map_err(|error| error.to_string())
     };
 
+    // Later calls get the result of the first one, even if they name another library.
     LOADED.get_or_init(load).as_ref().map_err(|problem| {
         failed(format!(
             "{} cannot be loaded: {problem}; {help}",

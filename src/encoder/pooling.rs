@@ -1,8 +1,8 @@
-//! How a layer's output becomes one row.
+//! Pooling: reduces the output of a layer to one row.
 //!
-//! An output is a vector (C), tokens (N, C) or a map (C, H, W). Grids are means over cells as
-//! PyTorch's `adaptive_avg_pool2d` cuts them, laid out channel by channel, rows of cells within:
-//! (C, rows, columns).
+//! An output is a vector (C), tokens (N, C) or a feature map (C, H, W). A grid holds the means over
+//! cells, which are cut as by PyTorch's `adaptive_avg_pool2d`, and is flattened in the order (C,
+//! rows, columns).
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,40 +11,40 @@ use ndarray::{Array3, ArrayView3, ArrayViewD, Axis, Ix1, Ix2, Ix3};
 
 use super::Error;
 
-/// How a layer's output becomes one row.
+/// How the output of a layer is reduced to one row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pooling {
-    /// A vector, as it is.
+    /// The output is a vector and stays as it is.
     Vector,
-    /// The first token.
+    /// The first token, which is the class token.
     Cls,
     /// The mean over the map, or over the tokens after the first `skip`.
     Mean {
-        /// Tokens that are no patches: the class token and registers.
+        /// The number of tokens before the patches: the class token and registers.
         skip: usize,
     },
-    /// Means over cells of the map, or of the patch tokens after the first `skip`, laid out in the
-    /// image's shape.
+    /// Means over the cells of a map, or of the patch tokens after the first `skip`, which are put
+    /// in rows and columns as the patches lie in the image.
     Grid {
         /// Cells across.
         columns: usize,
         /// Cells down.
         rows: usize,
-        /// Tokens that are no patches.
+        /// The number of tokens before the patches.
         skip: usize,
     },
 }
 
-/// The most cells a side.
+/// The largest number of columns or rows of a grid.
 const MOST_CELLS: usize = 64;
 
 impl Pooling {
-    /// This pooling for an output of so many axes: a vector is never pooled.
+    /// The pooling for an output with `rank` axes: one with a single axis is never pooled.
     pub(super) fn for_rank(self, rank: usize) -> Self {
         if rank == 1 { Self::Vector } else { self }
     }
 
-    /// With this many tokens that are no patches.
+    /// The same pooling with `skip` tokens before the patches.
     #[must_use]
     pub fn after(self, skip: usize) -> Self {
         match self {
@@ -58,12 +58,12 @@ impl Pooling {
         }
     }
 
-    /// The word for it without the skipped tokens, for names.
+    /// Its text without the number of skipped tokens, for the names of features.
     pub(super) fn short(self) -> String {
         self.after(0).to_string()
     }
 
-    /// The row of one image's output.
+    /// Pools the output for one clip to a row.
     pub(super) fn pool(self, output: ArrayViewD<'_, f32>, seen: Seen) -> Result<Vec<f32>, Problem> {
         let shape = output.shape().to_vec();
         let wrong = || Problem::Shape {
@@ -71,6 +71,8 @@ impl Pooling {
             shape: shape.clone(),
         };
 
+        // If all tokens fill the image's grid of patches, and without the first `skip` they do not,
+        // then the model has no tokens before its patches, and a patch would be taken for one.
         if let (2, Self::Cls | Self::Mean { skip: 1.. } | Self::Grid { skip: 1.., .. }) =
             (output.ndim(), self)
         {
@@ -100,6 +102,8 @@ impl Pooling {
                 .to_vec()),
             (Self::Mean { skip }, 2) if skip < shape[0] => {
                 let tokens = output.into_dimensionality::<Ix2>().map_err(|_| wrong())?;
+
+                // The tokens (N, C) become a map (C, 1, N), whose only cell is their mean.
                 let patches = tokens.slice_move(ndarray::s![skip.., ..]).reversed_axes();
                 Ok(grid(patches.insert_axis(Axis(1)), 1, 1))
             }
@@ -111,6 +115,8 @@ impl Pooling {
                 },
                 2,
             ) if skip < shape[0] => {
+                // Tokens are ordered by time, row and column. A grid has no
+                // time axis, so the tokens of a clip are averaged over time.
                 let (times, height, width) = seen.patches(shape[0] - skip).ok_or_else(wrong)?;
                 let tokens = output.into_dimensionality::<Ix2>().map_err(|_| wrong())?;
                 let patches = tokens.slice_move(ndarray::s![skip.., ..]);
@@ -142,7 +148,7 @@ impl Pooling {
     }
 }
 
-/// What the network saw: the size of its images in pixels, and how many a clip has.
+/// The input of the network: the size of its images in pixels, and the number of images in a clip.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Seen {
     pub width: usize,
@@ -151,8 +157,9 @@ pub(super) struct Seen {
 }
 
 impl Seen {
-    /// How many times, rows and columns a number of patch tokens has: square patches, time first. A
-    /// clip's tokens stand for two images each, for one, or for all of them.
+    /// The shape (times, rows, columns) of a number of patch tokens, if the image can be cut into
+    /// that many square patches. A token of a clip may cover two images, one image, or the whole
+    /// clip.
     fn patches(self, tokens: usize) -> Option<(usize, usize, usize)> {
         let times = if self.window > 1 {
             vec![self.window / 2, self.window, 1]
@@ -162,6 +169,9 @@ impl Seen {
 
         times.into_iter().find_map(|times| {
             let area = tokens.is_multiple_of(times).then(|| tokens / times)?;
+
+            // Square patches: columns / rows = width / height, so columns²
+            // = area · width / height. The integer root is checked below.
             let columns = (area * self.width / self.height).isqrt();
             let rows = area.checked_div(columns)?;
             let fits = columns * rows == area && columns * self.height == rows * self.width;
@@ -171,7 +181,8 @@ impl Seen {
     }
 }
 
-/// Means over cells of a map (C, H, W); a cell reaches from ⌊iH/n⌋ to ⌈(i+1)H/n⌉.
+/// Means over the cells of a map (C, H, W). Cell i of n covers ⌊iH/n⌋ up to but not including
+/// ⌈(i+1)H/n⌉, so that neighbouring cells overlap where n does not divide H.
 fn grid(map: ArrayView3<'_, f32>, columns: usize, rows: usize) -> Vec<f32> {
     let (channels, height, width) = map.dim();
     let cell = |i: usize, n: usize, length: usize| i * length / n..((i + 1) * length).div_ceil(n);
@@ -191,7 +202,7 @@ fn grid(map: ArrayView3<'_, f32>, columns: usize, rows: usize) -> Vec<f32> {
     row
 }
 
-/// An output that cannot be pooled so.
+/// Why an output cannot be pooled as asked.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum Problem {
     #[error(
@@ -236,7 +247,7 @@ impl fmt::Display for Pooling {
 impl FromStr for Pooling {
     type Err = Error;
 
-    /// `vector`, `cls`, `mean` or `gridCxR` (columns × rows); `@N` after it leaves out the first N
+    /// Reads `vector`, `cls`, `mean` or `gridCxR` (columns × rows). `@N` after it skips the first N
     /// tokens.
     fn from_str(text: &str) -> Result<Self, Error> {
         let wrong = || Error::Option {
@@ -356,8 +367,8 @@ mod tests {
         );
     }
 
-    /// Oracle: by hand. 576 tokens are 32×18 of a wide image and 24×24 of a square one; a clip's
-    /// come in times.
+    /// Oracle: by hand. 576 tokens are 32×18 patches of a wide image and 24×24 of a square one; the
+    /// tokens of a clip also have a time axis.
     #[test]
     fn tokens_lie_in_the_images_shape() {
         let seen = |width, height, window| Seen {

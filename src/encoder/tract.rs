@@ -1,5 +1,6 @@
-//! Models in tract: pure Rust. The plan is made for one clip, since an open batch is 2 to 6 times
-//! slower; a batch is spread over the threads of the pool that calls.
+//! Models in tract, which is pure Rust. The execution plan is made for a batch of one clip, since a
+//! plan for an open batch size is 2 to 6 times slower. The clips of a batch are spread over the
+//! threads of the calling rayon pool.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -32,6 +33,7 @@ impl Tract {
                 .to_owned()
         };
 
+        // The plan is made for one exact shape: a batch of 1, and every other axis as it is known.
         let fixed: Option<Vec<usize>> = shape.iter().skip(1).copied().collect();
         let fixed = fixed.ok_or_else(|| wrong(open()))?;
         let shape: Vec<usize> = std::iter::once(1).chain(fixed).collect();
@@ -62,6 +64,7 @@ impl Tract {
             problem,
         };
 
+        // The clip is a view into the batch, while tract takes a tensor of its own.
         let numbers: Vec<f32> = clip.iter().copied().collect();
         let input = Tensor::from_shape(clip.shape(), &numbers)
             .map_err(|error| failed(format!("{error:#}")))?;
@@ -93,13 +96,11 @@ impl Runner for Tract {
 
         let count = self.names.len();
 
+        // Each run gave a batch of one; a batch axis is needed to put them together again.
         let joined = |output: usize| {
             let parts: Vec<_> = each.iter().map(|outputs| outputs[output].view()).collect();
             ndarray::concatenate(Axis(0), &parts).map_err(|_| {
-                let problem = format!(
-                    "layer '{}' has no axis that counts images",
-                    self.names[output]
-                );
+                let problem = format!("layer '{}' has no batch axis", self.names[output]);
                 Error::Runtime {
                     runtime: "tract",
                     problem,

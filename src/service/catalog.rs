@@ -1,4 +1,4 @@
-//! CatalogService.
+//! CatalogService: lists the rooms and adapters that the server has, page by page.
 
 use std::collections::BTreeMap;
 use std::ops::Bound;
@@ -8,12 +8,12 @@ use tonic::{Request, Response, Status};
 use super::convert;
 use super::snapshot::ServedRoom;
 use super::{Error, Handlers};
-use crate::geometry::Twist;
-use crate::proto::v1 as pb;
-use crate::proto::v1::catalog_service_server::CatalogService;
 use crate::store::StoredAdapter;
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::catalog_service_server::CatalogService;
+use seese3_core::geometry::Twist;
 
-/// Entries of a page when the caller leaves it to the server, and at most.
+/// Entries of a page if the caller names no size, and the largest size of a page.
 const PAGE: usize = 100;
 const LARGEST_PAGE: usize = 1_000;
 
@@ -79,7 +79,8 @@ impl CatalogService for Handlers {
     }
 }
 
-/// A page of entries by name and the token of the next: the last name of this one.
+/// One page of the entries in order of name, and the token of the next page: the last name of this
+/// page, or empty if this page is the last.
 fn page<'a, T>(
     all: &'a BTreeMap<String, T>,
     size: i32,
@@ -96,17 +97,20 @@ fn page<'a, T>(
         }
     };
 
+    // The token is the last name that the caller has seen. It keeps its meaning when entries are
+    // added or removed, and the server stores nothing between pages.
     let after = if token.is_empty() {
         Bound::Unbounded
-    } else if crate::room::is_plain_name(token) {
+    } else if seese3_core::room::is_plain_name(token) {
         Bound::Excluded(token)
     } else {
         return Err(Error::invalid(
             "page_token",
-            "is not one that this server gave; begin with the first page",
+            "is not a token of this service; start with the first page",
         ));
     };
 
+    // One entry is read beyond the page, only to learn whether another page follows.
     let mut rest = all.range::<str, _>((after, Bound::Unbounded));
     let page: Vec<(&String, &T)> = rest.by_ref().take(size).collect();
     let next = match (rest.next(), page.last()) {
@@ -138,7 +142,7 @@ fn room(served: &ServedRoom) -> pb::Room {
     }
 }
 
-fn revisions(rooms: &[(crate::room::RoomId, u64)]) -> Vec<pb::Revision> {
+fn revisions(rooms: &[(seese3_core::room::RoomId, u64)]) -> Vec<pb::Revision> {
     rooms
         .iter()
         .map(|(room, revision)| pb::Revision {

@@ -1,4 +1,4 @@
-//! EvaluationService.
+//! EvaluationService: Hit@ε of the server's navigators, or of predictions that a client sends.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -10,13 +10,14 @@ use tonic::{Request, Response, Status};
 use tracing::Instrument;
 
 use super::convert;
-use super::snapshot::{ServedNavigator, TrainedOn};
+use super::snapshot::ServedNavigator;
 use super::{Error, Handlers, Snapshot};
-use crate::cancel::Cancellation;
-use crate::eval::{PredictionScope, Protocol, evaluate, score_predictions};
-use crate::pairs::Split;
-use crate::proto::v1 as pb;
-use crate::proto::v1::evaluation_service_server::EvaluationService;
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::evaluation_service_server::EvaluationService;
+use seese3_core::cancel::Cancellation;
+use seese3_core::eval::{
+    Leak, PredictionScope, Protocol, TrainedOn, evaluate, is_calibrated_in, score_predictions,
+};
 
 type Events = mpsc::Sender<Result<pb::EvaluateResponse, Status>>;
 
@@ -33,6 +34,8 @@ impl EvaluationService for Handlers {
         let (served, protocol) =
             protocol(&snapshot, request.into_inner(), self.config.limits.steps)?;
 
+        // The evaluation runs as its own task; the caller receives the stream of its events at
+        // once.
         let (events, stream) = mpsc::channel(16);
         let run = self
             .clone()
@@ -63,7 +66,8 @@ impl EvaluationService for Handlers {
 }
 
 impl Handlers {
-    /// Sends progress and the report, or the error; stops when nobody listens any more.
+    /// Sends progress events and then the report, or the error. Stops when the caller has gone
+    /// away.
     async fn run_evaluation(
         self,
         served: Arc<ServedNavigator>,
@@ -83,13 +87,14 @@ impl Handlers {
                 };
                 let event = pb::evaluate_response::Event::Progress(progress);
 
-                // A listener that is slow misses progress; it must never hold a thread.
+                // A slow reader misses progress events; waiting for it would block a worker thread.
                 let _ = events.try_send(Ok(pb::EvaluateResponse { event: Some(event) }));
             })?;
 
             Ok(report_to_wire(&served, &report))
         };
 
+        // If the caller closes the stream, `run` is dropped, which cancels the computation.
         let finished = tokio::select! {
             finished = self.workers.run(budget, work) => finished,
             () = heard.closed() => return,
@@ -105,7 +110,7 @@ impl Handlers {
             })
             .map_err(Status::from);
 
-        // As above: without a listener there is nobody to tell.
+        // If this fails, the caller has gone away and nobody needs the result.
         let _ = heard.send(last).await;
     }
 }
@@ -129,6 +134,8 @@ fn protocol(
         mode,
     } = request;
 
+    // By default the adapter's own split and stride are used, so that the test pairs are those
+    // that were held out when it was trained.
     let served = snapshot.navigator(&room, &adapter)?.clone();
     let record = &served.adapter.record;
     let split = convert::split(&split)?.unwrap_or(record.split);
@@ -153,6 +160,8 @@ fn protocol(
         ));
     }
 
+    // The rows of the table are resolved before the stream begins, so that a request that cannot
+    // be evaluated is refused at once and progress knows its total.
     let navigators = protocol.rows(&served.navigator)?;
     Ok((
         served,
@@ -163,9 +172,12 @@ fn protocol(
     ))
 }
 
-fn report_to_wire(served: &ServedNavigator, report: &crate::eval::Report) -> pb::EvaluationReport {
+fn report_to_wire(
+    served: &ServedNavigator,
+    report: &seese3_core::eval::Report,
+) -> pb::EvaluationReport {
     let record = &served.adapter.record;
-    let in_room = served.trained_on.is_some();
+    let in_room = served.trained_on != TrainedOn::Nothing;
 
     pb::EvaluationReport {
         room: Some(convert::room_revision(served)),
@@ -178,14 +190,8 @@ fn report_to_wire(served: &ServedNavigator, report: &crate::eval::Report) -> pb:
         steps: report.protocol.steps,
         mode: convert::mode_to_wire(report.protocol.mode).into(),
         in_room,
-        leaks: in_room
-            && (record.split != report.protocol.split
-                || [Split::Whole, Split::Pairs].contains(&record.split)
-                || served.trained_on == Some(TrainedOn::OtherFrames)),
-        calibrated_here: record
-            .calibrated_on
-            .iter()
-            .any(|(room, _)| room == served.navigator.room().id()),
+        leaks: Leak::of(record, served.trained_on, report.protocol.split).is_some(),
+        calibrated_here: is_calibrated_in(record, served.navigator.room().id()),
         navigators: report.rows.iter().map(convert::row_to_wire).collect(),
     }
 }
@@ -222,6 +228,8 @@ fn score(
         thresholds: convert::thresholds(thresholds)?,
     };
 
+    // An error of the conversion names the position of the prediction. That there is at least one
+    // is checked by `score_predictions`.
     let predictions = predictions
         .into_iter()
         .enumerate()
@@ -229,6 +237,7 @@ fn score(
         .collect::<Result<Vec<_>, _>>()?;
     let row = score_predictions(&served.navigator, &predictions, &scope, cancel)?;
 
+    // Without a split the whole room is searched, so that every frame is a candidate.
     let frame_count = served.navigator.room().frame_count();
     let candidate_count = scope.split.map_or(frame_count, |split| {
         split.candidates(served.navigator.room().timeline()).len()

@@ -1,8 +1,8 @@
 //! The standard health service, `grpc.health.v1`: Check and Watch, for the server, each service and
 //! each room.
 //!
-//! Names: `""`, the services' full names, `rooms/NAME`. Watch of a name that is not known says
-//! SERVICE_UNKNOWN and stays open, as the specification wants.
+//! Names: `""` for the whole server, the full names of the services, and `rooms/NAME`. Watch of an
+//! unknown name answers SERVICE_UNKNOWN and stays open, as the specification demands.
 
 use std::pin::Pin;
 
@@ -15,11 +15,11 @@ use tonic_health::pb::health_server::{Health, HealthServer};
 use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
 
 use super::{Handlers, Phase};
-use crate::proto::v1::catalog_service_server::CatalogServiceServer;
-use crate::proto::v1::evaluation_service_server::EvaluationServiceServer;
-use crate::proto::v1::localization_service_server::LocalizationServiceServer;
-use crate::proto::v1::navigation_service_server::NavigationServiceServer;
-use crate::proto::v1::odometry_service_server::OdometryServiceServer;
+use seese3_client::proto::v1::catalog_service_server::CatalogServiceServer;
+use seese3_client::proto::v1::evaluation_service_server::EvaluationServiceServer;
+use seese3_client::proto::v1::localization_service_server::LocalizationServiceServer;
+use seese3_client::proto::v1::navigation_service_server::NavigationServiceServer;
+use seese3_client::proto::v1::odometry_service_server::OdometryServiceServer;
 
 const SERVICES: [&str; 6] = [
     "",
@@ -32,12 +32,13 @@ const SERVICES: [&str; 6] = [
 
 pub struct HealthOf(watch::Receiver<Phase>);
 
-/// The health of a server in this phase.
+/// The health service of a server whose phase this channel carries.
 pub fn service(phase: watch::Receiver<Phase>) -> HealthServer<HealthOf> {
     HealthServer::new(HealthOf(phase))
 }
 
-/// The status of a name, or none if it is not known.
+/// The status of the service or room `name`; none if the name is unknown. Rooms are unknown until
+/// the store is loaded.
 fn status(phase: &Phase, name: &str) -> Option<ServingStatus> {
     let has_room = |snapshot: &super::Snapshot| {
         name.strip_prefix("rooms/")
@@ -81,6 +82,8 @@ impl Health for HealthOf {
         tokio::spawn(async move {
             let mut last = None;
             loop {
+                // The read guard is dropped before the awaits below: while it lives, `run` cannot
+                // change the phase.
                 let (now, stopping) = {
                     let phase = phase.borrow_and_update();
                     let stopping = matches!(*phase, Phase::Draining(_) | Phase::Stopping);
@@ -91,6 +94,8 @@ impl Health for HealthOf {
                     )
                 };
 
+                // The first status is always sent, later ones only when they differ from the one
+                // before.
                 if last.replace(now) != Some(now)
                     && changes
                         .send(Ok(HealthCheckResponse { status: now.into() }))
@@ -100,7 +105,7 @@ impl Health for HealthOf {
                     return;
                 }
 
-                // A watcher must not keep a server that was told to stop.
+                // A stopping server waits for its open calls to end, so this one ends by itself.
                 if stopping {
                     return;
                 }
@@ -120,8 +125,8 @@ impl Health for HealthOf {
 mod tests {
     use super::*;
 
-    /// Oracle: the promise and the specification: every service that exists is NOT_SERVING
-    /// until all is loaded, and after the server was told to stop; a room is not known before it is
+    /// Oracle: the specification of grpc.health.v1: before the store is loaded and after the
+    /// shutdown signal every existing service is NOT_SERVING, and a room is unknown before it is
     /// loaded.
     #[test]
     fn nothing_serves_before_it_is_loaded() {

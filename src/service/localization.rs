@@ -1,4 +1,5 @@
-//! LocalizationService.
+//! LocalizationService: Localize, by retrieval of the nearest frames. Relocalize is in
+//! `relocalization`.
 
 use std::sync::Arc;
 
@@ -8,12 +9,12 @@ use super::convert;
 use super::snapshot::ServedNavigator;
 use super::status::view_error;
 use super::{Error, Handlers, Snapshot};
-use crate::cancel::Cancellation;
-use crate::localization::localize;
-use crate::navigation::{Error as E, Source, StepError};
-use crate::proto::v1 as pb;
-use crate::proto::v1::localization_service_server::LocalizationService;
-use crate::room;
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::localization_service_server::LocalizationService;
+use seese3_core::cancel::Cancellation;
+use seese3_core::localization::localize;
+use seese3_core::navigation::{Error as E, Source, StepError};
+use seese3_core::room;
 
 #[tonic::async_trait]
 impl LocalizationService for Handlers {
@@ -67,6 +68,8 @@ fn answer(
         ));
     }
 
+    // All rooms share one adapter, so that the view is embedded once and its distances compare
+    // between rooms.
     let served = rooms_under(snapshot, &rooms, &adapter)?;
     let first = &served[0];
     let source = convert::source("view", view, &first.adapter, snapshot)?;
@@ -77,6 +80,7 @@ fn answer(
         ));
     }
 
+    // A frame has a recorded pose, which serves as ground truth below; other views have none.
     let start = first
         .navigator
         .start(&source, None)
@@ -98,11 +102,13 @@ fn answer(
             .find(|served| served.navigator.room().id().as_str() == room)
     };
 
-    let place = |place: &crate::localization::Place| {
+    let place = |place: &seese3_core::localization::Place| {
         let served = revision(place.room.as_str()).ok_or(Error::Internal)?;
         Ok(pb::Place {
             room: Some(convert::room_revision(served)),
             hit: Some(convert::hit_to_wire(&place.hit, served.navigator.room())),
+            // The error is taken from the true pose itself, so that its twist is log(true⁻¹ ·
+            // found).
             error: start.pose.map(|truth| {
                 convert::error_to_wire(&StepError::of(&truth, &place.hit.pose, &truth), &thresholds)
             }),
@@ -116,7 +122,13 @@ fn answer(
     })
 }
 
-/// The rooms to look in, all under one adapter; at least one.
+/// The rooms to search, all under one adapter; at least one. An empty `rooms` means every room that
+/// the adapter fits; an empty `adapter` means the default of a single room, or the only one that
+/// fits all rooms.
+///
+/// # Errors
+/// [`Error::NotFound`] for an unknown room or adapter, [`Error::Invalid`] if a room is named twice
+/// or several adapters fit, [`Error::Precondition`] if the adapter does not fit a room.
 pub(super) fn rooms_under(
     snapshot: &Snapshot,
     rooms: &[String],
@@ -132,6 +144,8 @@ pub(super) fn rooms_under(
         }
     }
 
+    // Without the name of an adapter, one named room answers by its default adapter; several
+    // rooms need one adapter that fits them all.
     let adapter = match (adapter, rooms) {
         ("", [room]) => snapshot.navigator(room, "")?.adapter.name.clone(),
         ("", _) => only_adapter_of(snapshot, rooms)?,
@@ -160,8 +174,11 @@ pub(super) fn rooms_under(
         .collect()
 }
 
-/// The one adapter that fits all the rooms: distances under two adapters do not compare.
+/// The only adapter that fits all the rooms, since distances under two adapters do not compare. It
+/// is an error if none or several fit.
 fn only_adapter_of(snapshot: &Snapshot, rooms: &[String]) -> Result<String, Error> {
+    // Where all rooms are searched, those that no adapter fits are left out; otherwise one of
+    // them would rule out every adapter.
     let answered = snapshot
         .rooms()
         .iter()
@@ -173,6 +190,7 @@ fn only_adapter_of(snapshot: &Snapshot, rooms: &[String]) -> Result<String, Erro
         rooms.iter().collect()
     };
 
+    // Each room rules out the adapters that do not fit it.
     let mut fitting: Vec<&String> = snapshot.adapters().keys().collect();
     for room in asked {
         let served = snapshot.room(room)?;

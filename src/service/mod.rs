@@ -1,15 +1,17 @@
 //! The gRPC service: package `seese3.v1`, standard health and reflection.
 //!
-//! - A request keeps the [`Snapshot`] it began with; a snapshot never changes.
-//! - Work that computes runs on blocking threads, a bounded number at a time; a panic there costs
-//!   one request.
-//! - Deadlines and callers that went away stop the work between its pieces.
+//! - A request answers from the [`Snapshot`] that was current when it began; a snapshot never
+//!   changes.
+//! - Computation runs on blocking threads, a bounded number at a time; a panic there fails only
+//!   that one request.
+//! - Long work checks between its pieces whether the deadline passed or the caller went away, and
+//!   stops if so.
 
 mod catalog;
 mod convert;
 mod evaluation;
-mod eye;
-mod goals;
+mod image_encoder;
+mod navigate_to;
 mod health;
 mod localization;
 mod navigation;
@@ -20,10 +22,9 @@ mod snapshot;
 mod status;
 mod telemetry;
 mod track;
-mod work;
+mod workers;
 
-pub use convert::pose as pose_from_wire;
-pub use eye::ImageEncoders;
+pub use image_encoder::ImageEncoders;
 pub use shutdown::shutdown_signal;
 pub use snapshot::Snapshot;
 pub use status::Error;
@@ -37,46 +38,50 @@ use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, oneshot, watch};
 use tonic::transport::Server;
 use tonic::transport::server::TcpIncoming;
+use tower::util::MapRequestLayer;
+use tower_http::request_id::{PropagateRequestIdLayer, SetRequestIdLayer};
+use tower_http::trace::TraceLayer;
 
-use crate::navigation::{IndexKind, Limits};
-use crate::proto::FILE_DESCRIPTOR_SET;
-use crate::proto::v1::catalog_service_server::CatalogServiceServer;
-use crate::proto::v1::evaluation_service_server::EvaluationServiceServer;
-use crate::proto::v1::localization_service_server::LocalizationServiceServer;
-use crate::proto::v1::navigation_service_server::NavigationServiceServer;
-use crate::proto::v1::odometry_service_server::OdometryServiceServer;
 use crate::store::{self, Store};
-use work::Workers;
+use seese3_client::proto::FILE_DESCRIPTOR_SET;
+use seese3_client::proto::v1::catalog_service_server::CatalogServiceServer;
+use seese3_client::proto::v1::evaluation_service_server::EvaluationServiceServer;
+use seese3_client::proto::v1::localization_service_server::LocalizationServiceServer;
+use seese3_client::proto::v1::navigation_service_server::NavigationServiceServer;
+use seese3_client::proto::v1::odometry_service_server::OdometryServiceServer;
+use seese3_core::navigation::{IndexKind, Limits};
+use workers::Workers;
 
-/// How long callers have to hear that their request was given up.
+/// After the drain time, how long the server still waits for callers to receive the error of their
+/// abandoned requests.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
-/// What a server allows.
+/// The configuration and the limits of a server.
 #[derive(Debug, Clone)]
 pub struct Config {
-    /// Which index its navigators search.
+    /// The index in which navigators search for the nearest frames.
     pub index: IndexKind,
-    /// Of one question.
+    /// The limits of one request: steps, hits, and frames in the whole answer.
     pub limits: Limits,
-    /// What images are encoded with, if callers may send them.
+    /// The encoders for images that callers send; none if the server takes no images.
     pub encoders: Option<ImageEncoders>,
-    /// Of one batch, requests.
+    /// The largest number of requests in one BatchNavigate.
     pub batch: usize,
-    /// Of one ScorePredictions, pairs.
+    /// The largest number of predictions in one ScorePredictions.
     pub predictions: usize,
-    /// Of a received message, bytes.
+    /// The largest message that is received, bytes.
     pub message_bytes: usize,
-    /// Requests computed at a time.
+    /// The largest number of requests computed at the same time.
     pub threads: usize,
-    /// Requests that may wait for a thread; one more is refused.
+    /// The largest number of requests that wait for a thread; a further one is refused.
     pub queue: usize,
-    /// The longest a request may take, whatever its own deadline.
+    /// The longest time for one request; a caller's own deadline can only shorten it.
     pub longest: Duration,
-    /// Cameras that are followed at a time; one more is refused.
+    /// The largest number of Track streams open at the same time; a further one is refused.
     pub streams: usize,
-    /// Seals what a stream goes on from. Servers that share it take one another's tokens.
+    /// The key that authenticates resume tokens. Servers that share it accept one another's tokens.
     pub token_key: TokenKey,
-    /// How long requests in flight may go on after the server was told to stop.
+    /// How long requests in flight may continue after the shutdown signal.
     pub drain: Duration,
 }
 
@@ -101,6 +106,7 @@ impl Default for Config {
 
 /// Why a server ended.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum RunError {
     #[error(transparent)]
     Store(#[from] store::Error),
@@ -110,7 +116,7 @@ pub enum RunError {
     Navigator {
         adapter: String,
         room: String,
-        problem: crate::navigation::Error,
+        problem: seese3_core::navigation::Error,
     },
     #[error("adapter '{adapter}' cannot be given images: {problem}")]
     Encoder {
@@ -130,17 +136,17 @@ pub enum RunError {
     Loading(String),
 }
 
-/// What a server is doing.
+/// The stage of a server's life, which health and every handler read.
 #[derive(Clone)]
 enum Phase {
     Loading,
     Serving(Arc<Snapshot>),
     Draining(Arc<Snapshot>),
-    /// Told to stop before anything was loaded.
+    /// The shutdown signal came before the store was loaded.
     Stopping,
 }
 
-/// What every handler needs.
+/// The state that all handlers share.
 #[derive(Clone)]
 struct Handlers {
     phase: watch::Receiver<Phase>,
@@ -158,17 +164,20 @@ impl Handlers {
     }
 }
 
-/// Serves a store until `shutdown` completes. Health answers from the first moment, NOT_SERVING
-/// until all is loaded.
+/// Serves a store until `shutdown` completes. The health service answers from the first moment,
+/// with NOT_SERVING until the whole store is loaded.
 ///
 /// # Errors
-/// [`RunError`]; a store that is damaged ends the server before it serves.
+/// [`RunError`] if the store cannot be loaded and verified, in which case the server ends before it
+/// serves, or if the transport fails.
 pub async fn run(
     listener: TcpListener,
     store: Store,
     config: Config,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), RunError> {
+    // Health, reflection and the other services listen at once and read the phase from this
+    // channel. Until the store is loaded, requests are refused as UNAVAILABLE.
     let (phase, watched) = watch::channel(Phase::Loading);
     let (stop, stopped) = oneshot::channel::<()>();
     let workers = Workers::new(&config);
@@ -180,13 +189,15 @@ pub async fn run(
         streams: Arc::new(Semaphore::new(config.streams)),
     };
     let server = server(handlers, watched, listener, async {
-        // An error means the sender is gone: the server is to stop all the same.
+        // An error means that `run` was dropped; the server must stop then, too.
         let _ = stopped.await;
     })?;
 
     tokio::pin!(server, shutdown);
     let loading = snapshot::load(store, config.index, config.encoders);
 
+    // The server future has to be polled while the store loads, or no health check would be
+    // answered.
     let loaded = tokio::select! {
         loaded = loading => loaded?,
         ended = &mut server => return ended,
@@ -203,6 +214,8 @@ pub async fn run(
         "serving"
     );
 
+    // From here on requests are answered. The function waits for the shutdown signal or for a
+    // failure of the server.
     phase.send_replace(Phase::Serving(loaded.clone()));
 
     tokio::select! {
@@ -211,6 +224,9 @@ pub async fn run(
     }
 
     tracing::info!(bound_s = config.drain.as_secs_f64(), "draining");
+
+    // Health turns to NOT_SERVING and open Track streams end, so that load balancers and robots
+    // move to another server while short requests finish here.
     phase.send_replace(Phase::Draining(loaded));
 
     // An error means the server has ended already.
@@ -222,7 +238,7 @@ pub async fn run(
     tracing::warn!("the drain bound passed; requests still in flight are given up");
     workers.halt();
 
-    // Their callers are answered, unless they do not even read that.
+    // The abandoned requests now end with UNAVAILABLE. Wait a moment for callers to read that.
     tokio::time::timeout(LAST_WORDS, server)
         .await
         .unwrap_or(Ok(()))
@@ -236,6 +252,7 @@ fn server(
 ) -> Result<impl Future<Output = Result<(), RunError>> + Send, RunError> {
     let most = handlers.config.message_bytes;
 
+    // Reflection is offered in both versions, because some clients speak only v1alpha.
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
@@ -246,11 +263,26 @@ fn server(
     let v1 = reflection().build_v1().map_err(failed)?;
     let v1alpha = reflection().build_v1alpha().map_err(failed)?;
 
+    // Keep-alive pings detect clients that vanished without closing their connection; when it is
+    // closed their requests are cancelled.
     let router = Server::builder()
         .http2_keepalive_interval(Some(Duration::from_secs(30)))
         .http2_keepalive_timeout(Some(Duration::from_secs(20)))
         .max_concurrent_streams(Some(1_024))
-        .layer(telemetry::TelemetryLayer)
+        .layer(MapRequestLayer::new(telemetry::without_unfit_id))
+        .layer(SetRequestIdLayer::new(
+            telemetry::REQUEST_ID,
+            telemetry::RandomId,
+        ))
+        .layer(
+            TraceLayer::new_for_grpc()
+                .make_span_with(telemetry::span)
+                .on_request(())
+                .on_response(telemetry::record_headers)
+                .on_eos(telemetry::record_trailers)
+                .on_failure(()),
+        )
+        .layer(PropagateRequestIdLayer::new(telemetry::REQUEST_ID))
         .add_service(health::service(phase))
         .add_service(v1)
         .add_service(v1alpha)

@@ -1,14 +1,14 @@
-//! NavigationService.
+//! NavigationService: Navigate and BatchNavigate. NavigateTo is in `navigate_to`.
 
 use tonic::{Request, Response, Status};
 
 use super::convert;
 use super::status::brief;
 use super::{Error, Handlers, Snapshot};
-use crate::cancel::Cancellation;
-use crate::navigation::Limits;
-use crate::proto::v1 as pb;
-use crate::proto::v1::navigation_service_server::NavigationService;
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::navigation_service_server::NavigationService;
+use seese3_core::cancel::Cancellation;
+use seese3_core::navigation::Limits;
 
 #[tonic::async_trait]
 impl NavigationService for Handlers {
@@ -31,7 +31,7 @@ impl NavigationService for Handlers {
         Ok(Response::new(answer))
     }
 
-    type NavigateToStream = super::goals::Events;
+    type NavigateToStream = super::navigate_to::Events;
 
     async fn navigate_to(
         &self,
@@ -58,6 +58,8 @@ impl NavigationService for Handlers {
             .into());
         }
 
+        // The limit on retrieved frames bounds the size of one answer, so in a batch it holds for
+        // all requests together.
         let in_all = requests
             .iter()
             .map(hits_asked_for)
@@ -78,6 +80,8 @@ impl NavigationService for Handlers {
 
                 results.push(match navigate(&snapshot, request, limits, cancel) {
                     Ok(response) => pb::batch_navigate_result::Result::Response(response),
+                    // Cancellation ends the whole batch; any other error belongs to the one
+                    // request that caused it.
                     Err(Error::Cancelled) => return Err(Error::Cancelled),
                     Err(error) => pb::batch_navigate_result::Result::Failure(pb::Failure {
                         code: error.code().into(),
@@ -101,7 +105,8 @@ impl NavigationService for Handlers {
     }
 }
 
-/// How many frames a request asks for; each question is checked again when it is answered.
+/// How many frames a request asks for: motions times steps times hits. It only serves the sum over
+/// a batch; each request is checked in full when it is answered.
 fn hits_asked_for(request: &pb::NavigateRequest) -> u64 {
     let motions = match request
         .displacement
@@ -125,6 +130,9 @@ fn navigate(
     let served = snapshot.navigator(&request.room, &request.adapter)?;
     let (query, thresholds) = convert::query(request, &served.adapter, snapshot)?;
     let answer = served.navigator.answer(&query, limits, cancel)?;
+
+    // The answer repeats what was chosen by default (mode, reading, navigator), so that a caller
+    // sees how its numbers came about. Without an audit the index is the exact scan.
     let room = served.navigator.room();
 
     Ok(pb::NavigateResponse {

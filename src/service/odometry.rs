@@ -1,17 +1,21 @@
-//! OdometryService.
+//! OdometryService: EstimateMotion, the motion between two views. Track is in `track`.
 
+use std::sync::Arc;
+
+use ndarray::Array1;
 use tonic::{Request, Response, Status};
 
 use super::convert;
 use super::status::view_error;
 use super::{Error, Handlers, Snapshot};
-use crate::cancel::Cancellation;
-use crate::geometry::{body_twist, exp};
-use crate::navigation::{Source, StepError};
-use crate::odometry::{View, motion};
-use crate::proto::v1 as pb;
-use crate::proto::v1::odometry_service_server::OdometryService;
-use crate::room::FrameId;
+use crate::store::StoredAdapter;
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::odometry_service_server::OdometryService;
+use seese3_core::cancel::Cancellation;
+use seese3_core::geometry::{body_twist, exp};
+use seese3_core::navigation::{Source, StepError};
+use seese3_core::room::FrameId;
+use seese3_core::tracking::View;
 
 #[tonic::async_trait]
 impl OdometryService for Handlers {
@@ -55,25 +59,21 @@ fn answer(
 
     let thresholds = convert::thresholds(thresholds)?;
 
+    // A room is only needed to look up views that are frames; features, latents and images need
+    // no more than the adapter.
     let served = if room.is_empty() {
         None
     } else {
         Some(snapshot.navigator(&room, &adapter)?)
     };
 
-    let stored = match (served, adapter.as_str()) {
-        (Some(served), _) => &served.adapter,
-        (None, "") => match snapshot.adapters().len() {
-            1 => snapshot.adapters().values().next().ok_or(Error::Internal)?,
-            count => {
-                let problem =
-                    format!("is required when no room is named: the server has {count} adapters");
-                return Err(Error::invalid("adapter", problem));
-            }
-        },
-        (None, name) => snapshot.adapter(name)?,
+    let stored = match served {
+        Some(served) => &served.adapter,
+        None => adapter_without_room(snapshot, &adapter)?,
     };
 
+    // If both views are frames of the room, the true motion between them is recorded and is
+    // reported with the estimate.
     let frame_of =
         |given: &Option<pb::View>| match given.as_ref().and_then(|view| view.view.as_ref()) {
             Some(pb::view::View::FrameId(frame)) => Some(FrameId(*frame)),
@@ -81,7 +81,7 @@ fn answer(
         };
     let frames = frame_of(&first).zip(frame_of(&second));
 
-    let view = |field: &str, given| -> Result<View, Error> {
+    let latent = |field: &str, given| -> Result<Array1<f64>, Error> {
         cancel.check()?;
 
         let view = match convert::source(field, given, stored, snapshot)? {
@@ -102,18 +102,16 @@ fn answer(
             }
         };
 
-        // Checked one by one, so that the error names the view it is about.
+        // Each view is embedded by itself, so that an error names the view at fault.
         view.latent(&stored.adapter)
-            .map_err(|error| view_error(&error).within(field))?;
-
-        Ok(view)
+            .map_err(|error| view_error(&error).within(field))
     };
 
-    let first = view("first", first)?;
-    let second = view("second", second)?;
-    let twist = motion(&stored.adapter, &first, &second).map_err(|_| Error::Internal)?;
+    let first = latent("first", first)?;
+    let second = latent("second", second)?;
+    let twist = stored.adapter.motion(first.view(), second.view());
 
-    // Both frames have been looked up by now, so that their room and poses are there.
+    // `latent` has found both frames in the room, so their poses exist.
     let truth = served.zip(frames).and_then(|(served, (first, second))| {
         let poses = served.navigator.room().poses();
         Some((poses.get(first.row())?, poses.get(second.row())?))
@@ -122,6 +120,7 @@ fn answer(
     Ok(pb::EstimateMotionResponse {
         true_motion: truth
             .map(|(first, second)| convert::twist_to_wire(&body_twist(first, second))),
+        // The estimate as a pose: world_from_second = world_from_first · exp(motion).
         error: truth.map(|(first, second)| {
             convert::error_to_wire(
                 &StepError::of(first, &(first * exp(&twist)), second),
@@ -134,4 +133,23 @@ fn answer(
         }),
         motion: Some(convert::twist_to_wire(&twist)),
     })
+}
+
+/// The adapter of a request that names no room: the one it names, or the only one.
+fn adapter_without_room<'a>(
+    snapshot: &'a Snapshot,
+    adapter: &str,
+) -> Result<&'a Arc<StoredAdapter>, Error> {
+    if !adapter.is_empty() {
+        return snapshot.adapter(adapter);
+    }
+
+    match snapshot.adapters().len() {
+        1 => snapshot.adapters().values().next().ok_or(Error::Internal),
+        count => {
+            let problem =
+                format!("is required when no room is named: the server has {count} adapters");
+            Err(Error::invalid("adapter", problem))
+        }
+    }
 }

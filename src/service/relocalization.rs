@@ -1,24 +1,25 @@
-//! LocalizationService.Relocalize.
+//! LocalizationService.Relocalize: finds the room a camera is in, and its pose there, without any
+//! prior. Also chooses the rooms and maps for Track.
 
 use std::sync::Arc;
 
 use super::convert;
 use super::localization::rooms_under;
-use super::snapshot::{ServedNavigator, Snapshot};
+use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
 use super::status::view_error;
 use super::{Error, Handlers};
-use crate::cancel::Cancellation;
-use crate::navigation::{Hit, Source};
-use crate::odometry::{self, Map, RoomMatch, View, relocalize};
-use crate::proto::v1 as pb;
+use seese3_client::proto::v1 as pb;
+use seese3_core::cancel::Cancellation;
+use seese3_core::navigation::{Hit, Source};
+use seese3_core::tracking::{self, Map, RoomMatch, View, relocalize};
 
-/// Rooms in an answer that does not say how many.
+/// Rooms in an answer if the request does not say how many.
 const ROOMS: u32 = 3;
-/// The most views of one request.
+/// The largest number of views in one request.
 const MAX_VIEWS: usize = 256;
 
 impl Handlers {
-    /// Answers on a blocking thread.
+    /// Answers a Relocalize request on a worker thread.
     pub(super) async fn relocalized(
         &self,
         request: tonic::Request<pb::RelocalizeRequest>,
@@ -58,6 +59,7 @@ fn answer(
         )),
     };
 
+    // All rooms are compared; `shown` only limits how many of them the answer lists.
     let shown = within("room_count", room_count, ROOMS)?;
     let hits = within("hit_count", hit_count, 1)?;
 
@@ -73,6 +75,8 @@ fn answer(
     let stored = &served[0].adapter;
     let mut latents = Vec::with_capacity(views.len());
 
+    // Views are embedded one by one, with a check for cancellation before each, since an image
+    // may have to be encoded.
     for (position, view) in views.into_iter().enumerate() {
         cancel.check()?;
         let field = format!("views[{position}]");
@@ -83,7 +87,7 @@ fn answer(
             Source::Frame(_) => {
                 return Err(Error::invalid(
                     format!("{field}.frame_id"),
-                    "is a frame of a room, not what a camera sees",
+                    "is a stored frame; give a feature, a latent or an image of the camera",
                 ));
             }
         };
@@ -95,7 +99,7 @@ fn answer(
     }
 
     let found = relocalize(&maps, &latents, hits, cancel).map_err(|error| match error {
-        odometry::Error::Cancelled => Error::Cancelled,
+        tracking::Error::Cancelled => Error::Cancelled,
         _ => Error::Internal,
     })?;
 
@@ -114,10 +118,12 @@ fn answer(
     })
 }
 
-/// Rooms under one adapter, whose errors were measured if none is named.
+/// The rooms to track or relocalise in, all under one adapter; at least one. If no adapter is
+/// named, only those that can track in these rooms are considered: the first of a single room, else
+/// the only one.
 ///
 /// # Errors
-/// As [`rooms_under`].
+/// [`Error::Invalid`] on `adapter` if several can track; else as [`rooms_under`].
 pub fn rooms_to_track_in(
     snapshot: &Snapshot,
     rooms: &[String],
@@ -127,37 +133,14 @@ pub fn rooms_to_track_in(
         return rooms_under(snapshot, rooms, adapter);
     }
 
-    let mut fitting: Option<Vec<&str>> = None;
-    for served in snapshot
-        .rooms()
-        .iter()
-        .filter(|(name, _)| rooms.is_empty() || rooms.contains(name))
-        .map(|(_, room)| room)
-    {
-        let here: Vec<&str> = served
-            .navigators
-            .iter()
-            .filter(|n| n.map.is_some())
-            .map(|n| n.adapter.name.as_str())
-            .collect();
+    let fitting = match rooms {
+        [] => adapters_that_track_anywhere(snapshot),
+        [room] => default_that_tracks(snapshot, room),
+        several => adapters_that_track_in_all(snapshot, several),
+    };
 
-        match (&mut fitting, rooms.is_empty()) {
-            (Some(fitting), false) => fitting.retain(|name| here.contains(name)),
-            (Some(fitting), true) => fitting.extend(here),
-            (none, _) => *none = Some(here),
-        }
-    }
-
-    let mut fitting = fitting.unwrap_or_default();
-
-    // The newest is the default in one room; several rooms have no newest that is the same.
-    if rooms.len() == 1 {
-        fitting.truncate(1);
-    }
-
-    fitting.sort_unstable();
-    fitting.dedup();
-
+    // If no adapter can track here, `rooms_under` still chooses one: `maps` then says what that
+    // adapter or room lacks.
     match fitting.as_slice() {
         [] => rooms_under(snapshot, rooms, ""),
         [only] => rooms_under(snapshot, rooms, only),
@@ -172,22 +155,69 @@ pub fn rooms_to_track_in(
     }
 }
 
-/// The rooms as maps.
+/// The names of the adapters that can track in a room, its default first.
+fn adapters_that_track(room: &ServedRoom) -> Vec<&str> {
+    room.navigators
+        .iter()
+        .filter(|served| served.map.is_some())
+        .map(|served| served.adapter.name.as_str())
+        .collect()
+}
+
+/// Where no room is named, one room is enough: every adapter that can track in some room, by name.
+fn adapters_that_track_anywhere(snapshot: &Snapshot) -> Vec<&str> {
+    let mut names: Vec<&str> = snapshot
+        .rooms()
+        .values()
+        .flat_map(adapters_that_track)
+        .collect();
+    names.sort_unstable();
+    names.dedup();
+    names
+}
+
+/// In one room, its own default among the adapters that can track.
+fn default_that_tracks<'a>(snapshot: &'a Snapshot, room: &str) -> Vec<&'a str> {
+    let mut names = snapshot
+        .rooms()
+        .get(room)
+        .map_or_else(Vec::new, adapters_that_track);
+    names.truncate(1);
+    names
+}
+
+/// Several named rooms need an adapter that can track in every one of them; they have no common
+/// order of preference, so the names are sorted.
+fn adapters_that_track_in_all<'a>(snapshot: &'a Snapshot, rooms: &[String]) -> Vec<&'a str> {
+    let mut named = rooms.iter().filter_map(|room| snapshot.rooms().get(room));
+    let mut names = named.next().map_or_else(Vec::new, adapters_that_track);
+    for room in named {
+        let here = adapters_that_track(room);
+        names.retain(|name| here.contains(name));
+    }
+
+    names.sort_unstable();
+    names.dedup();
+    names
+}
+
+/// The maps of these rooms, which trackers and relocalisation match against.
 ///
 /// # Errors
-/// [`Error::Precondition`], which says what is missing.
+/// [`Error::Precondition`] if a room has no map, because its adapter is not calibrated or because
+/// the room is too small. The message says which.
 pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
     let map = |served: &Arc<ServedNavigator>| {
         let name = &served.adapter.name;
         let room = served.navigator.room().id();
 
         served.map.clone().ok_or_else(|| {
-            Error::Precondition(match served.adapter.adapter.calibration() {
+            Error::Precondition(match served.adapter.adapter.error_model() {
                 None => format!(
                     "adapter '{name}' neither tracks nor relocalises: its errors were not measured in two or more rooms that \
                      it did not learn from; train it with --calibrate-on"
                 ),
-                Some(_) => format!("room '{room}' is too small to be told from others: no frame is apart from the rest"),
+                Some(_) => format!("room '{room}' has too few distinct frames to track in"),
             })
         })
     };
@@ -199,7 +229,9 @@ fn room_to_wire(found: &RoomMatch, served: &[Arc<ServedNavigator>]) -> pb::RoomM
     let served = &served[found.map];
     let room = served.navigator.room();
 
-    let hit = |neighbour: &crate::index::Neighbour| {
+    // The distances of these hits are in standard deviations of frame noise, unlike those of
+    // Localize.
+    let hit = |neighbour: &seese3_core::index::Neighbour| {
         let hit = Hit {
             neighbour: *neighbour,
             pose: room.poses()[neighbour.frame.row()],
@@ -207,6 +239,7 @@ fn room_to_wire(found: &RoomMatch, served: &[Arc<ServedNavigator>]) -> pb::RoomM
         convert::hit_to_wire(&hit, room)
     };
 
+    // The pose and covariance are those of the newest view, read from its nearest frame.
     let anchor = &found.last.anchor;
     pb::RoomMatch {
         room: Some(convert::room_revision(served)),

@@ -1,6 +1,7 @@
-//! When a server is told to stop.
+//! The signals that ask a server to stop.
 
-/// Completes at SIGTERM or SIGINT (Ctrl-C).
+/// Completes when the process receives SIGTERM or SIGINT (Ctrl-C). If a handler cannot be
+/// installed, that signal never completes it.
 pub async fn shutdown_signal() {
     let interrupted = async {
         if tokio::signal::ctrl_c().await.is_err() {

@@ -1,69 +1,67 @@
-//! All that a server answers from, loaded and verified. Immutable.
+//! The rooms, adapters and image encoders that a server answers from, loaded, verified and
+//! immutable.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use sha2::{Digest, Sha256};
 
-use super::eye::{self, Eye, ImageEncoders};
+use super::image_encoder::{self, ImageEncoder, ImageEncoders};
 use super::{Error, RunError};
-use crate::adapter::Network;
-use crate::features::FeatureSource;
-use crate::navigation::{IndexKind, Navigator};
-use crate::odometry::Map;
-use crate::room::{FrameId, Room};
-use crate::store::{Store, StoredAdapter};
+use crate::store::{Store, StoredAdapter, StoredRoom};
+use seese3_core::adapter::{ErrorStatistics, Network};
+use seese3_core::eval::TrainedOn;
+use seese3_core::features::FeatureSource;
+use seese3_core::navigation::{IndexKind, Navigator};
+use seese3_core::room::{FrameId, Room, RoomId};
+use seese3_core::tracking::Map;
 
 /// A room that is served.
 pub struct ServedRoom {
     /// The room.
     pub room: Arc<Room>,
-    /// Its revision.
+    /// The revision that is served.
     pub revision: u64,
-    /// When that was published, RFC 3339.
+    /// When this revision was published, RFC 3339.
     pub created: String,
-    /// What its features were made by.
+    /// The sources of the room's features: encoder, layer, pooling and preprocessing.
     pub sources: Vec<FeatureSource>,
-    /// One for each adapter that fits, the default first.
+    /// One for each adapter that fits the room, the default first.
     pub navigators: Vec<Arc<ServedNavigator>>,
 }
 
-/// A room under an adapter.
+/// A room under one adapter that fits it.
 pub struct ServedNavigator {
-    /// Answers.
+    /// Retrieves frames and plans motions in the latents of this adapter.
     pub navigator: Arc<Navigator>,
-    /// What cameras are followed against, if the adapter is calibrated and the room not too small.
+    /// The map for tracking and relocalisation; none if the adapter is not calibrated or the room
+    /// is too small.
     pub map: Option<Arc<Map>>,
-    /// With whose numbers.
+    /// The adapter as it is stored, with its training record.
     pub adapter: Arc<StoredAdapter>,
-    /// SHA-256 of what answers are computed from: poses, latents, and how the adapter reads them.
+    /// SHA-256 of the numbers that answers depend on: poses, latents, and the adapter's parameters,
+    /// scale and calibration.
     pub content: [u8; 32],
     /// The room's revision.
     pub room_revision: u64,
-    /// Whether the adapter learned from this room, and from which frames of it.
-    pub trained_on: Option<TrainedOn>,
+    /// What the adapter has seen of this room.
+    pub trained_on: TrainedOn,
 }
 
-/// What an adapter learned from, of the room that it serves.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum TrainedOn {
-    /// The frames that are served.
-    TheseFrames,
-    /// Other frames under the room's name: a test frame of today may have been a training frame.
-    OtherFrames,
-}
-
-/// Rooms and adapters, newest revisions.
+/// The newest revision of every room and adapter of a store.
 pub struct Snapshot {
     rooms: BTreeMap<String, ServedRoom>,
     adapters: BTreeMap<String, Arc<StoredAdapter>>,
-    eyes: BTreeMap<String, Arc<Eye>>,
+    image_encoders: BTreeMap<String, Arc<ImageEncoder>>,
 }
 
 impl Snapshot {
-    /// What encodes images for an adapter.
-    pub fn eye(&self, adapter: &StoredAdapter) -> Result<&Eye, Error> {
-        self.eyes.get(&adapter.name).map(AsRef::as_ref).ok_or_else(|| {
+    /// The image encoder of an adapter.
+    ///
+    /// # Errors
+    /// [`Error::Precondition`] if this server has no encoder for it.
+    pub fn image_encoder(&self, adapter: &StoredAdapter) -> Result<&ImageEncoder, Error> {
+        self.image_encoders.get(&adapter.name).map(AsRef::as_ref).ok_or_else(|| {
             let encoder = &adapter.adapter.source().encoder;
             Error::Precondition(format!(
                 "images cannot be sent for adapter '{}': this server has no encoder '{encoder}'; start it with \
@@ -94,6 +92,9 @@ impl Snapshot {
     }
 
     /// A room by name.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if the name is empty, [`Error::NotFound`] if no such room is served.
     pub fn room(&self, name: &str) -> Result<&ServedRoom, Error> {
         if name.is_empty() {
             return Err(Error::invalid("room", "is required"));
@@ -106,6 +107,9 @@ impl Snapshot {
     }
 
     /// An adapter by name.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if the name is empty, [`Error::NotFound`] if no such adapter is served.
     pub fn adapter(&self, name: &str) -> Result<&Arc<StoredAdapter>, Error> {
         if name.is_empty() {
             return Err(Error::invalid("adapter", "is required"));
@@ -117,7 +121,12 @@ impl Snapshot {
         })
     }
 
-    /// A room under the adapter of that name, or under its default if the name is empty.
+    /// A room under the adapter of that name, or under the room's default adapter if the name is
+    /// empty.
+    ///
+    /// # Errors
+    /// As [`Snapshot::room`] and [`Snapshot::adapter`]; [`Error::Precondition`] if the adapter does
+    /// not fit the room, or none does.
     pub fn navigator(&self, room: &str, adapter: &str) -> Result<&Arc<ServedNavigator>, Error> {
         let served = self.room(room)?;
         if adapter.is_empty() {
@@ -140,12 +149,18 @@ impl Snapshot {
     }
 }
 
-/// Loads every room and adapter of a store and makes their navigators, off the serving threads.
+/// Loads every room and adapter of a store and builds their navigators, on a blocking thread.
+///
+/// # Errors
+/// [`RunError`] if the store is empty or damaged, or if an adapter, a room or an encoder cannot be
+/// used.
 pub async fn load(
     store: Store,
     index: IndexKind,
     encoders: Option<ImageEncoders>,
 ) -> Result<Snapshot, RunError> {
+    // Loading mixes reads with long computation (embedding, indexing). On an async thread it
+    // would hold up the health checks that are answered meanwhile.
     let runtime = tokio::runtime::Handle::current();
     let loading = tokio::task::spawn_blocking(move || {
         runtime.block_on(load_all(&store, index, encoders.as_ref()))
@@ -162,100 +177,15 @@ async fn load_all(
     encoders: Option<&ImageEncoders>,
 ) -> Result<Snapshot, RunError> {
     let mut adapters = BTreeMap::new();
-    let mut shared = BTreeMap::new();
     for name in store.adapter_names().await? {
         let stored = store.load_adapter(&name, None).await?;
-        // One for all rooms: maps of one adapter are told by it.
-        shared.insert(name.clone(), Arc::new(stored.adapter.clone()));
         adapters.insert(name, Arc::new(stored));
     }
 
-    let eyes = eye::open(encoders, &adapters)?;
+    let image_encoders = image_encoder::open(encoders, &adapters)?;
     let mut rooms = BTreeMap::new();
     for summary in store.rooms().await? {
-        let stored = store.load_room(&summary.room, None).await?;
-        let room = Arc::new(stored.room);
-        let mut fitting: Vec<&Arc<StoredAdapter>> = adapters.values().collect();
-
-        let rank = |a: &StoredAdapter| {
-            let learned_here = a.record.rooms.iter().any(|(name, _)| name == room.id());
-            (learned_here, a.created.clone(), a.name.clone())
-        };
-        fitting.sort_by_key(|adapter| std::cmp::Reverse(rank(adapter)));
-
-        let mut navigators = Vec::new();
-        for adapter in fitting {
-            let source = adapter.adapter.source();
-            let Some(features) = stored
-                .features
-                .iter()
-                .find(|features| features.source().is_like(source))
-            else {
-                continue;
-            };
-
-            let Some(computing) = shared.get(&adapter.name) else {
-                continue;
-            };
-            let navigator = Navigator::new(room.clone(), features, computing.clone(), index);
-            let navigator = navigator.map_err(|problem| RunError::Navigator {
-                adapter: adapter.name.clone(),
-                room: room.id().to_string(),
-                problem,
-            })?;
-
-            log_audit(&navigator, &adapter.name);
-
-            let trained = adapter
-                .record
-                .rooms
-                .iter()
-                .find(|(name, _)| name == room.id());
-
-            let trained_on = match trained {
-                None => None,
-                Some((name, revision))
-                    if store
-                        .same_frames(name.as_str(), *revision, stored.revision)
-                        .await? =>
-                {
-                    Some(TrainedOn::TheseFrames)
-                }
-                Some(_) => Some(TrainedOn::OtherFrames),
-            };
-
-            let adapter = adapter.clone();
-            let room_revision = stored.revision;
-            let navigator = Arc::new(navigator);
-            let map = map(&navigator);
-
-            let content = content(&navigator);
-            let served = ServedNavigator {
-                navigator,
-                map,
-                content,
-                adapter,
-                room_revision,
-                trained_on,
-            };
-
-            navigators.push(Arc::new(served));
-        }
-
-        let sources = stored
-            .features
-            .iter()
-            .map(|features| features.source().clone())
-            .collect();
-
-        let served = ServedRoom {
-            room,
-            revision: stored.revision,
-            created: stored.created,
-            sources,
-            navigators,
-        };
-
+        let served = load_room(store, index, &adapters, &summary.room).await?;
         rooms.insert(summary.room, served);
     }
 
@@ -268,33 +198,150 @@ async fn load_all(
     Ok(Snapshot {
         rooms,
         adapters,
-        eyes,
+        image_encoders,
     })
 }
 
-/// What answers are computed from, hashed: names and revisions of two stores may be the same by
-/// chance.
-fn content(navigator: &Navigator) -> [u8; 32] {
-    let mut digest = Sha256::new();
+/// A room under every adapter that fits it.
+async fn load_room(
+    store: &Store,
+    index: IndexKind,
+    adapters: &BTreeMap<String, Arc<StoredAdapter>>,
+    name: &str,
+) -> Result<ServedRoom, RunError> {
+    let StoredRoom {
+        room,
+        revision,
+        created,
+        features,
+        ..
+    } = store.load_room(name, None).await?;
+    let room = Arc::new(room);
 
-    let poses = navigator.room().poses().iter().flat_map(|pose| {
-        let t = pose.translation.vector;
-        let q = pose.rotation.coords;
-        [t.x, t.y, t.z, q.x, q.y, q.z, q.w]
-    });
-    poses
-        .chain(navigator.latents().iter().copied())
-        .for_each(|x| digest.update(x.to_le_bytes()));
+    let mut navigators = Vec::new();
+    for adapter in by_preference(adapters, room.id()) {
+        // An adapter fits a room that has features made as its training features were.
+        let source = adapter.adapter.source();
+        let Some(features) = features.iter().find(|set| set.source().is_like(source)) else {
+            continue;
+        };
+
+        let navigator = Navigator::new(room.clone(), features, adapter.adapter.clone(), index)
+            .map_err(|problem| RunError::Navigator {
+                adapter: adapter.name.clone(),
+                room: room.id().to_string(),
+                problem,
+            })?;
+        log_audit(&navigator, &adapter.name);
+
+        let navigator = Arc::new(navigator);
+        navigators.push(Arc::new(ServedNavigator {
+            map: map(&navigator),
+            content: content(&navigator),
+            trained_on: store
+                .trained_on(&adapter.record, room.id(), revision)
+                .await?,
+            room_revision: revision,
+            adapter,
+            navigator,
+        }));
+    }
+
+    Ok(ServedRoom {
+        sources: features.iter().map(|set| set.source().clone()).collect(),
+        room,
+        revision,
+        created,
+        navigators,
+    })
+}
+
+/// Adapters in order of preference, of which the first that fits is a room's default: those trained
+/// in this room first, then the newest.
+fn by_preference(
+    adapters: &BTreeMap<String, Arc<StoredAdapter>>,
+    room: &RoomId,
+) -> Vec<Arc<StoredAdapter>> {
+    let rank = |adapter: &StoredAdapter| {
+        let is_trained_here = adapter.record.rooms.iter().any(|(name, _)| name == room);
+        (
+            is_trained_here,
+            adapter.created.clone(),
+            adapter.name.clone(),
+        )
+    };
+
+    let mut ranked: Vec<Arc<StoredAdapter>> = adapters.values().cloned().collect();
+    ranked.sort_by_key(|adapter| std::cmp::Reverse(rank(adapter)));
+    ranked
+}
+
+/// SHA-256 of the numbers that answers are computed from. Name and revision do not identify a room
+/// or adapter across stores: two stores may use the same ones for different content.
+fn content(navigator: &Navigator) -> [u8; 32] {
+    let mut digest = ContentDigest(Sha256::new());
+
+    // Every number enters with all its bits, so that states resume only where the tracker would
+    // compute exactly the same.
+    for pose in navigator.room().poses() {
+        digest.numbers(&pose.translation.vector);
+        digest.numbers(&pose.rotation.coords);
+    }
+    digest.numbers(navigator.latents());
 
     let adapter = navigator.adapter();
     for parameter in adapter.network().parameters() {
-        parameter
-            .iter()
-            .for_each(|x| digest.update(x.to_le_bytes()));
+        digest.numbers(&parameter.mapv(f64::from));
+    }
+    digest.numbers(&adapter.scale().mean);
+    digest.numbers(&adapter.scale().deviation);
+
+    if let Some(error_model) = adapter.error_model() {
+        digest.error_statistics(error_model.statistics());
     }
 
-    digest.update(format!("{:?} {:?}", adapter.scale(), adapter.calibration()));
-    digest.finalize().into()
+    digest.0.finalize().into()
+}
+
+/// A hash of numbers, in a fixed order.
+struct ContentDigest(Sha256);
+
+impl ContentDigest {
+    fn numbers<'a>(&mut self, numbers: impl IntoIterator<Item = &'a f64>) {
+        for number in numbers {
+            self.0.update(number.to_le_bytes());
+        }
+    }
+
+    fn error_statistics(&mut self, statistics: &ErrorStatistics) {
+        // Destructured with no `..`, so that a new statistic breaks the build here.
+        let ErrorStatistics {
+            frame_noise,
+            motion_spread,
+            motion_errors,
+            anchor_errors,
+            out_of_distribution_ratio,
+            certain_match_ratio,
+            jump_distance,
+            map_pose_factor,
+        } = statistics;
+
+        self.numbers(frame_noise);
+        self.numbers(motion_spread);
+        for table in [&motion_errors.shapes, anchor_errors] {
+            for stratum in table.strata() {
+                self.numbers([&stratum.at, &stratum.gain]);
+                self.numbers(&stratum.covariance);
+            }
+        }
+        self.numbers([
+            &motion_errors.floor,
+            out_of_distribution_ratio,
+            certain_match_ratio,
+            jump_distance,
+            map_pose_factor,
+        ]);
+    }
 }
 
 fn log_audit(navigator: &Navigator, adapter: &str) {
@@ -307,10 +354,10 @@ fn log_audit(navigator: &Navigator, adapter: &str) {
     }
 }
 
-/// All frames of a room as a map; none where cameras cannot be followed, which the log says if it
-/// is the room's fault.
+/// The map of all frames of a room; none if the adapter is not calibrated. A room that is too small
+/// to track in also gives none, which is logged.
 fn map(navigator: &Arc<Navigator>) -> Option<Arc<Map>> {
-    navigator.adapter().calibration()?;
+    navigator.adapter().error_model()?;
     let frames: Vec<FrameId> = (0..navigator.room().frame_count() as u32)
         .map(FrameId)
         .collect();

@@ -1,15 +1,16 @@
-//! What went wrong, as gRPC says it. The one place where status codes are chosen.
+//! Errors as gRPC statuses. This is the only place where status codes are chosen.
 
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
-use crate::{adapter, cancel, eval, navigation, pairs, room};
+use seese3_core::{adapter, cancel, eval, navigation, room, splits};
 
 /// The domain of this service's error reasons.
 const DOMAIN: &str = "seese3.v1";
 
-/// Why a request has no answer.
+/// Why a request is refused or fails.
 #[derive(Debug, thiserror::Error, PartialEq)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
     #[error("{field}: {problem}")]
     Invalid { field: String, problem: String },
@@ -25,12 +26,12 @@ pub enum Error {
     Deadline,
     #[error("the request was cancelled")]
     Cancelled,
-    #[error("internal error; the request id is in the server's log")]
+    #[error("internal error; the server's log has the cause under the request id")]
     Internal,
 }
 
 impl Error {
-    /// A field that has to change.
+    /// An error in the request field `field`.
     pub fn invalid(field: impl Into<String>, problem: impl ToString) -> Self {
         Self::Invalid {
             field: field.into(),
@@ -38,7 +39,7 @@ impl Error {
         }
     }
 
-    /// The same error with its field inside another.
+    /// The same error with its field prefixed by the field that contains it.
     pub fn within(self, parent: &str) -> Self {
         match self {
             Self::Invalid { field, problem } => Self::Invalid {
@@ -53,7 +54,7 @@ impl Error {
         }
     }
 
-    /// The same error about a field of another name.
+    /// The same error with its field replaced by another name.
     pub fn named(self, name: &str) -> Self {
         match self {
             Self::Invalid { problem, .. } => Self::Invalid {
@@ -101,6 +102,8 @@ impl From<Error> for Status {
         let mut details = ErrorDetails::new();
         details.set_error_info(error.reason(), DOMAIN, std::collections::HashMap::new());
 
+        // Details in the standard types of google.rpc, so that a client learns the field to
+        // change, the missing resource, or when to retry, without reading the message.
         match &error {
             Error::Invalid { field, problem } => {
                 details.add_bad_request_violation(brief(field), brief(problem));
@@ -118,7 +121,8 @@ impl From<Error> for Status {
     }
 }
 
-/// One line of bounded length: what a caller sent may be neither, and metadata must be small.
+/// The text as one line of at most 300 characters and an ellipsis: it may quote what a caller sent,
+/// and gRPC metadata must stay small.
 pub fn brief(text: &str) -> String {
     const MOST: usize = 300;
 
@@ -145,6 +149,8 @@ impl From<navigation::Error> for Error {
     fn from(error: navigation::Error) -> Self {
         use navigation::Error as E;
 
+        // The field that the caller has to change. Errors that no change of the request can cure
+        // return early.
         let field = match &error {
             E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => {
                 return Self::NotFound {
@@ -160,12 +166,14 @@ impl From<navigation::Error> for Error {
                 };
             }
             E::Cancelled(_) => return Self::Cancelled,
+            // Features were checked when the store was loaded, so a misfit now is the server's
+            // own fault.
             E::FeatureRows { .. } | E::Features(_) => return Self::Internal,
             E::SourceFrame(_) => "source.frame_id",
             E::TargetFrame(_) => "displacement.target_frame_id",
             E::Adapter(
                 adapter::Error::NoCorrector { .. }
-                | adapter::Error::NotCalibrated
+                | adapter::Error::NoErrorCovariance
                 | adapter::Error::GatedMotion
                 | adapter::Error::WhitenedColumns { .. },
             ) => "navigator",
@@ -182,7 +190,8 @@ impl From<navigation::Error> for Error {
     }
 }
 
-/// What is wrong with a feature or a latent; the field is relative to the view that holds it.
+/// A feature or a latent that does not fit the adapter. The field is relative to the view that
+/// contains it.
 pub fn view_error(error: &adapter::Error) -> Error {
     use adapter::Error as E;
 
@@ -202,32 +211,36 @@ impl From<eval::Error> for Error {
     fn from(error: eval::Error) -> Self {
         use eval::Error as E;
 
+        // As above, with the field names of the evaluation requests.
         let field = match &error {
             E::Cancelled(_) | E::Navigation(navigation::Error::Cancelled(_)) => {
                 return Self::Cancelled;
             }
             E::Navigation(navigation::Error::Adapter(
                 adapter::Error::NoCorrector { .. }
-                | adapter::Error::NotCalibrated
+                | adapter::Error::NoErrorCovariance
                 | adapter::Error::GatedMotion
                 | adapter::Error::WhitenedColumns { .. },
             ))
             | E::Adapter(
-                adapter::Error::NotCalibrated
+                adapter::Error::NoErrorCovariance
                 | adapter::Error::GatedMotion
                 | adapter::Error::WhitenedColumns { .. },
             ) => "navigators",
             E::Navigation(navigation::Error::Refit(_)) => {
                 return Self::Precondition(error.to_string());
             }
-            E::Navigation(_) | E::Adapter(_) | E::Odometry(_) => return Self::Internal,
+
+            // Evaluations use the room's own frames and features, which were checked when the
+            // store was loaded.
+            E::Navigation(_) | E::Adapter(_) => return Self::Internal,
             E::Room(_) => "room",
             E::Pairs(
-                pairs::Error::ZeroStride
-                | pairs::Error::NoPairs { .. }
-                | pairs::Error::EmptyRange { .. },
+                splits::Error::ZeroStride
+                | splits::Error::NoPairs { .. }
+                | splits::Error::EmptyRange { .. },
             ) => "stride",
-            E::Pairs(pairs::Error::NoDatasetSplit) => "split",
+            E::Pairs(splits::Error::NoDatasetSplit) => "split",
             E::Threshold { .. } | E::ThresholdCount { .. } => "thresholds",
             E::NoCandidates { .. } => "exclude_radius",
             E::NothingToFitOn { .. } => "navigators",

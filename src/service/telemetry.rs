@@ -1,91 +1,77 @@
-//! A line in the log for each request, with an id that the caller can give and gets back.
+//! One log line for each request when it ends, with a request id that the caller may choose and that
+//! the response returns.
+//!
+//! Each request has a span of its own. Its gRPC status comes with the headers of a response that
+//! failed at once, and otherwise with the trailers, behind the last message of a stream; it is
+//! recorded in the span, and the line is written when the span closes. A request whose caller went
+//! away closes without a status.
 
-use std::future::Future;
-use std::pin::Pin;
-use std::task::{Context, Poll};
-use std::time::Instant;
+use std::time::Duration;
 
-use http::{HeaderValue, Request, Response};
-use tonic::body::Body;
-use tower::{Layer, Service};
-use tracing::Instrument;
+use http::{HeaderMap, HeaderName, HeaderValue, Request, Response};
+use tower_http::request_id::{MakeRequestId, RequestId};
+use tracing::{Span, field};
 
-/// Of the id, in requests and responses.
-const REQUEST_ID: &str = "x-request-id";
-/// The longest id that is taken over.
+/// The metadata key of the request id, in requests and responses.
+pub const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+/// The longest id that is accepted from a caller, bytes.
 const LONGEST_ID: usize = 128;
 
-/// Makes [`Telemetry`].
+/// Removes an id that is too long or not printable, so that the request gets a new one.
+pub fn without_unfit_id<B>(mut request: Request<B>) -> Request<B> {
+    if request.headers().get(REQUEST_ID).is_some_and(is_unfit) {
+        request.headers_mut().remove(REQUEST_ID);
+    }
+
+    request
+}
+
+fn is_unfit(id: &HeaderValue) -> bool {
+    let is_printable = id.as_bytes().iter().all(u8::is_ascii_graphic);
+    id.is_empty() || id.len() > LONGEST_ID || !is_printable
+}
+
+/// Makes ids of 16 hexadecimal digits.
 #[derive(Debug, Clone, Copy)]
-pub struct TelemetryLayer;
+pub struct RandomId;
 
-/// Logs requests on their way to a service.
-#[derive(Debug, Clone)]
-pub struct Telemetry<S>(S);
-
-impl<S> Layer<S> for TelemetryLayer {
-    type Service = Telemetry<S>;
-
-    fn layer(&self, inner: S) -> Self::Service {
-        Telemetry(inner)
+impl MakeRequestId for RandomId {
+    fn make_request_id<B>(&mut self, _: &Request<B>) -> Option<RequestId> {
+        let id = format!("{:016x}", rand::random::<u64>());
+        HeaderValue::from_str(&id).ok().map(RequestId::new)
     }
 }
 
-impl<S> Service<Request<Body>> for Telemetry<S>
-where
-    S: Service<Request<Body>, Response = Response<Body>> + Clone + Send + 'static,
-    S::Future: Send,
-{
-    type Response = Response<Body>;
-    type Error = S::Error;
-    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, Self::Error>> + Send>>;
+/// The span of a request; its status is recorded once it is known.
+pub fn span<B>(request: &Request<B>) -> Span {
+    let id = request.headers().get(REQUEST_ID);
+    tracing::info_span!(
+        "request",
+        id = id.and_then(|id| id.to_str().ok()).unwrap_or_default(),
+        method = request.uri().path(),
+        grpc_status = field::Empty,
+    )
+}
 
-    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Self::Error>> {
-        self.0.poll_ready(context)
-    }
+/// Records the status of a response that failed before its first message.
+pub fn record_headers<B>(response: &Response<B>, _: Duration, span: &Span) {
+    record_status(response.headers(), span);
+}
 
-    fn call(&mut self, request: Request<Body>) -> Self::Future {
-        let begun = Instant::now();
-        let id = request_id(request.headers().get(REQUEST_ID));
-        let span = tracing::info_span!(
-            "request",
-            id = id.to_str().unwrap_or_default(),
-            method = request.uri().path()
-        );
-
-        // The service that was polled ready answers; its clone stays for the next request.
-        let ready = self.0.clone();
-        let mut inner = std::mem::replace(&mut self.0, ready);
-
-        let answered = async move {
-            let mut response = inner.call(request).await?;
-            let headers = response.headers_mut();
-            let code = headers
-                .get("grpc-status")
-                .and_then(|code| code.to_str().ok())
-                .unwrap_or("0")
-                .to_owned();
-
-            headers.insert(REQUEST_ID, id);
-            let ms = begun.elapsed().as_secs_f64() * 1e3;
-            tracing::info!(grpc_status = code, ms, "answered");
-
-            Ok(response)
-        };
-
-        Box::pin(answered.instrument(span))
+/// Records the status behind the last message; without one the stream ended well.
+pub fn record_trailers(trailers: Option<&HeaderMap>, _: Duration, span: &Span) {
+    match trailers {
+        Some(trailers) => record_status(trailers, span),
+        None => {
+            span.record("grpc_status", "0");
+        }
     }
 }
 
-/// The caller's id if it is short and printable, else a new one.
-fn request_id(given: Option<&HeaderValue>) -> HeaderValue {
-    let fits = |id: &&HeaderValue| {
-        !id.is_empty() && id.len() <= LONGEST_ID && id.as_bytes().iter().all(u8::is_ascii_graphic)
-    };
-    match given.filter(fits) {
-        Some(id) => id.clone(),
-        None => HeaderValue::from_str(&format!("{:016x}", rand::random::<u64>()))
-            .unwrap_or(HeaderValue::from_static("unnamed")),
+fn record_status(headers: &HeaderMap, span: &Span) {
+    let status = headers.get("grpc-status");
+    if let Some(status) = status.and_then(|status| status.to_str().ok()) {
+        span.record("grpc_status", status);
     }
 }
 
@@ -93,13 +79,20 @@ fn request_id(given: Option<&HeaderValue>) -> HeaderValue {
 mod tests {
     use super::*;
 
+    /// Oracle: the promise: ids of up to 128 printable characters are kept, others are replaced by
+    /// one of 16 digits that is new each time.
     #[test]
     fn long_or_unprintable_ids_are_replaced() {
-        let given = |text: &str| request_id(Some(&HeaderValue::from_str(text).unwrap()));
-        assert_eq!(given("robot-7/42"), "robot-7/42");
-        assert_ne!(given("a b"), "a b");
-        assert_eq!(given(&"x".repeat(129)).len(), 16);
+        let kept = |id: &str| {
+            let request = Request::builder().header(REQUEST_ID, id).body(()).unwrap();
+            without_unfit_id(request).headers().contains_key(REQUEST_ID)
+        };
+        assert!(kept("robot-7/42") && kept(&"x".repeat(128)));
+        assert!(!kept("a b") && !kept("") && !kept(&"x".repeat(129)));
 
-        assert_ne!(request_id(None), request_id(None));
+        let made = || RandomId.make_request_id(&Request::new(())).unwrap();
+        let first = made();
+        assert_eq!(first.header_value().len(), 16);
+        assert_ne!(first.header_value(), made().header_value());
     }
 }

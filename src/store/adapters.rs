@@ -1,4 +1,6 @@
-//! Adapters in the store.
+//! Publishing and loading adapters.
+
+use std::sync::Arc;
 
 use nalgebra::{Matrix6, Vector6};
 use ndarray::{Array2, ArrayView2};
@@ -7,22 +9,23 @@ use object_store::path::Path;
 use super::format::{AdapterBody, TrainingEntry};
 use super::manifest::{self, SCHEMA};
 use super::tensors::{TensorReader, TensorWriter};
-use super::{ATTEMPTS, Error, Kind, Published, Store, calibration, revision_path};
-use crate::adapter::{
+use super::{ATTEMPTS, Error, Kind, Published, Store, error_model, revision_path};
+use seese3_core::adapter::{
     self, Adapter, Corrector, CorrectorKind, Mixture, Network, TargetScale, TrainingRecord,
 };
-use crate::room::is_plain_name;
+use seese3_core::room::is_plain_name;
 
 /// The frame of every twist: the body frame of the source camera (A-1).
 const TWIST_FRAME: &str = "body";
-/// The tensor of Σ, (6, 6) f64 on (v, ω).
+/// The tensor with the second moment Σ of the adapter's errors, (6, 6) f64 on (v, ω).
 const ERROR_COVARIANCE: &str = "error.covariance";
-/// Golden inputs in an adapter's file.
+/// The largest number of golden inputs that are stored with an adapter.
 const GOLDEN_ROWS: usize = 8;
-/// How far a golden output may be off, in units of the larger of 1 and the output itself.
+/// The largest accepted difference from a golden output, in units of the larger of 1 and the
+/// magnitude of that output.
 const GOLDEN_TOLERANCE: f64 = 1e-6;
 
-/// An adapter as it was stored; its golden vectors have been run.
+/// An adapter that was loaded from the store and reproduced its golden outputs.
 #[derive(Debug, Clone)]
 pub struct StoredAdapter {
     /// Its name.
@@ -31,18 +34,23 @@ pub struct StoredAdapter {
     pub revision: u64,
     /// When it was published, RFC 3339.
     pub created: String,
-    /// The adapter.
-    pub adapter: Adapter,
-    /// How it came to be.
+    /// The adapter. All rooms share it: a tracker takes maps of several rooms only if their adapter
+    /// is the same `Arc`, compared by pointer.
+    pub adapter: Arc<Adapter>,
+    /// How it was trained.
     pub record: TrainingRecord,
 }
 
 impl Store {
-    /// Publishes an adapter; some of `features` (n, d), the ones it was trained on, become its
-    /// golden inputs.
+    /// Publishes an adapter as a new revision. Some rows of `features` (n, d), the features that it
+    /// was trained on, are stored as golden inputs, together with the outputs that it gives for
+    /// them. Publishing the same content again creates no revision.
     ///
     /// # Errors
-    /// [`Error::Name`], [`Error::Damaged`] if the features do not fit, or as the store fails.
+    /// [`Error::Name`] if the name cannot be a folder, [`Error::Damaged`] if the features do not
+    /// fit the adapter, [`Error::Contended`] if other publishers took every revision number that
+    /// was tried, otherwise as [`Store::load_adapter`] if the newest revision cannot be read, or
+    /// [`Error::Io`] if the store cannot be written.
     pub async fn publish_adapter(
         &self,
         name: &str,
@@ -59,10 +67,14 @@ impl Store {
 
         let folder = Path::from(Kind::Adapter.folder()).join(name);
         let bytes = adapter_file(name, adapter, features)?;
+
+        // The weights are written before the manifest that makes them visible.
         let weights = self
             .write_object(&folder, "weights", "safetensors", bytes)
             .await?;
 
+        // As for rooms: try to create the next revision, and start again if another publisher was
+        // faster.
         for _ in 0..ATTEMPTS {
             let newest = match self.revisions(&folder).await?.last() {
                 Some(&revision) => Some(self.adapter_body(&folder, revision).await?),
@@ -77,10 +89,12 @@ impl Store {
                 source: adapter.source().into(),
                 weights: weights.clone(),
                 twist_frame: TWIST_FRAME.to_owned(),
+                // σ of the targets is divided by n, not by n − 1 (A-11).
                 deviation_ddof: 0,
                 training: TrainingEntry::new(record, adapter),
             };
 
+            // Content that differs only in the revision number and the date is not published again.
             if let Some(newest) = newest {
                 let same = AdapterBody {
                     revision: newest.revision,
@@ -116,10 +130,14 @@ impl Store {
         })
     }
 
-    /// Loads an adapter, its newest revision if none is named, and runs its golden vectors.
+    /// Loads an adapter, the given revision or else the newest, and checks that its golden inputs
+    /// still give their stored outputs.
     ///
     /// # Errors
-    /// [`Error::Unknown`], [`Error::UnknownRevision`], [`Error::Damaged`], or as the store fails.
+    /// [`Error::Unknown`] if there is no such adapter, [`Error::UnknownRevision`] if it has no such
+    /// revision, [`Error::Damaged`] if a file is truncated or altered or the golden outputs are not
+    /// reproduced, [`Error::Schema`] if a newer program wrote it, [`Error::Io`] if a file cannot be
+    /// read.
     pub async fn load_adapter(
         &self,
         name: &str,
@@ -127,9 +145,13 @@ impl Store {
     ) -> Result<StoredAdapter, Error> {
         let (folder, revision) = self.resolve(Kind::Adapter, name, revision).await?;
         let body = self.adapter_body(&folder, revision).await?;
+
+        // Motions in another frame or of another scale would be wrong without any other sign, so
+        // the conventions are checked before any tensor is read.
         if body.twist_frame != TWIST_FRAME || body.deviation_ddof != 0 {
             let problem = format!(
-                "states twists in the frame '{}' and ddof {}; this program answers for '{TWIST_FRAME}' and 0",
+                "has twists in the frame '{}' and targets of ddof {}; this program supports only \
+                '{TWIST_FRAME}' and 0",
                 body.twist_frame, body.deviation_ddof
             );
             return Err(Error::Damaged {
@@ -145,13 +167,17 @@ impl Store {
         };
 
         let tensors = TensorReader::new(&file, &bytes)?;
-        let calibration = calibration::read(&tensors, &file)?;
+        let error_model = error_model::read(&tensors, &file)?;
         let mixing = body.training.mixing().map_err(&damaged)?;
+
+        // The names of the tensors follow from the number of charts and their mixing, both of which
+        // stand in the manifest.
         let network = Mixture::from_tensors(body.training.charts, mixing, |name| {
             read_weights(&tensors, name)
         });
         let network = network.map_err(|error| error.within(&file))?;
 
+        // W predicts z-scored motions; μ and σ turn them back into metres and radians.
         let scale = TargetScale {
             mean: vector6(&tensors, "target.mean", &file)?,
             deviation: vector6(&tensors, "target.deviation", &file)?,
@@ -162,11 +188,12 @@ impl Store {
             false => None,
         };
 
+        // Correctors share the weights file; a prefix tells their tensors apart.
         let mut correctors = Vec::with_capacity(body.training.correctors.len());
         for name in &body.training.correctors {
             let kind = CorrectorKind::from_name(name).ok_or_else(|| {
                 damaged(format!(
-                    "has a corrector '{name}', which means nothing to this program"
+                    "has a corrector '{name}', which this program does not know"
                 ))
             })?;
             let read = |tensor: &str| read_weights(&tensors, &corrector_tensor(kind, tensor));
@@ -175,38 +202,41 @@ impl Store {
             correctors.push(corrector.map_err(|error| error.within(&file))?);
         }
 
+        // The optional parts are added one by one, and each is checked as it is added.
         let adapter = Adapter::new(body.source.into(), network, scale)
             .and_then(|adapter| adapter.with_correctors(correctors))
             .and_then(|adapter| match error_covariance {
                 Some(covariance) => adapter.with_error_covariance(covariance),
                 None => Ok(adapter),
             })
-            .and_then(|adapter| match calibration {
-                Some(calibration) => adapter.with_calibration(calibration),
+            .and_then(|adapter| match error_model {
+                Some(error_model) => adapter.with_error_model(error_model),
                 None => Ok(adapter),
             })
             .map_err(|error| damaged(error.to_string()))?;
 
+        // The checksums show that the file is intact. The golden vectors show that this program, on
+        // this machine, still computes the same function from it.
         check_golden(&adapter, &tensors, &file)?;
         let manifest = self.shown(&revision_path(&folder, revision));
         let record = body.training.record().map_err(|word| Error::Damaged {
             file: manifest,
-            problem: format!("{word} means nothing to this program"),
+            problem: format!("has {word}, which this program does not know"),
         })?;
 
         Ok(StoredAdapter {
             name: body.adapter,
             revision,
             created: body.created,
-            adapter,
+            adapter: Arc::new(adapter),
             record,
         })
     }
 
-    /// The names of all adapters.
+    /// The names of all adapters, sorted.
     ///
     /// # Errors
-    /// As the store fails.
+    /// [`Error::Io`] if the store cannot be listed.
     pub async fn adapter_names(&self) -> Result<Vec<String>, Error> {
         self.names(Kind::Adapter).await
     }
@@ -253,7 +283,7 @@ fn corrector_tensor(kind: CorrectorKind, tensor: &str) -> String {
     format!("corrector.{}.{tensor}", kind.name())
 }
 
-/// The shape that PyTorch gives a tensor which is two-dimensional here.
+/// The shape of a tensor in PyTorch; in this program every tensor is two-dimensional.
 fn torch_shape(name: &str, array: &Array2<f32>) -> Vec<usize> {
     let last = name.rsplit('.').next().unwrap_or(name);
     match array.dim() {
@@ -279,6 +309,8 @@ fn adapter_file(
     };
 
     let mut tensors = TensorWriter::default();
+
+    // Weights keep PyTorch's names and shapes.
     for (name, array) in adapter
         .network()
         .names()
@@ -312,14 +344,17 @@ fn adapter_file(
         );
     }
 
-    if let Some(calibration) = adapter.calibration() {
-        calibration::write(&mut tensors, calibration);
+    if let Some(error_model) = adapter.error_model() {
+        error_model::write(&mut tensors, error_model);
     }
 
+    // The golden inputs are spread evenly over the training features.
     let rows: Vec<usize> = (0..features.nrows())
         .step_by(features.nrows().div_ceil(GOLDEN_ROWS).max(1))
         .collect();
     let golden = features.select(ndarray::Axis(0), &rows);
+
+    // The golden outputs are what this program computes now: latents, motions and corrected steps.
     let latents = adapter
         .embed(golden.view())
         .map_err(|error| damaged(error.to_string()))?;
@@ -369,7 +404,8 @@ fn golden_corrector(kind: CorrectorKind) -> String {
     format!("golden.corrector.{}", kind.name())
 }
 
-/// The corrected steps from each golden latent by the motion that it sees from the first.
+/// The corrected latent step from each golden latent, for the motion from the first golden latent
+/// to it. Same shape as `latents`.
 fn golden_steps(
     adapter: &Adapter,
     kind: CorrectorKind,
@@ -391,6 +427,8 @@ fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Re
     };
 
     let features = tensors.f32("golden.features")?;
+
+    // With no inputs every comparison below would succeed.
     if features.nrows() == 0 {
         return Err(damaged("has no golden inputs".to_owned()));
     }
@@ -400,6 +438,7 @@ fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Re
         .map_err(|error| damaged(error.to_string()))?;
     let twists = golden_twists(adapter, &latents);
 
+    // Recompute every kind of output, and pair it with the one that was stored.
     let mut checked = Vec::new();
     for corrector in adapter.correctors() {
         let kind = corrector.kind();
@@ -411,6 +450,8 @@ fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Re
     checked.push(("latents", latents, tensors.f64("golden.latents")?));
     checked.push(("twists", twists, tensors.f64("golden.twists")?));
 
+    // Sums may be rounded differently on another machine, so the outputs need not agree in every
+    // bit.
     for (what, found, stored) in checked {
         let near = |(found, stored): (&f64, &f64)| {
             (found - stored).abs() <= GOLDEN_TOLERANCE * stored.abs().max(1.0)

@@ -1,13 +1,13 @@
-//! Shapes on disk: the bodies of manifests.
+//! The bodies of manifests as they are written to disk, kept separate from the domain types.
 
 use serde::{Deserialize, Serialize};
 
 use super::manifest::ObjectRef;
-use crate::adapter::{Adapter, Loss, Mixing, PairPlan, TrainConfig, TrainingRecord};
-use crate::features::{FeatureSource, UNSPECIFIED};
-use crate::pairs::{Split, StrideRange};
-use crate::room::{Provenance, RoomId};
-use crate::scores::MotionScores;
+use seese3_core::adapter::{Adapter, Loss, Mixing, PairPlan, TrainConfig, TrainingRecord};
+use seese3_core::features::{FeatureSource, UNSPECIFIED};
+use seese3_core::motion_scores::MotionScores;
+use seese3_core::room::{Provenance, RoomId};
+use seese3_core::splits::{Split, StrideRange};
 
 /// The body of a room's manifest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -15,22 +15,22 @@ pub struct RoomBody {
     pub schema: u64,
     pub room: String,
     pub revision: u64,
-    /// RFC 3339.
+    /// When it was published, RFC 3339.
     pub created: String,
     pub frame_count: usize,
-    /// `world_from_camera` (n, 4, 4) f64, metres; where known `timestamps_ns`, `numbers`,
-    /// `sequences` and `held_out` (0 or 1), each (n,) i64.
+    /// The tensors `world_from_camera` (n, 4, 4) f64, metres, and, where known, `timestamps_ns`,
+    /// `numbers`, `sequences` and `held_out` (0 or 1), each (n,) i64.
     pub frames: ObjectRef,
-    /// A JSON list of the recording's own frame names.
+    /// A JSON list of the frame names in the recording.
     pub frame_names: Option<ObjectRef>,
-    /// A JSON list of where the frames' images are.
+    /// A JSON list of the image paths, one per frame, relative to the images root in `provenance`.
     #[serde(default)]
     pub images: Option<ObjectRef>,
     pub features: Vec<FeaturesEntry>,
     pub provenance: ProvenanceEntry,
 }
 
-/// One set of features of a room: `features` (n, d) f32.
+/// One set of features of a room. Its object holds the tensor `features` (n, d) f32.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FeaturesEntry {
     pub source: SourceEntry,
@@ -66,13 +66,14 @@ pub struct AdapterBody {
     pub schema: u64,
     pub adapter: String,
     pub revision: u64,
-    /// RFC 3339.
+    /// When it was published, RFC 3339.
     pub created: String,
     pub source: SourceEntry,
-    /// Weights f32 under PyTorch's names; `target.mean`, `target.deviation` (6,) f64 ordered (v,
-    /// ω); `golden.features`, `golden.latents`, `golden.twists`: run when the adapter is loaded.
+    /// The tensors: weights f32 under PyTorch's names; `target.mean` and `target.deviation` (6,)
+    /// f64, ordered (v, ω); and the golden vectors `golden.features`, `golden.latents` and
+    /// `golden.twists`, which are checked whenever the adapter is loaded.
     pub weights: ObjectRef,
-    /// The frame of the twists: always `body` of the source camera.
+    /// The frame of the twists: always `body`, the body frame of the source camera.
     pub twist_frame: String,
     /// Delta degrees of freedom of `target.deviation`.
     pub deviation_ddof: u32,
@@ -92,10 +93,10 @@ pub struct TrainingEntry {
     clip_norm: f64,
     hidden: usize,
     latent: usize,
-    /// Charts, the paper's K.
+    /// The number of charts, the paper's K.
     #[serde(default = "one_chart")]
     pub charts: usize,
-    /// How they are mixed: by a learned `gate`, or `even`.
+    /// How the charts are mixed: by a learned `gate`, or `even` for an ensemble.
     #[serde(default = "by_gate")]
     mixing: String,
     #[serde(default = "squared_error")]
@@ -108,19 +109,21 @@ pub struct TrainingEntry {
     average: f64,
     #[serde(default)]
     through_zero: bool,
-    /// Rooms in which its errors were measured; then the weights hold `error.covariance`.
+    /// The calibration rooms with their revisions, in which the adapter's errors were measured. If
+    /// there are any, the weights object also holds `error.covariance`.
     #[serde(default)]
     calibrated_on: Vec<(String, u64)>,
-    /// Correctors by name, under `corrector.NAME.` in the weights.
+    /// The names of the correctors. Their tensors in the weights object begin with
+    /// `corrector.NAME.`.
     #[serde(default)]
     pub correctors: Vec<String>,
-    /// Smallest and largest stride, and how many pairs were drawn; absent when all pairs at one
-    /// stride were taken.
+    /// The smallest stride, the largest stride and the number of pairs drawn; absent if all pairs
+    /// at one stride were used.
     #[serde(default)]
     range: Option<(u32, u32, usize)>,
     seed: u64,
     pair_count: usize,
-    /// By room, in the order of `rooms`.
+    /// The test scores of each room, in the order of `rooms`.
     #[serde(default)]
     room_tests: Vec<ScoresEntry>,
     test: ScoresEntry,
@@ -128,7 +131,7 @@ pub struct TrainingEntry {
     train_mean_r2: Option<f64>,
 }
 
-/// R² by component; null where the targets do not vary.
+/// R² scores of predicted motions; null where a score is undefined because the targets do not vary.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ScoresEntry {
     n: usize,
@@ -144,6 +147,7 @@ pub struct ScoresEntry {
 
 impl From<&FeatureSource> for SourceEntry {
     fn from(source: &FeatureSource) -> Self {
+        // Destructured with no `..`, so that a new field of the domain type breaks the build here.
         let FeatureSource {
             name,
             encoder,
@@ -218,6 +222,7 @@ impl SourceEntry {
 
 impl From<&Provenance> for ProvenanceEntry {
     fn from(provenance: &Provenance) -> Self {
+        // Destructured with no `..`, so that a new field of the domain type breaks the build here.
         let Provenance {
             format,
             licence,
@@ -254,6 +259,7 @@ impl From<ProvenanceEntry> for Provenance {
 
 impl From<&MotionScores> for ScoresEntry {
     fn from(scores: &MotionScores) -> Self {
+        // JSON has no NaN, so an undefined score is stored as null.
         let known = |value: f64| value.is_finite().then_some(value);
         Self {
             n: scores.n,
@@ -285,8 +291,11 @@ impl From<ScoresEntry> for MotionScores {
 }
 
 impl TrainingEntry {
-    /// What is written of an adapter and its record.
+    /// The entry that is stored for an adapter and its training record.
     pub fn new(record: &TrainingRecord, adapter: &Adapter) -> Self {
+        // Destructured with no `..`, so that a new setting breaks the build here. The charts and
+        // their mixing are taken from the network instead, so that they describe the stored
+        // weights.
         let TrainConfig {
             epochs,
             batch,
@@ -353,12 +362,12 @@ impl TrainingEntry {
         }
     }
 
-    /// How the charts are mixed, or the word that means nothing.
+    /// How the charts are mixed. The error is the value that this program does not know.
     pub fn mixing(&self) -> Result<Mixing, String> {
         Mixing::from_name(&self.mixing).ok_or_else(|| format!("mixing '{}'", self.mixing))
     }
 
-    /// The record, or the word in it that means nothing.
+    /// The training record. The error is the first value that this program does not know.
     pub fn record(self) -> Result<TrainingRecord, String> {
         let split =
             Split::from_name(&self.split).ok_or_else(|| format!("split '{}'", self.split))?;

@@ -1,7 +1,7 @@
-//! The manifest of a revision: JSON that carries its own checksum.
+//! The manifest of a revision: JSON that contains its own checksum.
 //!
-//! `{"sha256": "…", "body": {…}}`, the checksum being that of the body's bytes as they stand in the
-//! file.
+//! The form is `{"sha256": "…", "body": {…}}`. The checksum is that of the body's bytes exactly as
+//! they stand in the file.
 
 use object_store::path::Path;
 use serde::de::DeserializeOwned;
@@ -13,14 +13,14 @@ use super::{Error, sha256};
 /// The version of the manifests that this program writes, and the newest that it reads.
 pub const SCHEMA: u64 = 1;
 
-/// A file of a revision.
+/// A reference from a manifest to an object file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ObjectRef {
-    /// Its name under `objects/`.
+    /// The name of the file under `objects/`.
     pub file: String,
-    /// Of its content, in hexadecimal.
+    /// The SHA-256 of its content, in hexadecimal.
     pub sha256: String,
-    /// Its size.
+    /// Its size in bytes.
     pub bytes: u64,
 }
 
@@ -36,7 +36,7 @@ struct Versioned {
     schema: u64,
 }
 
-/// The bytes of a manifest with this body.
+/// Serialises a body together with its checksum. `file` is the name used in errors.
 pub fn encode(file: &str, body: &impl Serialize) -> Result<Vec<u8>, Error> {
     let damaged = |error: serde_json::Error| Error::Damaged {
         file: file.to_owned(),
@@ -45,6 +45,7 @@ pub fn encode(file: &str, body: &impl Serialize) -> Result<Vec<u8>, Error> {
     let body = serde_json::to_string_pretty(body).map_err(damaged)?;
     let sha256 = sha256(body.as_bytes());
 
+    // A `RawValue` is written as it is, so the text in the file is the text that was hashed.
     let body = RawValue::from_string(body).map_err(damaged)?;
     serde_json::to_vec_pretty(&Envelope {
         sha256,
@@ -60,6 +61,7 @@ pub fn check_place(
     says: (&str, u64),
     revision: u64,
 ) -> Result<(), Error> {
+    // The checksum does not reveal this case: a manifest that was copied as a whole is intact.
     if says == (folder.filename().unwrap_or_default(), revision) {
         return Ok(());
     }
@@ -75,7 +77,7 @@ pub fn check_place(
     })
 }
 
-/// The body of a manifest, if it is whole.
+/// The body of a manifest, after its checksum and its schema version were checked.
 pub fn decode<T: DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, Error> {
     let damaged = |problem: String| Error::Damaged {
         file: file.to_owned(),
@@ -84,15 +86,22 @@ pub fn decode<T: DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, Error>
 
     let envelope: Envelope<'_> = serde_json::from_slice(bytes).map_err(|error| {
         damaged(format!(
-            "is no manifest ({error}): it was truncated or altered; restore it, or remove it to go back to the \
-             revision before"
+            "is not a valid manifest ({error}): it was truncated or altered; restore it, or remove \
+            it to return to the previous revision"
         ))
     })?;
 
+    // The checksum covers the raw text of the body, so it is compared before the body is parsed.
     if sha256(envelope.body.get().as_bytes()) != envelope.sha256 {
-        return Err(damaged("does not have its own checksum: it was altered; restore it, or remove it to go back to the revision before".to_owned()));
+        return Err(damaged(
+            "does not have the checksum that it states: it was altered; restore it, or remove it \
+        to return to the previous revision"
+                .to_owned(),
+        ));
     }
 
+    // The schema version is parsed on its own first. A body of a newer schema may not fit `T`, and
+    // the error should then ask for an update instead of reporting damage.
     let Versioned { schema } =
         serde_json::from_str(envelope.body.get()).map_err(|error| damaged(error.to_string()))?;
     if schema > SCHEMA {

@@ -1,16 +1,17 @@
-//! The store: versioned, checksummed rooms and adapters, in a folder or a bucket.
+//! The store: versioned, checksummed rooms and adapters, in a local folder or an object store.
 //!
 //! ```text
-//! rooms/NAME/objects/…            tensors, named by their content
-//! rooms/NAME/revisions/000001.json   the manifest, written last: a version is visible whole or not at all
-//! adapters/NAME/…                 the same
+//! rooms/NAME/objects/…               tensors and lists of names; the file name contains the hash
+//! rooms/NAME/revisions/000001.json   the manifest, written last: a revision is visible completely
+//!                                    or not at all
+//! adapters/NAME/…                    the same for an adapter
 //! ```
 //!
-//! Tensors are safetensors files; in Python: `safetensors.numpy.load_file(path)`. Published
-//! revisions never change.
+//! Tensors are safetensors files; Python reads them with `safetensors.numpy.load_file(path)`.
+//! Published revisions never change.
 
 mod adapters;
-mod calibration;
+mod error_model;
 mod format;
 mod manifest;
 mod rooms;
@@ -27,8 +28,10 @@ use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload}
 use sha2::{Digest, Sha256};
 use tokio_stream::StreamExt;
 
-/// What can go wrong with stored things. Each names the place and what to do.
+/// Why the store could not be read or written. Each message names the file, room or adapter
+/// concerned; where there is a remedy, it says so.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
     #[error("store '{location}' cannot be opened: {problem}")]
     Open { location: String, problem: String },
@@ -57,7 +60,7 @@ pub enum Error {
     },
     #[error("room '{room}' has {}; name one", several(known))]
     WhichFeatures { room: String, known: Vec<String> },
-    #[error("{name:?} is no name for {what}: use 1 to 100 letters, digits, '.', '-' or '_'")]
+    #[error("{name:?} cannot name {what}: use 1 to 100 letters, digits, '.', '-' or '_'")]
     Name { what: &'static str, name: String },
     #[error("{file}: {problem}")]
     Damaged { file: String, problem: String },
@@ -99,18 +102,18 @@ fn listed(names: &[String]) -> String {
     }
 }
 
-/// A version that was published, or found to be there already.
+/// The result of publishing: a new revision, or the existing one with the same content.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Published {
-    /// Counted from 1.
+    /// The number of the revision, counted from 1.
     pub revision: u64,
-    /// Whether it is new; publishing the same content again is not.
+    /// Whether this call created the revision. Publishing unchanged content creates none.
     pub is_new: bool,
-    /// The manifest, relative to the store.
+    /// The path of the manifest, relative to the root of the store.
     pub manifest: String,
 }
 
-/// How often publishing tries again when another publisher was faster.
+/// How many revision numbers publishing tries before it fails, each lost to a faster publisher.
 const ATTEMPTS: u64 = 16;
 
 /// An opened store.
@@ -120,7 +123,7 @@ pub struct Store {
     location: String,
 }
 
-/// Rooms or adapters.
+/// The two kinds of content in a store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Room,
@@ -144,10 +147,10 @@ impl Kind {
 }
 
 impl Store {
-    /// Opens a folder, making it if it is not there, or a bucket by its URL.
+    /// Opens the store in a folder, which is created if necessary, or at an object-store URL.
     ///
     /// # Errors
-    /// [`Error::Open`].
+    /// [`Error::Open`] if the folder cannot be created or the store cannot be opened.
     pub fn create(location: &str) -> Result<Self, Error> {
         if !location.contains("://") {
             std::fs::create_dir_all(location).map_err(|error| Error::Open {
@@ -159,10 +162,11 @@ impl Store {
         Self::open(location)
     }
 
-    /// Opens a folder that exists, or a bucket by its URL.
+    /// Opens the store in an existing folder, or at an object-store URL.
     ///
     /// # Errors
-    /// [`Error::Missing`] or [`Error::Open`].
+    /// [`Error::Missing`] if the folder does not exist; [`Error::Open`] if the URL is not valid or
+    /// not supported, or if the folder cannot be opened.
     pub fn open(location: &str) -> Result<Self, Error> {
         let failed = |problem: String| Error::Open {
             location: location.to_owned(),
@@ -173,6 +177,9 @@ impl Store {
             let url = url::Url::parse(location).map_err(|error| failed(error.to_string()))?;
             let (objects, prefix) =
                 object_store::parse_url(&url).map_err(|error| failed(error.to_string()))?;
+
+            // From here on, all paths are relative to the folder in the URL, as they are for a
+            // local store.
             let objects = object_store::prefix::PrefixStore::new(objects, prefix);
 
             return Ok(Self {
@@ -189,6 +196,9 @@ impl Store {
 
         let objects = LocalFileSystem::new_with_prefix(location)
             .map_err(|error| failed(error.to_string()))?;
+
+        // Every write reaches the disk before the next one starts. Otherwise a power failure could
+        // leave a manifest whose objects were lost.
         let objects = objects.with_fsync(true);
 
         Ok(Self {
@@ -197,7 +207,7 @@ impl Store {
         })
     }
 
-    /// A store in any object store; `location` names it in messages.
+    /// Uses an object store that is already open; `location` is its name in error messages.
     pub fn with_objects(objects: Arc<dyn ObjectStore>, location: &str) -> Self {
         Self {
             objects,
@@ -205,17 +215,18 @@ impl Store {
         }
     }
 
-    /// Where it is, as it was given.
+    /// The folder or URL, exactly as the caller gave it.
     pub fn location(&self) -> &str {
         &self.location
     }
 
-    /// The name of a file of this store, for people.
+    /// The full path of a file of this store, for error messages.
     fn shown(&self, path: &Path) -> String {
         format!("{}/{path}", self.location.trim_end_matches('/'))
     }
 
-    /// What the object store said, without the path that it repeats.
+    /// Converts an error of the object store. A missing object gets a message of its own that says
+    /// what to do.
     fn io(&self, path: &Path, error: &object_store::Error) -> Error {
         let cause = match error {
             object_store::Error::NotFound { .. } => {
@@ -243,7 +254,8 @@ impl Store {
         Ok(bytes.to_vec())
     }
 
-    /// Reads an object and checks that it is the one its manifest means.
+    /// Reads an object and checks its length and checksum against the manifest. Returns the name of
+    /// the file, for error messages, and its bytes.
     async fn read_object(
         &self,
         folder: &Path,
@@ -253,6 +265,8 @@ impl Store {
         let file = self.shown(&path);
         let bytes = self.read(&path).await?;
 
+        // The length is compared first: it needs no hashing, and its difference points to a
+        // truncated file.
         let problem = if bytes.len() as u64 != object.bytes {
             format!(
                 "is {} bytes long, its manifest says {}: it was truncated or altered",
@@ -260,7 +274,7 @@ impl Store {
                 object.bytes
             )
         } else if sha256(&bytes) != object.sha256 {
-            "does not have the checksum of its manifest: it was altered".to_owned()
+            "does not have the checksum that its manifest states: it was altered".to_owned()
         } else {
             return Ok((file, bytes));
         };
@@ -271,7 +285,8 @@ impl Store {
         })
     }
 
-    /// Writes an object under a name made of its content; writing it twice is harmless.
+    /// Writes an object under a name that contains the hash of its content, so that writing the
+    /// same content twice is harmless.
     async fn write_object(
         &self,
         folder: &Path,
@@ -280,6 +295,9 @@ impl Store {
         bytes: Vec<u8>,
     ) -> Result<manifest::ObjectRef, Error> {
         let sha256 = sha256(&bytes);
+
+        // 64 bits of the hash keep different contents apart: an existing object is only ever
+        // replaced by the same bytes.
         let file = format!("{stem}-{}.{extension}", &sha256[..16]);
         let path = folder.clone().join("objects").join(file.as_str());
         let size = bytes.len() as u64;
@@ -294,7 +312,7 @@ impl Store {
         })
     }
 
-    /// Writes a manifest if no other has that revision; false if one has.
+    /// Writes a manifest unless the revision already exists. Returns whether it was written.
     async fn write_manifest(
         &self,
         folder: &Path,
@@ -302,6 +320,9 @@ impl Store {
         bytes: Vec<u8>,
     ) -> Result<bool, Error> {
         let path = revision_path(folder, revision);
+
+        // `Create` fails if the object exists. This one atomic write decides which of several
+        // concurrent publishers gets the revision.
         let options = PutOptions::from(PutMode::Create);
         match self
             .objects
@@ -314,7 +335,7 @@ impl Store {
         }
     }
 
-    /// Names of a kind that have at least one revision, in order.
+    /// The names of all rooms, or of all adapters, that have at least one revision; sorted.
     async fn names(&self, kind: Kind) -> Result<Vec<String>, Error> {
         let folder = Path::from(kind.folder());
         let listed = self.objects.list_with_delimiter(Some(&folder)).await;
@@ -325,7 +346,11 @@ impl Store {
             let Some(name) = prefix.filename().map(str::to_owned) else {
                 continue;
             };
-            if crate::room::is_plain_name(&name) && !self.revisions(&prefix).await?.is_empty() {
+
+            // A folder without a revision was left by an interrupted publication, since the
+            // manifest is written last. It does not count as published.
+            if seese3_core::room::is_plain_name(&name) && !self.revisions(&prefix).await?.is_empty()
+            {
                 names.push(name);
             }
         }
@@ -334,7 +359,7 @@ impl Store {
         Ok(names)
     }
 
-    /// Revisions of a room or an adapter, in order.
+    /// The revision numbers of a room or an adapter, in ascending order.
     async fn revisions(&self, folder: &Path) -> Result<Vec<u64>, Error> {
         let prefix = folder.clone().join("revisions");
         let mut listed = self.objects.list(Some(&prefix));
@@ -352,7 +377,7 @@ impl Store {
         Ok(revisions)
     }
 
-    /// The revision asked for, or the newest.
+    /// The folder of a room or an adapter, and the requested revision or else the newest.
     async fn resolve(
         &self,
         kind: Kind,
@@ -360,7 +385,10 @@ impl Store {
         revision: Option<u64>,
     ) -> Result<(Path, u64), Error> {
         let folder = Path::from(kind.folder()).join(name);
-        let revisions = if crate::room::is_plain_name(name) {
+
+        // A name that is not valid cannot have been published. It is treated like an unknown one
+        // and never listed as a path.
+        let revisions = if seese3_core::room::is_plain_name(name) {
             self.revisions(&folder).await?
         } else {
             Vec::new()
@@ -395,7 +423,7 @@ fn revision_path(folder: &Path, revision: u64) -> Path {
         .join(format!("{revision:06}.json"))
 }
 
-/// The beginning of a text's SHA-256, for names of files.
+/// The first 16 hexadecimal digits of a text's SHA-256, for use in file names.
 pub fn short_digest(text: &str) -> String {
     sha256(text.as_bytes())[..16].to_owned()
 }

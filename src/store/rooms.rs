@@ -1,4 +1,4 @@
-//! Rooms in the store.
+//! Publishing and loading rooms.
 
 use object_store::path::Path;
 
@@ -6,11 +6,13 @@ use super::format::{FeaturesEntry, RoomBody};
 use super::manifest::{self, ObjectRef, SCHEMA};
 use super::tensors::{TensorReader, TensorWriter};
 use super::{ATTEMPTS, Error, Kind, Published, Store, revision_path};
-use crate::features::{FeatureSource, Features};
-use crate::geometry::{Pose, nearest_rotation};
-use crate::room::{Frames, Room, RoomId, is_plain_name};
+use seese3_core::adapter::TrainingRecord;
+use seese3_core::eval::TrainedOn;
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::{Pose, nearest_rotation};
+use seese3_core::room::{Frames, Room, RoomId, is_plain_name};
 
-/// A room as it was stored.
+/// A room that was loaded from the store, with its features.
 #[derive(Debug, Clone)]
 pub struct StoredRoom {
     /// The room.
@@ -19,31 +21,59 @@ pub struct StoredRoom {
     pub revision: u64,
     /// When it was published, RFC 3339.
     pub created: String,
-    /// All its features, or those that were asked for.
+    /// All features of the room, or only those that were requested.
     pub features: Vec<Features>,
 }
 
-/// What a manifest says of a room.
+/// A summary of a room, read from its manifest alone.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RoomSummary {
     /// Its name.
     pub room: String,
     /// The newest revision.
     pub revision: u64,
-    /// Its frames.
+    /// The number of frames.
     pub frame_count: usize,
-    /// What its features were made by.
+    /// The source of each set of features.
     pub features: Vec<FeatureSource>,
 }
 
+/// The objects of a room that a manifest names.
+struct RoomObjects {
+    frames: ObjectRef,
+    frame_names: Option<ObjectRef>,
+    images: Option<ObjectRef>,
+    features: Vec<FeaturesEntry>,
+}
+
+/// The features of the newest revision that are not published anew.
+fn features_to_keep(newest: &RoomBody, published: &[FeaturesEntry]) -> Vec<FeaturesEntry> {
+    let is_published = |entry: &&FeaturesEntry| {
+        published
+            .iter()
+            .any(|other| other.source.name() == entry.source.name())
+    };
+
+    newest
+        .features
+        .iter()
+        .filter(|entry| !is_published(entry))
+        .cloned()
+        .collect()
+}
+
 impl Store {
-    /// Publishes a room with features. What the newest revision has besides, features of other
-    /// names, timestamps, images and the like, stays with the room as long as its poses are the
-    /// same; publishing the same again makes no revision.
+    /// Publishes a room with features as a new revision.
+    ///
+    /// If the newest revision has the same poses, everything in it that this call does not give
+    /// (features of other names, timestamps, images and the like) is carried over. Publishing the
+    /// same content again creates no revision.
     ///
     /// # Errors
-    /// [`Error::FeatureRows`], [`Error::DuplicateFeatures`], [`Error::Name`], or as the store
-    /// fails.
+    /// [`Error::FeatureRows`], [`Error::DuplicateFeatures`] or [`Error::Name`] if the features do
+    /// not fit the room, see [`check_features`]; [`Error::Contended`] if other publishers took
+    /// every revision number that was tried; otherwise as [`Store::load_room`] if the newest
+    /// revision cannot be read, or [`Error::Io`] if the store cannot be written.
     pub async fn publish_room(
         &self,
         room: &Room,
@@ -51,44 +81,19 @@ impl Store {
     ) -> Result<Published, Error> {
         check_features(room, features)?;
         let folder = Path::from(Kind::Room.folder()).join(room.id().as_str());
+
+        // A room that is imported again, for instance without its images, must not lose what was
+        // known of it. What it leaves empty is filled in from the newest revision.
         let (room, known) = &self.with_what_is_known(&folder, room).await?;
 
-        let frames = match known {
-            Some(frames) => frames.clone(),
-            None => {
-                self.write_object(&folder, "frames", "safetensors", frames_file(room)?)
-                    .await?
-            }
-        };
+        // All objects are written before the manifest that names them. If the program stops in
+        // between, they are never read.
+        let objects = self
+            .write_objects(&folder, room, known.as_ref(), features)
+            .await?;
 
-        let frame_names = match room.frame_names() {
-            [] => None,
-            names => Some(
-                self.write_object(&folder, "frame-names", "json", names_file(names)?)
-                    .await?,
-            ),
-        };
-
-        let images = match room.images() {
-            [] => None,
-            images => Some(
-                self.write_object(&folder, "images", "json", names_file(images)?)
-                    .await?,
-            ),
-        };
-
-        let mut entries = Vec::with_capacity(features.len());
-        for set in features {
-            let stem = format!("features-{}", set.source().name);
-            let object = self
-                .write_object(&folder, &stem, "safetensors", features_file(set)?)
-                .await?;
-            entries.push(FeaturesEntry {
-                source: set.source().into(),
-                object,
-            });
-        }
-
+        // Optimistic concurrency: build the manifest on the newest revision and try to create the
+        // next one. If another publisher was faster, start again from its revision.
         for _ in 0..ATTEMPTS {
             let newest = match self.revisions(&folder).await?.last() {
                 Some(&revision) => Some(self.room_body(&folder, revision).await?),
@@ -101,34 +106,27 @@ impl Store {
                 revision: newest.as_ref().map_or(1, |body| body.revision + 1),
                 created: chrono::Utc::now().to_rfc3339(),
                 frame_count: room.frame_count(),
-                frames: frames.clone(),
-                frame_names: frame_names.clone(),
-                images: images.clone(),
-                features: entries.clone(),
+                frames: objects.frames.clone(),
+                frame_names: objects.frame_names.clone(),
+                images: objects.images.clone(),
+                features: objects.features.clone(),
                 provenance: room.provenance().into(),
             };
 
+            // Row i of the features belongs to frame i. Features published earlier therefore stay
+            // valid as long as the poses are the same.
             if let Some(newest) = &newest
                 && (newest.frames == body.frames || self.has_poses(&folder, newest, room).await?)
             {
-                let given = |entry: &FeaturesEntry| {
-                    entries
-                        .iter()
-                        .any(|e| e.source.name() == entry.source.name())
-                };
-
-                body.features.extend(
-                    newest
-                        .features
-                        .iter()
-                        .filter(|entry| !given(entry))
-                        .cloned(),
-                );
+                body.features
+                    .extend(features_to_keep(newest, &objects.features));
             }
 
+            // In a fixed order the same content compares equal, whoever published it.
             body.features
                 .sort_by(|a, b| a.source.name().cmp(b.source.name()));
 
+            // Content that differs only in the revision number and the date is not published again.
             if let Some(newest) = newest {
                 let same = RoomBody {
                     revision: newest.revision,
@@ -164,18 +162,83 @@ impl Store {
         })
     }
 
-    /// Loads a room, its newest revision if none is named, with all its features.
+    /// Writes the objects of a room. `known_frames` are those of the newest revision, if the room has
+    /// the same.
+    async fn write_objects(
+        &self,
+        folder: &Path,
+        room: &Room,
+        known_frames: Option<&ObjectRef>,
+        features: &[Features],
+    ) -> Result<RoomObjects, Error> {
+        let frames = match known_frames {
+            Some(frames) => frames.clone(),
+            None => {
+                self.write_object(folder, "frames", "safetensors", frames_file(room)?)
+                    .await?
+            }
+        };
+        let frame_names = self
+            .write_names(folder, "frame-names", room.frame_names())
+            .await?;
+        let images = self.write_names(folder, "images", room.images()).await?;
+
+        // Every set of features is an object of its own, so that a later revision can refer to it
+        // without copying.
+        let mut entries = Vec::with_capacity(features.len());
+        for set in features {
+            let stem = format!("features-{}", set.source().name);
+            let object = self
+                .write_object(folder, &stem, "safetensors", features_file(set)?)
+                .await?;
+            entries.push(FeaturesEntry {
+                source: set.source().into(),
+                object,
+            });
+        }
+
+        Ok(RoomObjects {
+            frames,
+            frame_names,
+            images,
+            features: entries,
+        })
+    }
+
+    /// Writes a list of names, if there are any.
+    async fn write_names(
+        &self,
+        folder: &Path,
+        stem: &str,
+        names: &[String],
+    ) -> Result<Option<ObjectRef>, Error> {
+        if names.is_empty() {
+            return Ok(None);
+        }
+
+        let object = self
+            .write_object(folder, stem, "json", names_file(names)?)
+            .await?;
+        Ok(Some(object))
+    }
+
+    /// Loads a room with all its features: the given revision, or the newest if none is given.
     ///
     /// # Errors
-    /// [`Error::Unknown`], [`Error::UnknownRevision`], [`Error::Damaged`], or as the store fails.
+    /// [`Error::Unknown`] if there is no such room, [`Error::UnknownRevision`] if it has no such
+    /// revision, [`Error::Damaged`] if a file is truncated or altered, [`Error::Schema`] if a newer
+    /// program wrote it, [`Error::Io`] if a file cannot be read.
     pub async fn load_room(&self, name: &str, revision: Option<u64>) -> Result<StoredRoom, Error> {
         self.load(name, revision, None).await
     }
 
-    /// Loads a room with one of its features; the only one, if no name is given.
+    /// Loads the newest revision of a room with one set of features: the named one, or the only one
+    /// if no name is given. The features are returned beside the room, whose own list is empty.
     ///
     /// # Errors
-    /// As [`Store::load_room`], and [`Error::UnknownFeatures`].
+    /// As [`Store::load_room`]; also [`Error::UnknownFeatures`] if the room has no features of this
+    /// name, and [`Error::WhichFeatures`] if no name is given and the room does not have exactly
+    /// one set.
     pub async fn load_room_with(
         &self,
         name: &str,
@@ -195,6 +258,7 @@ impl Store {
             known: known.clone(),
         };
 
+        // Without a name, the choice must be unambiguous.
         let wanted = match (features, known.as_slice()) {
             (Some(wanted), _) if known.iter().any(|name| name == wanted) => wanted.to_owned(),
             (Some(wanted), _) => return Err(unknown(wanted)),
@@ -207,17 +271,41 @@ impl Store {
             }
         };
 
+        // Load exactly the revision whose features were listed above: a newer one may have been
+        // published since.
         let mut stored = self.load(name, Some(revision), Some(&wanted)).await?;
         let features = stored.features.pop().ok_or_else(|| unknown(&wanted))?;
 
         Ok((stored, features))
     }
 
-    /// Whether two revisions of a room have the same frames; false when one of them is not there
-    /// any more.
+    /// What an adapter has seen of a revision of a room. A room imported again has a new revision but
+    /// often the same frames, so the frames are compared and not the numbers of the revisions.
     ///
     /// # Errors
-    /// [`Error::Damaged`], or as the store fails.
+    /// As [`Store::same_frames`].
+    pub async fn trained_on(
+        &self,
+        record: &TrainingRecord,
+        room: &RoomId,
+        revision: u64,
+    ) -> Result<TrainedOn, Error> {
+        let Some((name, trained)) = record.rooms.iter().find(|(name, _)| name == room) else {
+            return Ok(TrainedOn::Nothing);
+        };
+
+        if self.same_frames(name.as_str(), *trained, revision).await? {
+            Ok(TrainedOn::TheseFrames)
+        } else {
+            Ok(TrainedOn::OtherFrames)
+        }
+    }
+
+    /// Whether two revisions of a room have the same frames. False if one of them no longer exists.
+    ///
+    /// # Errors
+    /// [`Error::Damaged`] if a manifest is truncated or altered, [`Error::Schema`] if a newer
+    /// program wrote it, [`Error::Io`] if the store cannot be read.
     pub async fn same_frames(&self, name: &str, one: u64, other: u64) -> Result<bool, Error> {
         if one == other {
             return Ok(true);
@@ -232,16 +320,18 @@ impl Store {
             return Ok(false);
         }
 
+        // The references contain checksums, so the frames themselves need not be read.
         let one = self.room_body(&folder, one).await?;
         let other = self.room_body(&folder, other).await?;
 
         Ok(one.frames == other.frames)
     }
 
-    /// What the newest manifest of every room says, by name.
+    /// A summary of the newest revision of every room, sorted by name.
     ///
     /// # Errors
-    /// [`Error::Damaged`], or as the store fails.
+    /// [`Error::Damaged`] if a manifest is truncated or altered, [`Error::Schema`] if a newer
+    /// program wrote it, [`Error::Io`] if the store cannot be read.
     pub async fn rooms(&self) -> Result<Vec<RoomSummary>, Error> {
         let mut summaries = Vec::new();
         for room in self.names(Kind::Room).await? {
@@ -264,9 +354,9 @@ impl Store {
         Ok(summaries)
     }
 
-    /// A room with what the newest revision knows of the same frames and it does not say itself;
-    /// and that revision's object of frames, where it says all of it: poses that are the same but
-    /// for rounding are not written again.
+    /// Fills in what a room leaves empty from the newest revision, if that has the same poses. Also
+    /// returns that revision's frames object if it already holds every column of the result, so
+    /// that poses that differ only by rounding are not written again.
     async fn with_what_is_known(
         &self,
         folder: &Path,
@@ -277,10 +367,12 @@ impl Store {
         };
         let body = self.room_body(folder, newest).await?;
 
+        // Other poses mean another recording under the same name, so nothing is carried over.
         if !self.has_poses(folder, &body, room).await? {
             return Ok((room.clone(), None));
         }
 
+        // No set of features has an empty name: this loads the room without any features.
         let known = self
             .load(room.id().as_str(), Some(newest), Some(""))
             .await?
@@ -297,6 +389,7 @@ impl Store {
         let given = room.frames();
         let before = known.frames();
 
+        // A column that is given takes precedence over the stored one.
         let frames = Frames {
             poses: given.poses.clone(),
             timestamps_ns: either(&given.timestamps_ns, &before.timestamps_ns),
@@ -307,6 +400,8 @@ impl Store {
             held_out: either(&given.held_out, &before.held_out),
         };
 
+        // Besides the poses, only these columns are in the frames object. Names and images are
+        // objects of their own.
         let columns = |frames: &Frames| {
             let Frames {
                 timestamps_ns,
@@ -319,19 +414,22 @@ impl Store {
             (timestamps_ns, numbers, sequences, held_out)
         };
 
+        // The poses are known to agree up to rounding. If the other columns agree too, the stored
+        // object is kept, and comparing revisions by checksum still finds the same frames.
         let object = (columns(&frames) == columns(before)).then_some(body.frames);
         let mut provenance = room.provenance().clone();
         if provenance.licence.is_empty() {
             provenance.licence.clone_from(&known.provenance().licence);
         }
 
+        // Image paths are relative to the images root, so both come from the same revision.
         if given.images.is_empty() {
             provenance
                 .images_root
                 .clone_from(&known.provenance().images_root);
         }
 
-        let damaged = |error: crate::room::Error| Error::Damaged {
+        let damaged = |error: seese3_core::room::Error| Error::Damaged {
             file: self.shown(folder),
             problem: error.to_string(),
         };
@@ -342,10 +440,14 @@ impl Store {
         ))
     }
 
-    /// Whether a stored revision has a room's poses, whatever else it says of the frames.
+    /// Whether a stored revision has the poses of a room, up to rounding. Other columns are not
+    /// compared.
     async fn has_poses(&self, folder: &Path, body: &RoomBody, room: &Room) -> Result<bool, Error> {
         let (file, bytes) = self.read_object(folder, &body.frames).await?;
         let stored = read_frames(&file, &bytes)?.poses;
+
+        // A stored rotation is projected and converted to a quaternion when it is read, so equal
+        // poses agree only up to rounding.
         let same =
             |(a, b): (&Pose, &Pose)| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-12;
 
@@ -372,9 +474,13 @@ impl Store {
         };
         let id = RoomId::new(&body.room).map_err(|error| damaged(error.to_string()))?;
 
+        // The checksums show that the files are intact; `Room::new` checks that they form a room,
+        // for instance that all columns are equally long.
         let room = Room::new(id, frames, body.provenance.into())
             .map_err(|error| damaged(error.to_string()))?;
         let mut features = Vec::new();
+
+        // `only` selects one set by its name. Without it, every set is loaded.
         for entry in body
             .features
             .into_iter()
@@ -387,6 +493,7 @@ impl Store {
                 problem: error.to_string(),
             })?;
 
+            // The two objects are intact each by itself, but they must also belong together.
             if set.rows().nrows() != room.frame_count() {
                 let problem = format!(
                     "has {} rows, the room {} frames",
@@ -433,15 +540,17 @@ impl Store {
     }
 }
 
-/// Refuses features that could not be published with a room, before anything is written.
+/// Checks that features can be published with a room, before anything is written.
 ///
 /// # Errors
-/// [`Error::Name`], [`Error::DuplicateFeatures`] or [`Error::FeatureRows`].
+/// [`Error::Name`] if a name cannot be part of a file name, [`Error::DuplicateFeatures`] if two
+/// sets have the same name, [`Error::FeatureRows`] if a set does not have one row per frame.
 pub fn check_features(room: &Room, features: &[Features]) -> Result<(), Error> {
     for (position, set) in features.iter().enumerate() {
         let name = set.source().name.clone();
         let rows = set.rows().nrows();
 
+        // The name becomes part of the name of a file in the store.
         if !is_plain_name(&name) {
             return Err(Error::Name {
                 what: "features",
@@ -476,6 +585,7 @@ fn frames_file(room: &Room) -> Result<Vec<u8>, Error> {
     let n = room.frame_count();
     let mut tensors = TensorWriter::default();
 
+    // nalgebra stores a matrix by column; the transpose gives the rows that NumPy expects.
     let rows = room
         .poses()
         .iter()
@@ -487,6 +597,8 @@ fn frames_file(room: &Room) -> Result<Vec<u8>, Error> {
     }
 
     let frames = room.frames();
+
+    // A column that the recording does not have is left out of the file and read back as empty.
     for (name, values) in [
         ("numbers", frames.numbers.clone()),
         (
@@ -546,11 +658,13 @@ fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
         return Err(damaged("'world_from_camera' is not (n, 4, 4)".to_owned()));
     }
 
+    // The stored entries carry rounding errors. Projection onto SO(3) makes the rotation exact
+    // before it becomes a quaternion.
     let pose = |(row, matrix): (usize, ndarray::ArrayView1<'_, f64>)| {
         let m = nalgebra::Matrix4::from_row_iterator(matrix.iter().copied());
         let rotation = nearest_rotation(&m.fixed_view::<3, 3>(0, 0).into_owned());
         let rotation = rotation
-            .ok_or_else(|| damaged(format!("frame {row} has no rotation")))?
+            .ok_or_else(|| damaged(format!("frame {row} has no valid rotation")))?
             .rotation;
         let quaternion = nalgebra::UnitQuaternion::from_rotation_matrix(&rotation);
 
@@ -566,6 +680,7 @@ fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
         .map(pose)
         .collect::<Result<_, Error>>()?;
 
+    // These tensors are optional: a missing one means that the recording has no such data.
     let column = |name: &str| -> Result<Vec<i64>, Error> {
         Ok(if tensors.has(name) {
             tensors.i64(name)?.iter().copied().collect()
@@ -575,7 +690,7 @@ fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
     };
 
     let sequence = |value: i64| {
-        u32::try_from(value).map_err(|_| damaged(format!("{value} numbers no sequence")))
+        u32::try_from(value).map_err(|_| damaged(format!("{value} is no sequence number")))
     };
 
     Ok(Frames {
@@ -590,13 +705,14 @@ fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
             .into_iter()
             .map(|mark| mark != 0)
             .collect(),
+        // Names and images are JSON objects of their own, which `load` reads.
         names: Vec::new(),
         images: Vec::new(),
     })
 }
 
 impl StoredRoom {
-    /// The features of this name.
+    /// The set of features with this name, if it was loaded.
     pub fn features(&self, name: &str) -> Option<&Features> {
         self.features
             .iter()

@@ -1,4 +1,4 @@
-//! Arrays on disk: safetensors.
+//! Reading and writing named arrays as safetensors files.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use safetensors::tensor::{Dtype, TensorView};
 
 use super::Error;
 
-/// Tensors by name, to be written.
+/// Collects named tensors and serialises them into one file.
 #[derive(Default)]
 pub struct TensorWriter(BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>);
 
@@ -46,7 +46,7 @@ impl TensorWriter {
         );
     }
 
-    /// The file's bytes.
+    /// Serialises the collected tensors. `file` is the name used in errors.
     pub fn finish(self, file: &str) -> Result<Vec<u8>, Error> {
         let damaged = |problem: String| Error::Damaged {
             file: file.to_owned(),
@@ -64,7 +64,7 @@ impl TensorWriter {
     }
 }
 
-/// A safetensors file that was read.
+/// The tensors of a safetensors file in memory.
 pub struct TensorReader<'a> {
     file: &'a str,
     tensors: SafeTensors<'a>,
@@ -95,7 +95,8 @@ impl<'a> TensorReader<'a> {
         self.rows(name, Dtype::I64, i64::from_le_bytes)
     }
 
-    /// A tensor as rows: a vector is one row, the last axes of a stack are laid end to end.
+    /// A tensor as a matrix: a scalar becomes (1, 1), a vector (n,) becomes (1, n), and a tensor
+    /// (n, a, b, …) becomes (n, a·b·…).
     fn rows<T, const N: usize>(
         &self,
         name: &str,
@@ -111,6 +112,8 @@ impl<'a> TensorReader<'a> {
             .tensor(name)
             .map_err(|_| damaged(format!("has no tensor '{name}'")))?;
 
+        // Every tensor of the schema has exactly one type. A file with another type is refused, not
+        // converted.
         if tensor.dtype() != dtype {
             return Err(damaged(format!(
                 "tensor '{name}' is {:?}, expected {dtype:?}",
@@ -118,6 +121,8 @@ impl<'a> TensorReader<'a> {
             )));
         }
 
+        // The bytes are little-endian and need not be aligned, so each number is decoded from its
+        // own `N` bytes.
         let values = tensor
             .data()
             .as_chunks::<N>()

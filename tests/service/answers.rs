@@ -1,7 +1,7 @@
 //! What the server answers is what the oracles and the definitions say.
 
-use seese3::proto::v1 as pb;
 use seese3::service::Config;
+use seese3_client::proto::v1 as pb;
 
 use crate::harness::{
     by_twist, feature, feature_row, frame, latent, oracle, question, start, to_frame, twist,
@@ -675,9 +675,9 @@ async fn the_catalog_lists_what_the_store_has() {
 
 /// Oracle: the exact index.
 #[tokio::test]
-async fn the_hnsw_index_gives_the_exact_indexs_answers_here_and_says_what_it_is() {
-    use seese3::index::HnswParameters;
-    use seese3::navigation::IndexKind;
+async fn the_hnsw_index_answers_as_the_exact_one_here_and_says_what_it_is() {
+    use seese3_core::index::HnswParameters;
+    use seese3_core::navigation::IndexKind;
 
     let index = IndexKind::Hnsw(HnswParameters::default());
     let exact = start(Config::default()).await;

@@ -1,9 +1,10 @@
 //! Walking to a goal over the wire.
 
-use seese3::geometry::PoseError;
-use seese3::proto::v1 as pb;
-use seese3::proto::v1::navigate_to_request::Goal;
-use seese3::service::{Config, pose_from_wire};
+use seese3::service::Config;
+use seese3_client::convert;
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::navigate_to_request::Goal;
+use seese3_core::geometry::PoseError;
 use tonic::Code;
 
 use crate::harness::{feature, features_of, frame, room_of, start};
@@ -38,7 +39,7 @@ async fn a_goal_is_reached_frame_by_frame() {
             assert!(step.current_step as usize >= number && step.navigation_time_ns > 0);
 
             let Some(hit) = &step.current else { continue };
-            let pose = pose_from_wire(hit.pose.clone().unwrap(), "synthetic").unwrap();
+            let pose = convert::pose(&hit.pose.clone().unwrap()).unwrap();
             let error = PoseError::between(&pose, &goal);
 
             assert!((error.translation_m - step.distance_remaining_m).abs() < 1e-12);
@@ -63,6 +64,44 @@ async fn a_goal_is_reached_frame_by_frame() {
     assert!(reached >= 3, "{reached} of 4 goals were reached");
 }
 
+/// Oracle: the definition: the first recovery is the last step where none is allowed, and a pursuit
+/// that is allowed more goes on.
+#[tokio::test]
+async fn a_pursuit_recovers_as_often_as_it_may() {
+    let server = start(Config::default()).await;
+    let mut stopped = 0;
+    let mut went_on = 0;
+
+    for (from, to) in [(10, 300), (100, 400), (300, 20), (480, 100), (250, 450)] {
+        for max_recoveries in [0, 50] {
+            let asked = pb::NavigateToRequest {
+                max_recoveries: Some(max_recoveries),
+                ..question(frame(from), Goal::GoalFrameId(to))
+            };
+            let mut recoveries = Vec::new();
+            let result = server
+                .client
+                .navigate_to(asked, |step| recoveries.push(step.number_of_recoveries))
+                .await
+                .unwrap();
+
+            let recovered = recoveries.iter().filter(|&&count| count > 0).count();
+            if max_recoveries == 0 {
+                assert!(recovered <= 1, "{from} to {to}: {recoveries:?}");
+                let is_stuck = result.outcome() == pb::NavigateToOutcome::Stuck;
+                stopped += usize::from(recovered == 1 && is_stuck);
+            } else {
+                went_on += usize::from(recovered > 1);
+            }
+        }
+    }
+
+    assert!(
+        stopped > 0 && went_on > 0,
+        "{stopped} pursuits were stopped by a recovery, {went_on} went on: the test shows nothing"
+    );
+}
+
 /// Oracle: the definitions of the bounds.
 #[tokio::test]
 async fn a_pursuit_ends_at_its_bounds() {
@@ -85,9 +124,14 @@ async fn a_pursuit_ends_at_its_bounds() {
         tolerance_rad: 1e-6,
         ..question(frame(10), Goal::GoalFrameId(300))
     };
-    let spent = server.client.navigate_to(asked, |_| ()).await.unwrap();
-
-    assert_ne!(spent.outcome(), pb::NavigateToOutcome::Reached);
+    let mut steps = Vec::new();
+    let spent = server
+        .client
+        .navigate_to(asked, |step| steps.push(step.current_step))
+        .await
+        .unwrap();
+    assert_eq!(spent.outcome(), pb::NavigateToOutcome::StepsSpent);
+    assert_eq!(steps, [0, 1], "the start, and the one step that is allowed");
 
     let seen = feature(features_of("synthetic").rows().row(40).to_vec());
     let near = server

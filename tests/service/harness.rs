@@ -3,17 +3,17 @@
 use std::time::Duration;
 
 use ndarray::Array2;
-use seese3::adapter::{
-    Adapter, PairPlan, Samples, Siamese, TENSOR_NAMES, TrainConfig, TrainingRecord,
-};
-use seese3::client::Client;
-use seese3::features::{FeatureSource, Features};
-use seese3::pairs::Split;
-use seese3::proto::v1 as pb;
-use seese3::room::{Frames, Provenance, Room, RoomId, Timeline};
-use seese3::scores::MotionScores;
 use seese3::service::{Config, RunError, run};
 use seese3::store::Store;
+use seese3_client::Client;
+use seese3_client::proto::v1 as pb;
+use seese3_core::adapter::{
+    Adapter, PairPlan, Samples, Siamese, TENSOR_NAMES, TrainConfig, TrainingRecord,
+};
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::motion_scores::MotionScores;
+use seese3_core::room::{Frames, Provenance, Room, RoomId, Timeline};
+use seese3_core::splits::Split;
 use tokio::net::TcpListener;
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;

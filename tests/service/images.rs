@@ -5,17 +5,17 @@ use std::path::PathBuf;
 
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use ndarray::Array2;
-use seese3::adapter::Preset;
 use seese3::encoder::{Bounds, Encoder, Runtime, RuntimeKind};
-use seese3::features::Features;
-use seese3::image::RgbImage;
-use seese3::pairs::Split;
-use seese3::proto::v1 as pb;
-use seese3::room::{Frames, Provenance, Room, RoomId};
 use seese3::service::{Config, ImageEncoders};
 use seese3::store::Store;
-use seese3::studio::{Camera, Scene, camera_path, render};
-use seese3::training::{Lesson, Recipe, learn};
+use seese3_client::proto::v1 as pb;
+use seese3_core::adapter::Preset;
+use seese3_core::features::Features;
+use seese3_core::image::RgbImage;
+use seese3_core::room::{Frames, Provenance, Room, RoomId};
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
+use seese3_lab::studio::{Camera, Scene, camera_path, render};
 use tonic::Code;
 
 use crate::harness::{TestServer, frame, start_on, to_frame};
@@ -57,15 +57,15 @@ async fn drawn_store() -> (tempfile::TempDir, Store, Vec<RgbImage>) {
         .await
         .unwrap();
 
-    let mut recipe = Recipe::of(Preset::PaperBase, Split::Time, 10, 0);
-    recipe.config.epochs = 2;
+    let mut plan = TrainingPlan::of(Preset::PaperBase, Split::Time, 10, 0);
+    plan.config.epochs = 2;
 
-    let lesson = Lesson {
+    let data = RoomData {
         room: &room,
         revision: 1,
         features: &features,
     };
-    let (adapter, record) = learn(&[lesson], &recipe, &mut |_| ()).unwrap();
+    let (adapter, record) = train_adapter(&[data], &plan, &mut |_| ()).unwrap();
     store
         .publish_adapter("eyes", &adapter, &record, features.rows())
         .await
@@ -198,7 +198,7 @@ async fn an_image_is_answered_as_its_frame_is() {
 }
 
 fn refused<T: std::fmt::Debug>(
-    answer: Result<T, seese3::client::Error>,
+    answer: Result<T, seese3_client::Error>,
     code: Code,
     words: &[&str],
 ) {
@@ -210,7 +210,7 @@ fn refused<T: std::fmt::Debug>(
     }
 }
 
-/// Oracle: the list of bad visitors: no image, a cut one, one too large, and a server without that
+/// Oracle: a list of bad images: no image, a cut one, one too large, and a server without that
 /// encoder.
 #[tokio::test]
 async fn images_that_cannot_be_answered_are_refused_by_field() {

@@ -2,12 +2,12 @@
 
 use std::time::{Duration, Instant};
 
-use seese3::client::Client;
-use seese3::proto::v1 as pb;
-use seese3::proto::v1::evaluation_service_client::EvaluationServiceClient;
-use seese3::proto::v1::navigation_service_client::NavigationServiceClient;
 use seese3::service::{Config, RunError, run};
 use seese3::store::Store;
+use seese3_client::Client;
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::evaluation_service_client::EvaluationServiceClient;
+use seese3_client::proto::v1::navigation_service_client::NavigationServiceClient;
 use tokio::net::TcpListener;
 use tokio_stream::StreamExt;
 use tonic::transport::{Channel, Endpoint};
@@ -102,7 +102,7 @@ async fn health_answers_for_the_server_its_services_and_its_rooms() {
         .unwrap();
 }
 
-/// Oracle: the issue: NOT_SERVING until all is loaded, and a store that is damaged ends the server
+/// Oracle: the promise of the deployment's page: NOT_SERVING until all is loaded, and a store that is damaged ends the server
 /// with its file.
 #[tokio::test]
 async fn a_damaged_store_never_serves() {
@@ -201,7 +201,7 @@ async fn reflection_lists_the_services_in_both_versions() {
 /// DEADLINE_EXCEEDED, and the only thread is free again at once.
 #[tokio::test]
 async fn a_deadline_ends_the_work() {
-    let limits = seese3::navigation::Limits {
+    let limits = seese3_core::navigation::Limits {
         steps: 4_000_000_000,
         hits: 1_000,
         hits_in_all: u64::MAX,
@@ -308,7 +308,7 @@ async fn every_answer_carries_a_request_id() {
 /// the server ends; when it does not end in time, the bound does.
 #[tokio::test]
 async fn stopping_answers_what_is_in_flight_within_a_bound() {
-    let limits = seese3::navigation::Limits {
+    let limits = seese3_core::navigation::Limits {
         steps: 4_000_000_000,
         hits: 1_000,
         hits_in_all: u64::MAX,

@@ -1,4 +1,11 @@
 //! The service over a real server on a free port, asked through the real client.
+#![allow(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::too_many_lines,
+    reason = "a failed step is a failed run here, and a case may be long"
+)]
 
 #[path = "../support/mod.rs"]
 mod support;

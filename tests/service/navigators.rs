@@ -1,9 +1,9 @@
 //! Every navigator over the wire: correctors, refits, metrics, mixtures.
 
-use seese3::adapter::{Adapter, Corrector, CorrectorKind, Error, Mixing, Mixture};
-use seese3::proto::v1 as pb;
 use seese3::service::Config;
 use seese3::store::Store;
+use seese3_client::proto::v1 as pb;
+use seese3_core::adapter::{Adapter, Corrector, CorrectorKind, Error, Mixing, Mixture};
 
 use crate::harness::{
     TestServer, features_of, frame, latent, oracle, oracle_adapter, question, record, room_of,

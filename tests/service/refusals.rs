@@ -1,8 +1,8 @@
 //! Bad visitors: each gets the right code and the field to change, and the server goes on.
 
-use seese3::client::Error;
-use seese3::proto::v1 as pb;
 use seese3::service::Config;
+use seese3_client::Error;
+use seese3_client::proto::v1 as pb;
 use tonic::Code;
 
 use crate::harness::{
@@ -37,7 +37,7 @@ fn level(x: f64) -> pb::Pose {
     }
 }
 
-/// Oracle: the list of bad input, field by field.
+/// Oracle: a list of bad input, field by field: what each field may be stands in the protos.
 #[tokio::test]
 async fn navigate_names_the_field() {
     use Code::{InvalidArgument, NotFound};

@@ -7,35 +7,26 @@ use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Ix2};
 use safetensors::{Dtype, SafeTensors};
-use seese3::geometry::{Pose, nearest_rotation};
+use seese3_core::geometry::{Pose, nearest_rotation};
 
-/// The folder of large inputs outside the repository: `SEESE3_SHARED`, else `../shared`. None when
-/// it is absent.
-pub fn shared() -> Option<PathBuf> {
+/// The folder of large inputs outside the repository: `SEESE3_SHARED`, else `../shared`.
+///
+/// # Panics
+/// When it is absent: tests that need it are ignored unless asked for.
+pub fn shared() -> PathBuf {
     let given = std::env::var_os("SEESE3_SHARED").map(PathBuf::from);
     let folder = given.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"));
-    folder.is_dir().then_some(folder)
-}
-
-/// Says that a test that needs the folder of large inputs was skipped.
-pub fn skipped(test: &str) {
-    eprintln!("SKIPPED {test}: no folder SEESE3_SHARED or ../shared");
+    assert!(
+        folder.is_dir(),
+        "no folder {}: name the folder of large inputs in SEESE3_SHARED",
+        folder.display()
+    );
+    folder
 }
 
 /// The committed oracles.
 pub fn golden() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden")
-}
-
-/// Every room that has oracles: the committed synthetic one, and the real one where it is.
-pub fn oracle_rooms(test: &str) -> Vec<(&'static str, PathBuf)> {
-    let mut rooms = vec![("synthetic", golden())];
-    match shared() {
-        Some(folder) => rooms.push(("real", folder.join("oracles"))),
-        None => skipped(&format!("{test} (its real half)")),
-    }
-
-    rooms
 }
 
 /// A float array of a NumPy file.

@@ -1,12 +1,13 @@
 //! Made-up places that a camera sways in, and an adapter whose errors were measured there: what
 //! following is tested with.
 
-use seese3::adapter::{Adapter, Preset, TrainingRecord};
-use seese3::features::{FeatureSource, Features};
-use seese3::geometry::Pose;
-use seese3::pairs::Split;
-use seese3::room::{Frames, Provenance, Room, RoomId};
-use seese3::training::{Lesson, Recipe, calibrate, learn};
+use seese3_core::adapter::{Adapter, Preset, TrainingRecord};
+use seese3_core::calibration::calibrate;
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::Pose;
+use seese3_core::room::{Frames, Provenance, Room, RoomId};
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 
 pub const FRAMES: usize = 300;
 const COLUMNS: usize = 48;
@@ -66,32 +67,33 @@ pub fn served(name: &str) -> (Room, Features) {
 /// An adapter learned in both, its errors measured in four others.
 pub fn calibrated() -> (Adapter, TrainingRecord) {
     let learned = [served("hall"), served("attic"), place("barn", 3)];
-    let mut recipe = Recipe::of(Preset::PaperBase, Split::Whole, 10, 0);
-    recipe.config.epochs = 60;
+    let mut plan = TrainingPlan::of(Preset::PaperBase, Split::Whole, 10, 0);
+    plan.config.epochs = 60;
 
-    let lessons: Vec<Lesson<'_>> = learned
+    let room_data: Vec<RoomData<'_>> = learned
         .iter()
-        .map(|(room, features)| Lesson {
+        .map(|(room, features)| RoomData {
             room,
             revision: 1,
             features,
         })
         .collect();
 
-    let (adapter, record) = learn(&lessons, &recipe, &mut |_| ()).unwrap();
+    let (adapter, record) = train_adapter(&room_data, &plan, &mut |_| ()).unwrap();
     let others: Vec<(Room, Features)> = (10..14)
         .map(|seed| place(&format!("other{seed}"), seed))
         .collect();
 
-    let lessons: Vec<Lesson<'_>> = others
+    let room_data: Vec<RoomData<'_>> = others
         .iter()
-        .map(|(room, features)| Lesson {
+        .map(|(room, features)| RoomData {
             room,
             revision: 1,
             features,
         })
         .collect();
 
-    let calibration = calibrate(&adapter, &record, &lessons).unwrap();
-    (adapter.with_calibration(calibration).unwrap(), record)
+    let (adapter, report) = calibrate(adapter, &record, &room_data).unwrap();
+    assert!(report.can_track);
+    (adapter, record)
 }

@@ -1,5 +1,5 @@
-//! `seese3 evaluate`: the paper's navigation table on a room's held-out motions, and the errors of
-//! paths.
+//! `seese3 evaluate`: the paper's navigation table on a room's held-out pairs, and the errors of
+//! estimated trajectories.
 
 mod odometry;
 mod trajectory;
@@ -15,13 +15,15 @@ use super::ask::ModeName;
 use super::progress::bar;
 use super::protocol::SplitName;
 use super::{check_writable, say, write_json};
-use crate::adapter::TrainingRecord;
-use crate::cancel::Cancellation;
-use crate::eval::{NavigatorKind, Protocol, evaluate};
-use crate::navigation::{IndexKind, Navigator};
-use crate::pairs::Split;
-use crate::report::{evaluation_json, evaluation_table};
 use crate::store::{Store, StoredAdapter};
+use seese3_core::adapter::TrainingRecord;
+use seese3_core::cancel::Cancellation;
+use seese3_core::eval::{Leak, Protocol, TrainedOn, evaluate, is_calibrated_in};
+use seese3_core::navigation::NavigatorKind;
+use seese3_core::navigation::{IndexKind, Navigator};
+use seese3_core::room::RoomId;
+use seese3_core::splits::Split;
+use seese3_lab::report::{evaluation_json, evaluation_table};
 
 #[derive(Debug, Args)]
 #[command(args_conflicts_with_subcommands = true)]
@@ -34,9 +36,9 @@ pub struct Evaluate {
 
 #[derive(Debug, Subcommand)]
 enum What {
-    /// Follow held-out frames: paths, covariances, what is lost, and which room it is
+    /// Track held-out frames of rooms: path errors, covariances, tracking status, relocalisation
     Odometry(odometry::Odometry),
-    /// APE and RPE of a path against the true one, as evo takes them
+    /// APE and RPE of an estimated trajectory against the true one, as evo defines them
     Trajectory(trajectory::Trajectory),
 }
 
@@ -53,7 +55,7 @@ impl Evaluate {
     }
 }
 
-/// The navigation table.
+/// Options of the navigation table.
 #[derive(Debug, Args)]
 struct Navigation {
     /// The store
@@ -62,35 +64,36 @@ struct Navigation {
     /// The room
     #[arg(long)]
     room: String,
-    /// Which of its features; may be left out when it has one
+    /// Name of its feature set; by default the one that the adapter was trained on
     #[arg(long)]
     features: Option<String>,
-    /// Which adapter; the newest that was trained on the room with this split, if none is named
+    /// Name of the adapter; by default the newest that was trained on the room (with --split, if
+    /// given)
     #[arg(long)]
     adapter: Option<String>,
-    /// Frames from source to target; the adapter's own, if none is given
+    /// Frames from the source to the target of a pair; by default as the adapter was trained
     #[arg(long)]
     stride: Option<u32>,
-    /// How frames are kept apart; the adapter's own, if none is given
+    /// How frames are split into training and test; by default as the adapter was trained
     #[arg(long, value_enum)]
     split: Option<SplitName>,
-    /// The source frame may not be retrieved
+    /// Do not retrieve the source frame
     #[arg(long)]
     exclude_source: bool,
     /// ε of Hit@ε, separated by commas
-    #[arg(long, value_delimiter = ',', default_values_t = crate::navigation::HIT_THRESHOLDS)]
+    #[arg(long, value_delimiter = ',', default_values_t = seese3_core::navigation::HIT_THRESHOLDS)]
     thresholds: Vec<f64>,
-    /// Rows of the table by name, separated by commas; a way to step may have +row-space, +whitened
-    /// or +motion, inverse-poincare-homogeneous also +calibrated
+    /// Rows of the table by name, separated by commas; +row-space, +whitened or +motion may follow
+    /// the name of a step, and +calibrated that of inverse-poincare-homogeneous
     #[arg(long, value_delimiter = ',')]
     navigators: Vec<String>,
-    /// Equal parts of each motion
+    /// Number of equal steps that each motion is cut into
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1_000))]
     steps: u32,
-    /// How the parts hang together
+    /// How these steps are chained
     #[arg(long, value_enum, default_value_t = ModeName::OpenLoop)]
     mode: ModeName,
-    /// Of the random navigator
+    /// Seed of the random navigator
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Write the table here as JSON
@@ -99,6 +102,10 @@ struct Navigation {
 }
 
 impl Navigation {
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one command, from its arguments to what it prints"
+    )]
     async fn run(self) -> anyhow::Result<()> {
         if let Some(path) = &self.json {
             check_writable(path)?;
@@ -106,6 +113,8 @@ impl Navigation {
 
         let store = Store::open(&self.store)?;
         let chosen = choose(&store, &self, self.split.map(Into::into)).await?;
+
+        // Without a name, the features are those that the adapter was trained on.
         let features_name = self
             .features
             .clone()
@@ -117,8 +126,9 @@ impl Navigation {
         let record = chosen.record.clone();
         let protocol = self.protocol(&record)?;
         let room = Arc::new(stored.room);
-        let navigator =
-            Navigator::new(room, &features, Arc::new(chosen.adapter), IndexKind::Exact)?;
+        let navigator = Navigator::new(room, &features, chosen.adapter.clone(), IndexKind::Exact)?;
+
+        // Counted before the work starts, since the progress bar needs a total.
         let rows = protocol.rows(&navigator)?.len();
         let progress = bar(rows as u64, "evaluating");
 
@@ -134,28 +144,11 @@ impl Navigation {
 
         progress.finish_and_clear();
 
-        let in_room = record
-            .rooms
-            .iter()
-            .any(|(room, _)| room.as_str() == self.room);
-
-        let trained = record
-            .rooms
-            .iter()
-            .find(|(room, _)| room.as_str() == self.room)
-            .map(|(_, revision)| *revision);
-
-        let other_frames = match trained {
-            Some(revision) => {
-                !store
-                    .same_frames(&self.room, revision, stored.revision)
-                    .await?
-            }
-            None => false,
-        };
-
-        let leaky = [Split::Whole, Split::Pairs].contains(&record.split);
-        let leaks = in_room && (record.split != protocol.split || leaky || other_frames);
+        let trained_on = store
+            .trained_on(&record, navigator.room().id(), stored.revision)
+            .await?;
+        let in_room = trained_on != TrainedOn::Nothing;
+        let leak = Leak::of(&record, trained_on, protocol.split);
 
         say(format_args!(
             "room '{}' revision {}, features '{features_name}', adapter '{}' revision {} ({})",
@@ -180,10 +173,13 @@ impl Navigation {
             protocol.split, protocol.stride, report.n, report.candidate_count
         ));
 
-        self.say_caveats(&protocol, &record, leaks, other_frames);
+        // Warnings come before the table, so that nobody reads it without them.
+        say_caveats(&protocol, &record, navigator.room().id(), leak);
         say(evaluation_table(&report).trim_end());
 
         if let Some(path) = &self.json {
+            // The file says what was evaluated and whether it leaks, so that it can be judged by
+            // itself.
             let adapter = json!({ "name": chosen.name, "revision": chosen.revision, "preset": record.preset,
                 "trained_split": record.split.name(), "trained_stride": record.stride, "seed": record.config.seed });
 
@@ -195,7 +191,7 @@ impl Navigation {
                 ("features", json!(features_name)),
                 ("adapter", adapter),
                 ("in_room", json!(in_room)),
-                ("leaks", json!(leaks)),
+                ("leaks", json!(leak.is_some())),
             ];
 
             let context = context
@@ -210,45 +206,7 @@ impl Navigation {
         Ok(())
     }
 
-    /// What the table must not be read without.
-    fn say_caveats(
-        &self,
-        protocol: &Protocol,
-        record: &TrainingRecord,
-        leaks: bool,
-        other_frames: bool,
-    ) {
-        if protocol.steps > 1 {
-            say(format_args!(
-                "{} equal parts of each motion, {}",
-                protocol.steps,
-                protocol.mode.name()
-            ));
-        }
-
-        if record
-            .calibrated_on
-            .iter()
-            .any(|(room, _)| room.as_str() == self.room)
-        {
-            say(
-                "LEAK: the adapter's errors were measured in this room; +calibrated has seen its poses",
-            );
-        }
-
-        if leaks {
-            let why = if other_frames {
-                "on other frames of this room".to_owned()
-            } else {
-                format!("under the split '{}'", record.split)
-            };
-            say(format_args!(
-                "LEAK: the adapter was trained {why}; test pairs may have been trained on"
-            ));
-        }
-    }
-
-    /// What is asked for, the adapter's own split and stride where nothing is.
+    /// The protocol of the options; where they leave out split or stride, the adapter's own.
     fn protocol(&self, record: &TrainingRecord) -> anyhow::Result<Protocol> {
         Ok(Protocol {
             split: self.split.map_or(record.split, Into::into),
@@ -263,7 +221,34 @@ impl Navigation {
     }
 }
 
-/// Navigators by name.
+/// Prints what a reader of the table must know: several steps per motion, and leaks.
+fn say_caveats(protocol: &Protocol, record: &TrainingRecord, room: &RoomId, leak: Option<Leak>) {
+    if protocol.steps > 1 {
+        say(format_args!(
+            "{} equal parts of each motion, {}",
+            protocol.steps,
+            protocol.mode.name()
+        ));
+    }
+
+    // The calibrated metric uses errors measured on the very poses that it is tested on.
+    if is_calibrated_in(record, room) {
+        say(
+            "LEAK: the adapter's errors were measured in this room; +calibrated has seen its poses",
+        );
+    }
+
+    let why = match leak {
+        None => return,
+        Some(Leak::OtherFrames) => "on other frames of this room".to_owned(),
+        Some(Leak::Split) => format!("under the split '{}'", record.split),
+    };
+    say(format_args!(
+        "LEAK: the adapter was trained {why}; test pairs may have been trained on"
+    ));
+}
+
+/// The navigators with these names, or an error that lists the known names.
 pub fn navigators_named(names: &[String]) -> anyhow::Result<Vec<NavigatorKind>> {
     let named = |name: &String| {
         let unknown = || {
@@ -278,8 +263,8 @@ pub fn navigators_named(names: &[String]) -> anyhow::Result<Vec<NavigatorKind>> 
     names.iter().map(named).collect()
 }
 
-/// The adapter that was named, or the newest that fits the room, its features, the split and, if
-/// one does, the stride.
+/// The adapter that was named, else the newest that was trained on the room, with these features
+/// and this split where they are given. Adapters of the wanted stride come first.
 async fn choose(
     store: &Store,
     wanted: &Navigation,
@@ -294,12 +279,14 @@ async fn choose(
     for name in &names {
         let stored = match store.load_adapter(name, None).await {
             Ok(stored) => stored,
+            // One adapter that cannot be read must not hide the others.
             Err(error) => {
                 say(format_args!("passed over adapter '{name}': {error}"));
                 continue;
             }
         };
 
+        // Rooms are compared by name: the adapter may have been trained on another revision.
         let fits = wanted
             .features
             .as_ref()
@@ -321,6 +308,8 @@ async fn choose(
             .stride
             .is_none_or(|stride| stride == stored.record.stride)
     };
+
+    // Compared in this order: the right stride, then the date, then the name.
     let best = |a: &StoredAdapter| (same_stride(a), a.created.clone(), a.name.clone());
 
     match fitting.into_iter().max_by(|a, b| best(a).cmp(&best(b))) {

@@ -1,4 +1,4 @@
-//! `seese3 evaluate trajectory`: APE and RPE of one file against another, as evo takes them.
+//! `seese3 evaluate trajectory`: APE and RPE of one file against another, as evo defines them.
 
 use std::path::PathBuf;
 
@@ -7,18 +7,18 @@ use clap::Args;
 
 use super::super::{check_writable, say, write_json};
 use crate::datasets::read_tum_trajectory;
-use crate::report::{PathErrors, PathProtocol, path_errors_json, path_errors_table};
-use crate::trajectory::{RpePairs, associate};
+use seese3_core::trajectory::{RpePairs, associate};
+use seese3_lab::report::{PathErrors, PathProtocol, path_errors_json, path_errors_table};
 
 #[derive(Debug, Args)]
 pub struct Trajectory {
-    /// The true path, a TUM file: "timestamp tx ty tz qx qy qz qw" a line, world_from_camera
+    /// The true path, a TUM file with lines "timestamp tx ty tz qx qy qz qw", world_from_camera
     #[arg(long)]
     reference: PathBuf,
     /// The estimated path, a TUM file
     #[arg(long)]
     estimate: PathBuf,
-    /// The farthest apart in time that two poses belong together, milliseconds
+    /// Largest time difference at which two poses are matched, milliseconds
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u64).range(..=1_000_000))]
     max_difference_ms: u64,
     #[command(flatten)]
@@ -28,13 +28,13 @@ pub struct Trajectory {
     json: Option<PathBuf>,
 }
 
-/// Which relative errors are taken.
+/// Between which poses the relative error is taken.
 #[derive(Debug, Clone, Args)]
 pub struct RelativeOptions {
-    /// Poses over which RPE is taken
+    /// Number of poses from the first to the second of a pair, in RPE
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     delta: u32,
-    /// Take every pair that far apart, not one after the other
+    /// Take every pair that far apart, overlapping ones too, instead of one after the other
     #[arg(long)]
     all_pairs: bool,
 }
@@ -75,12 +75,13 @@ impl Trajectory {
             )
         };
 
+        // Poses are matched by time: the two files need neither the same rate nor the same length.
         let matches = associate(&reference, &estimate, self.max_difference_ms * 1_000_000)
             .with_context(files)?;
         let errors = PathErrors::of(&reference, &estimate, &matches, self.relative.protocol())
             .with_context(files)?;
         say(format_args!(
-            "{} poses belong together; {} of the reference's and {} of the estimate's to none",
+            "{} poses matched; {} of the reference and {} of the estimate have no match",
             errors.matched, errors.unmatched_reference, errors.unmatched_estimate
         ));
 

@@ -1,4 +1,4 @@
-//! `seese3 sweep adapters`.
+//! `seese3 sweep adapters`: one adapter per room and point of a grid, resumable and sharded.
 
 use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
@@ -9,21 +9,20 @@ use rayon::prelude::*;
 
 use super::super::progress::bar;
 use super::super::protocol::{LossName, ProtocolOptions};
-use super::super::rooms::load_rooms;
+use super::super::rooms::{data, load_rooms};
 use super::super::{say, write_file};
-use super::journal::{self, Journal};
-use super::one::{content, done, row};
-use crate::adapter::{Loss, TrainConfig};
-use crate::features::Features;
-use crate::generalisation::nested_choice;
-use crate::report::{
-    SweepRow, aligned, configurations_rows, difficulty_rows, parts_rows, success_rows,
-    sweep_parquet,
-};
+use super::journal::{self, SweepJournal};
 use crate::store::{Store, StoredRoom};
-use crate::training::Recipe;
+use seese3_core::adapter::{Loss, TrainConfig};
+use seese3_core::features::Features;
+use seese3_core::training::TrainingPlan;
+use seese3_lab::experiments::adapter_sweep::{SweepRow, content, row, run};
+use seese3_lab::experiments::cross_room::nested_choice;
+use seese3_lab::report::{
+    aligned, configurations_rows, difficulty_rows, parts_rows, success_rows, sweep_parquet,
+};
 
-/// Configurations that are shown.
+/// How many of the best configurations are printed.
 const SHOWN: usize = 10;
 
 #[derive(Debug, Args)]
@@ -31,10 +30,10 @@ pub struct Adapters {
     /// The store
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// The rooms, each learned by itself: names, or patterns with *
+    /// The rooms, each trained on by itself: names, or patterns with *
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// Features by name, separated by commas; may be left out when the first room has one
+    /// Feature sets by name, separated by commas; may be left out when the first room has one
     #[arg(long, value_delimiter = ',')]
     features: Vec<String>,
     #[command(flatten)]
@@ -42,36 +41,36 @@ pub struct Adapters {
     /// Latent sizes, separated by commas
     #[arg(long, value_delimiter = ',', default_values_t = [10, 20, 40, 80, 160, 320])]
     geo_dims: Vec<usize>,
-    /// Counts of charts
+    /// Numbers of charts K, separated by commas
     #[arg(long, value_delimiter = ',', default_values_t = [1, 2, 4])]
     chart_counts: Vec<usize>,
-    /// Learning rates
+    /// Learning rates, separated by commas
     #[arg(long, value_delimiter = ',', default_values_t = [3e-4, 1e-3, 3e-3, 1e-2, 3e-2])]
     lrs: Vec<f64>,
-    /// Losses
+    /// Losses, separated by commas
     #[arg(long, value_enum, value_delimiter = ',', default_values_t = [LossName::Mse, LossName::Cosine, LossName::Rotation])]
     losses: Vec<LossName>,
     /// Runs of each configuration, from seed 0 on
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     seeds: u64,
-    /// Only so many configurations, drawn from the grid by --sample-seed; all if nothing is given
+    /// Try only this many configurations, drawn from the grid by --sample-seed; by default all
     #[arg(long)]
     sample: Option<usize>,
-    /// Of --sample
+    /// Seed of the draw of --sample
     #[arg(long, default_value_t = 0)]
     sample_seed: u64,
-    /// Only part I of N of the runs, for a scheduler that spreads them: 1/4 to 4/4
+    /// Do only part I of N of the runs, for a scheduler that spreads them: 1/4 to 4/4
     #[arg(long, value_name = "I/N", default_value = "1/1")]
     shard: String,
-    /// Where the runs go: a folder; what it holds already is not done again
+    /// Folder of the results; runs that it already holds are not repeated
     #[arg(long)]
     out: PathBuf,
 }
 
-/// A run that is to be done.
+/// A run to do, with its row still without scores.
 struct Task<'a> {
     room: &'a (StoredRoom, Features),
-    recipe: Recipe,
+    plan: TrainingPlan,
     row: SweepRow,
 }
 
@@ -93,7 +92,9 @@ impl Adapters {
             }
         }
 
-        let journal = Journal::open(&self.out, &format!("shard-{part}-of-{parts}"))?;
+        let journal = SweepJournal::open(&self.out, &format!("shard-{part}-of-{parts}"))?;
+
+        // What any shard has finished, now or before a restart, is not repeated.
         let known: HashSet<String> = journal::rows(&self.out)?
             .into_iter()
             .map(|row| row.key)
@@ -103,6 +104,8 @@ impl Adapters {
         let keys: HashSet<String> = tasks.iter().map(|task| task.row.key.clone()).collect();
         let all = tasks.len();
 
+        // The full list is cut into shards before finished runs are dropped: shards never overlap,
+        // whatever has been done already.
         let ours: Vec<Task<'_>> = tasks
             .into_iter()
             .skip(part - 1)
@@ -116,19 +119,21 @@ impl Adapters {
         ));
 
         let progress = bar(ours.len() as u64, "sweep");
+
+        // Every row is written when its run ends, so a killed sweep loses only the runs under way.
         ours.into_par_iter().try_for_each(|task| {
-            let row = done(task.room, &task.recipe, task.row);
+            let row = run(&data(task.room), &task.plan, task.row);
             progress.inc(1);
             journal.add(&row)
         })?;
 
         progress.finish_and_clear();
+
+        // The Parquet file holds every run of the folder; the printed tables are of this grid
+        // alone.
         let in_folder = journal::rows(&self.out)?;
         let file = self.out.join("runs.parquet");
-        write_file(
-            &file,
-            &sweep_parquet(&in_folder).map_err(anyhow::Error::msg)?,
-        )?;
+        write_file(&file, &sweep_parquet(&in_folder)?)?;
 
         let rows: Vec<SweepRow> = in_folder
             .iter()
@@ -143,6 +148,7 @@ impl Adapters {
             in_folder.len()
         ));
 
+        // Failed runs are rows like others, but a sweep without any score has failed.
         ensure!(
             rows.iter().any(|row| row.failure.is_empty()),
             "no run of this grid has scores"
@@ -151,9 +157,9 @@ impl Adapters {
         Ok(())
     }
 
-    /// The tables of this grid, and which rooms have no scores.
+    /// Prints the tables of this grid, and the rooms without scores.
     fn say_summary(&self, rows: &[SweepRow]) -> anyhow::Result<()> {
-        let base = self.protocol.recipe(0)?;
+        let base = self.protocol.plan(0)?;
         say(format_args!(
             "preset {} with {} epochs, split {}, stride {}; of each room the best run counts, chosen by its test score:",
             base.preset.name(),
@@ -174,6 +180,8 @@ impl Adapters {
         say(aligned(&parts_rows(rows)).trim_end());
         say("\nthe best configurations by mean R²:");
         say(aligned(&configurations_rows(rows, SHOWN)).trim_end());
+
+        // One line per room and reason, however many runs failed for it.
         let mut failures: BTreeMap<(&str, &str), usize> = BTreeMap::new();
 
         for row in rows.iter().filter(|row| !row.failure.is_empty()) {
@@ -201,7 +209,8 @@ impl Adapters {
         }
     }
 
-    /// Every run of the grid, in an order that depends on nothing but the arguments.
+    /// Every run of the grid. The order depends on the rooms and the arguments alone, so that all
+    /// shards cut the same list.
     fn tasks<'a>(&self, rooms: &'a [(StoredRoom, Features)]) -> anyhow::Result<Vec<Task<'a>>> {
         let mut grid: Vec<(usize, usize, f64, Loss)> = Vec::new();
         for &geo_dim in &self.geo_dims {
@@ -221,15 +230,17 @@ impl Adapters {
             "the grid is empty: give at least one of --geo-dims, --chart-counts, --lrs, --losses"
         );
 
+        // A smaller sample with the same seed is a part of a larger one, so a sweep can be
+        // extended.
         if let Some(count) = self.sample {
             let chosen = nested_choice(count, grid.len(), self.sample_seed);
             grid = chosen.into_iter().map(|place| grid[place]).collect();
         }
 
-        let base = self.protocol.recipe(0)?;
+        let base = self.protocol.plan(0)?;
         let mut tasks = Vec::new();
         for room in rooms {
-            let content = content(room);
+            let content = content(&data(room));
             for &(latent, charts, learning_rate, loss) in &grid {
                 for seed in 0..self.seeds {
                     let config = TrainConfig {
@@ -241,14 +252,17 @@ impl Adapters {
                         ..base.config.clone()
                     };
 
-                    let recipe = Recipe {
+                    let plan = TrainingPlan {
                         config,
                         ..base.clone()
                     };
-                    recipe.check().context("the grid")?;
 
-                    let row = row(room, &content, &recipe);
-                    tasks.push(Task { room, recipe, row });
+                    // All settings are checked before the first run starts, not hours into the
+                    // sweep.
+                    plan.check().context("the grid")?;
+
+                    let row = row(&data(room), &content, &plan);
+                    tasks.push(Task { room, plan, row });
                 }
             }
         }

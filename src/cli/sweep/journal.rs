@@ -1,4 +1,5 @@
-//! The rows of a sweep, a line a run, written as they are done: what a killed sweep goes on from.
+//! The journal of a sweep: one line per finished run, written at once, from which a killed sweep
+//! resumes.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -7,20 +8,20 @@ use std::sync::Mutex;
 
 use anyhow::Context;
 
-use crate::report::SweepRow;
+use seese3_lab::experiments::adapter_sweep::SweepRow;
 
-/// What journals' names end with.
+/// The end of every journal's file name.
 const EXTENSION: &str = "runs.jsonl";
 
-/// The journal of one shard.
-pub struct Journal {
+/// The journal of one shard, open for appending and locked against other processes.
+pub struct SweepJournal {
     path: PathBuf,
     file: Mutex<File>,
 }
 
-impl Journal {
-    /// Opens a shard's journal in a folder, which is made; what a kill left half written is cut
-    /// off.
+impl SweepJournal {
+    /// Opens the journal of a shard; creates the folder if needed, and cuts off a last line that a
+    /// killed sweep left incomplete.
     pub fn open(folder: &Path, shard: &str) -> anyhow::Result<Self> {
         std::fs::create_dir_all(folder)
             .with_context(|| format!("{} cannot be made", folder.display()))?;
@@ -35,8 +36,11 @@ impl Journal {
             .open(&path)
             .with_context(shown)?;
 
+        // Two sweeps that append to one file would mix their lines.
         file.try_lock()
-            .with_context(|| format!("{} is written by another sweep", path.display()))?;
+            .with_context(|| format!("{} is in use by another sweep", path.display()))?;
+
+        // Appending to an incomplete line would spoil two rows: cut behind the last line that ends.
         let text = std::fs::read(&path).with_context(shown)?;
         let whole = text
             .iter()
@@ -51,7 +55,7 @@ impl Journal {
         })
     }
 
-    /// Keeps a row.
+    /// Appends a row and waits until it is on disk.
     pub fn add(&self, row: &SweepRow) -> anyhow::Result<()> {
         let mut line = serde_json::to_vec(row)?;
         line.push(b'\n');
@@ -59,7 +63,7 @@ impl Journal {
         let mut file = self
             .file
             .lock()
-            .map_err(|_| anyhow::anyhow!("another run's writing failed"))?;
+            .map_err(|_| anyhow::anyhow!("another run failed while it wrote to the journal"))?;
 
         file.write_all(&line)
             .and_then(|()| file.sync_data())
@@ -67,8 +71,9 @@ impl Journal {
     }
 }
 
-/// The rows of all journals of a folder, by key, each once.
+/// The rows of all journals in a folder, sorted by key; a run that stands in several counts once.
 pub fn rows(folder: &Path) -> anyhow::Result<Vec<SweepRow>> {
+    // Sorted by key, the rows do not depend on which shard finished first.
     let mut found = std::collections::BTreeMap::new();
     let entries = std::fs::read_dir(folder)
         .with_context(|| format!("{} cannot be read", folder.display()))?;
@@ -81,7 +86,7 @@ pub fn rows(folder: &Path) -> anyhow::Result<Vec<SweepRow>> {
         let text =
             std::fs::read(&path).with_context(|| format!("{} cannot be read", path.display()))?;
 
-        // Another shard may be writing its last line.
+        // Another shard may be in the middle of its last line: only lines that end are read.
         let whole = text
             .iter()
             .rposition(|&byte| byte == b'\n')
@@ -93,7 +98,7 @@ pub fn rows(folder: &Path) -> anyhow::Result<Vec<SweepRow>> {
             .filter(|(_, line)| !line.is_empty())
         {
             let row: SweepRow = serde_json::from_slice(line).with_context(|| {
-                format!("{}, line {}: no run of a sweep", path.display(), number + 1)
+                format!("{}, line {}: not a sweep run", path.display(), number + 1)
             })?;
             found.insert(row.key.clone(), row);
         }

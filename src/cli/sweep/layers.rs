@@ -1,4 +1,4 @@
-//! `seese3 sweep layers`: M1 to M4 over the layers of a features set.
+//! `seese3 sweep layers`: M1 to M4 of every layer of an encoder's features.
 
 use std::path::PathBuf;
 
@@ -9,69 +9,71 @@ use rayon::prelude::*;
 use super::super::progress::bar;
 use super::super::protocol::{PresetName, SplitName};
 use super::super::{check_writable, say, write_json};
-use crate::adapter::Preset;
-use crate::features::Features;
-use crate::metrics::{
-    Duplicates, IntrinsicDimension, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe,
-};
-use crate::pairs::Split;
-use crate::report::{LayerScores, encoders_table, layers_json, layers_table};
-use crate::room::Room;
-use crate::scores::{MotionScores, deviation, mean};
 use crate::store::{Store, StoredRoom};
-use crate::training::{Lesson, Recipe, learn};
+use seese3_core::adapter::Preset;
+use seese3_core::features::Features;
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan};
+use seese3_lab::experiments::layers::{LayerProtocol, LayerScores, score_layer};
+use seese3_lab::probes::MutualKnn;
+use seese3_lab::report::{encoders_table, layers_json, layers_table};
 
 #[derive(Debug, Args)]
 pub struct Layers {
     /// The store
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// The room; may be given several times, then means over rooms are shown
+    /// The room; give it several times for means over rooms
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// Features by name, or what their names begin with; all of the room's if none is given
+    /// Feature sets by name, or by the part of their names before a hyphen; by default all of the
+    /// room's
     #[arg(long, value_delimiter = ',')]
     features: Vec<String>,
-    /// Frames from source to target, of M3 and M4
+    /// Frames from the source to the target of a pair, in M3 and M4
     #[arg(long, default_value_t = 40)]
     stride: u32,
-    /// How frames are kept apart, in M3 and M4
+    /// How frames are split into training and test, in M3 and M4
     #[arg(long, value_enum, default_value_t = SplitName::Time)]
     split: SplitName,
-    /// The protocol of M4
+    /// The training preset of M4
     #[arg(long, value_enum, default_value_t = PresetName::PaperBase)]
     preset: PresetName,
-    /// Passes of M4 over the pairs, instead of the preset's
+    /// Epochs of M4, in place of the preset's
     #[arg(long)]
     epochs: Option<usize>,
-    /// Adapters of M4, from seed 0 on
+    /// How many adapters M4 trains, with seeds from 0 on
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1_000))]
     seeds: u64,
-    /// Frames that M1 compares
+    /// How many frames M1 compares
     #[arg(long, default_value_t = 256)]
     m1_frames: usize,
-    /// Stride of M1
+    /// Stride between the frames that M1 compares
     #[arg(long, default_value_t = 1)]
     m1_stride: usize,
-    /// Neighbours of M1
+    /// Neighbours of a frame in M1, k
     #[arg(long, default_value_t = 10)]
     m1_k: usize,
-    /// Frames to each side that are no neighbours, in M1
+    /// Frames to each side that do not count as neighbours, in M1
     #[arg(long, default_value_t = 10)]
     m1_exclusion: usize,
-    /// Frames to each side that are no neighbours, in M2; 0 is the paper's, which measures the path
+    /// Frames to each side that do not count as neighbours, in M2; the paper's 0 measures the path
     /// rather than the room
     #[arg(long, default_value_t = 10)]
     m2_gap: usize,
-    /// Also a line an encoder, by its best layer: for checkpoints of one encoder
+    /// Also print one line per encoder, by its best layer: to compare checkpoints of one encoder
     #[arg(long)]
     by_encoder: bool,
-    /// Write all of it here as JSON
+    /// Write all results to this file as JSON
     #[arg(long)]
     json: Option<PathBuf>,
 }
 
 impl Layers {
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one command, from its arguments to what it prints"
+    )]
     pub async fn run(self) -> anyhow::Result<()> {
         if let Some(file) = &self.json {
             check_writable(file)?;
@@ -88,6 +90,7 @@ impl Layers {
             rooms.push(store.load_room(room, None).await?);
         }
 
+        // The same room twice would count twice in the means.
         if let Some(twice) = self
             .rooms
             .iter()
@@ -98,15 +101,19 @@ impl Layers {
         }
 
         let names = self.names(&rooms)?;
+
+        // One task per layer and room; the table takes the means over rooms.
         let tasks: Vec<(usize, &StoredRoom, &Features)> = (0..names.len())
             .flat_map(|layer| rooms.iter().map(move |room| (layer, room)))
             .filter_map(|(layer, room)| Some((layer, room, room.features(&names[layer])?)))
             .collect();
+        let protocol = self.layer_protocol();
         let progress = bar(tasks.len() as u64, "layers");
 
         let scored: Vec<(usize, LayerScores)> = tasks
             .into_par_iter()
             .map(|(layer, stored, features)| {
+                // An error names its room and features, since tasks run in parallel.
                 let what = || {
                     format!(
                         "room '{}', features '{}'",
@@ -115,7 +122,12 @@ impl Layers {
                     )
                 };
 
-                let scores = self.scores(stored, features).with_context(what)?;
+                let data = RoomData {
+                    room: &stored.room,
+                    revision: stored.revision,
+                    features,
+                };
+                let scores = score_layer(&data, &protocol).with_context(what)?;
                 progress.inc(1);
 
                 Ok((layer, scores))
@@ -127,6 +139,7 @@ impl Layers {
         let split: Split = self.split.into();
         let preset: Preset = self.preset.into();
 
+        // The table alone would not say how its numbers were measured.
         say(format_args!(
             "{} rooms; M1: {} frames at stride {}, k {}, exclusion {}; M2: gap {}; M3, M4: stride {}, split {split}; \
              M4: {}, {} seeds",
@@ -155,8 +168,10 @@ impl Layers {
         Ok(())
     }
 
-    /// The features that every room has, of those that were asked for.
+    /// The names of the feature sets that were asked for. Every room must have them, from one
+    /// source.
     fn names(&self, rooms: &[StoredRoom]) -> anyhow::Result<Vec<String>> {
+        // `dinov2` means `dinov2-7` and `dinov2-9`, but not `dinov2b-7`.
         let calls_for = |given: &str, name: &str| {
             name == given
                 || name
@@ -178,6 +193,7 @@ impl Layers {
             .map(|&name| name.to_owned())
             .collect();
 
+        // A name that matches nothing is a typing error, and would otherwise be passed over.
         let missing = self
             .features
             .iter()
@@ -194,6 +210,7 @@ impl Layers {
             );
         }
 
+        // A mean over rooms needs the same encoder, layer and pooling in each of them.
         for name in &names {
             for stored in rooms {
                 let first = rooms[0].features(name).map(Features::source);
@@ -222,66 +239,21 @@ impl Layers {
         Ok(names)
     }
 
-    fn scores(&self, stored: &StoredRoom, features: &Features) -> anyhow::Result<LayerScores> {
-        let room = &stored.room;
-        let rows = features.rows();
+    fn layer_protocol(&self) -> LayerProtocol {
+        let mut plan = TrainingPlan::of(self.preset.into(), self.split.into(), self.stride, 0);
+        plan.config.epochs = self.epochs.unwrap_or(plan.config.epochs);
 
-        let knn = MutualKnn {
-            frames: self.m1_frames,
-            stride: self.m1_stride,
-            k: self.m1_k,
-            exclusion: self.m1_exclusion,
-            ..MutualKnn::default()
-        };
-
-        let m1 = mutual_knn(rows, room.poses(), &knn)?;
-        let m2: IntrinsicDimension = intrinsic_dimension(rows, self.m2_gap, Duplicates::DropRows)?;
-        let m3: MotionScores = ridge_probe(rows, room, self.split.into(), self.stride)?;
-
-        let adapters: Vec<MotionScores> = (0..self.seeds)
-            .into_par_iter()
-            .map(|seed| self.adapter(stored, features, seed))
-            .collect::<anyhow::Result<_>>()?;
-        let runs: Vec<f64> = adapters.iter().map(|scores| scores.overall).collect();
-
-        let adapters = MotionScores::mean(&adapters);
-        Ok(LayerScores {
-            features: features.source().name.clone(),
-            room: room_name(room),
-            dim: features.source().dim,
-            m1,
-            m2_two_nn: m2.two_nn.linear,
-            m2_mle: m2.mle_biased.harmonic,
-            m2_dropped: m2.dropped,
-            m3_r2: m3.overall,
-            encoder: features.source().encoder.clone(),
-            m4_r2: mean(&runs),
-            m4_translation: adapters.translation,
-            m4_rotation: adapters.rotation,
-            m4_deviation: deviation(&runs),
-            m4_runs: runs,
-        })
+        LayerProtocol {
+            mutual_knn: MutualKnn {
+                frames: self.m1_frames,
+                stride: self.m1_stride,
+                k: self.m1_k,
+                exclusion: self.m1_exclusion,
+                ..MutualKnn::default()
+            },
+            gap: self.m2_gap,
+            plan,
+            seeds: self.seeds,
+        }
     }
-
-    fn adapter(
-        &self,
-        stored: &StoredRoom,
-        features: &Features,
-        seed: u64,
-    ) -> anyhow::Result<MotionScores> {
-        let mut recipe = Recipe::of(self.preset.into(), self.split.into(), self.stride, seed);
-        recipe.config.epochs = self.epochs.unwrap_or(recipe.config.epochs);
-
-        let lesson = Lesson {
-            room: &stored.room,
-            revision: stored.revision,
-            features,
-        };
-
-        Ok(learn(&[lesson], &recipe, &mut |_| ())?.1.test)
-    }
-}
-
-fn room_name(room: &Room) -> String {
-    room.id().to_string()
 }

@@ -1,10 +1,9 @@
-//! `seese3 sweep`: many at once, over layers or over adapters.
+//! `seese3 sweep`: many training runs at once, over layers, adapters or formulations.
 
 mod adapters;
 mod formulations;
 mod journal;
 mod layers;
-pub mod one;
 
 use clap::{Args, Subcommand};
 
@@ -16,12 +15,12 @@ pub struct Sweep {
 
 #[derive(Debug, Subcommand)]
 enum Over {
-    /// M1 to M4 over the layers of a features set, the best by each
+    /// M1 to M4 of every layer of an encoder's features, with the best layer by each metric
     Layers(layers::Layers),
-    /// Adapters over latent sizes, charts, learning rates, losses and seeds: resumable, in shards,
-    /// a row a run
+    /// Adapters over a grid of latent sizes, charts, learning rates, losses and seeds; resumable
+    /// and shardable, one row per run
     Adapters(adapters::Adapters),
-    /// The adapter beside the paper's alternatives A to D
+    /// The adapter side by side with the paper's alternatives A to D
     Formulations(formulations::Formulations),
 }
 

@@ -1,51 +1,42 @@
-//! What enters: requests to questions. Every field is checked here, and named in what is wrong with
-//! it.
+//! Incoming requests, converted to domain queries. Every field is checked here, and an error names
+//! the field that is wrong.
 
-use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use seese3_client::convert::{self, ConvertError};
 
 use super::super::Error;
 use super::super::snapshot::Snapshot;
 use super::{CAMERA, world_frame};
-use crate::eval::{NavigatorKind, Prediction, check_thresholds, default_thresholds};
-use crate::geometry::{Pose, Twist};
-use crate::navigation::{
-    Displacement, FitOn, MAX_TRANSLATION_M, Metric, Mode, Query, Reading, Source, SourceAt,
-    StepKind,
-};
-use crate::pairs::{Pair, Split};
-use crate::proto::v1 as pb;
-use crate::room::FrameId;
 use crate::store::StoredAdapter;
+use seese3_client::proto::v1 as pb;
+use seese3_core::eval::{Prediction, check_thresholds, default_thresholds};
+use seese3_core::geometry::{Pose, Twist};
+use seese3_core::navigation::NavigatorKind;
+use seese3_core::navigation::{
+    Displacement, FitOn, MAX_TRANSLATION_M, Mode, Query, Reading, RetrievalMetric, Source,
+    SourceAt, StepKind,
+};
+use seese3_core::room::FrameId;
+use seese3_core::splits::{Pair, Split};
 
-/// How far from 1 a quaternion's norm may be.
-const QUATERNION_TOLERANCE: f64 = 1e-3;
-/// The most rows of one evaluation.
+/// The largest number of navigators in one evaluation.
 const MAX_NAVIGATORS: usize = 100;
 
-fn vector(field: &str, vector: Option<pb::Vector3>) -> Result<Vector3<f64>, Error> {
-    let pb::Vector3 { x, y, z } = vector.ok_or_else(|| Error::invalid(field, "is required"))?;
-    if [x, y, z].iter().all(|value| value.is_finite()) {
-        Ok(Vector3::new(x, y, z))
-    } else {
-        Err(Error::invalid(
-            field,
-            format!("({x}, {y}, {z}) must be finite"),
-        ))
+pub fn twist(twist: pb::Twist) -> Result<Twist, Error> {
+    let convert::Twist { linear, angular } = convert::twist(&twist)?;
+    Ok(Twist { linear, angular })
+}
+
+impl From<ConvertError> for Error {
+    fn from(error: ConvertError) -> Self {
+        Self::invalid(error.field, error.problem)
     }
 }
 
-pub fn twist(twist: pb::Twist) -> Result<Twist, Error> {
-    let pb::Twist { linear, angular } = twist;
-    Ok(Twist {
-        linear: vector("linear", linear)?,
-        angular: vector("angular", angular)?,
-    })
-}
-
-/// A pose in the world of a room.
+/// A camera pose in the world frame of a room, `world_from_camera`.
 ///
 /// # Errors
-/// [`Error::Invalid`] when a part is missing, is not finite, is no rotation, or names other frames.
+/// [`Error::Invalid`] if a part is missing or not finite, the quaternion is not of unit norm, the
+/// position is too far from the origin, or the pose names other frames.
 pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
     let pb::Pose {
         parent_frame,
@@ -54,6 +45,8 @@ pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
         orientation,
     } = pose;
 
+    // Empty frame names stand for the room's world and the camera. Any other name would be a pose
+    // in a frame that this server cannot relate to the room.
     let world = world_frame(room);
     if !parent_frame.is_empty() && parent_frame != world {
         return Err(Error::invalid(
@@ -69,33 +62,27 @@ pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
         ));
     }
 
-    let pb::Quaternion { w, x, y, z } =
-        orientation.ok_or_else(|| Error::invalid("orientation", "is required"))?;
-    let quaternion = Quaternion::new(w, x, y, z);
-    let norm = quaternion.norm();
-
-    if norm.is_nan() || (norm - 1.0).abs() > QUATERNION_TOLERANCE {
-        return Err(Error::invalid(
-            "orientation",
-            format!("has norm {norm}, a rotation has 1"),
-        ));
-    }
-
-    let position = vector("position", position)?;
-    if position.norm() > MAX_TRANSLATION_M {
+    let pose = convert::pose(&pb::Pose {
+        position,
+        orientation,
+        ..pb::Pose::default()
+    })?;
+    if pose.translation.vector.norm() > MAX_TRANSLATION_M {
         return Err(Error::invalid(
             "position",
             format!("is over {MAX_TRANSLATION_M:e} m from the origin"),
         ));
     }
 
-    Ok(Pose::from_parts(
-        position.into(),
-        UnitQuaternion::from_quaternion(quaternion),
-    ))
+    Ok(pose)
 }
 
-/// What a camera saw, or a frame, for an adapter; `field` is the view's name in its request.
+/// A view as the source of a query to `adapter`. An image is encoded here. `field` is the name of
+/// the view's field in its request.
+///
+/// # Errors
+/// [`Error::Invalid`] if the view is missing, or is a feature of another source or an image that
+/// cannot be decoded; [`Error::Precondition`] if the server has no encoder for images.
 pub fn source(
     field: &str,
     view: Option<pb::View>,
@@ -109,6 +96,9 @@ pub fn source(
             source_name,
         })) => {
             let own = &adapter.adapter.source().name;
+
+            // Features of different sources never compare, even where their width is the same. A
+            // caller that states the source is protected from mixing them up.
             if !source_name.is_empty() && source_name != *own {
                 let problem =
                     format!("'{source_name}' is not '{own}', which the adapter was trained on");
@@ -123,7 +113,7 @@ pub fn source(
         Some(pb::view::View::Latent(pb::Latent { values })) => Ok(Source::Latent(values)),
         Some(pb::view::View::Image(image)) => Ok(Source::Feature(
             snapshot
-                .eye(adapter)?
+                .image_encoder(adapter)?
                 .feature(&format!("{field}.image"), &image)?,
         )),
         None => Err(Error::invalid(
@@ -165,7 +155,10 @@ fn displacement(displacement: Option<pb::Displacement>, room: &str) -> Result<Di
     }
 }
 
-/// A question and the thresholds it is to be judged by.
+/// A navigation query, and the thresholds ε of Hit@ε for its errors.
+///
+/// # Errors
+/// [`Error::Invalid`], naming the field.
 pub fn query(
     request: pb::NavigateRequest,
     adapter: &StoredAdapter,
@@ -192,12 +185,13 @@ pub fn query(
     let thresholds = thresholds(given_thresholds)?;
     let (step, metric) = step_of(&navigator, reading)?;
 
-    // Last, since an image is costly.
+    // Encoding an image is costly, so that the fields above are checked before it; what follows needs
+    // the source.
     let source = source("source", view, adapter, snapshot)?;
     if source_pose.is_some() && matches!(source, Source::Frame(_)) {
         return Err(Error::invalid(
             "source_pose",
-            "is not to be given with a frame, whose pose the room knows",
+            "must be left out for a frame: its pose is recorded in the room",
         ));
     }
 
@@ -223,17 +217,20 @@ pub fn query(
     Ok((query, thresholds))
 }
 
-/// How to step, and under which metric, by name, or inverse Poincaré in a reading.
-fn step_of(name: &str, reading: i32) -> Result<(StepKind, Metric), Error> {
+/// How a motion becomes a latent step, and the metric of the search: as `name` says, or inverse
+/// Poincaré with the given reading if the name is empty.
+fn step_of(name: &str, reading: i32) -> Result<(StepKind, RetrievalMetric), Error> {
     let given = reading_of(reading)?;
     if name.is_empty() {
-        return Ok((StepKind::InversePoincare(given), Metric::Full));
+        return Ok((StepKind::InversePoincare(given), RetrievalMetric::Full));
     }
 
+    // The name of a navigator determines its reading, if it has one, so a reading beside it could
+    // only contradict.
     if reading != pb::Reading::Unspecified as i32 {
         return Err(Error::invalid(
             "reading",
-            "is not to be given with a navigator, whose name says it",
+            "must be left out with a navigator, which has its own",
         ));
     }
 
@@ -241,13 +238,13 @@ fn step_of(name: &str, reading: i32) -> Result<(StepKind, Metric), Error> {
         NavigatorKind::Step(step, metric) => Ok((step, metric)),
         _ => Err(Error::invalid(
             "navigator",
-            format!("'{name}' is a row of Evaluate; it makes no latent step"),
+            format!("'{name}' is a baseline of Evaluate; it makes no latent step"),
         )),
     }
 }
 
-/// Pairs of a room that a refit is fitted on: under the adapter's own split and stride, or the time
-/// split where the adapter set nothing apart.
+/// The pairs of a room on which a ridge refit is fitted: those of the adapter's own split
+/// and stride. An adapter trained under `whole` held out no frames; then the time split is used.
 fn fit_on(adapter: &StoredAdapter) -> FitOn {
     let split = match adapter.record.split {
         Split::Whole => Split::Time,
@@ -291,7 +288,8 @@ fn reading_of(reading: i32) -> Result<Reading, Error> {
     }
 }
 
-/// How many rows to each side of the source are excluded, none if it is not.
+/// The exclusion radius: how many rows on each side of the source frame may not be retrieved,
+/// besides the frame itself. None if the source may be retrieved.
 pub fn exclusion(exclude_source: bool, exclude_radius: u32) -> Result<Option<u32>, Error> {
     match (exclude_source, exclude_radius) {
         (true, radius) => Ok(Some(radius)),
@@ -303,7 +301,7 @@ pub fn exclusion(exclude_source: bool, exclude_radius: u32) -> Result<Option<u32
     }
 }
 
-/// Thresholds as given, or the paper's.
+/// The given thresholds ε, or the paper's if there are none.
 pub fn thresholds(given: Vec<f64>) -> Result<Vec<f64>, Error> {
     let thresholds = if given.is_empty() {
         default_thresholds()
@@ -315,7 +313,7 @@ pub fn thresholds(given: Vec<f64>) -> Result<Vec<f64>, Error> {
     Ok(thresholds)
 }
 
-/// The split of a name, none if the name is empty.
+/// The split of this name; none if the name is empty.
 pub fn split(name: &str) -> Result<Option<Split>, Error> {
     match Split::from_name(name) {
         Some(split) => Ok(Some(split)),
@@ -330,7 +328,7 @@ pub fn split(name: &str) -> Result<Option<Split>, Error> {
     }
 }
 
-/// Rows of the table by name; none means the adapter's own table.
+/// The navigators of an evaluation by name. An empty list stands for the adapter's own table.
 pub fn navigators(names: &[String]) -> Result<Vec<NavigatorKind>, Error> {
     let twice = |(position, name): (usize, &String)| names[..position].contains(name);
 

@@ -1,4 +1,4 @@
-//! Wire types to domain types and back: the one place that knows both.
+//! Conversion between wire types and domain types. This is the only place that knows both.
 
 mod incoming;
 mod outgoing;
@@ -8,10 +8,10 @@ pub use incoming::{
 };
 pub use outgoing::*;
 
-/// The child frame of every pose.
+/// The child frame of every pose, unless a Track stream names its own.
 const CAMERA: &str = "camera";
 
-/// The world frame of a room.
+/// The name of a room's world frame, the parent frame of its poses.
 pub fn world_frame(room: &str) -> String {
     format!("rooms/{room}")
 }

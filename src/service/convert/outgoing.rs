@@ -1,17 +1,19 @@
-//! What leaves: answers to the wire.
+//! Outgoing answers: domain types converted to wire types.
 
 use nalgebra::Vector3;
 
 use super::super::snapshot::ServedNavigator;
 use super::{CAMERA, world_frame};
-use crate::adapter::Adapter;
-use crate::eval::{NavigatorKind, RetrievalScores, Row};
-use crate::features::FeatureSource;
-use crate::geometry::{Pose, Twist};
-use crate::navigation::{AnswerStep, Hit, Mode, Query, Reading, StepError, StepKind};
-use crate::proto::v1 as pb;
-use crate::room::Room;
-use crate::scores::{MotionScores, Rate};
+use seese3_client::proto::v1 as pb;
+use seese3_core::adapter::Adapter;
+use seese3_core::eval::{RetrievalScores, Row};
+use seese3_core::features::FeatureSource;
+use seese3_core::geometry::{Pose, Twist};
+use seese3_core::motion_scores::MotionScores;
+use seese3_core::navigation::NavigatorKind;
+use seese3_core::navigation::{AnswerStep, Hit, Mode, Query, Reading, StepError, StepKind};
+use seese3_core::room::Room;
+use seese3_core::statistics::Rate;
 
 pub fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
     pb::Vector3 {
@@ -21,8 +23,9 @@ pub fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
     }
 }
 
-/// Row by row.
+/// The 36 numbers of the matrix in row-major order.
 pub fn matrix_to_wire(matrix: &nalgebra::Matrix6<f64>) -> Vec<f64> {
+    // nalgebra stores matrices by column, so the transposed one is read in rows.
     matrix.transpose().iter().copied().collect()
 }
 
@@ -97,7 +100,7 @@ pub fn error_to_wire(error: &StepError, thresholds: &[f64]) -> pb::PoseError {
     }
 }
 
-/// The ways to step that an adapter has, by name.
+/// The names of the navigators that an adapter offers, under the paper's metric.
 pub fn navigator_names(adapter: &Adapter) -> Vec<String> {
     let has = |step: &StepKind| match step {
         StepKind::Corrector(kind) => adapter
@@ -112,12 +115,12 @@ pub fn navigator_names(adapter: &Adapter) -> Vec<String> {
         .collect()
 }
 
-/// The navigator of a question, by name.
+/// The name of the navigator that a query uses.
 pub fn navigator_to_wire(query: &Query) -> String {
     NavigatorKind::Step(query.step, query.metric).name()
 }
 
-/// The reading of a question; unspecified for a way to step that has none.
+/// The reading that a query uses; unspecified for a navigator that has none.
 pub fn reading_to_wire(step: StepKind) -> pb::Reading {
     match step {
         StepKind::InversePoincare(Reading::Affine) => pb::Reading::Affine,
@@ -174,6 +177,7 @@ pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
 }
 
 pub fn scores_to_wire(scores: &MotionScores) -> pb::MotionScores {
+    // R² is NaN where the true motions do not vary; on the wire it is then absent.
     let known = |value: f64| value.is_finite().then_some(value);
     pb::MotionScores {
         n: scores.n as u32,

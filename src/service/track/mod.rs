@@ -1,4 +1,7 @@
-//! OdometryService.Track: frames in, answers out, in order.
+//! OdometryService.Track: a stream of frames in, one answer for each in the same order.
+//!
+//! Two tasks serve a stream. `read` receives messages and, if the newest frame wins, drops frames
+//! that waited too long; `answer_all` hands each message to the [`Session`] on a worker thread.
 
 mod sealed;
 mod session;
@@ -17,24 +20,26 @@ use tonic::{Status, Streaming};
 use tracing::Instrument;
 
 use super::{Error, Handlers, Phase};
-use crate::proto::v1 as pb;
-use crate::proto::v1::track_request::Message;
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::track_request::Message;
 use session::Session;
 
-/// The answers of a stream.
+/// The stream of answers.
 pub type Answers = Pin<Box<dyn Stream<Item = Result<pb::TrackResponse, Status>> + Send>>;
 
-/// Answers that may wait for a listener; behind them frames wait.
+/// The largest number of answers that wait for a slow reader; beyond it, frames are not processed
+/// until one is read.
 const UNREAD: usize = 32;
 
-/// A message, when it came, and the frames that it overtook.
-struct Came {
+/// A message, its time of arrival, and the frames that were dropped in its favour.
+struct Incoming {
     since: Instant,
     message: Result<Message, Status>,
     overtaken: Option<Overtaken>,
 }
 
-/// Frames that a newer one overtook: the last of them, and how many they are.
+/// Frames that were dropped because a newer one arrived before their turn: time and sequence of the
+/// last of them, and their number.
 #[derive(Debug, Clone, Copy)]
 pub struct Overtaken {
     pub timestamp_ns: i64,
@@ -43,12 +48,21 @@ pub struct Overtaken {
 }
 
 impl Handlers {
-    /// Answers a stream's messages until it ends, goes wrong, or the server is told to stop.
+    /// Starts a stream and answers its messages until the caller ends it, an error ends it, or the
+    /// server stops.
+    ///
+    /// # Errors
+    /// [`Error::Loading`] if the server does not serve, [`Error::Deadline`] if no first message
+    /// comes, [`Error::Invalid`] if it is no valid configuration, [`Error::Busy`] if too many
+    /// streams are open, or as [`Session::open`].
     pub(super) async fn follow(
         &self,
         mut requests: Streaming<pb::TrackRequest>,
     ) -> Result<Answers, Status> {
         let snapshot = self.snapshot()?;
+
+        // A stream has no deadline, but its configuration must arrive in time, or streams that
+        // never send one would stay open for ever.
         let first = tokio::time::timeout(self.config.longest, requests.message()).await;
 
         let config = match first.map_err(|_| Error::Deadline)?? {
@@ -62,6 +76,8 @@ impl Handlers {
             }
         };
 
+        // The permit is held for as long as the stream lives and bounds the number of streams,
+        // since their frames are never refused for a full queue.
         let place = self
             .streams
             .clone()
@@ -76,7 +92,8 @@ impl Handlers {
             })
             .await?;
 
-        // One waits here, one is read ahead; what is behind them waits with the sender.
+        // One message waits in this channel and `read` holds another one. Later ones stay unread,
+        // so that the transport makes the sender wait.
         let (sender, frames) = mpsc::channel(1);
         let (answers, stream) = mpsc::channel(UNREAD);
         tokio::spawn(read(requests, sender, session.newest_wins()));
@@ -87,8 +104,8 @@ impl Handlers {
             tokio::select! {
                 () = handlers.answer_all(session, frames, &answers) => {}
                 () = told_to_stop(&mut phase) => {
-                    // The token of the last answer goes on elsewhere. A listener that does not read
-                    // is not waited for.
+                    // The caller can resume on another server with the token of its last answer. A
+                    // reader that is too slow to take this error is not waited for.
                     let _ = answers.try_send(Err(Error::Loading.into()));
                 }
             }
@@ -103,25 +120,30 @@ impl Handlers {
     async fn answer_all(
         &self,
         mut session: Session,
-        mut frames: mpsc::Receiver<Came>,
+        mut frames: mpsc::Receiver<Incoming>,
         answers: &mpsc::Sender<Result<pb::TrackResponse, Status>>,
     ) {
+        // The first answer confirms the configuration, before any frame.
         if answers.send(Ok(session.started())).await.is_err() {
             return;
         }
 
-        while let Some(Came {
+        while let Some(Incoming {
             since,
             message,
             overtaken,
         }) = frames.recv().await
         {
+            // One refusal counts all frames that this one overtook, so that the caller can
+            // account for every frame it sent.
             if let Some(frames) = overtaken
                 && answers.send(Ok(session.superseded(frames))).await.is_err()
             {
                 return;
             }
 
+            // A refused frame is an answer like any other. An error means that the stream cannot
+            // go on: it is sent as the last item.
             let answer = match message {
                 Ok(message) => match self.handled(session, message, since).await {
                     Ok((back, answer)) => {
@@ -143,7 +165,12 @@ impl Handlers {
         }
     }
 
-    /// Handles a message on a blocking thread, which gives the session back.
+    /// Handles one message on a worker thread. The session moves to that thread and comes back with
+    /// the answer.
+    ///
+    /// # Errors
+    /// The outer error means that the session is lost, because the work panicked or the server
+    /// stops; the inner one is the answer to the message.
     async fn handled(
         &self,
         mut session: Session,
@@ -168,32 +195,39 @@ impl Handlers {
     }
 }
 
-/// Completes once the server does not serve any more.
+/// Completes when the server is no longer serving.
 async fn told_to_stop(phase: &mut watch::Receiver<Phase>) {
-    // An error means the server is gone. The guard that is returned must not live on.
+    // An error means that the server is gone. The guard is dropped at once, because `run` cannot
+    // change the phase while it lives.
     let _ = phase
         .wait_for(|phase| !matches!(phase, Phase::Serving(_)))
         .await
         .map(drop);
 }
 
-/// Reads messages as they come, one ahead; where the newest frame wins, further, as long as each
-/// overtakes the one before. Ends with the stream, or when nobody asks for its messages any more.
+/// Reads messages as they arrive, at most one ahead of the one being answered. If the newest frame
+/// wins, it goes on reading while a message waits, and each newer frame replaces the waiting one.
+/// Ends with the stream, at its first error, or when the messages are no longer wanted.
 async fn read(
     mut requests: Streaming<pb::TrackRequest>,
-    sender: mpsc::Sender<Came>,
+    sender: mpsc::Sender<Incoming>,
     newest_wins: bool,
 ) {
-    let mut waiting: Option<Came> = None;
+    let mut waiting: Option<Incoming> = None;
     loop {
         let may_read = waiting.is_none() || newest_wins;
         tokio::select! {
+            // Polled in this order: a message that can be handed over leaves before the next one
+            // is read, so that no frame is dropped without need.
             biased;
             () = sender.closed() => return,
             permit = sender.reserve(), if waiting.is_some() => {
                 let (Ok(permit), Some(came)) = (permit, waiting.take()) else { return };
                 let ends = came.message.is_err();
                 permit.send(came);
+
+                // Nothing is read after an error, of the transport or of a message without
+                // content.
                 if ends {
                     return;
                 }
@@ -201,12 +235,12 @@ async fn read(
             next = requests.next(), if may_read => {
                 let Some(next) = next else {
                     if let Some(came) = waiting.take() {
-                        // An error means that nobody asks any more.
+                        // An error means that the messages are no longer wanted.
                         let _ = sender.send(came).await;
                     }
                     return;
                 };
-                let mut came = Came { since: Instant::now(), message: message_of(next), overtaken: None };
+                let mut came = Incoming { since: Instant::now(), message: message_of(next), overtaken: None };
                 if let Some(before) = waiting.take()
                     && let Some(before) = overtake(before, &mut came)
                     && sender.send(before).await.is_err()
@@ -230,13 +264,17 @@ fn message_of(next: Result<pb::TrackRequest, Status>) -> Result<Message, Status>
     }
 }
 
-/// Has a later frame take the place of one that waits; gives that one back when the other is none.
-fn overtake(before: Came, came: &mut Came) -> Option<Came> {
+/// Drops the waiting frame `before` in favour of the newer frame `came`, which then counts it.
+/// Returns `before` if it has to be answered itself: if either message is not a frame, or `came` is
+/// not later in both time and sequence.
+fn overtake(before: Incoming, came: &mut Incoming) -> Option<Incoming> {
     let (Ok(Message::Frame(old)), Ok(Message::Frame(new))) = (&before.message, &came.message)
     else {
         return Some(before);
     };
 
+    // Late and duplicate frames must not displace a good one; each gets its own refusal from the
+    // tracker.
     if new.timestamp_ns <= old.timestamp_ns || new.sequence <= old.sequence {
         return Some(before);
     }

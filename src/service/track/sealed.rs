@@ -1,20 +1,23 @@
-//! A stream's state as bytes, number by number to the bit.
+//! The state of a stream as bytes, for resume tokens. Every number comes back bit by bit.
+//!
+//! The messages are the tokens' own format and no part of the public API. A change of their layout
+//! or meaning needs a new `MAGIC` in `token`.
 
 use nalgebra::{Matrix6, Quaternion, Translation3, UnitQuaternion};
 use prost::Message;
 
 use super::super::Error;
-use crate::geometry::Pose;
-use crate::odometry::{Belief, Candidate, Chain, Keyframe, Last, State};
+use seese3_core::geometry::Pose;
+use seese3_core::tracking::{Belief, Candidate, Keyframe, LastFrame, State, TrackingHealth};
 
-/// What a token holds: what the stream was configured with, what it was answered from, and its
-/// state.
+/// The content of a token: the configuration of the stream, a hash of what it was answered from,
+/// and its state.
 #[derive(Clone, PartialEq, Message)]
 pub struct Sealed {
     /// The configuration as it was sent.
     #[prost(message, optional, tag = "1")]
-    pub config: Option<crate::proto::v1::TrackConfig>,
-    /// Name and revision of the adapter and of every room, hashed: what the answers depend on.
+    pub config: Option<seese3_client::proto::v1::TrackConfig>,
+    /// Hash of the rooms and their adapter, by name, revision and content: what answers depend on.
     #[prost(bytes = "vec", tag = "2")]
     pub served: Vec<u8>,
     #[prost(message, optional, tag = "3")]
@@ -30,23 +33,23 @@ pub struct SealedState {
     #[prost(message, optional, tag = "3")]
     keyframe: Option<SealedKeyframe>,
     #[prost(double, repeated, tag = "4")]
-    initial: Vec<f64>,
-    /// One behind the other.
+    initial_pose: Vec<f64>,
+    /// The rows of `State::recent` one after another; `recent_count` says how many they are.
     #[prost(double, repeated, tag = "5")]
     recent: Vec<f64>,
     #[prost(uint32, tag = "6")]
     recent_count: u32,
-    /// Fresh, held, held and confirmed, lost.
+    /// Tracking health: 0 fresh, 1 held, 2 held and confirmed, 3 lost.
     #[prost(uint32, tag = "7")]
-    chain: u32,
+    health: u32,
     #[prost(int32, tag = "8")]
-    chain_count: i32,
+    health_count: i32,
     #[prost(message, optional, tag = "9")]
     candidate: Option<SealedCandidate>,
     #[prost(uint32, tag = "10")]
-    unseen: u32,
+    frames_off_map: u32,
     #[prost(uint32, tag = "11")]
-    unlooked: u32,
+    frames_since_anchor: u32,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -70,9 +73,9 @@ struct SealedKeyframe {
     #[prost(double, repeated, tag = "3")]
     odom: Vec<f64>,
     #[prost(double, repeated, tag = "4")]
-    place: Vec<f64>,
+    map_pose: Vec<f64>,
     #[prost(double, repeated, tag = "5")]
-    told: Vec<f64>,
+    reported_pose: Vec<f64>,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -80,9 +83,9 @@ struct SealedCandidate {
     #[prost(uint64, tag = "1")]
     room: u64,
     #[prost(double, repeated, tag = "2")]
-    place: Vec<f64>,
+    map_pose: Vec<f64>,
     #[prost(uint32, tag = "3")]
-    agreed: u32,
+    agreeing_anchors: u32,
     #[prost(uint64, tag = "4")]
     sequence: u64,
     #[prost(double, repeated, tag = "5")]
@@ -90,7 +93,7 @@ struct SealedCandidate {
 }
 
 impl SealedLast {
-    fn opened(self) -> Result<Last, Error> {
+    fn opened(self) -> Result<LastFrame, Error> {
         let Self {
             time_ns,
             sequence,
@@ -98,7 +101,7 @@ impl SealedLast {
             latent,
         } = self;
 
-        Ok(Last {
+        Ok(LastFrame {
             time_ns,
             sequence,
             latent,
@@ -113,19 +116,19 @@ impl SealedKeyframe {
             sequence,
             latent,
             odom,
-            place,
-            told,
+            map_pose,
+            reported_pose,
         } = self;
 
-        let place = belief_of_numbers(&place)?;
-        let told = belief_of_numbers(&told)?;
+        let map_pose = belief_of_numbers(&map_pose)?;
+        let reported_pose = belief_of_numbers(&reported_pose)?;
 
         Ok(Keyframe {
             sequence,
             latent,
             odom: required(&odom)?,
-            place,
-            told,
+            map_pose,
+            reported_pose,
         })
     }
 }
@@ -134,8 +137,8 @@ impl SealedCandidate {
     fn opened(self) -> Result<Candidate, Error> {
         let Self {
             room,
-            place,
-            agreed,
+            map_pose,
+            agreeing_anchors,
             sequence,
             latent,
         } = self;
@@ -144,8 +147,8 @@ impl SealedCandidate {
             room: index(room)?,
             sequence,
             latent,
-            place: required(&place)?,
-            agreed,
+            map_pose: required(&map_pose)?,
+            agreeing_anchors,
         })
     }
 }
@@ -154,7 +157,8 @@ fn index(room: u64) -> Result<usize, Error> {
     usize::try_from(room).map_err(|_| Error::Internal)
 }
 
-/// Translation, quaternion (x, y, z, w), and the upper half of the covariance.
+/// The 28 numbers of a belief: translation, quaternion (x, y, z, w), and the upper triangle of the
+/// symmetric covariance, row by row.
 fn belief_to_numbers(belief: &Belief) -> Vec<f64> {
     let t = belief.pose.translation.vector;
     let q = belief.pose.rotation.coords;
@@ -166,12 +170,13 @@ fn belief_to_numbers(belief: &Belief) -> Vec<f64> {
         .collect()
 }
 
-/// None of no numbers.
+/// The belief of such numbers; none if there are no numbers.
 fn belief_of_numbers(numbers: &[f64]) -> Result<Option<Belief>, Error> {
     if numbers.is_empty() {
         return Ok(None);
     }
 
+    // 7 numbers of the pose, then the 21 of the upper triangle of a 6×6 matrix.
     let &[x, y, z, i, j, k, w, ref upper @ ..] = numbers else {
         return Err(Error::Internal);
     };
@@ -179,7 +184,8 @@ fn belief_of_numbers(numbers: &[f64]) -> Result<Option<Belief>, Error> {
         return Err(Error::Internal);
     }
 
-    // As it was, not normalised again: that could change the last bit.
+    // The quaternion is not normalised again: that could change its last bit, and answers after a
+    // resume must equal those without one.
     let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
     let mut covariance = Matrix6::zeros();
     let places = (0..6).flat_map(|row| (row..6).map(move |column| (row, column)));
@@ -198,6 +204,69 @@ fn required(numbers: &[f64]) -> Result<Belief, Error> {
     belief_of_numbers(numbers)?.ok_or(Error::Internal)
 }
 
+/// The numbers of a belief; none of an unknown one.
+fn numbers(belief: &Option<Belief>) -> Vec<f64> {
+    belief.as_ref().map_or_else(Vec::new, belief_to_numbers)
+}
+
+impl From<&LastFrame> for SealedLast {
+    fn from(last: &LastFrame) -> Self {
+        let LastFrame {
+            time_ns,
+            sequence,
+            latent,
+            odom,
+        } = last;
+
+        Self {
+            time_ns: *time_ns,
+            sequence: *sequence,
+            odom: belief_to_numbers(odom),
+            latent: latent.clone(),
+        }
+    }
+}
+
+impl From<&Keyframe> for SealedKeyframe {
+    fn from(keyframe: &Keyframe) -> Self {
+        let Keyframe {
+            sequence,
+            latent,
+            odom,
+            map_pose,
+            reported_pose,
+        } = keyframe;
+
+        Self {
+            sequence: *sequence,
+            latent: latent.clone(),
+            odom: belief_to_numbers(odom),
+            map_pose: numbers(map_pose),
+            reported_pose: numbers(reported_pose),
+        }
+    }
+}
+
+impl From<&Candidate> for SealedCandidate {
+    fn from(candidate: &Candidate) -> Self {
+        let Candidate {
+            room,
+            sequence,
+            latent,
+            map_pose,
+            agreeing_anchors,
+        } = candidate;
+
+        Self {
+            room: *room as u64,
+            map_pose: belief_to_numbers(map_pose),
+            agreeing_anchors: *agreeing_anchors,
+            sequence: *sequence,
+            latent: latent.clone(),
+        }
+    }
+}
+
 impl From<&State> for SealedState {
     fn from(state: &State) -> Self {
         // Destructured with no `..`, so that a new field breaks the build here.
@@ -205,110 +274,73 @@ impl From<&State> for SealedState {
             room,
             last,
             keyframe,
-            initial,
+            initial_pose,
             recent,
-            chain,
+            health,
             candidate,
-            unseen,
-            unlooked,
+            frames_off_map,
+            frames_since_anchor,
         } = state;
 
-        let numbers =
-            |belief: &Option<Belief>| belief.as_ref().map_or_else(Vec::new, belief_to_numbers);
-
-        let (chain, chain_count) = match *chain {
-            Chain::Fresh => (0, 0),
-            Chain::Held { count, confirmed } => (1 + u32::from(confirmed), count),
-            Chain::Lost { count } => (3, i32::try_from(count).unwrap_or(i32::MAX)),
+        // Tracking health is stored as a number for its state and the state's counter.
+        let (health, health_count) = match *health {
+            TrackingHealth::NotStarted => (0, 0),
+            TrackingHealth::Consistent { score, confirmed } => (1 + u32::from(confirmed), score),
+            TrackingHealth::Lost { certain_matches } => {
+                (3, i32::try_from(certain_matches).unwrap_or(i32::MAX))
+            }
         };
 
         Self {
             room: room.map(|room| room as u64),
-            last: last.as_ref().map(
-                |Last {
-                     time_ns,
-                     sequence,
-                     latent,
-                     odom,
-                 }| SealedLast {
-                    time_ns: *time_ns,
-                    sequence: *sequence,
-                    odom: belief_to_numbers(odom),
-                    latent: latent.clone(),
-                },
-            ),
-            keyframe: keyframe.as_ref().map(
-                |Keyframe {
-                     sequence,
-                     latent,
-                     odom,
-                     place,
-                     told,
-                 }| SealedKeyframe {
-                    sequence: *sequence,
-                    latent: latent.clone(),
-                    odom: belief_to_numbers(odom),
-                    place: numbers(place),
-                    told: numbers(told),
-                },
-            ),
-            initial: numbers(initial),
+            last: last.as_ref().map(SealedLast::from),
+            keyframe: keyframe.as_ref().map(SealedKeyframe::from),
+            initial_pose: numbers(initial_pose),
             recent: recent.iter().flatten().copied().collect(),
             recent_count: recent.len() as u32,
-            chain,
-            chain_count,
-            candidate: candidate.as_ref().map(
-                |Candidate {
-                     room,
-                     sequence,
-                     latent,
-                     place,
-                     agreed,
-                 }| SealedCandidate {
-                    room: *room as u64,
-                    place: belief_to_numbers(place),
-                    agreed: *agreed,
-                    sequence: *sequence,
-                    latent: latent.clone(),
-                },
-            ),
-            unseen: *unseen,
-            unlooked: *unlooked,
+            health,
+            health_count,
+            candidate: candidate.as_ref().map(SealedCandidate::from),
+            frames_off_map: *frames_off_map,
+            frames_since_anchor: *frames_since_anchor,
         }
     }
 }
 
 impl SealedState {
-    /// The state.
+    /// The tracker's state.
     ///
     /// # Errors
-    /// [`Error::Internal`] when a number is missing: no token that was sealed lacks one.
+    /// [`Error::Internal`] if a belief does not have 28 numbers, or a room's index is too large for
+    /// this machine. No token that a server sealed has either.
     pub fn state(self) -> Result<State, Error> {
         let Self {
             room,
             last,
             keyframe,
-            initial,
+            initial_pose,
             recent,
             recent_count,
-            chain,
-            chain_count,
+            health,
+            health_count,
             candidate,
-            unseen,
-            unlooked,
+            frames_off_map,
+            frames_since_anchor,
         } = self;
 
-        let chain = match chain {
-            0 => Chain::Fresh,
-            1 | 2 => Chain::Held {
-                count: chain_count,
-                confirmed: chain == 2,
+        let health = match health {
+            0 => TrackingHealth::NotStarted,
+            1 | 2 => TrackingHealth::Consistent {
+                score: health_count,
+                confirmed: health == 2,
             },
-            _ => Chain::Lost {
-                count: chain_count.unsigned_abs(),
+            _ => TrackingHealth::Lost {
+                certain_matches: health_count.unsigned_abs(),
             },
         };
 
+        // The rows of `recent` all have one width, which follows from their number. Whether it is
+        // the adapter's is checked by the session.
         let width = recent.len().checked_div(recent_count as usize).unwrap_or(0);
         let last = last.map(SealedLast::opened).transpose()?;
         let keyframe = keyframe.map(SealedKeyframe::opened).transpose()?;
@@ -318,12 +350,12 @@ impl SealedState {
             room: room.map(index).transpose()?,
             last,
             keyframe,
-            initial: belief_of_numbers(&initial)?,
+            initial_pose: belief_of_numbers(&initial_pose)?,
             recent: recent.chunks(width.max(1)).map(<[f64]>::to_vec).collect(),
-            chain,
+            health,
             candidate,
-            unseen,
-            unlooked,
+            frames_off_map,
+            frames_since_anchor,
         })
     }
 }
@@ -332,7 +364,7 @@ impl SealedState {
 mod tests {
     use super::*;
 
-    /// Oracle: the promise: what was sealed comes back, to the bit.
+    /// Oracle: the contract: a sealed state comes back bit by bit.
     #[test]
     fn a_state_comes_back_to_the_bit() {
         let odd = Pose::new(
@@ -341,7 +373,7 @@ mod tests {
         );
 
         let belief = Belief::known(odd, 0.1, 0.2).moved(
-            crate::geometry::Twist {
+            seese3_core::geometry::Twist {
                 linear: nalgebra::Vector3::new(0.1, 0.2, 0.3),
                 angular: nalgebra::Vector3::y() * 0.4,
             },
@@ -350,7 +382,7 @@ mod tests {
 
         let state = State {
             room: Some(3),
-            last: Some(Last {
+            last: Some(LastFrame {
                 time_ns: -5,
                 sequence: u64::MAX,
                 latent: vec![-1.5; 20],
@@ -360,31 +392,31 @@ mod tests {
                 sequence: 9,
                 latent: vec![1.0 / 3.0; 20],
                 odom: belief,
-                place: Some(belief),
-                told: None,
+                map_pose: Some(belief),
+                reported_pose: None,
             }),
-            initial: None,
+            initial_pose: None,
             recent: vec![vec![0.1; 20], vec![-0.0; 20]],
-            chain: Chain::Held {
-                count: -1,
+            health: TrackingHealth::Consistent {
+                score: -1,
                 confirmed: false,
             },
             candidate: Some(Candidate {
                 room: 1,
                 sequence: 8,
                 latent: vec![0.5; 20],
-                place: belief,
-                agreed: 2,
+                map_pose: belief,
+                agreeing_anchors: 2,
             }),
-            unseen: 7,
-            unlooked: 2,
+            frames_off_map: 7,
+            frames_since_anchor: 2,
         };
 
         for state in [
             state,
             State::default(),
             State {
-                chain: Chain::Lost { count: 4 },
+                health: TrackingHealth::Lost { certain_matches: 4 },
                 ..State::default()
             },
         ] {
@@ -396,7 +428,7 @@ mod tests {
 
             assert_eq!(back, state);
 
-            // Equality takes -0 for 0.
+            // Equality does not distinguish -0 from 0, but the bytes do.
             assert_eq!(SealedState::from(&back).encode_to_vec(), bytes);
         }
     }

@@ -1,4 +1,5 @@
-//! One stream: its configuration, its rooms, and what it says of a frame.
+//! One Track stream: its configuration, its rooms, the state of its tracker, and the answers to its
+//! messages.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,21 +16,22 @@ use super::Overtaken;
 use super::sealed::{Sealed, SealedState};
 use super::token::TokenKey;
 use super::wire;
-use crate::navigation::Source;
-use crate::odometry::{Belief, Observation, Refusal, Settings, State, Tracker, View};
-use crate::proto::v1 as pb;
+use seese3_client::proto::v1 as pb;
+use seese3_core::navigation::Source;
+use seese3_core::tracking::{Belief, Observation, Refusal, State, Tracker, TrackerSettings, View};
 
-/// How surely a pose is known whose sender does not say, metres and radians.
+/// The standard deviation by axis of a pose whose sender states none: 0.1 m and 0.1 rad.
 const KNOWN: f64 = 0.1;
-/// The surest and the least sure that a pose may be called.
+/// The standard deviations that a sender may state, metres or radians.
 const DEVIATIONS: std::ops::RangeInclusive<f64> = 1e-6..=1e3;
-/// What a stream's frames are called if it does not say.
+/// The names of the map, odometry and camera frames if the stream does not choose its own.
 const FRAME_NAMES: [&str; 3] = ["map", "odom", "camera"];
 /// The longest name of a frame.
 const LONGEST_NAME: usize = 100;
 const FIELD: &str = "config";
 
-/// A configured stream.
+/// A configured stream and the state of its tracker. The server keeps it only while the stream is
+/// open; every answer carries it as a resume token.
 pub struct Session {
     snapshot: Arc<Snapshot>,
     served: Vec<Arc<ServedNavigator>>,
@@ -42,10 +44,12 @@ pub struct Session {
 }
 
 impl Session {
-    /// A stream as it is configured, or as a token says.
+    /// Opens a stream from its configuration, or resumes the one whose token the configuration
+    /// holds.
     ///
     /// # Errors
-    /// [`Error`], naming the field.
+    /// [`Error`], naming the field: the configuration or the token is not valid, or this server has
+    /// other rooms or another adapter than the one that sealed the token.
     pub fn open(
         snapshot: &Arc<Snapshot>,
         config: pb::TrackConfig,
@@ -57,6 +61,8 @@ impl Session {
 
         let field = format!("{FIELD}.resume_token");
 
+        // A token contains the configuration of its stream, so any other field could only
+        // contradict it.
         let alone = pb::TrackConfig {
             resume_token: config.resume_token.clone(),
             ..pb::TrackConfig::default()
@@ -69,6 +75,8 @@ impl Session {
             ));
         }
 
+        // The seal is genuine from here on, so a token that does not decode is an error of this
+        // server.
         let sealed =
             Sealed::decode(key.open(&field, &config.resume_token)?).map_err(|_| Error::Internal)?;
         let (config, state) = sealed.config.zip(sealed.state).ok_or(Error::Internal)?;
@@ -80,9 +88,11 @@ impl Session {
             other => other,
         })?;
 
+        // The state is made of latents and poses, which mean nothing under another adapter or
+        // map.
         if session.digest != sealed.served {
             let problem =
-                "the adapter or the rooms are others here than where the token is from; start anew";
+                "this server has other rooms or another adapter than the token; start anew";
             return Err(Error::Precondition(format!("{field}: {problem}")));
         }
 
@@ -97,8 +107,9 @@ impl Session {
         Ok(session)
     }
 
-    /// Whether the state is one of these rooms and this adapter. The hash says so; a state that is
-    /// not would be a panic.
+    /// Whether the state's latents have the width of this adapter and its room indices exist here.
+    /// The digest should guarantee it; without this check a state that does not fit would be a
+    /// panic in the tracker.
     fn fits(&self) -> bool {
         let adapter = &self.served[0].adapter.adapter;
         let rooms = self.served.len();
@@ -134,6 +145,8 @@ impl Session {
         config: pb::TrackConfig,
         key: &TokenKey,
     ) -> Result<Self, Error> {
+        // Everything is checked before the stream starts: rooms and adapter, maps, settings,
+        // frame names, and the initial pose.
         let served = rooms(snapshot, &config)?;
         let adapter = &served[0].adapter;
         let maps = maps(&served)?;
@@ -142,6 +155,7 @@ impl Session {
         let names = frame_names(config.frames.clone().unwrap_or_default())?;
         back_pressure(config.back_pressure)?;
 
+        // A pose only has a meaning in the world of a room, so the room must be known as well.
         let begins = match config.initial_pose.clone() {
             None => None,
             Some(_) if config.room.is_empty() => {
@@ -153,10 +167,12 @@ impl Session {
             ),
         };
 
+        // Without anchors nothing ever finds the camera on the map, so dead reckoning needs a
+        // pose to begin from.
         if !settings.fuse && begins.is_none() {
             return Err(Error::invalid(
                 "fusion",
-                "of nothing finds no place: give room and initial_pose, or let places correct",
+                "FUSION_NONE needs room and initial_pose; give both, or use FUSION_ANCHORS",
             ));
         }
 
@@ -178,12 +194,13 @@ impl Session {
         })
     }
 
-    /// Whether only the newest frame that waits is to be answered.
+    /// Whether only the newest of the waiting frames is answered.
     pub fn newest_wins(&self) -> bool {
         self.config.back_pressure == pb::BackPressure::Newest as i32
     }
 
-    /// The first answer.
+    /// The first answer of a stream: which adapter, room, frame names and keyframe policy are in
+    /// effect.
     pub fn started(&self) -> pb::TrackResponse {
         let adapter = &self.served[0].adapter;
         let settings = self.tracker.settings();
@@ -205,10 +222,11 @@ impl Session {
         self.answer(pb::track_response::Answer::Started(started))
     }
 
-    /// Takes a frame.
+    /// Answers one frame with an update of the tracker, or with a refusal if the frame itself is at
+    /// fault. `waited` is the time since the frame's arrival.
     ///
     /// # Errors
-    /// What is not the frame's fault.
+    /// [`Error`] if the server is at fault; the stream then ends.
     pub fn take(
         &mut self,
         frame: pb::TrackFrame,
@@ -225,6 +243,8 @@ impl Session {
         let answer = match self.observe(timestamp_ns, sequence, view) {
             Ok(update) => {
                 let update = wire::update(&update, &self.names, &self.served);
+
+                // Counted from the frame's arrival, so that the wait for a thread is included.
                 let elapsed_ns =
                     u64::try_from((waited + begun.elapsed()).as_nanos()).unwrap_or(u64::MAX);
 
@@ -250,7 +270,7 @@ impl Session {
         Ok(self.answer(answer))
     }
 
-    /// Frames that a newer one overtook: one answer for all of them.
+    /// One refusal for all the frames that a newer one overtook.
     pub fn superseded(&self, frames: Overtaken) -> pb::TrackResponse {
         let Overtaken {
             timestamp_ns,
@@ -267,11 +287,13 @@ impl Session {
         }))
     }
 
-    /// Puts the camera somewhere, or refuses to.
+    /// Sets the camera's pose on the map, or answers with a refusal if the given pose is not valid.
     pub fn put(&mut self, given: pb::SetInitialPose) -> pb::TrackResponse {
+        // A bad pose ends neither the stream nor the tracking: the caller gets a refusal and the
+        // state stays as it was.
         let answer = match self.place_of(given) {
             Ok(place) => {
-                self.tracker.put(&mut self.state, place);
+                self.tracker.set_pose(&mut self.state, place);
                 pb::track_response::Answer::Acknowledged(pb::TrackAcknowledged {})
             }
             Err(error) => pb::track_response::Answer::Refusal(pb::TrackRefusal {
@@ -290,6 +312,8 @@ impl Session {
             .initial_pose
             .ok_or_else(|| Error::invalid(field, "is required"))?;
 
+        // A pose is relative to the world of one room. As long as several rooms are possible it
+        // has no meaning.
         let room = self.state.room.ok_or_else(|| {
             Error::Precondition(format!(
                 "{field}: the room is not known yet; name it in the configuration"
@@ -300,7 +324,8 @@ impl Session {
         known_pose(given, &name, &self.names).map_err(|error| error.within(field))
     }
 
-    /// Forgets everything but the configuration; where the camera began is not where it is.
+    /// Starts tracking anew with the same configuration. The configured initial pose is not used
+    /// again, because the camera has moved since.
     pub fn reset(&mut self) -> pb::TrackResponse {
         self.state = self.tracker.start(None);
         self.answer(pb::track_response::Answer::Acknowledged(
@@ -313,9 +338,11 @@ impl Session {
         time_ns: i64,
         sequence: u64,
         view: Option<pb::View>,
-    ) -> Result<crate::odometry::Update, Refused> {
+    ) -> Result<seese3_core::tracking::Update, Refused> {
         use pb::TrackRefusalReason as Reason;
 
+        // What is wrong with the view is the caller's error and refuses only this frame. Anything
+        // else is the server's and ends the stream.
         let view_refused = |error: Error| match error {
             Error::Invalid { .. } | Error::Precondition(_) => {
                 Refused::Frame(Reason::View, error.to_string())
@@ -332,7 +359,7 @@ impl Session {
             Source::Frame(_) => {
                 let error = Error::invalid(
                     "frame.view.frame_id",
-                    "is a frame of a room, not what a camera sees",
+                    "is a stored frame; give a feature, a latent or an image of the camera",
                 );
                 return Err(view_refused(error));
             }
@@ -347,6 +374,7 @@ impl Session {
             latent,
         };
 
+        // Late and duplicate frames are refused too. A refused frame leaves the state as it was.
         self.tracker
             .observe(&mut self.state, &observation)
             .map_err(|refusal| {
@@ -360,6 +388,8 @@ impl Session {
     }
 
     fn answer(&self, answer: pb::track_response::Answer) -> pb::TrackResponse {
+        // Every answer carries the whole state, so that the stream can go on from it after a
+        // restart or on another server.
         let sealed = Sealed {
             config: Some(self.config.clone()),
             served: self.digest.clone(),
@@ -372,19 +402,24 @@ impl Session {
     }
 }
 
-/// Why a frame has no update.
+/// Why a frame gets no update.
 enum Refused {
     /// The frame is refused; the stream goes on.
     Frame(pb::TrackRefusalReason, String),
-    /// The stream ends.
+    /// The server is at fault; the stream ends.
     Server(Error),
 }
 
-/// The rooms of a configuration, under one adapter; at least one.
+/// The rooms of a configuration, all under one adapter; at least one.
+///
+/// # Errors
+/// [`Error::Invalid`] if both `room` and `rooms` are given, or as [`rooms_to_track_in`].
 fn rooms(
     snapshot: &Snapshot,
     config: &pb::TrackConfig,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+    // A single room is passed on as a list of one, so that errors about `rooms[0]` are renamed to
+    // the field that the caller filled.
     match (config.room.as_str(), config.rooms.as_slice()) {
         ("", rooms) => rooms_to_track_in(snapshot, rooms, &config.adapter),
         (room, []) => {
@@ -401,16 +436,17 @@ fn rooms(
         }
         _ => Err(Error::invalid(
             "rooms",
-            "are for a room that is not known; leave them or room empty",
+            "are candidates for an unknown room; give room or rooms, not both",
         )),
     }
 }
 
 fn settings(
     config: &pb::TrackConfig,
-    adapter: &crate::adapter::Adapter,
-) -> Result<Settings, Error> {
-    let plain = Settings::of(adapter);
+    adapter: &seese3_core::adapter::Adapter,
+) -> Result<TrackerSettings, Error> {
+    // On the wire 0 means that the caller leaves the value to the adapter's defaults.
+    let plain = TrackerSettings::of(adapter);
 
     let pb::KeyframePolicy {
         displacement,
@@ -435,7 +471,7 @@ fn settings(
         }
     };
 
-    Ok(Settings {
+    Ok(TrackerSettings {
         keyframe_frames: if frames == 0 {
             plain.keyframe_frames
         } else {
@@ -463,6 +499,9 @@ fn back_pressure(given: i32) -> Result<(), Error> {
 fn frame_names(given: pb::FrameNames) -> Result<pb::FrameNames, Error> {
     let pb::FrameNames { map, odom, camera } = given;
     let mut names = [map, odom, camera];
+
+    // Empty names take the defaults. The others are repeated in answers, so they must be short
+    // and free of control characters.
     for (name, (plain, field)) in names
         .iter_mut()
         .zip(FRAME_NAMES.into_iter().zip(["map", "odom", "camera"]))
@@ -476,6 +515,7 @@ fn frame_names(given: pb::FrameNames) -> Result<pb::FrameNames, Error> {
         }
     }
 
+    // In a transform tree every frame needs a name of its own.
     if names[0] == names[1] || names[1] == names[2] || names[0] == names[2] {
         return Err(Error::invalid("frames", "must be three different names"));
     }
@@ -484,7 +524,11 @@ fn frame_names(given: pb::FrameNames) -> Result<pb::FrameNames, Error> {
     Ok(pb::FrameNames { map, odom, camera })
 }
 
-/// A pose in the room's world, which a stream also calls by its own name.
+/// A pose on the map that is given from outside, with its uncertainty. Its frames may have the
+/// stream's own names or those of the service, `rooms/NAME` and `camera`.
+///
+/// # Errors
+/// [`Error::Invalid`] if the pose is missing or not valid, or a standard deviation is out of range.
 fn known_pose(given: pb::InitialPose, room: &str, names: &pb::FrameNames) -> Result<Belief, Error> {
     let pb::InitialPose {
         pose,
@@ -493,6 +537,8 @@ fn known_pose(given: pb::InitialPose, room: &str, names: &pb::FrameNames) -> Res
     } = given;
     let mut pose = pose.ok_or_else(|| Error::invalid("pose", "is required"))?;
 
+    // `convert::pose` takes an empty name for the room's world or the camera, so the stream's own
+    // names are cleared.
     for (frame, name) in [
         (&mut pose.parent_frame, &names.map),
         (&mut pose.child_frame, &names.camera),
@@ -504,6 +550,7 @@ fn known_pose(given: pb::InitialPose, room: &str, names: &pb::FrameNames) -> Res
 
     let pose = convert::pose(pose, room).map_err(|error| error.within("pose"))?;
 
+    // On the wire 0 means that the sender does not state its uncertainty.
     let deviation = |field: &str, given: f64| match given {
         0.0 => Ok(KNOWN),
         given if DEVIATIONS.contains(&given) => Ok(given),
@@ -519,7 +566,8 @@ fn known_pose(given: pb::InitialPose, room: &str, names: &pb::FrameNames) -> Res
     Ok(Belief::known(pose, translation, rotation))
 }
 
-/// What the answers depend on: the rooms under the adapter, by name, revision and content.
+/// Hash of everything that answers depend on: the rooms and their adapter, by name, revision and
+/// content.
 fn digest(served: &[Arc<ServedNavigator>]) -> Vec<u8> {
     let mut digest = Sha256::new();
     for served in served {

@@ -1,23 +1,27 @@
-//! Resume tokens: a stream's state, sealed with the server's key, so that servers keep no session.
+//! Resume tokens: the state of a stream, authenticated with the server's key, so that servers keep
+//! no sessions.
+//!
+//! A token is MAGIC, key id, state, and the HMAC-SHA-256 of all of that. It is protected against
+//! changes but not encrypted: its holder can read the state.
 
 use hmac::{Hmac, Mac};
 use sha2::{Digest, Sha256};
 
 use super::super::Error;
 
-/// What a token begins with: what it is, and the version of its layout.
+/// The first bytes of a token: its kind and the version of its layout.
 const MAGIC: &[u8; 4] = b"S3T1";
-/// Bytes that say which key sealed it.
+/// Bytes of the id of the key that sealed it.
 const KEY_ID: usize = 8;
-/// Bytes of the seal.
+/// Bytes of the seal, an HMAC-SHA-256.
 const SEAL: usize = 32;
-/// The least that a key may be made from.
+/// The shortest secret that a key may be derived from, bytes.
 const LEAST_KEY_BYTES: usize = 16;
 
-/// Seals states. Servers that share a key take one another's tokens.
+/// A key that seals tokens and verifies them. Servers that share it accept one another's tokens.
 #[derive(Clone)]
 pub struct TokenKey {
-    /// With the key, before any byte.
+    /// HMAC-SHA-256 initialised with the key; cloned for every token.
     mac: Hmac<Sha256>,
     id: [u8; KEY_ID],
 }
@@ -29,10 +33,10 @@ impl std::fmt::Debug for TokenKey {
 }
 
 impl TokenKey {
-    /// A key from a secret.
+    /// A key derived from a secret.
     ///
     /// # Errors
-    /// What is wrong with it, in words.
+    /// A message for the operator if the secret is too short.
     pub fn new(secret: &[u8]) -> Result<Self, String> {
         if secret.len() < LEAST_KEY_BYTES {
             return Err(format!(
@@ -45,11 +49,13 @@ impl TokenKey {
     }
 
     fn of(secret: &[u8]) -> Self {
-        // Secrets of every length become 32 bytes; the id is another hash, and gives nothing of the
-        // key away.
+        // Secrets of any length become 32 bytes. The id is a hash with another prefix, so that it
+        // reveals nothing of the key although tokens show it.
         let hash = |what: &[u8]| Sha256::digest([what, secret].concat());
         let mut id = [0; KEY_ID];
         id.copy_from_slice(&hash(b"seese3 token key id ")[..KEY_ID]);
+
+        // The block size of SHA-256 is 64 bytes; HMAC pads a shorter key with zeros.
         let mut block = [0; 64];
         block[..32].copy_from_slice(&hash(b"seese3 token key "));
 
@@ -59,14 +65,14 @@ impl TokenKey {
         }
     }
 
-    /// A key that nobody else has: its tokens end with this server.
+    /// A random key that no other server has: its tokens are worthless once this server ends.
     pub fn random() -> Self {
         let secret: [u8; 32] = rand::random();
-        // HMAC takes keys of every length, and this one is long enough.
+        // 32 random bytes are long enough, so the check in `new` is not needed.
         Self::of(&secret)
     }
 
-    /// A state as a token.
+    /// Seals a state into a token.
     pub fn seal(&self, state: &[u8]) -> Vec<u8> {
         let mut token = [MAGIC.as_slice(), &self.id, state].concat();
         let seal = self
@@ -80,10 +86,11 @@ impl TokenKey {
         token
     }
 
-    /// The state of a token.
+    /// Verifies a token and returns its state.
     ///
     /// # Errors
-    /// [`Error::Invalid`] on `field` when it is no token, another key's, or was altered.
+    /// [`Error::Invalid`] on `field` if it is not a token of this version, was sealed with another
+    /// key, or was altered.
     pub fn open<'a>(&self, field: &str, token: &'a [u8]) -> Result<&'a [u8], Error> {
         let begins = MAGIC.len() + KEY_ID;
         if token.len() < begins + SEAL || &token[..MAGIC.len()] != MAGIC {
@@ -93,14 +100,17 @@ impl TokenKey {
             ));
         }
 
+        // The key's id is compared first, so that a server with the wrong key can be told from an
+        // altered token.
         if token[MAGIC.len()..begins] != self.id {
-            let problem = "was sealed by a server with another key; servers that share streams share --token-key-file";
+            let problem = "was sealed with another key; give both servers one --token-key-file";
             return Err(Error::invalid(field, problem));
         }
 
         let (sealed, seal) = token.split_at(token.len() - SEAL);
 
-        // In constant time.
+        // Compared in constant time, so that the duration tells a forger nothing about the right
+        // seal.
         let genuine = self
             .mac
             .clone()
@@ -124,7 +134,8 @@ mod tests {
         TokenKey::new(b"sixteen bytes or more").unwrap()
     }
 
-    /// Oracle: the promise: what was sealed comes back; any other byte anywhere is refused.
+    /// Oracle: the contract: a sealed state comes back, and a token with any bit changed is
+    /// refused.
     #[test]
     fn an_altered_token_is_refused() {
         let state = b"where the camera was".as_slice();
@@ -153,7 +164,7 @@ mod tests {
         assert!(key().open("t", &[token.as_slice(), b"x"].concat()).is_err());
     }
 
-    /// Oracle: the promise: another key's tokens are refused, and said to be that.
+    /// Oracle: the contract: tokens of another key are refused, and the message says so.
     #[test]
     fn another_keys_token_is_refused() {
         let other = TokenKey::new(b"another secret, as long").unwrap();

@@ -1,32 +1,37 @@
-//! What a tracker says, as it is sent.
+//! A tracker's updates as wire messages.
 
 use std::sync::Arc;
 
 use super::super::convert;
 use super::super::snapshot::ServedNavigator;
-use crate::geometry::Pose;
-use crate::navigation::Hit;
-use crate::odometry::{AGREEING, Status, Update};
-use crate::proto::v1 as pb;
+use seese3_client::proto::v1 as pb;
+use seese3_core::geometry::Pose;
+use seese3_core::navigation::Hit;
+use seese3_core::tracking::{ANCHORS_TO_AGREE, Status, Update};
 
-/// An update without the frame's own numbers and its time.
+/// An update as a wire message. Its `timestamp_ns`, `sequence` and `elapsed_ns` are left 0; the
+/// session fills them in.
 pub fn update(
     update: &Update,
     names: &pb::FrameNames,
     served: &[Arc<ServedNavigator>],
 ) -> pb::TrackUpdate {
+    // As in REP-105, map_from_odom = map_from_camera · camera_from_odom is the correction of the
+    // drift: it jumps when the pose is corrected, while odom stays continuous.
     let odom_from_camera = update.odom.pose;
     let map_from_odom = update
-        .place
+        .map_pose
         .map(|place| place.pose * odom_from_camera.inverse());
 
-    let (room, neighbour) = update.best;
+    let (room, neighbour) = update.best_match;
     let navigator = &served[room].navigator;
     let hit = Hit {
         neighbour,
         pose: navigator.room().poses()[neighbour.frame.row()],
     };
 
+    // The nearest frame of an unknown room would be misleading, so that it is reported only when
+    // the room is known.
     let known = update.room.map(|room| &served[room]);
     pb::TrackUpdate {
         timestamp_ns: 0,
@@ -39,9 +44,9 @@ pub fn update(
         odom_from_camera_covariance: convert::matrix_to_wire(&update.odom.ros_covariance()),
         map_from_odom: map_from_odom.map(|found| pose(&found, &names.map, &names.odom)),
         map_from_camera: update
-            .place
+            .map_pose
             .map(|place| pose(&place.pose, &names.map, &names.camera)),
-        map_from_camera_covariance: update.place.map_or_else(Vec::new, |place| {
+        map_from_camera_covariance: update.map_pose.map_or_else(Vec::new, |place| {
             convert::matrix_to_wire(&place.ros_covariance())
         }),
         body_velocity: update.velocity.as_ref().map(convert::twist_to_wire),
@@ -50,7 +55,7 @@ pub fn update(
         out_of_distribution: update.out_of_distribution,
         room: known.map(|served| convert::room_revision(served)),
         best_match: known.map(|_| convert::hit_to_wire(&hit, navigator.room())),
-        match_used: update.used,
+        match_used: update.match_used,
         match_surprise: update.surprise,
         elapsed_ns: 0,
         candidate: update
@@ -58,10 +63,10 @@ pub fn update(
             .as_ref()
             .map(|candidate| pb::PlaceCandidate {
                 room: Some(convert::room_revision(&served[candidate.room])),
-                map_from_camera: Some(pose(&candidate.place.pose, &names.map, &names.camera)),
+                map_from_camera: Some(pose(&candidate.map_pose.pose, &names.map, &names.camera)),
                 sequence: candidate.sequence,
-                agreed: candidate.agreed,
-                needed: AGREEING,
+                agreed: candidate.agreeing_anchors,
+                needed: ANCHORS_TO_AGREE,
             }),
     }
 }

@@ -1,0 +1,371 @@
+//! A client of the service, in wire types. An error is one line that says what went wrong.
+
+use std::time::Duration;
+
+use tokio_stream::Stream;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Code, Status, Streaming};
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
+use tonic_types::StatusExt;
+
+use crate::proto::v1 as pb;
+use crate::proto::v1::catalog_service_client::CatalogServiceClient;
+use crate::proto::v1::evaluation_service_client::EvaluationServiceClient;
+use crate::proto::v1::localization_service_client::LocalizationServiceClient;
+use crate::proto::v1::navigation_service_client::NavigationServiceClient;
+use crate::proto::v1::odometry_service_client::OdometryServiceClient;
+
+/// The largest answer that the client accepts, bytes.
+const MESSAGE_BYTES: usize = 64 << 20;
+
+/// Why a call failed.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum Error {
+    #[error("'{address}' is no server address: {problem}; write HOST:PORT")]
+    Address { address: String, problem: String },
+    #[error("cannot connect to {address}: {problem}")]
+    Connect { address: String, problem: String },
+    #[error("the server refused ({:?}): {}", .0.code(), .0.message())]
+    Refused(Box<Status>),
+    #[error("no answer came before the deadline")]
+    Deadline,
+    #[error("the server ended its answer without a result")]
+    NoReport,
+}
+
+impl Error {
+    /// The gRPC code of the server's answer; none if the server did not answer.
+    pub fn code(&self) -> Option<Code> {
+        match self {
+            Self::Refused(status) => Some(status.code()),
+            _ => None,
+        }
+    }
+
+    /// The request field that the server names as the cause; none if it names none.
+    pub fn field(&self) -> Option<String> {
+        let Self::Refused(status) = self else {
+            return None;
+        };
+
+        // An invalid field is reported as a bad request, a name that is not served as a resource
+        // whose type holds the field.
+        let details = status.get_error_details();
+        let violation = details
+            .bad_request()
+            .and_then(|bad| bad.field_violations.first());
+
+        let resource = details
+            .resource_info()
+            .map(|resource| resource.resource_type.clone());
+
+        violation
+            .map(|violation| violation.field.clone())
+            .or(resource)
+    }
+}
+
+impl From<Status> for Error {
+    fn from(status: Status) -> Self {
+        // The client's own transport reports a passed deadline as a cancellation with this text.
+        if status.code() == Code::Cancelled && status.message() == "Timeout expired" {
+            return Self::Deadline;
+        }
+
+        Self::Refused(Box::new(status))
+    }
+}
+
+/// A connection to a server. Cloning it is cheap and shares the connection.
+#[derive(Debug, Clone)]
+pub struct Client {
+    channel: Channel,
+    deadline: Duration,
+}
+
+impl Client {
+    /// Connects to `address`, HOST:PORT or a URL. Every call but `track` gets `deadline`.
+    ///
+    /// # Errors
+    /// [`Error::Address`] if the address cannot be parsed, [`Error::Connect`] if no connection is
+    /// made within the deadline or 10 s.
+    pub async fn connect(address: &str, deadline: Duration) -> Result<Self, Error> {
+        let url = if address.contains("://") {
+            address.to_owned()
+        } else {
+            format!("http://{address}")
+        };
+        let endpoint = Endpoint::from_shared(url).map_err(|error| Error::Address {
+            address: address.to_owned(),
+            problem: error.to_string(),
+        })?;
+
+        let endpoint = endpoint
+            .connect_timeout(deadline.min(Duration::from_secs(10)))
+            .tcp_nodelay(true);
+
+        // The error of tonic only says that the transport failed; its source has the reason.
+        let channel = endpoint.connect().await.map_err(|error| {
+            let cause =
+                std::error::Error::source(&error).map_or(error.to_string(), ToString::to_string);
+            Error::Connect {
+                address: address.to_owned(),
+                problem: cause,
+            }
+        })?;
+
+        Ok(Self { channel, deadline })
+    }
+
+    /// Navigates from a view by a motion.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] if the server refuses the request, [`Error::Deadline`] if no answer comes
+    /// in time; so for every call.
+    pub async fn navigate(
+        &self,
+        request: pb::NavigateRequest,
+    ) -> Result<pb::NavigateResponse, Error> {
+        let mut service = NavigationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service.navigate(self.request(request)).await?.into_inner())
+    }
+
+    /// Answers several navigation requests in one call; the results have the order of the requests.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] if the whole batch is refused. A single request that fails is a failure
+    /// within the results.
+    pub async fn batch_navigate(
+        &self,
+        requests: Vec<pb::NavigateRequest>,
+    ) -> Result<Vec<pb::BatchNavigateResult>, Error> {
+        let mut service = NavigationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service
+            .batch_navigate(self.request(pb::BatchNavigateRequest { requests }))
+            .await?
+            .into_inner()
+            .results)
+    }
+
+    /// Walks to a goal; `feedback` is called after each step.
+    ///
+    /// # Errors
+    /// [`Error::Refused`], or [`Error::NoReport`] if the stream ends without a result.
+    pub async fn navigate_to(
+        &self,
+        request: pb::NavigateToRequest,
+        mut feedback: impl FnMut(pb::NavigateToFeedback),
+    ) -> Result<pb::NavigateToResult, Error> {
+        let mut service = NavigationServiceClient::new(self.channel.clone());
+        let mut events = service
+            .navigate_to(self.request(request))
+            .await?
+            .into_inner();
+
+        while let Some(pb::NavigateToResponse { event }) = events.message().await? {
+            match event {
+                Some(pb::navigate_to_response::Event::Result(result)) => return Ok(result),
+                Some(pb::navigate_to_response::Event::Feedback(step)) => feedback(step),
+                None => {}
+            }
+        }
+
+        Err(Error::NoReport)
+    }
+
+    /// The stored frames that look most like a view, with their poses.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn localize(
+        &self,
+        request: pb::LocalizeRequest,
+    ) -> Result<pb::LocalizeResponse, Error> {
+        let mut service = LocalizationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service.localize(self.request(request)).await?.into_inner())
+    }
+
+    /// The rooms ranked by how well they match some views, and the pose in each.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn relocalize(
+        &self,
+        request: pb::RelocalizeRequest,
+    ) -> Result<pb::RelocalizeResponse, Error> {
+        let mut service = LocalizationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service
+            .relocalize(self.request(request))
+            .await?
+            .into_inner())
+    }
+
+    /// The motion between two views.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn estimate_motion(
+        &self,
+        request: pb::EstimateMotionRequest,
+    ) -> Result<pb::EstimateMotionResponse, Error> {
+        let mut service = OdometryServiceClient::new(self.channel.clone());
+        Ok(service
+            .estimate_motion(self.request(request))
+            .await?
+            .into_inner())
+    }
+
+    /// Opens a tracking stream: sends `requests` as they are made and returns the stream of
+    /// answers. There is no deadline, because a stream lasts as long as the robot moves.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] if the stream cannot be opened; later errors are items of the stream.
+    pub async fn track(
+        &self,
+        requests: impl Stream<Item = pb::TrackRequest> + Send + 'static,
+    ) -> Result<Streaming<pb::TrackResponse>, Error> {
+        let mut service = OdometryServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service.track(requests).await?.into_inner())
+    }
+
+    /// All rooms, page by page.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn rooms(&self) -> Result<Vec<pb::Room>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let mut rooms = Vec::new();
+        let mut page_token = String::new();
+        loop {
+            let request = self.request(pb::ListRoomsRequest {
+                page_size: 0,
+                page_token,
+            });
+            let page = service.list_rooms(request).await?.into_inner();
+            rooms.extend(page.rooms);
+
+            page_token = page.next_page_token;
+            if page_token.is_empty() {
+                return Ok(rooms);
+            }
+        }
+    }
+
+    /// A room of the catalog by name.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn room(&self, room: &str) -> Result<Option<pb::Room>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        Ok(service
+            .get_room(self.request(pb::GetRoomRequest {
+                room: room.to_owned(),
+            }))
+            .await?
+            .into_inner()
+            .room)
+    }
+
+    /// All adapters, page by page.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn adapters(&self) -> Result<Vec<pb::Adapter>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let mut adapters = Vec::new();
+        let mut page_token = String::new();
+        loop {
+            let request = self.request(pb::ListAdaptersRequest {
+                page_size: 0,
+                page_token,
+            });
+            let page = service.list_adapters(request).await?.into_inner();
+            adapters.extend(page.adapters);
+
+            page_token = page.next_page_token;
+            if page_token.is_empty() {
+                return Ok(adapters);
+            }
+        }
+    }
+
+    /// An adapter of the catalog by name.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn adapter(&self, adapter: &str) -> Result<Option<pb::Adapter>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let request = self.request(pb::GetAdapterRequest {
+            adapter: adapter.to_owned(),
+        });
+
+        Ok(service.get_adapter(request).await?.into_inner().adapter)
+    }
+
+    /// Evaluates navigators on a room's test pairs; `progress` is called when each navigator
+    /// begins.
+    ///
+    /// # Errors
+    /// [`Error::Refused`], or [`Error::NoReport`] if the stream ends without a report.
+    pub async fn evaluate(
+        &self,
+        request: pb::EvaluateRequest,
+        mut progress: impl FnMut(pb::EvaluationProgress),
+    ) -> Result<pb::EvaluationReport, Error> {
+        let mut service = EvaluationServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        let mut events = service.evaluate(self.request(request)).await?.into_inner();
+        while let Some(pb::EvaluateResponse { event }) = events.message().await? {
+            match event {
+                Some(pb::evaluate_response::Event::Report(report)) => return Ok(report),
+                Some(pb::evaluate_response::Event::Progress(step)) => progress(step),
+                None => {}
+            }
+        }
+
+        Err(Error::NoReport)
+    }
+
+    /// Scores predictions that were made elsewhere.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn score_predictions(
+        &self,
+        request: pb::ScorePredictionsRequest,
+    ) -> Result<pb::ScorePredictionsResponse, Error> {
+        let mut service = EvaluationServiceClient::new(self.channel.clone());
+        Ok(service
+            .score_predictions(self.request(request))
+            .await?
+            .into_inner())
+    }
+
+    /// Whether `name` is SERVING: `""` is the whole server, otherwise the full name of a service or
+    /// `rooms/NAME`.
+    ///
+    /// # Errors
+    /// [`Error::Refused`], also for a name that the server does not know.
+    pub async fn serves(&self, name: &str) -> Result<bool, Error> {
+        let mut health = HealthClient::new(self.channel.clone());
+        let request = self.request(HealthCheckRequest {
+            service: name.to_owned(),
+        });
+
+        Ok(health.check(request).await?.into_inner().status() == ServingStatus::Serving)
+    }
+
+    fn request<T>(&self, message: T) -> tonic::Request<T> {
+        let mut request = tonic::Request::new(message);
+        request.set_timeout(self.deadline);
+        request
+    }
+}

@@ -1,0 +1,183 @@
+//! Poses and motions from the wire and to it, as nalgebra's types.
+//!
+//! A wire pose is `parent_from_child`: it takes coordinates of the child frame to those of the parent
+//! frame, metres. A wire twist is in se(3): v in metres and ω in radians, in the body frame of the
+//! camera that the motion starts from.
+
+use nalgebra::{Isometry3, Quaternion, UnitQuaternion, Vector3};
+
+use crate::proto::v1 as pb;
+
+/// How far from 1 a quaternion's norm may be: more is no rounding, and so no rotation.
+const QUATERNION_TOLERANCE: f64 = 1e-3;
+
+/// What is wrong with a message that should be a pose or a motion.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{field} {problem}")]
+pub struct ConvertError {
+    /// The field to change.
+    pub field: &'static str,
+    /// What is wrong with it.
+    pub problem: String,
+}
+
+impl ConvertError {
+    fn new(field: &'static str, problem: impl Into<String>) -> Self {
+        Self {
+            field,
+            problem: problem.into(),
+        }
+    }
+}
+
+/// A camera motion in se(3), in the body frame of the camera that it starts from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Twist {
+    /// v, metres.
+    pub linear: Vector3<f64>,
+    /// ω, the rotation axis times the angle, radians.
+    pub angular: Vector3<f64>,
+}
+
+/// `parent_from_child` of a wire pose. The names of its frames are not looked at.
+///
+/// # Errors
+/// [`ConvertError`] if a part is missing, is not finite, or is no rotation.
+pub fn pose(pose: &pb::Pose) -> Result<Isometry3<f64>, ConvertError> {
+    let orientation = pose
+        .orientation
+        .as_ref()
+        .ok_or_else(|| ConvertError::new("orientation", "is required"))?;
+    let quaternion = Quaternion::new(orientation.w, orientation.x, orientation.y, orientation.z);
+    let norm = quaternion.norm();
+
+    // A small deviation is the sender's rounding, which `UnitQuaternion` normalises away below; a
+    // large one means that the four numbers are no rotation.
+    if norm.is_nan() || (norm - 1.0).abs() > QUATERNION_TOLERANCE {
+        let problem = format!("has norm {norm}, a rotation has 1");
+        return Err(ConvertError::new("orientation", problem));
+    }
+
+    let position = vector("position", pose.position.as_ref())?;
+    Ok(Isometry3::from_parts(
+        position.into(),
+        UnitQuaternion::from_quaternion(quaternion),
+    ))
+}
+
+/// A wire pose of `parent_from_child` with the names of both frames.
+pub fn pose_to_wire(
+    parent_from_child: &Isometry3<f64>,
+    parent_frame: &str,
+    child_frame: &str,
+) -> pb::Pose {
+    let q = parent_from_child.rotation.quaternion();
+    pb::Pose {
+        parent_frame: parent_frame.to_owned(),
+        child_frame: child_frame.to_owned(),
+        position: Some(vector_to_wire(&parent_from_child.translation.vector)),
+        orientation: Some(pb::Quaternion {
+            w: q.w,
+            x: q.i,
+            y: q.j,
+            z: q.k,
+        }),
+    }
+}
+
+/// The motion of a wire twist.
+///
+/// # Errors
+/// [`ConvertError`] if a part is missing or not finite.
+pub fn twist(twist: &pb::Twist) -> Result<Twist, ConvertError> {
+    Ok(Twist {
+        linear: vector("linear", twist.linear.as_ref())?,
+        angular: vector("angular", twist.angular.as_ref())?,
+    })
+}
+
+/// A motion on the wire.
+pub fn twist_to_wire(twist: &Twist) -> pb::Twist {
+    pb::Twist {
+        linear: Some(vector_to_wire(&twist.linear)),
+        angular: Some(vector_to_wire(&twist.angular)),
+    }
+}
+
+fn vector(field: &'static str, vector: Option<&pb::Vector3>) -> Result<Vector3<f64>, ConvertError> {
+    let &pb::Vector3 { x, y, z } = vector.ok_or_else(|| ConvertError::new(field, "is required"))?;
+    let vector = Vector3::new(x, y, z);
+
+    if vector.iter().all(|value| value.is_finite()) {
+        Ok(vector)
+    } else {
+        let problem = format!("({x}, {y}, {z}) must be finite");
+        Err(ConvertError::new(field, problem))
+    }
+}
+
+fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
+    pb::Vector3 {
+        x: vector.x,
+        y: vector.y,
+        z: vector.z,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the definitions: what goes out comes back, and names are kept.
+    #[test]
+    fn poses_and_twists_come_back() {
+        let parent_from_child =
+            Isometry3::new(Vector3::new(1.0, -2.0, 0.5), Vector3::new(0.1, 0.2, -0.3));
+        let wire = pose_to_wire(&parent_from_child, "rooms/kitchen", "camera");
+        let back = pose(&wire).unwrap();
+
+        assert!((back.to_homogeneous() - parent_from_child.to_homogeneous()).norm() < 1e-12);
+        assert_eq!(
+            (&*wire.parent_frame, &*wire.child_frame),
+            ("rooms/kitchen", "camera")
+        );
+
+        let motion = Twist {
+            linear: Vector3::new(0.1, 0.0, 0.4),
+            angular: Vector3::new(0.0, 0.2, 0.0),
+        };
+        assert_eq!(twist(&twist_to_wire(&motion)), Ok(motion));
+    }
+
+    /// Oracle: by hand: a missing part, a number that is not finite, and a quaternion of norm 2.
+    #[test]
+    fn what_is_no_pose_is_refused_by_field() {
+        let identity = pose_to_wire(&Isometry3::identity(), "", "");
+        let field = |wire: &pb::Pose| pose(wire).unwrap_err().field;
+
+        let missing = pb::Pose {
+            position: None,
+            ..identity.clone()
+        };
+        let infinite = pb::Pose {
+            position: Some(pb::Vector3 {
+                x: f64::INFINITY,
+                y: 0.0,
+                z: 0.0,
+            }),
+            ..identity.clone()
+        };
+        let stretched = pb::Pose {
+            orientation: Some(pb::Quaternion {
+                w: 2.0,
+                x: 0.0,
+                y: 0.0,
+                z: 0.0,
+            }),
+            ..identity
+        };
+        assert_eq!(field(&missing), "position");
+        assert_eq!(field(&infinite), "position");
+        assert_eq!(field(&stretched), "orientation");
+    }
+}

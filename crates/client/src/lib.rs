@@ -1,0 +1,51 @@
+//! A client of [seese3](https://docs.rs/seese3), latent navigation over gRPC: all that a robot's program
+//! has to link.
+//!
+//! ```no_run
+//! use std::time::Duration;
+//!
+//! use seese3_client::{Client, convert, proto::v1 as pb};
+//!
+//! # async fn ask() -> Result<(), Box<dyn std::error::Error>> {
+//! let client = Client::connect("127.0.0.1:50051", Duration::from_secs(5)).await?;
+//!
+//! // How did the camera move between two stored frames?
+//! let view = |frame| {
+//!     Some(pb::View {
+//!         view: Some(pb::view::View::FrameId(frame)),
+//!     })
+//! };
+//! let answer = client
+//!     .estimate_motion(pb::EstimateMotionRequest {
+//!         room: "kitchen".into(),
+//!         first: view(100),
+//!         second: view(110),
+//!         ..Default::default()
+//!     })
+//!     .await?;
+//!
+//! let motion = convert::twist(&answer.motion.unwrap_or_default())?;
+//! println!("{:.2} m, {:.1}°", motion.linear.norm(), motion.angular.norm().to_degrees());
+//! # Ok(()) }
+//! ```
+//!
+//! | module | what |
+//! | --- | --- |
+//! | [`Client`] | a connection; one method per call of the service |
+//! | [`proto::v1`] | the wire types, generated from `proto/seese3/v1`, where every field is explained |
+//! | [`convert`] | poses and motions as nalgebra's types |
+//!
+//! Conventions: metres, radians, seconds; camera axes x right, y down, z forward; poses are
+//! `parent_from_child`; twists are (v, ω) in the body frame of the camera that a motion starts from.
+//!
+//! The feature `server` adds the server's side of the protocol; a robot does not need it.
+
+pub mod proto;
+pub mod convert;
+mod client;
+
+pub use client::{Client, Error};
+/// The types that [`convert`] speaks.
+pub use nalgebra;
+/// The types that streams and statuses are made of.
+pub use tonic;

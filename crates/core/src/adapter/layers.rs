@@ -1,0 +1,235 @@
+//! The layers of the networks, with forward and backward passes written by hand. Rows are samples;
+//! weights are (out, in), as in PyTorch, and biases (1, out).
+
+use ndarray::{Array2, Axis, Zip};
+
+use super::Real;
+use super::seeded::Seeded;
+
+/// Added to a LayerNorm's variance, PyTorch's default.
+const LAYER_NORM_EPS: f64 = 1e-5;
+
+/// A weight and a bias uniform in ±1/√fan_in, as PyTorch draws a `Linear`.
+pub(super) fn linear_initial<T: Real>(
+    inputs: usize,
+    outputs: usize,
+    random: &mut Seeded,
+) -> [Array2<T>; 2] {
+    [
+        uniform(outputs, inputs, inputs, random),
+        uniform(1, outputs, inputs, random),
+    ]
+}
+
+/// Numbers uniform in ±1/√fan_in.
+pub(super) fn uniform<T: Real>(
+    rows: usize,
+    columns: usize,
+    fan_in: usize,
+    random: &mut Seeded,
+) -> Array2<T> {
+    within(rows, columns, (fan_in as f64).sqrt().recip(), random)
+}
+
+/// Numbers uniform in ±bound.
+pub(super) fn within<T: Real>(
+    rows: usize,
+    columns: usize,
+    bound: f64,
+    random: &mut Seeded,
+) -> Array2<T> {
+    Array2::from_shape_simple_fn((rows, columns), || {
+        T::of(f64::from(random.symmetric(bound)))
+    })
+}
+
+/// x Wᵀ + b.
+pub(super) fn linear<T: Real>(
+    input: &Array2<T>,
+    weight: &Array2<T>,
+    bias: &Array2<T>,
+) -> Array2<T> {
+    input.dot(&weight.t()) + bias
+}
+
+/// Subtracts the mean from every row and divides the row by its standard deviation. Returns the
+/// reciprocals of the standard deviations, shape (n, 1).
+pub(super) fn normalise<T: Real>(rows: &mut Array2<T>) -> Array2<T> {
+    let width = T::of(rows.ncols() as f64);
+    let mut inverse_deviation = Array2::zeros((rows.nrows(), 1));
+    for (mut row, mut scale) in rows
+        .outer_iter_mut()
+        .zip(inverse_deviation.outer_iter_mut())
+    {
+        let mean = row.sum() / width;
+        row.mapv_inplace(|x| x - mean);
+        let variance = row.fold(T::zero(), |sum, &x| sum + x * x) / width;
+        scale[0] = (variance + T::of(LAYER_NORM_EPS)).sqrt().recip();
+
+        row.mapv_inplace(|x| x * scale[0]);
+    }
+
+    inverse_deviation
+}
+
+/// Turns `d` from the gradient with respect to the output of [`normalise`] into the gradient with
+/// respect to its input.
+pub(super) fn normalise_backward<T: Real>(
+    d: &mut Array2<T>,
+    normalised: &Array2<T>,
+    inverse_deviation: &Array2<T>,
+) {
+    let width = T::of(d.ncols() as f64);
+    for ((mut row, normalised), scale) in d
+        .outer_iter_mut()
+        .zip(normalised.outer_iter())
+        .zip(inverse_deviation.iter())
+    {
+        // Every number of a row takes part in its mean and its deviation, so the gradient of
+        // y = (x − mean)/deviation, which is `normalised`, is
+        // dx = (dy − mean(dy) − y · mean(dy ⊙ y)) / deviation.
+        let mean = row.sum() / width;
+
+        let along = row
+            .iter()
+            .zip(&normalised)
+            .fold(T::zero(), |sum, (&d, &x)| sum + d * x)
+            / width;
+        Zip::from(&mut row)
+            .and(&normalised)
+            .for_each(|d, &x| *d = *scale * (*d - mean - x * along));
+    }
+}
+
+/// Φ(x), the cumulative distribution function of the standard normal distribution. GELU in its
+/// exact form is x Φ(x).
+pub(super) fn cumulative<T: Real>(input: &Array2<T>) -> Array2<T> {
+    input.mapv(|x| T::of(0.5) * (T::one() + (x * T::of(std::f64::consts::FRAC_1_SQRT_2)).erf()))
+}
+
+/// Turns `d` from the gradient with respect to GELU's output into the gradient with respect to its
+/// input x. The derivative is Φ(x) + x p(x), with p the density of the standard normal
+/// distribution.
+pub(super) fn gelu_backward<T: Real>(d: &mut Array2<T>, input: &Array2<T>, cumulative: &Array2<T>) {
+    let density_scale = T::of((2.0 * std::f64::consts::PI).sqrt().recip());
+    let half = T::of(0.5);
+
+    Zip::from(d)
+        .and(input)
+        .and(cumulative)
+        .for_each(|d, &x, &cumulative| {
+            *d *= cumulative + x * density_scale * (-half * x * x).exp();
+        });
+}
+
+/// Linear layers with GELU between them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Dense<T> {
+    /// Weight and bias of each layer.
+    pub(super) layers: Vec<[Array2<T>; 2]>,
+}
+
+/// What [`Dense::backward`] needs of the forward pass.
+pub struct DenseActivations<T> {
+    /// The input of each layer.
+    inputs: Vec<Array2<T>>,
+    /// The input x of each GELU, and Φ(x).
+    gelus: Vec<[Array2<T>; 2]>,
+    /// The output of the last layer, shape (n, k).
+    pub output: Array2<T>,
+}
+
+impl<T: Real> Dense<T> {
+    /// Initial weights as PyTorch draws them; `widths` are the columns of the input and of each
+    /// layer's output.
+    pub fn random(widths: &[usize], random: &mut Seeded) -> Self {
+        Self {
+            layers: widths
+                .windows(2)
+                .map(|pair| linear_initial(pair[0], pair[1], random))
+                .collect(),
+        }
+    }
+
+    /// Columns of the input and of each layer's output.
+    pub(super) fn widths(&self) -> Vec<usize> {
+        let input = self.layers.first().map(|[weight, _]| weight.ncols());
+        input
+            .into_iter()
+            .chain(self.layers.iter().map(|[weight, _]| weight.nrows()))
+            .collect()
+    }
+
+    /// PyTorch's names of the tensors: in a `Sequential` called `prefix`, or for a single layer in
+    /// a `Linear` of that name.
+    pub fn names(&self, prefix: &str) -> Vec<String> {
+        // In a `Sequential` the GELUs between the linear layers take the odd numbers.
+        let name = |place: usize| match self.layers.len() {
+            1 => prefix.to_owned(),
+            _ => format!("{prefix}.{}", 2 * place),
+        };
+        (0..self.layers.len())
+            .flat_map(|i| ["weight", "bias"].map(|part| format!("{}.{part}", name(i))))
+            .collect()
+    }
+
+    /// Weight and bias of each layer, in order.
+    pub fn parameters(&self) -> Vec<&Array2<T>> {
+        self.layers.iter().flatten().collect()
+    }
+
+    /// As [`Dense::parameters`], to be changed.
+    pub fn parameters_mut(&mut self) -> Vec<&mut Array2<T>> {
+        self.layers.iter_mut().flatten().collect()
+    }
+
+    /// The forward pass of rows, shape (n, d).
+    pub fn forward(&self, input: Array2<T>) -> DenseActivations<T> {
+        let mut inputs = Vec::new();
+        let mut gelus = Vec::new();
+        let mut output = input;
+        for (place, [weight, bias]) in self.layers.iter().enumerate() {
+            // Each layer but the first reads its input through a GELU, whose input and Φ are kept
+            // for the backward pass.
+            if place > 0 {
+                let cumulative = cumulative(&output);
+                let passed = &output * &cumulative;
+                gelus.push([output, cumulative]);
+                output = passed;
+            }
+
+            let next = linear(&output, weight, bias);
+            inputs.push(output);
+            output = next;
+        }
+
+        DenseActivations {
+            inputs,
+            gelus,
+            output,
+        }
+    }
+
+    /// Adds the gradient of the parameters to `gradient` and returns the gradient with respect to
+    /// the input.
+    pub fn backward(
+        &self,
+        forward: &DenseActivations<T>,
+        d_output: &Array2<T>,
+        gradient: &mut Self,
+    ) -> Array2<T> {
+        let mut d = d_output.clone();
+        for place in (0..self.layers.len()).rev() {
+            gradient.layers[place][0] += &d.t().dot(&forward.inputs[place]);
+            gradient.layers[place][1] += &d.sum_axis(Axis(0));
+            d = d.dot(&self.layers[place][0]);
+
+            if place > 0 {
+                let [input, cumulative] = &forward.gelus[place - 1];
+                gelu_backward(&mut d, input, cumulative);
+            }
+        }
+
+        d
+    }
+}

@@ -1,0 +1,108 @@
+//! Training losses on z-scored twists, each with its gradient with respect to the prediction.
+
+use ndarray::{Array2, ArrayView2, Axis, Zip, s};
+
+use super::Real;
+
+/// Vector lengths below this are replaced by it, as in PyTorch's `cosine_similarity`.
+const COSINE_EPS: f64 = 1e-8;
+
+/// The training loss. Source: SeeSE3, Sec. A.6, the sweep.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Loss {
+    /// The mean over batch and components of (y − t)², the paper's default.
+    #[default]
+    MeanSquaredError,
+    /// The mean over the batch of 1 − cos(y, t), both as vectors of six numbers.
+    Cosine,
+    /// Mean squared error of the three components of ω alone.
+    Rotation,
+}
+
+impl Loss {
+    /// Every loss.
+    pub const ALL: [Self; 3] = [Self::MeanSquaredError, Self::Cosine, Self::Rotation];
+
+    /// The word for it on the command line and in a manifest.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::MeanSquaredError => "mse",
+            Self::Cosine => "cosine",
+            Self::Rotation => "rotation",
+        }
+    }
+
+    /// The loss with this [`Loss::name`].
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|loss| loss.name() == name)
+    }
+
+    /// The loss of predictions (n, 6) against targets (n, 6), and its gradient with respect to the
+    /// predictions.
+    pub fn value<T: Real>(
+        self,
+        predicted: ArrayView2<'_, T>,
+        target: ArrayView2<'_, T>,
+    ) -> (f64, Array2<T>) {
+        match self {
+            Self::MeanSquaredError => mean_squared_error(predicted, target),
+            Self::Cosine => cosine(predicted, target),
+            Self::Rotation => {
+                let mut gradient = Array2::zeros(predicted.dim());
+                let (loss, inner) =
+                    mean_squared_error(predicted.slice(s![.., 3..]), target.slice(s![.., 3..]));
+                gradient.slice_mut(s![.., 3..]).assign(&inner);
+
+                (loss, gradient)
+            }
+        }
+    }
+}
+
+/// The mean over rows and columns of (y − t)², and its gradient with respect to y.
+pub(super) fn mean_squared_error<T: Real>(
+    predicted: ArrayView2<'_, T>,
+    target: ArrayView2<'_, T>,
+) -> (f64, Array2<T>) {
+    let difference = &predicted - &target;
+    let count = difference.len() as f64;
+    let loss = difference.iter().map(|x| x.f64() * x.f64()).sum::<f64>() / count;
+    (loss, difference * T::of(2.0 / count))
+}
+
+fn cosine<T: Real>(predicted: ArrayView2<'_, T>, target: ArrayView2<'_, T>) -> (f64, Array2<T>) {
+    let n = predicted.nrows() as f64;
+    let mut gradient = Array2::zeros(predicted.dim());
+    let mut loss = 0.0;
+    for ((y, t), mut d) in predicted
+        .axis_iter(Axis(0))
+        .zip(target.axis_iter(Axis(0)))
+        .zip(gradient.axis_iter_mut(Axis(0)))
+    {
+        let length = |row: &ndarray::ArrayView1<'_, T>| {
+            row.iter()
+                .map(|x| x.f64() * x.f64())
+                .sum::<f64>()
+                .sqrt()
+                .max(COSINE_EPS)
+        };
+
+        let a = length(&y);
+        let c = length(&t);
+
+        let cosine = y
+            .iter()
+            .zip(&t)
+            .map(|(y, t)| y.f64() * t.f64())
+            .sum::<f64>()
+            / (a * c);
+        loss += 1.0 - cosine;
+
+        // ∂cos/∂y = t/(|y||t|) − cos(y, t) · y/|y|²; the loss is one minus the cosine.
+        Zip::from(&mut d).and(&y).and(&t).for_each(|d, &y, &t| {
+            *d = T::of(-(t.f64() / (a * c) - cosine * y.f64() / (a * a)) / n);
+        });
+    }
+
+    (loss / n, gradient)
+}

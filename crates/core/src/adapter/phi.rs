@@ -1,0 +1,212 @@
+//! The network φ: Linear(d, 64) → LayerNorm(64) → GELU (erf) → Linear(64, 20), with its forward
+//! pass and a backward pass written by hand.
+
+use ndarray::{Array2, Axis};
+
+use super::Real;
+use super::layers::{
+    cumulative, gelu_backward, linear, linear_initial, normalise, normalise_backward,
+};
+use super::seeded::Seeded;
+
+/// Sizes of φ.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Widths {
+    /// d, columns of a feature.
+    pub feature: usize,
+    /// Columns between the two linear layers.
+    pub hidden: usize,
+    /// k, columns of a latent.
+    pub latent: usize,
+}
+
+/// Parameters of φ.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Phi<T> {
+    /// In the order of [`Phi::NAMES`].
+    pub(super) tensors: [Array2<T>; 6],
+}
+
+/// What the backward pass needs of the forward pass.
+pub struct Activations<T> {
+    input: Array2<T>,
+    normalised: Array2<T>,
+    inverse_deviation: Array2<T>,
+    scaled: Array2<T>,
+    cumulative: Array2<T>,
+    hidden: Array2<T>,
+    /// φ(z), shape (n, k).
+    pub latents: Array2<T>,
+}
+
+impl<T: Real> Phi<T> {
+    /// PyTorch's names of the tensors in a `Sequential`.
+    pub const NAMES: [&str; 6] = [
+        "0.weight", "0.bias", "1.weight", "1.bias", "3.weight", "3.bias",
+    ];
+
+    /// Initial weights as PyTorch draws them: weights and biases of linear layers uniform in
+    /// ±1/√fan_in, LayerNorm weights 1 and biases 0.
+    pub fn random(widths: Widths, random: &mut Seeded) -> Self {
+        let Widths {
+            feature,
+            hidden,
+            latent,
+        } = widths;
+        let [first_weight, first_bias] = linear_initial(feature, hidden, random);
+
+        let [last_weight, last_bias] = linear_initial(hidden, latent, random);
+        let norm_weight = Array2::ones((1, hidden));
+        let norm_bias = Array2::zeros((1, hidden));
+
+        Self {
+            tensors: [
+                first_weight,
+                first_bias,
+                norm_weight,
+                norm_bias,
+                last_weight,
+                last_bias,
+            ],
+        }
+    }
+
+    /// The shapes that the tensors must have to fit the weights of the two linear layers.
+    pub(super) fn expected_shapes(&self) -> [(usize, usize); 6] {
+        let (hidden, feature) = self.tensors[0].dim();
+        let latent = self.tensors[4].nrows();
+
+        [
+            (hidden, feature),
+            (1, hidden),
+            (1, hidden),
+            (1, hidden),
+            (latent, hidden),
+            (1, latent),
+        ]
+    }
+
+    /// Columns of a feature, d.
+    pub fn feature_dim(&self) -> usize {
+        self.tensors[0].ncols()
+    }
+
+    /// Columns of a latent, k.
+    pub fn latent_dim(&self) -> usize {
+        self.tensors[4].nrows()
+    }
+
+    /// The tensors, in the order of [`Phi::NAMES`].
+    pub fn parameters(&self) -> Vec<&Array2<T>> {
+        self.tensors.iter().collect()
+    }
+
+    /// As [`Phi::parameters`], to be changed.
+    pub fn parameters_mut(&mut self) -> Vec<&mut Array2<T>> {
+        self.tensors.iter_mut().collect()
+    }
+
+    /// A φ of the same shape in which every number is zero.
+    pub fn zeros(&self) -> Self {
+        Self {
+            tensors: self
+                .tensors
+                .each_ref()
+                .map(|tensor| Array2::zeros(tensor.dim())),
+        }
+    }
+
+    /// The same numbers in another precision.
+    pub(super) fn cast<U: Real>(&self) -> Phi<U> {
+        Phi {
+            tensors: self
+                .tensors
+                .each_ref()
+                .map(|tensor| tensor.mapv(|x| U::of(x.f64()))),
+        }
+    }
+
+    /// Folds the standardisation of features into the first layer:
+    /// W₁(z − m)/s + b₁ = (W₁/s) z + (b₁ − (W₁/s) m).
+    pub(super) fn fold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
+        let [first_weight, first_bias, ..] = &mut self.tensors;
+
+        // Computed in f64, since (W₁/s) m can be far larger than the bias that it is subtracted
+        // from.
+        let wide = |tensor: &Array2<T>| tensor.mapv(|x| x.f64());
+        let weight = wide(first_weight) / &wide(deviation);
+        let bias = wide(first_bias) - wide(mean).dot(&weight.t());
+        *first_weight = weight.mapv(T::of);
+
+        *first_bias = bias.mapv(T::of);
+    }
+
+    /// The forward pass of feature rows, shape (n, d).
+    pub fn forward(&self, input: Array2<T>) -> Activations<T> {
+        let [
+            first_weight,
+            first_bias,
+            norm_weight,
+            norm_bias,
+            last_weight,
+            last_bias,
+        ] = &self.tensors;
+
+        let mut normalised = linear(&input, first_weight, first_bias);
+        let inverse_deviation = normalise(&mut normalised);
+        let scaled = &normalised * norm_weight + norm_bias;
+
+        // GELU(x) = x Φ(x). Φ(x) is kept, since GELU's derivative needs it again.
+        let cumulative = cumulative(&scaled);
+        let hidden = &scaled * &cumulative;
+        let latents = linear(&hidden, last_weight, last_bias);
+
+        Activations {
+            input,
+            normalised,
+            inverse_deviation,
+            scaled,
+            cumulative,
+            hidden,
+            latents,
+        }
+    }
+
+    /// Adds the gradient of the parameters to `gradient`; `d_latents` is the gradient with respect
+    /// to the latents, shape (n, k).
+    ///
+    /// The last bias is left alone. It cancels in the difference of two latents, so its gradient is
+    /// exactly zero, and Adam would amplify the rounding noise in its place to the full learning
+    /// rate. [`Phi::backward_whole`] includes it.
+    pub fn backward(&self, forward: &Activations<T>, d_latents: &Array2<T>, gradient: &mut Self) {
+        let [_, _, norm_weight, _, last_weight, _] = &self.tensors;
+        gradient.tensors[4] += &d_latents.t().dot(&forward.hidden);
+        let mut d_scaled = d_latents.dot(last_weight);
+        gelu_backward(&mut d_scaled, &forward.scaled, &forward.cumulative);
+
+        // LayerNorm in reverse: first its weight and bias, then the normalisation itself.
+        gradient.tensors[2] += &(&d_scaled * &forward.normalised).sum_axis(Axis(0));
+        gradient.tensors[3] += &d_scaled.sum_axis(Axis(0));
+        let mut d_first = d_scaled * norm_weight;
+        normalise_backward(
+            &mut d_first,
+            &forward.normalised,
+            &forward.inverse_deviation,
+        );
+
+        gradient.tensors[0] += &d_first.t().dot(&forward.input);
+        gradient.tensors[1] += &d_first.sum_axis(Axis(0));
+    }
+
+    /// [`Phi::backward`] for latents that are not subtracted from one another, so that the last
+    /// bias has a gradient.
+    pub fn backward_whole(
+        &self,
+        forward: &Activations<T>,
+        d_latents: &Array2<T>,
+        gradient: &mut Self,
+    ) {
+        self.backward(forward, d_latents, gradient);
+        gradient.tensors[5] += &d_latents.sum_axis(Axis(0));
+    }
+}

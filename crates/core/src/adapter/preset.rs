@@ -1,0 +1,117 @@
+//! Named training protocols: the paper's two, and one of ours.
+
+use super::TrainConfig;
+use crate::room::Timeline;
+use crate::splits::{Error as PairError, Pair, Split, StrideRange};
+
+/// A training protocol.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Preset {
+    /// All training pairs at one stride, for 10 epochs.
+    PaperBase,
+    /// 30,000 pairs with strides 10 to 40, for 200 epochs: the paper's "optimal config".
+    PaperRange,
+    /// Ours, for adapters that are used in rooms outside their training set: 17 epochs of 30,000
+    /// pairs with strides 1 to 40, about 1,000 steps, on standardised features with added noise,
+    /// with averaged weights and μ = 0.
+    Steady,
+}
+
+/// Which training pairs are used.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum PairPlan {
+    /// Every training pair at one stride, in frames.
+    Stride(u32),
+    /// Pairs drawn at random from a range of strides.
+    Range(StrideRange),
+}
+
+impl Preset {
+    /// Every preset.
+    pub const ALL: [Self; 3] = [Self::PaperBase, Self::PaperRange, Self::Steady];
+
+    /// The word for it on the command line and in a manifest.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::PaperBase => "paper-base",
+            Self::PaperRange => "paper-range",
+            Self::Steady => "steady",
+        }
+    }
+
+    /// The settings of the optimiser, with the given seed.
+    pub fn config(self, seed: u64) -> TrainConfig {
+        let plain = TrainConfig {
+            seed,
+            ..TrainConfig::default()
+        };
+
+        match self {
+            Self::PaperBase => TrainConfig {
+                epochs: 10,
+                ..plain
+            },
+            Self::PaperRange => TrainConfig {
+                epochs: 200,
+                ..plain
+            },
+            Self::Steady => TrainConfig {
+                epochs: 17,
+                learning_rate: 3e-4,
+                standardise: true,
+                noise: 0.5,
+                average: 0.99,
+                through_zero: true,
+                ..plain
+            },
+        }
+    }
+
+    /// The training pairs of this preset for an adapter that is tested at `stride` frames.
+    pub fn plan(self, stride: u32) -> PairPlan {
+        match self {
+            Self::PaperBase => PairPlan::Stride(stride),
+            Self::PaperRange => PairPlan::Range(StrideRange {
+                low: 10,
+                high: 40,
+                count: 30_000,
+            }),
+            Self::Steady => PairPlan::Range(StrideRange {
+                low: 1,
+                high: 40,
+                count: 30_000,
+            }),
+        }
+    }
+}
+
+impl PairPlan {
+    /// The training pairs of several rooms, each with the position of its room in `rooms`.
+    ///
+    /// # Errors
+    /// The errors of [`Split::train_pairs`] for a single stride, and of [`Split::sampled_range`]
+    /// for a range.
+    pub fn pairs(
+        &self,
+        split: Split,
+        rooms: &[&Timeline],
+        seed: u64,
+    ) -> Result<Vec<(usize, Pair)>, PairError> {
+        match self {
+            Self::Stride(stride) => {
+                let mut pairs = Vec::new();
+                for (room, timeline) in rooms.iter().enumerate() {
+                    pairs.extend(
+                        split
+                            .train_pairs(timeline, *stride)?
+                            .into_iter()
+                            .map(|pair| (room, pair)),
+                    );
+                }
+
+                Ok(pairs)
+            }
+            Self::Range(range) => split.sampled_range(rooms, range, seed),
+        }
+    }
+}

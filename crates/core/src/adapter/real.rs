@@ -1,0 +1,36 @@
+//! The two precisions of the networks: f32 for training, f64 for answers and for comparison with
+//! reference implementations.
+
+/// A floating-point type that networks can be computed in: f32 or f64.
+pub trait Real: ndarray::NdFloat + Default {
+    /// The error function.
+    fn erf(self) -> Self;
+    /// The nearest value to an f64.
+    fn of(value: f64) -> Self;
+    /// This value as f64.
+    fn f64(self) -> f64;
+}
+
+impl Real for f32 {
+    fn erf(self) -> Self {
+        libm::erff(self)
+    }
+    fn of(value: f64) -> Self {
+        value as f32
+    }
+    fn f64(self) -> f64 {
+        f64::from(self)
+    }
+}
+
+impl Real for f64 {
+    fn erf(self) -> Self {
+        libm::erf(self)
+    }
+    fn of(value: f64) -> Self {
+        value
+    }
+    fn f64(self) -> f64 {
+        self
+    }
+}

@@ -1,0 +1,361 @@
+//! Training data: features, poses and pairs of frames.
+
+use ndarray::{Array2, ArrayBase, ArrayView2, Axis, Data, Ix2};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::{At, Error, Real, STILL, TargetScale};
+use crate::geometry::{Pose, Twist, body_twist};
+use crate::statistics::median;
+
+/// Lower bound on the standard deviation by which a column is divided, as a fraction of the
+/// columns' median.
+const LEAST_SPREAD: f64 = 1e-3;
+
+/// Training data: the features of any number of rooms one below the other, and pairs of their rows.
+#[derive(Debug, Clone)]
+pub struct Samples<T> {
+    features: Array2<T>,
+    poses: Vec<Pose>,
+    pairs: Vec<[usize; 2]>,
+    twists: Vec<Twist>,
+    targets: Array2<T>,
+    scale: TargetScale,
+}
+
+/// A batch of pairs, and the distinct frames at their ends.
+pub struct Batch<T> {
+    /// Features of the distinct frames, shape (m, d).
+    pub features: Array2<T>,
+    /// For each pair the rows of its frames in `features`, source first.
+    slots: Vec<[usize; 2]>,
+    /// Z-scored twists of the pairs, shape (n, 6).
+    pub targets: Array2<T>,
+}
+
+impl<T: Real> Samples<T> {
+    /// Training data from `features` (n, d), the `poses` of their rows as `world_from_camera`, and
+    /// `pairs` of rows, source first. Both ends of a pair must be in the same world frame.
+    ///
+    /// # Errors
+    /// [`Error::NoPairs`] when there is no pair or a pair names a row that does not exist;
+    /// [`Error::NoMotion`] when the camera moves the same way in all pairs.
+    pub fn new(
+        features: ArrayView2<'_, f32>,
+        poses: Vec<Pose>,
+        pairs: Vec<[usize; 2]>,
+    ) -> Result<Self, Error> {
+        let known = features.nrows().min(poses.len());
+        if pairs.is_empty() || pairs.iter().flatten().any(|&row| row >= known) {
+            return Err(Error::NoPairs);
+        }
+
+        let twists: Vec<Twist> = pairs
+            .iter()
+            .map(|&[from, to]| body_twist(&poses[from], &poses[to]))
+            .collect();
+        let scale = TargetScale::of(&twists);
+
+        let features = features.mapv(|x| T::of(f64::from(x)));
+        Self::scaled(features, poses, pairs, twists, scale)
+    }
+
+    /// The same samples with targets scaled by μ = 0 and σ the root mean square.
+    ///
+    /// # Errors
+    /// [`Error::NoMotion`] when the camera does not move in any pair.
+    pub fn through_zero(self) -> Result<Self, Error> {
+        let scale = TargetScale::about_zero(&self.twists);
+
+        let Self {
+            features,
+            poses,
+            pairs,
+            twists,
+            ..
+        } = self;
+
+        Self::scaled(features, poses, pairs, twists, scale)
+    }
+
+    fn scaled(
+        features: Array2<T>,
+        poses: Vec<Pose>,
+        pairs: Vec<[usize; 2]>,
+        twists: Vec<Twist>,
+        scale: TargetScale,
+    ) -> Result<Self, Error> {
+        if twists
+            .iter()
+            .all(|twist| (twist.to_vector() - scale.mean).amax() < STILL)
+        {
+            return Err(Error::NoMotion);
+        }
+
+        let normalised: Vec<_> = twists
+            .iter()
+            .map(|&twist| scale.normalised(twist))
+            .collect();
+        let targets = Array2::from_shape_fn((twists.len(), 6), |(row, column)| {
+            T::of(normalised[row][column])
+        });
+
+        Ok(Self {
+            features,
+            poses,
+            pairs,
+            twists,
+            targets,
+            scale,
+        })
+    }
+
+    /// μ and σ by which the twists are z-scored.
+    pub fn scale(&self) -> &TargetScale {
+        &self.scale
+    }
+
+    /// How many pairs there are.
+    pub fn pair_count(&self) -> usize {
+        self.pairs.len()
+    }
+
+    /// Columns of a feature.
+    pub fn feature_dim(&self) -> usize {
+        self.features.ncols()
+    }
+
+    /// The true motions of the pairs, each in its source's body frame.
+    pub fn twists(&self) -> &[Twist] {
+        &self.twists
+    }
+
+    /// The rows of a pair, source first.
+    pub fn pair(&self, pair: usize) -> [usize; 2] {
+        self.pairs[pair]
+    }
+
+    /// The pose of a row, `world_from_camera`.
+    pub fn pose(&self, row: usize) -> &Pose {
+        &self.poses[row]
+    }
+
+    /// The pairs whose indices are in `batch`, with noise on the features if the settings ask for
+    /// it.
+    pub fn batch(&self, batch: &[usize], at: At<'_>) -> Batch<T> {
+        // A frame that occurs in several pairs gets a single row, so that φ runs once for each
+        // distinct frame.
+        let mut places = vec![usize::MAX; self.features.nrows()];
+        let mut frames = Vec::new();
+
+        let mut place = |row: usize| {
+            if places[row] == usize::MAX {
+                places[row] = frames.len();
+                frames.push(row);
+            }
+
+            places[row]
+        };
+
+        let slots = batch
+            .iter()
+            .map(|&pair| self.pairs[pair].map(&mut place))
+            .collect();
+
+        let mut features = self.features.select(Axis(0), &frames);
+
+        // Each step has a random stream of its own, so that its noise depends on the seed and the
+        // step alone.
+        if at.config.noise > 0.0 {
+            let mut random = ChaCha8Rng::seed_from_u64(at.config.seed);
+            random.set_stream(at.step);
+            let noise = normal(&mut random, features.len());
+            features
+                .iter_mut()
+                .zip(noise)
+                .for_each(|(x, noise)| *x += T::of(at.config.noise * noise));
+        }
+
+        Batch {
+            features,
+            slots,
+            targets: self.targets.select(Axis(0), batch),
+        }
+    }
+}
+
+impl Samples<f32> {
+    /// The same samples with z-scored features, and the mean and the population standard deviation
+    /// that were used, each (1, d). The statistics are those of the rows that occur in pairs. A
+    /// column that hardly varies there is divided by a thousandth of the median deviation instead.
+    pub(super) fn standardised(&self) -> (Self, [Array2<f32>; 2]) {
+        // The statistics leave out frames that occur in no training pair, such as a room's test
+        // frames.
+        let mut used = vec![false; self.features.nrows()];
+        self.pairs
+            .iter()
+            .flatten()
+            .for_each(|&row| used[row] = true);
+
+        let rows: Vec<usize> = (0..used.len()).filter(|&row| used[row]).collect();
+        let known = self.features.select(Axis(0), &rows).mapv(f64::from);
+        let count = rows.len().max(1) as f64;
+        let mean = known.sum_axis(Axis(0)) / count;
+        let variance = (&known - &mean).mapv(|x| x * x).sum_axis(Axis(0)) / count;
+
+        // A column that hardly varies in these frames holds rounding errors. Scaled up to unit
+        // variance, it would dominate the others in a room in which it does vary.
+        let spreads: Vec<f64> = variance.iter().map(|x| x.sqrt()).collect();
+        let least = (LEAST_SPREAD * median(&spreads)).max(f64::MIN_POSITIVE);
+        let deviation = variance.mapv(|x| x.sqrt().max(least));
+        let row = |values: ndarray::Array1<f64>| values.mapv(|x| x as f32).insert_axis(Axis(0));
+        let mean = row(mean);
+
+        let deviation = row(deviation);
+        let features = (&self.features - &mean) / &deviation;
+
+        (
+            Self {
+                features,
+                ..self.clone()
+            },
+            [mean, deviation],
+        )
+    }
+
+    /// The features, shape (n, d).
+    pub fn features(&self) -> ArrayView2<'_, f32> {
+        self.features.view()
+    }
+}
+
+impl<T: Real> Batch<T> {
+    /// For each pair the rows of its frames in `features`, source first.
+    pub fn slots(&self) -> impl Iterator<Item = [usize; 2]> + '_ {
+        self.slots.iter().copied()
+    }
+
+    /// From `rows`, one for each distinct frame, those of the pairs' sources, one for each pair.
+    pub fn sources<S: Data<Elem = T>>(&self, rows: &ArrayBase<S, Ix2>) -> Array2<T> {
+        self.end(rows, 0)
+    }
+
+    /// From `rows`, one for each distinct frame, the differences target minus source, one for each
+    /// pair.
+    pub fn differences(&self, rows: &Array2<T>) -> Array2<T> {
+        self.end(rows, 1) - self.end(rows, 0)
+    }
+
+    fn end<S: Data<Elem = T>>(&self, rows: &ArrayBase<S, Ix2>, end: usize) -> Array2<T> {
+        rows.select(
+            Axis(0),
+            &self
+                .slots
+                .iter()
+                .map(|slots| slots[end])
+                .collect::<Vec<_>>(),
+        )
+    }
+
+    /// The backward pass of [`Batch::differences`]: the gradient with respect to its `rows`, from
+    /// the gradient with respect to the differences. Contributions of several pairs to one frame
+    /// add up.
+    pub fn scattered(&self, d_differences: &Array2<T>) -> Array2<T> {
+        let mut d_rows = Array2::zeros((self.features.nrows(), d_differences.ncols()));
+        for (slots, d) in self.slots.iter().zip(d_differences.outer_iter()) {
+            let mut target = d_rows.row_mut(slots[1]);
+            target += &d;
+            let mut source = d_rows.row_mut(slots[0]);
+            source -= &d;
+        }
+
+        d_rows
+    }
+
+    /// The backward pass of [`Batch::sources`]: the gradient with respect to its `rows`, from the
+    /// gradient with respect to its result.
+    pub fn scattered_to_sources(&self, d_sources: &Array2<T>) -> Array2<T> {
+        let mut d_rows = Array2::zeros((self.features.nrows(), d_sources.ncols()));
+        for (slots, d) in self.slots.iter().zip(d_sources.outer_iter()) {
+            let mut source = d_rows.row_mut(slots[0]);
+            source += &d;
+        }
+
+        d_rows
+    }
+}
+
+/// Draws from the standard normal distribution by the Box–Muller transform.
+fn normal(random: &mut ChaCha8Rng, count: usize) -> impl Iterator<Item = f64> + '_ {
+    let pair = |random: &mut ChaCha8Rng| {
+        let a: f32 = random.random();
+        let b: f32 = random.random();
+        let radius = (-2.0 * (1.0 - a).ln()).sqrt();
+        let (sine, cosine) = (std::f32::consts::TAU * b).sin_cos();
+
+        [f64::from(radius * cosine), f64::from(radius * sine)]
+    };
+
+    (0..count.div_ceil(2))
+        .flat_map(move |_| pair(random))
+        .take(count)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::adapter::TrainConfig;
+    use crate::geometry::exp;
+
+    /// Oracle: the definition of a normal deviate: mean 0 and the deviation asked for, other
+    /// numbers at every step, the same at the same step of the same seed.
+    #[test]
+    fn noise_has_the_deviation_asked_for() {
+        let features = Array2::<f32>::zeros((3, 20_000));
+
+        let ahead = exp(&Twist {
+            linear: nalgebra::Vector3::z(),
+            angular: nalgebra::Vector3::x() * 0.1,
+        });
+
+        let pairs = vec![[0, 1], [1, 2]];
+        let samples = Samples::<f64>::new(
+            features.view(),
+            vec![Pose::identity(), ahead, ahead * ahead * ahead],
+            pairs,
+        )
+        .unwrap();
+
+        let config = |noise| TrainConfig {
+            noise,
+            ..crate::adapter::Preset::PaperBase.config(3)
+        };
+
+        let batch = |noise: f64, step| {
+            samples
+                .batch(
+                    &[0],
+                    At {
+                        config: &config(noise),
+                        step,
+                    },
+                )
+                .features
+        };
+
+        assert!(batch(0.0, 1).iter().all(|&x| x == 0.0));
+
+        let noisy = batch(0.2, 1);
+        let count = noisy.len() as f64;
+        let mean = noisy.sum() / count;
+        let second = noisy.mapv(|x| x * x).sum() / count;
+
+        assert!(
+            mean.abs() < 0.005 && (second.sqrt() - 0.2).abs() < 0.004,
+            "{mean} {second}"
+        );
+
+        assert_eq!(noisy, batch(0.2, 1));
+        assert_ne!(noisy, batch(0.2, 2));
+    }
+}

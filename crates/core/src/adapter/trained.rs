@@ -1,0 +1,484 @@
+//! A trained adapter: what answers are computed with.
+
+use std::sync::Arc;
+
+use nalgebra::{Matrix6, Vector6};
+use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis, s};
+
+use super::inverse::{pseudo_inverse, target};
+use super::{
+    Corrector, CorrectorKind, Error, ErrorModel, Inverse, MAX_LATENT, Mixing, Mixture, Network,
+    Reading, TargetScale,
+};
+use crate::features::FeatureSource;
+use crate::geometry::Twist;
+
+/// Rows embedded at a time, so that memory stays flat with the size of a room.
+const EMBED_ROWS: usize = 1_024;
+/// The largest accepted deviation of a gate's sum of shares from 1, and of each share of an
+/// ensemble from 1/K.
+const GATE_TOLERANCE: f64 = 1e-6;
+
+/// A trained adapter. It is immutable and is meant for features of one source only.
+#[derive(Debug, Clone)]
+pub struct Adapter {
+    source: FeatureSource,
+    network: Mixture<f32>,
+    network_f64: Mixture<f64>,
+    scale: TargetScale,
+    inverse: Inverse,
+    correctors: Vec<(Corrector<f32>, Corrector<f64>)>,
+    error_covariance: Option<Matrix6<f64>>,
+    error_model: Option<Arc<ErrorModel>>,
+}
+
+impl Adapter {
+    /// Checks trained weights and prepares W⁺.
+    ///
+    /// # Errors
+    /// [`Error::FeatureDim`] when network and source differ in width, [`Error::WeightsNotFinite`]
+    /// or [`Error::NotFinite`] when a weight or a component of μ is not finite,
+    /// [`Error::Deviation`] when a component of σ is not finite and positive, and
+    /// [`Error::RankDeficient`] when a chart's W does not have rank 6.
+    pub fn new(
+        source: FeatureSource,
+        network: impl Into<Mixture<f32>>,
+        scale: TargetScale,
+    ) -> Result<Self, Error> {
+        let network = network.into();
+        if network.feature_dim() != source.dim {
+            return Err(Error::FeatureDim {
+                expected: network.feature_dim(),
+                actual: source.dim,
+            });
+        }
+
+        if let Some(tensor) = network.not_finite() {
+            return Err(Error::WeightsNotFinite { tensor });
+        }
+
+        for (component, &value) in scale.deviation.iter().enumerate() {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(Error::Deviation { component, value });
+            }
+        }
+
+        if let Some(position) = scale.mean.iter().position(|x| !x.is_finite()) {
+            return Err(Error::NotFinite {
+                what: "target mean",
+                position,
+                value: scale.mean[position],
+            });
+        }
+
+        let network_f64 = network.cast::<f64>();
+
+        // A gate can give nearly the whole weight to one chart, so each chart's W must have rank
+        // 6 by itself.
+        for chart in network_f64.charts() {
+            Inverse::new(chart.motion_matrix(), &scale)?;
+        }
+
+        // For charts under a gate this is the inverse at equal shares; `step` computes the one
+        // for the source's gate.
+        let inverse = Inverse::new(
+            network_f64
+                .motion_matrix(network_f64.even_gate().view())
+                .view(),
+            &scale,
+        )?;
+
+        Ok(Self {
+            source,
+            network,
+            network_f64,
+            scale,
+            inverse,
+            correctors: Vec::new(),
+            error_covariance: None,
+            error_model: None,
+        })
+    }
+
+    /// The same adapter with `correctors`, at most one of each kind.
+    ///
+    /// # Errors
+    /// [`Error::CorrectorTwice`] when two are of the same kind, [`Error::WeightsNotFinite`] when a
+    /// weight is not finite, or [`Error::WeightShape`] when a corrector does not fit the adapter's
+    /// latents.
+    pub fn with_correctors(mut self, correctors: Vec<Corrector<f32>>) -> Result<Self, Error> {
+        for corrector in correctors {
+            let name = corrector.kind().name();
+            if self.corrector(corrector.kind()).is_ok() {
+                return Err(Error::CorrectorTwice { name });
+            }
+
+            corrector.check(self.network.coordinate_count())?;
+            let precise = corrector.cast::<f64>();
+            self.correctors.push((corrector, precise));
+        }
+
+        Ok(self)
+    }
+
+    /// The same adapter with the second moment of its errors on (v, ω), Σ = mean r rᵀ with
+    /// r = ΔP − σ⊙W(g₂ − g₁), in metres and radians, measured in rooms outside its training set.
+    ///
+    /// # Errors
+    /// [`Error::ErrorCovariance`] when Σ is not symmetric and positive definite.
+    pub fn with_error_covariance(mut self, covariance: Matrix6<f64>) -> Result<Self, Error> {
+        let symmetric = (covariance - covariance.transpose()).amax() <= 1e-9 * covariance.amax();
+        if !symmetric || covariance.cholesky().is_none() {
+            return Err(Error::ErrorCovariance);
+        }
+
+        self.error_covariance = Some(covariance);
+        Ok(self)
+    }
+
+    /// The second moment of the adapter's errors on (v, ω), in metres and radians, if it was
+    /// measured.
+    pub fn error_covariance(&self) -> Option<Matrix6<f64>> {
+        self.error_covariance
+    }
+
+    /// The same adapter with its calibration, the error statistics that a tracker needs.
+    ///
+    /// # Errors
+    /// [`Error::ErrorModel`] when the calibration was made for latents of another width.
+    pub fn with_error_model(mut self, error_model: ErrorModel) -> Result<Self, Error> {
+        if error_model.frame_noise().size() != self.coordinate_count() {
+            return Err(Error::ErrorModel {
+                what: "the size of a covariance of latents",
+            });
+        }
+
+        self.error_model = Some(Arc::new(error_model));
+        Ok(self)
+    }
+
+    /// The calibration, if the adapter has one.
+    pub fn error_model(&self) -> Option<&Arc<ErrorModel>> {
+        self.error_model.as_ref()
+    }
+
+    /// The source of the features that the adapter was trained on.
+    pub fn source(&self) -> &FeatureSource {
+        &self.source
+    }
+
+    /// The trained weights.
+    pub fn network(&self) -> &Mixture<f32> {
+        &self.network
+    }
+
+    /// The trained correctors.
+    pub fn correctors(&self) -> impl Iterator<Item = &Corrector<f32>> {
+        self.correctors.iter().map(|(corrector, _)| corrector)
+    }
+
+    /// μ and σ of the training twists.
+    pub fn scale(&self) -> &TargetScale {
+        &self.scale
+    }
+
+    /// W⁺ in its three readings; for a mixture, at equal shares of all charts.
+    pub fn inverse(&self) -> &Inverse {
+        &self.inverse
+    }
+
+    /// Columns of a latent: the coordinates, and with several charts the share of each chart.
+    pub fn latent_dim(&self) -> usize {
+        self.network.latent_dim()
+    }
+
+    /// Number of coordinates in a latent, the columns on which distances are computed.
+    pub fn coordinate_count(&self) -> usize {
+        self.network.coordinate_count()
+    }
+
+    /// W of each chart, shape (6, k).
+    pub fn motion_matrices(&self) -> Vec<ArrayView2<'_, f64>> {
+        self.network_f64
+            .charts()
+            .iter()
+            .map(super::Siamese::motion_matrix)
+            .collect()
+    }
+
+    /// σ ⊙ W, shape (6, [`Adapter::coordinate_count`]), which maps a difference of latents to the
+    /// motion without μ. For an ensemble it is σ ⊙ W̄.
+    ///
+    /// # Errors
+    /// [`Error::GatedMotion`] for charts under a gate, since their matrix changes with the source
+    /// frame.
+    pub fn motion_of_coordinates(&self) -> Result<Array2<f64>, Error> {
+        if self.network.chart_count() > 1 && self.network.mixing() == Mixing::Gate {
+            return Err(Error::GatedMotion);
+        }
+
+        let mut matrix = self
+            .network_f64
+            .motion_matrix(self.network_f64.even_gate().view());
+        for (mut row, &deviation) in matrix.outer_iter_mut().zip(self.scale.deviation.iter()) {
+            row *= deviation;
+        }
+
+        Ok(matrix)
+    }
+
+    /// Refuses features of a source other than the one the adapter was trained on.
+    ///
+    /// # Errors
+    /// [`Error::FeatureDim`] when the widths differ, [`Error::FeatureSource`] when the features
+    /// were made in another way.
+    pub fn check_source(&self, source: &FeatureSource) -> Result<(), Error> {
+        if source.dim != self.source.dim {
+            return Err(Error::FeatureDim {
+                expected: self.source.dim,
+                actual: source.dim,
+            });
+        }
+
+        if !source.is_like(&self.source) {
+            return Err(Error::FeatureSource {
+                expected: describe(&self.source),
+                actual: describe(source),
+            });
+        }
+
+        Ok(())
+    }
+
+    /// Latents φ(z) of feature rows: shape (n, d) in, (n, [`Adapter::latent_dim`]) out.
+    ///
+    /// # Errors
+    /// [`Error::FeatureDim`] when the features have another width than the adapter was trained on,
+    /// [`Error::NotFinite`] when a number in them is not finite.
+    ///
+    /// Source: SeeSE3, Eq. 3.
+    pub fn embed(&self, features: ArrayView2<'_, f32>) -> Result<Array2<f64>, Error> {
+        if features.ncols() != self.source.dim {
+            return Err(Error::FeatureDim {
+                expected: self.source.dim,
+                actual: features.ncols(),
+            });
+        }
+
+        if let Some(((_, position), &value)) = features
+            .indexed_iter()
+            .find(|(_, value)| !value.is_finite())
+        {
+            return Err(Error::NotFinite {
+                what: "feature",
+                position,
+                value: f64::from(value),
+            });
+        }
+
+        let mut latents = Array2::zeros((features.nrows(), self.latent_dim()));
+        let chunks = features.axis_chunks_iter(Axis(0), EMBED_ROWS);
+        for (rows, mut out) in chunks.zip(latents.axis_chunks_iter_mut(Axis(0), EMBED_ROWS)) {
+            out.assign(&self.network_f64.embed(rows.mapv(f64::from)));
+        }
+
+        Ok(latents)
+    }
+
+    /// The latent φ(z) of one feature.
+    ///
+    /// # Errors
+    /// The errors of [`Adapter::embed`].
+    pub fn embed_one(&self, feature: &[f32]) -> Result<Array1<f64>, Error> {
+        let row = ArrayView1::from(feature);
+        Ok(self.embed(row.insert_axis(Axis(0)))?.row(0).to_owned())
+    }
+
+    /// The camera's motion between two latents, ΔP = σ ⊙ W(g₂ − g₁) + μ, in the body frame of the
+    /// first camera. For a mixture, the gate of the first latent weighs the charts.
+    ///
+    /// Source: SeeSE3, Eq. 3, with the z-scoring of the targets undone.
+    pub fn motion(&self, from: ArrayView1<'_, f64>, to: ArrayView1<'_, f64>) -> Twist {
+        let normalised = match self.network_f64.charts() {
+            [chart] => chart.motion_matrix().dot(&(&to - &from)),
+            _ => {
+                let coordinates = s![..self.coordinate_count()];
+                let step = &to.slice(coordinates) - &from.slice(coordinates);
+
+                self.network_f64
+                    .motion_matrix(self.network_f64.gate_of(from).view())
+                    .dot(&step)
+            }
+        };
+
+        self.scale
+            .twist(&Vector6::from_fn(|row, _| normalised[row]))
+    }
+
+    /// [`Adapter::motion`] without μ, so that equal latents give zero motion (A-16, homogeneous).
+    pub fn displacement(&self, from: ArrayView1<'_, f64>, to: ArrayView1<'_, f64>) -> Twist {
+        Twist::from_vector(&(self.motion(from, to).to_vector() - self.scale.mean))
+    }
+
+    /// The latent step of a motion from `latent`, ĝ − g = W⁺ΔP. A mixture's gate stays as it is at
+    /// the source (A-36). `mean_share` is explained at [`Inverse::step`].
+    ///
+    /// Source: SeeSE3, ĝ = φ(z) + W⁺ΔP.
+    pub fn step(
+        &self,
+        latent: ArrayView1<'_, f64>,
+        twist: Twist,
+        reading: Reading,
+        mean_share: f64,
+    ) -> Array1<f64> {
+        if self.network_f64.chart_count() == 1 || self.network_f64.mixing() == Mixing::Even {
+            return self.widened(self.inverse.step(twist, reading, mean_share));
+        }
+
+        // The gate depends on the source, so the mixed matrix has to be inverted for each query.
+        // It has rank 6, since each chart's W has.
+        let mixed = self
+            .network_f64
+            .motion_matrix(self.network_f64.gate_of(latent).view());
+        let (inverse, ..) = pseudo_inverse(mixed.view());
+
+        self.widened(inverse.dot(&target(&self.scale, twist, reading, mean_share)))
+    }
+
+    /// The latent step of a motion from `latent` by a corrector. A corrector with a residual adds
+    /// its output to W⁺ΔP in the affine reading; the linear one predicts the target latent, from
+    /// which the source is subtracted. A part of a longer motion is treated as a motion of its own:
+    /// μ only scales the corrector's input, and cannot be shared among parts.
+    ///
+    /// # Errors
+    /// [`Error::NoCorrector`] when the adapter has no corrector of this kind.
+    ///
+    /// Source: SeeSE3, Sec. A.9; widths and heads are ours (A-17).
+    pub fn corrected_step(
+        &self,
+        kind: CorrectorKind,
+        latent: ArrayView1<'_, f64>,
+        twist: Twist,
+    ) -> Result<Array1<f64>, Error> {
+        let corrector = self.corrector(kind)?;
+        let wanted = target(&self.scale, twist, Reading::Affine, 1.0);
+        let here = latent.slice(s![..self.coordinate_count()]);
+        let added = corrector.added(here, wanted.view());
+
+        if kind.has_residual() {
+            Ok(self.step(latent, twist, Reading::Affine, 1.0) + self.widened(added))
+        } else {
+            Ok(self.widened(added - here))
+        }
+    }
+
+    /// Refuses a latent whose width, numbers or shares of the charts are invalid.
+    ///
+    /// # Errors
+    /// [`Error::LatentDim`] when its width is wrong, [`Error::NotFinite`] when a number is not
+    /// finite, [`Error::LatentRange`] when one exceeds [`MAX_LATENT`] in magnitude, or
+    /// [`Error::Gate`] when its last columns are not valid shares of the charts.
+    pub fn check_latent(&self, latent: &[f64]) -> Result<(), Error> {
+        if latent.len() != self.latent_dim() {
+            return Err(Error::LatentDim {
+                expected: self.latent_dim(),
+                actual: latent.len(),
+            });
+        }
+
+        if let Some(position) = latent.iter().position(|x| !x.is_finite()) {
+            return Err(Error::NotFinite {
+                what: "latent",
+                position,
+                value: latent[position],
+            });
+        }
+
+        if let Some(position) = latent.iter().position(|x| x.abs() > MAX_LATENT) {
+            return Err(Error::LatentRange {
+                position,
+                value: latent[position],
+            });
+        }
+
+        // Shares of the charts lie between 0 and 1 and add up to 1. If only the sum is wrong, no
+        // single chart is at fault, and the first one is reported.
+        let gate = &latent[self.coordinate_count()..];
+        let sum: f64 = gate.iter().sum();
+        let off = gate.iter().position(|share| !(0.0..=1.0).contains(share));
+        let off = off.or((!gate.is_empty() && (sum - 1.0).abs() > GATE_TOLERANCE).then_some(0));
+
+        // An ensemble has no gate to vary the shares, so each of them is 1/K.
+        let even = (gate.len() as f64).recip();
+        let uneven = |share: &f64| {
+            self.network.mixing() == Mixing::Even && (share - even).abs() > GATE_TOLERANCE
+        };
+        let off = off.or(gate.iter().position(uneven));
+
+        match off {
+            Some(chart) => Err(Error::Gate {
+                chart,
+                value: gate[chart],
+            }),
+            None => Ok(()),
+        }
+    }
+
+    /// Extends a step of the coordinates to a step of the whole latent, which leaves the shares of
+    /// the charts as they are.
+    fn widened(&self, coordinates: Array1<f64>) -> Array1<f64> {
+        if coordinates.len() == self.latent_dim() {
+            return coordinates;
+        }
+
+        let mut step = Array1::zeros(self.latent_dim());
+        step.slice_mut(s![..coordinates.len()]).assign(&coordinates);
+
+        step
+    }
+
+    fn corrector(&self, kind: CorrectorKind) -> Result<&Corrector<f64>, Error> {
+        let found = self
+            .correctors
+            .iter()
+            .map(|(_, precise)| precise)
+            .find(|corrector| corrector.kind() == kind);
+
+        found.ok_or_else(|| {
+            let names: Vec<&str> = self
+                .correctors
+                .iter()
+                .map(|(corrector, _)| corrector.kind().name())
+                .collect();
+            let known = if names.is_empty() {
+                "none".to_owned()
+            } else {
+                names.join(", ")
+            };
+
+            Error::NoCorrector {
+                name: kind.name(),
+                known,
+            }
+        })
+    }
+}
+
+/// A source in words, enough to see which of its parts differ.
+fn describe(source: &FeatureSource) -> String {
+    let FeatureSource {
+        name,
+        encoder,
+        layer,
+        base,
+        norm,
+        pooling,
+        preprocess,
+        dim,
+    } = source;
+
+    format!(
+        "{name} (encoder {encoder}, layer {layer}, base {base}, norm {norm}, pooling {pooling}, \
+         preprocess {preprocess}, {dim} columns)"
+    )
+}

@@ -1,0 +1,125 @@
+//! Errors of the motions that an adapter reads between two frames.
+
+use nalgebra::Vector6;
+use ndarray::{Array2, Axis};
+
+use super::Error;
+use super::model::EmbeddedRoom;
+use super::robust_covariance::robust_covariance;
+use crate::adapter::{self, Adapter, ErrorTable, MotionErrors, PairPlan, Stratum, Whitener};
+use crate::geometry::body_twist;
+use crate::splits::Pair;
+
+/// u₀ of [`MotionErrors`]: chosen, not measured, about the squared length u between successive frames;
+/// it matters only where u is near zero.
+const FLOOR: f64 = 0.05;
+
+/// A pair of frames of one of several rooms.
+#[derive(Debug, Clone, Copy)]
+pub struct RoomPair {
+    /// The room's place among the rooms.
+    pub room: usize,
+    /// Its two frames.
+    pub pair: Pair,
+}
+
+/// The strides that motions are measured at: the Fibonacci numbers 1, 2, 3, 5, 8, … below the longest
+/// stride that the adapter was trained on, and that one.
+pub fn strides(plan: &PairPlan) -> Vec<u32> {
+    let longest = match plan {
+        PairPlan::Stride(stride) => *stride,
+        PairPlan::Range(range) => range.high,
+    };
+
+    let mut strides = vec![1, 2];
+    while let [.., a, b] = strides[..]
+        && a + b < longest
+    {
+        strides.push(a + b);
+    }
+
+    strides.retain(|&stride| stride < longest);
+    strides.push(longest);
+    strides
+}
+
+/// The second moment of the differences of latents of pairs, mean d dᵀ, shape (c, c).
+pub fn second_moment(rooms: &[EmbeddedRoom<'_>], pairs: &[RoomPair]) -> Result<Array2<f64>, Error> {
+    let size = rooms[0].coordinates.ncols();
+    if pairs.len() <= size {
+        return Err(adapter::Error::NoPairs.into());
+    }
+
+    let mut differences = Array2::zeros((pairs.len(), size));
+    for (at, mut row) in pairs.iter().zip(differences.axis_iter_mut(Axis(0))) {
+        let coordinates = &rooms[at.room].coordinates;
+        let target = coordinates.row(at.pair.target.row());
+        let source = coordinates.row(at.pair.source.row());
+        row.assign(&(&target - &source));
+    }
+
+    let moment = differences.t().dot(&differences) / pairs.len() as f64;
+    // Rounding may leave the product asymmetric in its last bits.
+    Ok((&moment + &moment.t()) * 0.5)
+}
+
+/// The covariances of motions by stride; `spread` is the whitener of the motion spread.
+pub fn motion_errors(
+    adapter: &Adapter,
+    rooms: &[EmbeddedRoom<'_>],
+    pairs_by_stride: &[(u32, Vec<RoomPair>)],
+    spread: &Whitener,
+) -> Result<MotionErrors, Error> {
+    let mut strata = Vec::with_capacity(pairs_by_stride.len());
+    for (stride, pairs) in pairs_by_stride {
+        let residuals: Vec<Vector6<f64>> = pairs
+            .iter()
+            .map(|at| scaled_residual(adapter, &rooms[at.room], at.pair, spread))
+            .collect();
+        strata.push(Stratum {
+            at: f64::from(*stride),
+            gain: 1.0,
+            covariance: robust_covariance(&residuals)?,
+        });
+    }
+
+    Ok(MotionErrors {
+        shapes: ErrorTable::new(strata)?,
+        floor: FLOOR,
+    })
+}
+
+/// The error of one read motion, divided by √(u + u₀): what is left has the covariance S(n).
+fn scaled_residual(
+    adapter: &Adapter,
+    room: &EmbeddedRoom<'_>,
+    pair: Pair,
+    spread: &Whitener,
+) -> Vector6<f64> {
+    let from = pair.source.row();
+    let to = pair.target.row();
+    let read = adapter
+        .displacement(room.latents.row(from), room.latents.row(to))
+        .to_vector();
+    let truth = body_twist(&room.poses[from], &room.poses[to]).to_vector();
+
+    let difference = &room.coordinates.row(to) - &room.coordinates.row(from);
+    let squared_length = spread.squared_length(difference.view());
+    (truth - read) / (squared_length + FLOOR).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand.
+    #[test]
+    fn strides_grow_to_the_longest() {
+        assert_eq!(strides(&PairPlan::Stride(1)), [1]);
+        assert_eq!(strides(&PairPlan::Stride(2)), [1, 2]);
+        assert_eq!(
+            strides(&PairPlan::Stride(40)),
+            [1, 2, 3, 5, 8, 13, 21, 34, 40]
+        );
+    }
+}

@@ -1,0 +1,108 @@
+//! The computations of [seese3](https://docs.rs/seese3): latent navigation with Poincaré adapters.
+//!
+//! An encoder turns an image into a feature z. A small trained network φ, the *Poincaré adapter*,
+//! turns features into latents in which camera motion is linear: ΔP ≈ W(φ(z₂) − φ(z₁)), with
+//! ΔP = log(P₁⁻¹P₂) ∈ se(3). Inverted, a motion can be imagined: ĝ = φ(z) + W⁺ΔP, and the stored frame
+//! nearest to ĝ shows where it leads.
+//!
+//! ```
+//! use std::sync::Arc;
+//!
+//! use seese3_core::adapter::{Adapter, Preset};
+//! use seese3_core::features::{FeatureSource, Features};
+//! use seese3_core::geometry::Pose;
+//! use seese3_core::navigation::{IndexKind, Navigator};
+//! use seese3_core::room::{Frames, Provenance, Room, RoomId};
+//! use seese3_core::splits::Split;
+//! use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! // A made-up recording: poses, and features that depend on them.
+//! let poses: Vec<Pose> = (0..200)
+//!     .map(|t| {
+//!         let sway = |axis: f64| (f64::from(t) / (9.0 + axis)).sin();
+//!         let position = nalgebra::Vector3::new(sway(0.0), 0.2 * sway(1.0), sway(2.0));
+//!         Pose::new(position, nalgebra::Vector3::new(0.1 * sway(3.0), 0.4 * sway(4.0), 0.1 * sway(5.0)))
+//!     })
+//!     .collect();
+//! let rows = ndarray::Array2::from_shape_fn((200, 12), |(row, column)| {
+//!     let p = &poses[row];
+//!     let numbers = [p.translation.vector, p.rotation.scaled_axis()];
+//!     (numbers[column % 2][column % 3] * (1.0 + column as f64)) as f32
+//! });
+//! let features = Features::new(FeatureSource::imported("made-up", 12), rows)?;
+//! let frames = Frames { poses, ..Frames::default() };
+//! let room = Room::new(RoomId::new("hall")?, frames, Provenance::default())?;
+//!
+//! // Train an adapter on pairs of frames five apart.
+//! let data = RoomData { room: &room, revision: 1, features: &features };
+//! let plan = TrainingPlan::of(Preset::PaperBase, Split::Time, 5, 0);
+//! let (adapter, record) = train_adapter(&[data], &plan, &mut |_| ())?;
+//! assert!(record.pair_count > 0);
+//!
+//! // Read the motion between two frames, and find the frames that look like one.
+//! let navigator = Navigator::new(Arc::new(room), &features, Arc::new(adapter), IndexKind::Exact)?;
+//! let latents = navigator.latents();
+//! let motion = navigator.adapter().motion(latents.row(10), latents.row(15));
+//! assert!(motion.is_finite());
+//! assert_eq!(navigator.nearest(latents.row(10), 3)[0].neighbour.frame.row(), 10);
+//! # Ok(()) }
+//! ```
+//!
+//! # Conventions
+//!
+//! A [`geometry::Pose`] is `world_from_camera`, metres. A [`geometry::Twist`] is ordered (v, ω), in the
+//! body frame of the camera that a motion starts from; |ω| ≤ π. Camera axes are x right, y down,
+//! z forward. Weights are f32 as trained; answers are computed in f64. The numbers A-nn are those of
+//! the ambiguities in `docs/paper.md`.
+//!
+//! # The map
+//!
+//! The modules stand bottom to top, and each uses only those above its line; a test enforces it.
+//!
+//! | module | what |
+//! | --- | --- |
+//! | [`cancel`] | a flag that says that nobody waits for the result any more |
+//! | [`geometry`] | SE(3): poses, twists, errors between poses |
+//! | [`room`] | a recording: frames with poses, times and image names |
+//! | [`image`] | 8-bit RGB pictures |
+//! | [`features`] | one row of encoder output per frame, and what made it |
+//! | [`index`] | nearest neighbours: the exact scan, HNSW |
+//! | [`ridge`] | ridge regression in closed form |
+//! | [`splits`] | which pairs of frames train and which test; which frames a map holds |
+//! | [`statistics`] | means, quantiles, rates, the bootstrap over rooms, coverage of covariances |
+//! | [`motion_scores`] | R² of predicted motions |
+//! | [`trajectory`] | paths against the true ones: association, alignment, APE, RPE |
+//! | [`adapter`] | features to latents, latents to motions and back; networks and their training |
+//! | [`training`] | from rooms to an adapter and its scores |
+//! | [`navigation`] | from a frame and a motion to the frames that follow |
+//! | [`localization`] | from a view to the frames that look like it |
+//! | [`tracking`] | a camera followed frame by frame, with covariances |
+//! | [`calibration`] | how large an adapter's errors are in rooms that it did not learn from |
+//! | [`eval`] | Hit@ε on held-out motions, and whether a score leaks |
+//!
+//! Nothing here reads files, the network, the clock or the environment; randomness enters as a seed.
+
+pub mod cancel;
+pub mod geometry;
+pub mod room;
+pub mod image;
+pub mod features;
+pub mod index;
+pub mod ridge;
+pub mod splits;
+pub mod statistics;
+pub mod motion_scores;
+pub mod trajectory;
+pub mod adapter;
+pub mod training;
+pub mod navigation;
+pub mod localization;
+pub mod tracking;
+pub mod calibration;
+pub mod eval;
+
+/// Vectors and matrices of poses and twists.
+pub use nalgebra;
+/// Arrays of features and latents.
+pub use ndarray;

@@ -1,0 +1,55 @@
+//! From a feature to a pose: the nearest frames in one room or in all, by latent distance.
+//!
+//! Latent distances are comparable only under one adapter, so all rooms of a query must share it.
+
+use ndarray::ArrayView1;
+
+use crate::cancel::{Cancellation, Cancelled};
+use crate::navigation::{Hit, Navigator};
+use crate::room::RoomId;
+
+/// A stored frame that matches the query, and the room it belongs to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Place {
+    /// The room.
+    pub room: RoomId,
+    /// The frame, its distance and its pose, `world_from_camera` in that room's world.
+    pub hit: Hit,
+}
+
+/// The `k` nearest frames of all `rooms`, by distance, then room, then frame.
+///
+/// # Errors
+/// [`Cancelled`] between two rooms.
+pub fn localize<'a>(
+    rooms: impl IntoIterator<Item = &'a Navigator>,
+    latent: ArrayView1<'_, f64>,
+    k: usize,
+    cancel: &Cancellation,
+) -> Result<Vec<Place>, Cancelled> {
+    let mut places = Vec::new();
+    for navigator in rooms {
+        cancel.check()?;
+        let room = navigator.room().id();
+        places.extend(navigator.nearest(latent, k).into_iter().map(|hit| Place {
+            room: room.clone(),
+            hit,
+        }));
+
+        // Sorted and cut after every room, so that the list never holds more than 2k frames.
+        places.sort_by(|a, b| {
+            let distance = a
+                .hit
+                .neighbour
+                .distance
+                .total_cmp(&b.hit.neighbour.distance);
+            distance
+                .then_with(|| a.room.cmp(&b.room))
+                .then(a.hit.neighbour.frame.cmp(&b.hit.neighbour.frame))
+        });
+
+        places.truncate(k);
+    }
+
+    Ok(places)
+}

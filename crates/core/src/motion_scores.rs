@@ -1,0 +1,157 @@
+//! Scores of predicted motions: R² by component, and hit rates with confidence intervals.
+
+use nalgebra::{Vector3, Vector6};
+
+use crate::geometry::Twist;
+use crate::statistics::mean_of_known;
+
+/// Motions whose true translation |v| is shorter, metres, have no direction to score.
+pub const LEAST_DIRECTED_M: f64 = 1e-3;
+
+/// R² of predicted twists. A component whose targets do not vary has no R² and is left out of the
+/// means; a mean over no component is NaN.
+///
+/// R² = 1 − Σ(y − ŷ)² / Σ(y − ȳ)², ȳ the mean of the evaluated targets (scikit-learn's `r2_score`).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MotionScores {
+    /// Pairs scored.
+    pub n: usize,
+    /// R² of each component, (v, ω); NaN when it does not vary.
+    pub components: [f64; 6],
+    /// Mean of the components' R².
+    pub overall: f64,
+    /// Mean over the components of v.
+    pub translation: f64,
+    /// Mean over the components of ω.
+    pub rotation: f64,
+    /// Mean R² of the components of v/|v|, over pairs with |v| > 1 mm.
+    pub direction: f64,
+    /// R² of |v|.
+    pub magnitude: f64,
+    /// Pairs left out of `direction` because the camera hardly moves.
+    pub direction_pairs_dropped: usize,
+}
+
+impl MotionScores {
+    /// Scores predictions against truths, pair by pair; both must be equally long.
+    pub fn of(truth: &[Twist], predicted: &[Twist]) -> Self {
+        let components: [f64; 6] =
+            std::array::from_fn(|c| r2(pairs_of(truth, predicted, |twist| twist.to_vector()[c])));
+
+        // The direction of a camera that hardly moves is noise, so such pairs are left out.
+        let moving: Vec<(Vector3<f64>, Vector3<f64>)> = truth
+            .iter()
+            .zip(predicted)
+            .filter(|(truth, _)| truth.linear.norm() > LEAST_DIRECTED_M)
+            .map(|(truth, predicted)| {
+                // A predicted translation of zero has no direction; it stays zero instead of
+                // becoming NaN.
+                let length = predicted.linear.norm().max(1e-12);
+                (truth.linear.normalize(), predicted.linear / length)
+            })
+            .collect();
+
+        let direction: Vec<f64> = (0..3)
+            .map(|c| r2(moving.iter().map(|(t, p)| (t[c], p[c])).collect()))
+            .collect();
+
+        Self {
+            n: truth.len(),
+            components,
+            overall: mean_of_known(&components),
+            translation: mean_of_known(&components[..3]),
+            rotation: mean_of_known(&components[3..]),
+            direction: mean_of_known(&direction),
+            magnitude: r2(pairs_of(truth, predicted, |twist| twist.linear.norm())),
+            direction_pairs_dropped: truth.len() - moving.len(),
+        }
+    }
+}
+
+impl MotionScores {
+    /// The mean of several scores, field by field, leaving out NaN; counts are summed.
+    pub fn mean(scores: &[Self]) -> Self {
+        let of = |figure: fn(&Self) -> f64| {
+            mean_of_known(&scores.iter().map(figure).collect::<Vec<_>>())
+        };
+
+        let component = |c: usize| {
+            mean_of_known(
+                &scores
+                    .iter()
+                    .map(|score| score.components[c])
+                    .collect::<Vec<_>>(),
+            )
+        };
+
+        Self {
+            n: scores.iter().map(|score| score.n).sum(),
+            components: std::array::from_fn(component),
+            overall: of(|score| score.overall),
+            translation: of(|score| score.translation),
+            rotation: of(|score| score.rotation),
+            direction: of(|score| score.direction),
+            magnitude: of(|score| score.magnitude),
+            direction_pairs_dropped: scores
+                .iter()
+                .map(|score| score.direction_pairs_dropped)
+                .sum(),
+        }
+    }
+
+    /// How many components do not vary, and so have no R².
+    pub fn still_components(&self) -> usize {
+        self.components.iter().filter(|r2| r2.is_nan()).count()
+    }
+}
+
+/// Mean of R² over the components when `constant` is predicted for every pair.
+pub fn constant_r2(truth: &[Twist], constant: &Vector6<f64>) -> f64 {
+    let predicted = vec![Twist::from_vector(constant); truth.len()];
+    MotionScores::of(truth, &predicted).overall
+}
+
+/// True values with a standard deviation below this, in their own unit, count as constant: what
+/// varies is rounding.
+const STILL: f64 = 1e-9;
+
+/// R² of (truth, prediction) pairs; NaN when the truths do not vary.
+pub fn r2(pairs: Vec<(f64, f64)>) -> f64 {
+    let mean = pairs.iter().map(|(truth, _)| truth).sum::<f64>() / pairs.len() as f64;
+    let total: f64 = pairs.iter().map(|(truth, _)| (truth - mean).powi(2)).sum();
+
+    let residual: f64 = pairs
+        .iter()
+        .map(|(truth, predicted)| (truth - predicted).powi(2))
+        .sum();
+
+    if total > pairs.len() as f64 * STILL * STILL {
+        1.0 - residual / total
+    } else {
+        f64::NAN
+    }
+}
+
+fn pairs_of(
+    truth: &[Twist],
+    predicted: &[Twist],
+    value: impl Fn(&Twist) -> f64,
+) -> Vec<(f64, f64)> {
+    truth
+        .iter()
+        .zip(predicted)
+        .map(|(truth, predicted)| (value(truth), value(predicted)))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the definition of R² on three points: residual 1, total 8.
+    #[test]
+    fn r2_by_hand() {
+        assert!((r2(vec![(1.0, 1.0), (3.0, 2.0), (5.0, 5.0)]) - 0.875).abs() < 1e-15);
+        assert!(r2(vec![(1.0, 0.0), (1.0, 2.0)]).is_nan());
+    }
+}

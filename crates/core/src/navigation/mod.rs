@@ -1,0 +1,104 @@
+//! Inverse Poincaré navigation: from a frame and a wanted camera motion to the frames that the
+//! camera would see, in one step or several.
+//!
+//! - One step in latent space is ĝ = g + W⁺ΔP in one of three readings ([`Reading`], A-16), or what
+//!   another [`Stepper`] gives. The stored frames nearest to ĝ under a [`RetrievalMetric`] are retrieved.
+//! - Steps are chained in one of three ways (A-22): open loop adds all steps up in latent space;
+//!   snap continues from the latent of each retrieved frame; closed loop does so too, and also
+//!   plans the remaining motion anew from that frame's pose.
+//! - Start reading at [`Navigator::answer`]; [`walk`] is the loop inside it.
+
+mod kind;
+mod multi_step;
+mod navigator;
+mod pursuit;
+mod query;
+mod search;
+mod stepper;
+
+pub use crate::adapter::Reading;
+pub use kind::NavigatorKind;
+pub use multi_step::{Leg, Mode, Plan, Space, Start, Step, walk};
+pub use navigator::{Answer, AnswerStep, Hit, Navigator, StepError};
+pub use pursuit::{Feedback, Outcome, Pursuit, pursue};
+pub use query::{Displacement, FitOn, Limits, Query, Source, SourceAt};
+pub use search::{IndexKind, RetrievalMetric, Search};
+pub use stepper::{Refit, RefitData, StepKind, Stepper};
+
+use crate::{adapter, cancel, features, geometry, ridge, room, splits};
+
+/// Thresholds ε of the paper's Hit@ε, compared with ‖ΔP_target − ΔP_retrieved‖₂, in which metres
+/// and radians are mixed.
+pub const HIT_THRESHOLDS: [f64; 4] = [0.1, 0.2, 0.3, 0.5];
+
+/// The longest translation of one motion, metres.
+pub const MAX_TRANSLATION_M: f64 = 1e6;
+
+/// Why a query cannot be answered.
+#[derive(Debug, thiserror::Error, PartialEq)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum Error {
+    #[error("source: {0}")]
+    SourceFrame(room::Error),
+    #[error("target: {0}")]
+    TargetFrame(room::Error),
+    #[error(transparent)]
+    Adapter(#[from] adapter::Error),
+    #[error(transparent)]
+    Features(#[from] features::Error),
+    #[error("no linear map from motions to steps can be fitted in this room: {0}")]
+    Refit(#[from] ridge::Error),
+    #[error("no linear map from motions to steps can be fitted in this room: {0}")]
+    Pairs(#[from] splits::Error),
+    #[error(transparent)]
+    Cancelled(#[from] cancel::Cancelled),
+    #[error(
+        "room '{room}' has {frame_count} frames, its features have {rows} rows; every frame needs one"
+    )]
+    FeatureRows {
+        room: room::RoomId,
+        frame_count: usize,
+        rows: usize,
+    },
+    #[error("steps must be 1 to {most} in all, got {actual}")]
+    Steps { actual: u64, most: u32 },
+    #[error("hit_count must be 1 to {most}, got {actual}")]
+    HitCount { actual: u32, most: u32 },
+    #[error("steps times hit_count is {actual}, over the limit of {most} frames in one answer")]
+    HitsInAll { actual: u64, most: u64 },
+    #[error("displacement has no twist; give at least one")]
+    NoTwist,
+    #[error(
+        "displacement {position} has a number that is not finite or a translation over {MAX_TRANSLATION_M:e} m"
+    )]
+    TwistNotFinite { position: usize },
+    #[error(
+        "displacement {position} turns by {angle_rad:.6} rad; a motion must turn by less than π ({:.6}), \
+         or its logarithm is not unique: cut it in parts",
+        std::f64::consts::PI
+    )]
+    TwistBeyondPi { position: usize, angle_rad: f64 },
+    #[error(
+        "{what} needs a source whose pose is known: use a frame of the room, or give source_pose"
+    )]
+    PoseNeeded { what: &'static str },
+    #[error("no frame is left to retrieve: all {frame_count} frames are excluded")]
+    NoCandidates { frame_count: usize },
+}
+
+/// Refuses a motion with a number that is not finite, a translation over [`MAX_TRANSLATION_M`] or a
+/// rotation of π or more.
+fn check_twist(twist: geometry::Twist, position: usize) -> Result<(), Error> {
+    if !twist.is_finite() || twist.linear.norm() > MAX_TRANSLATION_M {
+        return Err(Error::TwistNotFinite { position });
+    }
+
+    if !twist.is_unique_logarithm() {
+        return Err(Error::TwistBeyondPi {
+            position,
+            angle_rad: twist.angular.norm(),
+        });
+    }
+
+    Ok(())
+}

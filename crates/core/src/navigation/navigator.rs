@@ -1,0 +1,382 @@
+//! A [`Navigator`]: one room, embedded by one adapter and indexed, ready to answer queries.
+
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+
+use ndarray::{Array1, Array2, ArrayView1, ArrayView2};
+
+use super::{
+    Displacement, Error, FitOn, IndexKind, Leg, Limits, Plan, Query, Refit, RefitData,
+    RetrievalMetric, Search, Source, Space, Start, StepKind, Stepper, check_twist, walk,
+};
+use crate::adapter::Adapter;
+use crate::cancel::Cancellation;
+use crate::features::Features;
+use crate::geometry::{Pose, PoseError, Twist, body_twist, exp};
+use crate::index::{Audit, Neighbour};
+use crate::room::Room;
+use crate::splits::Pair;
+
+/// The most fitted refits that a navigator keeps; the one fitted first is dropped for another.
+const MOST_REFITS: usize = 32;
+
+/// A retrieved frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hit {
+    /// The frame and its distance to the latent that was searched for.
+    pub neighbour: Neighbour,
+    /// Its pose, `world_from_camera`.
+    pub pose: Pose,
+}
+
+/// One step of an answer.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AnswerStep {
+    /// ĝ, the latent that the step aimed at.
+    pub latent: Array1<f64>,
+    /// The frames nearest to it; at least one.
+    pub hits: Vec<Hit>,
+    /// Where the step should have arrived, `world_from_camera`, if the source's pose is known.
+    pub requested_pose: Option<Pose>,
+    /// The error of the nearest frame against `requested_pose`, if that is known.
+    pub error: Option<StepError>,
+}
+
+/// How far a step's nearest frame is from where it should have arrived.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepError {
+    /// As distance and angle.
+    pub pose: PoseError,
+    /// ‖ΔP_requested − ΔP_retrieved‖₂, both from the source: what Hit@ε compares with ε.
+    pub twist: f64,
+}
+
+impl StepError {
+    /// The error of a found pose against the wanted one, for a camera that started at `source`; all
+    /// three are `world_from_camera`.
+    pub fn of(source: &Pose, found: &Pose, wanted: &Pose) -> Self {
+        let difference =
+            body_twist(source, wanted).to_vector() - body_twist(source, found).to_vector();
+        Self {
+            pose: PoseError::between(found, wanted),
+            twist: difference.norm(),
+        }
+    }
+}
+
+/// The answer to a [`Query`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct Answer {
+    /// All steps in order.
+    pub steps: Vec<AnswerStep>,
+    /// The whole motion that was asked for, in the source's body frame, if its logarithm is unique.
+    pub displacement: Option<Twist>,
+}
+
+/// One room under one adapter: latents of all frames and an index over them. Immutable.
+pub struct Navigator {
+    room: Arc<Room>,
+    adapter: Arc<Adapter>,
+    latents: Array2<f64>,
+    kind: IndexKind,
+    /// The search under [`RetrievalMetric::Full`].
+    search: Search,
+    /// The searches under the other metrics, indexed by `metric as usize`, each built when it is first
+    /// asked for.
+    other_searches: [OnceLock<Search>; RetrievalMetric::ALL.len()],
+    /// Fitted refits by variant and pairs: fitting one takes all pairs of the room.
+    refits: Mutex<Vec<(Refit, FitOn, Arc<Stepper>)>>,
+    /// Held while a search is built, so that no two threads build the same one.
+    building: Mutex<()>,
+}
+
+impl Navigator {
+    /// Embeds a room's features and indexes them.
+    ///
+    /// # Errors
+    /// [`Error::FeatureRows`] when there is not one feature row per frame; [`Error::Adapter`] when
+    /// the features are not from the source that the adapter was trained on.
+    pub fn new(
+        room: Arc<Room>,
+        features: &Features,
+        adapter: Arc<Adapter>,
+        kind: IndexKind,
+    ) -> Result<Self, Error> {
+        adapter.check_source(features.source())?;
+        let frame_count = room.frame_count();
+        let rows = features.rows().nrows();
+        if rows != frame_count {
+            return Err(Error::FeatureRows {
+                room: room.id().clone(),
+                frame_count,
+                rows,
+            });
+        }
+
+        let latents = adapter.embed(features.rows())?;
+        let search = Search::new(kind, RetrievalMetric::Full, &adapter, latents.view())?;
+
+        Ok(Self {
+            room,
+            adapter,
+            latents,
+            kind,
+            search,
+            other_searches: Default::default(),
+            refits: Mutex::new(Vec::new()),
+            building: Mutex::new(()),
+        })
+    }
+
+    /// The room.
+    pub fn room(&self) -> &Arc<Room> {
+        &self.room
+    }
+
+    /// The adapter.
+    pub fn adapter(&self) -> &Arc<Adapter> {
+        &self.adapter
+    }
+
+    /// Latents of all frames, shape (n, k).
+    pub fn latents(&self) -> ArrayView2<'_, f64> {
+        self.latents.view()
+    }
+
+    /// How an approximate index compares with the exact scan; `None` if the index is exact.
+    pub fn audit(&self) -> Option<Audit> {
+        self.search.audit()
+    }
+
+    /// The `k` frames nearest to a latent, by all its coordinates.
+    pub fn nearest(&self, latent: ArrayView1<'_, f64>, k: usize) -> Vec<Hit> {
+        self.hits(&self.search.nearest(latent, k, None))
+    }
+
+    /// The search over all frames under a metric.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] when the adapter lacks what the metric needs, such as calibrated errors.
+    pub fn search(&self, metric: RetrievalMetric) -> Result<&Search, Error> {
+        if metric == RetrievalMetric::Full {
+            return Ok(&self.search);
+        }
+
+        let cell = &self.other_searches[metric as usize];
+        if let Some(search) = cell.get() {
+            return Ok(search);
+        }
+
+        // Checked again under the lock, because another thread may have built the search meanwhile.
+        // The lock guards no data, so a poisoned one is safe to take.
+        let _building = self.building.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(search) = cell.get() {
+            return Ok(search);
+        }
+
+        let search = Search::new(self.kind, metric, &self.adapter, self.latents.view())?;
+        Ok(cell.get_or_init(|| search))
+    }
+
+    /// A method of stepping in this room. A refit is fitted to the room when it is first asked for.
+    ///
+    /// # Errors
+    /// As [`Stepper::new`]; [`Error::Pairs`] when the room has no pairs to fit a refit on.
+    pub fn stepper(&self, kind: StepKind, fit_on: FitOn) -> Result<Arc<Stepper>, Error> {
+        let StepKind::Refit(refit) = kind else {
+            return Ok(Arc::new(self.fit(kind, &[], &[])?));
+        };
+
+        // The lock is held while a refit is fitted, so that two callers do not both fit it.
+        let mut refits = self.refits.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = refits
+            .iter()
+            .find(|(other, other_fit_on, _)| *other == refit && *other_fit_on == fit_on);
+        if let Some((_, _, stepper)) = known {
+            return Ok(stepper.clone());
+        }
+
+        let FitOn { split, stride } = fit_on;
+        let timeline = self.room.timeline();
+        let stepper = if refit.in_sample {
+            self.fit(kind, &[], &split.test_pairs(timeline, stride)?)?
+        } else {
+            self.fit(kind, &split.train_pairs(timeline, stride)?, &[])?
+        };
+
+        let stepper = Arc::new(stepper);
+        if refits.len() == MOST_REFITS {
+            refits.remove(0);
+        }
+        refits.push((refit, fit_on, stepper.clone()));
+        Ok(stepper)
+    }
+
+    fn fit(&self, kind: StepKind, train: &[Pair], test: &[Pair]) -> Result<Stepper, Error> {
+        let data = RefitData {
+            latents: self.latents.view(),
+            poses: self.room.poses(),
+            train,
+            test,
+        };
+
+        Stepper::new(kind, &self.adapter, data)
+    }
+
+    /// The latent, the frame and the pose of a source.
+    ///
+    /// # Errors
+    /// [`Error::SourceFrame`] for an unknown frame, [`Error::Adapter`] for a feature or latent that
+    /// does not fit.
+    pub fn start(&self, source: &Source, pose: Option<Pose>) -> Result<Start, Error> {
+        match source {
+            Source::Frame(frame) => {
+                let pose = *self.room.pose(*frame).map_err(Error::SourceFrame)?;
+                let latent = self.latents.row(frame.row()).to_owned();
+
+                Ok(Start {
+                    latent,
+                    frame: Some(*frame),
+                    pose: Some(pose),
+                })
+            }
+            Source::Feature(feature) => Ok(Start {
+                latent: self.adapter.embed_one(feature)?,
+                frame: None,
+                pose,
+            }),
+            Source::Latent(latent) => {
+                self.adapter.check_latent(latent)?;
+
+                Ok(Start {
+                    latent: Array1::from(latent.clone()),
+                    frame: None,
+                    pose,
+                })
+            }
+        }
+    }
+
+    /// Answers a query: walks its motions one after another and returns the frames retrieved at
+    /// every step.
+    ///
+    /// # Errors
+    /// When the query is over a limit, does not fit the room or the adapter, or is cancelled;
+    /// [`Error`] says what to change.
+    pub fn answer(
+        &self,
+        query: &Query,
+        limits: Limits,
+        cancel: &Cancellation,
+    ) -> Result<Answer, Error> {
+        query.check(limits)?;
+        let start = self.start(&query.source.source, query.source.pose)?;
+        let twists = self.twists(&query.displacement, &start)?;
+        let stepper = self.stepper(query.step, query.fit_on)?;
+        let space = Space {
+            stepper: &stepper,
+            search: self.search(query.metric)?,
+            ..self.space(&stepper)
+        };
+
+        let plan = Plan {
+            mode: query.mode,
+            steps: query.steps,
+            hit_count: query.hit_count as usize,
+            exclude_source: query.exclude_source,
+        };
+
+        let mut steps = Vec::new();
+        let mut from = start.clone();
+        let mut wanted = start.pose;
+
+        // Each motion is one leg. A leg starts where the previous one arrived, but its goal
+        // continues from where the previous one should have arrived, so that a closed loop corrects
+        // the error of earlier legs.
+        for twist in twists {
+            let begun_at = wanted;
+            let leg = Leg {
+                motion: twist,
+                goal: begun_at.map(|pose| pose * exp(&twist)),
+            };
+            let walked = walk(space, &from, leg, plan, cancel)?;
+
+            for (done, step) in (1usize..).zip(walked) {
+                // After step n of S the camera should stand at begun_at · exp(n ξ / S).
+                let share = twist.times(done).divided(query.steps);
+                wanted = begun_at.map(|pose| pose * exp(&share));
+
+                from = query
+                    .mode
+                    .next_start(&from, &step.latent, step.neighbours[0].frame, space);
+                steps.push(self.answer_step(step, start.pose, wanted));
+            }
+        }
+
+        // All motions composed into one twist, from the source to where the last should have ended.
+        let displacement = start
+            .pose
+            .zip(wanted)
+            .map(|(from, to)| body_twist(&from, &to));
+
+        Ok(Answer {
+            steps,
+            displacement: displacement.filter(|twist| twist.is_unique_logarithm()),
+        })
+    }
+
+    /// The space of a walk over all frames of the room, searched under [`RetrievalMetric::Full`].
+    pub fn space<'a>(&'a self, stepper: &'a Stepper) -> Space<'a> {
+        Space {
+            adapter: &self.adapter,
+            stepper,
+            latents: self.latents.view(),
+            poses: self.room.poses(),
+            search: &self.search,
+        }
+    }
+
+    fn twists(&self, displacement: &Displacement, start: &Start) -> Result<Vec<Twist>, Error> {
+        let target = match displacement {
+            Displacement::Twists(twists) => return Ok(twists.clone()),
+            Displacement::TargetFrame(frame) => {
+                *self.room.pose(*frame).map_err(Error::TargetFrame)?
+            }
+            Displacement::TargetPose(pose) => *pose,
+        };
+
+        let source = start.pose.ok_or(Error::PoseNeeded { what: "a target" })?;
+        let twist = body_twist(&source, &target);
+        check_twist(twist, 0)?;
+
+        Ok(vec![twist])
+    }
+
+    fn answer_step(
+        &self,
+        step: super::Step,
+        source: Option<Pose>,
+        requested: Option<Pose>,
+    ) -> AnswerStep {
+        let hits = self.hits(&step.neighbours);
+        let error = source
+            .zip(requested)
+            .map(|(source, requested)| StepError::of(&source, &hits[0].pose, &requested));
+
+        AnswerStep {
+            latent: step.latent,
+            hits,
+            requested_pose: requested,
+            error,
+        }
+    }
+
+    fn hits(&self, neighbours: &[Neighbour]) -> Vec<Hit> {
+        neighbours
+            .iter()
+            .map(|&neighbour| Hit {
+                neighbour,
+                pose: self.room.poses()[neighbour.frame.row()],
+            })
+            .collect()
+    }
+}

@@ -1,0 +1,103 @@
+//! Which frames of a recording make up the map of a tracker, and which are tracked against it.
+
+use crate::room::FrameId;
+
+/// Blocks that a recording is cut into, of which every fifth is left out of a map.
+const BLOCKS: usize = 20;
+/// Every so many blocks one is left out.
+const BLOCK_PERIOD: usize = 5;
+/// The place of the block that is left out in its period, so that a recording begins mapped.
+const LEFT_OUT_BLOCK: usize = 2;
+
+/// How the frames of a recording are divided into mapped and tracked ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum HoldOut {
+    /// Mapped: every second frame. Tracked: the others, from first to last.
+    Interleaved,
+    /// As interleaved, but every fifth of twenty blocks of the recording is not mapped at all.
+    Blocks,
+    /// Mapped: the first four fifths of the recording. Tracked: the last fifth.
+    Time,
+}
+
+impl HoldOut {
+    /// Every hold-out.
+    pub const ALL: [Self; 3] = [Self::Interleaved, Self::Blocks, Self::Time];
+
+    /// Its name on the command line and in reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Interleaved => "interleaved",
+            Self::Blocks => "blocks",
+            Self::Time => "time",
+        }
+    }
+
+    /// The mapped frames of a recording with `frame_count` frames, in order.
+    pub fn mapped(self, frame_count: usize) -> Vec<FrameId> {
+        let is_mapped = |row: &usize| match self {
+            Self::Interleaved => row.is_multiple_of(2),
+            Self::Blocks => row.is_multiple_of(2) && !is_in_left_out_block(*row, frame_count),
+            Self::Time => *row < frame_count * 4 / 5,
+        };
+
+        frames_where(frame_count, is_mapped)
+    }
+
+    /// The tracked frames of a recording with `frame_count` frames, in order; none of them is mapped.
+    pub fn tracked(self, frame_count: usize) -> Vec<FrameId> {
+        let is_tracked = |row: &usize| match self {
+            Self::Interleaved | Self::Blocks => row % 2 == 1,
+            Self::Time => *row >= frame_count * 4 / 5,
+        };
+
+        frames_where(frame_count, is_tracked)
+    }
+
+    /// Whether the frames directly before and after a tracked frame are mapped.
+    pub fn has_mapped_neighbours(self, frame: FrameId, frame_count: usize) -> bool {
+        match self {
+            Self::Interleaved => true,
+            Self::Blocks => !is_in_left_out_block(frame.row(), frame_count),
+            Self::Time => false,
+        }
+    }
+}
+
+/// Whether a row lies in one of the blocks that [`HoldOut::Blocks`] leaves out of the map.
+pub fn is_in_left_out_block(row: usize, frame_count: usize) -> bool {
+    let block_length = frame_count.div_ceil(BLOCKS).max(1);
+    (row / block_length) % BLOCK_PERIOD == LEFT_OUT_BLOCK
+}
+
+fn frames_where(frame_count: usize, keep: impl Fn(&usize) -> bool) -> Vec<FrameId> {
+    (0..frame_count)
+        .filter(keep)
+        .map(|row| FrameId(row as u32))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the definition: no frame is both mapped and tracked.
+    #[test]
+    fn what_is_tracked_is_not_mapped() {
+        for hold_out in HoldOut::ALL {
+            let name = hold_out.name();
+            let mapped = hold_out.mapped(400);
+            let tracked = hold_out.tracked(400);
+
+            assert!(
+                tracked.iter().all(|frame| !mapped.contains(frame)),
+                "{name}"
+            );
+            assert!(mapped.len() >= 160 && tracked.len() >= 80, "{name}");
+        }
+
+        // Of 400 frames a block has 20; the third one is rows 40 to 59.
+        let mapped = HoldOut::Blocks.mapped(400);
+        assert!(!mapped.contains(&FrameId(40)) && mapped.contains(&FrameId(38)));
+    }
+}

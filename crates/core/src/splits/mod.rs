@@ -1,0 +1,479 @@
+//! Splits: which pairs of frames are trained on, which are tested, and among which frames an answer
+//! is searched for.
+//!
+//! A pair (i, j) is two frames of one room, j = i + stride. Frame i is the source, frame j the
+//! target.
+
+mod hold_out;
+
+pub use hold_out::{HoldOut, is_in_left_out_block};
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::room::{FrameId, Timeline};
+
+/// Number of frames in a block of [`Split::Blocks`].
+const BLOCK_FRAMES: usize = 50;
+
+/// Why a room gives no pairs.
+#[derive(Debug, thiserror::Error, PartialEq)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum Error {
+    #[error("stride must be at least 1")]
+    ZeroStride,
+    #[error(
+        "{frame_count} frames are too few for stride {stride} under the split '{split}': no {side} pair is left"
+    )]
+    NoPairs {
+        frame_count: usize,
+        stride: u32,
+        split: Split,
+        side: &'static str,
+    },
+    #[error(
+        "the split 'dataset' is the recording's own, and this room has none; use time or blocks"
+    )]
+    NoDatasetSplit,
+    #[error("strides {low} to {high} are not a range: low must be 1 or more and at most high")]
+    EmptyRange { low: u32, high: u32 },
+}
+
+/// Two frames of one room.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Pair {
+    /// The frame the motion starts from.
+    pub source: FrameId,
+    /// The frame it ends at.
+    pub target: FrameId,
+}
+
+/// How frames or pairs are divided into a training side and a test side.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Split {
+    /// The first 80 % of the frames are for training, the rest for testing; both ends of a pair lie
+    /// on the same side. The paper's split.
+    Time,
+    /// Blocks of 50 frames, of which block b is for testing when b mod 5 = 2. A test pair lies
+    /// within one block; both ends of a training pair lie outside the test blocks.
+    Blocks,
+    /// The pair (i, j) is for testing when i mod 5 = 2. The sides share frames: this leaks on
+    /// purpose, to check an implementation, and does not measure generalisation.
+    Pairs,
+    /// The recording's own split: 7-Scenes' TestSplit, 12-Scenes' first sequence. Both ends of a
+    /// pair lie on the same side.
+    Dataset,
+    /// Every pair is for training and for testing: for rooms that are trained on, or held out, as a
+    /// whole.
+    Whole,
+}
+
+impl Split {
+    /// Every split.
+    pub const ALL: [Self; 5] = [
+        Self::Time,
+        Self::Blocks,
+        Self::Pairs,
+        Self::Dataset,
+        Self::Whole,
+    ];
+
+    /// Its name on the command line, on the wire and in a manifest.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Time => "time",
+            Self::Blocks => "blocks",
+            Self::Pairs => "pairs",
+            Self::Dataset => "dataset",
+            Self::Whole => "whole",
+        }
+    }
+
+    /// The split with this [`Split::name`].
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|split| split.name() == name)
+    }
+
+    /// Training pairs at one stride, by source frame.
+    ///
+    /// # Errors
+    /// [`Error::ZeroStride`] for a stride of 0; [`Error::NoDatasetSplit`] under [`Split::Dataset`]
+    /// when the room has no split of its own; [`Error::NoPairs`] when no pair is left.
+    pub fn train_pairs(self, timeline: &Timeline, stride: u32) -> Result<Vec<Pair>, Error> {
+        self.pairs(timeline, stride, Side::Train)
+    }
+
+    /// Test pairs at one stride, by source frame.
+    ///
+    /// # Errors
+    /// As [`Split::train_pairs`].
+    pub fn test_pairs(self, timeline: &Timeline, stride: u32) -> Result<Vec<Pair>, Error> {
+        self.pairs(timeline, stride, Side::Test)
+    }
+
+    /// Whether a pair of any stride is a test pair.
+    pub fn tests(self, timeline: &Timeline, pair: Pair) -> bool {
+        self.is_on(timeline, pair, Side::Test)
+    }
+
+    /// The frames among which the answer to a test query is searched for: the test frames,
+    /// or all frames under [`Split::Pairs`] and [`Split::Whole`], which hold no frames out.
+    pub fn candidates(self, timeline: &Timeline) -> Vec<FrameId> {
+        let all = matches!(self, Self::Pairs | Self::Whole);
+        let candidate = |&frame: &FrameId| all || self.tests_frame(timeline, frame);
+        frames(timeline.frame_count).filter(candidate).collect()
+    }
+
+    /// Draws `count` training pairs with replacement from the pairs of all rooms whose stride lies
+    /// in `low..=high`; each comes with the index of its room. This is the paper's range pairing
+    /// with replacement because its 30,000 pairs exceed the distinct pairs of a room.
+    ///
+    /// # Errors
+    /// [`Error::EmptyRange`] when `low` is 0 or above `high`; [`Error::NoPairs`] when a room has no
+    /// pair at any stride of the range.
+    pub fn sampled_range(
+        self,
+        timelines: &[&Timeline],
+        range: &StrideRange,
+        seed: u64,
+    ) -> Result<Vec<(usize, Pair)>, Error> {
+        let &StrideRange { low, high, count } = range;
+        if low == 0 || low > high {
+            return Err(Error::EmptyRange { low, high });
+        }
+
+        // The pool holds every distinct pair of every stride, and each is equally likely to be
+        // drawn.
+        let mut pool: Vec<(usize, Pair)> = Vec::new();
+        for (room, timeline) in timelines.iter().enumerate() {
+            let before = pool.len();
+
+            // Strides longer than the room have no pairs; they are cut off, so that a huge `high`
+            // costs nothing.
+            let longest = u32::try_from(timeline.frame_count).unwrap_or(u32::MAX);
+            let pairs = (low..=high.min(longest))
+                .filter_map(|stride| self.train_pairs(timeline, stride).ok())
+                .flatten();
+            pool.extend(pairs.map(|pair| (room, pair)));
+
+            // A room without any pair is an error; otherwise it would silently be left out of the
+            // training.
+            if pool.len() == before {
+                let frame_count = timeline.frame_count;
+                return Err(Error::NoPairs {
+                    frame_count,
+                    stride: low,
+                    split: self,
+                    side: Side::Train.name(),
+                });
+            }
+        }
+
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        Ok((0..count)
+            .map(|_| pool[random.random_range(0..pool.len())])
+            .collect())
+    }
+
+    fn pairs(self, timeline: &Timeline, stride: u32, side: Side) -> Result<Vec<Pair>, Error> {
+        if stride == 0 {
+            return Err(Error::ZeroStride);
+        }
+        if self == Self::Dataset && timeline.held_out.is_empty() {
+            return Err(Error::NoDatasetSplit);
+        }
+
+        let frame_count = timeline.frame_count;
+        let last_source = frame_count.saturating_sub(stride as usize);
+
+        let pairs: Vec<Pair> = frames(last_source)
+            .map(|source| Pair {
+                source,
+                target: FrameId(source.0 + stride),
+            })
+            .filter(|&pair| self.is_on(timeline, pair, side))
+            .collect();
+
+        if pairs.is_empty() {
+            return Err(Error::NoPairs {
+                frame_count,
+                stride,
+                split: self,
+                side: side.name(),
+            });
+        }
+
+        Ok(pairs)
+    }
+
+    fn is_on(self, timeline: &Timeline, pair: Pair, side: Side) -> bool {
+        match self {
+            Self::Whole => timeline.joins(pair.source, pair.target),
+            _ => self.side(timeline, pair) == Some(side),
+        }
+    }
+
+    /// The side that a pair belongs to; `None` when its ends lie on different sides or in different
+    /// sequences.
+    fn side(self, timeline: &Timeline, pair: Pair) -> Option<Side> {
+        if !timeline.joins(pair.source, pair.target) {
+            return None;
+        }
+
+        let tested = |frame| self.tests_frame(timeline, frame);
+        let block = |frame: FrameId| frame.row() / BLOCK_FRAMES;
+        match self {
+            Self::Pairs => Some(if pair.source.0 % 5 == 2 {
+                Side::Test
+            } else {
+                Side::Train
+            }),
+            Self::Time | Self::Blocks | Self::Dataset | Self::Whole => {
+                match (tested(pair.source), tested(pair.target)) {
+                    (false, false) => Some(Side::Train),
+                    // Two different test blocks have training blocks between them, so a test pair
+                    // must stay in one.
+                    (true, true)
+                        if self != Self::Blocks || block(pair.source) == block(pair.target) =>
+                    {
+                        Some(Side::Test)
+                    }
+                    _ => None,
+                }
+            }
+        }
+    }
+
+    fn tests_frame(self, timeline: &Timeline, frame: FrameId) -> bool {
+        match self {
+            Self::Time => frame.row() >= timeline.frame_count * 4 / 5,
+            Self::Dataset => timeline.held_out.get(frame.row()).copied().unwrap_or(false),
+            Self::Blocks => (frame.row() / BLOCK_FRAMES) % 5 == 2,
+            Self::Pairs | Self::Whole => false,
+        }
+    }
+}
+
+impl std::fmt::Display for Split {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// Strides to draw training pairs from, and how many pairs to draw.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StrideRange {
+    /// The smallest stride.
+    pub low: u32,
+    /// The largest stride.
+    pub high: u32,
+    /// Pairs drawn.
+    pub count: usize,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Side {
+    Train,
+    Test,
+}
+
+impl Side {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Train => "training",
+            Self::Test => "test",
+        }
+    }
+}
+
+fn frames(count: usize) -> impl Iterator<Item = FrameId> {
+    (0..count as u32).map(FrameId)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the pair counts of the published PyTorch reference on 1,000 frames: its column n.
+    #[test]
+    fn test_pair_counts_are_the_reference_ones() {
+        for (split, stride, expected) in [
+            (Split::Pairs, 10, 198),
+            (Split::Pairs, 20, 196),
+            (Split::Pairs, 40, 192),
+            (Split::Time, 10, 190),
+            (Split::Time, 20, 180),
+            (Split::Time, 40, 160),
+        ] {
+            assert_eq!(
+                split
+                    .test_pairs(&Timeline::unbroken(1000), stride)
+                    .unwrap()
+                    .len(),
+                expected,
+                "{split} {stride}"
+            );
+        }
+
+        assert_eq!(
+            Split::Time
+                .train_pairs(&Timeline::unbroken(1000), 40)
+                .unwrap()
+                .len(),
+            760
+        );
+    }
+
+    /// Oracle: the definition of a time split, floor(0.8 N) frames train.
+    #[test]
+    fn no_frame_is_on_both_sides_of_the_time_or_block_split() {
+        for split in [Split::Time, Split::Blocks] {
+            let ends = |pairs: Vec<Pair>| {
+                pairs
+                    .into_iter()
+                    .flat_map(|pair| [pair.source, pair.target])
+            };
+            let trained: std::collections::HashSet<_> =
+                ends(split.train_pairs(&Timeline::unbroken(503), 10).unwrap()).collect();
+
+            assert!(
+                ends(split.test_pairs(&Timeline::unbroken(503), 10).unwrap())
+                    .all(|frame| !trained.contains(&frame)),
+                "{split}"
+            );
+
+            assert!(
+                split
+                    .candidates(&Timeline::unbroken(503))
+                    .iter()
+                    .all(|frame| !trained.contains(frame)),
+                "{split}"
+            );
+        }
+
+        assert_eq!(
+            Split::Time.candidates(&Timeline::unbroken(503))[0],
+            FrameId(402)
+        );
+    }
+
+    /// Oracle: by hand: Σ (320 − s) over the strides s from 10 to 40 is 9,145, the distinct pairs
+    /// among 320 training frames.
+    #[test]
+    fn range_pairing_draws_from_the_papers_pool() {
+        let distinct: usize = (10..=40)
+            .map(|s| {
+                Split::Time
+                    .train_pairs(&Timeline::unbroken(400), s)
+                    .unwrap()
+                    .len()
+            })
+            .sum();
+
+        assert_eq!(distinct, 9_145);
+
+        let range = StrideRange {
+            low: 10,
+            high: 40,
+            count: 30_000,
+        };
+
+        let room = Timeline::unbroken(400);
+        let drawn = Split::Time.sampled_range(&[&room], &range, 7).unwrap();
+        assert_eq!(drawn.len(), 30_000);
+
+        let fits = |pair: &Pair| {
+            (10..=40).contains(&(pair.target.0 - pair.source.0)) && pair.target.0 < 320
+        };
+
+        assert!(drawn.iter().all(|(room, pair)| *room == 0 && fits(pair)));
+
+        assert_ne!(
+            drawn,
+            Split::Time.sampled_range(&[&room], &range, 8).unwrap()
+        );
+
+        let pooled = Split::Time
+            .sampled_range(&[&room, &room, &room], &range, 7)
+            .unwrap();
+
+        let share = |of: usize| {
+            pooled
+                .iter()
+                .filter(|(room, pair)| *room == of && fits(pair))
+                .count()
+        };
+
+        assert!(
+            (0..3).all(|of| share(of).abs_diff(10_000) < 500),
+            "rooms are drawn from alike"
+        );
+    }
+
+    /// Oracle: by hand.
+    #[test]
+    fn a_whole_room_trains_and_tests() {
+        let room = Timeline::unbroken(10);
+        let train = Split::Whole.train_pairs(&room, 4).unwrap();
+        assert_eq!(train.len(), 6);
+        assert_eq!(train, Split::Whole.test_pairs(&room, 4).unwrap());
+
+        assert_eq!(Split::Whole.candidates(&room).len(), 10);
+    }
+
+    #[test]
+    fn a_room_too_short_for_its_stride_is_refused() {
+        assert!(matches!(
+            Split::Time.test_pairs(&Timeline::unbroken(100), 40),
+            Err(Error::NoPairs { side: "test", .. })
+        ));
+
+        assert_eq!(
+            Split::Time.test_pairs(&Timeline::unbroken(100), 0),
+            Err(Error::ZeroStride)
+        );
+    }
+
+    /// Oracle: by hand. Two sequences of four frames, the second held out: no pair joins them, and
+    /// the recording's own split tests the second.
+    #[test]
+    fn pairs_stay_in_their_sequence_and_the_datasets_own_split_is_kept() {
+        let timeline = Timeline {
+            frame_count: 8,
+            sequences: vec![0, 0, 0, 0, 1, 1, 1, 1],
+            held_out: vec![false, false, false, false, true, true, true, true],
+        };
+
+        let rows = |pairs: Vec<Pair>| {
+            pairs
+                .iter()
+                .map(|p| (p.source.0, p.target.0))
+                .collect::<Vec<_>>()
+        };
+
+        assert_eq!(
+            rows(Split::Dataset.train_pairs(&timeline, 2).unwrap()),
+            [(0, 2), (1, 3)]
+        );
+
+        assert_eq!(
+            rows(Split::Dataset.test_pairs(&timeline, 2).unwrap()),
+            [(4, 6), (5, 7)]
+        );
+
+        assert_eq!(
+            rows(Split::Time.train_pairs(&timeline, 2).unwrap()),
+            [(0, 2), (1, 3)]
+        );
+
+        assert_eq!(
+            Split::Dataset.candidates(&timeline),
+            [4, 5, 6, 7].map(FrameId)
+        );
+
+        assert_eq!(
+            Split::Dataset.test_pairs(&Timeline::unbroken(8), 2),
+            Err(Error::NoDatasetSplit)
+        );
+    }
+}

@@ -1,0 +1,204 @@
+//! Statistics that more than one module reports: means, quantiles, rates with their intervals, the
+//! bootstrap over rooms, and the coverage of stated covariances.
+//!
+//! Pairs of frames from one room resemble each other, so an interval over many rooms resamples the
+//! rooms ([`bootstrap_mean`]); the interval of a count of independent trials is Wilson's ([`Rate`]).
+
+mod coverage;
+
+pub use coverage::{
+    CHI_SQUARED_68, CHI_SQUARED_95, Coverage, balancing_factor, coverage, coverage_deviation,
+};
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// How many times [`bootstrap_mean`] resamples.
+const RESAMPLES: usize = 10_000;
+
+/// A rate with its count and its 95 % interval.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rate {
+    /// Successes over `n`.
+    pub rate: f64,
+    /// Lower end of Wilson's 95 % interval.
+    pub low: f64,
+    /// Upper end of Wilson's 95 % interval.
+    pub high: f64,
+    /// The number of trials.
+    pub n: usize,
+}
+
+impl Rate {
+    /// The rate of `successes` in `n` > 0 trials with Wilson's score interval.
+    pub fn of(successes: usize, n: usize) -> Self {
+        /// The 97.5 % point of the standard normal distribution.
+        const Z: f64 = 1.959_963_984_540_054;
+
+        let count = n as f64;
+        let rate = successes as f64 / n as f64;
+        let spread = Z * (rate * (1.0 - rate) / count + Z * Z / (4.0 * count * count)).sqrt();
+        let centre = rate + Z * Z / (2.0 * count);
+        let scale = 1.0 + Z * Z / count;
+
+        // At 0 and n the ends are exact; computed, they would be off by rounding.
+        let low = if successes == 0 {
+            0.0
+        } else {
+            (centre - spread) / scale
+        };
+        let high = if successes == n {
+            1.0
+        } else {
+            (centre + spread) / scale
+        };
+
+        Self { rate, low, high, n }
+    }
+
+    /// The number of successes.
+    pub fn successes(&self) -> usize {
+        (self.rate * self.n as f64).round() as usize
+    }
+}
+
+/// The median; of an even count, the mean of the two middle values. NaN without values.
+pub fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    match sorted.len() {
+        0 => f64::NAN,
+        n if n % 2 == 1 => sorted[n / 2],
+        n => 0.5 * (sorted[n / 2 - 1] + sorted[n / 2]),
+    }
+}
+
+/// The value at a `share` of the sorted values, 0 to 1, by the nearest rank. `None` without values.
+pub fn quantile(values: &[f64], share: f64) -> Option<f64> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let rank = (sorted.len().saturating_sub(1) as f64 * share).round() as usize;
+
+    sorted.get(rank).copied()
+}
+
+/// The arithmetic mean; NaN without values.
+pub fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+/// The arithmetic mean of the values that are not NaN; NaN if none is left.
+pub fn mean_of_known(values: &[f64]) -> f64 {
+    let known: Vec<f64> = values.iter().copied().filter(|x| !x.is_nan()).collect();
+    mean(&known)
+}
+
+/// Sample standard deviation, with n − 1 in the denominator.
+pub fn deviation(values: &[f64]) -> f64 {
+    let centre = mean(values);
+    let squares: f64 = values.iter().map(|value| (value - centre).powi(2)).sum();
+    (squares / (values.len() as f64 - 1.0)).sqrt()
+}
+
+/// A mean over rooms with its 95 % bootstrap interval.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RoomMean {
+    /// The mean.
+    pub mean: f64,
+    /// The 2.5 % point of the resampled means.
+    pub low: f64,
+    /// The 97.5 % point of the resampled means.
+    pub high: f64,
+    /// The number of rooms.
+    pub rooms: usize,
+}
+
+/// The mean of one value per room, with a percentile bootstrap over the rooms; NaN without values.
+pub fn bootstrap_mean(values: &[f64], seed: u64) -> RoomMean {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut means: Vec<f64> = (0..RESAMPLES)
+        .map(|_| {
+            let drawn = (0..values.len()).map(|_| values[random.random_range(0..values.len())]);
+            drawn.sum::<f64>() / values.len() as f64
+        })
+        .collect();
+
+    means.sort_by(f64::total_cmp);
+    let point = |share: f64| means[((RESAMPLES - 1) as f64 * share).round() as usize];
+
+    RoomMean {
+        mean: mean(values),
+        low: point(0.025),
+        high: point(0.975),
+        rooms: values.len(),
+    }
+}
+
+/// The mean of the differences `ours − theirs`, paired room by room: both lists hold the same rooms
+/// in the same order.
+pub fn paired_difference(ours: &[f64], theirs: &[f64], seed: u64) -> RoomMean {
+    let differences: Vec<f64> = ours.iter().zip(theirs).map(|(a, b)| a - b).collect();
+    bootstrap_mean(&differences, seed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand; SciPy's `binomtest(8, 40).proportion_ci(method="wilson")` is (0.10497,
+    /// 0.34758).
+    #[test]
+    fn wilson_interval_of_eight_in_forty() {
+        let rate = Rate::of(8, 40);
+        assert!(
+            (rate.low - 0.104_97).abs() < 1e-4 && (rate.high - 0.347_58).abs() < 1e-4,
+            "{rate:?}"
+        );
+
+        assert_eq!(Rate::of(0, 40).low, 0.0);
+        assert_eq!(Rate::of(40, 40).high, 1.0);
+    }
+
+    /// Oracle: by hand.
+    #[test]
+    fn medians_of_odd_and_even_counts() {
+        assert_eq!(median(&[3.0, 1.0, 2.0]), 2.0);
+        assert_eq!(median(&[4.0, 1.0, 2.0, 3.0]), 2.5);
+    }
+
+    /// Oracle: NumPy's `quantile(method="nearest")` of 0, 1, …, 10 at .97, .02 and .5.
+    #[test]
+    fn quantiles_are_of_the_nearest_rank() {
+        let values: Vec<f64> = (0..11).rev().map(f64::from).collect();
+        assert_eq!(quantile(&values, 0.97), Some(10.0));
+        assert_eq!(quantile(&values, 0.02), Some(0.0));
+        assert_eq!(quantile(&values, 0.5), Some(5.0));
+        assert_eq!(quantile(&[], 0.5), None);
+    }
+
+    /// Oracle: the normal approximation, mean ± 1.96 standard errors, which is near for a hundred
+    /// even values.
+    #[test]
+    fn the_bootstrap_interval_is_near_the_normal_one() {
+        let values: Vec<f64> = (0..100).map(|i| f64::from(i) / 99.0).collect();
+        let found = bootstrap_mean(&values, 1);
+        let error = 1.96 * deviation(&values) / 10.0;
+
+        assert!((found.mean - 0.5).abs() < 1e-12 && found.rooms == 100);
+        assert!(
+            (found.low - (0.5 - error)).abs() < 0.005 && (found.high - (0.5 + error)).abs() < 0.005,
+            "{found:?}"
+        );
+    }
+
+    /// Oracle: by hand. A difference that is the same in every room has no spread, however the
+    /// rooms differ.
+    #[test]
+    fn differences_are_paired_by_room() {
+        let found = paired_difference(&[0.9, 0.5, 0.1], &[0.8, 0.4, 0.0], 1);
+        assert!(
+            (found.mean - 0.1).abs() < 1e-12 && (found.high - found.low).abs() < 1e-12,
+            "{found:?}"
+        );
+    }
+}

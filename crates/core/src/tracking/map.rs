@@ -1,0 +1,176 @@
+//! A room as a tracker matches views against it.
+
+use std::sync::Arc;
+
+use ndarray::{Array2, ArrayView1, Axis, s};
+
+use super::{Belief, Error, room_errors};
+use crate::adapter::{ErrorModel, MotionErrors, TEMPORAL_NEIGHBOURS};
+use crate::geometry::exp;
+use crate::index::{ExactIndex, Exclusion, Index, Neighbour};
+use crate::navigation::Navigator;
+use crate::room::FrameId;
+use crate::statistics::median;
+
+/// How many mapped frames are asked, at most, how far their nearest others are.
+const SAMPLED_FRAMES: usize = 1_000;
+
+/// The mapped frames of a room under an adapter with an error model.
+pub struct Map {
+    navigator: Arc<Navigator>,
+    error_model: Arc<ErrorModel>,
+    index: ExactIndex,
+    typical_distance: f64,
+    extent_m: f64,
+    motion_errors: MotionErrors,
+    anchor_factor: f64,
+}
+
+/// How a view matches a map.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MapMatch {
+    /// The nearest mapped frames, by distance in standard deviations of frame noise; at least one.
+    pub nearest: Vec<Neighbour>,
+    /// The distance of the nearest frame over the room's limit: above 1 the view looks like another
+    /// place.
+    pub out_of_distribution: f64,
+    /// Whether the view is so near that hardly any frame of another room would be.
+    pub is_certain: bool,
+    /// The pose read from the nearest frame, `world_from_camera`.
+    pub anchor: Belief,
+}
+
+impl Map {
+    /// A map of the frames `mapped` of a room, given in order.
+    ///
+    /// # Errors
+    /// [`Error::NotCalibrated`] when the adapter has no error model, [`Error::SmallMap`] when no
+    /// mapped frame has another one that is not its neighbour in time.
+    pub fn new(navigator: Arc<Navigator>, mapped: &[FrameId]) -> Result<Self, Error> {
+        let error_model = navigator
+            .adapter()
+            .error_model()
+            .ok_or(Error::NotCalibrated)?
+            .clone();
+
+        // Distances are taken in standard deviations of frame noise, so that they compare between
+        // rooms and adapters.
+        let coordinates = s![.., ..navigator.adapter().coordinate_count()];
+        let whitened = error_model
+            .frame_noise()
+            .whitened(navigator.latents().slice(coordinates));
+        let index = ExactIndex::new(whitened.view(), mapped);
+
+        let typical_distance = typical_distance(&index, &whitened, mapped);
+        if !(typical_distance.is_finite() && typical_distance > 0.0) {
+            return Err(Error::SmallMap {
+                room: navigator.room().id().clone(),
+                frames: mapped.len(),
+            });
+        }
+
+        // How large the adapter's errors are in this very room is told by its own frames, whose
+        // poses are known.
+        let motion_errors = room_errors::motion_errors(&navigator, &error_model, mapped)
+            .map_err(Error::RoomErrors)?;
+        let anchor_factor = room_errors::anchor_factor(&navigator, &error_model, mapped, &whitened);
+
+        Ok(Self {
+            extent_m: extent(&navigator, mapped),
+            navigator,
+            error_model,
+            index,
+            typical_distance,
+            motion_errors,
+            anchor_factor,
+        })
+    }
+
+    /// The room and its adapter.
+    pub fn navigator(&self) -> &Arc<Navigator> {
+        &self.navigator
+    }
+
+    /// The errors of motions read in this room, scaled by what its mapped frames show.
+    pub fn motion_errors(&self) -> &MotionErrors {
+        &self.motion_errors
+    }
+
+    /// The diagonal of the box around the mapped camera positions, metres.
+    pub fn extent_m(&self) -> f64 {
+        self.extent_m
+    }
+
+    /// Matches a view, given by its latent of shape (k,), with the `count` nearest mapped frames.
+    pub fn match_view(&self, latent: ArrayView1<'_, f64>, count: usize) -> MapMatch {
+        let adapter = self.navigator.adapter();
+        let coordinates = latent.slice(s![..adapter.coordinate_count()]);
+        let whitened = self
+            .error_model
+            .frame_noise()
+            .whitened(coordinates.insert_axis(Axis(0)));
+
+        let nearest = self
+            .index
+            .nearest(&whitened.row(0).to_vec(), count.max(1), None);
+        // A map has frames, or it would not have a typical distance.
+        let best = nearest.first().copied().unwrap_or(Neighbour {
+            frame: FrameId(0),
+            distance: f64::INFINITY,
+        });
+
+        // The stored frame is near the view, not at it: add the motion from it to the view, shrunk by
+        // the gain that calibration found for matches of this distance.
+        let errors = self.error_model.anchor_errors(best.distance);
+        let latents = self.navigator.latents();
+        let motion = adapter
+            .displacement(latents.row(best.frame.row()), latent)
+            .scaled(errors.gain);
+        let pose = self.navigator.room().poses()[best.frame.row()] * exp(&motion);
+
+        let limits = self.error_model.statistics();
+        let relative_distance = best.distance / self.typical_distance;
+        MapMatch {
+            nearest,
+            out_of_distribution: relative_distance / limits.out_of_distribution_ratio,
+            is_certain: relative_distance <= limits.certain_match_ratio,
+            anchor: Belief {
+                pose,
+                covariance: errors.covariance * self.anchor_factor,
+            },
+        }
+    }
+}
+
+/// The median distance from a mapped frame to the nearest other one that is not its neighbour in
+/// time: how far apart views of this room lie when a camera comes back.
+fn typical_distance(index: &ExactIndex, whitened: &Array2<f64>, mapped: &[FrameId]) -> f64 {
+    let every = mapped.len().div_ceil(SAMPLED_FRAMES).max(1);
+    let distances: Vec<f64> = mapped
+        .iter()
+        .step_by(every)
+        .filter_map(|&centre| {
+            let exclusion = Exclusion {
+                centre,
+                radius: TEMPORAL_NEIGHBOURS,
+            };
+            let row = whitened.row(centre.row()).to_vec();
+            Some(index.nearest(&row, 1, Some(exclusion)).first()?.distance)
+        })
+        .collect();
+
+    median(&distances)
+}
+
+/// The diagonal of the box around the mapped camera positions, metres.
+fn extent(navigator: &Navigator, mapped: &[FrameId]) -> f64 {
+    let mut low = nalgebra::Vector3::repeat(f64::INFINITY);
+    let mut high = nalgebra::Vector3::repeat(f64::NEG_INFINITY);
+    for frame in mapped {
+        let position = navigator.room().poses()[frame.row()].translation.vector;
+        low = low.inf(&position);
+        high = high.sup(&position);
+    }
+
+    (high - low).norm()
+}

@@ -1,0 +1,149 @@
+//! What a tracker knows of a stream, what it is given for each frame, and what it answers.
+
+use ndarray::Array1;
+
+use super::health::TrackingHealth;
+use super::{Belief, Status};
+use crate::geometry::Twist;
+use crate::index::Neighbour;
+
+/// One frame of a stream.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Observation {
+    /// When it was taken, nanoseconds on the sensor's clock.
+    pub time_ns: i64,
+    /// The sender's number of the frame. Numbers that are missing are frames that are missing.
+    pub sequence: u64,
+    /// Its latent under the tracker's adapter, shape (k,).
+    pub latent: Array1<f64>,
+}
+
+/// Everything that a tracker knows of a stream.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct State {
+    /// The map that the camera is believed to be in, by its place in [`super::Tracker::maps`].
+    pub room: Option<usize>,
+    /// The last frame that was accepted.
+    pub last: Option<LastFrame>,
+    /// The frame that motions are read from.
+    pub keyframe: Option<Keyframe>,
+    /// The pose that was given from outside, until the first frame arrives: `world_from_camera`.
+    pub initial_pose: Option<Belief>,
+    /// Whitened latents of the last frames, the newest last: what a jump of the view is told by.
+    pub recent: Vec<Vec<f64>>,
+    /// Whether the frames follow from one another and match the room.
+    pub health: TrackingHealth,
+    /// A map pose that recent anchors agree on and that is not believed yet.
+    pub candidate: Option<Candidate>,
+    /// Frames since the last one that matched the map.
+    pub frames_off_map: u32,
+    /// Frames since an anchor was last due.
+    pub frames_since_anchor: u32,
+}
+
+/// The last frame of a stream.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LastFrame {
+    /// When it was taken, nanoseconds on the sensor's clock.
+    pub time_ns: i64,
+    /// The sender's number.
+    pub sequence: u64,
+    /// Its latent.
+    pub latent: Vec<f64>,
+    /// `odom_from_camera`.
+    pub odom: Belief,
+}
+
+/// The frame that motions are read from.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Keyframe {
+    /// The sender's number.
+    pub sequence: u64,
+    /// Its latent.
+    pub latent: Vec<f64>,
+    /// `odom_from_camera` at this frame.
+    pub odom: Belief,
+    /// `map_from_camera` at this frame, if it is believed: what anchors are compared with.
+    pub map_pose: Option<Belief>,
+    /// `map_from_camera` as it is reported: with the covariance that its errors really have, and
+    /// also after the tracker stopped believing it.
+    pub reported_pose: Option<Belief>,
+}
+
+/// A map pose that recent anchors agree on.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Candidate {
+    /// The map, by its place in [`super::Tracker::maps`].
+    pub room: usize,
+    /// The number of the newest frame that spoke for it.
+    pub sequence: u64,
+    /// That frame's latent.
+    pub latent: Vec<f64>,
+    /// `map_from_camera` at that frame.
+    pub map_pose: Belief,
+    /// How many anchors in a row agreed.
+    pub agreeing_anchors: u32,
+}
+
+/// What a tracker answers to a frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Update {
+    /// The motion from the keyframe to this frame, in the keyframe's body frame.
+    pub motion: Twist,
+    /// The covariance of that motion's error on (v, ω), metres and radians.
+    pub motion_covariance: nalgebra::Matrix6<f64>,
+    /// The keyframe's number.
+    pub keyframe_sequence: u64,
+    /// Whether this frame is the keyframe from now on.
+    pub is_keyframe: bool,
+    /// `odom_from_camera`.
+    pub odom: Belief,
+    /// `map_from_camera` as it is reported; the map's frame is the room's world. In a single room it is
+    /// still given when the stream is LOST, so look at `status` before using it.
+    pub map_pose: Option<Belief>,
+    /// The mean velocity since the frame before, metres and radians per second, in the camera's
+    /// body frame; none for the first frame.
+    pub velocity: Option<Twist>,
+    /// Whether the place is known, and confirmed by recent frames.
+    pub status: Status,
+    /// Why the status is what it is, in words.
+    pub reason: String,
+    /// The distance to the nearest mapped frame over the room's own limit: above 1 the frame looks
+    /// like another place.
+    pub out_of_distribution: f64,
+    /// The map that the camera is believed to be in.
+    pub room: Option<usize>,
+    /// The map and the mapped frame that the view resembles most.
+    pub best_match: (usize, Neighbour),
+    /// Whether that frame corrected the pose.
+    pub match_used: bool,
+    /// The squared Mahalanobis distance of the best match from the expected place, if an anchor was
+    /// tried and a place was expected.
+    pub surprise: Option<f64>,
+    /// A map pose that recent anchors agree on and that is not believed yet.
+    pub candidate: Option<Candidate>,
+}
+
+/// Why a frame was refused. The state of the stream is as if it had never arrived.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Refusal {
+    /// The frame is not newer than the one before.
+    #[error("timestamp {time_ns} ns is not later than that of the frame before, {last_ns} ns")]
+    Late {
+        /// The frame's time.
+        time_ns: i64,
+        /// The time of the frame before.
+        last_ns: i64,
+    },
+    /// The frame's number is not larger than the last one's.
+    #[error("sequence {sequence} is not larger than that of the frame before, {last}")]
+    Duplicate {
+        /// The frame's number.
+        sequence: u64,
+        /// The number of the frame before.
+        last: u64,
+    },
+    /// The latent does not fit the tracker's adapter.
+    #[error(transparent)]
+    View(#[from] crate::adapter::Error),
+}

@@ -1,0 +1,80 @@
+//! The status of a stream: whether its pose should be trusted, and why.
+
+use super::health::{FRAMES_TO_RECOVER, TrackingHealth};
+use super::map::MapMatch;
+use super::state::State;
+use super::tracker::{ANCHORS_TO_AGREE, Tracker};
+use super::{Belief, Status};
+
+/// Frames without a match after which a known place is in doubt.
+const FRAMES_UNTIL_DOUBT: u32 = 10;
+
+impl Tracker {
+    /// The status after a frame, and the reason in words. `reported_pose` is where the frame was
+    /// taken, if that is believed.
+    pub(super) fn status(
+        &self,
+        state: &State,
+        reported_pose: Option<&Belief>,
+        matched: &MapMatch,
+    ) -> (Status, String) {
+        if let TrackingHealth::Lost { certain_matches } = state.health {
+            return (Status::Lost, reason_of_loss(certain_matches, matched));
+        }
+
+        let agreeing = state
+            .candidate
+            .as_ref()
+            .map_or(0, |candidate| candidate.agreeing_anchors);
+
+        let Some(reported_pose) = reported_pose else {
+            let reason = if self.settings.fuse {
+                format!("{agreeing} of {ANCHORS_TO_AGREE} anchors agree on a place")
+            } else {
+                "nothing is corrected: only a pose that is set tells the place".to_owned()
+            };
+            return (Status::Relocalizing, reason);
+        };
+
+        // A position that is known to no better than the size of the room says nothing.
+        let deviation = reported_pose.position_deviation_m();
+        let extent = state.room.map_or(0.0, |room| self.maps[room].extent_m());
+        if deviation > extent {
+            let reason = format!(
+                "the position is known to {deviation:.1} m, the room is {extent:.1} m wide"
+            );
+            return (Status::Lost, reason);
+        }
+
+        if agreeing > 0 {
+            let reason = format!(
+                "{agreeing} of {ANCHORS_TO_AGREE} anchors speak for another place than the one that is believed"
+            );
+            return (Status::Degraded, reason);
+        }
+
+        match state.frames_off_map {
+            0..FRAMES_UNTIL_DOUBT => (
+                Status::Tracking,
+                "recent frames look like mapped places".to_owned(),
+            ),
+            frames => (
+                Status::Degraded,
+                format!("no mapped place for {frames} frames"),
+            ),
+        }
+    }
+}
+
+fn reason_of_loss(certain_matches: u32, matched: &MapMatch) -> String {
+    if matched.out_of_distribution > 1.0 {
+        return "the frames do not look like the room".to_owned();
+    }
+
+    match certain_matches {
+        0 => "the view jumped, or nothing is sure of the room yet".to_owned(),
+        count => {
+            format!("{count} of {FRAMES_TO_RECOVER} frames in a row look like the room again")
+        }
+    }
+}

@@ -1,0 +1,677 @@
+//! Tracking a camera frame by frame: dead reckoning from keyframes, corrected by mapped frames that
+//! look alike.
+//!
+//! Start reading at [`Tracker::observe`], which hands a frame to `step`, the whole algorithm in six
+//! paragraphs.
+//!
+//! - A tracker keeps nothing: all that it knows of a stream is its [`State`], and the same state and
+//!   frame give the same answer to the bit.
+//! - `odom_from_camera` is continuous: motions are composed and never corrected. `map_from_camera` is
+//!   corrected and may jump.
+//! - The map pose is kept twice. The *believed* pose is the filter's own, with the covariance that
+//!   the filter computes; anchors are compared with it. The *reported* pose is what clients are told,
+//!   with the covariance that its errors were measured to have. While both exist they are the same
+//!   pose and differ in covariance alone; after LOST only the reported one remains. A filter that treats anchors as
+//!   independent grows far too sure of itself, because anchors on the same part of a path err alike.
+
+use std::sync::Arc;
+
+use nalgebra::Matrix6;
+use ndarray::{ArrayView1, Axis, s};
+
+use super::health::{Continuity, FrameEvidence, TrackingHealth};
+use super::state::{Candidate, Keyframe, LastFrame, Observation, Refusal, State, Update};
+use super::{Belief, Error, Map, MapMatch, ROOM_RATIO};
+use crate::adapter::{Adapter, ErrorModel, JUMP_WINDOW};
+use crate::geometry::{Pose, Twist, body_twist};
+
+/// 99 % of χ² with six degrees of freedom: an anchor whose surprise is larger is refused.
+const GATE: f64 = 16.81;
+/// Successive anchors err alike: each one's covariance is multiplied by this.
+const ANCHOR_INFLATION: f64 = 2.0;
+/// Accepted frames from one anchor to the next: those in between err alike and tell nothing new.
+const ANCHOR_EVERY: u32 = 3;
+/// Anchors in a row that must agree on a place before it replaces another one, or is believed where
+/// none was.
+pub const ANCHORS_TO_AGREE: u32 = 4;
+/// The deviation of a stream's own origin, metres and radians: it is zero by definition, but a
+/// covariance has to be positive definite.
+const ORIGIN_DEVIATION: f64 = 1e-6;
+
+/// Settings of a tracker.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrackerSettings {
+    /// A new keyframe is taken once a frame's number exceeds the keyframe's by this; at least 1.
+    pub keyframe_frames: u32,
+    /// A new keyframe is taken after a motion of this length, ‖(v, ω)‖, metres and radians mixed;
+    /// above 0.
+    pub keyframe_displacement: f64,
+    /// Whether mapped frames that look alike correct the pose.
+    pub fuse: bool,
+}
+
+impl TrackerSettings {
+    /// Settings that keep motions within those that the adapter was trained for and its errors were
+    /// measured over: a keyframe after as many frames as the longest of them, or after twice the root
+    /// mean square of their lengths.
+    ///
+    /// Differences of latents add up, so many keyframes read a path no better than few; the measured
+    /// errors only hold while a single motion is read since the last map pose.
+    pub fn of(adapter: &Adapter) -> Self {
+        let scale = adapter.scale();
+        let mean_square = scale.mean.norm_squared() + scale.deviation.norm_squared();
+        let longest = adapter
+            .error_model()
+            .map_or(1.0, |error_model| error_model.longest_frames());
+
+        Self {
+            keyframe_frames: longest as u32,
+            keyframe_displacement: 2.0 * mean_square.sqrt(),
+            fuse: true,
+        }
+    }
+}
+
+/// Tracks cameras through the maps of one adapter.
+pub struct Tracker {
+    pub(super) maps: Vec<Arc<Map>>,
+    pub(super) settings: TrackerSettings,
+    error_model: Arc<ErrorModel>,
+    map_pose_factor: f64,
+}
+
+impl Tracker {
+    /// A tracker over one or more maps that share an adapter.
+    ///
+    /// # Errors
+    /// [`Error::NoMap`] without a map, [`Error::Adapters`] when the maps have several adapters,
+    /// [`Error::NotCalibrated`] when the adapter has no error model.
+    pub fn new(maps: Vec<Arc<Map>>, settings: TrackerSettings) -> Result<Self, Error> {
+        let adapter = maps
+            .first()
+            .ok_or(Error::NoMap)?
+            .navigator()
+            .adapter()
+            .clone();
+        if maps
+            .iter()
+            .any(|map| !Arc::ptr_eq(map.navigator().adapter(), &adapter))
+        {
+            return Err(Error::Adapters);
+        }
+
+        let error_model = adapter.error_model().ok_or(Error::NotCalibrated)?.clone();
+        let map_pose_factor = error_model.statistics().map_pose_factor;
+
+        Ok(Self {
+            maps,
+            settings,
+            error_model,
+            map_pose_factor,
+        })
+    }
+
+    /// The same tracker with another factor of the covariances of corrected map poses. Calibration
+    /// searches the right one with it.
+    #[must_use]
+    pub fn with_map_pose_factor(self, map_pose_factor: f64) -> Self {
+        Self {
+            map_pose_factor,
+            ..self
+        }
+    }
+
+    /// The maps that cameras are tracked in.
+    pub fn maps(&self) -> &[Arc<Map>] {
+        &self.maps
+    }
+
+    /// The settings.
+    pub fn settings(&self) -> TrackerSettings {
+        self.settings
+    }
+
+    /// The state of a stream before its first frame: in the only map, or in one that is to be found.
+    /// `initial_pose` is `world_from_camera` of the first frame, if it is known.
+    pub fn start(&self, initial_pose: Option<Belief>) -> State {
+        let health = if initial_pose.is_some() {
+            TrackingHealth::confirmed()
+        } else {
+            TrackingHealth::NotStarted
+        };
+
+        State {
+            room: (self.maps.len() == 1).then_some(0),
+            health,
+            initial_pose,
+            ..State::default()
+        }
+    }
+
+    /// Sets where a stream's camera is, `world_from_camera`; `odom` continues as it was.
+    pub fn set_pose(&self, state: &mut State, pose: Belief) {
+        state.health = TrackingHealth::confirmed();
+        state.candidate = None;
+        state.frames_off_map = 0;
+
+        match &state.last {
+            // The pose is that of the last frame, which becomes the keyframe.
+            Some(last) => {
+                state.keyframe = Some(Keyframe {
+                    sequence: last.sequence,
+                    latent: last.latent.clone(),
+                    odom: last.odom,
+                    map_pose: Some(pose),
+                    reported_pose: Some(pose),
+                });
+            }
+            None => state.initial_pose = Some(pose),
+        }
+    }
+
+    /// Takes one frame. The state changes only if the frame is accepted.
+    ///
+    /// # Errors
+    /// [`Refusal`] for a frame that is late or a duplicate, or whose latent does not fit the adapter.
+    pub fn observe(&self, state: &mut State, frame: &Observation) -> Result<Update, Refusal> {
+        if let Some(last) = &state.last {
+            if frame.sequence <= last.sequence {
+                return Err(Refusal::Duplicate {
+                    sequence: frame.sequence,
+                    last: last.sequence,
+                });
+            }
+
+            if frame.time_ns <= last.time_ns {
+                return Err(Refusal::Late {
+                    time_ns: frame.time_ns,
+                    last_ns: last.time_ns,
+                });
+            }
+        }
+
+        self.adapter()
+            .check_latent(frame.latent.as_slice().unwrap_or_default())?;
+
+        Ok(self.step(state, frame))
+    }
+
+    fn adapter(&self) -> &Arc<Adapter> {
+        self.maps[0].navigator().adapter()
+    }
+
+    fn step(&self, state: &mut State, frame: &Observation) -> Update {
+        // 1. What the frame looks like: the best map, the mapped frame nearest to it, and whether the
+        // view follows from the views before.
+        let view = self.match_maps(state.room, frame.latent.view());
+        let matches_room = view.matched.out_of_distribution <= 1.0;
+        let continuity = self.record_view(state, frame);
+
+        // 2. What that says of the stream's health.
+        state.health = state.health.after(FrameEvidence {
+            matches_room,
+            matches_certainly: view.matched.is_certain,
+            continuity,
+        });
+        state.frames_off_map = if matches_room {
+            0
+        } else {
+            state.frames_off_map.saturating_add(1)
+        };
+
+        // 3. Dead reckoning: the motion since the keyframe carries every pose forward.
+        let reading = MotionReading::of(continuity, matches_room);
+        let prediction = self.predict(state, frame, reading);
+        let mut poses = prediction.poses;
+        if state.health.is_lost() {
+            self.stop_believing(state, &mut poses);
+        }
+
+        // 4. Correction: every few frames the mapped frame that looks alike is tried as an anchor.
+        let correction = self.correct_when_due(state, &mut poses, frame, &view);
+        if correction.is_applied {
+            poses.reported_pose = poses
+                .map_pose
+                .map(|map_pose| self.as_sure_as(&view.matched.anchor, map_pose));
+        }
+
+        // 5. What is remembered for the next frame.
+        let keyframe_sequence = state
+            .keyframe
+            .as_ref()
+            .map_or(frame.sequence, |keyframe| keyframe.sequence);
+        let velocity = state
+            .last
+            .as_ref()
+            .map(|last| mean_velocity(last, frame, &poses.odom));
+        let is_keyframe =
+            correction.is_applied || self.is_keyframe_due(state, frame.sequence, &prediction);
+        remember(state, frame, &poses, is_keyframe);
+
+        // 6. The answer. The status judges the reported covariance, but only while the filter still
+        // believes a pose.
+        let believed = poses.map_pose.and(poses.reported_pose);
+        let (status, reason) = self.status(state, believed.as_ref(), &view.matched);
+
+        Update {
+            motion: prediction.motion,
+            motion_covariance: prediction.covariance,
+            keyframe_sequence,
+            is_keyframe,
+            odom: poses.odom,
+            map_pose: poses.reported_pose,
+            velocity,
+            status,
+            reason,
+            out_of_distribution: view.matched.out_of_distribution,
+            room: state.room,
+            best_match: (view.room, view.matched.nearest[0]),
+            match_used: correction.is_applied,
+            surprise: correction.surprise,
+            candidate: state.candidate.clone(),
+        }
+    }
+
+    /// How the view matches the believed room or, if no room is believed yet, the one of all maps
+    /// that it matches best.
+    fn match_maps(&self, room: Option<usize>, latent: ArrayView1<'_, f64>) -> BestMap {
+        if let Some(room) = room {
+            return BestMap {
+                room,
+                is_clear: true,
+                matched: self.maps[room].match_view(latent, 1),
+            };
+        }
+
+        let mut matches: Vec<(usize, MapMatch)> = self
+            .maps
+            .iter()
+            .enumerate()
+            .map(|(room, map)| (room, map.match_view(latent, 1)))
+            .collect();
+        let distance = |found: &(usize, MapMatch)| found.1.nearest[0].distance;
+        matches.sort_by(|a, b| distance(a).total_cmp(&distance(b)).then(a.0.cmp(&b.0)));
+
+        let is_clear = matches
+            .get(1)
+            .is_none_or(|second| distance(&matches[0]) <= ROOM_RATIO * distance(second));
+        let (room, matched) = matches.swap_remove(0);
+
+        BestMap {
+            room,
+            is_clear,
+            matched,
+        }
+    }
+
+    /// Adds the frame's view to the recent ones, and says how it follows from them.
+    fn record_view(&self, state: &mut State, frame: &Observation) -> Continuity {
+        let coordinates = frame.latent.slice(s![..self.adapter().coordinate_count()]);
+        let whitened = self
+            .error_model
+            .frame_noise()
+            .whitened(coordinates.insert_axis(Axis(0)))
+            .row(0)
+            .to_vec();
+
+        let nearest = state
+            .recent
+            .iter()
+            .map(|other| distance(other, &whitened))
+            .fold(f64::INFINITY, f64::min);
+
+        // How far the views of a moving camera lie apart grows slowly with the frames in between,
+        // about as their cube root.
+        let frames = frames_since_last(state, frame);
+        let limit = self.error_model.statistics().jump_distance * (frames as f64).cbrt();
+
+        let continuity = if frames > JUMP_WINDOW as u64 {
+            Continuity::Gap
+        } else if !state.recent.is_empty() && nearest > limit {
+            Continuity::Jump
+        } else {
+            Continuity::Continuous
+        };
+
+        // A gap comes first: after one even a near view may hide a jump. After either, the views
+        // before say nothing of those that follow.
+        if continuity != Continuity::Continuous {
+            state.recent.clear();
+        } else if state.recent.len() == JUMP_WINDOW {
+            state.recent.remove(0);
+        }
+        state.recent.push(whitened);
+
+        continuity
+    }
+
+    /// Stops believing the map pose of a lost stream. In a single room the last pose is still
+    /// reported, less and less surely, but anchors have to agree before it is believed again; with
+    /// several rooms even the room is open again.
+    fn stop_believing(&self, state: &mut State, poses: &mut Poses) {
+        poses.map_pose = None;
+        state.candidate = None;
+
+        if self.maps.len() > 1 {
+            poses.reported_pose = None;
+            state.room = None;
+        }
+    }
+
+    /// The motion from the keyframe to this frame, and the poses that it leads to.
+    fn predict(&self, state: &State, frame: &Observation, reading: MotionReading) -> Prediction {
+        let Some(keyframe) = &state.keyframe else {
+            // The first frame is the origin of `odom`.
+            let odom = Belief::known(Pose::identity(), ORIGIN_DEVIATION, ORIGIN_DEVIATION);
+            return Prediction {
+                motion: Twist::default(),
+                covariance: odom.covariance,
+                poses: Poses {
+                    odom,
+                    map_pose: state.initial_pose,
+                    reported_pose: state.initial_pose,
+                },
+            };
+        };
+
+        let from = EarlierView {
+            latent: &keyframe.latent,
+            sequence: keyframe.sequence,
+        };
+        let (mut motion, mut covariance) = self.motion_between(state.room, from, frame);
+
+        if reading != MotionReading::Complete || state.health.is_lost() {
+            covariance += self.error_model.unread_errors();
+        }
+
+        // A motion that was not seen cannot be read from the views at its ends: the camera is taken
+        // to be where it was at the last frame, with the errors of any motion.
+        if reading == MotionReading::Unseen {
+            let last_odom = state
+                .last
+                .as_ref()
+                .map_or(keyframe.odom.pose, |last| last.odom.pose);
+            motion = body_twist(&keyframe.odom.pose, &last_odom);
+        }
+
+        let carried = |belief: &Belief| belief.moved(motion, &covariance);
+        Prediction {
+            motion,
+            covariance,
+            poses: Poses {
+                odom: carried(&keyframe.odom),
+                map_pose: keyframe.map_pose.as_ref().map(carried),
+                reported_pose: keyframe.reported_pose.as_ref().map(carried),
+            },
+        }
+    }
+
+    /// A corrected map pose as it is reported: with the covariance of the anchor that corrected it,
+    /// times the factor that calibration found. The filter
+    /// would combine many anchors into one very sure pose, but anchors on the same part of a path err
+    /// alike.
+    fn as_sure_as(&self, anchor: &Belief, map_pose: Belief) -> Belief {
+        Belief {
+            covariance: anchor.covariance * self.map_pose_factor,
+            ..map_pose
+        }
+    }
+
+    fn is_keyframe_due(&self, state: &State, sequence: u64, prediction: &Prediction) -> bool {
+        let keyframe_frames = u64::from(self.settings.keyframe_frames);
+        let is_old = state
+            .keyframe
+            .as_ref()
+            .is_none_or(|keyframe| sequence.saturating_sub(keyframe.sequence) >= keyframe_frames);
+
+        is_old
+            || state.health.is_lost()
+            || prediction.motion.norm() >= self.settings.keyframe_displacement
+    }
+
+    /// The motion from an earlier view to this frame, and the covariance of its error.
+    fn motion_between(
+        &self,
+        room: Option<usize>,
+        from: EarlierView<'_>,
+        to: &Observation,
+    ) -> (Twist, Matrix6<f64>) {
+        let latent = ArrayView1::from(from.latent);
+        let coordinates = s![..self.adapter().coordinate_count()];
+        let difference = &to.latent.slice(coordinates) - &latent.slice(coordinates);
+
+        // In a known room the errors are those that its own frames showed.
+        let errors = room.map_or(&self.error_model.statistics().motion_errors, |room| {
+            self.maps[room].motion_errors()
+        });
+        let squared_length = self.error_model.spread_length(difference.view());
+        let frames = to.sequence.saturating_sub(from.sequence);
+        let covariance = errors.at(squared_length, frames);
+
+        let motion = self.adapter().displacement(latent, to.latent.view());
+        if motion.is_unique_logarithm() {
+            return (motion, covariance);
+        }
+
+        // No camera turns by half between two frames that are compared: nothing was read.
+        let covariance = covariance + self.error_model.unread_errors();
+        (Twist::default(), covariance)
+    }
+
+    /// Tries the best match as an anchor, if one is due and the view clearly matches one map.
+    fn correct_when_due(
+        &self,
+        state: &mut State,
+        poses: &mut Poses,
+        frame: &Observation,
+        view: &BestMap,
+    ) -> Correction {
+        state.frames_since_anchor = state.frames_since_anchor.saturating_add(1);
+        let is_due = state.frames_since_anchor >= ANCHOR_EVERY || state.keyframe.is_none();
+        let matches_room = view.matched.out_of_distribution <= 1.0;
+
+        if !(self.settings.fuse && matches_room && is_due) {
+            return Correction::NONE;
+        }
+
+        state.frames_since_anchor = 0;
+        if view.is_clear {
+            self.correct(state, poses, frame, view)
+        } else {
+            Correction::NONE
+        }
+    }
+
+    /// Corrects the map pose by an anchor. An anchor within the gate of the believed pose is applied
+    /// at once. Any other one, and each one where nothing is believed, becomes a candidate, which is
+    /// applied once several anchors in a row agree.
+    fn correct(
+        &self,
+        state: &mut State,
+        poses: &mut Poses,
+        frame: &Observation,
+        view: &BestMap,
+    ) -> Correction {
+        let earlier_candidate = state.candidate.take();
+        if state.health.is_lost() {
+            return Correction::NONE;
+        }
+
+        let anchor = Belief {
+            pose: view.matched.anchor.pose,
+            covariance: view.matched.anchor.covariance * ANCHOR_INFLATION,
+        };
+        let surprise_at = |belief: &Belief| {
+            belief
+                .innovation(&anchor)
+                .map_or(f64::INFINITY, |innovation| innovation.squared_length)
+        };
+
+        let believed = poses.map_pose.filter(|_| state.room == Some(view.room));
+        let surprise = believed.as_ref().map(surprise_at);
+        if let (Some(believed), Some(surprise)) = (believed, surprise)
+            && surprise <= GATE
+        {
+            poses.map_pose = Some(believed.corrected(&anchor));
+            return Correction {
+                is_applied: true,
+                surprise: Some(surprise),
+            };
+        }
+
+        // The earlier candidate was seen some frames ago: carry it to this frame, then compare.
+        let carried = earlier_candidate
+            .filter(|candidate| candidate.room == view.room)
+            .map(|candidate| self.carried_candidate(candidate, frame));
+        let (map_pose, agreeing_anchors) = match carried {
+            Some((map_pose, agreeing)) if surprise_at(&map_pose) <= GATE => {
+                (map_pose.corrected(&anchor), agreeing + 1)
+            }
+            _ => (anchor, 1),
+        };
+
+        let is_applied = agreeing_anchors >= ANCHORS_TO_AGREE;
+        if is_applied {
+            state.room = Some(view.room);
+            poses.map_pose = Some(map_pose);
+        } else {
+            state.candidate = Some(Candidate {
+                room: view.room,
+                sequence: frame.sequence,
+                latent: frame.latent.to_vec(),
+                map_pose,
+                agreeing_anchors,
+            });
+        }
+
+        Correction {
+            is_applied,
+            surprise,
+        }
+    }
+
+    /// Where a candidate's camera would be at this frame, and how many anchors agreed on it.
+    fn carried_candidate(&self, candidate: Candidate, frame: &Observation) -> (Belief, u32) {
+        let from = EarlierView {
+            latent: &candidate.latent,
+            sequence: candidate.sequence,
+        };
+        let (motion, covariance) = self.motion_between(Some(candidate.room), from, frame);
+
+        let map_pose = candidate.map_pose.moved(motion, &covariance);
+        (map_pose, candidate.agreeing_anchors)
+    }
+}
+
+/// Keeps the frame, and takes it as the keyframe if one is due.
+fn remember(state: &mut State, frame: &Observation, poses: &Poses, is_keyframe: bool) {
+    let latent = frame.latent.to_vec();
+
+    if is_keyframe {
+        state.keyframe = Some(Keyframe {
+            sequence: frame.sequence,
+            latent: latent.clone(),
+            odom: poses.odom,
+            map_pose: poses.map_pose,
+            reported_pose: poses.reported_pose,
+        });
+        state.initial_pose = None;
+    }
+
+    state.last = Some(LastFrame {
+        time_ns: frame.time_ns,
+        sequence: frame.sequence,
+        latent,
+        odom: poses.odom,
+    });
+}
+
+/// How many frames the camera took since the last accepted one, this one included: numbers that are
+/// missing are frames that are missing.
+fn frames_since_last(state: &State, frame: &Observation) -> u64 {
+    state
+        .last
+        .as_ref()
+        .map_or(1, |last| frame.sequence - last.sequence)
+}
+
+/// Metres and radians per second since the last frame, in the last frame's body frame.
+fn mean_velocity(last: &LastFrame, frame: &Observation, odom: &Belief) -> Twist {
+    let seconds = frame.time_ns.abs_diff(last.time_ns) as f64 * 1e-9;
+    body_twist(&last.odom.pose, &odom.pose).scaled(seconds.recip())
+}
+
+fn distance(a: &[f64], b: &[f64]) -> f64 {
+    let squares = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b));
+    squares.sum::<f64>().sqrt()
+}
+
+/// The map that a view matches best.
+struct BestMap {
+    /// Its place in [`Tracker::maps`].
+    room: usize,
+    /// Whether no other map matches nearly as well.
+    is_clear: bool,
+    matched: MapMatch,
+}
+
+/// How much of the motion before a frame was seen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum MotionReading {
+    /// All of it.
+    Complete,
+    /// Frames of it are missing, but the room was seen again after them.
+    Partial,
+    /// Nothing that can be relied on: the view jumped, or a gap led away from the map.
+    Unseen,
+}
+
+impl MotionReading {
+    fn of(continuity: Continuity, matches_room: bool) -> Self {
+        match continuity {
+            Continuity::Continuous => Self::Complete,
+            Continuity::Gap if matches_room => Self::Partial,
+            Continuity::Gap | Continuity::Jump => Self::Unseen,
+        }
+    }
+}
+
+/// An earlier frame that a motion is read from.
+#[derive(Clone, Copy)]
+struct EarlierView<'a> {
+    latent: &'a [f64],
+    sequence: u64,
+}
+
+/// The poses of a stream at one frame.
+#[derive(Debug, Clone, Copy)]
+struct Poses {
+    /// `odom_from_camera`.
+    odom: Belief,
+    /// `map_from_camera` as the filter believes it.
+    map_pose: Option<Belief>,
+    /// `map_from_camera` as it is reported.
+    reported_pose: Option<Belief>,
+}
+
+/// A motion since the keyframe, the covariance of its error, and where it leads.
+struct Prediction {
+    motion: Twist,
+    covariance: Matrix6<f64>,
+    poses: Poses,
+}
+
+/// What an anchor did to the map pose.
+struct Correction {
+    is_applied: bool,
+    /// The squared Mahalanobis distance of the anchor from the believed pose, if there was one.
+    surprise: Option<f64>,
+}
+
+impl Correction {
+    /// No anchor was tried.
+    const NONE: Self = Self {
+        is_applied: false,
+        surprise: None,
+    };
+}

@@ -1,0 +1,441 @@
+//! Training: from the features and poses of rooms to an adapter and its scores.
+
+use ndarray::{Array2, ArrayView2, s};
+
+use crate::adapter::{
+    self, Adapter, CorrectorKind, EpochProgress, MAX_CHARTS, Mixing, PairPlan, Preset, Samples,
+    TrainConfig, TrainingRecord, train, train_corrector,
+};
+use crate::features::Features;
+use crate::geometry::{Pose, Twist, body_twist};
+use crate::motion_scores::{MotionScores, constant_r2};
+use crate::room::{Room, RoomId};
+use crate::splits::{self, Pair, Split};
+use crate::statistics::mean_of_known;
+
+/// Why training or calibration failed.
+#[derive(Debug, thiserror::Error, PartialEq)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum Error {
+    #[error(transparent)]
+    Pairs(#[from] splits::Error),
+    #[error("room '{room}': {problem}")]
+    RoomPairs {
+        room: RoomId,
+        problem: splits::Error,
+    },
+    #[error(transparent)]
+    Adapter(#[from] adapter::Error),
+    #[error("room '{room}' has {frame_count} frames, features '{features}' have {rows} rows")]
+    FeatureRows {
+        room: RoomId,
+        frame_count: usize,
+        features: String,
+        rows: usize,
+    },
+    #[error("features '{features}' of rooms '{first}' and '{room}' were not encoded alike")]
+    UnlikeFeatures {
+        features: String,
+        first: RoomId,
+        room: RoomId,
+    },
+    #[error(
+        "alternatives need one chart, mean squared error and unscaled features; take a paper preset"
+    )]
+    NotPlain,
+    #[error("no room was given to train on")]
+    NoRoom,
+    #[error("{what} must be {least} to {most}, got {given}")]
+    Setting {
+        what: &'static str,
+        least: usize,
+        most: usize,
+        given: usize,
+    },
+    #[error("{what} must be finite and {bound}, got {given}")]
+    Rate {
+        what: &'static str,
+        bound: &'static str,
+        given: f64,
+    },
+}
+
+/// The largest number of epochs.
+pub const MAX_EPOCHS: usize = 100_000;
+/// The largest number of columns of a chart's latent.
+pub const MAX_LATENT_DIM: usize = 4_096;
+/// The most pairs in one step.
+const MAX_BATCH: usize = 1 << 20;
+/// Epochs of a corrector; the paper does not state them.
+pub const CORRECTOR_EPOCHS: usize = 200;
+
+/// What decides the numbers of a training run, besides its rooms.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrainingPlan {
+    /// The preset that the settings started from.
+    pub preset: Preset,
+    /// How frames are split into training and test.
+    pub split: Split,
+    /// Frames from source to target in the test pairs.
+    pub stride: u32,
+    /// Which training pairs are used.
+    pub pairs: PairPlan,
+    /// The optimiser's settings, and the seed of the weights, of the order of pairs, and of drawn
+    /// pairs.
+    pub config: TrainConfig,
+    /// Correctors to train after the adapter for [`CORRECTOR_EPOCHS`] epochs, by mean squared error
+    /// on its latents, with the adapter's learning rate, weight decay, batch size and seed.
+    pub correctors: Vec<CorrectorKind>,
+}
+
+impl TrainingPlan {
+    /// A preset's own pairs and settings, without correctors.
+    pub fn of(preset: Preset, split: Split, stride: u32, seed: u64) -> Self {
+        let pairs = preset.plan(stride);
+        let config = preset.config(seed);
+
+        Self {
+            preset,
+            split,
+            stride,
+            pairs,
+            config,
+            correctors: Vec::new(),
+        }
+    }
+
+    /// The same plan with another seed.
+    #[must_use]
+    pub fn with_seed(&self, seed: u64) -> Self {
+        let mut plan = self.clone();
+        plan.config.seed = seed;
+        plan
+    }
+
+    /// Checks that the settings are in range and fit together.
+    ///
+    /// # Errors
+    /// [`Error::Setting`] or [`Error::Rate`] for a number out of range, [`Error::Adapter`] for a
+    /// corrector given twice and for z-scored features under a gate.
+    pub fn check(&self) -> Result<(), Error> {
+        self.check_counts()?;
+        self.check_rates()?;
+
+        // An adapter has at most one corrector of a kind.
+        let twice = |(at, kind): (usize, &CorrectorKind)| self.correctors[..at].contains(kind);
+        if let Some((_, kind)) = self
+            .correctors
+            .iter()
+            .enumerate()
+            .find(|&given| twice(given))
+        {
+            return Err(Error::Adapter(adapter::Error::CorrectorTwice {
+                name: kind.name(),
+            }));
+        }
+
+        if self.config.standardise && self.config.charts > 1 && self.config.mixing == Mixing::Gate {
+            return Err(Error::Adapter(adapter::Error::GatedStandardised));
+        }
+
+        Ok(())
+    }
+
+    fn check_counts(&self) -> Result<(), Error> {
+        let config = &self.config;
+        for (what, given, least, most) in [
+            ("epochs", config.epochs, 1, MAX_EPOCHS),
+            ("batch", config.batch, 1, MAX_BATCH),
+            ("hidden columns", config.hidden, 1, MAX_LATENT_DIM),
+            ("geo_dim", config.latent, 6, MAX_LATENT_DIM),
+            ("charts", config.charts, 1, MAX_CHARTS),
+        ] {
+            if !(least..=most).contains(&given) {
+                return Err(Error::Setting {
+                    what,
+                    least,
+                    most,
+                    given,
+                });
+            }
+        }
+
+        Ok(())
+    }
+
+    /// A NaN or an infinity would otherwise come to light only in the training.
+    fn check_rates(&self) -> Result<(), Error> {
+        let config = &self.config;
+        let is_positive = |value: f64| value.is_finite() && value > 0.0;
+        for (what, given) in [
+            ("the learning rate", config.learning_rate),
+            ("the clipping norm", config.clip_norm),
+        ] {
+            if !is_positive(given) {
+                let bound = "positive";
+                return Err(Error::Rate { what, bound, given });
+            }
+        }
+
+        for (what, given) in [
+            ("the noise", config.noise),
+            ("the weight decay", config.weight_decay),
+        ] {
+            if given != 0.0 && !is_positive(given) {
+                let bound = "not negative";
+                return Err(Error::Rate { what, bound, given });
+            }
+        }
+
+        if !(0.0..1.0).contains(&config.average) {
+            return Err(Error::Rate {
+                what: "the decay of the average",
+                bound: "at least 0 and under 1",
+                given: config.average,
+            });
+        }
+
+        Ok(())
+    }
+}
+
+/// A room to train or evaluate on, with one of its feature sets.
+#[derive(Debug, Clone, Copy)]
+pub struct RoomData<'a> {
+    /// The room: its frames and their poses.
+    pub room: &'a Room,
+    /// The room's revision in the store.
+    pub revision: u64,
+    /// The room's features, one row per frame.
+    pub features: &'a Features,
+}
+
+/// Trains one adapter on all rooms together, and scores it on each room's test pairs.
+///
+/// # Errors
+/// [`Error`] when there is no room, a room is too short for the split, the rooms' features do not
+/// fit together, a setting is out of range, or training diverges.
+///
+/// Source: SeeSE3, M4 (Eq. 3, Sec. A.2); cross-room training Sec. A.10.
+pub fn train_adapter(
+    room_data: &[RoomData<'_>],
+    plan: &TrainingPlan,
+    progress: &mut dyn FnMut(EpochProgress),
+) -> Result<(Adapter, TrainingRecord), Error> {
+    plan.check()?;
+    check_rooms(room_data)?;
+
+    // Test pairs are taken before training, so that a room that is too short is refused at once.
+    let tests = test_pairs(room_data, plan)?;
+    let samples = samples(room_data, plan)?;
+    let network = train(&samples, &plan.config, progress)?;
+    let adapter = Adapter::new(
+        room_data[0].features.source().clone(),
+        network,
+        samples.scale().clone(),
+    )?;
+
+    let mut correctors = Vec::with_capacity(plan.correctors.len());
+
+    // Correctors differ from the adapter in their epochs alone.
+    let config = TrainConfig {
+        epochs: CORRECTOR_EPOCHS,
+        ..plan.config.clone()
+    };
+
+    for &kind in &plan.correctors {
+        correctors.push(train_corrector(
+            kind,
+            &adapter,
+            &samples,
+            &config,
+            &mut |_| (),
+        )?);
+    }
+
+    let adapter = adapter.with_correctors(correctors)?;
+    let mut room_tests = Vec::with_capacity(room_data.len());
+    let mut train_mean_r2 = Vec::with_capacity(room_data.len());
+
+    // Every room is scored by itself: in the mean, rooms count alike, not pairs.
+    for (data, pairs) in room_data.iter().zip(&tests) {
+        let truth = motions(data.room.poses(), pairs);
+        room_tests.push(MotionScores::of(
+            &truth,
+            &predictions(&adapter, data.features.rows(), pairs)?,
+        ));
+
+        // The baseline: R² of predicting the mean training motion μ for every test pair.
+        train_mean_r2.push(constant_r2(&truth, &samples.scale().mean));
+    }
+
+    let record = TrainingRecord {
+        preset: plan.preset.name().to_owned(),
+        split: plan.split,
+        stride: plan.stride,
+        pairs: plan.pairs.clone(),
+        rooms: room_data
+            .iter()
+            .map(|data| (data.room.id().clone(), data.revision))
+            .collect(),
+        calibrated_on: Vec::new(),
+        config: plan.config.clone(),
+        pair_count: samples.pair_count(),
+        test: MotionScores::mean(&room_tests),
+        room_tests,
+        train: train_scores(&adapter, &samples)?,
+        train_mean_r2: mean_of_known(&train_mean_r2),
+    };
+
+    Ok((adapter, record))
+}
+
+/// The training pairs of the rooms, with the features of all rooms stacked below one another.
+///
+/// # Errors
+/// [`Error::Pairs`] when the plan gives no pair of some room, [`Error::Adapter`] when the pairs do
+/// not differ in their motions.
+pub fn samples(room_data: &[RoomData<'_>], plan: &TrainingPlan) -> Result<Samples<f32>, Error> {
+    let timelines: Vec<_> = room_data.iter().map(|data| data.room.timeline()).collect();
+    let drawn = plan.pairs.pairs(plan.split, &timelines, plan.config.seed)?;
+
+    // The frames of all rooms stand one below the other; each room begins at its first row.
+    let mut first_rows = Vec::with_capacity(room_data.len());
+    let mut count = 0;
+    for data in room_data {
+        first_rows.push(count);
+        count += data.room.frame_count();
+    }
+
+    let columns = room_data
+        .first()
+        .map_or(0, |data| data.features.source().dim);
+    let mut features = Array2::zeros((count, columns));
+
+    let mut poses = Vec::with_capacity(count);
+    for (data, &first) in room_data.iter().zip(&first_rows) {
+        features
+            .slice_mut(s![first..first + data.room.frame_count(), ..])
+            .assign(&data.features.rows());
+        poses.extend_from_slice(data.room.poses());
+    }
+
+    // Pairs number frames within a room; samples number rows of the stack.
+    let rows = |(room, pair): (usize, Pair)| {
+        [pair.source, pair.target].map(|frame| first_rows[room] + frame.row())
+    };
+    let samples = Samples::new(
+        features.view(),
+        poses,
+        drawn.into_iter().map(rows).collect(),
+    )?;
+
+    // Around zero, σ is the root mean square, and zero motion leaves the latent where it is, in
+    // every reading.
+    Ok(if plan.config.through_zero {
+        samples.through_zero()?
+    } else {
+        samples
+    })
+}
+
+/// The test pairs of each room; empty under [`Split::Whole`], which keeps no pairs for testing.
+pub fn test_pairs(
+    room_data: &[RoomData<'_>],
+    plan: &TrainingPlan,
+) -> Result<Vec<Vec<Pair>>, Error> {
+    let of = |data: &RoomData<'_>| {
+        if plan.split == Split::Whole {
+            return Ok(Vec::new());
+        }
+
+        let pairs = plan.split.test_pairs(data.room.timeline(), plan.stride);
+
+        // With several rooms, the error has to name the one without test pairs.
+        pairs.map_err(|problem| match room_data.len() {
+            1 => Error::Pairs(problem),
+            _ => Error::RoomPairs {
+                room: data.room.id().clone(),
+                problem,
+            },
+        })
+    };
+
+    room_data.iter().map(of).collect()
+}
+
+/// Refuses rooms whose features do not fit their frames, or one another.
+///
+/// # Errors
+/// [`Error::NoRoom`], [`Error::FeatureRows`] or [`Error::UnlikeFeatures`].
+pub fn check_rooms(room_data: &[RoomData<'_>]) -> Result<(), Error> {
+    let first = room_data.first().ok_or(Error::NoRoom)?;
+    for data in room_data {
+        let frame_count = data.room.frame_count();
+        let rows = data.features.rows().nrows();
+        let features = data.features.source().name.clone();
+        if rows != frame_count {
+            return Err(Error::FeatureRows {
+                room: data.room.id().clone(),
+                frame_count,
+                features,
+                rows,
+            });
+        }
+
+        // One adapter can only be trained on features of one encoder, layer and pooling.
+        let source = first.features.source();
+        let own = data.features.source();
+        if !own.is_like(source) || own.dim != source.dim {
+            let first = first.room.id().clone();
+            let room = data.room.id().clone();
+
+            return Err(Error::UnlikeFeatures {
+                features,
+                first,
+                room,
+            });
+        }
+    }
+
+    Ok(())
+}
+
+/// The true motions of pairs, each in the body frame of its source camera.
+pub fn motions(poses: &[Pose], pairs: &[Pair]) -> Vec<Twist> {
+    pairs
+        .iter()
+        .map(|pair| body_twist(&poses[pair.source.row()], &poses[pair.target.row()]))
+        .collect()
+}
+
+/// The motions that an adapter predicts for pairs from the features of their two frames.
+///
+/// # Errors
+/// As [`Adapter::embed`].
+pub fn predictions(
+    adapter: &Adapter,
+    rows: ArrayView2<'_, f32>,
+    pairs: &[Pair],
+) -> Result<Vec<Twist>, adapter::Error> {
+    let latents = adapter.embed(rows)?;
+    let motion = |pair: &Pair| {
+        adapter.motion(
+            latents.row(pair.source.row()),
+            latents.row(pair.target.row()),
+        )
+    };
+
+    Ok(pairs.iter().map(motion).collect())
+}
+
+fn train_scores(adapter: &Adapter, samples: &Samples<f32>) -> Result<MotionScores, Error> {
+    let latents = adapter.embed(samples.features())?;
+    let motion = |pair: usize| {
+        let [from, to] = samples.pair(pair);
+        adapter.motion(latents.row(from), latents.row(to))
+    };
+    let predicted: Vec<Twist> = (0..samples.pair_count()).map(motion).collect();
+
+    Ok(MotionScores::of(samples.twists(), &predicted))
+}

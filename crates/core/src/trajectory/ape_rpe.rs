@@ -1,0 +1,164 @@
+//! Absolute and relative pose errors.
+
+use nalgebra::Matrix4;
+
+use super::{Error, Trajectory};
+use crate::geometry::{Pose, PoseError};
+use crate::statistics::{mean, median};
+
+/// Which part of a pose error is measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Relation {
+    /// The distance, metres.
+    Translation,
+    /// The angle, radians.
+    Rotation,
+    /// The Frobenius norm of the matrix E − I, which mixes metres and rotation.
+    Full,
+}
+
+impl Relation {
+    /// Every relation.
+    pub const ALL: [Self; 3] = [Self::Translation, Self::Rotation, Self::Full];
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Translation => "translation",
+            Self::Rotation => "rotation",
+            Self::Full => "full",
+        }
+    }
+
+    /// The measure of an error E.
+    fn of(self, error: &Pose) -> f64 {
+        let parts = PoseError::between(&Pose::identity(), error);
+        match self {
+            Self::Translation => parts.translation_m,
+            Self::Rotation => parts.rotation_rad,
+            Self::Full => (error.to_homogeneous() - Matrix4::identity()).norm(),
+        }
+    }
+}
+
+/// Which pairs of poses a relative error is computed over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RpePairs {
+    /// Consecutive intervals: 0 to Δ, Δ to 2Δ, ...
+    Consecutive,
+    /// Every two poses that are Δ apart.
+    All,
+}
+
+/// The absolute pose errors, one per pose: E = est⁻¹ ref, both `world_from_camera`.
+///
+/// # Errors
+/// [`Error::Unequal`] when the lengths differ.
+///
+/// Source: evo's `APE`.
+pub fn ape(
+    reference: &Trajectory,
+    estimate: &Trajectory,
+    relation: Relation,
+) -> Result<Vec<f64>, Error> {
+    check(reference, estimate)?;
+    let pairs = estimate.poses.iter().zip(&reference.poses);
+
+    Ok(pairs
+        .map(|(ours, truth)| relation.of(&ours.inv_mul(truth)))
+        .collect())
+}
+
+/// The relative pose errors, E = (ref_i⁻¹ ref_j)⁻¹ (est_i⁻¹ est_j) with j = i + Δ, of the motions
+/// over `delta` poses.
+///
+/// # Errors
+/// [`Error::Unequal`] when the lengths differ; [`Error::NoPairs`] when `delta` is 0 or the
+/// trajectories are not longer than it.
+///
+/// Source: evo's `RPE`.
+pub fn rpe(
+    reference: &Trajectory,
+    estimate: &Trajectory,
+    relation: Relation,
+    delta: usize,
+    pairs: RpePairs,
+) -> Result<Vec<f64>, Error> {
+    check(reference, estimate)?;
+    let have = reference.len();
+    if delta == 0 || delta >= have {
+        return Err(Error::NoPairs { have, delta });
+    }
+
+    let step = match pairs {
+        RpePairs::Consecutive => delta,
+        RpePairs::All => 1,
+    };
+
+    let error = |i: usize| {
+        let motion = |path: &Trajectory| path.poses[i].inv_mul(&path.poses[i + delta]);
+        relation.of(&motion(reference).inv_mul(&motion(estimate)))
+    };
+
+    Ok((0..have - delta).step_by(step).map(error).collect())
+}
+
+fn check(reference: &Trajectory, estimate: &Trajectory) -> Result<(), Error> {
+    match reference.len() == estimate.len() {
+        true => Ok(()),
+        false => Err(Error::Unequal {
+            reference: reference.len(),
+            estimate: estimate.len(),
+        }),
+    }
+}
+
+/// Summary statistics of errors, in the errors' unit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Statistics {
+    /// The root mean square.
+    pub rmse: f64,
+    /// The mean.
+    pub mean: f64,
+    /// The median.
+    pub median: f64,
+    /// The population standard deviation.
+    pub deviation: f64,
+    /// The smallest.
+    pub least: f64,
+    /// The largest.
+    pub largest: f64,
+    /// The sum of squares.
+    pub sum_of_squares: f64,
+    /// The number of errors.
+    pub count: usize,
+}
+
+impl Statistics {
+    /// The statistics of `errors`. Of an empty slice the count and the sum of squares are 0, and
+    /// everything else is NaN.
+    pub fn of(errors: &[f64]) -> Self {
+        let count = errors.len();
+        let sum_of_squares = errors.iter().map(|x| x * x).sum::<f64>();
+        let middle = mean(errors);
+        let variance = errors
+            .iter()
+            .map(|x| (x - middle) * (x - middle))
+            .sum::<f64>()
+            / count as f64;
+
+        // The extremes of an empty slice would be ±∞; adding NaN makes them NaN like the other
+        // figures.
+        let none = if count == 0 { f64::NAN } else { 0.0 };
+        Self {
+            rmse: (sum_of_squares / count as f64).sqrt(),
+            mean: middle,
+            median: median(errors),
+            deviation: variance.sqrt(),
+            least: none + errors.iter().copied().fold(f64::INFINITY, f64::min),
+            largest: none + errors.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+            sum_of_squares,
+            count,
+        }
+    }
+}

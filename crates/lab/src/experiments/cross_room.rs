@@ -1,0 +1,357 @@
+//! Cross-room statistics: how an adapter does in rooms that it was not trained on, and whether one
+//! navigator is better than another there.
+//!
+//! Confidence intervals resample rooms rather than pairs, because the pairs of one room are alike.
+
+use std::sync::Arc;
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+
+use seese3_core::adapter::{Adapter, TrainingRecord};
+use seese3_core::calibration::calibrate_retrieval;
+use seese3_core::cancel::Cancellation;
+use seese3_core::eval::{Protocol, Row, evaluate};
+use seese3_core::motion_scores::MotionScores;
+use seese3_core::navigation::{IndexKind, Navigator, NavigatorKind};
+use seese3_core::room::RoomId;
+use seese3_core::statistics::{Rate, RoomMean, bootstrap_mean};
+use seese3_core::training::{RoomData, TrainingPlan, motions, predictions, train_adapter};
+
+use super::Error;
+
+/// R² below this counts as this in a clipped mean: R² has no lower bound, and one bad room would
+/// dominate the mean.
+pub const CLIPPED_R2: f64 = -1.0;
+
+/// The scores of an adapter in one room.
+#[derive(Debug, Clone)]
+pub struct RoomOutcome {
+    /// The room.
+    pub room: RoomId,
+    /// R² of the motions between the ends of its test pairs.
+    pub motion: MotionScores,
+    /// One row per navigator.
+    pub rows: Vec<Row>,
+    /// Number of frames among which answers were searched for.
+    pub candidate_count: usize,
+}
+
+impl RoomOutcome {
+    /// A navigator's Hit@ε at the first threshold of the protocol.
+    pub fn hit_rate(&self, navigator: &str) -> Option<Rate> {
+        let row = self.rows.iter().find(|row| row.name == navigator)?;
+        row.retrieval.hits.first().map(|(_, rate)| *rate)
+    }
+}
+
+/// Results of one adapter in the held-out rooms.
+#[derive(Debug, Clone)]
+pub struct CrossRoomRun {
+    /// Rooms that the adapter was trained on.
+    pub training_rooms: Vec<String>,
+    /// Calibration rooms, in which the adapter's errors were measured.
+    pub calibration_rooms: Vec<String>,
+    /// Seed of the training run.
+    pub seed: u64,
+    /// One outcome per held-out room.
+    pub outcomes: Vec<RoomOutcome>,
+    /// Rooms that could not be evaluated, and why.
+    pub skipped: Vec<(String, String)>,
+}
+
+impl CrossRoomRun {
+    /// The names of the navigators that were evaluated, in their order.
+    pub fn navigators(&self) -> Vec<&str> {
+        self.outcomes.first().map_or(Vec::new(), |outcome| {
+            outcome.rows.iter().map(|row| row.name.as_str()).collect()
+        })
+    }
+
+    /// A navigator's hit rates, one per room in which it was evaluated.
+    pub fn hit_rates(&self, navigator: &str) -> Vec<f64> {
+        self.outcomes
+            .iter()
+            .filter_map(|outcome| outcome.hit_rate(navigator))
+            .map(|rate| rate.rate)
+            .collect()
+    }
+
+    /// Overall R² of the motions, one value per room.
+    pub fn r2(&self) -> Vec<f64> {
+        self.outcomes
+            .iter()
+            .map(|outcome| outcome.motion.overall)
+            .collect()
+    }
+}
+
+/// How an adapter is trained on some rooms and evaluated in others.
+pub struct CrossRoomPlan<'a> {
+    /// How the adapter is trained, with its seed.
+    pub training: &'a TrainingPlan,
+    /// How many of the rooms, from the last one on, are calibration rooms instead of training rooms.
+    pub calibration_rooms: usize,
+    /// How the held-out rooms are evaluated.
+    pub protocol: &'a Protocol,
+}
+
+/// What became of a [`CrossRoomPlan`].
+pub struct CrossRoomResult {
+    /// The adapter, calibrated for retrieval if there were calibration rooms.
+    pub adapter: Adapter,
+    /// How it was trained.
+    pub record: TrainingRecord,
+    /// How it did in the held-out rooms.
+    pub run: CrossRoomRun,
+}
+
+/// Who hears of the progress of [`train_and_test`].
+pub struct CrossRoomProgress<'a> {
+    /// Called after every epoch of the training.
+    pub epoch: &'a (dyn Fn() + Sync),
+    /// Called after every held-out room.
+    pub room: &'a (dyn Fn() + Sync),
+}
+
+/// Trains an adapter on `rooms` and evaluates it in the rooms `held_out`.
+///
+/// # Errors
+/// [`Error`] when the training or the calibration fails. A held-out room that cannot be evaluated is
+/// skipped, and the run says why.
+pub fn train_and_test(
+    rooms: &[RoomData<'_>],
+    held_out: &[RoomData<'_>],
+    plan: &CrossRoomPlan<'_>,
+    progress: &CrossRoomProgress<'_>,
+) -> Result<CrossRoomResult, Error> {
+    let Some(training_rooms) = rooms.len().checked_sub(plan.calibration_rooms) else {
+        return Err(Error::Input(format!(
+            "{} of {} rooms cannot be calibration rooms",
+            plan.calibration_rooms,
+            rooms.len()
+        )));
+    };
+    let (training, calibration) = rooms.split_at(training_rooms);
+    let (mut adapter, mut record) =
+        train_adapter(training, plan.training, &mut |_| (progress.epoch)())?;
+
+    if !calibration.is_empty() {
+        let (calibrated, report) = calibrate_retrieval(adapter, &record, calibration)?;
+        adapter = calibrated;
+        record.calibrated_on = report.rooms;
+    }
+
+    let mut run = CrossRoomRun {
+        training_rooms: names(training),
+        calibration_rooms: names(calibration),
+        seed: plan.training.config.seed,
+        outcomes: Vec::new(),
+        skipped: Vec::new(),
+    };
+    for outcome in outcomes(
+        &Arc::new(adapter.clone()),
+        held_out,
+        plan.protocol,
+        progress.room,
+    ) {
+        match outcome {
+            Ok(outcome) => run.outcomes.push(outcome),
+            Err((room, why)) => run.skipped.push((room.to_string(), why.to_string())),
+        }
+    }
+
+    Ok(CrossRoomResult {
+        adapter,
+        record,
+        run,
+    })
+}
+
+fn names(rooms: &[RoomData<'_>]) -> Vec<String> {
+    rooms
+        .iter()
+        .map(|data| data.room.id().to_string())
+        .collect()
+}
+
+/// Evaluates an adapter in each of several rooms, in parallel. Results are in the order of the
+/// rooms; a room that cannot be evaluated gives its error (A-25). `done` is called after each room.
+pub fn outcomes(
+    adapter: &Arc<Adapter>,
+    room_data: &[RoomData<'_>],
+    protocol: &Protocol,
+    done: &(dyn Fn() + Sync),
+) -> Vec<Result<RoomOutcome, (RoomId, Error)>> {
+    let of = |data: &RoomData<'_>| {
+        let outcome =
+            outcome(adapter, data, protocol).map_err(|error| (data.room.id().clone(), error));
+        done();
+        outcome
+    };
+    room_data.par_iter().map(of).collect()
+}
+
+fn outcome(
+    adapter: &Arc<Adapter>,
+    data: &RoomData<'_>,
+    protocol: &Protocol,
+) -> Result<RoomOutcome, Error> {
+    let room = Arc::new(data.room.clone());
+    let navigator = Navigator::new(
+        room.clone(),
+        data.features,
+        adapter.clone(),
+        IndexKind::Exact,
+    )?;
+
+    let report = evaluate(
+        &navigator,
+        protocol,
+        &Cancellation::default(),
+        &mut |_, _| (),
+    )?;
+
+    // The motion scores are of the same test pairs as the retrieval scores above.
+    let pairs = protocol
+        .split
+        .test_pairs(room.timeline(), protocol.stride)?;
+    let predicted = predictions(adapter, data.features.rows(), &pairs)?;
+
+    Ok(RoomOutcome {
+        room: room.id().clone(),
+        motion: MotionScores::of(&motions(room.poses(), &pairs), &predicted),
+        rows: report.rows,
+        candidate_count: report.candidate_count,
+    })
+}
+
+/// The share of rooms in which a navigator's hit rate is strictly above Identity's; `None` when no
+/// room has both.
+pub fn wins(outcomes: &[RoomOutcome], navigator: &str) -> Option<Rate> {
+    let identity = NavigatorKind::Identity.name();
+    let pairs: Vec<(f64, f64)> = outcomes
+        .iter()
+        .filter_map(|outcome| {
+            Some((
+                outcome.hit_rate(navigator)?.rate,
+                outcome.hit_rate(&identity)?.rate,
+            ))
+        })
+        .collect();
+
+    let won = pairs
+        .iter()
+        .filter(|(ours, identity)| ours > identity)
+        .count();
+
+    (!pairs.is_empty()).then(|| Rate::of(won, pairs.len()))
+}
+
+/// R² over rooms: what the paper's scaling curves show (Sec. 5).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MotionSummary {
+    /// Rooms whose overall R² is above 0.
+    pub positive: Rate,
+    /// Rooms whose overall R² is above 0.3.
+    pub above_0_3: Rate,
+    /// The largest overall R².
+    pub best: f64,
+    /// Mean of max(R², −1).
+    pub clipped: RoomMean,
+}
+
+impl MotionSummary {
+    /// The summary of one overall R² per room; rooms without one (NaN) are left out. `None` when
+    /// none remains.
+    pub fn of(r2: &[f64], seed: u64) -> Option<Self> {
+        let known: Vec<f64> = r2.iter().copied().filter(|r2| !r2.is_nan()).collect();
+        let above =
+            |least: f64| Rate::of(known.iter().filter(|&&r2| r2 > least).count(), known.len());
+        let clipped: Vec<f64> = known.iter().map(|r2| r2.max(CLIPPED_R2)).collect();
+
+        (!known.is_empty()).then(|| Self {
+            positive: above(0.0),
+            above_0_3: above(0.3),
+            best: known.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+            clipped: bootstrap_mean(&clipped, seed),
+        })
+    }
+}
+
+/// The first `count` of `of` rooms in a seeded random order, so that a smaller choice is contained
+/// in a larger one.
+pub fn nested_choice(count: usize, of: usize, seed: u64) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..of).collect();
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+
+    // Fisher–Yates shuffle of all rooms: the order must not depend on how many are taken.
+    for place in 0..of.saturating_sub(1) {
+        let other = random.random_range(place..of);
+        order.swap(place, other);
+    }
+
+    order.truncate(count);
+    order
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand: of three rooms one is won, one lost, one tied, and a tie is no win.
+    #[test]
+    fn a_win_is_strictly_more_hits_than_identity() {
+        let retrieval = |hits: usize| seese3_core::eval::RetrievalScores {
+            top1: Rate::of(0, 10),
+            hits: vec![(0.1, Rate::of(hits, 10))],
+            twist_error_mean: 0.0,
+            twist_error_median: 0.0,
+            translation_m_median: 0.0,
+            rotation_rad_median: 0.0,
+            pose_recalls: Vec::new(),
+        };
+
+        let row = |name: &str, hits| Row {
+            name: name.to_owned(),
+            n: 10,
+            latent: None,
+            retrieval: retrieval(hits),
+        };
+
+        let outcome = |ours, identity| RoomOutcome {
+            room: RoomId::new("r").unwrap(),
+            motion: MotionScores::of(&[], &[]),
+            rows: vec![row("identity", identity), row("ours", ours)],
+            candidate_count: 10,
+        };
+        let won = wins(&[outcome(5, 4), outcome(3, 4), outcome(4, 4)], "ours").unwrap();
+
+        assert_eq!((won.successes(), won.n), (1, 3));
+        assert!(wins(&[outcome(5, 4)], "theirs").is_none());
+    }
+
+    /// Oracle: by hand.
+    #[test]
+    fn r2_of_rooms_is_clipped_and_counted() {
+        let summary = MotionSummary::of(&[0.5, 0.1, -7.0, f64::NAN], 0).unwrap();
+        assert_eq!((summary.positive.rate, summary.positive.n), (2.0 / 3.0, 3));
+        assert_eq!((summary.above_0_3.rate, summary.best), (1.0 / 3.0, 0.5));
+        assert!((summary.clipped.mean + 0.4 / 3.0).abs() < 1e-12);
+
+        assert!(MotionSummary::of(&[f64::NAN], 0).is_none());
+    }
+
+    /// Oracle: the definition: no room twice, and the smaller choice within the larger one.
+    #[test]
+    fn smaller_choices_are_within_larger_ones() {
+        let small = nested_choice(5, 100, 3);
+        let large = nested_choice(50, 100, 3);
+        assert_eq!(small, large[..5]);
+
+        let distinct: std::collections::HashSet<_> = large.iter().collect();
+        assert_eq!(distinct.len(), 50);
+        assert_ne!(large, nested_choice(50, 100, 4));
+    }
+}

@@ -1,0 +1,99 @@
+//! M1 to M4 of one feature set in one room: a row of the table over an encoder's layers.
+
+use rayon::prelude::*;
+
+use seese3_core::motion_scores::MotionScores;
+use seese3_core::statistics::{deviation, mean};
+use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
+
+use super::Error;
+use crate::probes::{Duplicates, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
+
+/// What decides the numbers of a row besides its room and features.
+#[derive(Debug, Clone)]
+pub struct LayerProtocol {
+    /// How M1 compares neighbours.
+    pub mutual_knn: MutualKnn,
+    /// Frames to each side that M2 leaves out as neighbours.
+    pub gap: usize,
+    /// Split and stride of M3 and M4, and how M4 is trained; its seed is replaced.
+    pub plan: TrainingPlan,
+    /// Adapters of M4, from seed 0 on.
+    pub seeds: u64,
+}
+
+/// M1 to M4 of one feature set in one room.
+#[derive(Debug, Clone)]
+pub struct LayerScores {
+    /// The features' name.
+    pub features: String,
+    /// The encoder they come from.
+    pub encoder: String,
+    /// The room.
+    pub room: String,
+    /// Columns of a feature.
+    pub dim: usize,
+    /// Mutual k-NN, 0 to 1.
+    pub m1: f64,
+    /// Intrinsic dimension by TwoNN.
+    pub m2_two_nn: f64,
+    /// Intrinsic dimension by maximum likelihood.
+    pub m2_mle: f64,
+    /// Rows that M2 dropped because they equal another row.
+    pub m2_dropped: usize,
+    /// R² of ridge regression.
+    pub m3_r2: f64,
+    /// Mean over seeds of the adapter's R².
+    pub m4_r2: f64,
+    /// Mean over seeds of R² of translation.
+    pub m4_translation: f64,
+    /// Mean over seeds of R² of rotation.
+    pub m4_rotation: f64,
+    /// Sample standard deviation over seeds of the adapter's R².
+    pub m4_deviation: f64,
+    /// The adapter's R², one per seed.
+    pub m4_runs: Vec<f64>,
+}
+
+/// Scores one feature set in one room.
+///
+/// # Errors
+/// [`Error::Probe`] or [`Error::Training`] when the room is too short for a probe.
+pub fn score_layer(data: &RoomData<'_>, protocol: &LayerProtocol) -> Result<LayerScores, Error> {
+    let room = data.room;
+    let rows = data.features.rows();
+    let plan = &protocol.plan;
+
+    let m1 = mutual_knn(rows, room.poses(), &protocol.mutual_knn)?;
+    let m2 = intrinsic_dimension(rows, protocol.gap, Duplicates::DropRows)?;
+    let m3 = ridge_probe(rows, room, plan.split, plan.stride)?;
+
+    let adapter = |seed: u64| -> Result<MotionScores, Error> {
+        let (_, record) = train_adapter(&[*data], &plan.with_seed(seed), &mut |_| ())?;
+        Ok(record.test)
+    };
+    let adapters: Vec<MotionScores> = (0..protocol.seeds)
+        .into_par_iter()
+        .map(adapter)
+        .collect::<Result<_, Error>>()?;
+    let m4_runs: Vec<f64> = adapters.iter().map(|scores| scores.overall).collect();
+    let m4 = MotionScores::mean(&adapters);
+
+    let source = data.features.source();
+    Ok(LayerScores {
+        features: source.name.clone(),
+        encoder: source.encoder.clone(),
+        room: room.id().to_string(),
+        dim: source.dim,
+        m1,
+        m2_two_nn: m2.two_nn.linear,
+        m2_mle: m2.mle_biased.harmonic,
+        m2_dropped: m2.dropped,
+        m3_r2: m3.overall,
+        m4_r2: mean(&m4_runs),
+        m4_translation: m4.translation,
+        m4_rotation: m4.rotation,
+        m4_deviation: deviation(&m4_runs),
+        m4_runs,
+    })
+}

@@ -1,0 +1,89 @@
+//! What researchers run: each experiment computes its results and owns their types.
+//!
+//! - [`seeds`]: one training plan with several seeds.
+//! - [`probe`] and [`layers`]: M1 to M4 of features in rooms, and over the layers of an encoder.
+//! - [`formulations`]: the adapter beside the paper's alternatives.
+//! - [`adapter_sweep`]: a grid of adapters, one row per run.
+//! - [`cross_room`]: an adapter in rooms that it never saw.
+//! - [`odometry`]: a tracker along held-out frames.
+//!
+//! An experiment takes rooms that are loaded ([`seese3_core::training::RoomData`]) and reads and
+//! writes no file. [`crate::report`] renders the results.
+
+pub mod adapter_sweep;
+pub mod cross_room;
+pub mod formulations;
+pub mod layers;
+pub mod odometry;
+pub mod probe;
+pub mod seeds;
+
+use seese3_core::{adapter, calibration, eval, navigation, splits, tracking, training, trajectory};
+
+use crate::probes;
+
+/// Why an experiment has no result.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// No adapter could be trained.
+    #[error(transparent)]
+    Training(#[from] training::Error),
+    /// An adapter refused its input.
+    #[error(transparent)]
+    Adapter(#[from] adapter::Error),
+    /// An adapter's errors could not be measured.
+    #[error(transparent)]
+    Calibration(#[from] calibration::Error),
+    /// A room could not be navigated in.
+    #[error(transparent)]
+    Navigation(#[from] navigation::Error),
+    /// Navigators could not be evaluated.
+    #[error(transparent)]
+    Evaluation(#[from] eval::Error),
+    /// A camera could not be tracked.
+    #[error(transparent)]
+    Tracking(#[from] tracking::Error),
+    /// Two paths could not be compared.
+    #[error(transparent)]
+    Trajectory(#[from] trajectory::Error),
+    /// Features could not be probed.
+    #[error(transparent)]
+    Probe(#[from] probes::Error),
+    /// A room gives no pairs.
+    #[error(transparent)]
+    Splits(#[from] splits::Error),
+    /// A result could not be rendered.
+    #[error("a result cannot be rendered")]
+    Rendering(#[source] Box<dyn std::error::Error + Send + Sync>),
+    /// Seeds have 32 bits, as PyTorch's have.
+    #[error("--seed and --seeds reach over 2³²")]
+    Seed,
+    /// What failed, and why.
+    #[error("{what}")]
+    In {
+        /// The room, or the part of the experiment.
+        what: String,
+        /// Why it failed.
+        #[source]
+        problem: Box<Error>,
+    },
+    /// What the experiment needs and did not get, in words.
+    #[error("{0}")]
+    Input(String),
+}
+
+/// Says in an error what failed.
+pub(crate) trait Within<T> {
+    /// Names the room or the part that failed, if it failed.
+    fn within(self, what: impl Fn() -> String) -> Result<T, Error>;
+}
+
+impl<T, E: Into<Error>> Within<T> for Result<T, E> {
+    fn within(self, what: impl Fn() -> String) -> Result<T, Error> {
+        self.map_err(|problem| Error::In {
+            what: what(),
+            problem: Box::new(problem.into()),
+        })
+    }
+}

@@ -1,0 +1,353 @@
+//! How well a tracker does on frames that its map does not hold: paths, covariances, and whether it
+//! knows when it is lost.
+//!
+//! Start reading at [`evaluate`]. Every room is mapped and tracked under one hold-out; frames of the
+//! other rooms are then played to its tracker, which should answer LOST.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use seese3_core::adapter::Adapter;
+use seese3_core::cancel::Cancellation;
+use seese3_core::navigation::{IndexKind, Navigator};
+use seese3_core::room::Room;
+use seese3_core::splits::HoldOut;
+use seese3_core::tracking::{
+    InitialPose, Map, MotionSurprise, Replay, Segment, Status, Tracker, TrackerSettings,
+    relocalize, replay,
+};
+use seese3_core::training::RoomData;
+use seese3_core::trajectory::{Relation, RpePairs, Statistics, Trajectory, ape, rpe};
+
+use super::{Error, Within};
+
+/// Nanoseconds between the frames of a recording without times: a camera at 30 Hz.
+const PERIOD_NS: i64 = 33_333_333;
+/// How many frames of another room are played to a room's tracker.
+const OTHER_ROOM_FRAMES: usize = 60;
+/// Every so many tracked frames, one is looked for in all rooms.
+const RELOCALISED_STEP: usize = 5;
+
+/// What decides an evaluation besides the rooms and the adapter.
+#[derive(Debug, Clone, Copy)]
+pub struct OdometryProtocol {
+    /// Which frames are mapped and which are tracked.
+    pub hold_out: HoldOut,
+    /// Settings of the trackers.
+    pub settings: TrackerSettings,
+}
+
+/// A tracker over one room.
+pub struct TrackedRoom {
+    room: Arc<Room>,
+    map: Arc<Map>,
+    tracker: Tracker,
+}
+
+/// How a room was tracked in.
+#[derive(Debug, Clone)]
+pub struct RoomOdometry {
+    /// The room.
+    pub room: String,
+    /// How it was recorded.
+    pub format: String,
+    /// Frames that the map holds.
+    pub mapped_frames: usize,
+    /// Frames that were tracked.
+    pub tracked_frames: usize,
+    /// Errors of dead reckoning, laid on the true first pose.
+    pub odom: PathErrors,
+    /// Errors of the fused path, over the frames where a place was known.
+    pub fused: PathErrors,
+    /// Squared Mahalanobis lengths of the errors of map poses whose neighbours in time are mapped.
+    pub map_poses_mapped: Vec<f64>,
+    /// The same where the neighbours are not mapped.
+    pub map_poses_unmapped: Vec<f64>,
+    /// Errors of read motions, with the lengths of the motions.
+    pub motions: Vec<MotionSurprise>,
+    /// Shares of frames by status.
+    pub statuses: StatusShares,
+    /// The same stream when nothing was known at its beginning.
+    pub unknown_start: UnknownStart,
+    /// Frames of other rooms, played to the tracker as the beginning of a stream.
+    pub other_rooms_from_start: LostFrames,
+    /// Frames of other rooms, played after this room's own.
+    pub other_rooms_after_own: LostFrames,
+}
+
+/// Errors of a path without alignment, as root mean squares.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PathErrors {
+    /// Absolute translation errors, metres.
+    pub ape_m: f64,
+    /// Absolute rotation errors, radians.
+    pub ape_rad: f64,
+    /// Relative translation errors over one frame, metres.
+    pub rpe_m: f64,
+}
+
+impl PathErrors {
+    /// Of a path with fewer than two poses.
+    const UNKNOWN: Self = Self {
+        ape_m: f64::NAN,
+        ape_rad: f64::NAN,
+        rpe_m: f64::NAN,
+    };
+}
+
+/// Shares of frames by the status that they were answered with.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StatusShares {
+    /// TRACKING.
+    pub tracking: f64,
+    /// DEGRADED.
+    pub degraded: f64,
+    /// LOST.
+    pub lost: f64,
+    /// RELOCALIZING.
+    pub relocalizing: f64,
+}
+
+/// A stream of which nothing was known at its beginning.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UnknownStart {
+    /// The share of frames that were answered LOST.
+    pub lost: f64,
+    /// Frames until the place was right; none if it never was.
+    pub frames_to_relocalise: Option<usize>,
+}
+
+/// How many frames of other rooms were answered LOST.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct LostFrames {
+    /// Frames that were played.
+    pub frames: usize,
+    /// Frames that were answered LOST.
+    pub lost: usize,
+}
+
+/// Which room single views were taken to be in.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Relocalisation {
+    /// The right room was named.
+    pub right: usize,
+    /// A wrong room was named.
+    pub wrong: usize,
+    /// No room was named.
+    pub ambiguous: usize,
+    /// The number of rooms to choose from.
+    pub rooms: usize,
+}
+
+/// Trackers over each of several rooms, mapped as the protocol says.
+///
+/// # Errors
+/// [`Error`] when a room is too small or the adapter has no error model.
+pub fn trackers(
+    rooms: &[RoomData<'_>],
+    adapter: &Arc<Adapter>,
+    protocol: &OdometryProtocol,
+) -> Result<Vec<TrackedRoom>, Error> {
+    let tracker = |data: &RoomData<'_>| {
+        let room = Arc::new(data.room.clone());
+        let mapped = protocol.hold_out.mapped(room.frame_count());
+        let navigator = Navigator::new(
+            room.clone(),
+            data.features,
+            adapter.clone(),
+            IndexKind::Exact,
+        )?;
+
+        let what = || format!("room '{}'", room.id());
+        let map = Arc::new(Map::new(Arc::new(navigator), &mapped).within(what)?);
+        let tracker = Tracker::new(vec![map.clone()], protocol.settings).within(what)?;
+        Ok(TrackedRoom { room, map, tracker })
+    };
+
+    rooms.iter().map(tracker).collect()
+}
+
+/// Tracks the held-out frames of every room; `done` hears of each room's replay, for its paths.
+///
+/// # Errors
+/// [`Error`] when a room's path cannot be compared with the true one.
+pub fn evaluate(
+    rooms: &[TrackedRoom],
+    hold_out: HoldOut,
+    done: &(dyn Fn(&RoomOdometry, &Replay) + Sync),
+) -> Result<Vec<RoomOdometry>, Error> {
+    let one = |room: &TrackedRoom| {
+        let own = own_replay(room, hold_out, InitialPose::Given);
+        let found = room_odometry(room, rooms, hold_out, &own)?;
+        done(&found, &own);
+        Ok(found)
+    };
+
+    rooms.par_iter().map(one).collect()
+}
+
+/// Looks for single views of the tracked frames in all rooms; with one room there is no choice.
+///
+/// # Errors
+/// [`Error`] of matching the views.
+pub fn relocalisation(rooms: &[TrackedRoom], hold_out: HoldOut) -> Result<Relocalisation, Error> {
+    let maps: Vec<Arc<Map>> = rooms.iter().map(|room| room.map.clone()).collect();
+
+    let of_room = |(place, room): (usize, &TrackedRoom)| {
+        let mut found = Relocalisation::default();
+        let tracked = hold_out.tracked(room.room.frame_count());
+
+        for frame in tracked.into_iter().step_by(RELOCALISED_STEP) {
+            let latent = room.map.navigator().latents().row(frame.row()).to_owned();
+            let answer = relocalize(&maps, &[latent], 1, &Cancellation::default())?;
+
+            if answer.ambiguous {
+                found.ambiguous += 1;
+            } else if answer.rooms[0].map == place {
+                found.right += 1;
+            } else {
+                found.wrong += 1;
+            }
+        }
+
+        Ok(found)
+    };
+
+    let by_room: Vec<Relocalisation> = rooms
+        .par_iter()
+        .enumerate()
+        .map(of_room)
+        .collect::<Result<_, Error>>()?;
+    let sum = |of: fn(&Relocalisation) -> usize| by_room.iter().map(of).sum();
+
+    Ok(Relocalisation {
+        right: sum(|found| found.right),
+        wrong: sum(|found| found.wrong),
+        ambiguous: sum(|found| found.ambiguous),
+        rooms: rooms.len(),
+    })
+}
+
+fn room_odometry(
+    room: &TrackedRoom,
+    all: &[TrackedRoom],
+    hold_out: HoldOut,
+    own: &Replay,
+) -> Result<RoomOdometry, Error> {
+    let frame_count = room.room.frame_count();
+    let what = || format!("room '{}'", room.room.id());
+
+    let odom = path_errors(&own.odom_path(), &own.truth).within(what)?;
+    let fused_path = own.map_path();
+    let fused = if fused_path.rows.len() < 2 {
+        PathErrors::UNKNOWN
+    } else {
+        path_errors(&fused_path.path, &own.truth.select(&fused_path.rows))?
+    };
+
+    let unknown = own_replay(room, hold_out, InitialPose::Unknown);
+    let tracked = hold_out.tracked(frame_count);
+    let has_mapped_neighbours =
+        |row: usize| hold_out.has_mapped_neighbours(tracked[row], frame_count);
+
+    Ok(RoomOdometry {
+        room: room.room.id().to_string(),
+        format: room.room.provenance().format.clone(),
+        mapped_frames: hold_out.mapped(frame_count).len(),
+        tracked_frames: own.updates.len(),
+        odom,
+        fused,
+        map_poses_mapped: own.map_pose_surprises_where(has_mapped_neighbours),
+        map_poses_unmapped: own.map_pose_surprises_where(|row| !has_mapped_neighbours(row)),
+        motions: own.motion_surprises(),
+        statuses: StatusShares {
+            tracking: own.share(Status::Tracking),
+            degraded: own.share(Status::Degraded),
+            lost: own.share(Status::Lost),
+            relocalizing: own.share(Status::Relocalizing),
+        },
+        unknown_start: UnknownStart {
+            lost: unknown.share(Status::Lost),
+            frames_to_relocalise: unknown.frames_to_relocalise(),
+        },
+        other_rooms_from_start: lost_frames(room, all, None),
+        other_rooms_after_own: lost_frames(room, all, Some(hold_out)),
+    })
+}
+
+fn path_errors(estimate: &Trajectory, reference: &Trajectory) -> Result<PathErrors, Error> {
+    let absolute = |relation| -> Result<f64, Error> {
+        Ok(Statistics::of(&ape(reference, estimate, relation)?).rmse)
+    };
+    let relative = rpe(
+        reference,
+        estimate,
+        Relation::Translation,
+        1,
+        RpePairs::Consecutive,
+    )?;
+
+    Ok(PathErrors {
+        ape_m: absolute(Relation::Translation)?,
+        ape_rad: absolute(Relation::Rotation)?,
+        rpe_m: Statistics::of(&relative).rmse,
+    })
+}
+
+/// The tracked frames of a room, replayed through its own tracker.
+fn own_replay(room: &TrackedRoom, hold_out: HoldOut, initial_pose: InitialPose) -> Replay {
+    let segment = Segment {
+        latents: room.map.navigator().latents(),
+        poses: room.room.poses(),
+        frames: &hold_out.tracked(room.room.frame_count()),
+    };
+
+    replay(&room.tracker, &[segment], PERIOD_NS, initial_pose)
+}
+
+/// Frames of every other room, played to a room's tracker: as the beginning of a stream, or after
+/// the last frames that the hold-out tracks in the room itself. A tracker that knows when it is lost
+/// answers LOST to all of them.
+fn lost_frames(room: &TrackedRoom, all: &[TrackedRoom], own: Option<HoldOut>) -> LostFrames {
+    let own_frames = own.map(|hold_out| {
+        let mut frames = hold_out.tracked(room.room.frame_count());
+        frames.split_off(frames.len().saturating_sub(OTHER_ROOM_FRAMES))
+    });
+
+    let mut found = LostFrames::default();
+    for other in all.iter().filter(|other| other.room.id() != room.room.id()) {
+        let mut frames = HoldOut::Interleaved.tracked(other.room.frame_count());
+        frames.truncate(OTHER_ROOM_FRAMES);
+        let theirs = Segment {
+            latents: other.map.navigator().latents(),
+            poses: other.room.poses(),
+            frames: &frames,
+        };
+
+        let replayed = match &own_frames {
+            None => replay(&room.tracker, &[theirs], PERIOD_NS, InitialPose::Unknown),
+            Some(own_frames) => {
+                let ours = Segment {
+                    latents: room.map.navigator().latents(),
+                    poses: room.room.poses(),
+                    frames: own_frames,
+                };
+                replay(
+                    &room.tracker,
+                    &[ours, theirs],
+                    PERIOD_NS,
+                    InitialPose::Given,
+                )
+            }
+        };
+
+        // The other room's frames are the last ones that were played.
+        let updates = &replayed.updates[replayed.updates.len() - frames.len()..];
+        let is_lost = |update: &&seese3_core::tracking::Update| update.status == Status::Lost;
+        found.frames += updates.len();
+        found.lost += updates.iter().filter(is_lost).count();
+    }
+
+    found
+}

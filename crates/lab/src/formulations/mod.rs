@@ -1,0 +1,215 @@
+//! The paper's alternatives to the adapter: other ways from two features to a motion (Sec. A.5).
+//!
+//! - A: M = ψ(z₂) ψ(z₁)⁻¹ with ψ: d → SE(3), trained on the motion in the world frame.
+//! - B: the same ψ, trained on absolute poses.
+//! - C: M = head(φ(z₂) − φ(z₁)), a pose, trained on the motion in the body frame.
+//! - D: W φ(z₂ − z₁), trained on z-scored twists.
+//!
+//! All are scored by the twist in the body frame of the first camera. They are compared, not
+//! served.
+
+mod difference_input;
+mod geodesic_head;
+mod pose_head;
+mod world_pose;
+
+pub use difference_input::DifferenceInput;
+pub use geodesic_head::GeodesicHead;
+pub use world_pose::{AbsolutePose, UnanchoredMotion, WorldPose};
+
+use ndarray::ArrayView2;
+
+use seese3_core::adapter::building_blocks::{Seeded, fit};
+use seese3_core::adapter::{EpochProgress, Objective, Samples, TrainConfig, Widths};
+use seese3_core::geometry::{Pose, Twist, log};
+use seese3_core::motion_scores::MotionScores;
+use seese3_core::splits::Pair;
+use seese3_core::training::{self, RoomData, TrainingPlan, check_rooms, motions, test_pairs};
+
+/// A model that predicts a motion from two features.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Formulation {
+    /// The adapter: W(φ(z₂) − φ(z₁)).
+    Poincare,
+    /// A: ψ(z₂) ψ(z₁)⁻¹, trained on motions in the world frame.
+    Unanchored,
+    /// B: the same ψ, trained on absolute poses.
+    Absolute,
+    /// C: a pose head on φ(z₂) − φ(z₁).
+    GeodesicHead,
+    /// D: W φ(z₂ − z₁).
+    DifferenceInput,
+}
+
+impl Formulation {
+    /// The adapter, then the paper's four.
+    pub const ALL: [Self; 5] = [
+        Self::Poincare,
+        Self::Unanchored,
+        Self::Absolute,
+        Self::GeodesicHead,
+        Self::DifferenceInput,
+    ];
+
+    /// Its name in tables and on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Poincare => "poincare",
+            Self::Unanchored => "a-unanchored",
+            Self::Absolute => "b-absolute",
+            Self::GeodesicHead => "c-se3-mlp",
+            Self::DifferenceInput => "d-difference-input",
+        }
+    }
+}
+
+/// Trains one formulation on all rooms together and scores it on each room's test pairs.
+///
+/// # Errors
+/// As [`training::train_adapter`]; [`training::Error::NotPlain`] when a setting is one that only the
+/// adapter supports.
+///
+/// Source: SeeSE3, Sec. A.5.
+pub fn train_formulation(
+    formulation: Formulation,
+    room_data: &[RoomData<'_>],
+    plan: &TrainingPlan,
+    progress: &mut dyn FnMut(EpochProgress),
+) -> Result<Vec<MotionScores>, training::Error> {
+    if formulation == Formulation::Poincare {
+        // Settings that only the adapter supports would favour it in the comparison, so the other
+        // formulations refuse them below.
+        return Ok(training::train_adapter(room_data, plan, progress)?
+            .1
+            .room_tests);
+    }
+
+    plan.check()?;
+    check_rooms(room_data)?;
+    let plain = TrainConfig::default();
+
+    let TrainConfig {
+        standardise,
+        charts,
+        loss,
+        ..
+    } = plan.config;
+
+    if (standardise, charts, loss) != (plain.standardise, plain.charts, plain.loss) {
+        return Err(training::Error::NotPlain);
+    }
+
+    let tests = test_pairs(room_data, plan)?;
+    let samples = training::samples(room_data, plan)?;
+
+    let TrainConfig {
+        hidden,
+        latent,
+        seed,
+        ..
+    } = plan.config;
+    let widths = Widths {
+        feature: samples.feature_dim(),
+        hidden,
+        latent,
+    };
+
+    // One seeded stream draws the initial weights and then the order of the pairs, as PyTorch does
+    // after `torch.manual_seed`.
+    let mut random = Seeded::new(seed);
+    let config = &plan.config;
+
+    let mut run = Run {
+        room_data,
+        tests: &tests,
+        samples: &samples,
+        config,
+    };
+
+    // The formulations differ only in their network and in how its output becomes a motion.
+    Ok(match formulation {
+        Formulation::Unanchored => {
+            let start = UnanchoredMotion(WorldPose::random(widths, &mut random));
+            run.scores(start, &mut random, progress, |network, ends| {
+                network.0.motion(ends)
+            })?
+        }
+        Formulation::Absolute => {
+            let start = AbsolutePose(WorldPose::random(widths, &mut random));
+            run.scores(start, &mut random, progress, |network, ends| {
+                network.0.motion(ends)
+            })?
+        }
+        Formulation::GeodesicHead => {
+            let start = GeodesicHead::random(widths, &mut random);
+            run.scores(start, &mut random, progress, |network, ends| {
+                network.motions(ends.features)
+            })?
+        }
+
+        // The adapter has returned above; it stands here only to complete the match.
+        Formulation::Poincare | Formulation::DifferenceInput => {
+            let start = DifferenceInput::random(widths, &mut random);
+            let scale = samples.scale();
+
+            run.scores(start, &mut random, progress, |network, ends| {
+                network.motions(ends.features, scale)
+            })?
+        }
+    })
+}
+
+/// The two ends of pairs, as a formulation sees them.
+pub struct Ends<'a> {
+    /// Features of the sources and of the targets, each (n, d).
+    pub features: [ArrayView2<'a, f32>; 2],
+    /// `world_from_camera` of the sources.
+    pub sources: &'a [Pose],
+}
+
+struct Run<'a> {
+    room_data: &'a [RoomData<'a>],
+    tests: &'a [Vec<Pair>],
+    samples: &'a Samples<f32>,
+    config: &'a TrainConfig,
+}
+
+impl Run<'_> {
+    fn scores<N: Objective<f32, Data = Samples<f32>>>(
+        &mut self,
+        start: N,
+        random: &mut Seeded,
+        progress: &mut dyn FnMut(EpochProgress),
+        predict: impl Fn(&N, Ends<'_>) -> Vec<Twist>,
+    ) -> Result<Vec<MotionScores>, training::Error> {
+        let network = fit(self.samples, start, self.config, random, progress)?;
+        let score = |(data, pairs): (&RoomData<'_>, &Vec<Pair>)| {
+            let rows = |end: fn(&Pair) -> usize| {
+                let rows: Vec<usize> = pairs.iter().map(end).collect();
+                data.features.rows().select(ndarray::Axis(0), &rows)
+            };
+            let sources = rows(|pair| pair.source.row());
+
+            let targets = rows(|pair| pair.target.row());
+
+            let poses: Vec<Pose> = pairs
+                .iter()
+                .map(|pair| data.room.poses()[pair.source.row()])
+                .collect();
+            let ends = Ends {
+                features: [sources.view(), targets.view()],
+                sources: &poses,
+            };
+
+            MotionScores::of(&motions(data.room.poses(), pairs), &predict(&network, ends))
+        };
+
+        Ok(self.room_data.iter().zip(self.tests).map(score).collect())
+    }
+}
+
+/// log(P₁⁻¹ M P₁): a motion M in the world frame, P₂ = M P₁, as a twist in the body frame of the
+/// first camera.
+fn body_motion(world: &Pose, source: &Pose) -> Twist {
+    log(&(source.inv_mul(world) * source))
+}

@@ -1,0 +1,205 @@
+//! M2: the intrinsic dimension of the features, that is of the manifold on which they lie.
+//!
+//! Distances are computed directly, in f64. Expanding them as ‖x‖² − 2xy + ‖y‖² cancels for
+//! duplicate rows and gives meaningless dimensions.
+
+use ndarray::{ArrayView2, Axis};
+use rayon::prelude::*;
+
+use super::Error;
+use seese3_core::statistics::{mean, median};
+
+/// Number of neighbours K of the maximum-likelihood estimate.
+const MLE_NEIGHBOURS: usize = 20;
+/// Share of the largest ratios that TwoNN leaves out.
+const DISCARDED: f64 = 0.1;
+
+/// How identical rows are treated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Duplicates {
+    /// A row whose nearest neighbour is at distance zero is dropped, as in scikit-dimension.
+    DropRows,
+    /// The first of each group of identical rows is kept.
+    KeepFirst,
+}
+
+/// TwoNN (Facco et al. 2017), estimated in three ways.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TwoNn {
+    /// Slope of −log(1 − F) over log μ through the origin, without the largest tenth of the ratios
+    /// μ: the usual estimate.
+    pub linear: f64,
+    /// Maximum likelihood with the largest tenth of the ratios censored.
+    pub censored: f64,
+    /// Maximum likelihood over all ratios.
+    pub likelihood: f64,
+}
+
+/// MLE (Levina and Bickel 2004) over 20 neighbours. The unbiased form normalises by K − 2, the
+/// biased one by K − 1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Mle {
+    /// The harmonic mean over rows (MacKay and Ghahramani): the usual combination.
+    pub harmonic: f64,
+    /// The mean over rows.
+    pub mean: f64,
+    /// The median over rows.
+    pub median: f64,
+}
+
+/// M2 by every estimator.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct IntrinsicDimension {
+    /// See [`TwoNn`].
+    pub two_nn: TwoNn,
+    /// Normalised by K − 1.
+    pub mle_biased: Mle,
+    /// Normalised by K − 2.
+    pub mle_unbiased: Mle,
+    /// Rows that were used.
+    pub used: usize,
+    /// Rows that were dropped as duplicates.
+    pub dropped: usize,
+}
+
+/// The intrinsic dimension of `rows` (n, d). Rows at most `gap` apart do not count as neighbours;
+/// with 0 only the row itself is left out.
+///
+/// # Errors
+/// [`Error::TooFewRows`] when fewer than 21 rows are left without duplicates;
+/// [`Error::TooFewCandidates`] when the gap leaves a row fewer than 20 candidates.
+///
+/// Source: SeeSE3, M2; the paper states neither gap nor K.
+pub fn intrinsic_dimension(
+    rows: ArrayView2<'_, f32>,
+    gap: usize,
+    duplicates: Duplicates,
+) -> Result<IntrinsicDimension, Error> {
+    let all = rows.mapv(f64::from);
+    let kept: Vec<usize> = match duplicates {
+        Duplicates::DropRows => (0..all.nrows()).collect(),
+        Duplicates::KeepFirst => {
+            let mut seen = std::collections::HashSet::new();
+
+            // Rows are compared bit by bit; adding 0.0 turns −0.0 into 0.0, so that equal numbers
+            // have equal bits.
+            let bits = |row: usize| {
+                all.row(row)
+                    .iter()
+                    .map(|x| (x + 0.0).to_bits())
+                    .collect::<Vec<_>>()
+            };
+
+            (0..all.nrows())
+                .filter(|&row| seen.insert(bits(row)))
+                .collect()
+        }
+    };
+
+    let points = all.select(Axis(0), &kept);
+    let nearest = |row: usize| -> Result<Vec<f64>, Error> {
+        let here = points.row(row);
+        let mut squares: Vec<f64> = (0..points.nrows())
+            .filter(|&other| other != row && other.abs_diff(row) > gap)
+            .map(|other| {
+                here.iter()
+                    .zip(points.row(other))
+                    .map(|(x, y)| (x - y) * (x - y))
+                    .sum()
+            })
+            .collect();
+
+        if squares.len() < MLE_NEIGHBOURS {
+            return Err(Error::TooFewCandidates {
+                frame: kept[row],
+                k: MLE_NEIGHBOURS,
+                exclusion: gap,
+            });
+        }
+
+        // Only the K nearest have to be sorted; selecting them first is linear in the number of
+        // rows.
+        squares.select_nth_unstable_by(MLE_NEIGHBOURS - 1, f64::total_cmp);
+        squares.truncate(MLE_NEIGHBOURS);
+        squares.sort_by(f64::total_cmp);
+
+        Ok(squares.into_iter().map(f64::sqrt).collect())
+    };
+
+    let distances: Vec<Vec<f64>> = (0..points.nrows())
+        .into_par_iter()
+        .map(nearest)
+        .collect::<Result<_, _>>()?;
+
+    // The estimators divide by the nearest distance, so rows at distance zero to another are
+    // dropped.
+    let usable: Vec<&Vec<f64>> = distances.iter().filter(|row| row[0] > 0.0).collect();
+
+    if usable.len() <= MLE_NEIGHBOURS {
+        return Err(Error::TooFewRows {
+            kept: usable.len(),
+            rows: all.nrows(),
+            needed: MLE_NEIGHBOURS + 1,
+        });
+    }
+
+    Ok(IntrinsicDimension {
+        two_nn: two_nn(&usable),
+        mle_biased: mle(&usable, MLE_NEIGHBOURS as f64 - 1.0),
+        mle_unbiased: mle(&usable, MLE_NEIGHBOURS as f64 - 2.0),
+        used: usable.len(),
+        dropped: all.nrows() - usable.len(),
+    })
+}
+
+fn two_nn(distances: &[&Vec<f64>]) -> TwoNn {
+    // log μ of each row, with μ the distance to its second neighbour over that to its first.
+    let mut logs: Vec<f64> = distances.iter().map(|row| (row[1] / row[0]).ln()).collect();
+    logs.sort_by(f64::total_cmp);
+    let count = logs.len();
+    let used = (count as f64 * (1.0 - DISCARDED)) as usize;
+
+    let likelihood = (count as f64 - 1.0) / logs.iter().sum::<f64>();
+
+    // −log(1 − F) at the i-th smallest ratio, with the empirical F = (i + 1)/n.
+    let share = |i: usize| -(1.0 - (i + 1) as f64 / count as f64).ln();
+    let used_logs = &logs[..used];
+    let square: f64 = used_logs.iter().map(|x| x * x).sum();
+
+    let linear = used_logs
+        .iter()
+        .enumerate()
+        .map(|(i, x)| x * share(i))
+        .sum::<f64>()
+        / square;
+
+    // All that is used of a censored ratio is that it is at least as large as the last one kept.
+    let tail = (count - used) as f64 * used_logs.last().copied().unwrap_or(f64::NAN);
+    let censored = (used as f64 - 1.0) / (used_logs.iter().sum::<f64>() + tail);
+
+    TwoNn {
+        linear,
+        censored,
+        likelihood,
+    }
+}
+
+fn mle(distances: &[&Vec<f64>], factor: f64) -> Mle {
+    // One row's estimate: the factor over Σ_j log(r_K / r_j).
+    let of = |row: &&Vec<f64>| {
+        factor
+            / row
+                .iter()
+                .map(|r| (row[row.len() - 1] / r).ln())
+                .sum::<f64>()
+    };
+
+    let each: Vec<f64> = distances.iter().map(of).collect();
+    let inverse: Vec<f64> = each.iter().map(|m| 1.0 / m).collect();
+
+    Mle {
+        harmonic: 1.0 / mean(&inverse),
+        mean: mean(&each),
+        median: median(&each),
+    }
+}

@@ -1,0 +1,51 @@
+//! The probes M1 to M3: how much of SE(3) a room's features hold before an adapter is trained on
+//! them. M4, the score of a trained adapter, is in `training`.
+
+mod intrinsic_dimension;
+mod mutual_knn;
+mod ridge_probe;
+
+pub use intrinsic_dimension::{Duplicates, IntrinsicDimension, Mle, TwoNn, intrinsic_dimension};
+pub use mutual_knn::{Bound, Counted, MutualKnn, feature_neighbours, mutual_knn, pose_neighbours};
+pub use ridge_probe::ridge_probe;
+
+use seese3_core::{ridge, splits};
+
+/// Why a probe has no value.
+#[derive(Debug, thiserror::Error, PartialEq)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum Error {
+    #[error("{frames} frames at stride {stride} need {needed} frames, the room has {have}")]
+    TooFewFrames {
+        frames: usize,
+        stride: usize,
+        needed: usize,
+        have: usize,
+    },
+    #[error(
+        "frame {frame} has fewer than {k} candidates that are more than {exclusion} frames away"
+    )]
+    TooFewCandidates {
+        frame: usize,
+        k: usize,
+        exclusion: usize,
+    },
+    #[error("{what} must be at least {least}, got {given}")]
+    TooSmall {
+        what: &'static str,
+        least: usize,
+        given: usize,
+    },
+    #[error("row {row} of the features is zero; it has no direction")]
+    NoDirection { row: usize },
+    #[error("{kept} of {rows} rows are left without duplicates; {needed} are needed")]
+    TooFewRows {
+        kept: usize,
+        rows: usize,
+        needed: usize,
+    },
+    #[error(transparent)]
+    Pairs(#[from] splits::Error),
+    #[error(transparent)]
+    Ridge(#[from] ridge::Error),
+}

@@ -1,0 +1,272 @@
+//! M1: whether frames with similar features have similar poses, measured as the overlap of their
+//! nearest neighbours.
+
+use ndarray::{ArrayView2, Axis};
+use rayon::prelude::*;
+
+use super::Error;
+use seese3_core::geometry::Pose;
+
+/// The options of M1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MutualKnn {
+    /// Number of frames that are compared: 0, s, 2s, … of the room.
+    pub frames: usize,
+    /// The stride s, in frames of the room.
+    pub stride: usize,
+    /// Number of neighbours of each frame.
+    pub k: usize,
+    /// Frames within this temporal distance do not count as neighbours; a frame itself never does.
+    pub exclusion: usize,
+    /// The unit of `exclusion`.
+    pub counted: Counted,
+    /// Whether a frame at exactly the distance `exclusion` is left out too.
+    pub bound: Bound,
+}
+
+/// What a temporal distance is counted in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Counted {
+    /// The frames that are compared.
+    Sampled,
+    /// The frames of the room.
+    Native,
+}
+
+/// Whether a range includes its limit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Bound {
+    /// The limit is included.
+    Inclusive,
+    /// The limit is not included.
+    Exclusive,
+}
+
+impl MutualKnn {
+    /// Whether two of the compared frames may be neighbours.
+    fn apart(&self, frame: usize, other: usize) -> bool {
+        let distance = match self.counted {
+            Counted::Sampled => frame.abs_diff(other),
+            Counted::Native => frame.abs_diff(other).saturating_mul(self.stride),
+        };
+        let near = match self.bound {
+            Bound::Inclusive => distance <= self.exclusion,
+            Bound::Exclusive => distance < self.exclusion,
+        };
+
+        frame != other && !near
+    }
+}
+
+impl Default for MutualKnn {
+    /// The paper's: 256 frames, k = 10, 10 frames to each side left out.
+    fn default() -> Self {
+        Self {
+            frames: 256,
+            stride: 1,
+            k: 10,
+            exclusion: 10,
+            counted: Counted::Sampled,
+            bound: Bound::Inclusive,
+        }
+    }
+}
+
+/// The mean share of a frame's k nearest by feature (cosine) that are among its k nearest by pose,
+/// 0 to 1.
+///
+/// `rows` are features (n, d), `poses` are `world_from_camera`, metres.
+///
+/// # Errors
+/// [`Error::TooSmall`] for an option that is 0; [`Error::TooFewFrames`] when the room is too short;
+/// [`Error::TooFewCandidates`] when the exclusion leaves a frame fewer than k candidates;
+/// [`Error::NoDirection`] when a feature is zero.
+///
+/// Source: SeeSE3, M1.
+pub fn mutual_knn(
+    rows: ArrayView2<'_, f32>,
+    poses: &[Pose],
+    options: &MutualKnn,
+) -> Result<f64, Error> {
+    let by_feature = feature_neighbours(rows, options)?;
+    let by_pose = pose_neighbours(poses, options)?;
+    let shared =
+        |(a, b): (&Vec<usize>, &Vec<usize>)| a.iter().filter(|frame| b.contains(frame)).count();
+    let shared: usize = by_feature.iter().zip(&by_pose).map(shared).sum();
+
+    Ok(shared as f64 / (options.frames * options.k) as f64)
+}
+
+/// The k nearest neighbours of each compared frame by the cosine of their features, nearest first;
+/// ties go to the smaller frame number.
+///
+/// # Errors
+/// As [`mutual_knn`].
+pub fn feature_neighbours(
+    rows: ArrayView2<'_, f32>,
+    options: &MutualKnn,
+) -> Result<Vec<Vec<usize>>, Error> {
+    let sampled = sampled(rows.nrows(), options)?;
+    let mut units = rows.select(Axis(0), &sampled).mapv(f64::from);
+    for (mut row, &frame) in units.outer_iter_mut().zip(&sampled) {
+        let norm = row.iter().map(|x| x * x).sum::<f64>().sqrt();
+        if norm == 0.0 {
+            return Err(Error::NoDirection { row: frame });
+        }
+
+        row /= norm;
+    }
+
+    // Summed in the same order for every pair, so that identical rows have exactly the same
+    // distance to any other row.
+    let distance = |a: usize, b: usize| {
+        1.0 - units
+            .row(a)
+            .iter()
+            .zip(units.row(b))
+            .map(|(x, y)| x * y)
+            .sum::<f64>()
+    };
+
+    neighbours(options, distance)
+}
+
+/// The k nearest neighbours of each compared frame, nearest first, by the Euclidean distance of (t,
+/// R[:, 0], R[:, 1]), metres and unitless.
+///
+/// # Errors
+/// As [`mutual_knn`].
+pub fn pose_neighbours(poses: &[Pose], options: &MutualKnn) -> Result<Vec<Vec<usize>>, Error> {
+    // The first two columns of R determine the third, so that nine numbers describe a pose.
+    let nine = |frame: usize| -> [f64; 9] {
+        let t = poses[frame].translation.vector;
+        let r = poses[frame].rotation.to_rotation_matrix();
+        let r = r.matrix();
+        std::array::from_fn(|i| if i < 3 { t[i] } else { r[(i % 3, i / 3 - 1)] })
+    };
+    let points: Vec<[f64; 9]> = sampled(poses.len(), options)?
+        .into_iter()
+        .map(nine)
+        .collect();
+
+    let distance = |a: usize, b: usize| {
+        points[a]
+            .iter()
+            .zip(&points[b])
+            .map(|(x, y)| (x - y) * (x - y))
+            .sum::<f64>()
+            .sqrt()
+    };
+
+    neighbours(options, distance)
+}
+
+fn sampled(have: usize, options: &MutualKnn) -> Result<Vec<usize>, Error> {
+    let &MutualKnn {
+        frames, stride, k, ..
+    } = options;
+    for (what, given) in [("frames", frames), ("stride", stride), ("k", k)] {
+        if given == 0 {
+            return Err(Error::TooSmall {
+                what,
+                least: 1,
+                given,
+            });
+        }
+    }
+
+    let needed = (frames - 1).saturating_mul(stride).saturating_add(1);
+    if needed > have {
+        return Err(Error::TooFewFrames {
+            frames,
+            stride,
+            needed,
+            have,
+        });
+    }
+
+    Ok((0..frames).map(|frame| frame * stride).collect())
+}
+
+fn neighbours(
+    options: &MutualKnn,
+    distance: impl Fn(usize, usize) -> f64 + Sync,
+) -> Result<Vec<Vec<usize>>, Error> {
+    let &MutualKnn {
+        frames,
+        k,
+        exclusion,
+        ..
+    } = options;
+
+    let of = |frame: usize| {
+        let apart = |other: &usize| options.apart(frame, *other);
+        let mut others: Vec<(f64, usize)> = (0..frames)
+            .filter(apart)
+            .map(|other| (distance(frame, other), other))
+            .collect();
+
+        if others.len() < k {
+            return Err(Error::TooFewCandidates {
+                frame,
+                k,
+                exclusion,
+            });
+        }
+
+        // Ties go to the smaller frame number, so that the neighbours are the same in every run.
+        others.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        Ok(others.into_iter().take(k).map(|(_, other)| other).collect())
+    };
+
+    (0..frames).into_par_iter().map(of).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand, of a frame and the one three samples on, six frames of the room.
+    #[test]
+    fn distances_are_counted_as_asked() {
+        let apart = |counted, bound, exclusion| {
+            MutualKnn {
+                stride: 2,
+                exclusion,
+                counted,
+                bound,
+                ..MutualKnn::default()
+            }
+            .apart(4, 7)
+        };
+
+        assert!(
+            apart(Counted::Sampled, Bound::Inclusive, 2)
+                && !apart(Counted::Sampled, Bound::Inclusive, 3)
+        );
+
+        assert!(
+            apart(Counted::Sampled, Bound::Exclusive, 3)
+                && !apart(Counted::Sampled, Bound::Exclusive, 4)
+        );
+
+        assert!(
+            apart(Counted::Native, Bound::Inclusive, 5)
+                && !apart(Counted::Native, Bound::Inclusive, 6)
+        );
+
+        assert!(
+            apart(Counted::Native, Bound::Exclusive, 6)
+                && !apart(Counted::Native, Bound::Exclusive, 7)
+        );
+
+        assert!(
+            !MutualKnn {
+                exclusion: 0,
+                bound: Bound::Exclusive,
+                ..MutualKnn::default()
+            }
+            .apart(3, 3)
+        );
+    }
+}

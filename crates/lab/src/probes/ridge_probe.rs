@@ -1,0 +1,62 @@
+//! M3: how well a linear map predicts a motion from the difference of two features.
+
+use ndarray::{Array2, ArrayView2, Axis};
+
+use super::Error;
+use seese3_core::geometry::{Twist, body_twist};
+use seese3_core::motion_scores::MotionScores;
+use seese3_core::ridge::{Intercept, Ridge};
+use seese3_core::room::Room;
+use seese3_core::splits::{Pair, Split};
+
+/// R² on the test pairs of a ridge regression (α = 1, with intercept) from feature differences to
+/// motions.
+///
+/// `rows` are the room's features (n, d), one a frame. Differences are taken in f64.
+///
+/// # Errors
+/// [`Error::Pairs`] if the room is too short for the stride.
+///
+/// Source: SeeSE3, M3.
+pub fn ridge_probe(
+    rows: ArrayView2<'_, f32>,
+    room: &Room,
+    split: Split,
+    stride: u32,
+) -> Result<MotionScores, Error> {
+    let train = split.train_pairs(room.timeline(), stride)?;
+    let test = split.test_pairs(room.timeline(), stride)?;
+    let (train_x, train_y) = samples(rows, room, &train);
+    let targets = Array2::from_shape_fn((train_y.len(), 6), |(row, c)| train_y[row].to_vector()[c]);
+    let fit = Ridge::fit(train_x.view(), targets.view(), 1.0, Intercept::Fitted)?;
+
+    let (test_x, truth) = samples(rows, room, &test);
+    let predicted: Vec<Twist> = test_x
+        .outer_iter()
+        .map(|x| {
+            let y = fit.predict(x);
+            Twist::from_vector(&nalgebra::Vector6::from_fn(|c, _| y[c]))
+        })
+        .collect();
+
+    Ok(MotionScores::of(&truth, &predicted))
+}
+
+fn samples(rows: ArrayView2<'_, f32>, room: &Room, pairs: &[Pair]) -> (Array2<f64>, Vec<Twist>) {
+    let ends = |end: fn(&Pair) -> usize| {
+        rows.select(Axis(0), &pairs.iter().map(end).collect::<Vec<_>>())
+            .mapv(f64::from)
+    };
+
+    let motion = |pair: &Pair| {
+        body_twist(
+            &room.poses()[pair.source.row()],
+            &room.poses()[pair.target.row()],
+        )
+    };
+
+    (
+        ends(|pair| pair.target.row()) - ends(|pair| pair.source.row()),
+        pairs.iter().map(motion).collect(),
+    )
+}

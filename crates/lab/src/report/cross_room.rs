@@ -1,0 +1,204 @@
+//! Results of an adapter in rooms that it was not trained on, for `seese3 cross-room`.
+
+use serde_json::{Value, json};
+
+use super::json::{motion_json, rate_json};
+use super::table::aligned;
+use crate::experiments::cross_room::{CrossRoomRun, MotionSummary, RoomOutcome, wins};
+use seese3_core::statistics::{RoomMean, bootstrap_mean, paired_difference};
+
+/// One line per navigator: the number of rooms in which it beats Identity with Wilson's interval,
+/// its mean hit rate, and by how much that exceeds the hit rate of `baseline`. The intervals of the
+/// last two come from a bootstrap over rooms.
+pub fn cross_room_table(run: &CrossRoomRun, baseline: &str, threshold: f64) -> String {
+    let head = [
+        "navigator".to_owned(),
+        "beats Identity in".to_owned(),
+        format!("Hit@{threshold}"),
+        format!("over {baseline}"),
+    ];
+    let mut lines = vec![head.to_vec()];
+
+    let theirs = run.hit_rates(baseline);
+    for name in run.navigators() {
+        let ours = run.hit_rates(name);
+
+        let won = wins(&run.outcomes, name).map_or_else(String::new, |rate| {
+            format!(
+                "{}/{} ({:.0} %, {:.3}–{:.3})",
+                rate.successes(),
+                rate.n,
+                100.0 * rate.rate,
+                rate.low,
+                rate.high
+            )
+        });
+
+        // The difference is taken room by room, which needs a hit rate of both navigators in
+        // every room.
+        let over = match theirs.len() == ours.len() && name != baseline {
+            true => room_difference_text(&paired_difference(&ours, &theirs, 0)),
+            false => String::new(),
+        };
+
+        lines.push(vec![
+            name.to_owned(),
+            won,
+            room_mean_text(&bootstrap_mean(&ours, 0)),
+            over,
+        ]);
+    }
+
+    aligned(&lines)
+}
+
+/// One line per run: R² over the held-out rooms against the number of training rooms.
+pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str, threshold: f64) -> String {
+    let mut head = [
+        "rooms",
+        "seed",
+        "R² > 0",
+        "R² > 0.3",
+        "best R²",
+        "mean max(R², −1)",
+    ]
+    .map(str::to_owned)
+    .to_vec();
+
+    head.push(format!("Hit@{threshold}, {baseline}"));
+    let mut lines = vec![head];
+    for run in runs {
+        // A run without evaluated rooms has no line.
+        let Some(summary) = MotionSummary::of(&run.r2(), 0) else {
+            continue;
+        };
+
+        let MotionSummary {
+            positive,
+            above_0_3,
+            best,
+            clipped,
+        } = summary;
+
+        lines.push(vec![
+            run.training_rooms.len().to_string(),
+            run.seed.to_string(),
+            format!(
+                "{:.0} % ({}/{})",
+                100.0 * positive.rate,
+                positive.successes(),
+                positive.n
+            ),
+            format!("{:.0} %", 100.0 * above_0_3.rate),
+            format!("{best:.3}"),
+            room_mean_text(&clipped),
+            room_mean_text(&bootstrap_mean(&run.hit_rates(baseline), 0)),
+        ]);
+    }
+
+    aligned(&lines)
+}
+
+/// One line per room: the number of pairs, R², and each navigator's hit rate.
+pub fn rooms_table(run: &CrossRoomRun) -> String {
+    let names = run.navigators();
+    let mut lines = vec![
+        ["room", "n", "R²"]
+            .into_iter()
+            .chain(names.iter().copied())
+            .map(str::to_owned)
+            .collect::<Vec<_>>(),
+    ];
+
+    for outcome in &run.outcomes {
+        let mut cells = vec![
+            outcome.room.to_string(),
+            outcome.motion.n.to_string(),
+            format!("{:.3}", outcome.motion.overall),
+        ];
+
+        let rate = |name: &&str| {
+            outcome
+                .hit_rate(name)
+                .map_or_else(String::new, |rate| format!("{:.3}", rate.rate))
+        };
+        cells.extend(names.iter().map(rate));
+
+        lines.push(cells);
+    }
+
+    aligned(&lines)
+}
+
+/// The runs as JSON, with a summary over rooms and the scores of every room.
+pub fn cross_room_json(runs: &[CrossRoomRun], baseline: &str) -> Value {
+    let run = |run: &CrossRoomRun| {
+        let theirs = run.hit_rates(baseline);
+        let navigator = |name: &str| {
+            let ours = run.hit_rates(name);
+            json!({
+                "name": name,
+                "beats_identity": wins(&run.outcomes, name).map(|rate| rate_json(&rate)),
+                "hit": room_mean_json(&bootstrap_mean(&ours, 0)),
+                "over_baseline": room_mean_json(&paired_difference(&ours, &theirs, 0)),
+            })
+        };
+
+        let room = |outcome: &RoomOutcome| {
+            let rates = outcome.rows.iter().filter_map(|row| {
+                Some((row.name.clone(), rate_json(&outcome.hit_rate(&row.name)?)))
+            });
+
+            json!({
+                "room": outcome.room.as_str(),
+                "candidates": outcome.candidate_count,
+                "motion": motion_json(&outcome.motion),
+                "hit": rates.collect::<serde_json::Map<_, _>>(),
+            })
+        };
+
+        let summary = MotionSummary::of(&run.r2(), 0).map(|summary| {
+            json!({
+                "positive": rate_json(&summary.positive),
+                "above_0.3": rate_json(&summary.above_0_3),
+                "best": summary.best,
+                "clipped_mean": room_mean_json(&summary.clipped),
+            })
+        });
+
+        json!({
+            "learned_rooms": run.training_rooms,
+            "calibration_rooms": run.calibration_rooms,
+            "seed": run.seed,
+            "r2": summary,
+            "navigators": run.navigators().into_iter().map(navigator).collect::<Vec<_>>(),
+            "rooms": run.outcomes.iter().map(room).collect::<Vec<_>>(),
+            "skipped": run.skipped.iter().map(|(room, why)| json!({ "room": room, "why": why })).collect::<Vec<_>>(),
+        })
+    };
+
+    json!({ "baseline": baseline, "runs": runs.iter().map(run).collect::<Vec<_>>() })
+}
+
+/// A mean over rooms as JSON.
+pub fn room_mean_json(mean: &RoomMean) -> Value {
+    json!({ "mean": mean.mean, "low": mean.low, "high": mean.high, "rooms": mean.rooms })
+}
+
+/// A mean over rooms with its 95 % interval, as text.
+pub fn room_mean_text(mean: &RoomMean) -> String {
+    // A bootstrap over a single room has no spread, so that there is no interval to show.
+    if mean.rooms < 2 {
+        return format!("{:.3}", mean.mean);
+    }
+
+    format!("{:.3} [{:.3}, {:.3}]", mean.mean, mean.low, mean.high)
+}
+
+/// A signed difference over rooms with its 95 % interval, as text.
+pub fn room_difference_text(mean: &RoomMean) -> String {
+    if mean.rooms < 2 {
+        return format!("{:+.3}", mean.mean);
+    }
+    format!("{:+.3} [{:+.3}, {:+.3}]", mean.mean, mean.low, mean.high)
+}

@@ -1,0 +1,191 @@
+//! Plots of curves and scattered points, as SVG.
+
+use super::Error;
+use plotters::coord::Shift;
+use plotters::prelude::*;
+
+/// A named set of points (x, y).
+#[derive(Debug, Clone)]
+pub struct Series {
+    /// Name in the legend.
+    pub name: String,
+    /// Points in the order in which a line joins them; those that are not finite are left out.
+    pub points: Vec<[f64; 2]>,
+    /// Whether a line joins the points.
+    pub joined: bool,
+}
+
+/// A plot.
+#[derive(Debug, Clone)]
+pub struct Curves {
+    /// Title, drawn above the plot.
+    pub title: String,
+    /// Label of the x axis.
+    pub x: String,
+    /// Label of the y axis.
+    pub y: String,
+    /// Sets of points, each in its own colour; the ninth has the colour of the first again.
+    pub series: Vec<Series>,
+    /// Whether the line y = x is drawn.
+    pub diagonal: bool,
+}
+
+const SIZE: (u32, u32) = (1_080, 520);
+/// Left edge of the legend, pixels. It stands beside the plot so that it covers no points.
+const LEGEND_X: u32 = 800;
+const COLOURS: [RGBColor; 8] = [
+    RGBColor(31, 119, 180),
+    RGBColor(214, 96, 20),
+    RGBColor(44, 140, 70),
+    RGBColor(148, 103, 189),
+    RGBColor(140, 86, 75),
+    RGBColor(200, 60, 90),
+    RGBColor(100, 100, 100),
+    RGBColor(23, 160, 180),
+];
+
+/// The plot as an SVG document.
+///
+/// # Errors
+/// [`Error::Picture`], if the drawing library refuses.
+pub fn curves_svg(curves: &Curves) -> Result<String, Error> {
+    let mut svg = String::new();
+    {
+        let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
+        draw(&root, curves).map_err(|error| Error::Picture {
+            problem: error.to_string(),
+        })?;
+    }
+
+    Ok(svg)
+}
+
+fn draw(
+    root: &DrawingArea<SVGBackend<'_>, Shift>,
+    curves: &Curves,
+) -> Result<(), Box<dyn std::error::Error>> {
+    root.fill(&WHITE)?;
+    let (plot, legend) = root.split_horizontally(LEGEND_X);
+
+    // Values that are not finite are not drawn, and must not decide the ranges of the axes.
+    let values = |axis: usize| {
+        curves
+            .series
+            .iter()
+            .flat_map(|s| &s.points)
+            .map(move |p| p[axis])
+            .filter(|value| value.is_finite())
+    };
+
+    let mut x_range = range(values(0));
+    let mut y_range = range(values(1));
+    if curves.diagonal {
+        // Both axes share one range, so that the diagonal y = x runs through the whole plot.
+        let both = x_range.start.min(y_range.start)..x_range.end.max(y_range.end);
+        x_range = both.clone();
+        y_range = both;
+    }
+
+    let mut chart = ChartBuilder::on(&plot)
+        .caption(&curves.title, ("sans-serif", 20))
+        .margin(12)
+        .x_label_area_size(42)
+        .y_label_area_size(56)
+        .build_cartesian_2d(x_range.clone(), y_range.clone())?;
+
+    chart
+        .configure_mesh()
+        .light_line_style(WHITE)
+        .x_desc(&curves.x)
+        .y_desc(&curves.y)
+        .draw()?;
+
+    if curves.diagonal {
+        chart.draw_series(LineSeries::new(
+            [(x_range.start, x_range.start), (x_range.end, x_range.end)],
+            BLACK.mix(0.3),
+        ))?;
+    }
+
+    for (place, (series, colour)) in curves.series.iter().zip(COLOURS.iter().cycle()).enumerate() {
+        let points: Vec<(f64, f64)> = series
+            .points
+            .iter()
+            .filter(|p| p.iter().all(|value| value.is_finite()))
+            .map(|p| (p[0], p[1]))
+            .collect();
+
+        if series.joined {
+            chart.draw_series(LineSeries::new(
+                points.iter().copied(),
+                colour.stroke_width(2),
+            ))?;
+        }
+
+        // Points are marked on joined lines too, since only they are measured.
+        chart.draw_series(points.iter().map(|&at| Circle::new(at, 3, colour.filled())))?;
+
+        // The legend is drawn by hand, one line of 22 pixels per series.
+        let at = 60 + 22 * i32::try_from(place).unwrap_or(0);
+        legend.draw(&Circle::new((8, at + 7), 4, colour.filled()))?;
+
+        legend.draw(&Text::new(
+            series.name.clone(),
+            (20, at),
+            ("sans-serif", 13),
+        ))?;
+    }
+
+    root.present()?;
+    Ok(())
+}
+
+/// The range of the values with a margin to both sides; 0 to 1 if there are no values.
+fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
+    let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
+        (low.min(v), high.max(v))
+    });
+    if low > high {
+        return 0.0..1.0;
+    }
+
+    // Equal values would give an empty range, which cannot be drawn.
+    let margin = if high > low { 0.06 * (high - low) } else { 0.5 };
+    low - margin..high + margin
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: SVG's own words: a circle for every point that is a number (and one a series for the
+    /// legend), labels as given.
+    #[test]
+    fn every_point_is_drawn() {
+        let points = vec![[0.0, 1.0], [1.0, 2.0], [2.0, f64::NAN]];
+        let series = vec![Series {
+            name: "grows".to_owned(),
+            points,
+            joined: true,
+        }];
+
+        let curves = Curves {
+            title: "T".to_owned(),
+            x: "rooms".to_owned(),
+            y: "hits".to_owned(),
+            series,
+            diagonal: false,
+        };
+
+        let svg = curves_svg(&curves).unwrap();
+        assert_eq!(svg.matches("<circle").count(), 2 + 1);
+        assert!(svg.contains("grows") && svg.contains("rooms") && svg.contains("hits"));
+
+        let empty = Curves {
+            series: Vec::new(),
+            ..curves
+        };
+
+        assert!(curves_svg(&empty).unwrap().contains("<svg"));
+    }
+}

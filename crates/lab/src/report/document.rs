@@ -1,0 +1,260 @@
+//! A report of sections, tables and pictures: as Markdown with the pictures in files beside it, or
+//! as one HTML file with the pictures embedded.
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+
+/// A report.
+#[derive(Debug, Clone, Default)]
+pub struct Document {
+    /// Its title.
+    pub title: String,
+    /// Sections, in order.
+    pub sections: Vec<Section>,
+}
+
+/// A part with a heading.
+#[derive(Debug, Clone, Default)]
+pub struct Section {
+    /// Its heading.
+    pub title: String,
+    /// Paragraphs, tables and pictures, in order.
+    pub blocks: Vec<Block>,
+}
+
+/// A piece of a section.
+#[derive(Debug, Clone)]
+pub enum Block {
+    /// A paragraph, plain text.
+    Text(String),
+    /// A table, row by row; the first row is the head.
+    Table(Vec<Vec<String>>),
+    /// A picture.
+    Picture(Picture),
+}
+
+/// A picture.
+#[derive(Debug, Clone)]
+pub struct Picture {
+    /// Its file name, which ends with `.svg` or `.png`.
+    pub name: String,
+    /// The bytes of the SVG or PNG file.
+    pub bytes: Vec<u8>,
+    /// The caption, which is also the alternative text.
+    pub caption: String,
+}
+
+impl Section {
+    /// An empty section.
+    pub fn new(title: impl Into<String>) -> Self {
+        Self {
+            title: title.into(),
+            blocks: Vec::new(),
+        }
+    }
+
+    /// Adds a paragraph.
+    pub fn text(&mut self, text: impl Into<String>) {
+        self.blocks.push(Block::Text(text.into()));
+    }
+
+    /// Adds a table, row by row; the first row is the head.
+    pub fn table(&mut self, rows: Vec<Vec<String>>) {
+        self.blocks.push(Block::Table(rows));
+    }
+
+    /// Adds a picture.
+    pub fn picture(&mut self, name: impl Into<String>, bytes: Vec<u8>, caption: impl Into<String>) {
+        self.blocks.push(Block::Picture(Picture {
+            name: name.into(),
+            bytes,
+            caption: caption.into(),
+        }));
+    }
+}
+
+impl Document {
+    /// Every picture of the report, in order.
+    pub fn pictures(&self) -> impl Iterator<Item = &Picture> {
+        self.sections
+            .iter()
+            .flat_map(|section| &section.blocks)
+            .filter_map(|block| match block {
+                Block::Picture(picture) => Some(picture),
+                _ => None,
+            })
+    }
+
+    /// The report as Markdown. Links to pictures point into `folder`, a path relative to the
+    /// Markdown file; an empty `folder` means that the pictures lie beside it.
+    pub fn markdown(&self, folder: &str) -> String {
+        let mut text = format!("# {}\n", self.title);
+        for section in &self.sections {
+            text.push_str(&format!("\n## {}\n", section.title));
+
+            for block in &section.blocks {
+                text.push('\n');
+
+                match block {
+                    Block::Text(paragraph) => text.push_str(&format!("{paragraph}\n")),
+                    Block::Table(rows) => text.push_str(&markdown_table(rows)),
+                    Block::Picture(Picture { name, caption, .. }) => {
+                        let path = if folder.is_empty() {
+                            name.clone()
+                        } else {
+                            format!("{folder}/{name}")
+                        };
+                        text.push_str(&format!("![{caption}]({path})\n"));
+                    }
+                }
+            }
+        }
+
+        text
+    }
+
+    /// The report as one HTML file with the pictures embedded, so that it refers to no other file.
+    pub fn html(&self) -> String {
+        let mut body = format!("<h1>{}</h1>\n", escaped(&self.title));
+        for section in &self.sections {
+            body.push_str(&format!("<h2>{}</h2>\n", escaped(&section.title)));
+
+            for block in &section.blocks {
+                match block {
+                    Block::Text(paragraph) => {
+                        body.push_str(&format!("<p>{}</p>\n", escaped(paragraph)))
+                    }
+                    Block::Table(rows) => body.push_str(&html_table(rows)),
+                    Block::Picture(Picture {
+                        name,
+                        bytes,
+                        caption,
+                    }) => {
+                        let kind = if name.ends_with(".svg") {
+                            "svg+xml"
+                        } else {
+                            "png"
+                        };
+
+                        // A data URI puts the picture into the page itself.
+                        let data = STANDARD.encode(bytes);
+                        let caption = escaped(caption);
+                        body.push_str(&format!(
+                            "<figure><img alt=\"{caption}\" src=\"data:image/{kind};base64,{data}\">\
+                             <figcaption>{caption}</figcaption></figure>\n"
+                        ));
+                    }
+                }
+            }
+        }
+
+        let title = escaped(&self.title);
+        format!(
+            "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{title}</title>\
+             <style>{STYLE}</style></head>\n<body>\n{body}</body></html>\n"
+        )
+    }
+}
+
+const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem}\
+table{border-collapse:collapse;margin:1rem 0;font-variant-numeric:tabular-nums}\
+th,td{border-bottom:1px solid #ccc;padding:.2rem .6rem;text-align:right}\
+th:first-child,td:first-child{text-align:left}figure{margin:1rem 0}img{max-width:100%}figcaption{color:#555}";
+
+fn markdown_table(rows: &[Vec<String>]) -> String {
+    let line = |cells: &[String]| {
+        let cells: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|")).collect();
+        format!("| {} |\n", cells.join(" | "))
+    };
+
+    let Some((head, rest)) = rows.split_first() else {
+        return String::new();
+    };
+
+    // Markdown aligns by column: the first column holds names, the others hold numbers.
+    let rule: Vec<String> = (0..head.len())
+        .map(|column| if column == 0 { "---" } else { "---:" }.to_owned())
+        .collect();
+
+    [line(head), line(&rule)]
+        .into_iter()
+        .chain(rest.iter().map(|row| line(row)))
+        .collect()
+}
+
+fn html_table(rows: &[Vec<String>]) -> String {
+    let line = |cells: &[String], tag: &str| {
+        let cells: String = cells
+            .iter()
+            .map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell)))
+            .collect();
+        format!("<tr>{cells}</tr>\n")
+    };
+
+    let body: String = rows
+        .iter()
+        .enumerate()
+        .map(|(i, row)| line(row, if i == 0 { "th" } else { "td" }))
+        .collect();
+
+    format!("<table>\n{body}</table>\n")
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
+        .replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn document() -> Document {
+        let mut section = Section::new("R² < 0?");
+        section.text("5 > 3 & so on");
+
+        section.table(vec![
+            vec!["a|b".to_owned(), "n".to_owned()],
+            vec!["x".to_owned(), "1".to_owned()],
+        ]);
+
+        section.picture("p.svg", b"<svg/>".to_vec(), "A \"curve\"");
+
+        Document {
+            title: "T".to_owned(),
+            sections: vec![section],
+        }
+    }
+
+    /// Oracle: the two formats by hand.
+    #[test]
+    fn a_document_is_written_in_both_formats() {
+        let markdown = document().markdown("pictures");
+        assert!(
+            markdown.contains("| a\\|b | n |\n| --- | ---: |\n| x | 1 |"),
+            "{markdown}"
+        );
+
+        assert!(
+            markdown.contains("![A \"curve\"](pictures/p.svg)"),
+            "{markdown}"
+        );
+
+        let html = document().html();
+        assert!(
+            html.contains("<h2>R² &lt; 0?</h2>") && html.contains("<p>5 &gt; 3 &amp; so on</p>"),
+            "{html}"
+        );
+
+        // echo -n '<svg/>' | base64
+        assert!(
+            html.contains("data:image/svg+xml;base64,PHN2Zy8+")
+                && html.contains("A &quot;curve&quot;"),
+            "{html}"
+        );
+
+        assert!(!html.contains("p.svg"), "nothing outside is needed");
+    }
+}

@@ -1,0 +1,70 @@
+//! R² of the adapter beside that of the alternative formulations, in the shape of the paper's table
+//! (Sec. A.5).
+
+use serde_json::{Value, json};
+
+use super::json::{motion_json, parts_json};
+use super::table::aligned;
+use crate::experiments::formulations::FormulationScores;
+use seese3_core::motion_scores::MotionScores;
+use seese3_core::statistics::{deviation, mean_of_known};
+
+/// One line per formulation: R² by part of the motion, averaged over seeds; the overall R² with its
+/// sample standard deviation.
+pub fn formulations_table(scores: &[FormulationScores]) -> String {
+    let head = [
+        "formulation",
+        "overall",
+        "transl.",
+        "rotation",
+        "direct.",
+        "magnit.",
+    ];
+
+    let mut lines = vec![head.map(str::to_owned).to_vec()];
+    for score in scores {
+        let column = |of: fn(&MotionScores) -> f64| score.runs.iter().map(of).collect::<Vec<f64>>();
+        let overall = column(|run| run.overall);
+
+        // A single seed has no standard deviation.
+        let spread = if overall.len() > 1 {
+            format!(" ± {:.3}", deviation(&overall))
+        } else {
+            String::new()
+        };
+
+        let parts = [
+            column(|run| run.translation),
+            column(|run| run.rotation),
+            column(|run| run.direction),
+            column(|run| run.magnitude),
+        ];
+
+        let mut cells = vec![
+            score.name.to_owned(),
+            format!("{:.3}{spread}", mean_of_known(&overall)),
+        ];
+        cells.extend(
+            parts
+                .iter()
+                .map(|part| format!("{:.3}", mean_of_known(part))),
+        );
+
+        lines.push(cells);
+    }
+
+    aligned(&lines)
+}
+
+/// The scores as JSON, one entry per formulation.
+pub fn formulations_json(scores: &[FormulationScores]) -> Value {
+    let entry = |score: &FormulationScores| {
+        json!({
+            "name": score.name,
+            "by_part": parts_json(&score.runs),
+            "runs": score.runs.iter().map(motion_json).collect::<Vec<_>>(),
+        })
+    };
+
+    json!({ "formulations": scores.iter().map(entry).collect::<Vec<_>>() })
+}

@@ -1,0 +1,77 @@
+//! What the given rooms say about the paper's claims, and about ours.
+
+use serde_json::{Value, json};
+
+use crate::report::Section;
+
+/// A claim and the evidence found for or against it.
+pub struct Claim {
+    /// The claim in one sentence.
+    pub claim: &'static str,
+    /// Whether these rooms confirm it.
+    pub verdict: Verdict,
+    /// The numbers behind the verdict, in words.
+    pub found: String,
+}
+
+/// The outcome of testing a claim.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// The claim holds in every case.
+    Confirmed,
+    /// The claim holds in no case.
+    Contradicted,
+    /// The claim holds for some feature sets or rooms and not for others.
+    Mixed,
+    /// There was no case to test the claim on.
+    Untested,
+}
+
+impl Verdict {
+    /// Confirmed if the claim holds in every case, contradicted if it holds in none of them.
+    pub fn of(holds: &[bool]) -> Self {
+        let held = holds.iter().filter(|&&holds| holds).count();
+        match held {
+            _ if holds.is_empty() => Self::Untested,
+            0 => Self::Contradicted,
+            count if count == holds.len() => Self::Confirmed,
+            _ => Self::Mixed,
+        }
+    }
+
+    fn word(self) -> &'static str {
+        match self {
+            Self::Confirmed => "confirmed",
+            Self::Contradicted => "contradicted",
+            Self::Mixed => "mixed",
+            Self::Untested => "not tested",
+        }
+    }
+}
+
+/// The table of claims, one row per claim.
+pub fn section(claims: &[Claim]) -> Section {
+    let mut section = Section::new("The paper's claims in these rooms");
+
+    let mut rows = vec![
+        ["claim", "here", "what was found"]
+            .map(str::to_owned)
+            .to_vec(),
+    ];
+
+    for claim in claims {
+        rows.push(vec![
+            claim.claim.to_owned(),
+            claim.verdict.word().to_owned(),
+            claim.found.clone(),
+        ]);
+    }
+
+    section.table(rows);
+    section
+}
+
+pub fn json(claims: &[Claim]) -> Value {
+    let entry = |claim: &Claim| json!({ "claim": claim.claim, "verdict": claim.verdict.word(), "found": claim.found });
+    Value::Array(claims.iter().map(entry).collect())
+}

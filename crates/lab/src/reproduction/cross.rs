@@ -1,0 +1,270 @@
+//! Rooms that were never seen: zero-shot navigation against Identity, and scaling with the number of
+//! training rooms.
+
+use serde_json::{Value, json};
+
+use seese3_core::statistics::{Rate, bootstrap_mean, mean};
+
+use super::claims::{Claim, Verdict};
+use super::in_room::plotted;
+use super::notes::published_name;
+use super::plans::SetResults;
+use super::{Error, Found, Reproduction, paper};
+use crate::experiments::cross_room::{CrossRoomRun, MotionSummary, wins};
+use crate::report::{Curves, Section, Series, cross_room_json, room_mean_text};
+
+/// The paper's navigator.
+pub const AFFINE: &str = "inverse-poincare-affine";
+/// The service's navigator.
+pub const HOMOGENEOUS: &str = "inverse-poincare-homogeneous";
+
+/// The section on zero-shot navigation against Identity, with the scaling curves.
+#[expect(
+    clippy::too_many_lines,
+    reason = "a section of the report: its loop, its table and its claim"
+)]
+pub fn zero_shot(
+    given: &Reproduction<'_>,
+    results: &[SetResults],
+    claims: &mut Vec<Claim>,
+) -> Result<Found, Error> {
+    let mut section =
+        Section::new("Rooms never seen: zero-shot, and by how many rooms were learned from");
+
+    let head = [
+        "features",
+        "navigator",
+        "beats Identity in",
+        "Hit@0.1 [95 %]",
+        "R² > 0",
+        "mean max(R², −1) [95 %]",
+    ];
+
+    let mut rows = vec![head.map(str::to_owned).to_vec()];
+    let mut hits = Vec::new();
+    let mut fractions = Vec::new();
+    let mut record = Vec::new();
+
+    let mut zero_shot = Vec::new();
+    let mut refitted = Vec::new();
+    let mut grows = Vec::new();
+    for set in results {
+        let features = set.features.as_str();
+        let whole = &set.baseline().run;
+        rows.extend(zero_shot_rows(features, whole));
+
+        // Wilson's lower bound has to be above one half, not only the share of rooms itself.
+        zero_shot.push(wins(&whole.outcomes, AFFINE).is_some_and(|rate| rate.low > 0.5));
+        refitted.push(mean_hit(whole, "ridge-refit-in-sample") > mean_hit(whole, AFFINE));
+
+        // The scaling curve: one preset, by the number of training rooms.
+        let points = |of: &dyn Fn(&CrossRoomRun) -> f64| {
+            set.by_size
+                .iter()
+                .map(|result| [result.plan.rooms as f64, of(&result.run)])
+                .collect::<Vec<_>>()
+        };
+        let hit = points(&|run| mean_hit(run, AFFINE));
+
+        // NaN marks a size at which no room has an R².
+        let fraction =
+            points(&|run| MotionSummary::of(&run.r2(), 0).map_or(f64::NAN, |s| s.positive.rate));
+
+        // Only the ends of the curve are compared: a plateau in between goes unnoticed.
+        grows.push(hit.last().map(|p| p[1]) > hit.first().map(|p| p[1]));
+
+        hits.push(Series {
+            name: features.to_owned(),
+            points: hit,
+            joined: true,
+        });
+
+        fractions.push(Series {
+            name: features.to_owned(),
+            points: fraction,
+            joined: true,
+        });
+
+        let adapters: Vec<String> = set
+            .by_size
+            .iter()
+            .map(|result| published_name(&result.plan.adapter_name(), features))
+            .collect();
+
+        let runs: Vec<CrossRoomRun> = set
+            .by_size
+            .iter()
+            .map(|result| result.run.clone())
+            .collect();
+        record.push(json!({ "features": features, "adapters": adapters, "paper_range_by_size": cross_room_json(&runs, AFFINE) }));
+    }
+
+    rows.extend(paper_rows());
+    section.table(rows);
+
+    // Only the run of the table reports its skipped rooms: paper-range on all rooms.
+    for set in results {
+        let features = &set.features;
+        for (room, why) in &set.baseline().run.skipped {
+            section.text(format!("Skipped with {features}: room {room}: {why}."));
+        }
+    }
+
+    section.text(format!(
+        "Preset paper-range on all rooms that are learned together, one seed; every pair of a held-out room at stride \
+         {}, all its frames are candidates, the source included. Intervals of counts are Wilson's; of means, those of \
+         drawing the rooms again. The refit is fitted on the very pairs it is scored on.",
+        given.options.stride
+    ));
+
+    add_curves(&mut section, hits, fractions)?;
+
+    // Each verdict is over feature sets: the claim holds for a set or it does not.
+    let count = |held: &[bool]| {
+        format!(
+            "so for {} of {} features",
+            held.iter().filter(|&&h| h).count(),
+            held.len()
+        )
+    };
+
+    claims.push(Claim {
+        claim: "zero-shot navigation beats Identity in most rooms never seen (Hit@0.1)",
+        verdict: Verdict::of(&zero_shot),
+        found: format!(
+            "Wilson's interval of the share of rooms is above one half: {}",
+            count(&zero_shot)
+        ),
+    });
+
+    claims.push(Claim {
+        claim: "refitting the linear step in the room itself does better than zero-shot",
+        verdict: Verdict::of(&refitted),
+        found: format!("mean Hit@0.1 is higher, in sample: {}", count(&refitted)),
+    });
+
+    claims.push(Claim {
+        claim: "more training rooms transfer better, without a plateau",
+        verdict: Verdict::of(&grows),
+        found: format!(
+            "Hit@0.1 with all rooms is above that with the fewest: {}",
+            count(&grows)
+        ),
+    });
+
+    Ok((section, Value::Array(record)))
+}
+
+/// Adds the scaling curves of hit rates and of the share of rooms with R² above 0.
+fn add_curves(
+    section: &mut Section,
+    hits: Vec<Series>,
+    fractions: Vec<Series>,
+) -> Result<(), Error> {
+    let plot = |title: &str, y: &str, series: Vec<Series>| {
+        let title = title.to_owned();
+        let x = "rooms learned from".to_owned();
+        let y = y.to_owned();
+
+        plotted(&Curves {
+            title,
+            x,
+            y,
+            series,
+            diagonal: false,
+        })
+    };
+
+    let caption = "Zero-shot Hit@0.1 of inverse Poincaré by how many rooms were learned from";
+    section.picture(
+        "scaling-hits.svg",
+        plot("Zero-shot Hit@0.1", "mean over held-out rooms", hits)?,
+        caption,
+    );
+
+    let caption = "Held-out rooms with R² above 0 by how many rooms were learned from";
+    section.picture(
+        "scaling-r2.svg",
+        plot("Rooms with R² > 0", "share of held-out rooms", fractions)?,
+        caption,
+    );
+
+    Ok(())
+}
+
+/// One row per navigator: how one adapter does in the held-out rooms.
+fn zero_shot_rows(features: &str, run: &CrossRoomRun) -> Vec<Vec<String>> {
+    let summary = MotionSummary::of(&run.r2(), 0);
+
+    let names = [
+        AFFINE,
+        HOMOGENEOUS,
+        "inverse-poincare-affine+row-space",
+        "inverse-poincare-affine+whitened",
+        "ridge-refit-in-sample",
+    ];
+
+    let row = |name: &str| {
+        // R² belongs to the adapter, not to a navigator, so only the first row shows it.
+        let [positive, clipped] = match (name, &summary) {
+            (AFFINE, Some(s)) => [rate_text(&s.positive), room_mean_text(&s.clipped)],
+            _ => [String::new(), String::new()],
+        };
+
+        let beats = wins(&run.outcomes, name)
+            .as_ref()
+            .map_or_else(String::new, rate_text);
+
+        let hit = room_mean_text(&bootstrap_mean(&run.hit_rates(name), 0));
+        vec![
+            features.to_owned(),
+            name.to_owned(),
+            beats,
+            hit,
+            positive,
+            clipped,
+        ]
+    };
+
+    names.map(row).to_vec()
+}
+
+/// The paper's counts of rooms in which a navigator beats Identity, as table rows.
+fn paper_rows() -> Vec<Vec<String>> {
+    let mut rows = Vec::new();
+    for (encoder, zero, refit) in paper::CROSS_ROOM {
+        for (what, count) in [("zero-shot", zero), ("ridge-refit", refit)] {
+            let cells = [
+                format!("paper: {encoder}"),
+                what.to_owned(),
+                count.to_owned(),
+            ];
+
+            // The paper gives no hit rates and no R² for these rows: three cells stay empty.
+            rows.push(
+                cells
+                    .into_iter()
+                    .chain([const { String::new() }; 3])
+                    .collect(),
+            );
+        }
+    }
+
+    rows
+}
+
+fn mean_hit(run: &CrossRoomRun, navigator: &str) -> f64 {
+    mean(&run.hit_rates(navigator))
+}
+
+/// A count of rooms with its share and Wilson's interval.
+pub fn rate_text(rate: &Rate) -> String {
+    format!(
+        "{}/{} ({:.0} %, {:.2}–{:.2})",
+        rate.successes(),
+        rate.n,
+        100.0 * rate.rate,
+        rate.low,
+        rate.high
+    )
+}

@@ -1,0 +1,328 @@
+//! The paper's tables and figures on given rooms, as one report.
+//!
+//! Start reading at [`reproduce`]: every experiment gives one section of the report and one entry of
+//! the record. Claims and adapters that the sections leave are collected in [`Notes`].
+
+mod better;
+mod claims;
+mod cross;
+mod in_room;
+mod notes;
+mod paper;
+mod pictures;
+mod plans;
+mod success;
+
+pub use claims::{Claim, Verdict};
+pub use notes::{Notes, ReproducedAdapter, published_name};
+
+use serde_json::{Map, Value, json};
+
+use seese3_core::image::RgbImage;
+use seese3_core::room::{FrameId, Room};
+use seese3_core::training::RoomData;
+
+use crate::experiments::Error;
+use crate::report::{Document, Section, theory_json, theory_table_rows};
+use crate::theory::{Effort, checks};
+
+/// What decides the numbers of a reproduction besides its rooms and features.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// Frames from source to target.
+    pub stride: u32,
+    /// Strides of the curves within a room.
+    pub strides: Vec<u32>,
+    /// Numbers of training rooms along the scaling curve.
+    pub sizes: Vec<usize>,
+    /// How many of the training rooms are calibration rooms where a plan has some.
+    pub calibration_rooms: usize,
+    /// How many seeds, from 0 on, where a table averages over seeds.
+    pub seeds: u64,
+    /// Epochs in place of every preset's own, for a trial.
+    pub epochs: Option<usize>,
+}
+
+/// The rooms of the three groups, each with the same one of its feature sets.
+pub struct FeatureSet<'a> {
+    /// The name of the features.
+    pub features: String,
+    /// Rooms that one adapter is trained on together.
+    pub train: Vec<RoomData<'a>>,
+    /// Held-out rooms, which the adapters of several rooms never see.
+    pub test: Vec<RoomData<'a>>,
+    /// Rooms that each get an adapter of their own.
+    pub in_room: Vec<RoomData<'a>>,
+}
+
+/// What is reproduced: options, and rooms with features.
+pub struct Reproduction<'a> {
+    /// What decides the numbers.
+    pub options: Options,
+    /// One entry per feature set, the control last; each has the same rooms.
+    pub sets: Vec<FeatureSet<'a>>,
+    /// Where the pictures of walks come from.
+    pub images: &'a dyn Images,
+}
+
+/// Access to the images of rooms, which lie outside of this crate's reach.
+pub trait Images: Sync {
+    /// The image of a frame.
+    ///
+    /// # Errors
+    /// Why it cannot be read, in words.
+    fn read(&self, room: &Room, frame: FrameId) -> Result<RgbImage, String>;
+
+    /// An image as a PNG file.
+    ///
+    /// # Errors
+    /// Why it cannot be encoded, in words.
+    fn png(&self, image: &RgbImage) -> Result<Vec<u8>, String>;
+}
+
+/// The report, its machine-readable record, and the adapters behind its numbers.
+pub struct Reproduced {
+    /// The report.
+    pub document: Document,
+    /// Everything in the report, as JSON.
+    pub record: Map<String, Value>,
+    /// The adapters of the navigation tables.
+    pub adapters: Vec<ReproducedAdapter>,
+}
+
+/// How many experiments [`reproduce`] runs.
+pub const EXPERIMENTS: u64 = 9;
+
+/// A section of the report and its machine-readable record.
+type Found = (Section, Value);
+
+/// Refuses options and rooms that could only fail after hours.
+///
+/// # Errors
+/// [`Error::Input`], which names the option to change.
+pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
+    for set in &given.sets {
+        // A room on both sides would turn the zero-shot numbers into training scores.
+        let is_held_out = |data: &&RoomData<'_>| {
+            set.test
+                .iter()
+                .any(|other| other.room.id() == data.room.id())
+        };
+        if let Some(data) = set.train.iter().find(is_held_out) {
+            return Err(Error::Input(format!(
+                "room '{}' is both learned from and held out",
+                data.room.id()
+            )));
+        }
+    }
+
+    // Every set holds the same rooms, so the first one stands for all.
+    let rooms = given.sets.first().map_or(0, |set| set.train.len());
+    let is_out_of_range = |size: &&usize| **size == 0 || **size > rooms;
+    if let Some(size) = given.options.sizes.iter().find(is_out_of_range) {
+        return Err(Error::Input(format!(
+            "--sizes: {size} must be 1 to {rooms}, the number of training rooms"
+        )));
+    }
+
+    let calibration_rooms = given.options.calibration_rooms;
+    if calibration_rooms >= rooms {
+        return Err(Error::Input(format!(
+            "--calibration-rooms must leave rooms to train on: {calibration_rooms} of {rooms} were set aside"
+        )));
+    }
+
+    Ok(())
+}
+
+/// The names of all adapters that a reproduction leaves, but for the number of rooms in some, so that
+/// they can be checked before hours of training.
+pub fn adapter_names(given: &Reproduction<'_>) -> Vec<String> {
+    let mut names = Vec::new();
+    for set in &given.sets {
+        let rooms = set.in_room.iter().map(|data| data.room.id().as_str());
+        let all = rooms.chain([plans::LONGEST_NAME]);
+        names.extend(all.map(|what| published_name(what, &set.features)));
+    }
+
+    names
+}
+
+/// Runs the paper's experiments; `done` hears of each.
+///
+/// # Errors
+/// [`Error`] of the first experiment that fails, or of [`check`].
+pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced, Error> {
+    check(given)?;
+
+    let mut notes = Notes::default();
+    let mut record = Map::new();
+    let mut experiments = Vec::new();
+    let mut keep = |name: &str, (section, value): Found| {
+        record.insert(name.to_owned(), value);
+        experiments.push(section);
+        done();
+    };
+
+    keep("probes", in_room::probes(given, &mut notes.claims)?);
+    keep("strides", in_room::strides(given, &mut notes.claims)?);
+    keep("rooms_alone", success::section(given)?);
+    keep(
+        "formulations",
+        in_room::formulations(given, &mut notes.claims)?,
+    );
+    keep("navigation", in_room::navigation(given, &mut notes)?);
+
+    // Adapters trained on many rooms, evaluated in rooms that they never saw.
+    let across = plans::evaluate(given, &mut notes)?;
+    keep(
+        "cross_room",
+        cross::zero_shot(given, &across, &mut notes.claims)?,
+    );
+    keep("better", better::better(&across, &mut notes.claims));
+
+    // The walks use the steady adapter that was trained for the sections before.
+    keep("pictures", pictures::section(given, &notes)?);
+    keep("theory", theory()?);
+
+    record.insert("claims".to_owned(), claims::json(&notes.claims));
+    record.insert("protocol".to_owned(), protocol(given));
+
+    // The verdicts are known only now, but stand near the top of the report, behind the rooms.
+    let mut sections = vec![rooms_and_features(given), claims::section(&notes.claims)];
+    sections.append(&mut experiments);
+    sections.push(published(&notes));
+
+    Ok(Reproduced {
+        document: Document {
+            title: "SeeSE3 reproduced".to_owned(),
+            sections,
+        },
+        record,
+        adapters: notes.adapters,
+    })
+}
+
+fn protocol(given: &Reproduction<'_>) -> Value {
+    let Options {
+        stride,
+        strides,
+        sizes,
+        calibration_rooms,
+        seeds,
+        epochs,
+    } = &given.options;
+
+    let names = |rooms: &[RoomData<'_>]| {
+        rooms
+            .iter()
+            .map(|data| json!([data.room.id().as_str(), data.revision]))
+            .collect::<Vec<_>>()
+    };
+    let features: Vec<&str> = given.sets.iter().map(|set| set.features.as_str()).collect();
+
+    // The sets differ in their features alone, so the first one names all rooms.
+    let set = &given.sets[0];
+    json!({
+        "features": features,
+        "stride": stride,
+        "strides": strides,
+        "sizes": sizes,
+        "aside": calibration_rooms,
+        "seeds": seeds,
+        "epochs_instead_of_the_presets": epochs,
+        "train": names(&set.train),
+        "test": names(&set.test),
+        "in_room": names(&set.in_room),
+    })
+}
+
+/// The section that lists the rooms and the feature sets.
+fn rooms_and_features(given: &Reproduction<'_>) -> Section {
+    let mut section = Section::new("Rooms and features");
+    section.table(room_rows(&given.sets[0]));
+    section.table(feature_rows(&given.sets));
+
+    section.text(
+        "The paper's numbers stand beside these as context: encoders, rooms and sizes differ, and nothing here speaks of \
+         models that were not run.",
+    );
+
+    // A report from a trial run must not be mistaken for a result.
+    if let Some(epochs) = given.options.epochs {
+        section.text(format!(
+            "All training was cut to {epochs} epochs: this is a trial of the command, not a result."
+        ));
+    }
+
+    section
+}
+
+/// The three groups of rooms; the sets differ in their features alone, so one stands for all.
+fn room_rows(set: &FeatureSet<'_>) -> Vec<Vec<String>> {
+    let head = ["rooms", "count", "frames", "recorded as"];
+    let mut rows = vec![head.map(str::to_owned).to_vec()];
+
+    for (what, rooms) in [
+        ("learned together", &set.train),
+        ("held out", &set.test),
+        ("learned alone", &set.in_room),
+    ] {
+        let frames: usize = rooms.iter().map(|data| data.room.frame_count()).sum();
+        let mut formats: Vec<&str> = rooms
+            .iter()
+            .map(|data| data.room.provenance().format.as_str())
+            .collect();
+        formats.sort_unstable();
+        formats.dedup();
+
+        rows.push(vec![
+            what.to_owned(),
+            rooms.len().to_string(),
+            frames.to_string(),
+            formats.join(", "),
+        ]);
+    }
+
+    rows
+}
+
+fn feature_rows(sets: &[FeatureSet<'_>]) -> Vec<Vec<String>> {
+    let head = ["features", "encoder", "layer", "pooling", "columns"];
+    let mut rows = vec![head.map(str::to_owned).to_vec()];
+
+    for set in sets {
+        // One room stands for all: rooms whose features differ in source cannot be trained on
+        // together.
+        let source = set.train[0].features.source();
+        rows.push(vec![
+            set.features.clone(),
+            source.encoder.clone(),
+            source.layer.clone(),
+            source.pooling.clone(),
+            source.dim.to_string(),
+        ]);
+    }
+
+    rows
+}
+
+/// The section that says under which names the adapters are published.
+fn published(notes: &Notes) -> Section {
+    let mut section = Section::new("Adapters");
+    section.text(format!(
+        "The {} adapters of the tables of navigation are in the store, named \"reproduced.\" and what they learned from: \
+         evaluate, navigate and serve take them. The record has their revisions, seeds and protocols; the other tables' \
+         adapters are what `seese3 train` gives for the same room, preset and seed.",
+        notes.adapters.len()
+    ));
+
+    section
+}
+
+fn theory() -> Result<Found, Error> {
+    let found = checks(Effort::default(), &mut |_| ())?;
+    let mut section = Section::new("Theorems, measured against their bounds");
+    section.table(theory_table_rows(&found));
+    Ok((section, theory_json(&found)))
+}

@@ -1,0 +1,290 @@
+//! The adapters of the cross-room sections: which are trained, on how many rooms, and how they did in
+//! the held-out rooms.
+
+use rayon::prelude::*;
+
+use seese3_core::adapter::{Mixing, Preset, Reading};
+use seese3_core::eval::Protocol;
+use seese3_core::navigation::{NavigatorKind, Refit, RetrievalMetric, StepKind};
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan};
+
+use super::notes::{Notes, ReproducedAdapter};
+use super::{Error, FeatureSet, Reproduction};
+use crate::experiments::cross_room::{
+    CrossRoomPlan, CrossRoomProgress, CrossRoomRun, nested_choice, train_and_test,
+};
+
+/// How many adapters an ensemble has.
+pub const MEMBERS: usize = 4;
+
+/// The longest name that a plan gives an adapter: names are checked before training.
+pub const LONGEST_NAME: &str = "ensemble-aside-of-100000";
+
+/// What distinguishes the adapters of the cross-room sections.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PlanKind {
+    /// The paper's preset.
+    PaperRange,
+    /// The paper's preset with some of the rooms as calibration rooms.
+    PaperRangeCalibrated,
+    /// [`MEMBERS`] adapters of the paper's preset, with calibration rooms.
+    EnsembleCalibrated,
+    /// Preset steady.
+    Steady,
+    /// Preset steady with calibration rooms.
+    SteadyCalibrated,
+}
+
+impl PlanKind {
+    /// What tables call it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::PaperRange => "paper-range",
+            Self::PaperRangeCalibrated => "paper-range, errors measured aside",
+            Self::EnsembleCalibrated => "ensemble of paper-range, errors measured aside",
+            Self::Steady => "steady",
+            Self::SteadyCalibrated => "steady, errors measured aside",
+        }
+    }
+
+    /// The first part of its adapter's name; the number of rooms follows it.
+    fn short_name(self) -> &'static str {
+        match self {
+            Self::PaperRange => "paper-range",
+            Self::PaperRangeCalibrated => "paper-range-aside",
+            Self::EnsembleCalibrated => "ensemble-aside",
+            Self::Steady => "steady",
+            Self::SteadyCalibrated => "steady-aside",
+        }
+    }
+
+    fn preset(self) -> Preset {
+        match self {
+            Self::PaperRange | Self::PaperRangeCalibrated | Self::EnsembleCalibrated => {
+                Preset::PaperRange
+            }
+            Self::Steady | Self::SteadyCalibrated => Preset::Steady,
+        }
+    }
+
+    fn members(self) -> usize {
+        match self {
+            Self::EnsembleCalibrated => MEMBERS,
+            _ => 1,
+        }
+    }
+
+    /// Whether some of its rooms are calibration rooms.
+    pub fn is_calibrated(self) -> bool {
+        match self {
+            Self::PaperRangeCalibrated | Self::EnsembleCalibrated | Self::SteadyCalibrated => true,
+            Self::PaperRange | Self::Steady => false,
+        }
+    }
+}
+
+/// One adapter to train and to evaluate in the held-out rooms.
+#[derive(Debug, Clone, Copy)]
+pub struct Plan {
+    /// What distinguishes it.
+    pub kind: PlanKind,
+    /// Rooms in all, calibration rooms included.
+    pub rooms: usize,
+}
+
+impl Plan {
+    /// The adapter's name, as [`super::published_name`] takes it.
+    pub fn adapter_name(&self) -> String {
+        format!("{}-of-{}", self.kind.short_name(), self.rooms)
+    }
+}
+
+/// A plan, and how its adapter did in the held-out rooms.
+pub struct PlanResult {
+    /// The plan.
+    pub plan: Plan,
+    /// How its adapter did.
+    pub run: CrossRoomRun,
+}
+
+/// The results of all plans with one feature set.
+pub struct SetResults {
+    /// The name of the features.
+    pub features: String,
+    /// The plans that were given all rooms, the paper's first.
+    pub on_all_rooms: Vec<PlanResult>,
+    /// The paper's preset by the number of rooms, from the fewest to all.
+    pub by_size: Vec<PlanResult>,
+}
+
+impl SetResults {
+    /// The paper's preset on all rooms: what everything is compared with.
+    pub fn baseline(&self) -> &PlanResult {
+        &self.on_all_rooms[0]
+    }
+}
+
+/// The name of the adapter that preset steady gives on all rooms, with no calibration rooms among
+/// them.
+pub fn steady_adapter(set: &FeatureSet<'_>) -> String {
+    let plan = Plan {
+        kind: PlanKind::Steady,
+        rooms: set.train.len(),
+    };
+    plan.adapter_name()
+}
+
+/// Trains the adapters of every plan and feature set, and evaluates them in the held-out rooms.
+pub fn evaluate(given: &Reproduction<'_>, notes: &mut Notes) -> Result<Vec<SetResults>, Error> {
+    let mut all = Vec::with_capacity(given.sets.len());
+    for set in &given.sets {
+        let rooms = set.train.len();
+        let results: Vec<(PlanResult, ReproducedAdapter)> = plans(given, set)
+            .into_par_iter()
+            .map(|plan| result_of(given, set, plan))
+            .collect::<Result<_, Error>>()?;
+        let (results, adapters): (Vec<PlanResult>, Vec<ReproducedAdapter>) =
+            results.into_iter().unzip();
+        notes.adapters.extend(adapters);
+
+        let mut by_size: Vec<PlanResult> = Vec::new();
+        let mut on_all_rooms = Vec::new();
+        for result in results {
+            if result.plan.kind == PlanKind::PaperRange {
+                by_size.push(PlanResult {
+                    plan: result.plan,
+                    run: result.run.clone(),
+                });
+            }
+            if result.plan.rooms == rooms {
+                on_all_rooms.push(result);
+            }
+        }
+
+        // The paper's preset comes first; the others keep the order of the plans.
+        on_all_rooms.sort_by_key(|result| result.plan.kind != PlanKind::PaperRange);
+        by_size.sort_by_key(|result| result.plan.rooms);
+        all.push(SetResults {
+            features: set.features.clone(),
+            on_all_rooms,
+            by_size,
+        });
+    }
+
+    Ok(all)
+}
+
+/// Every plan, the longest training first, so that it does not run alone at the end.
+fn plans(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<Plan> {
+    let all = set.train.len();
+    let on_all_rooms = [
+        PlanKind::PaperRange,
+        PlanKind::PaperRangeCalibrated,
+        PlanKind::EnsembleCalibrated,
+    ];
+    let mut plans: Vec<Plan> = on_all_rooms.map(|kind| Plan { kind, rooms: all }).to_vec();
+
+    // The scaling curve of the paper's preset; its last point, all rooms, stands above.
+    let mut sizes = given.options.sizes.clone();
+    sizes.retain(|&size| size != all);
+    sizes.sort_unstable();
+    sizes.dedup();
+    plans.extend(sizes.into_iter().rev().map(|rooms| Plan {
+        kind: PlanKind::PaperRange,
+        rooms,
+    }));
+
+    // Preset steady takes a fraction of the steps.
+    let steady = [PlanKind::Steady, PlanKind::SteadyCalibrated];
+    plans.extend(steady.map(|kind| Plan { kind, rooms: all }));
+
+    plans
+}
+
+fn result_of(
+    given: &Reproduction<'_>,
+    set: &FeatureSet<'_>,
+    plan: Plan,
+) -> Result<(PlanResult, ReproducedAdapter), Error> {
+    let rooms: Vec<RoomData<'_>> = nested_choice(plan.rooms, set.train.len(), 0)
+        .into_iter()
+        .map(|room| set.train[room])
+        .collect();
+    let calibration_rooms = if plan.kind.is_calibrated() {
+        given.options.calibration_rooms
+    } else {
+        0
+    };
+
+    // Held-out rooms are tested whole: every pair at the stride, with every frame as a candidate.
+    let protocol = Protocol {
+        split: Split::Whole,
+        thresholds: vec![0.1],
+        navigators: navigators(calibration_rooms > 0),
+        ..Protocol::paper(given.options.stride)
+    };
+
+    let result = train_and_test(
+        &rooms,
+        &set.test,
+        &CrossRoomPlan {
+            training: &training_plan(given, plan.kind),
+            calibration_rooms,
+            protocol: &protocol,
+        },
+        &CrossRoomProgress {
+            epoch: &|| (),
+            room: &|| (),
+        },
+    )?;
+
+    let adapter = ReproducedAdapter::new(
+        &plan.adapter_name(),
+        &set.train[0],
+        result.adapter,
+        result.record,
+    );
+    let result = PlanResult {
+        plan,
+        run: result.run,
+    };
+    Ok((result, adapter))
+}
+
+fn training_plan(given: &Reproduction<'_>, kind: PlanKind) -> TrainingPlan {
+    let stride = given.options.stride;
+    let mut plan = given.plan(kind.preset(), Split::Whole, stride, 0, None);
+
+    // Members of an ensemble share one adapter's epochs; a single adapter is an ensemble of one.
+    plan.config.charts = kind.members();
+    plan.config.mixing = Mixing::Even;
+    plan
+}
+
+/// The rows of the cross-room tables. Calibrated retrieval needs the covariance of errors in rooms
+/// that were not trained on.
+fn navigators(is_calibrated: bool) -> Vec<NavigatorKind> {
+    let affine = StepKind::InversePoincare(Reading::Affine);
+    let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
+    let refit = StepKind::Refit(Refit {
+        z_scored: false,
+        intercept: false,
+        in_sample: true,
+    });
+
+    let mut navigators = vec![
+        NavigatorKind::Identity,
+        NavigatorKind::Step(affine, RetrievalMetric::Full),
+        NavigatorKind::Step(homogeneous, RetrievalMetric::Full),
+        NavigatorKind::Step(refit, RetrievalMetric::Full),
+        NavigatorKind::Step(affine, RetrievalMetric::RowSpace),
+        NavigatorKind::Step(affine, RetrievalMetric::Whitened),
+    ];
+    if is_calibrated {
+        let calibrated = NavigatorKind::Step(homogeneous, RetrievalMetric::Calibrated);
+        navigators.push(calibrated);
+    }
+
+    navigators
+}

@@ -1,0 +1,425 @@
+//! The furniture of a room: pieces along the walls, and a table with chairs in the middle.
+//!
+//! A piece is built in its own coordinates: x along its width, centred; y out of the wall into the
+//! room; z up; metres.
+
+use nalgebra::{Point3, Vector3};
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+
+use super::texture::{Colour, Material};
+use super::{Piece, Solid};
+
+/// A box of a piece: low corner, high corner, material.
+type Block = ([f64; 3], [f64; 3], Material);
+
+/// Furnishes a room of `size`, metres.
+pub(super) fn furnish(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Piece> {
+    let mut pieces = Vec::new();
+    let quarter = std::f64::consts::FRAC_PI_2;
+
+    // Two pieces stand at each wall, turned so that their backs are 2 cm from it. Walls are
+    // numbered counterclockwise, seen from above, from the wall y = 0.
+    for wall in 0..4u8 {
+        let length = if wall % 2 == 0 { size.x } else { size.y };
+        let turn = f64::from(wall) * quarter;
+        for slot in 0..2 {
+            let along = length * (0.27 + 0.46 * f64::from(slot)) + random.random_range(-0.1..0.1);
+            let blocks = wall_piece(random);
+
+            let at = match wall {
+                0 => [along, 0.02],
+                1 => [size.x - 0.02, along],
+                2 => [size.x - along, size.y - 0.02],
+                _ => [0.02, size.y - along],
+            };
+            pieces.push(Piece::new(&blocks, at, turn, random));
+        }
+    }
+
+    let centre = [size.x * 0.5, size.y * 0.5];
+    let turn = random.random_range(-0.4..0.4);
+    pieces.push(Piece::new(&table(random), centre, turn, random));
+
+    // Three chairs stand around the table, about 120° apart.
+    for side in 0..3 {
+        let angle = turn + f64::from(side) * 2.1 + random.random_range(-0.3..0.3);
+        let at = [
+            centre[0] + 0.85 * angle.cos(),
+            centre[1] + 0.75 * angle.sin(),
+        ];
+        pieces.push(Piece::new(&chair(random), at, angle + quarter, random));
+    }
+
+    pieces
+}
+
+/// Furnishes a room of `size`, metres, with a random number of pieces along each wall, and in most
+/// rooms with a table and chairs.
+pub(super) fn furnish_loosely(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Piece> {
+    let mut pieces = Vec::new();
+    let quarter = std::f64::consts::FRAC_PI_2;
+    for wall in 0..4u8 {
+        let length = if wall % 2 == 0 { size.x } else { size.y };
+        let turn = f64::from(wall) * quarter;
+        let slots = random.random_range(1..=(length / 1.9) as u32);
+        for slot in 0..slots {
+            let along = length * (f64::from(slot) + 0.5) / f64::from(slots)
+                + random.random_range(-0.12..0.12);
+            let blocks = wall_piece(random);
+
+            // The piece is drawn before it is left out: the order of the draws decides what a
+            // seed looks like.
+            if random.random_bool(0.2) {
+                continue;
+            }
+
+            let at = match wall {
+                0 => [along, 0.02],
+                1 => [size.x - 0.02, along],
+                2 => [size.x - along, size.y - 0.02],
+                _ => [0.02, size.y - along],
+            };
+            pieces.push(Piece::new(&blocks, at, turn, random));
+        }
+    }
+
+    if random.random_bool(0.7) {
+        let centre = [
+            size.x * random.random_range(0.42..0.58),
+            size.y * random.random_range(0.42..0.58),
+        ];
+
+        let turn = random.random_range(-0.6..0.6);
+        pieces.push(Piece::new(&table(random), centre, turn, random));
+
+        // One to four chairs stand around the table, about 90° apart.
+        for side in 0..random.random_range(1..5) {
+            let angle = turn + f64::from(side) * 1.6 + random.random_range(-0.3..0.3);
+            let at = [
+                centre[0] + 0.85 * angle.cos(),
+                centre[1] + 0.75 * angle.sin(),
+            ];
+            pieces.push(Piece::new(&chair(random), at, angle + quarter, random));
+        }
+    }
+
+    pieces
+}
+
+/// Furnishes a corridor along x, of `size`, metres, with shallow pieces on its long sides.
+pub(super) fn furnish_corridor(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Piece> {
+    let mut pieces = Vec::new();
+    let mut along = random.random_range(0.9..1.8);
+    while along < size.x - 0.9 {
+        // Beds, sofas and desks are too deep for a corridor.
+        let blocks = match random.random_range(0..5) {
+            0 => bookshelf(random),
+            1 => wardrobe(random),
+            2 => plant(random),
+            _ => sideboard(random),
+        };
+
+        let far = random.random_bool(0.5);
+        let (at, turn) = if far {
+            ([along, size.y - 0.02], std::f64::consts::PI)
+        } else {
+            ([along, 0.02], 0.0)
+        };
+        pieces.push(Piece::new(&blocks, at, turn, random));
+
+        along += random.random_range(1.5..2.8);
+    }
+
+    pieces
+}
+
+fn wall_piece(random: &mut ChaCha8Rng) -> Vec<Block> {
+    match random.random_range(0..7) {
+        0 => bookshelf(random),
+        1 => sofa(random),
+        2 => bed(random),
+        3 => desk(random),
+        4 => wardrobe(random),
+        5 => plant(random),
+        _ => sideboard(random),
+    }
+}
+
+fn hue(random: &mut ChaCha8Rng, saturation: f64, value: f64) -> Colour {
+    Colour::of_hue(random.random_range(0.0..1.0), saturation, value)
+}
+
+fn timber(random: &mut ChaCha8Rng) -> Material {
+    Material::Wood(Colour::of_hue(
+        random.random_range(0.04..0.11),
+        0.6,
+        random.random_range(0.25..0.6),
+    ))
+}
+
+fn cloth(random: &mut ChaCha8Rng) -> Material {
+    Material::Fabric(hue(random, 0.5, 0.5), hue(random, 0.4, 0.7))
+}
+
+fn bookshelf(random: &mut ChaCha8Rng) -> Vec<Block> {
+    let half = random.random_range(0.4..0.65);
+    let high = random.random_range(1.3..2.1);
+    let wood = timber(random);
+
+    // The books, the two sides and the top; then shelves 0.33 m apart, as the rows of spines in
+    // the books' texture are.
+    let mut blocks = vec![
+        ([-half, 0.0, 0.0], [half, 0.24, high], Material::Books),
+        ([-half - 0.03, 0.0, 0.0], [-half, 0.32, high], wood),
+        ([half, 0.0, 0.0], [half + 0.03, 0.32, high], wood),
+        ([-half, 0.0, high], [half, 0.32, high + 0.03], wood),
+    ];
+
+    let boards = (high / 0.33) as usize;
+    blocks.extend((0..boards).map(|board| {
+        let z = 0.33 * board as f64;
+        ([-half, 0.0, z], [half, 0.31, z + 0.025], wood)
+    }));
+
+    blocks
+}
+
+fn sofa(random: &mut ChaCha8Rng) -> Vec<Block> {
+    let cover = cloth(random);
+    let cushion = cloth(random);
+
+    // Seat, back, two arms and two cushions.
+    vec![
+        ([-0.8, 0.0, 0.1], [0.8, 0.85, 0.42], cover),
+        ([-0.8, 0.0, 0.42], [0.8, 0.22, 0.85], cover),
+        ([-0.95, 0.0, 0.08], [-0.8, 0.85, 0.6], cover),
+        ([0.8, 0.0, 0.08], [0.95, 0.85, 0.6], cover),
+        ([-0.7, 0.24, 0.43], [-0.3, 0.38, 0.78], cushion),
+        ([0.25, 0.24, 0.43], [0.65, 0.38, 0.78], cushion),
+    ]
+}
+
+fn bed(random: &mut ChaCha8Rng) -> Vec<Block> {
+    let wood = timber(random);
+    let blanket = cloth(random);
+
+    // Frame, mattress, blanket, headboard and two pillows.
+    vec![
+        ([-0.75, 0.0, 0.0], [0.75, 1.95, 0.28], wood),
+        (
+            [-0.72, 0.05, 0.28],
+            [0.72, 1.9, 0.45],
+            Material::Plain(Colour::WHITE),
+        ),
+        ([-0.74, 0.7, 0.3], [0.74, 1.93, 0.5], blanket),
+        ([-0.78, 0.0, 0.0], [0.78, 0.06, 1.0], wood),
+        (
+            [-0.6, 0.1, 0.45],
+            [-0.1, 0.5, 0.58],
+            Material::Plain(Colour::WHITE),
+        ),
+        (
+            [0.1, 0.1, 0.45],
+            [0.6, 0.5, 0.58],
+            Material::Plain(Colour::WHITE),
+        ),
+    ]
+}
+
+fn desk(random: &mut ChaCha8Rng) -> Vec<Block> {
+    let wood = timber(random);
+    let screen = random.random_range(-0.25..0.25);
+
+    // Top, one side, cupboard, screen, its stand, and an object beside it.
+    vec![
+        ([-0.7, 0.0, 0.7], [0.7, 0.65, 0.74], wood),
+        ([-0.68, 0.03, 0.0], [-0.62, 0.6, 0.7], wood),
+        (
+            [0.3, 0.03, 0.0],
+            [0.68, 0.6, 0.7],
+            Material::Doors(hue(random, 0.2, 0.6)),
+        ),
+        (
+            [screen - 0.28, 0.15, 0.86],
+            [screen + 0.28, 0.19, 1.2],
+            Material::Screen,
+        ),
+        (
+            [screen - 0.05, 0.12, 0.74],
+            [screen + 0.05, 0.2, 0.86],
+            Material::Plain(Colour([0.1, 0.1, 0.1])),
+        ),
+        (
+            [0.45, 0.2, 0.74],
+            [0.62, 0.45, 0.9],
+            Material::Plain(hue(random, 0.7, 0.6)),
+        ),
+    ]
+}
+
+fn wardrobe(random: &mut ChaCha8Rng) -> Vec<Block> {
+    let half = random.random_range(0.5..0.8);
+    let high = random.random_range(1.8..2.15);
+
+    let colour = Colour::of_hue(
+        random.random_range(0.03..0.15),
+        0.35,
+        random.random_range(0.4..0.8),
+    );
+
+    vec![(
+        [-half, 0.0, 0.0],
+        [half, 0.58, high],
+        Material::Doors(colour),
+    )]
+}
+
+fn sideboard(random: &mut ChaCha8Rng) -> Vec<Block> {
+    let mut blocks = vec![(
+        [-0.7, 0.0, 0.08],
+        [0.7, 0.42, 0.8],
+        Material::Doors(hue(random, 0.3, 0.65)),
+    )];
+
+    // Objects of random size and colour stand on top.
+    for item in 0..4 {
+        let x = -0.55 + 0.33 * f64::from(item) + random.random_range(-0.05..0.05);
+        let half = random.random_range(0.04..0.1);
+        let high = random.random_range(0.1..0.4);
+        let stuff = Material::Plain(hue(random, 0.7, 0.65));
+        blocks.push((
+            [x - half, 0.15, 0.8],
+            [x + half, 0.15 + 2.0 * half, 0.8 + high],
+            stuff,
+        ));
+    }
+
+    blocks
+}
+
+fn plant(random: &mut ChaCha8Rng) -> Vec<Block> {
+    let pot = Material::Plain(hue(random, 0.5, 0.5));
+    let mut blocks = vec![([-0.17, 0.12, 0.0], [0.17, 0.46, 0.36], pot)];
+
+    // Cubes of leaves at random around the stem, which is added last.
+    for _ in 0..7 {
+        let x = random.random_range(-0.25..0.25);
+        let y = random.random_range(0.15..0.5);
+        let z = random.random_range(0.45..1.4);
+        let half = random.random_range(0.07..0.16);
+
+        let green = Material::Leaves(Colour::of_hue(random.random_range(0.25..0.4), 0.65, 0.5));
+        blocks.push((
+            [x - half, y - half, z - half],
+            [x + half, y + half, z + half],
+            green,
+        ));
+    }
+
+    blocks.push((
+        [-0.02, 0.27, 0.3],
+        [0.02, 0.31, 1.3],
+        Material::Plain(Colour([0.25, 0.16, 0.1])),
+    ));
+
+    blocks
+}
+
+fn table(random: &mut ChaCha8Rng) -> Vec<Block> {
+    let wood = timber(random);
+    let leg = |x: f64, y: f64| ([x - 0.03, y - 0.03, 0.0], [x + 0.03, y + 0.03, 0.72], wood);
+    let mut blocks = vec![([-0.6, -0.42, 0.72], [0.6, 0.42, 0.76], wood)];
+
+    blocks.extend([
+        leg(-0.54, -0.36),
+        leg(0.54, -0.36),
+        leg(-0.54, 0.36),
+        leg(0.54, 0.36),
+    ]);
+
+    // Objects of random size and colour stand on top.
+    for item in 0..3 {
+        let x = -0.4 + 0.4 * f64::from(item);
+        let y = random.random_range(-0.25..0.25);
+        let half = random.random_range(0.05..0.11);
+        let high = random.random_range(0.04..0.3);
+
+        let stuff = Material::Plain(hue(random, 0.8, 0.7));
+        blocks.push((
+            [x - half, y - half, 0.76],
+            [x + half, y + half, 0.76 + high],
+            stuff,
+        ));
+    }
+
+    blocks
+}
+
+fn chair(random: &mut ChaCha8Rng) -> Vec<Block> {
+    let wood = timber(random);
+    let seat = cloth(random);
+    let leg = |x: f64, y: f64| ([x - 0.02, y - 0.02, 0.0], [x + 0.02, y + 0.02, 0.43], wood);
+
+    vec![
+        ([-0.22, -0.22, 0.43], [0.22, 0.22, 0.48], seat),
+        ([-0.22, 0.19, 0.48], [0.22, 0.22, 0.95], wood),
+        leg(-0.19, -0.19),
+        leg(0.19, -0.19),
+        leg(-0.19, 0.19),
+        leg(0.19, 0.19),
+    ]
+}
+
+impl Piece {
+    /// A piece of these blocks that stands at `at` on the floor, metres, turned about the vertical
+    /// axis by `turn`, radians.
+    fn new(blocks: &[Block], at: [f64; 2], turn: f64, random: &mut ChaCha8Rng) -> Self {
+        let (sin, cos) = turn.sin_cos();
+        let solids: Vec<Solid> = blocks
+            .iter()
+            .map(|&(low, high, material)| {
+                let low = Vector3::from(low);
+                let high = Vector3::from(high);
+                let middle = (low + high) / 2.0;
+                let half = (high - low) / 2.0;
+
+                // From the piece's coordinates into those of the room.
+                let centre = Point3::new(
+                    at[0] + cos * middle.x - sin * middle.y,
+                    at[1] + sin * middle.x + cos * middle.y,
+                    middle.z,
+                );
+
+                Solid {
+                    centre,
+                    half,
+                    cos,
+                    sin,
+                    material,
+                    seed: random.random(),
+                }
+            })
+            .collect();
+
+        // The bounding sphere: its centre is the mean of the boxes' centres, and its radius holds
+        // the corners of every box.
+        let count = solids.len().max(1) as f64;
+        let centre = Point3::from(
+            solids
+                .iter()
+                .map(|solid| solid.centre.coords)
+                .sum::<Vector3<f64>>()
+                / count,
+        );
+
+        let reach = |solid: &Solid| (solid.centre - centre).norm() + solid.half.norm();
+        let radius = solids.iter().map(reach).fold(0.0, f64::max);
+
+        Self {
+            centre,
+            radius,
+            solids,
+        }
+    }
+}

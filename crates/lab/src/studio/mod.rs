@@ -1,0 +1,280 @@
+//! The studio: procedural rooms, rendered by ray casting, which give images with exact poses
+//! without a data set.
+//!
+//! - World axes: x and y along the floor, z up, metres. The floor is z = 0, and the room begins at
+//!   (0, 0).
+//! - Everything follows from a seed. Images are those of a pinhole camera with square pixels.
+
+mod camera_path;
+mod furniture;
+mod render;
+mod suite;
+mod surfaces;
+mod texture;
+
+pub use camera_path::camera_path;
+pub use render::{Camera, Sampling, render};
+pub use suite::{SuiteRoom, Walk};
+
+use nalgebra::{Point3, Vector3};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use texture::{Colour, Material};
+
+/// A furnished room.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    /// Width (x), depth (y) and height (z), metres.
+    size: Vector3<f64>,
+    shell: Shell,
+    pieces: Vec<Piece>,
+    lamp: Point3<f64>,
+    light: Light,
+}
+
+/// How a room is lit.
+#[derive(Debug, Clone, Copy)]
+struct Light {
+    /// Brightness of the lamp on a surface that faces it at about one metre.
+    lamp: f64,
+    /// Factors of the lamp's light in red, green and blue.
+    lamp_tint: [f64; 3],
+    /// Ambient light, which comes from all directions.
+    sky: f64,
+}
+
+impl Light {
+    const PLAIN: Self = Self {
+        lamp: 1.9,
+        lamp_tint: [1.0; 3],
+        sky: 0.30,
+    };
+}
+
+/// Surfaces of the floor, the walls and the ceiling.
+#[derive(Debug, Clone)]
+struct Shell {
+    seed: u32,
+    wall_colours: [Colour; 4],
+    wallpaper: Wallpaper,
+    floor: Floor,
+    /// Rectangles on each wall, in wall coordinates (along, up), metres.
+    panels: [Vec<Panel>; 4],
+    rug: Rug,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Floor {
+    Planks(Colour),
+    Tiles(Colour),
+    Carpet(Colour),
+}
+
+/// Pattern of the walls; lengths in metres.
+#[derive(Debug, Clone, Copy)]
+enum Wallpaper {
+    None,
+    /// Vertical stripes with this period.
+    Stripes(f64),
+    /// Boards from the floor up to this height.
+    Boards(f64),
+    Bricks,
+}
+
+/// A rectangle on a wall.
+#[derive(Debug, Clone, Copy)]
+struct Panel {
+    low: [f64; 2],
+    high: [f64; 2],
+    kind: PanelKind,
+    seed: u32,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum PanelKind {
+    Picture,
+    Window,
+    Door,
+}
+
+/// A rectangle on the floor.
+#[derive(Debug, Clone, Copy)]
+struct Rug {
+    low: [f64; 2],
+    high: [f64; 2],
+    colours: [Colour; 2],
+}
+
+/// A box, turned about the vertical axis.
+#[derive(Debug, Clone, Copy)]
+struct Solid {
+    centre: Point3<f64>,
+    half: Vector3<f64>,
+    cos: f64,
+    sin: f64,
+    material: Material,
+    seed: u32,
+}
+
+/// A piece of furniture: boxes inside a bounding sphere, so that one test rules out most rays.
+#[derive(Debug, Clone)]
+struct Piece {
+    centre: Point3<f64>,
+    radius: f64,
+    solids: Vec<Solid>,
+}
+
+impl Scene {
+    /// The room of a seed, 4.4 to 6.4 m by 3.8 to 5.2 m, with furniture along its walls and a table
+    /// in the middle.
+    pub fn new(seed: u64) -> Self {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let size = Vector3::new(
+            random.random_range(4.4..6.4),
+            random.random_range(3.8..5.2),
+            random.random_range(2.5..2.9),
+        );
+        let shell = Shell::new(size, &mut random);
+
+        let pieces = furniture::furnish(size, &mut random);
+
+        let lamp = Point3::new(
+            size.x * random.random_range(0.4..0.6),
+            size.y * random.random_range(0.4..0.6),
+            size.z - 0.25,
+        );
+
+        Self {
+            size,
+            shell,
+            pieces,
+            lamp,
+            light: Light::PLAIN,
+        }
+    }
+
+    /// Width (x), depth (y) and height (z), metres.
+    pub fn size(&self) -> Vector3<f64> {
+        self.size
+    }
+}
+
+impl Shell {
+    fn new(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Self {
+        // One of the four walls has an accent colour.
+        let base = Colour::of_hue(random.random_range(0.0..1.0), 0.22, 0.78);
+        let accent = Colour::of_hue(random.random_range(0.0..1.0), 0.45, 0.6);
+        let accent_wall = random.random_range(0..4);
+        let wall_colours =
+            std::array::from_fn(|wall| if wall == accent_wall { accent } else { base });
+
+        let wood = Colour::of_hue(
+            random.random_range(0.05..0.1),
+            0.55,
+            random.random_range(0.35..0.6),
+        );
+
+        let tile = Colour::of_hue(random.random_range(0.0..1.0), 0.15, 0.65);
+        let floor = if random.random_bool(0.6) {
+            Floor::Planks(wood)
+        } else {
+            Floor::Tiles(tile)
+        };
+
+        // The window is never in the wall of the door.
+        let door_wall = random.random_range(0..4);
+        let window_wall = (door_wall + random.random_range(1..4)) % 4;
+
+        // Walls are numbered counterclockwise, seen from above, from the wall y = 0: the even
+        // ones run along x.
+        let panels = std::array::from_fn(|wall| {
+            let length = if wall % 2 == 0 { size.x } else { size.y };
+
+            let feature = if wall == door_wall {
+                Some(PanelKind::Door)
+            } else if wall == window_wall {
+                Some(PanelKind::Window)
+            } else {
+                None
+            };
+
+            wall_panels(length, feature, random)
+        });
+
+        let centre = [size.x * 0.5, size.y * 0.5];
+        let half = [random.random_range(0.8..1.3), random.random_range(0.6..1.0)];
+
+        let rug = Rug {
+            low: [centre[0] - half[0], centre[1] - half[1]],
+            high: [centre[0] + half[0], centre[1] + half[1]],
+            colours: [
+                Colour::of_hue(random.random_range(0.0..1.0), 0.6, 0.45),
+                Colour::of_hue(random.random_range(0.0..1.0), 0.3, 0.75),
+            ],
+        };
+
+        Self {
+            seed: random.random(),
+            wall_colours,
+            wallpaper: Wallpaper::None,
+            floor,
+            panels,
+            rug,
+        }
+    }
+}
+
+/// The panels of one wall: the door or the window, if there is one, and pictures beside it.
+fn wall_panels(length: f64, feature: Option<PanelKind>, random: &mut ChaCha8Rng) -> Vec<Panel> {
+    let mut panels = Vec::new();
+    let mut taken = None;
+    if let Some(kind) = feature {
+        let (width, low, high) = if kind == PanelKind::Door {
+            (0.9, 0.0, 2.05)
+        } else {
+            (1.5, 0.95, 2.15)
+        };
+
+        let middle = length * random.random_range(0.35..0.65);
+        let from = middle - width / 2.0;
+        let to = middle + width / 2.0;
+
+        panels.push(Panel {
+            low: [from, low],
+            high: [to, high],
+            kind,
+            seed: random.random(),
+        });
+
+        // Pictures keep 15 cm away from the door or window.
+        taken = Some((from - 0.15, to + 0.15));
+    }
+
+    // Each third of the wall gets a picture, unless it would overlap the door or window or reach
+    // into a corner of the room.
+    for slot in 0..3 {
+        let middle = length * (f64::from(slot) + 0.5) / 3.0 + random.random_range(-0.2..0.2);
+        let width = random.random_range(0.4..0.9);
+        let height = random.random_range(0.4..0.7);
+        let from = middle - width / 2.0;
+
+        let to = middle + width / 2.0;
+        if taken.is_some_and(|(low, high)| from < high && to > low)
+            || from < 0.1
+            || to > length - 0.1
+        {
+            continue;
+        }
+
+        let bottom = random.random_range(1.25..1.5);
+        panels.push(Panel {
+            low: [from, bottom],
+            high: [to, bottom + height],
+            kind: PanelKind::Picture,
+            seed: random.random(),
+        });
+    }
+
+    panels
+}

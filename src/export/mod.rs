@@ -1,0 +1,7 @@
+//! Paths and streams as other programs read them: TUM, KITTI, MCAP.
+
+mod recording;
+mod trajectory;
+
+pub use recording::Recording;
+pub use trajectory::{kitti_trajectory, tum_trajectory};

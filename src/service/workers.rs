@@ -1,0 +1,277 @@
+//! Worker threads: answers are computed on blocking threads, a bounded number at a time, each
+//! within its caller's deadline.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::{Semaphore, watch};
+use tonic::metadata::MetadataMap;
+
+use super::{Config, Error};
+use seese3_core::cancel::Cancellation;
+
+/// Runs the computation of requests on blocking threads, apart from the async ones.
+#[derive(Clone)]
+pub struct Workers {
+    threads: Arc<Semaphore>,
+    admitted: Arc<Semaphore>,
+    longest: Duration,
+    halted: watch::Sender<bool>,
+}
+
+/// Cancels the work when it is dropped: the future that waited for the result is gone.
+pub struct CancelOnDrop(pub Arc<Cancellation>);
+
+impl Drop for CancelOnDrop {
+    fn drop(&mut self) {
+        self.0.cancel();
+    }
+}
+
+impl Workers {
+    pub fn new(config: &Config) -> Self {
+        let threads = config.threads.max(1);
+        Self {
+            threads: Arc::new(Semaphore::new(threads)),
+            // A request holds this permit while it waits and while it is computed; `try_acquire`
+            // refuses it once threads and queue are full.
+            admitted: Arc::new(Semaphore::new(threads + config.queue)),
+            longest: config.longest,
+            halted: watch::Sender::new(false),
+        }
+    }
+
+    /// Abandons all work, running and waiting. Its callers receive [`Error::Loading`], which is
+    /// UNAVAILABLE.
+    pub fn halt(&self) {
+        self.halted.send_replace(true);
+    }
+
+    /// How long a request may take: the caller's deadline, but at most the server's limit.
+    pub fn budget(&self, metadata: &MetadataMap) -> Duration {
+        requested(metadata).map_or(self.longest, |deadline| deadline.min(self.longest))
+    }
+
+    /// Runs `work` on a blocking thread. When the budget is spent or the caller goes away, the work
+    /// is asked to stop through its [`Cancellation`]; its thread is free for other requests only
+    /// when it has stopped.
+    ///
+    /// # Errors
+    /// [`Error::Busy`] if too many requests wait, [`Error::Deadline`] if the budget is spent,
+    /// [`Error::Loading`] if the server abandoned the work while stopping, [`Error::Internal`] if
+    /// it panicked, or the error of the work itself.
+    pub async fn run<T: Send + 'static>(
+        &self,
+        budget: Duration,
+        work: impl FnOnce(&Cancellation) -> Result<T, Error> + Send + 'static,
+    ) -> Result<T, Error> {
+        let admitted = self
+            .admitted
+            .clone()
+            .try_acquire_owned()
+            .map_err(|_| Error::Busy)?;
+
+        // The guard lives in this future. If the caller goes away the future is dropped, and the
+        // guard cancels the work that is still running on its thread.
+        let cancel = Arc::new(Cancellation::default());
+        let guard = CancelOnDrop(cancel.clone());
+
+        let computed = async {
+            let thread = self
+                .threads
+                .clone()
+                .acquire_owned()
+                .await
+                .map_err(|_| Error::Internal)?;
+
+            // Both permits move into the blocking task, because the task goes on when this future
+            // is dropped: they are free only when the computation has really ended.
+            let span = tracing::Span::current();
+            let task = tokio::task::spawn_blocking(move || {
+                let _thread = thread;
+                let _admitted = admitted;
+                span.in_scope(|| work(&cancel))
+            });
+
+            task.await.unwrap_or_else(|error| {
+                tracing::error!(%error, "a request panicked");
+                Err(Error::Internal)
+            })
+        };
+
+        let mut halted = self.halted.subscribe();
+
+        // Whichever comes first ends the wait. The budget includes the time in the queue.
+        let result = tokio::select! {
+            result = tokio::time::timeout(budget, computed) => result.unwrap_or(Err(Error::Deadline)),
+            _ = halted.wait_for(|halted| *halted) => Err(Error::Loading),
+        };
+
+        drop(guard);
+        result
+    }
+
+    /// Runs a short piece of work of a stream on a blocking thread. The stream was admitted when it
+    /// began, so the work waits for a thread as long as necessary and is never refused.
+    ///
+    /// # Errors
+    /// [`Error::Loading`] if the server abandoned the work while stopping, [`Error::Internal`] if
+    /// it panicked.
+    pub async fn run_admitted<T: Send + 'static>(
+        &self,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, Error> {
+        let mut halted = self.halted.subscribe();
+
+        let computed = async {
+            let thread = self
+                .threads
+                .clone()
+                .acquire_owned()
+                .await
+                .map_err(|_| Error::Internal)?;
+
+            // There is no cancellation, because the work is short; a dropped future only discards
+            // its result.
+            let span = tracing::Span::current();
+            let task = tokio::task::spawn_blocking(move || {
+                let _thread = thread;
+                span.in_scope(work)
+            });
+
+            task.await.map_err(|error| {
+                tracing::error!(%error, "a request panicked");
+                Error::Internal
+            })
+        };
+
+        tokio::select! {
+            result = computed => result,
+            _ = halted.wait_for(|halted| *halted) => Err(Error::Loading),
+        }
+    }
+}
+
+/// The caller's deadline from the header `grpc-timeout`, shortened by a tenth but at most 10 ms, so
+/// that DEADLINE_EXCEEDED arrives before the caller's transport gives up. None if the header is
+/// absent or malformed.
+fn requested(metadata: &MetadataMap) -> Option<Duration> {
+    // The format is up to eight digits and one letter for the unit, for instance `250m` for 250
+    // ms.
+    let text = metadata.get("grpc-timeout")?.to_str().ok()?;
+    let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
+    let count: u64 = digits.parse().ok().filter(|_| digits.len() <= 8)?;
+
+    let given = match unit {
+        "H" => Duration::from_secs(count * 3_600),
+        "M" => Duration::from_secs(count * 60),
+        "S" => Duration::from_secs(count),
+        "m" => Duration::from_millis(count),
+        "u" => Duration::from_micros(count),
+        "n" => Duration::from_nanos(count),
+        _ => return None,
+    };
+
+    Some(given - (given / 10).min(Duration::from_millis(10)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn workers(threads: usize, queue: usize) -> Workers {
+        Workers::new(&Config {
+            threads,
+            queue,
+            ..Config::default()
+        })
+    }
+
+    const LONG: Duration = Duration::from_secs(30);
+
+    /// Oracle: the promise itself: a panic costs one request, and the next is answered.
+    #[tokio::test]
+    async fn a_panic_costs_one_request() {
+        let workers = workers(1, 0);
+        assert_eq!(
+            workers.run::<()>(LONG, |_| panic!("on purpose")).await,
+            Err(Error::Internal)
+        );
+
+        assert_eq!(workers.run(LONG, |_| Ok(7)).await, Ok(7));
+    }
+
+    /// Oracle: the contract itself. The work loops until it is cancelled, and it reports that it
+    /// was.
+    #[tokio::test]
+    async fn a_deadline_stops_the_work() {
+        let workers = workers(1, 1);
+        let (told, hears) = tokio::sync::oneshot::channel();
+
+        let work = move |cancel: &Cancellation| {
+            while cancel.check().is_ok() {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+
+            let _ = told.send(());
+            Ok(())
+        };
+
+        let begun = std::time::Instant::now();
+
+        assert_eq!(
+            workers.run(Duration::from_millis(20), work).await,
+            Err(Error::Deadline)
+        );
+
+        hears.await.unwrap();
+
+        assert!(
+            begun.elapsed() < Duration::from_secs(2),
+            "at the deadline, not later"
+        );
+    }
+
+    /// Oracle: the definition of a bounded queue. With one thread and no room in the queue, the
+    /// second request is refused.
+    #[tokio::test]
+    async fn a_full_queue_refuses() {
+        let workers = workers(1, 0);
+        let (release, wait) = std::sync::mpsc::channel::<()>();
+        let busy = workers.clone();
+        let (begun, begins) = tokio::sync::oneshot::channel();
+
+        let first = tokio::spawn(async move {
+            busy.run(LONG, move |_| {
+                let _ = begun.send(());
+                let _ = wait.recv();
+                Ok(1)
+            })
+            .await
+        });
+
+        begins.await.unwrap();
+        assert_eq!(workers.run(LONG, |_| Ok(2)).await, Err(Error::Busy));
+
+        release.send(()).unwrap();
+        assert_eq!(first.await.unwrap(), Ok(1));
+    }
+
+    /// Oracle: the gRPC specification of `grpc-timeout`: up to eight digits and a unit.
+    #[test]
+    fn timeouts_are_read_as_grpc_writes_them() {
+        let read = |text: &str| {
+            let mut metadata = MetadataMap::new();
+            metadata.insert("grpc-timeout", text.parse().unwrap());
+            requested(&metadata)
+        };
+
+        assert_eq!(read("2S"), Some(Duration::from_millis(1_990)));
+        assert_eq!(read("50m"), Some(Duration::from_millis(45)));
+        assert_eq!(read("1H"), Some(Duration::from_millis(3_599_990)));
+
+        for nonsense in ["", "S", "5", "123456789S", "-1S", "5x"] {
+            assert_eq!(read(nonsense), None, "{nonsense}");
+        }
+    }
+}

@@ -1,0 +1,16 @@
+//! The program as a user runs it: what it prints, what it writes, and how it says no.
+#![allow(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::too_many_lines,
+    reason = "a failed step is a failed run here, and a case may be long"
+)]
+
+#[path = "../support/mod.rs"]
+mod support;
+
+mod basics;
+mod program;
+mod research;
+mod rooms;
