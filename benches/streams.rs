@@ -24,11 +24,12 @@ use seese3_client::proto::v1::odometry_service_server::{OdometryService, Odometr
 use seese3_client::proto::v1::track_request::Message;
 use seese3_client::proto::v1::track_response::Answer;
 use seese3_core::adapter::{Adapter, Preset};
+use seese3_core::calibration::calibrate;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{Pose, Twist, exp};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
-use seese3_core::training::{RoomData, TrainingPlan, calibrate, train_adapter};
+use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 use tokio::net::TcpListener;
 use tokio_stream::{Stream, StreamExt, wrappers::ReceiverStream};
 
@@ -91,9 +92,10 @@ fn adapter(rooms: &[(Room, Features)]) -> (Adapter, seese3_core::adapter::Traini
 
     let plan = TrainingPlan::of(Preset::PaperBase, Split::Whole, 20, 0);
     let (adapter, record) = train_adapter(&room_data[..1], &plan, &mut |_| ()).unwrap();
-    let calibration = calibrate(&adapter, &record, &room_data[1..]).unwrap();
+    let (adapter, report) = calibrate(adapter, &record, &room_data[1..]).unwrap();
+    assert!(report.can_track, "the streams need an adapter that tracks");
 
-    (adapter.with_error_model(calibration).unwrap(), record)
+    (adapter, record)
 }
 
 /// Answers every message with as many bytes as a tracker's answer has.

@@ -4,12 +4,14 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use clap::{Args, ValueEnum};
+use clap::Args;
 
+use super::named::one_of;
 use super::say;
 use crate::datasets::read_features;
 use seese3_client::Client;
 use seese3_client::proto::v1 as pb;
+use seese3_core::adapter::Reading;
 use seese3_core::navigation::Mode;
 
 #[derive(Debug, Args)]
@@ -118,12 +120,12 @@ pub struct Navigate {
     #[arg(long, default_value_t = 1)]
     steps: u32,
     /// Where each step starts from
-    #[arg(long, value_enum, default_value_t = ModeName::OpenLoop)]
-    mode: ModeName,
+    #[arg(long, value_parser = one_of::<Mode>(), default_value = "open-loop")]
+    mode: Mode,
     /// How the mean μ and deviation σ of the training motions enter the inverse of W; the server
     /// takes homogeneous if neither this nor --navigator is given
-    #[arg(long, value_enum, conflicts_with = "navigator")]
-    reading: Option<ReadingName>,
+    #[arg(long, value_parser = one_of::<Reading>(), conflicts_with = "navigator")]
+    reading: Option<Reading>,
     /// Navigator by name, instead of inverse Poincaré: corrector-mlp-3, ridge-refit,
     /// inverse-poincare-affine+motion, …; if empty, inverse Poincaré in the given --reading
     #[arg(long, default_value = "")]
@@ -134,33 +136,6 @@ pub struct Navigate {
     /// Never retrieve the frame that a step starts from
     #[arg(long)]
     exclude_source: bool,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum ModeName {
-    /// All steps are added up in latent space, without feedback
-    OpenLoop,
-    /// Each step starts from the frame that the previous step retrieved
-    Snap,
-    /// As snap, and the remaining motion to the goal is replanned from the retrieved frame's pose
-    ClosedLoop,
-}
-
-impl From<ModeName> for Mode {
-    fn from(name: ModeName) -> Self {
-        match name {
-            ModeName::OpenLoop => Self::OpenLoop,
-            ModeName::Snap => Self::Snap,
-            ModeName::ClosedLoop => Self::ClosedLoop,
-        }
-    }
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum ReadingName {
-    Affine,
-    Homogeneous,
-    Literal,
 }
 
 impl Navigate {
@@ -184,18 +159,18 @@ impl Navigate {
         };
 
         let mode = match self.mode {
-            ModeName::OpenLoop => pb::Mode::OpenLoop,
-            ModeName::Snap => pb::Mode::Snap,
-            ModeName::ClosedLoop => pb::Mode::ClosedLoop,
+            Mode::OpenLoop => pb::Mode::OpenLoop,
+            Mode::Snap => pb::Mode::Snap,
+            Mode::ClosedLoop => pb::Mode::ClosedLoop,
         };
 
         // An unspecified reading leaves the choice to the server: homogeneous, unless --navigator
         // already names one.
         let reading = match self.reading {
             None => pb::Reading::Unspecified,
-            Some(ReadingName::Affine) => pb::Reading::Affine,
-            Some(ReadingName::Homogeneous) => pb::Reading::Homogeneous,
-            Some(ReadingName::Literal) => pb::Reading::Literal,
+            Some(Reading::Affine) => pb::Reading::Affine,
+            Some(Reading::Homogeneous) => pb::Reading::Homogeneous,
+            Some(Reading::Literal) => pb::Reading::Literal,
         };
 
         // Fields left at their defaults are filled in by the server, the thresholds of Hit@ε

@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use anyhow::{Context, bail};
 use clap::Args;
 
-use super::ask::ModeName;
 use super::evaluate::navigators_named;
+use super::named::one_of;
 use super::progress::bar;
-use super::protocol::{ProtocolOptions, SplitName};
+use super::protocol::ProtocolOptions;
 use super::rooms::{data, load_rooms, room_words};
 use super::{check_writable, say, write_json};
 use crate::store::{Store, StoredRoom};
@@ -58,8 +58,8 @@ pub struct CrossRoom {
     protocol: ProtocolOptions,
     /// Split of the held-out rooms: which pairs are tested, and among which frames answers are
     /// searched
-    #[arg(long, value_enum, default_value_t = SplitName::Whole)]
-    test_split: SplitName,
+    #[arg(long, value_parser = one_of::<Split>(), default_value = "whole")]
+    test_split: Split,
     /// Navigators by name, separated by commas; if omitted: identity, inverse Poincaré (affine and
     /// homogeneous; with --calibration-rooms also +calibrated) and the ridge refits that the test split allows
     #[arg(long, value_delimiter = ',')]
@@ -239,7 +239,7 @@ impl CrossRoom {
 
             // A refit is fitted on training pairs of the held-out room, which the split `whole`
             // does not set apart. The in-sample refit takes the test pairs instead.
-            if self.test_split != SplitName::Whole {
+            if self.test_split != Split::Whole {
                 navigators.push(refit(false));
             }
 
@@ -262,7 +262,7 @@ impl CrossRoom {
                     );
                 }
                 NavigatorKind::Step(StepKind::Refit(refit), _)
-                    if !refit.in_sample && self.test_split == SplitName::Whole =>
+                    if !refit.in_sample && self.test_split == Split::Whole =>
                 {
                     bail!(
                         "--navigators: '{}' has no pairs to be fitted on under --test-split whole",
@@ -291,11 +291,10 @@ impl CrossRoom {
 
         // Each test motion is taken in a single open-loop step, as in the paper.
         Ok(Protocol {
-            split: self.test_split.into(),
+            split: self.test_split,
             thresholds: vec![self.threshold],
             // Radius 0: only the source frame itself is excluded, not its neighbours in time.
             exclude_source: self.exclude_source.then_some(0),
-            mode: ModeName::OpenLoop.into(),
             navigators,
             ..Protocol::paper(self.protocol.plan(self.seed)?.stride)
         })
@@ -318,7 +317,7 @@ impl CrossRoom {
             plan.split,
             room_words(test),
             plan.stride,
-            Split::from(self.test_split),
+            self.test_split,
             if self.exclude_source {
                 "excluded"
             } else {

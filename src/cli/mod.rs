@@ -14,6 +14,7 @@ mod evaluate;
 mod export;
 mod health;
 mod import;
+mod named;
 #[cfg(feature = "lab")]
 mod probe;
 mod progress;
@@ -178,6 +179,7 @@ fn write_file(path: &std::path::Path, content: &[u8]) -> anyhow::Result<()> {
 }
 
 /// Writes indented JSON, with a newline at the end.
+#[cfg(feature = "lab")]
 fn write_json(path: &std::path::Path, value: &serde_json::Value) -> anyhow::Result<()> {
     write_file(path, format!("{value:#}\n").as_bytes())
 }

@@ -1,7 +1,9 @@
 //! The options of a training protocol, shared by the commands that train.
 
 use anyhow::Context;
-use clap::{Args, ValueEnum};
+use clap::Args;
+
+use super::named::{ClosedSet, one_of};
 
 use seese3_core::adapter::{Loss, Mixing, PairPlan, Preset};
 use seese3_core::splits::{Split, StrideRange};
@@ -11,15 +13,15 @@ use seese3_core::training::TrainingPlan;
 #[derive(Debug, Clone, Args)]
 pub struct ProtocolOptions {
     /// Training protocol that supplies every setting not given below
-    #[arg(long, value_enum, default_value_t = PresetName::PaperBase)]
-    preset: PresetName,
+    #[arg(long, value_parser = one_of::<Preset>(), default_value = "paper-base")]
+    preset: Preset,
     /// Frames from the source to the target of a test pair, 1 to 100000; also of a training pair
     /// unless these are drawn from a range of strides
     #[arg(long, default_value_t = 40)]
     stride: u32,
     /// How training and test pairs are kept apart
-    #[arg(long, value_enum, default_value_t = SplitName::Time)]
-    split: SplitName,
+    #[arg(long, value_parser = one_of::<Split>(), default_value = "time")]
+    split: Split,
     /// Number of epochs, 1 to 100000; the preset's if omitted
     #[arg(long)]
     epochs: Option<usize>,
@@ -51,103 +53,18 @@ pub struct ProtocolOptions {
     #[arg(long)]
     charts: Option<usize>,
     /// How several charts are combined; the preset's if omitted (gate)
-    #[arg(long, value_enum)]
-    mixing: Option<MixingName>,
+    #[arg(long, value_parser = one_of::<Mixing>())]
+    mixing: Option<Mixing>,
     /// Training loss on z-scored motions; the preset's if omitted (mse)
-    #[arg(long, value_enum)]
-    loss: Option<LossName>,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum PresetName {
-    /// The paper's base protocol: all training pairs at one stride, 10 epochs
-    PaperBase,
-    /// The paper's range protocol: 30,000 pairs with strides 10 to 40, 200 epochs
-    PaperRange,
-    /// Not from the paper, for rooms outside the training set: 17 epochs of 30,000 pairs with
-    /// strides 1 to 40 (about 1,000 steps), z-scored features with noise, averaged weights
-    Steady,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum SplitName {
-    /// The first 80 % of the frames train, the rest test
-    Time,
-    /// Every fifth block of 50 frames tests, the others train
-    Blocks,
-    /// Every fifth source frame gives a test pair. Training and test pairs share frames: only for
-    /// checking an implementation, not for measuring generalisation
-    Pairs,
-    /// The recording's own split, if it has one
-    Dataset,
-    /// Every pair both trains and tests: for rooms that are training or held-out rooms as a whole
-    Whole,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum MixingName {
-    /// By a gate that is trained with the charts, as in the paper
-    Gate,
-    /// By their plain average: an ensemble of adapters, each trained for its share of the epochs
-    Even,
-}
-
-impl From<MixingName> for Mixing {
-    fn from(name: MixingName) -> Self {
-        match name {
-            MixingName::Gate => Self::Gate,
-            MixingName::Even => Self::Even,
-        }
-    }
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum LossName {
-    /// Mean squared error over all six components, as in the paper
-    Mse,
-    /// One minus the cosine between predicted and true motion, as vectors of six numbers
-    Cosine,
-    /// Mean squared error of the three rotation components only
-    Rotation,
-}
-
-impl From<PresetName> for Preset {
-    fn from(name: PresetName) -> Self {
-        match name {
-            PresetName::PaperBase => Self::PaperBase,
-            PresetName::PaperRange => Self::PaperRange,
-            PresetName::Steady => Self::Steady,
-        }
-    }
-}
-
-impl From<SplitName> for Split {
-    fn from(name: SplitName) -> Self {
-        match name {
-            SplitName::Time => Self::Time,
-            SplitName::Blocks => Self::Blocks,
-            SplitName::Pairs => Self::Pairs,
-            SplitName::Dataset => Self::Dataset,
-            SplitName::Whole => Self::Whole,
-        }
-    }
-}
-
-impl From<LossName> for Loss {
-    fn from(name: LossName) -> Self {
-        match name {
-            LossName::Mse => Self::MeanSquaredError,
-            LossName::Cosine => Self::Cosine,
-            LossName::Rotation => Self::Rotation,
-        }
-    }
+    #[arg(long, value_parser = one_of::<Loss>())]
+    loss: Option<Loss>,
 }
 
 impl ProtocolOptions {
     /// Rejects `--split whole`, which has no test pairs, for commands that score on test pairs.
     pub fn needs_test_pairs(&self) -> anyhow::Result<()> {
         anyhow::ensure!(
-            self.split != SplitName::Whole,
+            self.split != Split::Whole,
             "--split whole has no test pairs; choose another split"
         );
 
@@ -188,7 +105,7 @@ impl ProtocolOptions {
         );
 
         // The preset comes first; every option that was given replaces one of its settings.
-        let mut plan = TrainingPlan::of(self.preset.into(), self.split.into(), self.stride, seed);
+        let mut plan = TrainingPlan::of(self.preset, self.split, self.stride, seed);
         let config = &mut plan.config;
         let put = |into: &mut usize, given: Option<usize>| given.map_or((), |given| *into = given);
         put(&mut config.epochs, self.epochs);
@@ -200,8 +117,8 @@ impl ProtocolOptions {
 
         config.learning_rate = self.lr.unwrap_or(config.learning_rate);
         config.weight_decay = self.weight_decay.unwrap_or(config.weight_decay);
-        config.mixing = self.mixing.map_or(config.mixing, Into::into);
-        config.loss = self.loss.map_or(config.loss, Into::into);
+        config.mixing = self.mixing.unwrap_or(config.mixing);
+        config.loss = self.loss.unwrap_or(config.loss);
 
         plan.pairs = self.pair_plan(plan.pairs)?;
         Ok(plan)
@@ -255,3 +172,90 @@ const MAX_STRIDE: u32 = 100_000;
 
 /// The largest number of training pairs that is accepted.
 const MAX_PAIRS: usize = 10_000_000;
+
+impl ClosedSet for Preset {
+    fn all() -> Vec<Self> {
+        Self::ALL.to_vec()
+    }
+
+    fn name(self) -> &'static str {
+        self.name()
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            Self::PaperBase => {
+                "The paper's base protocol: all training pairs at one stride, 10 epochs"
+            }
+            Self::PaperRange => {
+                "The paper's range protocol: 30,000 pairs with strides 10 to 40, 200 epochs"
+            }
+            Self::Steady => {
+                "Not from the paper, for rooms outside the training set: 17 epochs of 30,000 pairs with strides 1 to 40 (about 1,000 steps), z-scored features with noise, averaged weights"
+            }
+        }
+    }
+}
+
+impl ClosedSet for Split {
+    fn all() -> Vec<Self> {
+        Self::ALL.to_vec()
+    }
+
+    fn name(self) -> &'static str {
+        self.name()
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            Self::Time => "The first 80 % of the frames train, the rest test",
+            Self::Blocks => "Every fifth block of 50 frames tests, the others train",
+            Self::Pairs => {
+                "Every fifth source frame gives a test pair. Training and test pairs share frames: only for checking an implementation, not for measuring generalisation"
+            }
+            Self::Dataset => "The recording's own split, if it has one",
+            Self::Whole => {
+                "Every pair both trains and tests: for rooms that are training or held-out rooms as a whole"
+            }
+        }
+    }
+}
+
+impl ClosedSet for Mixing {
+    fn all() -> Vec<Self> {
+        Self::ALL.to_vec()
+    }
+
+    fn name(self) -> &'static str {
+        self.name()
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            Self::Gate => "By a gate that is trained with the charts, as in the paper",
+            Self::Even => {
+                "By their plain average: an ensemble of adapters, each trained for its share of the epochs"
+            }
+        }
+    }
+}
+
+impl ClosedSet for Loss {
+    fn all() -> Vec<Self> {
+        Self::ALL.to_vec()
+    }
+
+    fn name(self) -> &'static str {
+        self.name()
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            Self::MeanSquaredError => "Mean squared error over all six components, as in the paper",
+            Self::Cosine => {
+                "One minus the cosine between predicted and true motion, as vectors of six numbers"
+            }
+            Self::Rotation => "Mean squared error of the three rotation components only",
+        }
+    }
+}

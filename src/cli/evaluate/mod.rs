@@ -11,16 +11,15 @@ use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
 use serde_json::json;
 
-use super::ask::ModeName;
+use super::named::one_of;
 use super::progress::bar;
-use super::protocol::SplitName;
 use super::{check_writable, say, write_json};
 use crate::store::{Store, StoredAdapter};
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{Leak, Protocol, TrainedOn, evaluate, is_calibrated_in};
 use seese3_core::navigation::NavigatorKind;
-use seese3_core::navigation::{IndexKind, Navigator};
+use seese3_core::navigation::{IndexKind, Mode, Navigator};
 use seese3_core::room::RoomId;
 use seese3_core::splits::Split;
 use seese3_lab::report::{evaluation_json, evaluation_table};
@@ -75,8 +74,8 @@ struct Navigation {
     #[arg(long)]
     stride: Option<u32>,
     /// How frames are split into training and test; by default as the adapter was trained
-    #[arg(long, value_enum)]
-    split: Option<SplitName>,
+    #[arg(long, value_parser = one_of::<Split>())]
+    split: Option<Split>,
     /// Do not retrieve the source frame
     #[arg(long)]
     exclude_source: bool,
@@ -91,8 +90,8 @@ struct Navigation {
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1_000))]
     steps: u32,
     /// How these steps are chained
-    #[arg(long, value_enum, default_value_t = ModeName::OpenLoop)]
-    mode: ModeName,
+    #[arg(long, value_parser = one_of::<Mode>(), default_value = "open-loop")]
+    mode: Mode,
     /// Seed of the random navigator
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -112,7 +111,7 @@ impl Navigation {
         }
 
         let store = Store::open(&self.store)?;
-        let chosen = choose(&store, &self, self.split.map(Into::into)).await?;
+        let chosen = choose(&store, &self, self.split).await?;
 
         // Without a name, the features are those that the adapter was trained on.
         let features_name = self
@@ -209,13 +208,13 @@ impl Navigation {
     /// The protocol of the options; where they leave out split or stride, the adapter's own.
     fn protocol(&self, record: &TrainingRecord) -> anyhow::Result<Protocol> {
         Ok(Protocol {
-            split: self.split.map_or(record.split, Into::into),
+            split: self.split.unwrap_or(record.split),
             stride: self.stride.unwrap_or(record.stride),
             exclude_source: self.exclude_source.then_some(0),
             thresholds: self.thresholds.clone(),
             seed: self.seed,
             steps: self.steps,
-            mode: self.mode.into(),
+            mode: self.mode,
             navigators: navigators_named(&self.navigators)?,
         })
     }

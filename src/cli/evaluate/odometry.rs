@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context;
-use clap::{Args, ValueEnum};
+use clap::Args;
 
 use seese3_core::eval::has_seen;
 use seese3_core::splits::HoldOut;
@@ -19,6 +19,7 @@ use seese3_lab::report::{
     relocalisation_text,
 };
 
+use super::super::named::{ClosedSet, one_of};
 use super::super::progress::bar;
 use super::super::rooms::{data, load_rooms};
 use super::super::{check_writable, say, write_file, write_json};
@@ -37,8 +38,8 @@ pub struct Odometry {
     #[arg(long)]
     adapter: String,
     /// Which frames are mapped and which are replayed
-    #[arg(long, alias = "course", value_enum, default_value_t = HoldOutName::Blocks)]
-    hold_out: HoldOutName,
+    #[arg(long, alias = "course", value_parser = one_of::<HoldOut>(), default_value = "blocks")]
+    hold_out: HoldOut,
     /// Frames after which a new keyframe is taken; by default what suits the adapter's training
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     keyframe_frames: Option<u32>,
@@ -55,26 +56,6 @@ pub struct Odometry {
     /// Write all results to this file as JSON
     #[arg(long)]
     json: Option<PathBuf>,
-}
-
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum HoldOutName {
-    /// Every second frame is mapped, the others are replayed
-    Interleaved,
-    /// As interleaved, but a fifth of the path is not mapped
-    Blocks,
-    /// The first four fifths are mapped, the last fifth is replayed
-    Time,
-}
-
-impl From<HoldOutName> for HoldOut {
-    fn from(name: HoldOutName) -> Self {
-        match name {
-            HoldOutName::Interleaved => Self::Interleaved,
-            HoldOutName::Blocks => Self::Blocks,
-            HoldOutName::Time => Self::Time,
-        }
-    }
 }
 
 impl Odometry {
@@ -101,7 +82,7 @@ impl Odometry {
         }
 
         let adapter = stored.adapter;
-        let hold_out = HoldOut::from(self.hold_out);
+        let hold_out = self.hold_out;
         let settings = self.settings(TrackerSettings::of(&adapter));
         let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
         let protocol = OdometryProtocol { hold_out, settings };
@@ -220,5 +201,23 @@ fn only_mean(table: &str) -> String {
     match lines.as_slice() {
         [head, .., last] => format!("{head}\n{last}\n"),
         _ => table.to_owned(),
+    }
+}
+
+impl ClosedSet for HoldOut {
+    fn all() -> Vec<Self> {
+        Self::ALL.to_vec()
+    }
+
+    fn name(self) -> &'static str {
+        self.name()
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            Self::Interleaved => "Every second frame is mapped, the others are replayed",
+            Self::Blocks => "As interleaved, but a fifth of the path is not mapped",
+            Self::Time => "The first four fifths are mapped, the last fifth is replayed",
+        }
     }
 }

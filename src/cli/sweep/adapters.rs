@@ -7,8 +7,9 @@ use anyhow::{Context, bail, ensure};
 use clap::Args;
 use rayon::prelude::*;
 
+use super::super::named::one_of;
 use super::super::progress::bar;
-use super::super::protocol::{LossName, ProtocolOptions};
+use super::super::protocol::ProtocolOptions;
 use super::super::rooms::{data, load_rooms};
 use super::super::{say, write_file};
 use super::journal::{self, SweepJournal};
@@ -48,8 +49,8 @@ pub struct Adapters {
     #[arg(long, value_delimiter = ',', default_values_t = [3e-4, 1e-3, 3e-3, 1e-2, 3e-2])]
     lrs: Vec<f64>,
     /// Losses, separated by commas
-    #[arg(long, value_enum, value_delimiter = ',', default_values_t = [LossName::Mse, LossName::Cosine, LossName::Rotation])]
-    losses: Vec<LossName>,
+    #[arg(long, value_parser = one_of::<Loss>(), value_delimiter = ',', default_values = ["mse", "cosine", "rotation"])]
+    losses: Vec<Loss>,
     /// Runs of each configuration, from seed 0 on
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     seeds: u64,
@@ -216,11 +217,7 @@ impl Adapters {
         for &geo_dim in &self.geo_dims {
             for &charts in &self.chart_counts {
                 for &lr in &self.lrs {
-                    grid.extend(
-                        self.losses
-                            .iter()
-                            .map(|&loss| (geo_dim, charts, lr, Loss::from(loss))),
-                    );
+                    grid.extend(self.losses.iter().map(|&loss| (geo_dim, charts, lr, loss)));
                 }
             }
         }

@@ -6,8 +6,8 @@ use anyhow::{Context, bail, ensure};
 use clap::Args;
 use rayon::prelude::*;
 
+use super::super::named::one_of;
 use super::super::progress::bar;
-use super::super::protocol::{PresetName, SplitName};
 use super::super::{check_writable, say, write_json};
 use crate::store::{Store, StoredRoom};
 use seese3_core::adapter::Preset;
@@ -34,11 +34,11 @@ pub struct Layers {
     #[arg(long, default_value_t = 40)]
     stride: u32,
     /// How frames are split into training and test, in M3 and M4
-    #[arg(long, value_enum, default_value_t = SplitName::Time)]
-    split: SplitName,
+    #[arg(long, value_parser = one_of::<Split>(), default_value = "time")]
+    split: Split,
     /// The training preset of M4
-    #[arg(long, value_enum, default_value_t = PresetName::PaperBase)]
-    preset: PresetName,
+    #[arg(long, value_parser = one_of::<Preset>(), default_value = "paper-base")]
+    preset: Preset,
     /// Epochs of M4, in place of the preset's
     #[arg(long)]
     epochs: Option<usize>,
@@ -80,7 +80,7 @@ impl Layers {
         }
 
         ensure!(
-            self.split != SplitName::Whole,
+            self.split != Split::Whole,
             "--split whole sets no test pairs apart; take another split"
         );
 
@@ -136,8 +136,8 @@ impl Layers {
 
         progress.finish_and_clear();
         let scores: Vec<LayerScores> = scored.into_iter().map(|(_, scores)| scores).collect();
-        let split: Split = self.split.into();
-        let preset: Preset = self.preset.into();
+        let split = self.split;
+        let preset = self.preset;
 
         // The table alone would not say how its numbers were measured.
         say(format_args!(
@@ -240,7 +240,7 @@ impl Layers {
     }
 
     fn layer_protocol(&self) -> LayerProtocol {
-        let mut plan = TrainingPlan::of(self.preset.into(), self.split.into(), self.stride, 0);
+        let mut plan = TrainingPlan::of(self.preset, self.split, self.stride, 0);
         plan.config.epochs = self.epochs.unwrap_or(plan.config.epochs);
 
         LayerProtocol {

@@ -1,0 +1,70 @@
+//! Options whose values are a closed set: parsed by the names that the set itself has.
+
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+
+use seese3_core::adapter::Reading;
+use seese3_core::navigation::Mode;
+
+/// A closed set of values with names.
+pub trait ClosedSet: Copy + Send + Sync + 'static {
+    /// Every value, in the order of the help text.
+    fn all() -> Vec<Self>;
+
+    /// The name on the command line, which is the name everywhere.
+    fn name(self) -> &'static str;
+
+    /// What the help text says of the value.
+    fn help(self) -> &'static str;
+}
+
+/// The parser of an option whose value is one of a closed set.
+pub fn one_of<T: ClosedSet>() -> impl TypedValueParser<Value = T> {
+    let possible = T::all()
+        .into_iter()
+        .map(|value| PossibleValue::new(value.name()).help(value.help()));
+
+    PossibleValuesParser::new(possible).try_map(|name| {
+        T::all()
+            .into_iter()
+            .find(|value| value.name() == name)
+            .ok_or("is not one of the possible values")
+    })
+}
+
+impl ClosedSet for Mode {
+    fn all() -> Vec<Self> {
+        vec![Self::OpenLoop, Self::Snap, Self::ClosedLoop]
+    }
+
+    fn name(self) -> &'static str {
+        self.name()
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            Self::OpenLoop => "All steps are added up in latent space, without feedback",
+            Self::Snap => "Each step starts from the frame that the previous step retrieved",
+            Self::ClosedLoop => {
+                "As snap, and the remaining motion to the goal is replanned from the retrieved frame's pose"
+            }
+        }
+    }
+}
+
+impl ClosedSet for Reading {
+    fn all() -> Vec<Self> {
+        Self::ALL.to_vec()
+    }
+
+    fn name(self) -> &'static str {
+        self.name()
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            Self::Affine => "Inverts the trained predictor exactly; zero motion moves the latent",
+            Self::Homogeneous => "Zero motion stays put, and equal parts add up to the whole",
+            Self::Literal => "As printed in the paper",
+        }
+    }
+}
