@@ -1,5 +1,5 @@
-//! A robot's program: asks a server for the frames that a motion leads to, and for the motion between
-//! two of them.
+//! A robot's program: asks a server for the frames that a motion leads to, and for the motion
+//! between two of them.
 //!
 //! ```sh
 //! cargo run --release -- demo                                  # makes demo-output/store

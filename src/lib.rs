@@ -14,8 +14,8 @@
 //! | [`service`] | the gRPC service |
 //! | [`cli`] | the commands |
 //!
-//! Where to start reading: a request in [`service`], a command in [`cli`], the tracking of a camera in
-//! [`seese3_core::tracking`]. `ARCHITECTURE.md` has the whole map and the invariants.
+//! Where to start reading: a request in [`service`], a command in [`cli`], the tracking of a camera
+//! in [`seese3_core::tracking`]. `ARCHITECTURE.md` has the whole map and the invariants.
 
 pub mod datasets;
 pub mod encoder;

@@ -39,8 +39,8 @@ pub struct CrossRoom {
     /// room has only one
     #[arg(long)]
     features: Option<String>,
-    /// Room counts of the scaling curve, separated by commas; each count includes the --calibration-rooms
-    /// rooms. All rooms of --train if omitted
+    /// Room counts of the scaling curve, separated by commas; each count includes the
+    /// --calibration-rooms rooms. All rooms of --train if omitted
     #[arg(long, value_delimiter = ',')]
     sizes: Vec<usize>,
     /// Number of rooms, out of each count, that are not trained on but used to measure the
@@ -61,7 +61,8 @@ pub struct CrossRoom {
     #[arg(long, value_parser = one_of::<Split>(), default_value = "whole")]
     test_split: Split,
     /// Navigators by name, separated by commas; if omitted: identity, inverse Poincaré (affine and
-    /// homogeneous; with --calibration-rooms also +calibrated) and the ridge refits that the test split allows
+    /// homogeneous; with --calibration-rooms also +calibrated) and the ridge refits that the test
+    /// split allows
     #[arg(long, value_delimiter = ',')]
     navigators: Vec<String>,
     /// Navigator that the others' Hit@ε is compared with

@@ -241,8 +241,8 @@ impl Destination {
         Ok(recording)
     }
 
-    /// The room of a recording. An exported bundle states its name, format and licence: the original
-    /// format is kept, and --licence and --name win over the stated ones.
+    /// The room of a recording. An exported bundle states its name, format and licence: the
+    /// original format is kept, and --licence and --name win over the stated ones.
     fn room(
         &self,
         format: &str,

@@ -174,7 +174,8 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
 }
 
 /// Replaces the placeholder source of every array by the one that `bundle.json` states. Arrays and
-/// list have to match: an array that is not listed is refused, and so is a listed one that is missing.
+/// list have to match: an array that is not listed is refused, and so is a listed one that is
+/// missing.
 fn with_sources(read: Vec<Features>, stated: &[Made], file: &Path) -> Result<Vec<Features>, Error> {
     let malformed = |problem: String| Error::Malformed {
         file: file.to_owned(),

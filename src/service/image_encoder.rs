@@ -97,8 +97,8 @@ pub fn open(
     Ok(image_encoders)
 }
 
-/// Reads every model before any adapter is looked at, so that a wrong path ends the server at once. A
-/// model that no adapter needs is probably a mistake of the operator.
+/// Reads every model before any adapter is looked at, so that a wrong path ends the server at once.
+/// A model that no adapter needs is probably a mistake of the operator.
 fn check_models(
     models: &[String],
     adapters: &BTreeMap<String, Arc<StoredAdapter>>,

@@ -1,5 +1,5 @@
-//! One log line for each request when it ends, with a request id that the caller may choose and that
-//! the response returns.
+//! One log line for each request when it ends, with a request id that the caller may choose and
+//! that the response returns.
 //!
 //! Each request has a span of its own. Its gRPC status comes with the headers of a response that
 //! failed at once, and otherwise with the trailers, behind the last message of a stream; it is

@@ -162,8 +162,8 @@ impl Store {
         })
     }
 
-    /// Writes the objects of a room. `known_frames` are those of the newest revision, if the room has
-    /// the same.
+    /// Writes the objects of a room. `known_frames` are those of the newest revision, if the room
+    /// has the same.
     async fn write_objects(
         &self,
         folder: &Path,
@@ -279,8 +279,8 @@ impl Store {
         Ok((stored, features))
     }
 
-    /// What an adapter has seen of a revision of a room. A room imported again has a new revision but
-    /// often the same frames, so the frames are compared and not the numbers of the revisions.
+    /// What an adapter has seen of a revision of a room. A room imported again has a new revision
+    /// but often the same frames, so the frames are compared and not the numbers of the revisions.
     ///
     /// # Errors
     /// As [`Store::same_frames`].

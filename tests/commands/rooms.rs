@@ -301,8 +301,8 @@ fn a_suite_is_drawn_once_and_encodes_as_its_images_do() {
     assert_eq!((picture.width(), picture.height()), (480, 120));
 }
 
-/// Oracle: the promise of the help: a corrupt image is named and stops; it is skipped and counted when asked;
-/// what was done before stays done.
+/// Oracle: the promise of the help: a corrupt image is named and stops; it is skipped and counted
+/// when asked; what was done before stays done.
 #[test]
 fn a_corrupt_image_is_named_or_left_out() {
     let folder = tempfile::tempdir().unwrap();
@@ -509,8 +509,8 @@ fn layers_are_swept() {
     );
 }
 
-/// Oracle: the promise of the manual: a lean build answers with the exact line to build it; recipes are
-/// listed in both.
+/// Oracle: the promise of the manual: a lean build answers with the exact line to build it; recipes
+/// are listed in both.
 #[test]
 fn models_need_a_build_that_can_run_them() {
     let said = succeeds(&["encoders"]);

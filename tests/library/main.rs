@@ -1,8 +1,10 @@
-//! The library against other libraries and against definitions: mpmath, PyTorch, NumPy, scikit-learn,
-//! SciPy, evo, Pillow; and the contracts of indexes, datasets, stores and of the tree itself.
+//! The library against other libraries and against definitions: mpmath, PyTorch, NumPy,
+//! scikit-learn, SciPy, evo, Pillow; and the contracts of indexes, datasets, stores and of the tree
+//! itself.
 //!
-//! Inputs and expected values lie in `tests/golden` with the scripts that made them. Tests that need
-//! the folder of large inputs are ignored, visibly, unless asked for: `cargo test -- --ignored`.
+//! Inputs and expected values lie in `tests/golden` with the scripts that made them. Tests that
+//! need the folder of large inputs are ignored, visibly, unless asked for: `cargo test --
+//! --ignored`.
 #![allow(
     missing_docs,
     clippy::unwrap_used,

@@ -528,8 +528,8 @@ async fn publishers_at_the_same_time_get_revisions_of_their_own() {
     assert_eq!(store.load_room("a", None).await.unwrap().features.len(), 6);
 }
 
-/// Oracle: a list of bad input: unknown names, names that are paths, rows that do not fit, places that
-/// are not there.
+/// Oracle: a list of bad input: unknown names, names that are paths, rows that do not fit, places
+/// that are not there.
 #[tokio::test]
 async fn bad_visitors_are_told_what_to_change() {
     let (_folder, store) = stored().await;

@@ -83,8 +83,9 @@ fn a_wrong_match_cannot_pull_the_pose() {
     assert!(refused > 0, "no wrong match was met");
 }
 
-/// Oracle: the definition: odom goes on from frame to frame by no more than the camera moves at most,
-/// but for half of that as the error of a reading, also where map is found, lost and found elsewhere.
+/// Oracle: the definition: odom goes on from frame to frame by no more than the camera moves at
+/// most, but for half of that as the error of a reading, also where map is found, lost and found
+/// elsewhere.
 #[test]
 fn odom_never_jumps() {
     let adapter = Arc::new(calibrated().0);
@@ -145,9 +146,9 @@ fn odom_never_jumps() {
     assert!(PoseError::between(&last, &room.poses()[FRAMES - 1]).translation_m < 0.3);
 }
 
-/// Oracle: the rule: after a gap the room has to be seen again. The views turn so slowly into those of
-/// another place that none is a jump: without a gap the confirmed camera explores on, behind a gap
-/// the same view leaves it lost.
+/// Oracle: the rule: after a gap the room has to be seen again. The views turn so slowly into those
+/// of another place that none is a jump: without a gap the confirmed camera explores on, behind a
+/// gap the same view leaves it lost.
 #[test]
 fn what_a_gap_hid_is_not_taken_on_trust() {
     let adapter = Arc::new(calibrated().0);

@@ -102,8 +102,8 @@ async fn health_answers_for_the_server_its_services_and_its_rooms() {
         .unwrap();
 }
 
-/// Oracle: the promise of the deployment's page: NOT_SERVING until all is loaded, and a store that is damaged ends the server
-/// with its file.
+/// Oracle: the promise of the deployment's page: NOT_SERVING until all is loaded, and a store that
+/// is damaged ends the server with its file.
 #[tokio::test]
 async fn a_damaged_store_never_serves() {
     let (folder, store) = filled_store().await;

@@ -597,8 +597,8 @@ async fn a_camera_is_put_where_it_is_not_where_its_keyframe_was() {
     );
 }
 
-/// Oracle: the recorded rooms: a room that is not named is found, the first one by name as well as the
-/// second, also when the stream is cut before that.
+/// Oracle: the recorded rooms: a room that is not named is found, the first one by name as well as
+/// the second, also when the stream is cut before that.
 #[tokio::test]
 async fn a_room_that_is_not_named_is_found() {
     let server = server(KEY).await;

@@ -1,8 +1,8 @@
 //! Poses and motions from the wire and to it, as nalgebra's types.
 //!
-//! A wire pose is `parent_from_child`: it takes coordinates of the child frame to those of the parent
-//! frame, metres. A wire twist is in se(3): v in metres and ω in radians, in the body frame of the
-//! camera that the motion starts from.
+//! A wire pose is `parent_from_child`: it takes coordinates of the child frame to those of the
+//! parent frame, metres. A wire twist is in se(3): v in metres and ω in radians, in the body frame
+//! of the camera that the motion starts from.
 
 use nalgebra::{Isometry3, Quaternion, UnitQuaternion, Vector3};
 

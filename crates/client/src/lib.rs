@@ -1,5 +1,5 @@
-//! A client of [seese3](https://docs.rs/seese3), latent navigation over gRPC: all that a robot's program
-//! has to link.
+//! A client of [seese3](https://docs.rs/seese3), latent navigation over gRPC: all that a robot's
+//! program has to link.
 //!
 //! ```no_run
 //! use std::time::Duration;
@@ -36,7 +36,8 @@
 //! | [`convert`] | poses and motions as nalgebra's types |
 //!
 //! Conventions: metres, radians, seconds; camera axes x right, y down, z forward; poses are
-//! `parent_from_child`; twists are (v, ω) in the body frame of the camera that a motion starts from.
+//! `parent_from_child`; twists are (v, ω) in the body frame of the camera that a motion starts
+//! from.
 //!
 //! The feature `server` adds the server's side of the protocol; a robot does not need it.
 

@@ -2,8 +2,8 @@
 //!
 //! An encoder turns an image into a feature z. A small trained network φ, the *Poincaré adapter*,
 //! turns features into latents in which camera motion is linear: ΔP ≈ W(φ(z₂) − φ(z₁)), with
-//! ΔP = log(P₁⁻¹P₂) ∈ se(3). Inverted, a motion can be imagined: ĝ = φ(z) + W⁺ΔP, and the stored frame
-//! nearest to ĝ shows where it leads.
+//! ΔP = log(P₁⁻¹P₂) ∈ se(3). Inverted, a motion can be imagined: ĝ = φ(z) + W⁺ΔP, and the stored
+//! frame nearest to ĝ shows where it leads.
 //!
 //! ```
 //! use std::sync::Arc;
@@ -51,10 +51,10 @@
 //!
 //! # Conventions
 //!
-//! A [`geometry::Pose`] is `world_from_camera`, metres. A [`geometry::Twist`] is ordered (v, ω), in the
-//! body frame of the camera that a motion starts from; |ω| ≤ π. Camera axes are x right, y down,
-//! z forward. Weights are f32 as trained; answers are computed in f64. The numbers A-nn are those of
-//! the ambiguities in `docs/paper.md`.
+//! A [`geometry::Pose`] is `world_from_camera`, metres. A [`geometry::Twist`] is ordered (v, ω), in
+//! the body frame of the camera that a motion starts from; |ω| ≤ π. Camera axes are x right, y down,
+//! z forward. Weights are f32 as trained; answers are computed in f64. The numbers A-nn are those
+//! of the ambiguities in `docs/paper.md`.
 //!
 //! # The map
 //!
@@ -81,7 +81,8 @@
 //! | [`calibration`] | how large an adapter's errors are in rooms that it did not learn from |
 //! | [`eval`] | Hit@ε on held-out motions, and whether a score leaks |
 //!
-//! Nothing here reads files, the network, the clock or the environment; randomness enters as a seed.
+//! Nothing here reads files, the network, the clock or the environment; randomness enters as a
+//! seed.
 
 pub mod cancel;
 pub mod geometry;

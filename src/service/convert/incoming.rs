@@ -185,8 +185,8 @@ pub fn query(
     let thresholds = thresholds(given_thresholds)?;
     let (step, metric) = step_of(&navigator, reading)?;
 
-    // Encoding an image is costly, so that the fields above are checked before it; what follows needs
-    // the source.
+    // Encoding an image is costly, so that the fields above are checked before it; what follows
+    // needs the source.
     let source = source("source", view, adapter, snapshot)?;
     if source_pose.is_some() && matches!(source, Source::Frame(_)) {
         return Err(Error::invalid(

@@ -1,5 +1,6 @@
 //! An adapter's error model: how large its errors are in rooms that it did not learn from. It is
-//! measured once, by [`crate::calibration`], and kept with the adapter; without one nothing is tracked.
+//! measured once, by [`crate::calibration`], and kept with the adapter; without one nothing is
+//! tracked.
 //!
 //! Start reading at [`ErrorStatistics`], which lists everything that is measured.
 
@@ -26,8 +27,8 @@ pub struct ErrorTable {
 pub struct Stratum {
     /// The predicting number, above 0.
     pub at: f64,
-    /// The share of a reading to be believed: the slope of the regression of truth on reading, 0 to 1.
-    /// 1 for motions, which are believed as they are read.
+    /// The share of a reading to be believed: the slope of the regression of truth on reading, 0 to
+    /// 1. 1 for motions, which are believed as they are read.
     pub gain: f64,
     /// The covariance of errors on (v, ω), metres and radians; positive definite.
     pub covariance: Matrix6<f64>,
@@ -98,13 +99,14 @@ impl ErrorTable {
 /// Covariances of read motions, Σ = (u + u₀) S(n).
 ///
 /// They grow with the squared length u of the latents' difference (fitted exponents are 1 within a
-/// few hundredths), and with the number n of frames that the motion takes, since over few frames u is
-/// mostly noise.
+/// few hundredths), and with the number n of frames that the motion takes, since over few frames u
+/// is mostly noise.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionErrors {
     /// S by the number of frames, 1 or more; on (v, ω), metres and radians.
     pub shapes: ErrorTable,
-    /// u₀, above 0, in the unit of u: what is added so that a camera that stands still has errors too.
+    /// u₀, above 0, in the unit of u: what is added so that a camera that stands still has errors
+    /// too.
     pub floor: f64,
 }
 
@@ -122,24 +124,25 @@ impl MotionErrors {
     }
 }
 
-/// Everything that calibration measures of an adapter's errors, in rooms that it did not learn from.
+/// Everything that calibration measures of an adapter's errors, in rooms that it did not learn
+/// from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ErrorStatistics {
-    /// Frame noise: half the second moment of the differences of latents from one frame to the next,
-    /// shape (c, c). It holds the camera's own motion over one frame as well as noise.
+    /// Frame noise: half the second moment of the differences of latents from one frame to the
+    /// next, shape (c, c). It holds the camera's own motion over one frame as well as noise.
     pub frame_noise: Array2<f64>,
-    /// Motion spread: the second moment of the differences of latents over motions of one frame up to
-    /// the longest stride that the adapter was trained on, shape (c, c).
+    /// Motion spread: the second moment of the differences of latents over motions of one frame up
+    /// to the longest stride that the adapter was trained on, shape (c, c).
     pub motion_spread: Array2<f64>,
     /// Errors of read motions; u is measured in `motion_spread`.
     pub motion_errors: MotionErrors,
     /// Errors of a pose read from a matching frame, by the match's distance in `frame_noise`.
     pub anchor_errors: ErrorTable,
-    /// A match whose distance is more than this many times the room's typical distance shows another
-    /// place.
+    /// A match whose distance is more than this many times the room's typical distance shows
+    /// another place.
     pub out_of_distribution_ratio: f64,
-    /// A match whose distance is at most this many times the room's typical distance certainly shows
-    /// this room: hardly any frame of another room comes so near.
+    /// A match whose distance is at most this many times the room's typical distance certainly
+    /// shows this room: hardly any frame of another room comes so near.
     pub certain_match_ratio: f64,
     /// A view further than this, in `frame_noise`, from each of the last [`JUMP_WINDOW`] frames has
     /// jumped; where frames are missing, than this times the cube root of the frames in between.
@@ -206,7 +209,8 @@ impl ErrorModel {
         &self.frame_noise
     }
 
-    /// The covariance of a motion over `frames` frames, read from a difference of latents, shape (c,).
+    /// The covariance of a motion over `frames` frames, read from a difference of latents, shape
+    /// (c,).
     pub fn motion_errors(&self, difference: ArrayView1<'_, f64>, frames: u64) -> Matrix6<f64> {
         self.statistics
             .motion_errors
@@ -224,8 +228,8 @@ impl ErrorModel {
         strata[strata.len() - 1].at
     }
 
-    /// The covariance of a motion of which nothing is known but that the adapter was trained for such
-    /// motions.
+    /// The covariance of a motion of which nothing is known but that the adapter was trained for
+    /// such motions.
     pub fn unread_errors(&self) -> Matrix6<f64> {
         // The mean squared length of a difference under its own second moment is the number of its
         // columns.

@@ -1,7 +1,7 @@
 //! Mixtures of charts, and the gate that weighs them: ΔP ≈ Σ_k α_k(z₁) W_k(φ_k(z₂) − φ_k(z₁)).
 //!
-//! - α = softmax_k((W_route z)·p_k / e^τ). The gate depends on the source frame alone (Sec. A.11). A
-//!   single chart has no gate.
+//! - α = softmax_k((W_route z)·p_k / e^τ). The gate depends on the source frame alone (Sec. A.11).
+//!   A single chart has no gate.
 //! - Charts that were trained separately can be mixed evenly, as an ensemble; then W̄ = \[W_1, …,
 //!   W_K\]/K.
 //! - Each φ_k is an MLP of its own. A latent of K > 1 charts holds their K·k coordinates,

@@ -100,8 +100,8 @@ fn add_matches(
     }
 }
 
-/// The share of read motions to be believed: the slope of the regression of truth on reading through
-/// the origin, 0 to 1.
+/// The share of read motions to be believed: the slope of the regression of truth on reading
+/// through the origin, 0 to 1.
 fn gain(matches: &[Match], scale: &Vector6<f64>) -> f64 {
     let mut truth_on_read = 0.0;
     let mut read_on_read = 0.0;

@@ -13,8 +13,9 @@ const STRIDE_STEP: usize = 5;
 /// A covariance of six components needs at least as many errors.
 const FEWEST_PAIRS: usize = 6;
 
-/// The second moment of the errors of motions without μ, Σ = mean r rᵀ with r = ΔP − σ⊙W(g₂ − g₁), on
-/// (v, ω), metres and radians, over all pairs of the rooms at the strides the adapter was trained on.
+/// The second moment of the errors of motions without μ, Σ = mean r rᵀ with r = ΔP − σ⊙W(g₂ − g₁),
+/// on (v, ω), metres and radians, over all pairs of the rooms at the strides the adapter was
+/// trained on.
 ///
 /// # Errors
 /// [`Error`] when a room is too short to have a pair.

@@ -11,8 +11,8 @@ use crate::statistics::{median, quantile};
 
 /// Every so many frames of another room are matched with a room.
 const OTHER_ROOM_STEP: usize = 4;
-/// The out-of-distribution limit lies between the distance that this share of a room's own frames is
-/// below …
+/// The out-of-distribution limit lies between the distance that this share of a room's own frames
+/// is below …
 const OWN_SHARE: f64 = 0.97;
 /// … and the distance that this share of other rooms' frames is below.
 const OTHERS_SHARE: f64 = 0.02;
@@ -33,8 +33,8 @@ pub struct MatchLimits {
 
 /// The limits of matches, from the rooms' whitened latents. A room's own frames are those of the
 /// blocks that its map leaves out, so that they are as far from the map as unmapped places are. The
-/// out-of-distribution limit is the geometric mean of a high quantile of own distances and a low one
-/// of other rooms' distances.
+/// out-of-distribution limit is the geometric mean of a high quantile of own distances and a low
+/// one of other rooms' distances.
 pub fn match_limits(rooms: &[Array2<f64>]) -> Result<MatchLimits, Error> {
     let mut own = Vec::new();
     let mut others = Vec::new();

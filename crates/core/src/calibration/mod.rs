@@ -10,8 +10,8 @@
 //!    error model so far (`map_pose_factor`).
 //!
 //! Errors are heavy-tailed and differ from room to room. The covariances of the error model are
-//! therefore fitted by Student's t, and one factor then balances the shares of errors inside the 68 %
-//! and the 95 % ellipsoid. The covariance of step 1 is a plain second moment.
+//! therefore fitted by Student's t, and one factor then balances the shares of errors inside the 68
+//! % and the 95 % ellipsoid. The covariance of step 1 is a plain second moment.
 
 mod anchors;
 mod error_covariance;
@@ -81,12 +81,12 @@ pub struct CalibrationReport {
     pub can_track: bool,
 }
 
-/// Calibrates an adapter for retrieval and, with two or more rooms, for tracking. `record` is how the
-/// adapter was trained.
+/// Calibrates an adapter for retrieval and, with two or more rooms, for tracking. `record` is how
+/// the adapter was trained.
 ///
 /// # Errors
-/// [`Error`], when the adapter learned from one of the rooms, a room is too short, or its features are
-/// not the adapter's.
+/// [`Error`], when the adapter learned from one of the rooms, a room is too short, or its features
+/// are not the adapter's.
 pub fn calibrate(
     adapter: Adapter,
     record: &TrainingRecord,

@@ -10,8 +10,8 @@ use crate::adapter::{self, Adapter, ErrorTable, MotionErrors, PairPlan, Stratum,
 use crate::geometry::body_twist;
 use crate::splits::Pair;
 
-/// u₀ of [`MotionErrors`]: chosen, not measured, about the squared length u between successive frames;
-/// it matters only where u is near zero.
+/// u₀ of [`MotionErrors`]: chosen, not measured, about the squared length u between successive
+/// frames; it matters only where u is near zero.
 const FLOOR: f64 = 0.05;
 
 /// A pair of frames of one of several rooms.
@@ -23,8 +23,8 @@ pub struct RoomPair {
     pub pair: Pair,
 }
 
-/// The strides that motions are measured at: the Fibonacci numbers 1, 2, 3, 5, 8, … below the longest
-/// stride that the adapter was trained on, and that one.
+/// The strides that motions are measured at: the Fibonacci numbers 1, 2, 3, 5, 8, … below the
+/// longest stride that the adapter was trained on, and that one.
 pub fn strides(plan: &PairPlan) -> Vec<u32> {
     let longest = match plan {
         PairPlan::Stride(stride) => *stride,

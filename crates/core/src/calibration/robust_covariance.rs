@@ -12,8 +12,8 @@ const DIMENSIONS: f64 = 6.0;
 /// Reweighting steps of the fit; it converges linearly, and thirty leave no visible change.
 const ITERATIONS: usize = 30;
 
-/// The covariance of errors: the shape of a Student's t, fitted by reweighting, times the factor that
-/// balances the shares of errors inside the 68 % and the 95 % ellipsoid.
+/// The covariance of errors: the shape of a Student's t, fitted by reweighting, times the factor
+/// that balances the shares of errors inside the 68 % and the 95 % ellipsoid.
 ///
 /// # Errors
 /// [`Error::ErrorModel`] when the errors do not span six dimensions.
@@ -62,8 +62,8 @@ mod tests {
 
     use super::*;
 
-    /// Oracle: the definition of a covariance: of normal errors it is their own, and both shares are
-    /// near what is wanted.
+    /// Oracle: the definition of a covariance: of normal errors it is their own, and both shares
+    /// are near what is wanted.
     #[test]
     fn the_shape_of_normal_errors_is_theirs() {
         let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(4);

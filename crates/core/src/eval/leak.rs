@@ -1,5 +1,5 @@
-//! Whether a score leaks: whether an adapter may have trained on the very pairs that it is tested on.
-//! This is the one place that decides it; commands, the service and reports ask here.
+//! Whether a score leaks: whether an adapter may have trained on the very pairs that it is tested
+//! on. This is the one place that decides it; commands, the service and reports ask here.
 
 use crate::adapter::TrainingRecord;
 use crate::room::RoomId;
@@ -26,8 +26,8 @@ pub enum Leak {
 }
 
 impl Leak {
-    /// The leak of testing under `split` in a room of which the adapter has seen `trained_on`; none if
-    /// the test pairs are held out.
+    /// The leak of testing under `split` in a room of which the adapter has seen `trained_on`; none
+    /// if the test pairs are held out.
     pub fn of(record: &TrainingRecord, trained_on: TrainedOn, split: Split) -> Option<Self> {
         // Under `whole` every pair is trained on; under `pairs` the pairs differ, but their frames
         // were all seen.

@@ -1,5 +1,5 @@
-//! The name of a navigator: the one place that writes and reads it. Tables, JSON, the command line and
-//! the wire all use it.
+//! The name of a navigator: the one place that writes and reads it. Tables, JSON, the command line
+//! and the wire all use it.
 
 use super::{Refit, RetrievalMetric, StepKind};
 use crate::adapter::{Adapter, CorrectorKind, Reading};

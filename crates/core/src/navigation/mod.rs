@@ -2,7 +2,8 @@
 //! camera would see, in one step or several.
 //!
 //! - One step in latent space is ĝ = g + W⁺ΔP in one of three readings ([`Reading`], A-16), or what
-//!   another [`Stepper`] gives. The stored frames nearest to ĝ under a [`RetrievalMetric`] are retrieved.
+//!   another [`Stepper`] gives. The stored frames nearest to ĝ under a [`RetrievalMetric`] are
+//!   retrieved.
 //! - Steps are chained in one of three ways: open loop adds all steps up in latent space;
 //!   snap continues from the latent of each retrieved frame; closed loop does so too, and also
 //!   plans the remaining motion anew from that frame's pose.

@@ -80,8 +80,8 @@ pub struct Navigator {
     kind: IndexKind,
     /// The search under [`RetrievalMetric::Full`].
     search: Search,
-    /// The searches under the other metrics, indexed by `metric as usize`, each built when it is first
-    /// asked for.
+    /// The searches under the other metrics, indexed by `metric as usize`, each built when it is
+    /// first asked for.
     other_searches: [OnceLock<Search>; RetrievalMetric::ALL.len()],
     /// Fitted refits by variant and pairs: fitting one takes all pairs of the room.
     refits: Mutex<Vec<(Refit, FitOn, Arc<Stepper>)>>,

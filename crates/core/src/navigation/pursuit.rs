@@ -196,9 +196,9 @@ enum Progress<'a> {
     Recovered(Option<&'a Hit>),
 }
 
-/// The latent proposes frames; their stored poses decide. The nearest frame in latent space is taken
-/// if it is progress. Otherwise the step recovers with the retrieved frame that is nearest to the
-/// goal, if any is nearer than the camera now.
+/// The latent proposes frames; their stored poses decide. The nearest frame in latent space is
+/// taken if it is progress. Otherwise the step recovers with the retrieved frame that is nearest to
+/// the goal, if any is nearer than the camera now.
 fn progress<'a>(
     hits: &'a [Hit],
     goal: &Pose,

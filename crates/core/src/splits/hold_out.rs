@@ -44,7 +44,8 @@ impl HoldOut {
         frames_where(frame_count, is_mapped)
     }
 
-    /// The tracked frames of a recording with `frame_count` frames, in order; none of them is mapped.
+    /// The tracked frames of a recording with `frame_count` frames, in order; none of them is
+    /// mapped.
     pub fn tracked(self, frame_count: usize) -> Vec<FrameId> {
         let is_tracked = |row: &usize| match self {
             Self::Interleaved | Self::Blocks => row % 2 == 1,

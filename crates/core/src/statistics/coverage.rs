@@ -1,8 +1,8 @@
 //! Whether stated covariances hold: the shares of errors inside their ellipsoids, and the factor
 //! that would make them hold.
 //!
-//! An error e with a stated covariance Σ has the squared Mahalanobis length eᵀ Σ⁻¹ e. If e is normal
-//! with six degrees of freedom, these lengths follow χ² with six degrees of freedom.
+//! An error e with a stated covariance Σ has the squared Mahalanobis length eᵀ Σ⁻¹ e. If e is
+//! normal with six degrees of freedom, these lengths follow χ² with six degrees of freedom.
 
 /// 68 % of χ² with six degrees of freedom lies below.
 pub const CHI_SQUARED_68: f64 = 7.012;
@@ -64,8 +64,8 @@ pub fn coverage(squared_lengths: &[f64]) -> Coverage {
 }
 
 /// The factor by which covariances have to be multiplied so that both shares of errors come nearest
-/// to what is wanted; of equally good factors the smallest. Sorts `squared_lengths`; `None` if there
-/// are none.
+/// to what is wanted; of equally good factors the smallest. Sorts `squared_lengths`; `None` if
+/// there are none.
 pub fn balancing_factor(squared_lengths: &mut [f64]) -> Option<f64> {
     if squared_lengths.is_empty() {
         return None;
@@ -114,8 +114,8 @@ mod tests {
         );
     }
 
-    /// Oracle: by hand: two of three errors have to be inside the inner ellipsoid and all inside the
-    /// outer one, which a factor of 4 does for lengths of 4·7 and 4·12.
+    /// Oracle: by hand: two of three errors have to be inside the inner ellipsoid and all inside
+    /// the outer one, which a factor of 4 does for lengths of 4·7 and 4·12.
     #[test]
     fn the_balancing_factor_brings_errors_inside() {
         let mut lengths = vec![4.0 * 7.0, 4.0 * 7.0, 4.0 * 12.0];

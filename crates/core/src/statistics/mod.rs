@@ -2,7 +2,8 @@
 //! bootstrap over rooms, and the coverage of stated covariances.
 //!
 //! Pairs of frames from one room resemble each other, so an interval over many rooms resamples the
-//! rooms ([`bootstrap_mean`]); the interval of a count of independent trials is Wilson's ([`Rate`]).
+//! rooms ([`bootstrap_mean`]); the interval of a count of independent trials is Wilson's
+//! ([`Rate`]).
 
 mod coverage;
 

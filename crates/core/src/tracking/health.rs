@@ -1,9 +1,9 @@
-//! Tracking health: whether a stream's frames follow from one another and match the room. It tells a
-//! camera that is lost from one that explores a part of the room that is not mapped.
+//! Tracking health: whether a stream's frames follow from one another and match the room. It tells
+//! a camera that is lost from one that explores a part of the room that is not mapped.
 //!
-//! A frame far from every mapped frame can mean two things. If the stream was confirmed to be in the
-//! room, and each view follows from the one before, the camera has only left the mapped part. If the
-//! stream was never confirmed, or the view jumped, nobody knows where the camera is.
+//! A frame far from every mapped frame can mean two things. If the stream was confirmed to be in
+//! the room, and each view follows from the one before, the camera has only left the mapped part.
+//! If the stream was never confirmed, or the view jumped, nobody knows where the camera is.
 
 /// Frames in a row that must match the room with certainty before a lost stream is tracked again.
 pub const FRAMES_TO_RECOVER: u32 = 5;
@@ -24,8 +24,8 @@ pub enum TrackingHealth {
         /// Matching frames, less two for each other one; not counted on once the
         /// stream is confirmed.
         score: i32,
-        /// Whether the stream is certainly in this room, so that frames unlike the map show parts of
-        /// the room that are not mapped.
+        /// Whether the stream is certainly in this room, so that frames unlike the map show parts
+        /// of the room that are not mapped.
         confirmed: bool,
     },
     /// The frames do not match the room, or do not follow from one another.

@@ -119,8 +119,8 @@ impl Map {
             distance: f64::INFINITY,
         });
 
-        // The stored frame is near the view, not at it: add the motion from it to the view, shrunk by
-        // the gain that calibration found for matches of this distance.
+        // The stored frame is near the view, not at it: add the motion from it to the view, shrunk
+        // by the gain that calibration found for matches of this distance.
         let errors = self.error_model.anchor_errors(best.distance);
         let latents = self.navigator.latents();
         let motion = adapter

@@ -32,7 +32,8 @@ pub struct RoomMatch {
     /// The mean distance of the views from their nearest frames, in standard deviations of frame
     /// noise.
     pub distance: f64,
-    /// The mean of the views' distances over the room's limit: above 1 they look like another place.
+    /// The mean of the views' distances over the room's limit: above 1 they look like another
+    /// place.
     pub out_of_distribution: f64,
     /// How the last view matches.
     pub last: MapMatch,
@@ -42,8 +43,8 @@ pub struct RoomMatch {
 /// `hit_count` frames are returned for the newest view.
 ///
 /// # Errors
-/// [`Error::NoMap`] without a map, [`Error::NoView`] without a view, [`Error::Adapters`] when the maps
-/// have several adapters, [`Error::Cancelled`] when nobody waits any more.
+/// [`Error::NoMap`] without a map, [`Error::NoView`] without a view, [`Error::Adapters`] when the
+/// maps have several adapters, [`Error::Cancelled`] when nobody waits any more.
 pub fn relocalize(
     maps: &[Arc<Map>],
     latents: &[Array1<f64>],

@@ -1,7 +1,8 @@
 //! How large an adapter's errors are in one room, compared with the rooms it was calibrated in.
 //!
-//! The poses of a map's frames are known, so its own frames tell: the errors of motions between them,
-//! and of poses read from one when it is left out of the map, against the calibrated covariances.
+//! The poses of a map's frames are known, so its own frames tell: the errors of motions between
+//! them, and of poses read from one when it is left out of the map, against the calibrated
+//! covariances.
 
 use ndarray::{Array2, s};
 
@@ -48,8 +49,8 @@ pub fn motion_errors(
     })
 }
 
-/// How large the errors of retrieved poses are in a room, compared with the calibration: a factor of
-/// covariances. `whitened` are the room's whitened latents, row by frame.
+/// How large the errors of retrieved poses are in a room, compared with the calibration: a factor
+/// of covariances. `whitened` are the room's whitened latents, row by frame.
 pub fn anchor_factor(
     navigator: &Navigator,
     error_model: &ErrorModel,

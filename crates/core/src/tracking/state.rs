@@ -98,8 +98,8 @@ pub struct Update {
     pub is_keyframe: bool,
     /// `odom_from_camera`.
     pub odom: Belief,
-    /// `map_from_camera` as it is reported; the map's frame is the room's world. In a single room it is
-    /// still given when the stream is LOST, so look at `status` before using it.
+    /// `map_from_camera` as it is reported; the map's frame is the room's world. In a single room
+    /// it is still given when the stream is LOST, so look at `status` before using it.
     pub map_pose: Option<Belief>,
     /// The mean velocity since the frame before, metres and radians per second, in the camera's
     /// body frame; none for the first frame.

@@ -4,15 +4,16 @@
 //! Start reading at [`Tracker::observe`], which hands a frame to `step`, the whole algorithm in six
 //! paragraphs.
 //!
-//! - A tracker keeps nothing: all that it knows of a stream is its [`State`], and the same state and
-//!   frame give the same answer to the bit.
-//! - `odom_from_camera` is continuous: motions are composed and never corrected. `map_from_camera` is
-//!   corrected and may jump.
+//! - A tracker keeps nothing: all that it knows of a stream is its [`State`], and the same state
+//!   and frame give the same answer to the bit.
+//! - `odom_from_camera` is continuous: motions are composed and never corrected. `map_from_camera`
+//!   is corrected and may jump.
 //! - The map pose is kept twice. The *believed* pose is the filter's own, with the covariance that
-//!   the filter computes; anchors are compared with it. The *reported* pose is what clients are told,
-//!   with the covariance that its errors were measured to have. While both exist they are the same
-//!   pose and differ in covariance alone; after LOST only the reported one remains. A filter that treats anchors as
-//!   independent grows far too sure of itself, because anchors on the same part of a path err alike.
+//!   the filter computes; anchors are compared with it. The *reported* pose is what clients are
+//!   told, with the covariance that its errors were measured to have. While both exist they are the
+//!   same pose and differ in covariance alone; after LOST only the reported one remains. A filter
+//!   that treats anchors as independent grows far too sure of itself, because anchors on the same
+//!   part of a path err alike.
 
 use std::sync::Arc;
 
@@ -52,11 +53,11 @@ pub struct TrackerSettings {
 
 impl TrackerSettings {
     /// Settings that keep motions within those that the adapter was trained for and its errors were
-    /// measured over: a keyframe after as many frames as the longest of them, or after twice the root
-    /// mean square of their lengths.
+    /// measured over: a keyframe after as many frames as the longest of them, or after twice the
+    /// root mean square of their lengths.
     ///
-    /// Differences of latents add up, so many keyframes read a path no better than few; the measured
-    /// errors only hold while a single motion is read since the last map pose.
+    /// Differences of latents add up, so many keyframes read a path no better than few; the
+    /// measured errors only hold while a single motion is read since the last map pose.
     pub fn of(adapter: &Adapter) -> Self {
         let scale = adapter.scale();
         let mean_square = scale.mean.norm_squared() + scale.deviation.norm_squared();
@@ -131,8 +132,8 @@ impl Tracker {
         self.settings
     }
 
-    /// The state of a stream before its first frame: in the only map, or in one that is to be found.
-    /// `initial_pose` is `world_from_camera` of the first frame, if it is known.
+    /// The state of a stream before its first frame: in the only map, or in one that is to be
+    /// found. `initial_pose` is `world_from_camera` of the first frame, if it is known.
     pub fn start(&self, initial_pose: Option<Belief>) -> State {
         let health = if initial_pose.is_some() {
             TrackingHealth::confirmed()
@@ -172,7 +173,8 @@ impl Tracker {
     /// Takes one frame. The state changes only if the frame is accepted.
     ///
     /// # Errors
-    /// [`Refusal`] for a frame that is late or a duplicate, or whose latent does not fit the adapter.
+    /// [`Refusal`] for a frame that is late or a duplicate, or whose latent does not fit the
+    /// adapter.
     pub fn observe(&self, state: &mut State, frame: &Observation) -> Result<Update, Refusal> {
         if let Some(last) = &state.last {
             if frame.sequence <= last.sequence {
@@ -201,7 +203,8 @@ impl Tracker {
     }
 
     fn step(&self, state: &mut State, frame: &Observation) -> Update {
-        // 1. What the frame looks like: the best map, the mapped frame nearest to it, and whether the
+        // 1. What the frame looks like: the best map, the mapped frame nearest to it, and whether
+        //    the
         // view follows from the views before.
         let view = self.match_maps(state.room, frame.latent.view());
         let matches_room = view.matched.out_of_distribution <= 1.0;
@@ -408,8 +411,8 @@ impl Tracker {
 
     /// A corrected map pose as it is reported: with the covariance of the anchor that corrected it,
     /// times the factor that calibration found. The filter
-    /// would combine many anchors into one very sure pose, but anchors on the same part of a path err
-    /// alike.
+    /// would combine many anchors into one very sure pose, but anchors on the same part of a path
+    /// err alike.
     fn as_sure_as(&self, anchor: &Belief, map_pose: Belief) -> Belief {
         Belief {
             covariance: anchor.covariance * self.map_pose_factor,
@@ -482,9 +485,9 @@ impl Tracker {
         }
     }
 
-    /// Corrects the map pose by an anchor. An anchor within the gate of the believed pose is applied
-    /// at once. Any other one, and each one where nothing is believed, becomes a candidate, which is
-    /// applied once several anchors in a row agree.
+    /// Corrects the map pose by an anchor. An anchor within the gate of the believed pose is
+    /// applied at once. Any other one, and each one where nothing is believed, becomes a candidate,
+    /// which is applied once several anchors in a row agree.
     fn correct(
         &self,
         state: &mut State,

@@ -91,7 +91,8 @@ impl CrossRoomRun {
 pub struct CrossRoomPlan<'a> {
     /// How the adapter is trained, with its seed.
     pub training: &'a TrainingPlan,
-    /// How many of the rooms, from the last one on, are calibration rooms instead of training rooms.
+    /// How many of the rooms, from the last one on, are calibration rooms instead of training
+    /// rooms.
     pub calibration_rooms: usize,
     /// How the held-out rooms are evaluated.
     pub protocol: &'a Protocol,
@@ -118,8 +119,8 @@ pub struct CrossRoomProgress<'a> {
 /// Trains an adapter on `rooms` and evaluates it in the rooms `held_out`.
 ///
 /// # Errors
-/// [`Error`] when the training or the calibration fails. A held-out room that cannot be evaluated is
-/// skipped, and the run says why.
+/// [`Error`] when the training or the calibration fails. A held-out room that cannot be evaluated
+/// is skipped, and the run says why.
 pub fn train_and_test(
     rooms: &[RoomData<'_>],
     held_out: &[RoomData<'_>],

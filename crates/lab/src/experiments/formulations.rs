@@ -29,7 +29,8 @@ pub enum Pooling {
 /// Trains every formulation with seeds 0 to `seeds`, on all cores; `done` hears of each run.
 ///
 /// # Errors
-/// [`Error::Training`] when a room is too short or the plan has settings that only the adapter knows.
+/// [`Error::Training`] when a room is too short or the plan has settings that only the adapter
+/// knows.
 pub fn compare(
     rooms: &[RoomData<'_>],
     plan: &TrainingPlan,

@@ -1,8 +1,8 @@
 //! How well a tracker does on frames that its map does not hold: paths, covariances, and whether it
 //! knows when it is lost.
 //!
-//! Start reading at [`evaluate`]. Every room is mapped and tracked under one hold-out; frames of the
-//! other rooms are then played to its tracker, which should answer LOST.
+//! Start reading at [`evaluate`]. Every room is mapped and tracked under one hold-out; frames of
+//! the other rooms are then played to its tracker, which should answer LOST.
 
 use std::sync::Arc;
 
@@ -307,8 +307,8 @@ fn own_replay(room: &TrackedRoom, hold_out: HoldOut, initial_pose: InitialPose) 
 }
 
 /// Frames of every other room, played to a room's tracker: as the beginning of a stream, or after
-/// the last frames that the hold-out tracks in the room itself. A tracker that knows when it is lost
-/// answers LOST to all of them.
+/// the last frames that the hold-out tracks in the room itself. A tracker that knows when it is
+/// lost answers LOST to all of them.
 fn lost_frames(room: &TrackedRoom, all: &[TrackedRoom], own: Option<HoldOut>) -> LostFrames {
     let own_frames = own.map(|hold_out| {
         let mut frames = hold_out.tracked(room.room.frame_count());

@@ -34,8 +34,8 @@ pub struct SeededTraining {
     pub runs: Vec<TrainingRun>,
 }
 
-/// Trains one adapter per seed, from the plan's own seed on, on all cores. `progress` hears of every
-/// epoch of every seed.
+/// Trains one adapter per seed, from the plan's own seed on, on all cores. `progress` hears of
+/// every epoch of every seed.
 ///
 /// # Errors
 /// [`Error`], when a seed is too large or training fails.

@@ -66,8 +66,8 @@ impl Formulation {
 /// Trains one formulation on all rooms together and scores it on each room's test pairs.
 ///
 /// # Errors
-/// As [`training::train_adapter`]; [`training::Error::NotPlain`] when a setting is one that only the
-/// adapter supports.
+/// As [`training::train_adapter`]; [`training::Error::NotPlain`] when a setting is one that only
+/// the adapter supports.
 ///
 /// Source: SeeSE3, Sec. A.5.
 pub fn train_formulation(

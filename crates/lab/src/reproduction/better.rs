@@ -88,8 +88,8 @@ pub fn better(results: &[SetResults], claims: &mut Vec<Claim>) -> Found {
     (section, Value::Array(record))
 }
 
-/// A plan against the baseline: its row of the table, its record, and three differences, paired room
-/// by room.
+/// A plan against the baseline: its row of the table, its record, and three differences, paired
+/// room by room.
 struct Compared {
     row: Vec<String>,
     record: Value,

@@ -1,5 +1,5 @@
-//! Rooms that were never seen: zero-shot navigation against Identity, and scaling with the number of
-//! training rooms.
+//! Rooms that were never seen: zero-shot navigation against Identity, and scaling with the number
+//! of training rooms.
 
 use serde_json::{Value, json};
 

@@ -1,7 +1,7 @@
 //! The paper's tables and figures on given rooms, as one report.
 //!
-//! Start reading at [`reproduce`]: every experiment gives one section of the report and one entry of
-//! the record. Claims and adapters that the sections leave are collected in [`Notes`].
+//! Start reading at [`reproduce`]: every experiment gives one section of the report and one entry
+//! of the record. Claims and adapters that the sections leave are collected in [`Notes`].
 
 mod better;
 mod claims;
@@ -135,8 +135,8 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
     Ok(())
 }
 
-/// The names of all adapters that a reproduction leaves, but for the number of rooms in some, so that
-/// they can be checked before hours of training.
+/// The names of all adapters that a reproduction leaves, but for the number of rooms in some, so
+/// that they can be checked before hours of training.
 pub fn adapter_names(given: &Reproduction<'_>) -> Vec<String> {
     let mut names = Vec::new();
     for set in &given.sets {

@@ -1,5 +1,5 @@
-//! The adapters of the cross-room sections: which are trained, on how many rooms, and how they did in
-//! the held-out rooms.
+//! The adapters of the cross-room sections: which are trained, on how many rooms, and how they did
+//! in the held-out rooms.
 
 use rayon::prelude::*;
 
