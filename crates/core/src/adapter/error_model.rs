@@ -27,8 +27,8 @@ pub struct ErrorTable {
 pub struct Stratum {
     /// The predicting number, above 0.
     pub at: f64,
-    /// The share of a reading to be believed: the slope of the regression of truth on reading, 0 to
-    /// 1. 1 for motions, which are believed as they are read.
+    /// The share of a reading to be believed, from 0 to 1: the slope of the regression of truth on
+    /// reading. It is 1 for motions, which are believed as they are read.
     pub gain: f64,
     /// The covariance of errors on (v, ω), metres and radians; positive definite.
     pub covariance: Matrix6<f64>,
