@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use clap::Args;
+use serde::Serialize;
 
 use super::evaluate::navigators_named;
 use super::named::one_of;
@@ -22,7 +23,9 @@ use seese3_core::training::{RoomData, TrainingPlan};
 use seese3_lab::experiments::cross_room::{
     CrossRoomPlan, CrossRoomProgress, CrossRoomRun, nested_choice, train_and_test,
 };
-use seese3_lab::report::{cross_room_json, cross_room_table, rooms_table, scaling_table};
+use seese3_lab::report::{
+    CrossRoomJson, cross_room_json, cross_room_table, rooms_table, scaling_table,
+};
 
 #[derive(Debug, Args)]
 pub struct CrossRoom {
@@ -84,6 +87,22 @@ pub struct CrossRoom {
 }
 
 type Loaded = (StoredRoom, Features);
+
+/// The file of --json: the results, and the protocol without which they mean little.
+#[derive(Debug, Serialize)]
+struct CrossRoomRecord {
+    #[serde(flatten)]
+    results: CrossRoomJson,
+    features: String,
+    stride: u32,
+    preset: &'static str,
+    epochs: usize,
+    learning_rate: f64,
+    split: &'static str,
+    source_excluded: bool,
+    test_split: &'static str,
+    threshold: f64,
+}
 
 impl CrossRoom {
     #[expect(
@@ -169,18 +188,18 @@ impl CrossRoom {
 
         // The protocol is written beside the scores, which mean little without it.
         if let Some(file) = &self.json {
-            let mut record = cross_room_json(&runs, &self.baseline);
-            record["features"] = source.into();
-            record["stride"] = plan.stride.into();
-            record["preset"] = plan.preset.name().into();
-
-            record["epochs"] = plan.config.epochs.into();
-            record["learning_rate"] = plan.config.learning_rate.into();
-            record["split"] = plan.split.name().into();
-            record["source_excluded"] = self.exclude_source.into();
-
-            record["test_split"] = protocol.split.name().into();
-            record["threshold"] = self.threshold.into();
+            let record = CrossRoomRecord {
+                results: cross_room_json(&runs, &self.baseline),
+                features: source,
+                stride: plan.stride,
+                preset: plan.preset.name(),
+                epochs: plan.config.epochs,
+                learning_rate: plan.config.learning_rate,
+                split: plan.split.name(),
+                source_excluded: self.exclude_source,
+                test_split: protocol.split.name(),
+                threshold: self.threshold,
+            };
             write_json(file, &record)?;
             say(format_args!("wrote {}", file.display()));
         }

@@ -167,7 +167,7 @@ impl EncoderOptions {
         let pooling: Pooling = self
             .pool
             .as_deref()
-            .unwrap_or(recipe.map_or("mean", |recipe| recipe.pooling))
+            .unwrap_or(recipe.map_or("mean", |recipe| recipe.pooling.as_str()))
             .parse()?;
 
         let word = |given: &Option<String>, recipe: Option<&str>, otherwise: &str| {
@@ -180,10 +180,14 @@ impl EncoderOptions {
         // numbers.
         let layer = |name: &String| Layer {
             name: name.clone(),
-            base: word(&self.base, recipe.map(|recipe| recipe.base), "name"),
+            base: word(
+                &self.base,
+                recipe.map(|recipe| recipe.base.as_str()),
+                "name",
+            ),
             norm: word(
                 &self.norm,
-                recipe.map(|recipe| recipe.norm),
+                recipe.map(|recipe| recipe.norm.as_str()),
                 seese3_core::features::UNSPECIFIED,
             ),
             pooling: pooling.after(skip),
@@ -240,7 +244,7 @@ impl EncoderOptions {
         let known = || {
             encoder::RECIPES
                 .iter()
-                .map(|recipe| recipe.name)
+                .map(|recipe| recipe.name.as_str())
                 .collect::<Vec<_>>()
                 .join(", ")
         };

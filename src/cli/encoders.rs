@@ -17,11 +17,11 @@ impl Encoders {
         // scripts.
         let chosen: Vec<_> = RECIPES
             .iter()
-            .filter(|recipe| self.name.as_ref().is_none_or(|name| name == recipe.name))
+            .filter(|recipe| self.name.as_ref().is_none_or(|name| *name == recipe.name))
             .collect();
 
         if chosen.is_empty() {
-            let known: Vec<&str> = RECIPES.iter().map(|recipe| recipe.name).collect();
+            let known: Vec<&str> = RECIPES.iter().map(|recipe| recipe.name.as_str()).collect();
             anyhow::bail!(
                 "there is no recipe '{}'; there are {}",
                 self.name.unwrap_or_default(),

@@ -180,6 +180,9 @@ fn write_file(path: &std::path::Path, content: &[u8]) -> anyhow::Result<()> {
 
 /// Writes indented JSON, with a newline at the end.
 #[cfg(feature = "lab")]
-fn write_json(path: &std::path::Path, value: &serde_json::Value) -> anyhow::Result<()> {
-    write_file(path, format!("{value:#}\n").as_bytes())
+fn write_json(path: &std::path::Path, record: &impl serde::Serialize) -> anyhow::Result<()> {
+    let mut text = serde_json::to_string_pretty(record)?;
+    text.push('\n');
+
+    write_file(path, text.as_bytes())
 }

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 use rayon::prelude::*;
-use serde_json::json;
 
 use super::progress::bar;
 use super::protocol::ProtocolOptions;
@@ -16,10 +15,10 @@ use seese3_core::features::Features;
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::training::{RoomData, TrainingPlan};
 use seese3_lab::experiments::probe::{
-    DimensionProtocol, ProbeProtocol, ProbeScores, probe, probe_adapters,
+    DimensionProtocol, DimensionScore, ProbeProtocol, ProbeScores, probe, probe_adapters,
 };
-use seese3_lab::probes::{Bound, Counted, Duplicates, MutualKnn};
-use seese3_lab::report::{probe_json, probe_table};
+use seese3_lab::probes::{Counted, Duplicates, Limit, MutualKnn};
+use seese3_lab::report::{ProbeContext, probe_json, probe_table};
 
 #[derive(Debug, Args)]
 pub struct Probe {
@@ -159,13 +158,18 @@ impl Probe {
             .for_each(|why| say(format_args!("skipped: {why}")));
 
         // M2 depends on the gap and on how duplicates were treated, so these are printed with it.
-        for (score, (dimension, options)) in scores
-            .iter()
-            .filter_map(|score| Some((score, score.m2.as_ref()?)))
-        {
+        for score in &scores {
+            let Some(DimensionScore {
+                dimension,
+                protocol,
+            }) = &score.m2
+            else {
+                continue;
+            };
+
             say(format_args!(
                 "M2 of {}: {} rows used, {} dropped as duplicates, gap {}",
-                score.room, dimension.used, dimension.dropped, options.gap
+                score.room, dimension.used, dimension.dropped, protocol.gap
             ));
         }
 
@@ -186,19 +190,13 @@ impl Probe {
         }
 
         if let Some(file) = &self.json {
-            // One room keeps the flat layout {m1, m2, …}; several rooms become a list.
-            let mut record = match scores.as_slice() {
-                [one] => probe_json(one),
-                several => {
-                    json!({ "rooms": several.iter().map(probe_json).collect::<Vec<_>>() })
-                }
+            let context = ProbeContext {
+                features: rooms[0].1.source().name.clone(),
+                split: base.split.name(),
+                preset: base.preset.name(),
+                skipped,
             };
-            record["skipped"] = json!(skipped);
-
-            record["features"] = json!(rooms[0].1.source().name);
-            record["split"] = json!(base.split.name());
-            record["preset"] = json!(base.preset.name());
-            write_json(file, &record)?;
+            write_json(file, &probe_json(&scores, context))?;
 
             say(format_args!("wrote {}", file.display()));
         }
@@ -237,10 +235,10 @@ impl Probe {
                 CountedName::Sampled => Counted::Sampled,
                 CountedName::Native => Counted::Native,
             },
-            bound: if self.m1_exclusive {
-                Bound::Exclusive
+            limit: if self.m1_exclusive {
+                Limit::Exclusive
             } else {
-                Bound::Inclusive
+                Limit::Inclusive
             },
         };
         let dimension = DimensionProtocol {

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use anyhow::{Context, bail};
 use clap::Args;
-use serde_json::{Map, Value, json};
+use serde::Serialize;
 
 use seese3_core::features::Features;
 use seese3_core::image::RgbImage;
@@ -13,7 +13,7 @@ use seese3_core::room::{FrameId, Room, is_plain_name};
 use seese3_lab::report::Document;
 use seese3_lab::reproduction::{
     EXPERIMENTS, FeatureSet, Images, Options, Reproduced, ReproducedAdapter, Reproduction,
-    adapter_names, check, reproduce,
+    ReproductionRecord, adapter_names, check, reproduce,
 };
 
 use super::progress::bar;
@@ -124,18 +124,20 @@ impl Reproduce {
         let progress = bar(EXPERIMENTS, "reproduce");
         let Reproduced {
             document,
-            mut record,
+            record,
             adapters,
         } = reproduce(&reproduction, &|| progress.inc(1))?;
         progress.finish_and_clear();
 
         // A run that fails before this point publishes nothing.
         let published = publish(&store, &adapters).await?;
-        record.insert("adapters".to_owned(), published);
-        let seconds = begun.elapsed().as_secs_f64();
-        record.insert("seconds".to_owned(), json!(seconds));
+        let record = FileRecord {
+            record,
+            adapters: published,
+            seconds: begun.elapsed().as_secs_f64(),
+        };
 
-        write(&self.out, &document, record)
+        write(&self.out, &document, &record)
     }
 
     fn options(&self) -> Options {
@@ -164,8 +166,37 @@ impl Reproduce {
     }
 }
 
-/// Publishes every adapter, and returns its name, revision and training settings as JSON.
-async fn publish(store: &Store, adapters: &[ReproducedAdapter]) -> anyhow::Result<Value> {
+/// The file `record.json`.
+#[derive(Debug, Serialize)]
+struct FileRecord {
+    #[serde(flatten)]
+    record: ReproductionRecord,
+    adapters: Vec<PublishedAdapter>,
+    /// Wall time of the whole run.
+    seconds: f64,
+}
+
+/// An adapter in the store, and how it was trained.
+#[derive(Debug, Serialize)]
+struct PublishedAdapter {
+    name: String,
+    revision: u64,
+    preset: String,
+    seed: u64,
+    epochs: usize,
+    charts: usize,
+    split: &'static str,
+    stride: u32,
+    pairs: usize,
+    rooms: usize,
+    calibration_rooms: usize,
+}
+
+/// Publishes every adapter.
+async fn publish(
+    store: &Store,
+    adapters: &[ReproducedAdapter],
+) -> anyhow::Result<Vec<PublishedAdapter>> {
     let mut published = Vec::with_capacity(adapters.len());
     for reproduced in adapters {
         let record = &reproduced.record;
@@ -179,32 +210,32 @@ async fn publish(store: &Store, adapters: &[ReproducedAdapter]) -> anyhow::Resul
             .await?
             .revision;
 
-        published.push(json!({
-            "name": reproduced.name,
-            "revision": revision,
-            "preset": record.preset,
-            "seed": record.config.seed,
-            "epochs": record.config.epochs,
-            "charts": record.config.charts,
-            "split": record.split.name(),
-            "stride": record.stride,
-            "pairs": record.pair_count,
-            "rooms": record.rooms.len(),
-            "calibration_rooms": record.calibrated_on.len(),
-        }));
+        published.push(PublishedAdapter {
+            name: reproduced.name.clone(),
+            revision,
+            preset: record.preset.clone(),
+            seed: record.config.seed,
+            epochs: record.config.epochs,
+            charts: record.config.charts,
+            split: record.split.name(),
+            stride: record.stride,
+            pairs: record.pair_count,
+            rooms: record.rooms.len(),
+            calibration_rooms: record.calibrated_on.len(),
+        });
     }
 
-    Ok(Value::Array(published))
+    Ok(published)
 }
 
-fn write(out: &Path, document: &Document, record: Map<String, Value>) -> anyhow::Result<()> {
+fn write(out: &Path, document: &Document, record: &FileRecord) -> anyhow::Result<()> {
     for picture in document.pictures() {
         write_file(&out.join(&picture.name), &picture.bytes)?;
     }
 
     write_file(&out.join("report.md"), document.markdown("").as_bytes())?;
     write_file(&out.join("report.html"), document.html().as_bytes())?;
-    write_json(&out.join("record.json"), &Value::Object(record))?;
+    write_json(&out.join("record.json"), record)?;
 
     say(format_args!(
         "wrote {0}/report.html, {0}/report.md and {0}/record.json",

@@ -10,7 +10,7 @@ use super::ask::Server;
 use super::progress::bar;
 use super::{check_writable, say, write_file};
 use crate::datasets::read_features;
-use crate::export::{Recording, tum_trajectory};
+use crate::export::{McapRecording, tum_trajectory};
 use seese3_client::convert;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::track_request::Message;
@@ -372,7 +372,7 @@ fn plain(pose: Option<pb::Pose>) -> Option<Pose> {
 
 fn recorded(heard: &Heard, seen: &[Seen]) -> anyhow::Result<Vec<u8>> {
     let names = &heard.names;
-    let mut recording = Recording::new()?;
+    let mut recording = McapRecording::new()?;
     for update in &heard.updates {
         // Each frame gives the transforms map → odom → camera, and the pose in map on a topic of
         // its own.

@@ -9,7 +9,7 @@ mod builtin;
 mod decode;
 mod journal;
 mod model_file;
-mod network;
+mod backbone;
 #[cfg(feature = "onnxruntime")]
 mod onnxruntime;
 mod pooling;
@@ -19,10 +19,10 @@ mod run;
 #[cfg(feature = "onnx")]
 mod tract;
 
+pub use backbone::{Runtime, RuntimeKind};
 pub use builtin::{BUILTIN_DIM, builtin_source, encode_builtin};
 pub use decode::{Bounds, decode, encode_png, read_image};
 pub use journal::{Journal, NumberedRows};
-pub use network::{Runtime, RuntimeKind};
 pub use pooling::Pooling;
 pub use preparation::{Filter, Preparation, Resize, normalised};
 pub use recipes::{EncoderRecipe, RECIPES, recipe};
@@ -32,7 +32,7 @@ use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, ArrayD, Axis, IxDyn};
 
-use network::Network;
+use backbone::Backbone;
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
 use seese3_core::room::is_plain_name;
@@ -114,7 +114,7 @@ pub const PIXELS: &str = "pixels";
 pub struct Encoder {
     id: String,
     preparation: Preparation,
-    network: Network,
+    backbone: Backbone,
     layers: Vec<Layer>,
     dims: Vec<usize>,
     window: usize,
@@ -129,7 +129,7 @@ impl Encoder {
         Self {
             id: source.encoder,
             preparation: builtin::preparation(),
-            network: Network::Builtin,
+            backbone: Backbone::Builtin,
             layers: vec![Layer {
                 name: source.layer,
                 base: source.base,
@@ -161,7 +161,7 @@ impl Encoder {
                 divisor: 255.0,
                 ..Preparation::default()
             },
-            network: Network::Pixels,
+            backbone: Backbone::Pixels,
             layers: vec![Layer {
                 name: PIXELS.to_owned(),
                 base: "name".to_owned(),
@@ -188,12 +188,12 @@ impl Encoder {
             layers,
             window,
         } = task;
-        let (network, id, size) = network::open(&file, &preparation, &layers, window, runtime)?;
+        let (backbone, id, size) = backbone::open(&file, &preparation, &layers, window, runtime)?;
 
         let mut encoder = Self {
             id,
             preparation,
-            network,
+            backbone,
             layers,
             dims: Vec::new(),
             window,
@@ -297,7 +297,7 @@ impl Encoder {
     /// model give the prefix alone.
     pub fn sources(&self, prefix: &str) -> Vec<FeatureSource> {
         let made = |(layer, &dim): (&Layer, &usize)| FeatureSource {
-            name: feature_name(prefix, layer, &self.network),
+            name: feature_name(prefix, layer, &self.backbone),
             encoder: self.id.clone(),
             layer: layer.name.clone(),
             base: layer.base.clone(),
@@ -312,7 +312,7 @@ impl Encoder {
 
     /// The name of the runtime that runs it; `none` for the encoders without a model.
     pub fn runtime(&self) -> &'static str {
-        self.network.runtime()
+        self.backbone.runtime()
     }
 
     /// The encoder's identity. For a model it is the file's name without extension, and the
@@ -364,7 +364,7 @@ impl Encoder {
         }
 
         // The built-in encoder computes whole rows, so that nothing is left to pool.
-        if matches!(self.network, Network::Builtin) {
+        if matches!(self.backbone, Backbone::Builtin) {
             for (mut row, clip) in rows.outer_iter_mut().zip(clips) {
                 row.assign(&ndarray::aview1(&encode_builtin(clip[0])));
             }
@@ -372,7 +372,7 @@ impl Encoder {
         }
 
         let outputs = self.outputs(clips)?;
-        let runtime = self.network.runtime();
+        let runtime = self.backbone.runtime();
 
         let seen = pooling::Seen {
             width: clips[0][0].width,
@@ -465,14 +465,14 @@ impl Encoder {
             problem: error.to_string(),
         })?;
 
-        let outputs = match &self.network {
-            Network::Builtin => Vec::new(),
+        let outputs = match &self.backbone {
+            Backbone::Builtin => Vec::new(),
             // Clips of raw pixels have one image, whose
             // axis is dropped to give maps (clip, 3, H, W).
-            Network::Pixels => vec![frames.index_axis_move(Axis(1), 0)],
-            Network::Model {
+            Backbone::Pixels => vec![frames.index_axis_move(Axis(1), 0)],
+            Backbone::Model {
                 runner, clip_axis, ..
-            } => runner.run(network::laid_out(frames, *clip_axis))?,
+            } => runner.run(backbone::laid_out(frames, *clip_axis))?,
         };
 
         // Rows are read along the first axis; if that is another one, they would belong to no clip.
@@ -499,13 +499,13 @@ impl Encoder {
 
 /// The name under which the features of a layer are stored. Characters that a name may not contain
 /// become dashes.
-fn feature_name(prefix: &str, layer: &Layer, network: &Network) -> String {
-    let name = match network {
-        Network::Builtin | Network::Pixels => prefix.to_owned(),
-        Network::Model { .. } if layer.pooling == Pooling::Vector => {
+fn feature_name(prefix: &str, layer: &Layer, backbone: &Backbone) -> String {
+    let name = match backbone {
+        Backbone::Builtin | Backbone::Pixels => prefix.to_owned(),
+        Backbone::Model { .. } if layer.pooling == Pooling::Vector => {
             format!("{prefix}-{}", layer.name)
         }
-        Network::Model { .. } => format!("{prefix}-{}-{}", layer.name, layer.pooling.short()),
+        Backbone::Model { .. } => format!("{prefix}-{}-{}", layer.name, layer.pooling.short()),
     };
 
     // A name must begin with a letter or digit; the `a`

@@ -8,8 +8,8 @@ use ort::environment::Environment;
 use ort::session::Session;
 use ort::value::TensorRef;
 
+use super::backbone::{Runner, Runtime};
 use super::model_file::ModelFile;
-use super::network::{Runner, Runtime};
 use super::{Error, RuntimeKind};
 
 const NAME: &str = "onnxruntime";

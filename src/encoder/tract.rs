@@ -13,7 +13,7 @@ use tract_onnx::prelude::{
 };
 
 use super::Error;
-use super::network::Runner;
+use super::backbone::Runner;
 
 pub(super) struct Tract {
     model: Arc<TypedRunnableModel>,

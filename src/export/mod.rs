@@ -3,5 +3,5 @@
 mod recording;
 mod trajectory;
 
-pub use recording::Recording;
+pub use recording::McapRecording;
 pub use trajectory::{kitti_trajectory, tum_trajectory};

@@ -13,14 +13,14 @@ use serde_json::{Value, json};
 use seese3_core::geometry::Pose;
 
 /// An MCAP recording that is being written, in memory.
-pub struct Recording {
+pub struct McapRecording {
     writer: Writer<Cursor<Vec<u8>>>,
     schemas: BTreeMap<&'static str, u16>,
     channels: BTreeMap<String, u16>,
     sequence: u32,
 }
 
-impl Recording {
+impl McapRecording {
     /// A recording without messages.
     ///
     /// # Errors
@@ -195,7 +195,7 @@ mod tests {
     /// Oracle: the library's own reader, and Foxglove's field names by hand.
     #[test]
     fn what_is_recorded_is_read_again() {
-        let mut recording = Recording::new().unwrap();
+        let mut recording = McapRecording::new().unwrap();
         let pose = Pose::translation(1.0, 2.0, 3.0);
         recording
             .pose("/pose", 1_500_000_000, "map", &pose)

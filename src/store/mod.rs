@@ -14,6 +14,7 @@ mod adapters;
 mod error_model;
 mod format;
 mod manifest;
+mod room_files;
 mod rooms;
 mod tensors;
 

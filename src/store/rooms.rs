@@ -4,12 +4,14 @@ use object_store::path::Path;
 
 use super::format::{FeaturesEntry, RoomBody};
 use super::manifest::{self, ObjectRef, SCHEMA};
-use super::tensors::{TensorReader, TensorWriter};
+use super::room_files::{
+    features_file, frames_file, names_file, read_features, read_frames, read_names,
+};
 use super::{ATTEMPTS, Error, Kind, Published, Store, revision_path};
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::{Pose, nearest_rotation};
+use seese3_core::geometry::Pose;
 use seese3_core::room::{Frames, Room, RoomId, is_plain_name};
 
 /// A room that was loaded from the store, with its features.
@@ -23,6 +25,15 @@ pub struct StoredRoom {
     pub created: String,
     /// All features of the room, or only those that were requested.
     pub features: Vec<Features>,
+}
+
+impl StoredRoom {
+    /// The set of features with this name, if it was loaded.
+    pub fn features(&self, name: &str) -> Option<&Features> {
+        self.features
+            .iter()
+            .find(|features| features.source().name == name)
+    }
 }
 
 /// A summary of a room, read from its manifest alone.
@@ -487,7 +498,7 @@ impl Store {
             .filter(|entry| only.is_none_or(|name| name == entry.source.name()))
         {
             let (file, bytes) = self.read_object(&folder, &entry.object).await?;
-            let rows = TensorReader::new(&file, &bytes)?.f32("features")?;
+            let rows = read_features(&file, &bytes)?;
             let set = Features::new(entry.source.into(), rows).map_err(|error| Error::Damaged {
                 file: file.clone(),
                 problem: error.to_string(),
@@ -524,10 +535,7 @@ impl Store {
         };
         let (file, bytes) = self.read_object(folder, object).await?;
 
-        serde_json::from_slice(&bytes).map_err(|error| Error::Damaged {
-            file,
-            problem: error.to_string(),
-        })
+        read_names(&file, &bytes)
     }
 
     async fn room_body(&self, folder: &Path, revision: u64) -> Result<RoomBody, Error> {
@@ -579,143 +587,4 @@ pub fn check_features(room: &Room, features: &[Features]) -> Result<(), Error> {
     }
 
     Ok(())
-}
-
-fn frames_file(room: &Room) -> Result<Vec<u8>, Error> {
-    let n = room.frame_count();
-    let mut tensors = TensorWriter::default();
-
-    // nalgebra stores a matrix by column; the transpose gives the rows that NumPy expects.
-    let rows = room
-        .poses()
-        .iter()
-        .flat_map(|pose| pose.to_homogeneous().transpose().as_slice().to_vec());
-    tensors.f64("world_from_camera", &[n, 4, 4], rows);
-
-    if !room.timestamps_ns().is_empty() {
-        tensors.i64("timestamps_ns", &[n], room.timestamps_ns().iter().copied());
-    }
-
-    let frames = room.frames();
-
-    // A column that the recording does not have is left out of the file and read back as empty.
-    for (name, values) in [
-        ("numbers", frames.numbers.clone()),
-        (
-            "sequences",
-            frames
-                .sequences
-                .iter()
-                .map(|&sequence| i64::from(sequence))
-                .collect(),
-        ),
-        (
-            "held_out",
-            frames
-                .held_out
-                .iter()
-                .map(|&held_out| i64::from(held_out))
-                .collect(),
-        ),
-    ] {
-        if !values.is_empty() {
-            tensors.i64(name, &[n], values.into_iter());
-        }
-    }
-
-    tensors.finish("frames")
-}
-
-fn names_file(names: &[String]) -> Result<Vec<u8>, Error> {
-    serde_json::to_vec(names).map_err(|error| Error::Damaged {
-        file: "frame-names".to_owned(),
-        problem: error.to_string(),
-    })
-}
-
-fn features_file(features: &Features) -> Result<Vec<u8>, Error> {
-    let rows = features.rows();
-    let mut tensors = TensorWriter::default();
-    tensors.f32(
-        "features",
-        &[rows.nrows(), rows.ncols()],
-        rows.iter().copied(),
-    );
-
-    tensors.finish("features")
-}
-
-fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
-    let tensors = TensorReader::new(file, bytes)?;
-
-    let damaged = |problem: String| Error::Damaged {
-        file: file.to_owned(),
-        problem,
-    };
-
-    let matrices = tensors.f64("world_from_camera")?;
-    if matrices.ncols() != 16 {
-        return Err(damaged("'world_from_camera' is not (n, 4, 4)".to_owned()));
-    }
-
-    // The stored entries carry rounding errors. Projection onto SO(3) makes the rotation exact
-    // before it becomes a quaternion.
-    let pose = |(row, matrix): (usize, ndarray::ArrayView1<'_, f64>)| {
-        let m = nalgebra::Matrix4::from_row_iterator(matrix.iter().copied());
-        let rotation = nearest_rotation(&m.fixed_view::<3, 3>(0, 0).into_owned());
-        let rotation = rotation
-            .ok_or_else(|| damaged(format!("frame {row} has no valid rotation")))?
-            .rotation;
-        let quaternion = nalgebra::UnitQuaternion::from_rotation_matrix(&rotation);
-
-        Ok(Pose::from_parts(
-            m.fixed_view::<3, 1>(0, 3).into_owned().into(),
-            quaternion,
-        ))
-    };
-
-    let poses = matrices
-        .outer_iter()
-        .enumerate()
-        .map(pose)
-        .collect::<Result<_, Error>>()?;
-
-    // These tensors are optional: a missing one means that the recording has no such data.
-    let column = |name: &str| -> Result<Vec<i64>, Error> {
-        Ok(if tensors.has(name) {
-            tensors.i64(name)?.iter().copied().collect()
-        } else {
-            Vec::new()
-        })
-    };
-
-    let sequence = |value: i64| {
-        u32::try_from(value).map_err(|_| damaged(format!("{value} is no sequence number")))
-    };
-
-    Ok(Frames {
-        poses,
-        timestamps_ns: column("timestamps_ns")?,
-        numbers: column("numbers")?,
-        sequences: column("sequences")?
-            .into_iter()
-            .map(sequence)
-            .collect::<Result<_, _>>()?,
-        held_out: column("held_out")?
-            .into_iter()
-            .map(|mark| mark != 0)
-            .collect(),
-        // Names and images are JSON objects of their own, which `load` reads.
-        names: Vec::new(),
-        images: Vec::new(),
-    })
-}
-
-impl StoredRoom {
-    /// The set of features with this name, if it was loaded.
-    pub fn features(&self, name: &str) -> Option<&Features> {
-        self.features
-            .iter()
-            .find(|features| features.source().name == name)
-    }
 }

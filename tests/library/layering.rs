@@ -60,7 +60,8 @@ const CRATES: [CrateRules; 4] = [
             ("std::env", &[]),
             ("std::time", &["service", "cli", "main"]),
             ("object_store", &["store"]),
-            ("serde", &["datasets", "store", "cli"]),
+            ("serde", &["datasets", "encoder", "store", "cli"]),
+            ("toml", &["encoder"]),
         ],
     },
 ];

@@ -64,6 +64,7 @@
 //! | --- | --- |
 //! | [`cancel`] | a flag that says that nobody waits for the result any more |
 //! | [`geometry`] | SE(3): poses, twists, errors between poses |
+//! | [`matrices`] | between ndarray and nalgebra |
 //! | [`room`] | a recording: frames with poses, times and image names |
 //! | [`image`] | 8-bit RGB pictures |
 //! | [`features`] | one row of encoder output per frame, and what made it |
@@ -86,6 +87,7 @@
 
 pub mod cancel;
 pub mod geometry;
+pub mod matrices;
 pub mod room;
 pub mod image;
 pub mod features;

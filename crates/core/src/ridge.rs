@@ -1,8 +1,10 @@
 //! Ridge regression in closed form, with scikit-learn's objective ‖Y − XB‖² + α‖B‖² (a sum, not a
 //! mean); the intercept is not penalised.
 
-use nalgebra::{Cholesky, DMatrix};
+use nalgebra::Cholesky;
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis};
+
+use crate::matrices::{to_nalgebra, to_ndarray};
 
 /// Why a fit fails.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -98,18 +100,10 @@ impl Ridge {
 /// (G + αI)⁻¹R for a symmetric G.
 fn solved(mut gram: Array2<f64>, alpha: f64, right: &Array2<f64>) -> Result<Array2<f64>, Error> {
     gram.diag_mut().mapv_inplace(|value| value + alpha);
-    let cholesky = Cholesky::new(matrix(gram.view())).ok_or(Error::NotPositiveDefinite)?;
-    let solution = cholesky.solve(&matrix(right.view()));
+    let cholesky = Cholesky::new(to_nalgebra(gram.view())).ok_or(Error::NotPositiveDefinite)?;
+    let solution = cholesky.solve(&to_nalgebra(right.view()));
 
-    Ok(Array2::from_shape_fn(right.dim(), |(row, column)| {
-        solution[(row, column)]
-    }))
-}
-
-fn matrix(array: ArrayView2<'_, f64>) -> DMatrix<f64> {
-    DMatrix::from_fn(array.nrows(), array.ncols(), |row, column| {
-        array[(row, column)]
-    })
+    Ok(to_ndarray(&solution))
 }
 
 #[cfg(test)]

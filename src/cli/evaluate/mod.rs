@@ -9,7 +9,6 @@ use std::sync::Arc;
 
 use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
-use serde_json::json;
 
 use super::named::one_of;
 use super::progress::bar;
@@ -22,7 +21,9 @@ use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{IndexKind, Mode, Navigator};
 use seese3_core::room::RoomId;
 use seese3_core::splits::Split;
-use seese3_lab::report::{evaluation_json, evaluation_table};
+use seese3_lab::report::{
+    AdapterJson, EvaluationContext, RoomJson, evaluation_json, evaluation_table,
+};
 
 #[derive(Debug, Args)]
 #[command(args_conflicts_with_subcommands = true)]
@@ -38,7 +39,7 @@ enum What {
     /// Track held-out frames of rooms: path errors, covariances, tracking status, relocalisation
     Odometry(odometry::Odometry),
     /// APE and RPE of an estimated trajectory against the true one, as evo defines them
-    Trajectory(trajectory::Trajectory),
+    Trajectory(trajectory::EvaluateTrajectory),
 }
 
 impl Evaluate {
@@ -179,24 +180,23 @@ impl Navigation {
         if let Some(path) = &self.json {
             // The file says what was evaluated and whether it leaks, so that it can be judged by
             // itself.
-            let adapter = json!({ "name": chosen.name, "revision": chosen.revision, "preset": record.preset,
-                "trained_split": record.split.name(), "trained_stride": record.stride, "seed": record.config.seed });
-
-            let context = [
-                (
-                    "room",
-                    json!({ "name": self.room, "revision": stored.revision }),
-                ),
-                ("features", json!(features_name)),
-                ("adapter", adapter),
-                ("in_room", json!(in_room)),
-                ("leaks", json!(leak.is_some())),
-            ];
-
-            let context = context
-                .map(|(key, value)| (key.to_owned(), value))
-                .into_iter()
-                .collect();
+            let context = EvaluationContext {
+                room: RoomJson {
+                    name: self.room.clone(),
+                    revision: stored.revision,
+                },
+                features: features_name,
+                adapter: AdapterJson {
+                    name: chosen.name,
+                    revision: chosen.revision,
+                    preset: record.preset,
+                    trained_split: record.split.name(),
+                    trained_stride: record.stride,
+                    seed: record.config.seed,
+                },
+                in_room,
+                leaks: leak.is_some(),
+            };
             write_json(path, &evaluation_json(&report, context))?;
 
             say(format_args!("wrote {}", path.display()));

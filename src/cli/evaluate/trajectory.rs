@@ -8,10 +8,11 @@ use clap::Args;
 use super::super::{check_writable, say, write_json};
 use crate::datasets::read_tum_trajectory;
 use seese3_core::trajectory::{RpePairs, associate};
-use seese3_lab::report::{PathErrors, PathProtocol, path_errors_json, path_errors_table};
+use seese3_lab::experiments::path_comparison::{PathComparison, PathProtocol};
+use seese3_lab::report::{path_errors_json, path_errors_table};
 
 #[derive(Debug, Args)]
-pub struct Trajectory {
+pub struct EvaluateTrajectory {
     /// The true path, a TUM file with lines "timestamp tx ty tz qx qy qz qw", world_from_camera
     #[arg(long)]
     reference: PathBuf,
@@ -53,7 +54,7 @@ impl RelativeOptions {
     }
 }
 
-impl Trajectory {
+impl EvaluateTrajectory {
     pub fn run(self) -> anyhow::Result<()> {
         if let Some(path) = &self.json {
             check_writable(path)?;
@@ -78,7 +79,7 @@ impl Trajectory {
         // Poses are matched by time: the two files need neither the same rate nor the same length.
         let matches = associate(&reference, &estimate, self.max_difference_ms * 1_000_000)
             .with_context(files)?;
-        let errors = PathErrors::of(&reference, &estimate, &matches, self.relative.protocol())
+        let errors = PathComparison::of(&reference, &estimate, &matches, self.relative.protocol())
             .with_context(files)?;
         say(format_args!(
             "{} poses matched; {} of the reference and {} of the estimate have no match",

@@ -10,7 +10,7 @@ use super::super::rooms::{data, load_rooms, room_words};
 use super::super::{check_writable, say, write_json};
 use crate::store::Store;
 use seese3_core::training::RoomData;
-use seese3_lab::experiments::formulations::{Pooling, compare};
+use seese3_lab::experiments::formulations::{RoomPooling, compare};
 use seese3_lab::formulations::Formulation;
 use seese3_lab::report::{formulations_json, formulations_table};
 
@@ -56,9 +56,9 @@ impl Formulations {
 
         // A task is one formulation with one seed; tasks run in parallel.
         let pooling = if self.pooled {
-            Pooling::Together
+            RoomPooling::Together
         } else {
-            Pooling::RoomByRoom
+            RoomPooling::RoomByRoom
         };
 
         let count = Formulation::ALL.len() as u64 * self.seeds;

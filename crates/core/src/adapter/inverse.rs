@@ -5,6 +5,7 @@ use ndarray::{Array1, Array2, ArrayView2};
 
 use super::{Error, TargetScale};
 use crate::geometry::Twist;
+use crate::matrices::to_nalgebra;
 
 /// Singular values up to this fraction of the largest one count as zero.
 const RANK_TOLERANCE: f64 = 1e-5;
@@ -113,7 +114,7 @@ pub(super) fn target(
 pub(super) fn pseudo_inverse(motion: ArrayView2<'_, f64>) -> (Array2<f64>, [f64; 6], usize) {
     // The tall transpose has the thin SVD with six columns: Wᵀ = U S Vᵀ, so W⁺ = U S⁻¹ Vᵀ.
     let columns = motion.ncols();
-    let svd = DMatrix::from_fn(columns, 6, |row, column| motion[(column, row)]).svd(true, true);
+    let svd = to_nalgebra(motion.t()).svd(true, true);
     let mut sorted: Vec<f64> = svd.singular_values.iter().copied().collect();
     sorted.sort_by(|a, b| b.total_cmp(a));
 

@@ -1,12 +1,12 @@
 //! Training data: features, poses and pairs of frames.
 
 use ndarray::{Array2, ArrayBase, ArrayView2, Axis, Data, Ix2};
-use rand::{RngExt, SeedableRng};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::{At, Error, Real, STILL, TargetScale};
 use crate::geometry::{Pose, Twist, body_twist};
-use crate::statistics::median;
+use crate::statistics::{median, normal_deviates};
 
 /// Lower bound on the standard deviation by which a column is divided, as a fraction of the
 /// columns' median.
@@ -169,7 +169,7 @@ impl<T: Real> Samples<T> {
         if at.config.noise > 0.0 {
             let mut random = ChaCha8Rng::seed_from_u64(at.config.seed);
             random.set_stream(at.step);
-            let noise = normal(&mut random, features.len());
+            let noise = normal_deviates(&mut random, features.len());
             features
                 .iter_mut()
                 .zip(noise)
@@ -283,22 +283,6 @@ impl<T: Real> Batch<T> {
 
         d_rows
     }
-}
-
-/// Draws from the standard normal distribution by the Box–Muller transform.
-fn normal(random: &mut ChaCha8Rng, count: usize) -> impl Iterator<Item = f64> + '_ {
-    let pair = |random: &mut ChaCha8Rng| {
-        let a: f32 = random.random();
-        let b: f32 = random.random();
-        let radius = (-2.0 * (1.0 - a).ln()).sqrt();
-        let (sine, cosine) = (std::f32::consts::TAU * b).sin_cos();
-
-        [f64::from(radius * cosine), f64::from(radius * sine)]
-    };
-
-    (0..count.div_ceil(2))
-        .flat_map(move |_| pair(random))
-        .take(count)
 }
 
 #[cfg(test)]

@@ -1,9 +1,10 @@
 //! Whitening: coordinates in which distances are standard deviations of a covariance.
 
-use nalgebra::{Cholesky, DMatrix};
+use nalgebra::Cholesky;
 use ndarray::{Array2, ArrayView1, ArrayView2};
 
 use super::Error;
+use crate::matrices::{to_nalgebra, to_ndarray};
 
 /// A covariance may differ from its transpose by this share of its largest entry.
 const SYMMETRY_TOLERANCE: f64 = 1e-9;
@@ -30,7 +31,7 @@ impl Whitener {
             return Err(unsound);
         }
 
-        let matrix = DMatrix::from_fn(size, size, |i, j| covariance[(i, j)]);
+        let matrix = to_nalgebra(covariance);
         if (&matrix - matrix.transpose()).amax() > SYMMETRY_TOLERANCE * matrix.amax() {
             return Err(unsound);
         }
@@ -39,7 +40,7 @@ impl Whitener {
         let inverse = lower.try_inverse().ok_or(unsound)?;
 
         Ok(Self {
-            matrix: Array2::from_shape_fn((size, size), |at| inverse[at]),
+            matrix: to_ndarray(&inverse),
         })
     }
 

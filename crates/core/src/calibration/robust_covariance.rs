@@ -58,19 +58,20 @@ fn weighted_moment(
 
 #[cfg(test)]
 mod tests {
-    use rand::{RngExt, SeedableRng};
+    use rand::SeedableRng;
 
     use super::*;
+    use crate::statistics::normal_deviates;
 
     /// Oracle: the definition of a covariance: of normal errors it is their own, and both shares
     /// are near what is wanted.
     #[test]
     fn the_shape_of_normal_errors_is_theirs() {
         let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(4);
-        let mut normal = || (0..12).map(|_| random.random_range(0.0..1.0)).sum::<f64>() - 6.0;
         let deviations = Vector6::new(0.1, 0.2, 0.3, 0.01, 0.02, 0.03);
         let drawn: Vec<Vector6<f64>> = (0..20_000)
-            .map(|_| Vector6::from_fn(|_, _| normal()).component_mul(&deviations))
+            .map(|_| Vector6::from_iterator(normal_deviates(&mut random, 6)))
+            .map(|normal| normal.component_mul(&deviations))
             .collect();
 
         let found = balanced(&drawn).unwrap();

@@ -5,6 +5,7 @@ use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
 
 use crate::adapter::{Adapter, Error};
 use crate::index::{Audit, ExactIndex, Exclusion, HnswIndex, HnswParameters, Index, Neighbour};
+use crate::matrices::{to_nalgebra, to_ndarray};
 use crate::room::FrameId;
 
 /// Singular values below this share of the largest count as zero, as in W⁺.
@@ -146,13 +147,12 @@ impl Projection {
 /// An orthonormal basis of the rows of W, shape (6, k).
 fn row_basis(w: ArrayView2<'_, f64>) -> Array2<f64> {
     // Thin SVD of the transpose, Wᵀ = U S Vᵀ: the columns of U span the row space of W.
-    let svd =
-        DMatrix::from_fn(w.ncols(), w.nrows(), |row, column| w[(column, row)]).svd(true, false);
+    let svd = to_nalgebra(w.t()).svd(true, false);
     let basis = svd
         .u
         .unwrap_or_else(|| DMatrix::zeros(w.ncols(), w.nrows()));
 
-    Array2::from_shape_fn(w.dim(), |(row, column)| basis[(column, row)])
+    to_ndarray(&basis.transpose())
 }
 
 /// The block-diagonal matrix of `parts`.
@@ -183,9 +183,7 @@ fn whitening(rows: ArrayView2<'_, f64>) -> Array2<f64> {
     let count = rows.nrows().max(1) as f64;
     let centred = &rows - &(rows.sum_axis(Axis(0)) / count);
     let covariance = centred.t().dot(&centred) / count;
-    let eigen = SymmetricEigen::new(DMatrix::from_fn(rows.ncols(), rows.ncols(), |i, j| {
-        covariance[(i, j)]
-    }));
+    let eigen = SymmetricEigen::new(to_nalgebra(covariance.view()));
     let largest = eigen.eigenvalues.iter().copied().fold(0.0, f64::max);
 
     // The eigenvalues of a covariance are squares of singular values, so the tolerance is squared
@@ -293,7 +291,7 @@ mod tests {
     fn whitened_distances_are_mahalanobis() {
         let rows = wave(40, 5);
         let white = rows.dot(&whitening(rows.view()).t());
-        let matrix = DMatrix::from_fn(40, 5, |i, j| rows[(i, j)]);
+        let matrix = to_nalgebra(rows.view());
         let centred = DMatrix::from_fn(40, 5, |i, j| matrix[(i, j)] - matrix.column(j).mean());
         let inverse = (centred.transpose() * &centred / 40.0)
             .try_inverse()
@@ -316,7 +314,7 @@ mod tests {
     fn row_space_distances_are_those_of_the_projector() {
         let w = wave(6, 20);
         let rows = wave(3, 20);
-        let matrix = DMatrix::from_fn(6, 20, |i, j| w[(i, j)]);
+        let matrix = to_nalgebra(w.view());
         let projector = matrix.clone().pseudo_inverse(1e-12).unwrap() * matrix;
 
         let basis = row_basis(w.view());

@@ -101,6 +101,22 @@ pub fn deviation(values: &[f64]) -> f64 {
     (squares / (values.len() as f64 - 1.0)).sqrt()
 }
 
+/// Independent draws from the standard normal distribution, by the Box–Muller transform.
+pub fn normal_deviates(random: &mut ChaCha8Rng, count: usize) -> impl Iterator<Item = f64> + '_ {
+    let pair = |random: &mut ChaCha8Rng| {
+        let a: f32 = random.random();
+        let b: f32 = random.random();
+        let radius = (-2.0 * (1.0 - a).ln()).sqrt();
+        let (sine, cosine) = (std::f32::consts::TAU * b).sin_cos();
+
+        [f64::from(radius * cosine), f64::from(radius * sine)]
+    };
+
+    (0..count.div_ceil(2))
+        .flat_map(move |_| pair(random))
+        .take(count)
+}
+
 /// A mean over rooms with its 95 % bootstrap interval.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RoomMean {

@@ -125,8 +125,10 @@ fn symmetric(matrix: &Matrix6<f64>) -> Matrix6<f64> {
 mod tests {
     use super::*;
     use nalgebra::Vector3;
-    use rand::{RngExt, SeedableRng};
+    use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
+
+    use crate::statistics::normal_deviates;
 
     fn twist(v: [f64; 3], w: [f64; 3]) -> Twist {
         Twist {
@@ -135,13 +137,8 @@ mod tests {
         }
     }
 
-    /// A normal deviate by the sum of twelve uniform ones: mean 0, variance 1.
-    fn normal(random: &mut ChaCha8Rng) -> f64 {
-        (0..12).map(|_| random.random_range(0.0..1.0)).sum::<f64>() - 6.0
-    }
-
     fn drawn(random: &mut ChaCha8Rng, covariance: &Matrix6<f64>) -> Vector6<f64> {
-        Cholesky::new(*covariance).unwrap().l() * Vector6::from_fn(|_, _| normal(random))
+        Cholesky::new(*covariance).unwrap().l() * Vector6::from_iterator(normal_deviates(random, 6))
     }
 
     /// Oracle: ten thousand drawn motions; the covariance of their ends is the predicted one.
@@ -209,7 +206,9 @@ mod tests {
         let mut belief = Belief::known(Pose::identity(), 1e-6, 1e-6);
         let noise = Matrix6::from_diagonal_element(1e-8);
         for step in 0..5_000 {
-            let motion = Twist::from_vector(&Vector6::from_fn(|_, _| 0.3 * normal(&mut random)));
+            let motion = Twist::from_vector(
+                &(0.3 * Vector6::from_iterator(normal_deviates(&mut random, 6))),
+            );
             belief = belief.moved(motion, &noise);
 
             if step % 7 == 0 {

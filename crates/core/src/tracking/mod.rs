@@ -7,7 +7,9 @@
 //!
 //! A [`Belief`] is a pose with the covariance of its error in its own body frame, on (v, ω).
 
+mod anchoring;
 mod belief;
+mod dead_reckoning;
 mod health;
 mod map;
 mod relocalize;
@@ -18,13 +20,14 @@ mod status;
 mod tracker;
 mod view;
 
+pub use anchoring::ANCHORS_TO_AGREE;
 pub use belief::{Belief, Innovation};
 pub use health::{Continuity, FrameEvidence, TrackingHealth};
 pub use map::{Map, MapMatch};
 pub use relocalize::{ROOM_RATIO, Relocalization, RoomMatch, relocalize};
 pub use replay::{InitialPose, MapPath, MotionSurprise, Replay, Segment, replay};
 pub use state::{Candidate, Keyframe, LastFrame, Observation, Refusal, State, Update};
-pub use tracker::{ANCHORS_TO_AGREE, Tracker, TrackerSettings};
+pub use tracker::{Tracker, TrackerSettings};
 pub use view::{View, motion};
 
 use crate::adapter;

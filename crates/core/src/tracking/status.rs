@@ -3,8 +3,8 @@
 use super::health::{FRAMES_TO_RECOVER, TrackingHealth};
 use super::map::MapMatch;
 use super::state::State;
-use super::tracker::{ANCHORS_TO_AGREE, Tracker};
-use super::{Belief, Status};
+use super::tracker::Tracker;
+use super::{ANCHORS_TO_AGREE, Belief, Status};
 
 /// Frames without a match after which a known place is in doubt.
 const FRAMES_UNTIL_DOUBT: u32 = 10;

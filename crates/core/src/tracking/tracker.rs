@@ -2,7 +2,7 @@
 //! look alike.
 //!
 //! Start reading at [`Tracker::observe`], which hands a frame to `step`, the whole algorithm in six
-//! paragraphs.
+//! paragraphs. Its third one is in `dead_reckoning.rs`, the fourth in `anchoring.rs`.
 //!
 //! - A tracker keeps nothing: all that it knows of a stream is its [`State`], and the same state
 //!   and frame give the same answer to the bit.
@@ -17,27 +17,15 @@
 
 use std::sync::Arc;
 
-use nalgebra::Matrix6;
 use ndarray::{ArrayView1, Axis, s};
 
+use super::anchoring::BestMap;
+use super::dead_reckoning::{MotionReading, Poses, Prediction};
 use super::health::{Continuity, FrameEvidence, TrackingHealth};
-use super::state::{Candidate, Keyframe, LastFrame, Observation, Refusal, State, Update};
+use super::state::{Keyframe, LastFrame, Observation, Refusal, State, Update};
 use super::{Belief, Error, Map, MapMatch, ROOM_RATIO};
 use crate::adapter::{Adapter, ErrorModel, JUMP_WINDOW};
-use crate::geometry::{Pose, Twist, body_twist};
-
-/// 99 % of χ² with six degrees of freedom: an anchor whose surprise is larger is refused.
-const GATE: f64 = 16.81;
-/// Successive anchors err alike: each one's covariance is multiplied by this.
-const ANCHOR_INFLATION: f64 = 2.0;
-/// Accepted frames from one anchor to the next: those in between err alike and tell nothing new.
-const ANCHOR_EVERY: u32 = 3;
-/// Anchors in a row that must agree on a place before it replaces another one, or is believed where
-/// none was.
-pub const ANCHORS_TO_AGREE: u32 = 4;
-/// The deviation of a stream's own origin, metres and radians: it is zero by definition, but a
-/// covariance has to be positive definite.
-const ORIGIN_DEVIATION: f64 = 1e-6;
+use crate::geometry::{Twist, body_twist};
 
 /// Settings of a tracker.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -77,8 +65,8 @@ impl TrackerSettings {
 pub struct Tracker {
     pub(super) maps: Vec<Arc<Map>>,
     pub(super) settings: TrackerSettings,
-    error_model: Arc<ErrorModel>,
-    map_pose_factor: f64,
+    pub(super) error_model: Arc<ErrorModel>,
+    pub(super) map_pose_factor: f64,
 }
 
 impl Tracker {
@@ -198,14 +186,13 @@ impl Tracker {
         Ok(self.step(state, frame))
     }
 
-    fn adapter(&self) -> &Arc<Adapter> {
+    pub(super) fn adapter(&self) -> &Arc<Adapter> {
         self.maps[0].navigator().adapter()
     }
 
     fn step(&self, state: &mut State, frame: &Observation) -> Update {
         // 1. What the frame looks like: the best map, the mapped frame nearest to it, and whether
-        //    the
-        // view follows from the views before.
+        //    the view follows from the views before.
         let view = self.match_maps(state.room, frame.latent.view());
         let matches_room = view.matched.out_of_distribution <= 1.0;
         let continuity = self.record_view(state, frame);
@@ -361,65 +348,6 @@ impl Tracker {
         }
     }
 
-    /// The motion from the keyframe to this frame, and the poses that it leads to.
-    fn predict(&self, state: &State, frame: &Observation, reading: MotionReading) -> Prediction {
-        let Some(keyframe) = &state.keyframe else {
-            // The first frame is the origin of `odom`.
-            let odom = Belief::known(Pose::identity(), ORIGIN_DEVIATION, ORIGIN_DEVIATION);
-            return Prediction {
-                motion: Twist::default(),
-                covariance: odom.covariance,
-                poses: Poses {
-                    odom,
-                    map_pose: state.initial_pose,
-                    reported_pose: state.initial_pose,
-                },
-            };
-        };
-
-        let from = EarlierView {
-            latent: &keyframe.latent,
-            sequence: keyframe.sequence,
-        };
-        let (mut motion, mut covariance) = self.motion_between(state.room, from, frame);
-
-        if reading != MotionReading::Complete || state.health.is_lost() {
-            covariance += self.error_model.unread_errors();
-        }
-
-        // A motion that was not seen cannot be read from the views at its ends: the camera is taken
-        // to be where it was at the last frame, with the errors of any motion.
-        if reading == MotionReading::Unseen {
-            let last_odom = state
-                .last
-                .as_ref()
-                .map_or(keyframe.odom.pose, |last| last.odom.pose);
-            motion = body_twist(&keyframe.odom.pose, &last_odom);
-        }
-
-        let carried = |belief: &Belief| belief.moved(motion, &covariance);
-        Prediction {
-            motion,
-            covariance,
-            poses: Poses {
-                odom: carried(&keyframe.odom),
-                map_pose: keyframe.map_pose.as_ref().map(carried),
-                reported_pose: keyframe.reported_pose.as_ref().map(carried),
-            },
-        }
-    }
-
-    /// A corrected map pose as it is reported: with the covariance of the anchor that corrected it,
-    /// times the factor that calibration found. The filter
-    /// would combine many anchors into one very sure pose, but anchors on the same part of a path
-    /// err alike.
-    fn as_sure_as(&self, anchor: &Belief, map_pose: Belief) -> Belief {
-        Belief {
-            covariance: anchor.covariance * self.map_pose_factor,
-            ..map_pose
-        }
-    }
-
     fn is_keyframe_due(&self, state: &State, sequence: u64, prediction: &Prediction) -> bool {
         let keyframe_frames = u64::from(self.settings.keyframe_frames);
         let is_old = state
@@ -430,139 +358,6 @@ impl Tracker {
         is_old
             || state.health.is_lost()
             || prediction.motion.norm() >= self.settings.keyframe_displacement
-    }
-
-    /// The motion from an earlier view to this frame, and the covariance of its error.
-    fn motion_between(
-        &self,
-        room: Option<usize>,
-        from: EarlierView<'_>,
-        to: &Observation,
-    ) -> (Twist, Matrix6<f64>) {
-        let latent = ArrayView1::from(from.latent);
-        let coordinates = s![..self.adapter().coordinate_count()];
-        let difference = &to.latent.slice(coordinates) - &latent.slice(coordinates);
-
-        // In a known room the errors are those that its own frames showed.
-        let errors = room.map_or(&self.error_model.statistics().motion_errors, |room| {
-            self.maps[room].motion_errors()
-        });
-        let squared_length = self.error_model.spread_length(difference.view());
-        let frames = to.sequence.saturating_sub(from.sequence);
-        let covariance = errors.at(squared_length, frames);
-
-        let motion = self.adapter().displacement(latent, to.latent.view());
-        if motion.is_unique_logarithm() {
-            return (motion, covariance);
-        }
-
-        // No camera turns by half between two frames that are compared: nothing was read.
-        let covariance = covariance + self.error_model.unread_errors();
-        (Twist::default(), covariance)
-    }
-
-    /// Tries the best match as an anchor, if one is due and the view clearly matches one map.
-    fn correct_when_due(
-        &self,
-        state: &mut State,
-        poses: &mut Poses,
-        frame: &Observation,
-        view: &BestMap,
-    ) -> Correction {
-        state.frames_since_anchor = state.frames_since_anchor.saturating_add(1);
-        let is_due = state.frames_since_anchor >= ANCHOR_EVERY || state.keyframe.is_none();
-        let matches_room = view.matched.out_of_distribution <= 1.0;
-
-        if !(self.settings.fuse && matches_room && is_due) {
-            return Correction::NONE;
-        }
-
-        state.frames_since_anchor = 0;
-        if view.is_clear {
-            self.correct(state, poses, frame, view)
-        } else {
-            Correction::NONE
-        }
-    }
-
-    /// Corrects the map pose by an anchor. An anchor within the gate of the believed pose is
-    /// applied at once. Any other one, and each one where nothing is believed, becomes a candidate,
-    /// which is applied once several anchors in a row agree.
-    fn correct(
-        &self,
-        state: &mut State,
-        poses: &mut Poses,
-        frame: &Observation,
-        view: &BestMap,
-    ) -> Correction {
-        let earlier_candidate = state.candidate.take();
-        if state.health.is_lost() {
-            return Correction::NONE;
-        }
-
-        let anchor = Belief {
-            pose: view.matched.anchor.pose,
-            covariance: view.matched.anchor.covariance * ANCHOR_INFLATION,
-        };
-        let surprise_at = |belief: &Belief| {
-            belief
-                .innovation(&anchor)
-                .map_or(f64::INFINITY, |innovation| innovation.squared_length)
-        };
-
-        let believed = poses.map_pose.filter(|_| state.room == Some(view.room));
-        let surprise = believed.as_ref().map(surprise_at);
-        if let (Some(believed), Some(surprise)) = (believed, surprise)
-            && surprise <= GATE
-        {
-            poses.map_pose = Some(believed.corrected(&anchor));
-            return Correction {
-                is_applied: true,
-                surprise: Some(surprise),
-            };
-        }
-
-        // The earlier candidate was seen some frames ago: carry it to this frame, then compare.
-        let carried = earlier_candidate
-            .filter(|candidate| candidate.room == view.room)
-            .map(|candidate| self.carried_candidate(candidate, frame));
-        let (map_pose, agreeing_anchors) = match carried {
-            Some((map_pose, agreeing)) if surprise_at(&map_pose) <= GATE => {
-                (map_pose.corrected(&anchor), agreeing + 1)
-            }
-            _ => (anchor, 1),
-        };
-
-        let is_applied = agreeing_anchors >= ANCHORS_TO_AGREE;
-        if is_applied {
-            state.room = Some(view.room);
-            poses.map_pose = Some(map_pose);
-        } else {
-            state.candidate = Some(Candidate {
-                room: view.room,
-                sequence: frame.sequence,
-                latent: frame.latent.to_vec(),
-                map_pose,
-                agreeing_anchors,
-            });
-        }
-
-        Correction {
-            is_applied,
-            surprise,
-        }
-    }
-
-    /// Where a candidate's camera would be at this frame, and how many anchors agreed on it.
-    fn carried_candidate(&self, candidate: Candidate, frame: &Observation) -> (Belief, u32) {
-        let from = EarlierView {
-            latent: &candidate.latent,
-            sequence: candidate.sequence,
-        };
-        let (motion, covariance) = self.motion_between(Some(candidate.room), from, frame);
-
-        let map_pose = candidate.map_pose.moved(motion, &covariance);
-        (map_pose, candidate.agreeing_anchors)
     }
 }
 
@@ -607,74 +402,4 @@ fn mean_velocity(last: &LastFrame, frame: &Observation, odom: &Belief) -> Twist 
 fn distance(a: &[f64], b: &[f64]) -> f64 {
     let squares = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b));
     squares.sum::<f64>().sqrt()
-}
-
-/// The map that a view matches best.
-struct BestMap {
-    /// Its place in [`Tracker::maps`].
-    room: usize,
-    /// Whether no other map matches nearly as well.
-    is_clear: bool,
-    matched: MapMatch,
-}
-
-/// How much of the motion before a frame was seen.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum MotionReading {
-    /// All of it.
-    Complete,
-    /// Frames of it are missing, but the room was seen again after them.
-    Partial,
-    /// Nothing that can be relied on: the view jumped, or a gap led away from the map.
-    Unseen,
-}
-
-impl MotionReading {
-    fn of(continuity: Continuity, matches_room: bool) -> Self {
-        match continuity {
-            Continuity::Continuous => Self::Complete,
-            Continuity::Gap if matches_room => Self::Partial,
-            Continuity::Gap | Continuity::Jump => Self::Unseen,
-        }
-    }
-}
-
-/// An earlier frame that a motion is read from.
-#[derive(Clone, Copy)]
-struct EarlierView<'a> {
-    latent: &'a [f64],
-    sequence: u64,
-}
-
-/// The poses of a stream at one frame.
-#[derive(Debug, Clone, Copy)]
-struct Poses {
-    /// `odom_from_camera`.
-    odom: Belief,
-    /// `map_from_camera` as the filter believes it.
-    map_pose: Option<Belief>,
-    /// `map_from_camera` as it is reported.
-    reported_pose: Option<Belief>,
-}
-
-/// A motion since the keyframe, the covariance of its error, and where it leads.
-struct Prediction {
-    motion: Twist,
-    covariance: Matrix6<f64>,
-    poses: Poses,
-}
-
-/// What an anchor did to the map pose.
-struct Correction {
-    is_applied: bool,
-    /// The squared Mahalanobis distance of the anchor from the believed pose, if there was one.
-    surprise: Option<f64>,
-}
-
-impl Correction {
-    /// No anchor was tried.
-    const NONE: Self = Self {
-        is_applied: false,
-        surprise: None,
-    };
 }

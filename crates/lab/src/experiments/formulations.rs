@@ -19,7 +19,7 @@ pub struct FormulationScores {
 
 /// How many networks a formulation trains for several rooms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Pooling {
+pub enum RoomPooling {
     /// One network per room.
     RoomByRoom,
     /// One network for all rooms together.
@@ -35,7 +35,7 @@ pub fn compare(
     rooms: &[RoomData<'_>],
     plan: &TrainingPlan,
     seeds: u64,
-    pooling: Pooling,
+    room_pooling: RoomPooling,
     done: &(dyn Fn() + Sync),
 ) -> Result<Vec<FormulationScores>, Error> {
     let tasks: Vec<(Formulation, u64)> = Formulation::ALL
@@ -46,7 +46,7 @@ pub fn compare(
     let runs: Vec<(Formulation, MotionScores)> = tasks
         .into_par_iter()
         .map(|(which, seed)| {
-            let scores = one_run(which, rooms, &plan.with_seed(seed), pooling)?;
+            let scores = one_run(which, rooms, &plan.with_seed(seed), room_pooling)?;
             done();
             Ok((which, scores))
         })
@@ -70,11 +70,11 @@ fn one_run(
     which: Formulation,
     rooms: &[RoomData<'_>],
     plan: &TrainingPlan,
-    pooling: Pooling,
+    room_pooling: RoomPooling,
 ) -> Result<MotionScores, Error> {
-    let scores = match pooling {
-        Pooling::Together => train_formulation(which, rooms, plan, &mut |_| ())?,
-        Pooling::RoomByRoom => {
+    let scores = match room_pooling {
+        RoomPooling::Together => train_formulation(which, rooms, plan, &mut |_| ())?,
+        RoomPooling::RoomByRoom => {
             let mut scores = Vec::with_capacity(rooms.len());
             for data in rooms {
                 let room = std::slice::from_ref(data);

@@ -6,6 +6,7 @@
 //! - [`adapter_sweep`]: a grid of adapters, one row per run.
 //! - [`cross_room`]: an adapter in rooms that it never saw.
 //! - [`odometry`]: a tracker along held-out frames.
+//! - [`path_comparison`]: an estimated path against a reference.
 //!
 //! An experiment takes rooms that are loaded ([`seese3_core::training::RoomData`]) and reads and
 //! writes no file. [`crate::report`] renders the results.
@@ -15,6 +16,7 @@ pub mod cross_room;
 pub mod formulations;
 pub mod layers;
 pub mod odometry;
+pub mod path_comparison;
 pub mod probe;
 pub mod seeds;
 

@@ -43,15 +43,33 @@ pub struct AtStride {
     pub runs: Vec<MotionScores>,
 }
 
+/// M1, and how it was taken.
+#[derive(Debug, Clone, Copy)]
+pub struct MutualKnnScore {
+    /// The mean share of neighbours by feature that are neighbours by pose, 0 to 1.
+    pub share: f64,
+    /// How the neighbours were compared.
+    pub options: MutualKnn,
+}
+
+/// M2, and how it was taken.
+#[derive(Debug, Clone)]
+pub struct DimensionScore {
+    /// The intrinsic dimension by several estimators.
+    pub dimension: IntrinsicDimension,
+    /// How it was taken.
+    pub protocol: DimensionProtocol,
+}
+
 /// What was measured in a room, or in several rooms together; what was not asked for is absent.
 #[derive(Debug, Clone)]
 pub struct ProbeScores {
     /// The room, or the rooms in words.
     pub room: String,
-    /// Mutual k-NN, 0 to 1, and how it was taken.
-    pub m1: Option<(f64, MutualKnn)>,
-    /// The intrinsic dimension, and how it was taken.
-    pub m2: Option<(IntrinsicDimension, DimensionProtocol)>,
+    /// Mutual k-NN.
+    pub m1: Option<MutualKnnScore>,
+    /// The intrinsic dimension.
+    pub m2: Option<DimensionScore>,
     /// Ridge regression by stride.
     pub m3: Vec<AtStride>,
     /// The adapter by stride.
@@ -67,15 +85,18 @@ pub fn probe(data: &RoomData<'_>, protocol: &ProbeProtocol) -> Result<ProbeScore
 
     let mut m1 = None;
     if let Some(options) = protocol.m1 {
-        let value = mutual_knn(rows, data.room.poses(), &options).within(|| "M1".to_owned())?;
-        m1 = Some((value, options));
+        let share = mutual_knn(rows, data.room.poses(), &options).within(|| "M1".to_owned())?;
+        m1 = Some(MutualKnnScore { share, options });
     }
 
     let mut m2 = None;
-    if let Some(options) = protocol.m2 {
-        let dimension = intrinsic_dimension(rows, options.gap, options.duplicates)
+    if let Some(protocol) = protocol.m2 {
+        let dimension = intrinsic_dimension(rows, protocol.gap, protocol.duplicates)
             .within(|| "M2".to_owned())?;
-        m2 = Some((dimension, options));
+        m2 = Some(DimensionScore {
+            dimension,
+            protocol,
+        });
     }
 
     let mut m3 = Vec::with_capacity(protocol.m3.len());

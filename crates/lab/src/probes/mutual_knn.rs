@@ -21,7 +21,7 @@ pub struct MutualKnn {
     /// The unit of `exclusion`.
     pub counted: Counted,
     /// Whether a frame at exactly the distance `exclusion` is left out too.
-    pub bound: Bound,
+    pub limit: Limit,
 }
 
 /// What a temporal distance is counted in.
@@ -35,7 +35,7 @@ pub enum Counted {
 
 /// Whether a range includes its limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Bound {
+pub enum Limit {
     /// The limit is included.
     Inclusive,
     /// The limit is not included.
@@ -49,9 +49,9 @@ impl MutualKnn {
             Counted::Sampled => frame.abs_diff(other),
             Counted::Native => frame.abs_diff(other).saturating_mul(self.stride),
         };
-        let near = match self.bound {
-            Bound::Inclusive => distance <= self.exclusion,
-            Bound::Exclusive => distance < self.exclusion,
+        let near = match self.limit {
+            Limit::Inclusive => distance <= self.exclusion,
+            Limit::Exclusive => distance < self.exclusion,
         };
 
         frame != other && !near
@@ -67,7 +67,7 @@ impl Default for MutualKnn {
             k: 10,
             exclusion: 10,
             counted: Counted::Sampled,
-            bound: Bound::Inclusive,
+            limit: Limit::Inclusive,
         }
     }
 }
@@ -229,41 +229,41 @@ mod tests {
     /// Oracle: by hand, of a frame and the one three samples on, six frames of the room.
     #[test]
     fn distances_are_counted_as_asked() {
-        let apart = |counted, bound, exclusion| {
+        let apart = |counted, limit, exclusion| {
             MutualKnn {
                 stride: 2,
                 exclusion,
                 counted,
-                bound,
+                limit,
                 ..MutualKnn::default()
             }
             .apart(4, 7)
         };
 
         assert!(
-            apart(Counted::Sampled, Bound::Inclusive, 2)
-                && !apart(Counted::Sampled, Bound::Inclusive, 3)
+            apart(Counted::Sampled, Limit::Inclusive, 2)
+                && !apart(Counted::Sampled, Limit::Inclusive, 3)
         );
 
         assert!(
-            apart(Counted::Sampled, Bound::Exclusive, 3)
-                && !apart(Counted::Sampled, Bound::Exclusive, 4)
+            apart(Counted::Sampled, Limit::Exclusive, 3)
+                && !apart(Counted::Sampled, Limit::Exclusive, 4)
         );
 
         assert!(
-            apart(Counted::Native, Bound::Inclusive, 5)
-                && !apart(Counted::Native, Bound::Inclusive, 6)
+            apart(Counted::Native, Limit::Inclusive, 5)
+                && !apart(Counted::Native, Limit::Inclusive, 6)
         );
 
         assert!(
-            apart(Counted::Native, Bound::Exclusive, 6)
-                && !apart(Counted::Native, Bound::Exclusive, 7)
+            apart(Counted::Native, Limit::Exclusive, 6)
+                && !apart(Counted::Native, Limit::Exclusive, 7)
         );
 
         assert!(
             !MutualKnn {
                 exclusion: 0,
-                bound: Bound::Exclusive,
+                limit: Limit::Exclusive,
                 ..MutualKnn::default()
             }
             .apart(3, 3)

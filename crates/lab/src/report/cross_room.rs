@@ -1,8 +1,10 @@
 //! Results of an adapter in rooms that it was not trained on, for `seese3 cross-room`.
 
-use serde_json::{Value, json};
+use std::collections::BTreeMap;
 
-use super::json::{motion_json, rate_json};
+use serde::Serialize;
+
+use super::json::{MotionJson, RateJson, RoomMeanJson};
 use super::table::aligned;
 use crate::experiments::cross_room::{CrossRoomRun, MotionSummary, RoomOutcome, wins};
 use seese3_core::statistics::{RoomMean, bootstrap_mean, paired_difference};
@@ -130,59 +132,111 @@ pub fn rooms_table(run: &CrossRoomRun) -> String {
     aligned(&lines)
 }
 
-/// The runs as JSON, with a summary over rooms and the scores of every room.
-pub fn cross_room_json(runs: &[CrossRoomRun], baseline: &str) -> Value {
-    let run = |run: &CrossRoomRun| {
-        let theirs = run.hit_rates(baseline);
-        let navigator = |name: &str| {
-            let ours = run.hit_rates(name);
-            json!({
-                "name": name,
-                "beats_identity": wins(&run.outcomes, name).map(|rate| rate_json(&rate)),
-                "hit": room_mean_json(&bootstrap_mean(&ours, 0)),
-                "over_baseline": room_mean_json(&paired_difference(&ours, &theirs, 0)),
-            })
-        };
-
-        let room = |outcome: &RoomOutcome| {
-            let rates = outcome.rows.iter().filter_map(|row| {
-                Some((row.name.clone(), rate_json(&outcome.hit_rate(&row.name)?)))
-            });
-
-            json!({
-                "room": outcome.room.as_str(),
-                "candidates": outcome.candidate_count,
-                "motion": motion_json(&outcome.motion),
-                "hit": rates.collect::<serde_json::Map<_, _>>(),
-            })
-        };
-
-        let summary = MotionSummary::of(&run.r2(), 0).map(|summary| {
-            json!({
-                "positive": rate_json(&summary.positive),
-                "above_0.3": rate_json(&summary.above_0_3),
-                "best": summary.best,
-                "clipped_mean": room_mean_json(&summary.clipped),
-            })
-        });
-
-        json!({
-            "learned_rooms": run.training_rooms,
-            "calibration_rooms": run.calibration_rooms,
-            "seed": run.seed,
-            "r2": summary,
-            "navigators": run.navigators().into_iter().map(navigator).collect::<Vec<_>>(),
-            "rooms": run.outcomes.iter().map(room).collect::<Vec<_>>(),
-            "skipped": run.skipped.iter().map(|(room, why)| json!({ "room": room, "why": why })).collect::<Vec<_>>(),
-        })
-    };
-
-    json!({ "baseline": baseline, "runs": runs.iter().map(run).collect::<Vec<_>>() })
+/// The runs of `seese3 cross-room`, with a summary over rooms and the scores of every room.
+#[derive(Debug, Serialize)]
+pub struct CrossRoomJson {
+    baseline: String,
+    runs: Vec<RunJson>,
 }
 
-/// A mean over rooms as JSON.
-pub fn room_mean_json(mean: &RoomMean) -> Value {
-    json!({ "mean": mean.mean, "low": mean.low, "high": mean.high, "rooms": mean.rooms })
+#[derive(Debug, Serialize)]
+struct RunJson {
+    learned_rooms: Vec<String>,
+    calibration_rooms: Vec<String>,
+    seed: u64,
+    r2: Option<SummaryJson>,
+    navigators: Vec<NavigatorJson>,
+    rooms: Vec<RoomJson>,
+    skipped: Vec<SkippedJson>,
+}
+
+#[derive(Debug, Serialize)]
+struct SummaryJson {
+    positive: RateJson,
+    #[serde(rename = "above_0.3")]
+    above_0_3: RateJson,
+    best: f64,
+    clipped_mean: RoomMeanJson,
+}
+
+#[derive(Debug, Serialize)]
+struct NavigatorJson {
+    name: String,
+    beats_identity: Option<RateJson>,
+    hit: RoomMeanJson,
+    over_baseline: RoomMeanJson,
+}
+
+#[derive(Debug, Serialize)]
+struct RoomJson {
+    room: String,
+    candidates: usize,
+    motion: MotionJson,
+    /// By navigator.
+    hit: BTreeMap<String, RateJson>,
+}
+
+#[derive(Debug, Serialize)]
+struct SkippedJson {
+    room: String,
+    why: String,
+}
+
+/// The record of cross-room runs; differences are taken from the navigator `baseline`.
+pub fn cross_room_json(runs: &[CrossRoomRun], baseline: &str) -> CrossRoomJson {
+    CrossRoomJson {
+        baseline: baseline.to_owned(),
+        runs: runs.iter().map(|run| run_json(run, baseline)).collect(),
+    }
+}
+
+fn run_json(run: &CrossRoomRun, baseline: &str) -> RunJson {
+    let theirs = run.hit_rates(baseline);
+    let navigator = |name: &str| {
+        let ours = run.hit_rates(name);
+        NavigatorJson {
+            name: name.to_owned(),
+            beats_identity: wins(&run.outcomes, name).as_ref().map(RateJson::from),
+            hit: (&bootstrap_mean(&ours, 0)).into(),
+            over_baseline: (&paired_difference(&ours, &theirs, 0)).into(),
+        }
+    };
+
+    let summary = MotionSummary::of(&run.r2(), 0).map(|summary| SummaryJson {
+        positive: (&summary.positive).into(),
+        above_0_3: (&summary.above_0_3).into(),
+        best: summary.best,
+        clipped_mean: (&summary.clipped).into(),
+    });
+
+    let skipped = run.skipped.iter().map(|(room, why)| SkippedJson {
+        room: room.clone(),
+        why: why.clone(),
+    });
+
+    RunJson {
+        learned_rooms: run.training_rooms.clone(),
+        calibration_rooms: run.calibration_rooms.clone(),
+        seed: run.seed,
+        r2: summary,
+        navigators: run.navigators().into_iter().map(navigator).collect(),
+        rooms: run.outcomes.iter().map(room_json).collect(),
+        skipped: skipped.collect(),
+    }
+}
+
+fn room_json(outcome: &RoomOutcome) -> RoomJson {
+    let rates = outcome
+        .rows
+        .iter()
+        .filter_map(|row| Some((row.name.clone(), (&outcome.hit_rate(&row.name)?).into())));
+
+    RoomJson {
+        room: outcome.room.to_string(),
+        candidates: outcome.candidate_count,
+        motion: (&outcome.motion).into(),
+        hit: rates.collect(),
+    }
 }
 
 /// A mean over rooms with its 95 % interval, as text.

@@ -1,9 +1,9 @@
 //! R² of the adapter beside that of the alternative formulations, in the shape of the paper's table
 //! (Sec. A.5).
 
-use serde_json::{Value, json};
+use serde::Serialize;
 
-use super::json::{motion_json, parts_json};
+use super::json::{MotionJson, PartsJson};
 use super::table::aligned;
 use crate::experiments::formulations::FormulationScores;
 use seese3_core::motion_scores::MotionScores;
@@ -56,15 +56,28 @@ pub fn formulations_table(scores: &[FormulationScores]) -> String {
     aligned(&lines)
 }
 
-/// The scores as JSON, one entry per formulation.
-pub fn formulations_json(scores: &[FormulationScores]) -> Value {
-    let entry = |score: &FormulationScores| {
-        json!({
-            "name": score.name,
-            "by_part": parts_json(&score.runs),
-            "runs": score.runs.iter().map(motion_json).collect::<Vec<_>>(),
-        })
+/// The record of `seese3 sweep formulations`, one entry per formulation.
+#[derive(Debug, Serialize)]
+pub struct FormulationsJson {
+    formulations: Vec<FormulationJson>,
+}
+
+#[derive(Debug, Serialize)]
+struct FormulationJson {
+    name: &'static str,
+    by_part: PartsJson,
+    runs: Vec<MotionJson>,
+}
+
+/// The record of formulations.
+pub fn formulations_json(scores: &[FormulationScores]) -> FormulationsJson {
+    let entry = |score: &FormulationScores| FormulationJson {
+        name: score.name,
+        by_part: PartsJson::of(&score.runs),
+        runs: score.runs.iter().map(MotionJson::from).collect(),
     };
 
-    json!({ "formulations": scores.iter().map(entry).collect::<Vec<_>>() })
+    FormulationsJson {
+        formulations: scores.iter().map(entry).collect(),
+    }
 }

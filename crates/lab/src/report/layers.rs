@@ -1,6 +1,6 @@
 //! The probe metrics M1 to M4 by layer of an encoder, for `seese3 sweep layers`.
 
-use serde_json::{Value, json};
+use serde::Serialize;
 
 use super::table::aligned;
 use crate::experiments::layers::LayerScores;
@@ -163,22 +163,77 @@ pub fn encoders_table(scores: &[LayerScores]) -> String {
     aligned(&lines)
 }
 
-/// The scores as JSON, one entry per layer and room.
-pub fn layers_json(scores: &[LayerScores]) -> Value {
-    let entry = |score: &LayerScores| {
-        json!({
-            "features": score.features,
-            "room": score.room,
-            "columns": score.dim,
-            "m1": { "value": score.m1 },
-            "m2": { "twonn": score.m2_two_nn, "mle": score.m2_mle, "dropped_rows": score.m2_dropped },
-            "m3": { "r2": score.m3_r2 },
-            "encoder": score.encoder,
-            "m4": { "r2": score.m4_r2, "translation": score.m4_translation, "rotation": score.m4_rotation, "deviation": score.m4_deviation, "runs": score.m4_runs },
-        })
+/// The record of `seese3 sweep layers`, one entry per layer and room.
+#[derive(Debug, Serialize)]
+pub struct LayersJson {
+    layers: Vec<LayerJson>,
+}
+
+#[derive(Debug, Serialize)]
+struct LayerJson {
+    features: String,
+    encoder: String,
+    room: String,
+    columns: usize,
+    m1: M1Json,
+    m2: M2Json,
+    m3: M3Json,
+    m4: M4Json,
+}
+
+#[derive(Debug, Serialize)]
+struct M1Json {
+    value: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct M2Json {
+    twonn: f64,
+    mle: f64,
+    dropped_rows: usize,
+}
+
+#[derive(Debug, Serialize)]
+struct M3Json {
+    r2: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct M4Json {
+    r2: f64,
+    translation: f64,
+    rotation: f64,
+    deviation: f64,
+    /// R² of each seed.
+    runs: Vec<f64>,
+}
+
+/// The record of layers.
+pub fn layers_json(scores: &[LayerScores]) -> LayersJson {
+    let entry = |score: &LayerScores| LayerJson {
+        features: score.features.clone(),
+        encoder: score.encoder.clone(),
+        room: score.room.clone(),
+        columns: score.dim,
+        m1: M1Json { value: score.m1 },
+        m2: M2Json {
+            twonn: score.m2_two_nn,
+            mle: score.m2_mle,
+            dropped_rows: score.m2_dropped,
+        },
+        m3: M3Json { r2: score.m3_r2 },
+        m4: M4Json {
+            r2: score.m4_r2,
+            translation: score.m4_translation,
+            rotation: score.m4_rotation,
+            deviation: score.m4_deviation,
+            runs: score.m4_runs.clone(),
+        },
     };
 
-    json!({ "layers": scores.iter().map(entry).collect::<Vec<_>>() })
+    LayersJson {
+        layers: scores.iter().map(entry).collect(),
+    }
 }
 
 #[cfg(test)]

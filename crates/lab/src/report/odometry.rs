@@ -179,7 +179,7 @@ pub fn relocalisation_text(found: &Relocalisation) -> String {
 
 /// The file of `seese3 evaluate odometry --json`.
 #[derive(Debug, Serialize)]
-struct OdometryJson {
+pub struct OdometryJson {
     rooms: Vec<RoomJson>,
     /// Shares of map poses inside the 68 % and the 95 % ellipsoid, over all rooms.
     coverage_places: [f64; 2],
@@ -231,12 +231,12 @@ struct RelocalisationJson {
     ambiguous: usize,
 }
 
-/// The results of every room, the coverage over all rooms, relocalisation, and the formulas, as
-/// JSON.
+/// The record of tracking: the results of every room, the coverage over all rooms, relocalisation,
+/// and the formulas.
 pub fn odometry_json(
     rooms: &[RoomOdometry],
     relocalisation: Option<&Relocalisation>,
-) -> serde_json::Value {
+) -> OdometryJson {
     let map_poses = [
         concat(rooms, |room| &room.map_poses_mapped),
         concat(rooms, |room| &room.map_poses_unmapped),
@@ -244,7 +244,7 @@ pub fn odometry_json(
     .concat();
     let motions: Vec<MotionSurprise> = rooms.iter().flat_map(|room| room.motions.clone()).collect();
 
-    serde_json::json!(OdometryJson {
+    OdometryJson {
         rooms: rooms.iter().map(room_json).collect(),
         coverage_places: shares(&map_poses),
         coverage_motions: shares(&squared_errors(&motions)),
@@ -257,7 +257,7 @@ pub fn odometry_json(
         ape_formula: super::APE_FORMULA,
         rpe_formula: super::RPE_FORMULA,
         alignment: "none",
-    })
+    }
 }
 
 fn room_json(room: &RoomOdometry) -> RoomJson {

@@ -1,109 +1,225 @@
 //! The probe metrics M1 to M4 of features in rooms, for `seese3 probe`.
 
-use serde_json::{Map, Value, json};
+use serde::Serialize;
 
-use super::json::{motion_json, parts_json};
+use super::json::{MotionJson, PartsJson};
 use super::table::aligned;
-use crate::experiments::probe::{AtStride, DimensionProtocol, ProbeScores};
-use crate::probes::{Bound, Counted, Duplicates, IntrinsicDimension, Mle, MutualKnn};
+use crate::experiments::probe::{
+    AtStride, DimensionProtocol, DimensionScore, MutualKnnScore, ProbeScores,
+};
+use crate::probes::{Counted, Duplicates, Limit, Mle, MutualKnn};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::statistics::{deviation, mean_of_known};
 
-/// The scores as `{"m1": {"value": …}, "m2": {"twonn": …, "mle": …}, "m3": {"r2": …}, "m4":
-/// {"r2": …}}`, each metric with its settings.
-pub fn probe_json(scores: &ProbeScores) -> Value {
-    let mut object = Map::new();
-    object.insert("room".to_owned(), json!(scores.room));
-    if let Some((value, options)) = &scores.m1 {
-        object.insert("m1".to_owned(), m1_json(*value, options));
-    }
-    if let Some((dimension, options)) = &scores.m2 {
-        object.insert("m2".to_owned(), m2_json(dimension, *options));
-    }
-
-    for (name, strides) in [("m3", &scores.m3), ("m4", &scores.m4)] {
-        // The first stride also stands at the top of the entry, so that a probe of a single
-        // stride can be read without looking into `strides`.
-        if let Some(first) = strides.first() {
-            let mut entry = stride_json(first);
-
-            let all: Vec<Value> = strides
-                .iter()
-                .map(|at| Value::Object(stride_json(at)))
-                .collect();
-            entry.insert("strides".to_owned(), json!(all));
-
-            object.insert(name.to_owned(), Value::Object(entry));
-        }
-    }
-
-    Value::Object(object)
+/// The record of `seese3 probe`.
+#[derive(Debug, Serialize)]
+pub struct ProbeJson {
+    #[serde(flatten)]
+    rooms: RoomsJson,
+    features: String,
+    split: &'static str,
+    preset: &'static str,
+    /// Why a room or a metric has no scores, in words.
+    skipped: Vec<String>,
 }
 
-fn m1_json(value: f64, options: &MutualKnn) -> Value {
-    let &MutualKnn {
+/// The scores of a single room stand at the top of the file; those of several are a list.
+#[derive(Debug, Serialize)]
+#[serde(untagged)]
+enum RoomsJson {
+    One(Box<RoomJson>),
+    Several { rooms: Vec<RoomJson> },
+}
+
+/// The scores of one room; a metric that was not asked for is left out.
+#[derive(Debug, Serialize)]
+struct RoomJson {
+    room: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    m1: Option<M1Json>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    m2: Option<M2Json>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    m3: Option<StridesJson>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    m4: Option<StridesJson>,
+}
+
+#[derive(Debug, Serialize)]
+struct M1Json {
+    value: f64,
+    frames: usize,
+    stride: usize,
+    k: usize,
+    exclusion: usize,
+    exclusion_counts: &'static str,
+    exclusion_is: &'static str,
+}
+
+#[derive(Debug, Serialize)]
+struct M2Json {
+    twonn: f64,
+    mle: f64,
+    twonn_censored: f64,
+    twonn_likelihood: f64,
+    mle_biased: MleJson,
+    mle_unbiased: MleJson,
+    gap: usize,
+    duplicates: &'static str,
+    used_rows: usize,
+    dropped_rows: usize,
+}
+
+/// A maximum-likelihood dimension by the way in which the points' own are averaged.
+#[derive(Debug, Serialize)]
+struct MleJson {
+    harmonic: f64,
+    mean: f64,
+    median: f64,
+}
+
+/// The first stride stands at the top, so that a probe of a single stride can be read without
+/// looking into `strides`.
+#[derive(Debug, Serialize)]
+struct StridesJson {
+    #[serde(flatten)]
+    first: StrideJson,
+    strides: Vec<StrideJson>,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct StrideJson {
+    stride: u32,
+    r2: f64,
+    /// Deviations over seeds; a single run has none.
+    #[serde(flatten)]
+    spread: Option<SeedSpreadJson>,
+    n: usize,
+    runs: Vec<MotionJson>,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct SeedSpreadJson {
+    sd: f64,
+    by_part: PartsJson,
+}
+
+/// What holds for all scores of a probe.
+#[derive(Debug, Clone)]
+pub struct ProbeContext {
+    /// The name of the features.
+    pub features: String,
+    /// How training and test frames were kept apart.
+    pub split: &'static str,
+    /// The preset of M4.
+    pub preset: &'static str,
+    /// Why a room or a metric has no scores, in words.
+    pub skipped: Vec<String>,
+}
+
+/// The record of a probe.
+pub fn probe_json(scores: &[ProbeScores], context: ProbeContext) -> ProbeJson {
+    let rooms = match scores {
+        [only] => RoomsJson::One(Box::new(room_json(only))),
+        several => RoomsJson::Several {
+            rooms: several.iter().map(room_json).collect(),
+        },
+    };
+
+    ProbeJson {
+        rooms,
+        features: context.features,
+        split: context.split,
+        preset: context.preset,
+        skipped: context.skipped,
+    }
+}
+
+fn room_json(scores: &ProbeScores) -> RoomJson {
+    RoomJson {
+        room: scores.room.clone(),
+        m1: scores.m1.as_ref().map(m1_json),
+        m2: scores.m2.as_ref().map(m2_json),
+        m3: strides_json(&scores.m3),
+        m4: strides_json(&scores.m4),
+    }
+}
+
+fn m1_json(score: &MutualKnnScore) -> M1Json {
+    let MutualKnn {
         frames,
         stride,
         k,
         exclusion,
         counted,
-        bound,
-    } = options;
+        limit,
+    } = score.options;
 
-    json!({
-        "value": value,
-        "frames": frames,
-        "stride": stride,
-        "k": k,
-        "exclusion": exclusion,
-        "exclusion_counts": match counted { Counted::Sampled => "sampled frames", Counted::Native => "room frames" },
-        "exclusion_is": match bound { Bound::Inclusive => "inclusive", Bound::Exclusive => "exclusive" },
-    })
-}
-
-fn m2_json(dimension: &IntrinsicDimension, options: DimensionProtocol) -> Value {
-    let DimensionProtocol { gap, duplicates } = options;
-
-    let mle =
-        |mle: &Mle| json!({ "harmonic": mle.harmonic, "mean": mle.mean, "median": mle.median });
-
-    json!({
-        "twonn": dimension.two_nn.linear,
-        "mle": dimension.mle_biased.harmonic,
-        "twonn_censored": dimension.two_nn.censored,
-        "twonn_likelihood": dimension.two_nn.likelihood,
-        "mle_biased": mle(&dimension.mle_biased),
-        "mle_unbiased": mle(&dimension.mle_unbiased),
-        "gap": gap,
-        "duplicates": match duplicates { Duplicates::DropRows => "dropped", Duplicates::KeepFirst => "first kept" },
-        "used_rows": dimension.used,
-        "dropped_rows": dimension.dropped,
-    })
-}
-
-fn stride_json(at: &AtStride) -> Map<String, Value> {
-    let overall: Vec<f64> = at.runs.iter().map(|run| run.overall).collect();
-    let mut entry = Map::new();
-    entry.insert("stride".to_owned(), json!(at.stride));
-    entry.insert("r2".to_owned(), json!(mean_of_known(&overall)));
-
-    // A single run has no standard deviation.
-    if at.runs.len() > 1 {
-        entry.insert("sd".to_owned(), json!(deviation(&overall)));
-        entry.insert("by_part".to_owned(), parts_json(&at.runs));
+    M1Json {
+        value: score.share,
+        frames,
+        stride,
+        k,
+        exclusion,
+        exclusion_counts: match counted {
+            Counted::Sampled => "sampled frames",
+            Counted::Native => "room frames",
+        },
+        exclusion_is: match limit {
+            Limit::Inclusive => "inclusive",
+            Limit::Exclusive => "exclusive",
+        },
     }
+}
 
-    entry.insert(
-        "n".to_owned(),
-        json!(at.runs.first().map_or(0, |run| run.n)),
-    );
+fn m2_json(score: &DimensionScore) -> M2Json {
+    let dimension = &score.dimension;
+    let DimensionProtocol { gap, duplicates } = score.protocol;
 
-    entry.insert(
-        "runs".to_owned(),
-        json!(at.runs.iter().map(motion_json).collect::<Vec<_>>()),
-    );
+    let mle = |mle: &Mle| MleJson {
+        harmonic: mle.harmonic,
+        mean: mle.mean,
+        median: mle.median,
+    };
 
-    entry
+    M2Json {
+        twonn: dimension.two_nn.linear,
+        mle: dimension.mle_biased.harmonic,
+        twonn_censored: dimension.two_nn.censored,
+        twonn_likelihood: dimension.two_nn.likelihood,
+        mle_biased: mle(&dimension.mle_biased),
+        mle_unbiased: mle(&dimension.mle_unbiased),
+        gap,
+        duplicates: match duplicates {
+            Duplicates::DropRows => "dropped",
+            Duplicates::KeepFirst => "first kept",
+        },
+        used_rows: dimension.used,
+        dropped_rows: dimension.dropped,
+    }
+}
+
+fn strides_json(strides: &[AtStride]) -> Option<StridesJson> {
+    let strides: Vec<StrideJson> = strides.iter().map(stride_json).collect();
+    let first = strides.first()?.clone();
+
+    Some(StridesJson { first, strides })
+}
+
+fn stride_json(at: &AtStride) -> StrideJson {
+    let overall: Vec<f64> = at.runs.iter().map(|run| run.overall).collect();
+    let spread = (at.runs.len() > 1).then(|| SeedSpreadJson {
+        sd: deviation(&overall),
+        by_part: PartsJson::of(&at.runs),
+    });
+
+    StrideJson {
+        stride: at.stride,
+        r2: mean_of_known(&overall),
+        spread,
+        n: at.runs.first().map_or(0, |run| run.n),
+        runs: at.runs.iter().map(MotionJson::from).collect(),
+    }
 }
 
 /// One line per room and metric, for M3 and M4 per stride.
@@ -123,12 +239,12 @@ pub fn probe_table(scores: &[ProbeScores]) -> String {
             );
         };
 
-        if let Some((value, options)) = &score.m1 {
+        if let Some(MutualKnnScore { share, options }) = &score.m1 {
             // M1 has only a value and a number of frames: empty cells keep the latter in the
             // column `n`.
             let absent = || "".to_owned();
             let cells = [
-                format!("{value:.3}"),
+                format!("{share:.3}"),
                 absent(),
                 absent(),
                 absent(),
@@ -142,7 +258,7 @@ pub fn probe_table(scores: &[ProbeScores]) -> String {
             );
         }
 
-        if let Some((dimension, ..)) = &score.m2 {
+        if let Some(DimensionScore { dimension, .. }) = &score.m2 {
             line(
                 "M2 TwoNN".to_owned(),
                 &[format!("{:.3}", dimension.two_nn.linear)],

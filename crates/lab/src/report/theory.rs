@@ -1,6 +1,6 @@
 //! The numeric checks of the paper's theorems, as a table and as JSON.
 
-use serde_json::{Value, json};
+use serde::Serialize;
 
 use super::table::aligned;
 use crate::theory::{Bound, Check};
@@ -48,17 +48,33 @@ fn bound_text(bound: Bound) -> String {
     }
 }
 
-/// The checks as JSON, one entry each.
-pub fn theory_json(checks: &[Check]) -> Value {
-    let entry = |check: &Check| {
-        json!({
-            "theorem": check.theorem,
-            "what": check.what,
-            "measured": check.measured,
-            "bound": bound_text(check.bound),
-            "holds": check.holds(),
-        })
+/// The record of `seese3 theory`, one entry per check.
+#[derive(Debug, Serialize)]
+pub struct TheoryJson {
+    checks: Vec<CheckJson>,
+}
+
+#[derive(Debug, Serialize)]
+struct CheckJson {
+    theorem: String,
+    what: String,
+    measured: f64,
+    /// The bound in words.
+    bound: String,
+    holds: bool,
+}
+
+/// The record of checks.
+pub fn theory_json(checks: &[Check]) -> TheoryJson {
+    let entry = |check: &Check| CheckJson {
+        theorem: check.theorem.to_string(),
+        what: check.what.to_string(),
+        measured: check.measured,
+        bound: bound_text(check.bound),
+        holds: check.holds(),
     };
 
-    json!({ "checks": checks.iter().map(entry).collect::<Vec<_>>() })
+    TheoryJson {
+        checks: checks.iter().map(entry).collect(),
+    }
 }

@@ -1,6 +1,6 @@
 //! Which navigators and presets beat the paper's in rooms that were never seen.
 
-use serde_json::{Value, json};
+use serde::Serialize;
 
 use seese3_core::statistics::{RoomMean, bootstrap_mean, paired_difference};
 
@@ -10,12 +10,12 @@ use super::cross::{AFFINE, HOMOGENEOUS, rate_text};
 use super::notes::published_name;
 use super::plans::{MEMBERS, PlanKind, PlanResult, SetResults};
 use crate::experiments::cross_room::{CLIPPED_R2, CrossRoomRun, MotionSummary};
-use crate::report::{Section, room_difference_text, room_mean_json, room_mean_text};
+use crate::report::{RoomMeanJson, Section, room_difference_text, room_mean_text};
 
 const CALIBRATED: &str = "inverse-poincare-homogeneous+calibrated";
 
 /// The section that compares other navigators and presets with the paper's.
-pub fn better(results: &[SetResults], claims: &mut Vec<Claim>) -> Found {
+pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<BetterRecord>> {
     let mut section = Section::new("Better than the paper's navigator and recipe?");
 
     let head = [
@@ -85,14 +85,30 @@ pub fn better(results: &[SetResults], claims: &mut Vec<Claim>) -> Found {
         ),
     });
 
-    (section, Value::Array(record))
+    Found { section, record }
+}
+
+/// A row of the section in `record.json`.
+#[derive(Debug, Serialize)]
+pub struct BetterRecord {
+    features: String,
+    plan: &'static str,
+    /// The adapter's name in the store.
+    adapter: String,
+    navigator: &'static str,
+    learned_rooms: usize,
+    calibration_rooms: usize,
+    hit: RoomMeanJson,
+    over_affine: RoomMeanJson,
+    over_homogeneous: RoomMeanJson,
+    clipped_r2_over_paper_range: RoomMeanJson,
 }
 
 /// A plan against the baseline: its row of the table, its record, and three differences, paired
 /// room by room.
 struct Compared {
     row: Vec<String>,
-    record: Value,
+    record: BetterRecord,
     /// Of the hit rate over the baseline's affine reading.
     over_affine: RoomMean,
     /// Of the hit rate over the baseline's homogeneous reading.
@@ -131,18 +147,18 @@ fn compared(features: &str, result: &PlanResult, baseline: &CrossRoomRun) -> Com
         room_difference_text(&clipped_r2),
     ];
 
-    let record = json!({
-        "features": features,
-        "plan": plan.kind.name(),
-        "adapter": published_name(&plan.adapter_name(), features),
-        "navigator": navigator,
-        "learned_rooms": run.training_rooms.len(),
-        "calibration_rooms": run.calibration_rooms.len(),
-        "hit": room_mean_json(&hit),
-        "over_affine": room_mean_json(&over_affine),
-        "over_homogeneous": room_mean_json(&over_homogeneous),
-        "clipped_r2_over_paper_range": room_mean_json(&clipped_r2),
-    });
+    let record = BetterRecord {
+        features: features.to_owned(),
+        plan: plan.kind.name(),
+        adapter: published_name(&plan.adapter_name(), features),
+        navigator,
+        learned_rooms: run.training_rooms.len(),
+        calibration_rooms: run.calibration_rooms.len(),
+        hit: (&hit).into(),
+        over_affine: (&over_affine).into(),
+        over_homogeneous: (&over_homogeneous).into(),
+        clipped_r2_over_paper_range: (&clipped_r2).into(),
+    };
 
     Compared {
         row,

@@ -1,6 +1,6 @@
 //! What the given rooms say about the paper's claims, and about ours.
 
-use serde_json::{Value, json};
+use serde::Serialize;
 
 use crate::report::Section;
 
@@ -71,7 +71,20 @@ pub fn section(claims: &[Claim]) -> Section {
     section
 }
 
-pub fn json(claims: &[Claim]) -> Value {
-    let entry = |claim: &Claim| json!({ "claim": claim.claim, "verdict": claim.verdict.word(), "found": claim.found });
-    Value::Array(claims.iter().map(entry).collect())
+/// A claim in `record.json`.
+#[derive(Debug, Serialize)]
+pub struct ClaimRecord {
+    claim: &'static str,
+    verdict: &'static str,
+    found: String,
+}
+
+pub fn records(claims: &[Claim]) -> Vec<ClaimRecord> {
+    let record = |claim: &Claim| ClaimRecord {
+        claim: claim.claim,
+        verdict: claim.verdict.word(),
+        found: claim.found.clone(),
+    };
+
+    claims.iter().map(record).collect()
 }

@@ -1,33 +1,42 @@
 //! Rooms that were never seen: zero-shot navigation against Identity, and scaling with the number
 //! of training rooms.
 
-use serde_json::{Value, json};
+use serde::Serialize;
 
 use seese3_core::statistics::{Rate, bootstrap_mean, mean};
 
 use super::claims::{Claim, Verdict};
-use super::in_room::plotted;
 use super::notes::published_name;
 use super::plans::SetResults;
+use super::render::plotted;
 use super::{Error, Found, Reproduction, paper};
 use crate::experiments::cross_room::{CrossRoomRun, MotionSummary, wins};
-use crate::report::{Curves, Section, Series, cross_room_json, room_mean_text};
+use crate::report::{CrossRoomJson, Curves, Section, Series, cross_room_json, room_mean_text};
 
 /// The paper's navigator.
 pub const AFFINE: &str = "inverse-poincare-affine";
 /// The service's navigator.
 pub const HOMOGENEOUS: &str = "inverse-poincare-homogeneous";
 
+/// The results with one feature set in `record.json`.
+#[derive(Debug, Serialize)]
+pub struct ZeroShotRecord {
+    features: String,
+    /// The adapters' names in the store, from the fewest rooms to all.
+    adapters: Vec<String>,
+    paper_range_by_size: CrossRoomJson,
+}
+
 /// The section on zero-shot navigation against Identity, with the scaling curves.
 #[expect(
     clippy::too_many_lines,
     reason = "a section of the report: its loop, its table and its claim"
 )]
-pub fn zero_shot(
+pub fn section(
     given: &Reproduction<'_>,
     results: &[SetResults],
     claims: &mut Vec<Claim>,
-) -> Result<Found, Error> {
+) -> Result<Found<Vec<ZeroShotRecord>>, Error> {
     let mut section =
         Section::new("Rooms never seen: zero-shot, and by how many rooms were learned from");
 
@@ -96,7 +105,11 @@ pub fn zero_shot(
             .iter()
             .map(|result| result.run.clone())
             .collect();
-        record.push(json!({ "features": features, "adapters": adapters, "paper_range_by_size": cross_room_json(&runs, AFFINE) }));
+        record.push(ZeroShotRecord {
+            features: features.to_owned(),
+            adapters,
+            paper_range_by_size: cross_room_json(&runs, AFFINE),
+        });
     }
 
     rows.extend(paper_rows());
@@ -152,7 +165,7 @@ pub fn zero_shot(
         ),
     });
 
-    Ok((section, Value::Array(record)))
+    Ok(Found { section, record })
 }
 
 /// Adds the scaling curves of hit rates and of the share of rooms with R² above 0.

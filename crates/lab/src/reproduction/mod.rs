@@ -6,24 +6,31 @@
 mod better;
 mod claims;
 mod cross;
-mod in_room;
+mod formulations;
+mod navigation;
 mod notes;
 mod paper;
 mod pictures;
 mod plans;
+mod probes;
+mod render;
+mod strides;
 mod success;
 
 pub use claims::{Claim, Verdict};
 pub use notes::{Notes, ReproducedAdapter, published_name};
 
-use serde_json::{Map, Value, json};
+use serde::Serialize;
 
+use seese3_core::adapter::Preset;
 use seese3_core::image::RgbImage;
 use seese3_core::room::{FrameId, Room};
-use seese3_core::training::RoomData;
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan};
 
 use crate::experiments::Error;
-use crate::report::{Document, Section, theory_json, theory_table_rows};
+use crate::experiments::adapter_sweep::SweepRow;
+use crate::report::{Document, Section, TheoryJson, theory_json, theory_table_rows};
 use crate::theory::{Effort, checks};
 
 /// What decides the numbers of a reproduction besides its rooms and features.
@@ -84,17 +91,51 @@ pub trait Images: Sync {
 pub struct Reproduced {
     /// The report.
     pub document: Document,
-    /// Everything in the report, as JSON.
-    pub record: Map<String, Value>,
+    /// Everything in the report, for programs.
+    pub record: ReproductionRecord,
     /// The adapters of the navigation tables.
     pub adapters: Vec<ReproducedAdapter>,
+}
+
+/// The results of every experiment; the fields are the keys of `record.json`.
+#[derive(Debug, Serialize)]
+pub struct ReproductionRecord {
+    probes: Vec<probes::ProbeRecord>,
+    strides: Vec<strides::StrideRecord>,
+    rooms_alone: Vec<SweepRow>,
+    formulations: Vec<formulations::FormulationRecord>,
+    navigation: Vec<navigation::NavigationRecord>,
+    cross_room: Vec<cross::ZeroShotRecord>,
+    better: Vec<better::BetterRecord>,
+    pictures: Vec<pictures::WalkRecord>,
+    theory: TheoryJson,
+    claims: Vec<claims::ClaimRecord>,
+    protocol: ProtocolRecord,
+}
+
+/// The options, and the rooms with their revisions.
+#[derive(Debug, Serialize)]
+struct ProtocolRecord {
+    features: Vec<String>,
+    stride: u32,
+    strides: Vec<u32>,
+    sizes: Vec<usize>,
+    aside: usize,
+    seeds: u64,
+    epochs_instead_of_the_presets: Option<usize>,
+    train: Vec<(String, u64)>,
+    test: Vec<(String, u64)>,
+    in_room: Vec<(String, u64)>,
 }
 
 /// How many experiments [`reproduce`] runs.
 pub const EXPERIMENTS: u64 = 9;
 
-/// A section of the report and its machine-readable record.
-type Found = (Section, Value);
+/// What an experiment found: a section of the report, and the same for programs.
+struct Found<R> {
+    section: Section,
+    record: R,
+}
 
 /// Refuses options and rooms that could only fail after hours.
 ///
@@ -156,42 +197,59 @@ pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced
     check(given)?;
 
     let mut notes = Notes::default();
-    let mut record = Map::new();
-    let mut experiments = Vec::new();
-    let mut keep = |name: &str, (section, value): Found| {
-        record.insert(name.to_owned(), value);
-        experiments.push(section);
-        done();
-    };
 
-    keep("probes", in_room::probes(given, &mut notes.claims)?);
-    keep("strides", in_room::strides(given, &mut notes.claims)?);
-    keep("rooms_alone", success::section(given)?);
-    keep(
-        "formulations",
-        in_room::formulations(given, &mut notes.claims)?,
-    );
-    keep("navigation", in_room::navigation(given, &mut notes)?);
+    let probes = probes::section(given, &mut notes.claims)?;
+    done();
+    let strides = strides::section(given, &mut notes.claims)?;
+    done();
+    let rooms_alone = success::section(given)?;
+    done();
+    let formulations = formulations::section(given, &mut notes.claims)?;
+    done();
+    let navigation = navigation::section(given, &mut notes)?;
+    done();
 
     // Adapters trained on many rooms, evaluated in rooms that they never saw.
     let across = plans::evaluate(given, &mut notes)?;
-    keep(
-        "cross_room",
-        cross::zero_shot(given, &across, &mut notes.claims)?,
-    );
-    keep("better", better::better(&across, &mut notes.claims));
+    let cross_room = cross::section(given, &across, &mut notes.claims)?;
+    done();
+    let better = better::section(&across, &mut notes.claims);
+    done();
 
     // The walks use the steady adapter that was trained for the sections before.
-    keep("pictures", pictures::section(given, &notes)?);
-    keep("theory", theory()?);
-
-    record.insert("claims".to_owned(), claims::json(&notes.claims));
-    record.insert("protocol".to_owned(), protocol(given));
+    let pictures = pictures::section(given, &notes)?;
+    done();
+    let theory = theory()?;
+    done();
 
     // The verdicts are known only now, but stand near the top of the report, behind the rooms.
     let mut sections = vec![rooms_and_features(given), claims::section(&notes.claims)];
-    sections.append(&mut experiments);
-    sections.push(published(&notes));
+    sections.extend([
+        probes.section,
+        strides.section,
+        rooms_alone.section,
+        formulations.section,
+        navigation.section,
+        cross_room.section,
+        better.section,
+        pictures.section,
+        theory.section,
+        published(&notes),
+    ]);
+
+    let record = ReproductionRecord {
+        probes: probes.record,
+        strides: strides.record,
+        rooms_alone: rooms_alone.record,
+        formulations: formulations.record,
+        navigation: navigation.record,
+        cross_room: cross_room.record,
+        better: better.record,
+        pictures: pictures.record,
+        theory: theory.record,
+        claims: claims::records(&notes.claims),
+        protocol: protocol(given),
+    };
 
     Ok(Reproduced {
         document: Document {
@@ -203,38 +261,49 @@ pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced
     })
 }
 
-fn protocol(given: &Reproduction<'_>) -> Value {
-    let Options {
-        stride,
-        strides,
-        sizes,
-        calibration_rooms,
-        seeds,
-        epochs,
-    } = &given.options;
+impl Reproduction<'_> {
+    /// A preset at a stride. Its epochs are the command's `--epochs`, else `epochs`, else the
+    /// preset's own.
+    fn plan(
+        &self,
+        preset: Preset,
+        split: Split,
+        stride: u32,
+        seed: u64,
+        epochs: Option<usize>,
+    ) -> TrainingPlan {
+        let mut plan = TrainingPlan::of(preset, split, stride, seed);
+        if let Some(epochs) = self.options.epochs.or(epochs) {
+            plan.config.epochs = epochs;
+        }
 
+        plan
+    }
+}
+
+fn protocol(given: &Reproduction<'_>) -> ProtocolRecord {
+    let options = &given.options;
     let names = |rooms: &[RoomData<'_>]| {
         rooms
             .iter()
-            .map(|data| json!([data.room.id().as_str(), data.revision]))
-            .collect::<Vec<_>>()
+            .map(|data| (data.room.id().to_string(), data.revision))
+            .collect()
     };
-    let features: Vec<&str> = given.sets.iter().map(|set| set.features.as_str()).collect();
 
     // The sets differ in their features alone, so the first one names all rooms.
     let set = &given.sets[0];
-    json!({
-        "features": features,
-        "stride": stride,
-        "strides": strides,
-        "sizes": sizes,
-        "aside": calibration_rooms,
-        "seeds": seeds,
-        "epochs_instead_of_the_presets": epochs,
-        "train": names(&set.train),
-        "test": names(&set.test),
-        "in_room": names(&set.in_room),
-    })
+    ProtocolRecord {
+        features: given.sets.iter().map(|set| set.features.clone()).collect(),
+        stride: options.stride,
+        strides: options.strides.clone(),
+        sizes: options.sizes.clone(),
+        aside: options.calibration_rooms,
+        seeds: options.seeds,
+        epochs_instead_of_the_presets: options.epochs,
+        train: names(&set.train),
+        test: names(&set.test),
+        in_room: names(&set.in_room),
+    }
 }
 
 /// The section that lists the rooms and the feature sets.
@@ -320,9 +389,12 @@ fn published(notes: &Notes) -> Section {
     section
 }
 
-fn theory() -> Result<Found, Error> {
+fn theory() -> Result<Found<TheoryJson>, Error> {
     let found = checks(Effort::default(), &mut |_| ())?;
     let mut section = Section::new("Theorems, measured against their bounds");
     section.table(theory_table_rows(&found));
-    Ok((section, theory_json(&found)))
+    Ok(Found {
+        section,
+        record: theory_json(&found),
+    })
 }

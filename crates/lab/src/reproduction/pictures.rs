@@ -2,13 +2,14 @@
 
 use std::sync::Arc;
 
-use nalgebra::{DMatrix, SymmetricEigen};
+use nalgebra::SymmetricEigen;
 use ndarray::{Array2, ArrayView2, Axis, s};
-use serde_json::{Value, json};
+use serde::Serialize;
 
 use seese3_core::adapter::{Adapter, Reading};
 use seese3_core::cancel::Cancellation;
 use seese3_core::image::RgbImage;
+use seese3_core::matrices::to_nalgebra;
 use seese3_core::navigation::{
     Displacement, FitOn, IndexKind, Limits, Mode, Navigator, Query, RetrievalMetric, Source,
     SourceAt, StepKind,
@@ -17,9 +18,9 @@ use seese3_core::room::FrameId;
 use seese3_core::splits::Split;
 use seese3_core::training::RoomData;
 
-use super::in_room::plotted;
 use super::notes::Notes;
 use super::plans::steady_adapter;
+use super::render::plotted;
 use super::{Error, FeatureSet, Found, Images, Reproduction};
 use crate::report::{Curves, Section, Series};
 
@@ -32,9 +33,18 @@ const FAR: u32 = 50;
 /// Width of an image in a strip, pixels.
 const WIDTH: usize = 200;
 
+/// A walk in `record.json`.
+#[derive(Debug, Serialize)]
+pub struct WalkRecord {
+    room: String,
+    frames: Vec<u32>,
+    metres_off: f64,
+    degrees_off: f64,
+}
+
 /// The section of walks in held-out rooms that have images, and of the paths of features and
 /// latents.
-pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found, Error> {
+pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Vec<WalkRecord>>, Error> {
     let mut section = Section::new("Walks in rooms never seen, and a recording unrolled");
     let set = &given.sets[0];
     let adapter = notes
@@ -52,20 +62,23 @@ pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found, Error> 
     for (position, room) in set.test.iter().filter(drawn).take(SHOWN).enumerate() {
         let room_of = Arc::new(room.room.clone());
         let navigator = Navigator::new(room_of, room.features, adapter.clone(), IndexKind::Exact)?;
-        let (walk, value) = walked(&navigator)?;
-        let strip = strip(given.images, room, &walk)?;
+        let walk = walked(&navigator)?;
+        let strip = strip(given.images, room, &walk.frames)?;
 
         let caption = format!(
             "Room {}: source, {STEPS} steps in an open loop, target; the last step is {:.2} m and {:.0}° from it",
             room.room.id(),
-            value.0,
-            value.1
+            walk.metres_off,
+            walk.degrees_off
         );
         section.picture(format!("walk-{position}.png"), strip, caption);
 
-        record.push(
-            json!({ "room": room.room.id().as_str(), "frames": walk, "metres_off": value.0, "degrees_off": value.1 }),
-        );
+        record.push(WalkRecord {
+            room: room.room.id().to_string(),
+            frames: walk.frames,
+            metres_off: walk.metres_off,
+            degrees_off: walk.degrees_off,
+        });
     }
 
     if record.is_empty() {
@@ -87,12 +100,20 @@ pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found, Error> 
     );
 
     section.text("Adapter of preset steady, learned from all rooms that are learned together; neither room nor frames were seen.");
-    Ok((section, Value::Array(record)))
+    Ok(Found { section, record })
 }
 
-/// The frames of a walk, the source first and the target last, and how far the walk ends from the
-/// target, metres and degrees.
-fn walked(navigator: &Navigator) -> Result<(Vec<u32>, (f64, f64)), Error> {
+/// A walk from a source to a target.
+struct Walk {
+    /// The source first, the target last.
+    frames: Vec<u32>,
+    /// The distance of the walk's end from the target, metres.
+    metres_off: f64,
+    /// The angle between the walk's end and the target, degrees.
+    degrees_off: f64,
+}
+
+fn walked(navigator: &Navigator) -> Result<Walk, Error> {
     let count = navigator.room().frame_count() as u32;
     let source = count / 4;
     let target = (source + FAR).min(count - 1);
@@ -132,13 +153,11 @@ fn walked(navigator: &Navigator) -> Result<(Vec<u32>, (f64, f64)), Error> {
         .and_then(|step| step.error)
         .ok_or_else(|| Error::Input("a walk between frames has an error".to_owned()))?;
 
-    Ok((
+    Ok(Walk {
         frames,
-        (
-            error.pose.translation_m,
-            error.pose.rotation_rad.to_degrees(),
-        ),
-    ))
+        metres_off: error.pose.translation_m,
+        degrees_off: error.pose.rotation_rad.to_degrees(),
+    })
 }
 
 /// Images side by side, as a PNG file.
@@ -265,9 +284,7 @@ fn main_directions(rows: ArrayView2<'_, f64>) -> Array2<f64> {
     } else {
         centred.t().dot(&centred)
     };
-    let eigen = SymmetricEigen::new(DMatrix::from_fn(gram.nrows(), gram.nrows(), |i, j| {
-        gram[(i, j)]
-    }));
+    let eigen = SymmetricEigen::new(to_nalgebra(gram.view()));
 
     // Eigenvalues come in no order: the largest belong to the directions of largest variance.
     let mut order: Vec<usize> = (0..gram.nrows()).collect();

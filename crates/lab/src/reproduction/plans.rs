@@ -86,14 +86,14 @@ impl PlanKind {
 
 /// One adapter to train and to evaluate in the held-out rooms.
 #[derive(Debug, Clone, Copy)]
-pub struct Plan {
+pub struct AdapterPlan {
     /// What distinguishes it.
     pub kind: PlanKind,
     /// Rooms in all, calibration rooms included.
     pub rooms: usize,
 }
 
-impl Plan {
+impl AdapterPlan {
     /// The adapter's name, as [`super::published_name`] takes it.
     pub fn adapter_name(&self) -> String {
         format!("{}-of-{}", self.kind.short_name(), self.rooms)
@@ -103,7 +103,7 @@ impl Plan {
 /// A plan, and how its adapter did in the held-out rooms.
 pub struct PlanResult {
     /// The plan.
-    pub plan: Plan,
+    pub plan: AdapterPlan,
     /// How its adapter did.
     pub run: CrossRoomRun,
 }
@@ -128,7 +128,7 @@ impl SetResults {
 /// The name of the adapter that preset steady gives on all rooms, with no calibration rooms among
 /// them.
 pub fn steady_adapter(set: &FeatureSet<'_>) -> String {
-    let plan = Plan {
+    let plan = AdapterPlan {
         kind: PlanKind::Steady,
         rooms: set.train.len(),
     };
@@ -176,28 +176,30 @@ pub fn evaluate(given: &Reproduction<'_>, notes: &mut Notes) -> Result<Vec<SetRe
 }
 
 /// Every plan, the longest training first, so that it does not run alone at the end.
-fn plans(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<Plan> {
+fn plans(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<AdapterPlan> {
     let all = set.train.len();
     let on_all_rooms = [
         PlanKind::PaperRange,
         PlanKind::PaperRangeCalibrated,
         PlanKind::EnsembleCalibrated,
     ];
-    let mut plans: Vec<Plan> = on_all_rooms.map(|kind| Plan { kind, rooms: all }).to_vec();
+    let mut plans: Vec<AdapterPlan> = on_all_rooms
+        .map(|kind| AdapterPlan { kind, rooms: all })
+        .to_vec();
 
     // The scaling curve of the paper's preset; its last point, all rooms, stands above.
     let mut sizes = given.options.sizes.clone();
     sizes.retain(|&size| size != all);
     sizes.sort_unstable();
     sizes.dedup();
-    plans.extend(sizes.into_iter().rev().map(|rooms| Plan {
+    plans.extend(sizes.into_iter().rev().map(|rooms| AdapterPlan {
         kind: PlanKind::PaperRange,
         rooms,
     }));
 
     // Preset steady takes a fraction of the steps.
     let steady = [PlanKind::Steady, PlanKind::SteadyCalibrated];
-    plans.extend(steady.map(|kind| Plan { kind, rooms: all }));
+    plans.extend(steady.map(|kind| AdapterPlan { kind, rooms: all }));
 
     plans
 }
@@ -205,7 +207,7 @@ fn plans(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<Plan> {
 fn result_of(
     given: &Reproduction<'_>,
     set: &FeatureSet<'_>,
-    plan: Plan,
+    plan: AdapterPlan,
 ) -> Result<(PlanResult, ReproducedAdapter), Error> {
     let rooms: Vec<RoomData<'_>> = nested_choice(plan.rooms, set.train.len(), 0)
         .into_iter()

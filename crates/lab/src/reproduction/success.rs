@@ -2,7 +2,6 @@
 //! hard the rooms are.
 
 use rayon::prelude::*;
-use serde_json::json;
 
 use seese3_core::adapter::Preset;
 use seese3_core::splits::Split;
@@ -17,7 +16,7 @@ const CHARTS: [usize; 3] = [1, 2, 4];
 
 /// The section of the paper's Table 2, with the tables of difficulty, of mixtures, and of the parts
 /// of the motion.
-pub fn section(given: &Reproduction<'_>) -> Result<Found, Error> {
+pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<SweepRow>>, Error> {
     let mut section = Section::new("Each room by itself: success, difficulty, mixtures of charts");
 
     let rows: Vec<SweepRow> = given
@@ -79,7 +78,10 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found, Error> {
         section.text(format!("Room {room} has no scores: {why}."));
     }
 
-    Ok((section, json!(rows)))
+    Ok(Found {
+        section,
+        record: rows,
+    })
 }
 
 /// The longest stride of the command; the paper's sweep has stride 40.

@@ -53,7 +53,7 @@ pub(super) trait Runner: Send + Sync {
 }
 
 /// What computes the outputs of layers from prepared images.
-pub(super) enum Network {
+pub(super) enum Backbone {
     /// [`super::encode_builtin`].
     Builtin,
     /// The prepared image itself.
@@ -67,7 +67,7 @@ pub(super) enum Network {
     },
 }
 
-impl Network {
+impl Backbone {
     pub fn runtime(&self) -> &'static str {
         match self {
             Self::Builtin | Self::Pixels => "none",
@@ -77,7 +77,7 @@ impl Network {
 }
 
 /// A model, its identity, and the size (width, height) of its images if that is fixed.
-pub(super) type Opened = (Network, String, Option<(usize, usize)>);
+pub(super) type Opened = (Backbone, String, Option<(usize, usize)>);
 
 /// Opens a model after checking that its file has the layers, the clip length and the image size.
 pub(super) fn open(
@@ -153,7 +153,7 @@ pub(super) fn open(
     let runner = runner(file, model, &names, &shape, runtime)?;
 
     Ok((
-        Network::Model {
+        Backbone::Model {
             runner,
             kind,
             clip_axis,

@@ -1,0 +1,204 @@
+//! Adapters of several seeds and their test scores, for `seese3 train`.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use super::json::{MotionJson, RateJson};
+use super::table::aligned;
+use crate::experiments::seeds::TrainingRun;
+use seese3_core::adapter::{PairPlan, TrainingRecord};
+use seese3_core::statistics::{deviation, mean};
+
+/// R² by part of the motion, one line per seed; with several seeds also their mean and sample
+/// standard deviation.
+pub fn training_table(runs: &[TrainingRun]) -> String {
+    let head = [
+        "seed",
+        "overall",
+        "transl.",
+        "rotation",
+        "direct.",
+        "magnit.",
+        "train R²",
+        "mean R²",
+        "Hit@0.1",
+        "s",
+    ];
+
+    let mut lines = vec![head.map(str::to_owned).to_vec()];
+
+    // In the order of the head, from `overall` on.
+    let numbers = |run: &TrainingRun| {
+        let test = &run.record.test;
+        let hit = run.hit_rate.rate;
+
+        [
+            test.overall,
+            test.translation,
+            test.rotation,
+            test.direction,
+            test.magnitude,
+            run.record.train.overall,
+            run.record.train_mean_r2,
+            hit,
+            run.seconds,
+        ]
+    };
+
+    for run in runs {
+        let mut cells = vec![run.record.config.seed.to_string()];
+        cells.extend(numbers(run).iter().map(|value| format!("{value:.3}")));
+        lines.push(cells);
+    }
+
+    // A single seed has no standard deviation.
+    if runs.len() > 1 {
+        for (label, of) in [("mean", mean as fn(&[f64]) -> f64), ("± sd", deviation)] {
+            let mut cells = vec![label.to_owned()];
+            cells.extend((0..9).map(|column| {
+                let values: Vec<f64> = runs.iter().map(|run| numbers(run)[column]).collect();
+                format!("{:.3}", of(&values))
+            }));
+
+            lines.push(cells);
+        }
+    }
+
+    aligned(&lines)
+}
+
+/// The record of `seese3 train`: one entry per seed, and the protocol that they share.
+#[derive(Debug, Serialize)]
+pub struct TrainingJson {
+    runs: Vec<RunJson>,
+    adapter: PublishedJson,
+    protocol: Option<ProtocolJson>,
+}
+
+#[derive(Debug, Serialize)]
+struct RunJson {
+    seed: u64,
+    test: MotionJson,
+    train: MotionJson,
+    train_mean_r2: f64,
+    rooms: Vec<MotionJson>,
+    inverse_poincare_affine: HitsJson,
+    seconds: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct HitsJson {
+    /// By ε, as text.
+    hit: BTreeMap<&'static str, RateJson>,
+}
+
+#[derive(Debug, Serialize)]
+struct PublishedJson {
+    name: String,
+    revision: u64,
+}
+
+#[derive(Debug, Serialize)]
+struct ProtocolJson {
+    preset: String,
+    split: &'static str,
+    stride: u32,
+    rooms: Vec<TrainedRoomJson>,
+    training_pairs: usize,
+    /// The shortest and the longest stride of the training pairs, if they were drawn from a range.
+    drawn_from_strides: Option<[u32; 2]>,
+    epochs: usize,
+    batch: usize,
+    learning_rate: f64,
+    weight_decay: f64,
+    clip_norm: f64,
+    hidden: usize,
+    latent: usize,
+    charts: usize,
+    mixing: &'static str,
+    loss: &'static str,
+    standardised_features: bool,
+    noise: f64,
+    weight_average: f64,
+    through_zero: bool,
+    calibrated_on: Vec<String>,
+    twist: &'static str,
+    /// The σ that standardises the training twists is the population's. Deviations over
+    /// seeds, elsewhere in these files, are sample deviations.
+    deviation_ddof: u32,
+}
+
+#[derive(Debug, Serialize)]
+struct TrainedRoomJson {
+    room: String,
+    revision: u64,
+}
+
+/// The record of a training: the runs of all seeds, and the adapter that was published.
+pub fn training_json(runs: &[TrainingRun], adapter: &str, revision: u64) -> TrainingJson {
+    TrainingJson {
+        runs: runs.iter().map(run_json).collect(),
+        adapter: PublishedJson {
+            name: adapter.to_owned(),
+            revision,
+        },
+        // The runs differ in their seed alone, so that the protocol of the first one holds for all.
+        protocol: runs.first().map(|run| protocol_json(&run.record)),
+    }
+}
+
+fn run_json(run: &TrainingRun) -> RunJson {
+    RunJson {
+        seed: run.record.config.seed,
+        test: (&run.record.test).into(),
+        train: (&run.record.train).into(),
+        train_mean_r2: run.record.train_mean_r2,
+        rooms: run.record.room_tests.iter().map(MotionJson::from).collect(),
+        inverse_poincare_affine: HitsJson {
+            hit: BTreeMap::from([("0.1", (&run.hit_rate).into())]),
+        },
+        seconds: run.seconds,
+    }
+}
+
+fn protocol_json(record: &TrainingRecord) -> ProtocolJson {
+    let config = &record.config;
+    let rooms = record.rooms.iter().map(|(room, revision)| TrainedRoomJson {
+        room: room.to_string(),
+        revision: *revision,
+    });
+    let calibrated_on = record
+        .calibrated_on
+        .iter()
+        .map(|(room, _)| room.to_string());
+
+    ProtocolJson {
+        preset: record.preset.clone(),
+        split: record.split.name(),
+        stride: record.stride,
+        rooms: rooms.collect(),
+        training_pairs: record.pair_count,
+        drawn_from_strides: match &record.pairs {
+            PairPlan::Stride(_) => None,
+            PairPlan::Range(range) => Some([range.low, range.high]),
+        },
+        epochs: config.epochs,
+        batch: config.batch,
+        learning_rate: config.learning_rate,
+        weight_decay: config.weight_decay,
+        clip_norm: config.clip_norm,
+        hidden: config.hidden,
+        latent: config.latent,
+        charts: config.charts,
+        mixing: config.mixing.name(),
+        loss: config.loss.name(),
+        standardised_features: config.standardise,
+        noise: config.noise,
+        weight_average: config.average,
+        through_zero: config.through_zero,
+        calibrated_on: calibrated_on.collect(),
+        twist: "body frame, (v, omega), metres and radians",
+        deviation_ddof: 0,
+    }
+}

@@ -1,0 +1,200 @@
+//! Probes M1 to M3 of the rooms that are learned alone.
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use seese3_core::splits::Split;
+use seese3_core::training::RoomData;
+
+use super::claims::{Claim, Verdict};
+use super::render::plotted;
+use super::{Error, Found, Reproduction, paper};
+use crate::experiments::Within;
+use crate::probes::{Duplicates, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
+use crate::report::{Curves, Section, Series};
+
+/// How many frames M1 compares: a recording of 400 frames then still allows a stride of 4.
+const M1_FRAMES: usize = 100;
+
+/// The probes of a room in `record.json`.
+#[derive(Debug, Serialize)]
+pub struct ProbeRecord {
+    features: String,
+    room: String,
+    m1_short: f64,
+    m1_long: f64,
+    twonn: f64,
+    mle: f64,
+    m3: f64,
+}
+
+struct Probed {
+    room: String,
+    short: f64,
+    long: f64,
+    twonn: f64,
+    mle: f64,
+    ridge: f64,
+}
+
+/// The section of M1 at a short and a long stride, M2 and M3.
+#[expect(
+    clippy::too_many_lines,
+    reason = "a section of the report: its loop, its table and its claim"
+)]
+pub fn section(
+    given: &Reproduction<'_>,
+    claims: &mut Vec<Claim>,
+) -> Result<Found<Vec<ProbeRecord>>, Error> {
+    let mut section = Section::new("Probes: M1, M2, M3");
+    let head = [
+        "features", "room", "M1 short", "M1 long", "TwoNN", "MLE", "M3 R²",
+    ];
+    let mut rows = vec![head.map(str::to_owned).to_vec()];
+
+    let mut series = Vec::new();
+    let mut record = Vec::new();
+    for set in &given.sets {
+        let probed: Vec<Probed> = set
+            .in_room
+            .par_iter()
+            .map(|room| probed(room, given))
+            .collect::<Result<_, Error>>()?;
+
+        // Probes train no adapter, so a room has one number and no spread over seeds.
+        for Probed {
+            room,
+            short,
+            long,
+            twonn,
+            mle,
+            ridge,
+        } in &probed
+        {
+            let numbers = [short, long, twonn, mle, ridge].map(|x| format!("{x:.3}"));
+            rows.push(
+                [set.features.clone(), room.clone()]
+                    .into_iter()
+                    .chain(numbers)
+                    .collect(),
+            );
+
+            record.push(ProbeRecord {
+                features: set.features.clone(),
+                room: room.clone(),
+                m1_short: *short,
+                m1_long: *long,
+                twonn: *twonn,
+                mle: *mle,
+                m3: *ridge,
+            });
+        }
+
+        // One point per room: M1 at the short stride against M1 at the long one.
+        let points = probed.iter().map(|p| [p.short, p.long]).collect();
+        series.push(Series {
+            name: set.features.clone(),
+            points,
+            joined: false,
+        });
+    }
+
+    // The paper's rows have M2 and M3 alone: the cells of the room and of M1 stay empty.
+    for (encoder, numbers) in paper::DIMENSIONS {
+        let empty = [String::new(), String::new()];
+        let numbers = numbers.map(|x| format!("{x:.2}"));
+        let name = [format!("paper: {encoder}"), String::new()];
+        rows.push(name.into_iter().chain(empty).chain(numbers).collect());
+    }
+
+    section.table(rows);
+
+    section.text(format!(
+        "M1: {M1_FRAMES} frames, k 10, 10 of them to each side left out; short is stride 1, long spreads them over the \
+         whole recording. M2: no gap, as in the paper. M3: stride {}, time split.",
+        given.options.stride
+    ));
+
+    let curves = Curves {
+        title: "Mutual k-NN, short against long stride".to_owned(),
+        x: "short stride".to_owned(),
+        y: "long stride".to_owned(),
+        series,
+        diagonal: true,
+    };
+
+    section.picture(
+        "m1.svg",
+        plotted(&curves)?,
+        "M1 at a short and a long stride, a point a room; the line is y = x",
+    );
+
+    // By convention the last feature set given is the control, which needs no trained encoder.
+    let long = |of: &Series| of.points.iter().map(|point| point[1]).collect::<Vec<f64>>();
+    let (control, trained) = curves
+        .series
+        .split_last()
+        .ok_or_else(|| Error::Input("at least one feature set is needed".to_owned()))?;
+
+    // Room by room: does the trained encoder's M1 at the long stride exceed the control's?
+    let above: Vec<bool> = trained
+        .iter()
+        .flat_map(|series| {
+            long(series)
+                .into_iter()
+                .zip(long(control))
+                .map(|(ours, theirs)| ours > theirs)
+        })
+        .collect();
+
+    claims.push(Claim {
+        claim: "topology: a trained encoder's neighbours at a long stride are neighbours by pose, more than raw pixels' (M1)",
+        verdict: Verdict::of(&above),
+        found: format!(
+            "M1 at the long stride is above that of {} in {} of {} rooms and features",
+            control.name,
+            above.iter().filter(|&&held| held).count(),
+            above.len()
+        ),
+    });
+
+    Ok(Found { section, record })
+}
+
+fn probed(data: &RoomData<'_>, given: &Reproduction<'_>) -> Result<Probed, Error> {
+    let room = data.room;
+    let rows = data.features.rows();
+
+    let what = || {
+        format!(
+            "room '{}', features '{}'",
+            room.id(),
+            data.features.source().name
+        )
+    };
+
+    // The long stride spreads the compared frames over the whole recording.
+    let long = (room.frame_count().saturating_sub(1) / (M1_FRAMES - 1)).max(1);
+
+    let at = |stride: usize| {
+        let options = MutualKnn {
+            frames: M1_FRAMES,
+            stride,
+            ..MutualKnn::default()
+        };
+        mutual_knn(rows, room.poses(), &options).within(what)
+    };
+
+    // M2 without a temporal gap, as in the paper; `sweep layers` leaves a gap by default.
+    let dimension = intrinsic_dimension(rows, 0, Duplicates::DropRows).within(what)?;
+    let ridge = ridge_probe(rows, room, Split::Time, given.options.stride).within(what)?;
+
+    Ok(Probed {
+        room: room.id().to_string(),
+        short: at(1)?,
+        long: at(long)?,
+        twonn: dimension.two_nn.linear,
+        mle: dimension.mle_biased.harmonic,
+        ridge: ridge.overall,
+    })
+}
