@@ -3,7 +3,8 @@
 //! This package is the program `seese3` and the parts it is made of. A robot's program links
 //! [`seese3_client`] alone; whoever wants the computations without a server links [`seese3_core`].
 //!
-//! The modules stand bottom to top, and each uses only those above its line; a test enforces it.
+//! The modules are listed from the lowest layer up: each uses only those listed before it, and a test
+//! enforces it.
 //!
 //! | module | what |
 //! | --- | --- |

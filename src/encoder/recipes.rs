@@ -22,9 +22,10 @@ pub struct EncoderRecipe {
     pub window: usize,
     /// The layers that can be used, by the names that the export gives them.
     pub layers: String,
-    /// Where the numbering of layers starts.
+    /// Where the numbering of layers starts, `0` or `1`, or `name` where layers have names.
     pub base: String,
-    /// Whether the encoder's final normalisation layer is included in the outputs.
+    /// Whether the encoder's final normalisation layer is included in the outputs: `final` or `none`
+    ///
     pub norm: String,
     /// The number of tokens before the patches.
     pub prefix_tokens: usize,

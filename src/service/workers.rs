@@ -1,4 +1,4 @@
-//! Worker threads: answers are computed on blocking threads, a bounded number at a time, each
+//! Where answers are computed: on blocking threads, a bounded number at a time, each
 //! within its caller's deadline.
 
 use std::sync::Arc;
@@ -49,7 +49,7 @@ impl Workers {
 
     /// How long a request may take: the caller's deadline, but at most the server's limit.
     pub fn budget(&self, metadata: &MetadataMap) -> Duration {
-        requested(metadata).map_or(self.longest, |deadline| deadline.min(self.longest))
+        caller_deadline(metadata).map_or(self.longest, |deadline| deadline.min(self.longest))
     }
 
     /// Runs `work` on a blocking thread. When the budget is spent or the caller goes away, the work
@@ -152,10 +152,10 @@ impl Workers {
     }
 }
 
-/// The caller's deadline from the header `grpc-timeout`, shortened by a tenth but at most 10 ms, so
-/// that DEADLINE_EXCEEDED arrives before the caller's transport gives up. None if the header is
+/// The caller's deadline from the header `grpc-timeout`, less a tenth of it or 10 ms, whichever is
+/// less, so that DEADLINE_EXCEEDED arrives before the caller's transport gives up. None if the header is
 /// absent or malformed.
-fn requested(metadata: &MetadataMap) -> Option<Duration> {
+fn caller_deadline(metadata: &MetadataMap) -> Option<Duration> {
     // The format is up to eight digits and one letter for the unit, for instance `250m` for 250
     // ms.
     let text = metadata.get("grpc-timeout")?.to_str().ok()?;
@@ -263,7 +263,7 @@ mod tests {
         let read = |text: &str| {
             let mut metadata = MetadataMap::new();
             metadata.insert("grpc-timeout", text.parse().unwrap());
-            requested(&metadata)
+            caller_deadline(&metadata)
         };
 
         assert_eq!(read("2S"), Some(Duration::from_millis(1_990)));

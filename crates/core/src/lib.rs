@@ -58,7 +58,8 @@
 //!
 //! # The map
 //!
-//! The modules stand bottom to top, and each uses only those above its line; a test enforces it.
+//! The modules are listed from the lowest layer up: each uses only those listed before it, and a test
+//! enforces it.
 //!
 //! | module | what |
 //! | --- | --- |

@@ -1,7 +1,8 @@
 //! The laboratory of [seese3](https://docs.rs/seese3): what researchers run, and the service never
 //! needs.
 //!
-//! The modules stand bottom to top, and each uses only those above its line; a test enforces it.
+//! The modules are listed from the lowest layer up: each uses only those listed before it, and a test
+//! enforces it.
 //!
 //! | module | what |
 //! | --- | --- |

@@ -185,8 +185,13 @@ pub fn query(
     let thresholds = thresholds(given_thresholds)?;
     let (step, metric) = step_of(&navigator, reading)?;
 
-    // Encoding an image is costly, so that the fields above are checked before it; what follows
-    // needs the source.
+    let mode = mode_of(mode)?;
+    let exclude_source = exclusion(exclude_source, exclude_radius)?;
+    let source_pose = source_pose
+        .map(|given| pose(given, &room).map_err(|error| error.within("source_pose")))
+        .transpose()?;
+
+    // Encoding an image is costly, so that every other field is checked before it.
     let source = source("source", view, adapter, snapshot)?;
     if source_pose.is_some() && matches!(source, Source::Frame(_)) {
         return Err(Error::invalid(
@@ -195,23 +200,19 @@ pub fn query(
         ));
     }
 
-    let known = source_pose
-        .map(|given| pose(given, &room).map_err(|error| error.within("source_pose")))
-        .transpose()?;
-
     let query = Query {
         source: SourceAt {
             source,
-            pose: known,
+            pose: source_pose,
         },
         displacement,
         steps: steps.unwrap_or(1),
-        mode: mode_of(mode)?,
+        mode,
         step,
         metric,
         fit_on: fit_on(adapter),
         hit_count: hit_count.unwrap_or(1),
-        exclude_source: exclusion(exclude_source, exclude_radius)?,
+        exclude_source,
     };
 
     Ok((query, thresholds))

@@ -1,4 +1,5 @@
-//! Conversion between wire types and domain types. This is the only place that knows both.
+//! Conversion between wire types and domain types. Messages that only one service builds are built
+//! beside it.
 
 mod incoming;
 mod outgoing;

@@ -145,7 +145,7 @@ pub struct ErrorStatistics {
     /// shows this room: hardly any frame of another room comes so near.
     pub certain_match_ratio: f64,
     /// A view further than this, in `frame_noise`, from each of the last [`JUMP_WINDOW`] frames has
-    /// jumped; where frames are missing, than this times the cube root of the frames in between.
+    /// jumped; where frames are missing, than this times the cube root of the frames from the last one to it.
     pub jump_distance: f64,
     /// The reported covariance of a corrected map pose is that of its anchor times this factor.
     pub map_pose_factor: f64,

@@ -316,7 +316,7 @@ impl Adapter {
     }
 
     /// [`Adapter::motion`] without μ, so that equal latents give zero motion (A-16, homogeneous).
-    pub fn displacement(&self, from: ArrayView1<'_, f64>, to: ArrayView1<'_, f64>) -> Twist {
+    pub fn motion_without_mean(&self, from: ArrayView1<'_, f64>, to: ArrayView1<'_, f64>) -> Twist {
         Twist::from_vector(&(self.motion(from, to).to_vector() - self.scale.mean))
     }
 

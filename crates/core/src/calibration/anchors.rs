@@ -92,7 +92,7 @@ fn add_matches(
             matches.push(Match {
                 distance: best.distance,
                 read: adapter
-                    .displacement(room.latents.row(at), room.latents.row(row))
+                    .motion_without_mean(room.latents.row(at), room.latents.row(row))
                     .to_vector(),
                 truth: body_twist(&room.poses[at], &room.poses[row]).to_vector(),
             });

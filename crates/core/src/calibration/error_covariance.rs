@@ -8,14 +8,14 @@ use crate::geometry::body_twist;
 use crate::splits::{self, Pair, Split};
 use crate::training::{self, RoomData};
 
-/// Of a range of strides, every so many are measured.
+/// Every fifth stride of a range is measured: neighbouring strides have nearly the same errors.
 const STRIDE_STEP: usize = 5;
 /// A covariance of six components needs at least as many errors.
 const FEWEST_PAIRS: usize = 6;
 
 /// The second moment of the errors of motions without μ, Σ = mean r rᵀ with r = ΔP − σ⊙W(g₂ − g₁),
-/// on (v, ω), metres and radians, over all pairs of the rooms at the strides the adapter was
-/// trained on.
+/// on (v, ω), metres and radians, over all pairs of the rooms at the trained stride or at every
+/// fifth one of a trained range.
 ///
 /// # Errors
 /// [`Error`] when a room is too short to have a pair.
@@ -24,7 +24,7 @@ pub fn error_covariance(
     record: &TrainingRecord,
     rooms: &[RoomData<'_>],
 ) -> Result<Matrix6<f64>, Error> {
-    let strides = strides(&record.pairs);
+    let strides = trained_strides(&record.pairs);
     let mut sum = Matrix6::zeros();
     let mut count = 0usize;
 
@@ -56,7 +56,7 @@ pub fn error_covariance(
 
 /// The strides that are measured: the trained one, or of a range every fifth from the lowest on and
 /// the highest.
-fn strides(plan: &PairPlan) -> Vec<u32> {
+fn trained_strides(plan: &PairPlan) -> Vec<u32> {
     match plan {
         PairPlan::Stride(stride) => vec![*stride],
         PairPlan::Range(range) => {

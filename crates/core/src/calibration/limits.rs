@@ -23,7 +23,7 @@ const OWN_JUMP_SHARE: f64 = 0.999;
 /// … and the distance that this share of views cut from one room to another is below.
 const OTHERS_JUMP_SHARE: f64 = 0.01;
 
-/// Distances of matches over the room's typical distance.
+/// Distances of matches, divided by the room's typical distance.
 pub struct MatchLimits {
     /// Above it a view shows another place.
     pub out_of_distribution: f64,
@@ -69,8 +69,9 @@ pub fn match_limits(rooms: &[Array2<f64>]) -> Result<MatchLimits, Error> {
     })
 }
 
-/// The distance in frame noise from the nearest of the last frames, above which a view has jumped:
-/// between what a moving camera does and what a cut to another room does.
+/// The limit of jumps, in standard deviations of frame noise: a view farther than this from all of
+/// the last frames has jumped. It lies between what a moving camera does and what a cut to another
+/// room does.
 pub fn jump_distance(rooms: &[Array2<f64>]) -> Result<f64, Error> {
     let mut own = Vec::new();
     let mut others = Vec::new();

@@ -10,9 +10,11 @@ use crate::statistics::coverage_deviation;
 use crate::tracking::{InitialPose, Map, Segment, Tracker, TrackerSettings, replay};
 use crate::training::RoomData;
 
-/// Factors that are tried: the smallest, the ratio of each to the one before, and how many.
+/// The smallest factor that is tried.
 const SMALLEST_FACTOR: f64 = 0.1;
+/// Each factor over the one before.
 const FACTOR_RATIO: f64 = 1.1;
+/// How many factors are tried.
 const FACTOR_COUNT: i32 = 40;
 /// Nanoseconds between frames: velocities play no role here.
 const PERIOD_NS: i64 = 1;

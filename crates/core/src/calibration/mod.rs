@@ -10,8 +10,9 @@
 //!    error model so far (`map_pose_factor`).
 //!
 //! Errors are heavy-tailed and differ from room to room. The covariances of the error model are
-//! therefore fitted by Student's t, and one factor then balances the shares of errors inside the 68
-//! % and the 95 % ellipsoid. The covariance of step 1 is a plain second moment.
+//! therefore fitted by Student's t, and each is then scaled so that the shares of errors inside its
+//! ellipsoids are as near as possible to 68 % and 95 %. The covariance of step 1 is a plain second
+//! moment.
 
 mod anchors;
 mod error_covariance;
@@ -82,7 +83,8 @@ pub struct CalibrationReport {
 }
 
 /// Calibrates an adapter for retrieval and, with two or more rooms, for tracking. `record` is how
-/// the adapter was trained.
+/// the adapter was trained; the caller adds the rooms of the report to its `calibrated_on`, by which
+/// leaks are told.
 ///
 /// # Errors
 /// [`Error`], when the adapter learned from one of the rooms, a room is too short, or its features

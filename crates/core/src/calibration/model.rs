@@ -4,7 +4,7 @@ use ndarray::{Array2, s};
 
 use super::anchors::anchor_errors;
 use super::limits::{jump_distance, match_limits};
-use super::motions::{RoomPair, motion_errors, second_moment, strides};
+use super::motions::{RoomPair, fibonacci_strides, motion_errors, second_moment};
 use super::{Error, FEWEST_ROOMS_TO_TRACK};
 use crate::adapter::{Adapter, ErrorStatistics, TrainingRecord, Whitener};
 use crate::geometry::Pose;
@@ -39,7 +39,7 @@ pub fn measure(
     }
 
     let embedded = embed(adapter, rooms)?;
-    let strides = strides(&record.pairs);
+    let strides = fibonacci_strides(&record.pairs);
 
     // Two successive frames each carry the noise of one latent, so half the second moment of their
     // difference is that of one.

@@ -23,9 +23,10 @@ pub struct RoomPair {
     pub pair: Pair,
 }
 
-/// The strides that motions are measured at: the Fibonacci numbers 1, 2, 3, 5, 8, … below the
-/// longest stride that the adapter was trained on, and that one.
-pub fn strides(plan: &PairPlan) -> Vec<u32> {
+/// The strides that a tracker's motions are measured at: the Fibonacci numbers 1, 2, 3, 5, 8, … below
+/// the longest stride that the adapter was trained on, and that one. Errors change with the
+/// logarithm of the stride, so that short strides are measured more closely than long ones.
+pub fn fibonacci_strides(plan: &PairPlan) -> Vec<u32> {
     let longest = match plan {
         PairPlan::Stride(stride) => *stride,
         PairPlan::Range(range) => range.high,
@@ -99,7 +100,7 @@ fn scaled_residual(
     let from = pair.source.row();
     let to = pair.target.row();
     let read = adapter
-        .displacement(room.latents.row(from), room.latents.row(to))
+        .motion_without_mean(room.latents.row(from), room.latents.row(to))
         .to_vector();
     let truth = body_twist(&room.poses[from], &room.poses[to]).to_vector();
 
@@ -115,10 +116,10 @@ mod tests {
     /// Oracle: by hand.
     #[test]
     fn strides_grow_to_the_longest() {
-        assert_eq!(strides(&PairPlan::Stride(1)), [1]);
-        assert_eq!(strides(&PairPlan::Stride(2)), [1, 2]);
+        assert_eq!(fibonacci_strides(&PairPlan::Stride(1)), [1]);
+        assert_eq!(fibonacci_strides(&PairPlan::Stride(2)), [1, 2]);
         assert_eq!(
-            strides(&PairPlan::Stride(40)),
+            fibonacci_strides(&PairPlan::Stride(40)),
             [1, 2, 3, 5, 8, 13, 21, 34, 40]
         );
     }

@@ -155,18 +155,20 @@ pub fn walk(
 
         // A closed loop divides the motion that remains among the steps that remain; the other
         // modes always take the same share of the whole motion.
-        let (part, parts) = match (goal, at.pose) {
+        let (remaining, steps_left) = match (goal, at.pose) {
             (Some(goal), Some(pose)) => (body_twist(&pose, &goal), plan.steps - done),
             _ => (leg.motion, plan.steps),
         };
 
         // The share of μ, or of a refit's intercept, that this step takes: the shares of all steps
         // add up to one.
-        let share = f64::from(plan.steps).recip();
-        let step =
-            space
-                .stepper
-                .step(space.adapter, at.latent.view(), part.divided(parts), share)?;
+        let mean_share = f64::from(plan.steps).recip();
+        let step = space.stepper.step(
+            space.adapter,
+            at.latent.view(),
+            remaining.divided(steps_left),
+            mean_share,
+        )?;
         let latent = &at.latent + &step;
 
         let exclusion = plan

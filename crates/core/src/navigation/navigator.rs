@@ -301,9 +301,9 @@ impl Navigator {
             let walked = walk(space, &from, leg, plan, cancel)?;
 
             for (done, step) in (1usize..).zip(walked) {
-                // After step n of S the camera should stand at begun_at · exp(n ξ / S).
-                let share = twist.times(done).divided(query.steps);
-                wanted = begun_at.map(|pose| pose * exp(&share));
+                // After step n of S the camera should stand at begun_at · exp(n ξ / S), ξ the motion.
+                let walked_so_far = twist.times(done).divided(query.steps);
+                wanted = begun_at.map(|pose| pose * exp(&walked_so_far));
 
                 from = query
                     .mode

@@ -18,7 +18,7 @@ pub const ANCHORS_TO_AGREE: u32 = 4;
 
 /// The map that a view matches best.
 pub(super) struct BestMap {
-    /// Its place in [`Tracker::maps`].
+    /// An index of [`Tracker::maps`].
     pub room: usize,
     /// Whether no other map matches nearly as well.
     pub is_clear: bool,
@@ -75,11 +75,14 @@ impl Tracker {
         frame: &Observation,
         view: &BestMap,
     ) -> Correction {
+        // While a stream is lost no place is a candidate. Frames that miss the room or match several
+        // rooms do not come here, so that anchors "in a row" may have such frames between them.
         let earlier_candidate = state.candidate.take();
         if state.health.is_lost() {
             return Correction::NONE;
         }
 
+        // The filter takes the inflated covariance; what is reported is measured with the plain one.
         let anchor = Belief {
             pose: view.matched.anchor.pose,
             covariance: view.matched.anchor.covariance * ANCHOR_INFLATION,
@@ -144,10 +147,11 @@ impl Tracker {
         let map_pose = candidate.map_pose.moved(motion, &covariance);
         (map_pose, candidate.agreeing_anchors)
     }
+
     /// A corrected map pose as it is reported: with the covariance of the anchor that corrected it,
     /// times the factor that calibration found. The filter would combine many anchors into one very
     /// sure pose, but anchors on the same part of a path err alike.
-    pub(super) fn as_sure_as(&self, anchor: &Belief, map_pose: Belief) -> Belief {
+    pub(super) fn reported(&self, map_pose: Belief, anchor: &Belief) -> Belief {
         Belief {
             covariance: anchor.covariance * self.map_pose_factor,
             ..map_pose

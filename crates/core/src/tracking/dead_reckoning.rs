@@ -1,5 +1,7 @@
 //! Dead reckoning: the motion that the views say the camera made since the last keyframe, and where
 //! it leads.
+//!
+//! Motions are read without the mean training motion μ: a camera that stands still must not drift.
 
 use nalgebra::Matrix6;
 use ndarray::{ArrayView1, s};
@@ -19,7 +21,8 @@ const ORIGIN_DEVIATION: f64 = 1e-6;
 pub(super) enum MotionReading {
     /// All of it.
     Complete,
-    /// Frames of it are missing, but the room was seen again after them.
+    /// Frames of it are missing, but the view after them matches the map, where latents are known to
+    /// be read well.
     Partial,
     /// Nothing that can be relied on: the view jumped, or a gap led away from the map.
     Unseen,
@@ -133,7 +136,7 @@ impl Tracker {
         let frames = to.sequence.saturating_sub(from.sequence);
         let covariance = errors.at(squared_length, frames);
 
-        let motion = self.adapter().displacement(latent, to.latent.view());
+        let motion = self.adapter().motion_without_mean(latent, to.latent.view());
         if motion.is_unique_logarithm() {
             return (motion, covariance);
         }

@@ -5,7 +5,7 @@
 //! the room, and each view follows from the one before, the camera has only left the mapped part.
 //! If the stream was never confirmed, or the view jumped, nobody knows where the camera is.
 
-/// Frames in a row that must match the room with certainty before a lost stream is tracked again.
+/// Frames in a row that must match the room with certainty before a lost stream's health is consistent again.
 pub const FRAMES_TO_RECOVER: u32 = 5;
 /// The score at which a stream is confirmed to be in the room: each matching frame adds one, each
 /// other frame takes away [`MISMATCH_COST`].
@@ -19,10 +19,10 @@ pub enum TrackingHealth {
     /// No frame was observed yet.
     #[default]
     NotStarted,
-    /// Each frame follows from the one before, back to some that matched the room.
+    /// Each frame follows from the one before, back to one that matched the room or whose pose was
+    /// given.
     Consistent {
-        /// Matching frames, less two for each other one; not counted on once the
-        /// stream is confirmed.
+        /// Matching frames, less two for each other one; not counted on once the stream is confirmed.
         score: i32,
         /// Whether the stream is certainly in this room, so that frames unlike the map show parts
         /// of the room that are not mapped.
@@ -59,7 +59,7 @@ pub enum Continuity {
 }
 
 impl TrackingHealth {
-    /// The health of a stream whose first pose was given: it is in the room by assumption.
+    /// The health of a stream whose pose was given: it is in the room by assumption.
     pub fn confirmed() -> Self {
         Self::Consistent {
             score: CONFIRMED_SCORE,
@@ -80,7 +80,8 @@ impl TrackingHealth {
         }
     }
 
-    /// Whether the stream's place is unknown.
+    /// Whether the frames contradict the room or one another. A [`Status`](super::Status) can be
+    /// LOST for another reason too: a position that is too uncertain.
     pub fn is_lost(self) -> bool {
         matches!(self, Self::Lost { .. })
     }

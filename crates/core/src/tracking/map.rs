@@ -124,7 +124,7 @@ impl Map {
         let errors = self.error_model.anchor_errors(best.distance);
         let latents = self.navigator.latents();
         let motion = adapter
-            .displacement(latents.row(best.frame.row()), latent)
+            .motion_without_mean(latents.row(best.frame.row()), latent)
             .scaled(errors.gain);
         let pose = self.navigator.room().poses()[best.frame.row()] * exp(&motion);
 

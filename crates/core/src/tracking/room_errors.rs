@@ -103,7 +103,9 @@ fn motion_surprises(
         let covariance = error_model.motion_errors(difference.view(), u64::from(to.0 - from.0));
 
         let truth = body_twist(&room.poses()[from.row()], &room.poses()[to.row()]).to_vector();
-        let read = adapter.displacement(latent_from, latent_to).to_vector();
+        let read = adapter
+            .motion_without_mean(latent_from, latent_to)
+            .to_vector();
         let error = truth - read;
         Some(error.dot(&covariance.cholesky()?.solve(&error)))
     };
@@ -133,7 +135,7 @@ fn anchor_surprises(
 
         let errors = error_model.anchor_errors(best.distance);
         let motion = adapter
-            .displacement(latents.row(best.frame.row()), latents.row(centre.row()))
+            .motion_without_mean(latents.row(best.frame.row()), latents.row(centre.row()))
             .scaled(errors.gain);
         let found: Pose = poses[best.frame.row()] * exp(&motion);
 

@@ -21,7 +21,8 @@ pub struct Observation {
 /// Everything that a tracker knows of a stream.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct State {
-    /// The map that the camera is believed to be in, by its place in [`super::Tracker::maps`].
+    /// The only map or, of several, the one that the camera was found in; an index of
+    /// [`super::Tracker::maps`].
     pub room: Option<usize>,
     /// The last frame that was accepted.
     pub last: Option<LastFrame>,
@@ -37,7 +38,7 @@ pub struct State {
     pub candidate: Option<Candidate>,
     /// Frames since the last one that matched the map.
     pub frames_off_map: u32,
-    /// Frames since an anchor was last due.
+    /// Frames since a match was last considered as an anchor.
     pub frames_since_anchor: u32,
 }
 
@@ -73,7 +74,7 @@ pub struct Keyframe {
 /// A map pose that recent anchors agree on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Candidate {
-    /// The map, by its place in [`super::Tracker::maps`].
+    /// The map, an index of [`super::Tracker::maps`].
     pub room: usize,
     /// The number of the newest frame that spoke for it.
     pub sequence: u64,
@@ -98,8 +99,10 @@ pub struct Update {
     pub is_keyframe: bool,
     /// `odom_from_camera`.
     pub odom: Belief,
-    /// `map_from_camera` as it is reported; the map's frame is the room's world. In a single room
-    /// it is still given when the stream is LOST, so look at `status` before using it.
+    /// `map_from_camera` as it is reported; the map's frame is the room's world. The last pose is
+    /// still given, less and less surely, while a stream is LOST or RELOCALIZING in a single room,
+    /// and where it is LOST because its position became too uncertain: look at `status` before
+    /// using it.
     pub map_pose: Option<Belief>,
     /// The mean velocity since the frame before, metres and radians per second, in the camera's
     /// body frame; none for the first frame.
@@ -111,7 +114,7 @@ pub struct Update {
     /// The distance to the nearest mapped frame over the room's own limit: above 1 the frame looks
     /// like another place.
     pub out_of_distribution: f64,
-    /// The map that the camera is believed to be in.
+    /// The only map or, of several, the one that the camera was found in.
     pub room: Option<usize>,
     /// The map and the mapped frame that the view resembles most.
     pub best_match: (usize, Neighbour),

@@ -11,7 +11,7 @@
 //! - The map pose is kept twice. The *believed* pose is the filter's own, with the covariance that
 //!   the filter computes; anchors are compared with it. The *reported* pose is what clients are
 //!   told, with the covariance that its errors were measured to have. While both exist they are the
-//!   same pose and differ in covariance alone; after LOST only the reported one remains. A filter
+//!   same pose and differ in covariance alone; where health is lost only the reported one remains. A filter
 //!   that treats anchors as independent grows far too sure of itself, because anchors on the same
 //!   part of a path err alike.
 
@@ -193,14 +193,14 @@ impl Tracker {
     fn step(&self, state: &mut State, frame: &Observation) -> Update {
         // 1. What the frame looks like: the best map, the mapped frame nearest to it, and whether
         //    the view follows from the views before.
-        let view = self.match_maps(state.room, frame.latent.view());
-        let matches_room = view.matched.out_of_distribution <= 1.0;
+        let best = self.match_maps(state.room, frame.latent.view());
+        let matches_room = best.matched.out_of_distribution <= 1.0;
         let continuity = self.record_view(state, frame);
 
         // 2. What that says of the stream's health.
         state.health = state.health.after(FrameEvidence {
             matches_room,
-            matches_certainly: view.matched.is_certain,
+            matches_certainly: best.matched.is_certain,
             continuity,
         });
         state.frames_off_map = if matches_room {
@@ -218,11 +218,11 @@ impl Tracker {
         }
 
         // 4. Correction: every few frames the mapped frame that looks alike is tried as an anchor.
-        let correction = self.correct_when_due(state, &mut poses, frame, &view);
+        let correction = self.correct_when_due(state, &mut poses, frame, &best);
         if correction.is_applied {
             poses.reported_pose = poses
                 .map_pose
-                .map(|map_pose| self.as_sure_as(&view.matched.anchor, map_pose));
+                .map(|map_pose| self.reported(map_pose, &best.matched.anchor));
         }
 
         // 5. What is remembered for the next frame.
@@ -238,10 +238,10 @@ impl Tracker {
             correction.is_applied || self.is_keyframe_due(state, frame.sequence, &prediction);
         remember(state, frame, &poses, is_keyframe);
 
-        // 6. The answer. The status judges the reported covariance, but only while the filter still
-        // believes a pose.
-        let believed = poses.map_pose.and(poses.reported_pose);
-        let (status, reason) = self.status(state, believed.as_ref(), &view.matched);
+        // 6. The answer. The status judges the reported pose, but only while the filter still
+        //    believes one.
+        let judged_pose = poses.map_pose.and(poses.reported_pose);
+        let (status, reason) = self.status(state, judged_pose.as_ref(), &best.matched);
 
         Update {
             motion: prediction.motion,
@@ -253,9 +253,9 @@ impl Tracker {
             velocity,
             status,
             reason,
-            out_of_distribution: view.matched.out_of_distribution,
+            out_of_distribution: best.matched.out_of_distribution,
             room: state.room,
-            best_match: (view.room, view.matched.nearest[0]),
+            best_match: (best.room, best.matched.nearest[0]),
             match_used: correction.is_applied,
             surprise: correction.surprise,
             candidate: state.candidate.clone(),
@@ -310,8 +310,8 @@ impl Tracker {
             .map(|other| distance(other, &whitened))
             .fold(f64::INFINITY, f64::min);
 
-        // How far the views of a moving camera lie apart grows slowly with the frames in between,
-        // about as their cube root.
+        // How far the views of a moving camera lie apart grows slowly with the frames from one to
+        // the other, about as the cube root of their number.
         let frames = frames_since_last(state, frame);
         let limit = self.error_model.statistics().jump_distance * (frames as f64).cbrt();
 

@@ -80,7 +80,7 @@ fn interval(rate: &Rate) -> String {
     format!("{:.3} [{:.3}, {:.3}]", rate.rate, rate.low, rate.high)
 }
 
-/// What was evaluated besides the protocol of the report: the rest of a JSON record's `protocol`.
+/// What was evaluated, besides the protocol of the report; flattened into `protocol` of the record.
 #[derive(Debug, Clone, Serialize)]
 pub struct EvaluationContext {
     /// The room.
@@ -115,7 +115,7 @@ pub struct AdapterJson {
     pub preset: String,
     /// How its training and test frames were kept apart.
     pub trained_split: &'static str,
-    /// Frames from source to target in its test pairs.
+    /// Frames from source to target in the pairs that it was tested on after its training.
     pub trained_stride: u32,
     /// The seed of its weights.
     pub seed: u64,

@@ -1,7 +1,7 @@
 //! Results for people and for programs: tables, JSON and pictures.
 //!
-//! The records that programs read are types with names in `…Json`: their fields are the keys of the
-//! file.
+//! The records that programs read are types with names in `…Json`, here, or `…Record`, in
+//! [`crate::reproduction`]: their fields are the keys of the file.
 
 mod adapter_sweep;
 mod columns;

@@ -104,7 +104,7 @@ struct SeedSpreadJson {
     by_part: PartsJson,
 }
 
-/// What holds for all scores of a probe.
+/// What was probed, and what could not be.
 #[derive(Debug, Clone)]
 pub struct ProbeContext {
     /// The name of the features.

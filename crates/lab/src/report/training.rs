@@ -82,6 +82,7 @@ struct RunJson {
     test: MotionJson,
     train: MotionJson,
     train_mean_r2: f64,
+    /// Test scores by room, in the order of the protocol's rooms.
     rooms: Vec<MotionJson>,
     inverse_poincare_affine: HitsJson,
     seconds: f64,

@@ -42,7 +42,8 @@ pub struct Options {
     pub strides: Vec<u32>,
     /// Numbers of training rooms along the scaling curve.
     pub sizes: Vec<usize>,
-    /// How many of the training rooms are calibration rooms where a plan has some.
+    /// Of the rooms that are learned together, how many a plan with calibration takes for that
+    /// instead.
     pub calibration_rooms: usize,
     /// How many seeds, from 0 on, where a table averages over seeds.
     pub seeds: u64,
@@ -97,7 +98,8 @@ pub struct Reproduced {
     pub adapters: Vec<ReproducedAdapter>,
 }
 
-/// The results of every experiment; the fields are the keys of `record.json`.
+/// The results of every experiment; the fields are keys of `record.json`, to which the command adds
+/// the published adapters and the time it took.
 #[derive(Debug, Serialize)]
 pub struct ReproductionRecord {
     probes: Vec<probes::ProbeRecord>,
@@ -176,8 +178,8 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
     Ok(())
 }
 
-/// The names of all adapters that a reproduction leaves, but for the number of rooms in some, so
-/// that they can be checked before hours of training.
+/// The names of the adapters of single rooms, and one that is as long as any of the others, so that
+/// names can be checked before hours of training.
 pub fn adapter_names(given: &Reproduction<'_>) -> Vec<String> {
     let mut names = Vec::new();
     for set in &given.sets {

@@ -46,6 +46,7 @@ pub struct WalkRecord {
 /// latents.
 pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Vec<WalkRecord>>, Error> {
     let mut section = Section::new("Walks in rooms never seen, and a recording unrolled");
+    // Pictures are of the first feature set alone.
     let set = &given.sets[0];
     let adapter = notes
         .adapter(&steady_adapter(set), &set.features)
@@ -55,11 +56,11 @@ pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Vec<Walk
     let mut record = Vec::new();
 
     // Only rooms that the studio rendered, and whose images are named in the store.
-    let drawn = |room: &&RoomData<'_>| {
+    let from_studio = |room: &&RoomData<'_>| {
         room.room.provenance().format.starts_with("studio") && !room.room.images().is_empty()
     };
 
-    for (position, room) in set.test.iter().filter(drawn).take(SHOWN).enumerate() {
+    for (position, room) in set.test.iter().filter(from_studio).take(SHOWN).enumerate() {
         let room_of = Arc::new(room.room.clone());
         let navigator = Navigator::new(room_of, room.features, adapter.clone(), IndexKind::Exact)?;
         let walk = walked(&navigator)?;

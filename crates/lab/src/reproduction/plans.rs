@@ -19,7 +19,7 @@ use crate::experiments::cross_room::{
 pub const MEMBERS: usize = 4;
 
 /// The longest name that a plan gives an adapter: names are checked before training.
-pub const LONGEST_NAME: &str = "ensemble-aside-of-100000";
+pub const LONGEST_NAME: &str = "paper-range-aside-of-100000";
 
 /// What distinguishes the adapters of the cross-room sections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
