@@ -282,6 +282,40 @@ fn hit_text(hit: &pb::Hit) -> String {
     )
 }
 
+/// Where the camera is, and what told it.
+fn located_text(located: &pb::LocatedPose) -> String {
+    let pose = located.pose.clone().unwrap_or_default();
+    let p = pose.position.unwrap_or_default();
+    let q = pose.orientation.unwrap_or_default();
+
+    // The diagonal of the covariance holds the variances of x, y, z and of the three rotations.
+    let deviation = |first: usize| {
+        let variances = (first..first + 3).filter_map(|axis| located.covariance.get(7 * axis));
+        variances.sum::<f64>().sqrt()
+    };
+
+    format!(
+        "camera at ({:.3}, {:.3}, {:.3}) m, wxyz ({:.3}, {:.3}, {:.3}, {:.3}) in {}, ± {:.3} m, ± {:.2}°\n\
+         from frame {}, distance {:.3}: translation {} × {:.1}, rotation {} × {:.1}",
+        p.x,
+        p.y,
+        p.z,
+        q.w,
+        q.x,
+        q.y,
+        q.z,
+        pose.parent_frame,
+        deviation(0),
+        deviation(3).to_degrees(),
+        located.frame_id,
+        located.distance,
+        located.translation_reader,
+        located.translation_gain,
+        located.rotation_reader,
+        located.rotation_gain
+    )
+}
+
 fn motion_text(motion: &pb::Twist) -> String {
     let v = motion.linear.unwrap_or_default();
     let w = motion.angular.unwrap_or_default();
@@ -344,6 +378,10 @@ impl Localize {
             revision(answer.adapter.as_ref()),
             answer.room_count
         ));
+
+        if let Some(located) = &answer.located {
+            say(located_text(located));
+        }
 
         // Only a view that is itself a frame of the room has a recorded pose, and hence an error.
         for place in &answer.places {

@@ -232,7 +232,7 @@ impl CrossRoom {
         let full = |step: StepKind| NavigatorKind::Step(step, RetrievalMetric::Full);
         let refit = |in_sample: bool| {
             full(StepKind::Refit(Refit {
-                z_scored: false,
+                z_scored: true,
                 intercept: false,
                 in_sample,
             }))

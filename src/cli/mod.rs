@@ -12,6 +12,7 @@ mod encoders;
 #[cfg(feature = "lab")]
 mod evaluate;
 mod export;
+mod fit;
 mod health;
 mod import;
 mod named;
@@ -64,6 +65,8 @@ enum Command {
     #[cfg(feature = "lab")]
     /// Train an adapter on the features of one or more rooms and publish it
     Train(train::Train),
+    /// Fit an adapter to one room, measure how far it may be believed there, and publish it
+    Fit(fit::Fit),
     #[cfg(feature = "lab")]
     /// Score navigators on held-out motions: Hit@ε with baselines and intervals
     Evaluate(evaluate::Evaluate),
@@ -109,6 +112,7 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Import(arguments) => arguments.run().await,
         Command::Export(arguments) => arguments.run().await,
         Command::Encode(arguments) => arguments.run().await,
+        Command::Fit(arguments) => arguments.run().await,
         Command::Encoders(arguments) => arguments.run(),
         #[cfg(feature = "lab")]
         Command::Studio(arguments) => arguments.run().await,

@@ -13,7 +13,7 @@ use seese3_core::training::TrainingPlan;
 #[derive(Debug, Clone, Args)]
 pub struct ProtocolOptions {
     /// Training protocol that supplies every setting not given below
-    #[arg(long, value_parser = one_of::<Preset>(), default_value = "paper-base")]
+    #[arg(long, value_parser = one_of::<Preset>(), default_value = "base")]
     preset: Preset,
     /// Frames from the source to the target of a test pair, 1 to 100000; also of a training pair
     /// unless these are drawn from a range of strides
@@ -109,6 +109,10 @@ impl ProtocolOptions {
         let config = &mut plan.config;
         let put = |into: &mut usize, given: Option<usize>| given.map_or((), |given| *into = given);
         put(&mut config.epochs, self.epochs);
+        if self.epochs.is_some() {
+            plan.least_steps = 0;
+        }
+        let config = &mut plan.config;
 
         put(&mut config.batch, self.batch);
         put(&mut config.hidden, self.hidden);
@@ -184,6 +188,9 @@ impl ClosedSet for Preset {
 
     fn help(self) -> &'static str {
         match self {
+            Self::Base => {
+                "As paper-base, but for as many epochs as 400 optimiser steps take, at least 10"
+            }
             Self::PaperBase => {
                 "The paper's base protocol: all training pairs at one stride, 10 epochs"
             }

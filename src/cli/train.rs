@@ -209,6 +209,8 @@ pub fn train_with_progress(
 
     let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
     let trained = train_seeds(&room_data, plan, seeds, &|epoch| {
+        // A plan with a floor in steps has more epochs than its preset.
+        progress.set_length((epoch.epochs as u64).saturating_mul(seeds));
         progress.set_message(format!("loss {:.4}", epoch.loss));
         progress.inc(1);
     })?;

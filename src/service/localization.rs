@@ -6,7 +6,7 @@ use std::sync::Arc;
 use tonic::{Request, Response, Status};
 
 use super::convert;
-use super::snapshot::ServedNavigator;
+use super::snapshot::{FittedLocalizer, ServedNavigator};
 use super::status::view_error;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
@@ -115,11 +115,42 @@ fn answer(
         })
     };
 
+    // A feature of one room that has a fitted adapter is also located.
+    let located = match (served.as_slice(), &source) {
+        ([only], Source::Feature(feature)) => located(only, feature)?,
+        _ => None,
+    };
+
     Ok(pb::LocalizeResponse {
         adapter: Some(convert::adapter_revision(first)),
         places: places.iter().map(place).collect::<Result<_, Error>>()?,
         room_count: served.len() as u32,
+        located,
     })
+}
+
+/// Where the camera of a feature is, if the adapter was fitted to the room.
+fn located(served: &ServedNavigator, feature: &[f32]) -> Result<Option<pb::LocatedPose>, Error> {
+    let Some(FittedLocalizer { localizer, rules }) = &served.localizer else {
+        return Ok(None);
+    };
+
+    // The feature was embedded before, so that it fits the adapter.
+    let view = localizer
+        .locate(feature, rules)
+        .map_err(|_| Error::Internal)?;
+    let room = served.navigator.room().id().as_str();
+
+    Ok(Some(pb::LocatedPose {
+        pose: Some(convert::pose_to_wire(&view.pose.pose, room)),
+        covariance: convert::matrix_to_wire(&view.pose.ros_covariance()),
+        frame_id: view.nearest.frame.0,
+        distance: view.nearest.distance,
+        translation_reader: view.translation.reader.name().to_owned(),
+        translation_gain: view.translation.gain,
+        rotation_reader: view.rotation.reader.name().to_owned(),
+        rotation_gain: view.rotation.gain,
+    }))
 }
 
 /// The rooms to search, all under one adapter; at least one. An empty `rooms` means every room that

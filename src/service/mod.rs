@@ -118,6 +118,12 @@ pub enum RunError {
         room: String,
         problem: seese3_core::navigation::Error,
     },
+    #[error("adapter '{adapter}' does not locate views in room '{room}': {problem}")]
+    Localizer {
+        adapter: String,
+        room: String,
+        problem: Box<seese3_core::fitting::Error>,
+    },
     #[error("adapter '{adapter}' cannot be given images: {problem}")]
     Encoder {
         adapter: String,

@@ -8,13 +8,15 @@ use sha2::{Digest, Sha256};
 
 use super::image_encoder::{self, ImageEncoder, ImageEncoders};
 use super::{Error, RunError};
-use crate::store::{Store, StoredAdapter, StoredRoom};
+use crate::store::{RoomFit, Store, StoredAdapter, StoredRoom};
 use seese3_core::adapter::{ErrorStatistics, Network};
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::FeatureSource;
+use seese3_core::fitting::{Localizer, ReadingRules};
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Room, RoomId};
 use seese3_core::tracking::Map;
+use seese3_core::training::RoomData;
 
 /// A room that is served.
 pub struct ServedRoom {
@@ -46,6 +48,16 @@ pub struct ServedNavigator {
     pub room_revision: u64,
     /// What the adapter has seen of this room.
     pub trained_on: TrainedOn,
+    /// Locates single views, where the adapter was fitted to these very frames.
+    pub localizer: Option<FittedLocalizer>,
+}
+
+/// A room's localizer, and the rules that were measured for it.
+pub struct FittedLocalizer {
+    /// Reads where a view is from the frame that it resembles most.
+    pub localizer: Localizer,
+    /// How far it is believed.
+    pub rules: ReadingRules,
 }
 
 /// The newest revision of every room and adapter of a store.
@@ -220,6 +232,12 @@ async fn load_room(
 
     let mut navigators = Vec::new();
     for adapter in by_preference(adapters, room.id()) {
+        // An adapter that was fitted to a room serves that room alone.
+        let is_of_another = |fit: &RoomFit| fit.room != *room.id();
+        if adapter.room_fit.as_ref().is_some_and(is_of_another) {
+            continue;
+        }
+
         // An adapter fits a room that has features made as its training features were.
         let source = adapter.adapter.source();
         let Some(features) = features.iter().find(|set| set.source().is_like(source)) else {
@@ -235,12 +253,28 @@ async fn load_room(
         log_audit(&navigator, &adapter.name);
 
         let navigator = Arc::new(navigator);
+        let trained_on = store
+            .trained_on(&adapter.record, room.id(), revision)
+            .await?;
+
+        // Rules that were measured on other frames say nothing of these.
+        let room_data = RoomData {
+            room: &room,
+            revision,
+            features,
+        };
+        let localizer = match &adapter.room_fit {
+            Some(fit) if trained_on == TrainedOn::TheseFrames => {
+                Some(fitted_localizer(store, &adapter, fit, &room_data).await?)
+            }
+            _ => None,
+        };
+
         navigators.push(Arc::new(ServedNavigator {
             map: map(&navigator),
             content: content(&navigator),
-            trained_on: store
-                .trained_on(&adapter.record, room.id(), revision)
-                .await?,
+            trained_on,
+            localizer,
             room_revision: revision,
             adapter,
             navigator,
@@ -253,6 +287,37 @@ async fn load_room(
         revision,
         created,
         navigators,
+    })
+}
+
+/// The localizer of a fitted adapter, with the adapter that it began from as a second reader.
+async fn fitted_localizer(
+    store: &Store,
+    adapter: &StoredAdapter,
+    fit: &RoomFit,
+    data: &RoomData<'_>,
+) -> Result<FittedLocalizer, RunError> {
+    let base = match &fit.base {
+        Some(base) => {
+            let stored = store.load_adapter(&base.name, Some(base.revision)).await?;
+            Some(stored.adapter)
+        }
+        None => None,
+    };
+
+    let mapped: Vec<FrameId> = (0..data.room.frame_count() as u32).map(FrameId).collect();
+    let localizer =
+        Localizer::new(data, &mapped, base, Some(adapter.adapter.clone())).map_err(|problem| {
+            RunError::Localizer {
+                adapter: adapter.name.clone(),
+                room: data.room.id().to_string(),
+                problem: Box::new(problem),
+            }
+        })?;
+
+    Ok(FittedLocalizer {
+        localizer,
+        rules: fit.rules.clone(),
     })
 }
 

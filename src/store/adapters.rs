@@ -6,14 +6,15 @@ use nalgebra::{Matrix6, Vector6};
 use ndarray::{Array2, ArrayView2};
 use object_store::path::Path;
 
-use super::format::{AdapterBody, TrainingEntry};
+use super::format::{AdapterBody, FittedEntry, TrainingEntry};
 use super::manifest::{self, SCHEMA};
 use super::tensors::{TensorReader, TensorWriter};
-use super::{ATTEMPTS, Error, Kind, Published, Store, error_model, revision_path};
+use super::{ATTEMPTS, Error, Kind, Published, Store, error_model, revision_path, room_fit};
 use seese3_core::adapter::{
     self, Adapter, Corrector, CorrectorKind, Mixture, Network, TargetScale, TrainingRecord,
 };
-use seese3_core::room::is_plain_name;
+use seese3_core::fitting::{Fitted, ReadingRules};
+use seese3_core::room::{RoomId, is_plain_name};
 
 /// The frame of every twist: the body frame of the source camera.
 const TWIST_FRAME: &str = "body";
@@ -39,6 +40,31 @@ pub struct StoredAdapter {
     pub adapter: Arc<Adapter>,
     /// How it was trained.
     pub record: TrainingRecord,
+    /// The room that it was fitted to, and how far it may be believed there; none for an adapter
+    /// that is meant for any room.
+    pub room_fit: Option<RoomFit>,
+}
+
+/// What makes an adapter one of a single room.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RoomFit {
+    /// The room.
+    pub room: RoomId,
+    /// The revision of the room whose frames it was fitted to.
+    pub room_revision: u64,
+    /// The adapter of other rooms that reads motions beside it, if there is one.
+    pub base: Option<BaseAdapter>,
+    /// Which reader is believed, by the distance of a view from the map.
+    pub rules: ReadingRules,
+}
+
+/// A published revision of an adapter, which never changes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct BaseAdapter {
+    /// Its name.
+    pub name: String,
+    /// Its revision.
+    pub revision: u64,
 }
 
 impl Store {
@@ -58,6 +84,35 @@ impl Store {
         record: &TrainingRecord,
         features: ArrayView2<'_, f32>,
     ) -> Result<Published, Error> {
+        self.publish(name, adapter, record, features, None).await
+    }
+
+    /// Publishes an adapter that was fitted to a room, as [`Store::publish_adapter`] does.
+    ///
+    /// # Errors
+    /// As [`Store::publish_adapter`].
+    pub async fn publish_fitted(
+        &self,
+        name: &str,
+        fitted: &Fitted,
+        room_fit: &RoomFit,
+        features: ArrayView2<'_, f32>,
+    ) -> Result<Published, Error> {
+        let Fitted {
+            adapter, record, ..
+        } = fitted;
+        self.publish(name, adapter, record, features, Some(room_fit))
+            .await
+    }
+
+    async fn publish(
+        &self,
+        name: &str,
+        adapter: &Adapter,
+        record: &TrainingRecord,
+        features: ArrayView2<'_, f32>,
+        room_fit: Option<&RoomFit>,
+    ) -> Result<Published, Error> {
         if !is_plain_name(name) {
             return Err(Error::Name {
                 what: "an adapter",
@@ -66,7 +121,7 @@ impl Store {
         }
 
         let folder = Path::from(Kind::Adapter.folder()).join(name);
-        let bytes = adapter_file(name, adapter, features)?;
+        let bytes = adapter_file(name, adapter, features, room_fit)?;
 
         // The weights are written before the manifest that makes them visible.
         let weights = self
@@ -92,6 +147,7 @@ impl Store {
                 // σ of the targets is divided by n, not by n − 1.
                 deviation_ddof: 0,
                 training: TrainingEntry::new(record, adapter),
+                fitted_to: room_fit.map(FittedEntry::from),
             };
 
             // Content that differs only in the revision number and the date is not published again.
@@ -188,19 +244,8 @@ impl Store {
             false => None,
         };
 
-        // Correctors share the weights file; a prefix tells their tensors apart.
-        let mut correctors = Vec::with_capacity(body.training.correctors.len());
-        for name in &body.training.correctors {
-            let kind = CorrectorKind::from_name(name).ok_or_else(|| {
-                damaged(format!(
-                    "has a corrector '{name}', which this program does not know"
-                ))
-            })?;
-            let read = |tensor: &str| read_weights(&tensors, &corrector_tensor(kind, tensor));
-            let corrector = Corrector::from_tensors(kind, network.coordinate_count(), read);
-
-            correctors.push(corrector.map_err(|error| error.within(&file))?);
-        }
+        let correctors =
+            read_correctors(&tensors, &body.training, network.coordinate_count(), &file)?;
 
         // The optional parts are added one by one, and each is checked as it is added.
         let adapter = Adapter::new(body.source.into(), network, scale)
@@ -224,7 +269,13 @@ impl Store {
             problem: format!("has {word}, which this program does not know"),
         })?;
 
+        let room_fit = match body.fitted_to {
+            Some(entry) => Some(room_fit::read(entry, &tensors, &file)?),
+            None => None,
+        };
+
         Ok(StoredAdapter {
+            room_fit,
             name: body.adapter,
             revision,
             created: body.created,
@@ -279,6 +330,27 @@ fn read_weights(tensors: &TensorReader<'_>, name: &str) -> Result<Array2<f32>, W
     tensors.f32(name).map_err(WeightError::File)
 }
 
+/// Reads the correctors that the manifest names. They share the weights file; a prefix tells their
+/// tensors apart.
+fn read_correctors(
+    tensors: &TensorReader<'_>,
+    training: &TrainingEntry,
+    coordinate_count: usize,
+    file: &str,
+) -> Result<Vec<Corrector<f32>>, Error> {
+    let corrector = |name: &String| {
+        let kind = CorrectorKind::from_name(name).ok_or_else(|| Error::Damaged {
+            file: file.to_owned(),
+            problem: format!("has a corrector '{name}', which this program does not know"),
+        })?;
+        let read = |tensor: &str| read_weights(tensors, &corrector_tensor(kind, tensor));
+
+        Corrector::from_tensors(kind, coordinate_count, read).map_err(|error| error.within(file))
+    };
+
+    training.correctors.iter().map(corrector).collect()
+}
+
 fn corrector_tensor(kind: CorrectorKind, tensor: &str) -> String {
     format!("corrector.{}.{tensor}", kind.name())
 }
@@ -302,12 +374,8 @@ fn adapter_file(
     name: &str,
     adapter: &Adapter,
     features: ArrayView2<'_, f32>,
+    room_fit: Option<&RoomFit>,
 ) -> Result<Vec<u8>, Error> {
-    let damaged = |problem: String| Error::Damaged {
-        file: name.to_owned(),
-        problem,
-    };
-
     let mut tensors = TensorWriter::default();
 
     // Weights keep PyTorch's names and shapes.
@@ -348,6 +416,23 @@ fn adapter_file(
         error_model::write(&mut tensors, error_model);
     }
 
+    if let Some(room_fit) = room_fit {
+        room_fit::write(&mut tensors, &room_fit.rules);
+    }
+
+    write_golden(&mut tensors, adapter, features).map_err(|error| Error::Damaged {
+        file: name.to_owned(),
+        problem: error.to_string(),
+    })?;
+    tensors.finish(name)
+}
+
+/// Writes golden vectors: some of the training features, and what the adapter makes of them.
+fn write_golden(
+    tensors: &mut TensorWriter,
+    adapter: &Adapter,
+    features: ArrayView2<'_, f32>,
+) -> Result<(), adapter::Error> {
     // The golden inputs are spread evenly over the training features.
     let rows: Vec<usize> = (0..features.nrows())
         .step_by(features.nrows().div_ceil(GOLDEN_ROWS).max(1))
@@ -355,9 +440,7 @@ fn adapter_file(
     let golden = features.select(ndarray::Axis(0), &rows);
 
     // The golden outputs are what this program computes now: latents, motions and corrected steps.
-    let latents = adapter
-        .embed(golden.view())
-        .map_err(|error| damaged(error.to_string()))?;
+    let latents = adapter.embed(golden.view())?;
 
     let twists = golden_twists(adapter, &latents);
 
@@ -380,8 +463,7 @@ fn adapter_file(
     );
 
     for corrector in adapter.correctors() {
-        let steps = golden_steps(adapter, corrector.kind(), &latents)
-            .map_err(|error| damaged(error.to_string()))?;
+        let steps = golden_steps(adapter, corrector.kind(), &latents)?;
         let name = golden_corrector(corrector.kind());
         tensors.f64(
             &name,
@@ -390,7 +472,7 @@ fn adapter_file(
         );
     }
 
-    tensors.finish(name)
+    Ok(())
 }
 
 /// The motion from the first golden latent to each, shape (n, 6).

@@ -112,7 +112,7 @@ pub fn read(tensors: &TensorReader<'_>, file: &str) -> Result<Option<ErrorModel>
 }
 
 /// Reads a tensor that must have this number of columns and, if given, of rows.
-fn sized(
+pub(super) fn sized(
     tensors: &TensorReader<'_>,
     name: &str,
     rows: Option<usize>,

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::adapters::RoomFit;
 use super::manifest::ObjectRef;
 use seese3_core::adapter::{Adapter, Loss, Mixing, PairPlan, TrainConfig, TrainingRecord};
 use seese3_core::features::{FeatureSource, UNSPECIFIED};
@@ -78,6 +79,18 @@ pub struct AdapterBody {
     /// Delta degrees of freedom of `target.deviation`.
     pub deviation_ddof: u32,
     pub training: TrainingEntry,
+    /// The room that the adapter was fitted to; absent for one that is meant for any room.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fitted_to: Option<FittedEntry>,
+}
+
+/// The room of a fitted adapter. The weights object also holds the tensor `fit.rules`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FittedEntry {
+    pub room: String,
+    pub room_revision: u64,
+    /// The name and the revision of the adapter that reads motions beside the fitted one.
+    pub base: Option<(String, u64)>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -143,6 +156,19 @@ pub struct ScoresEntry {
     direction: Option<f64>,
     magnitude: Option<f64>,
     direction_pairs_dropped: usize,
+}
+
+impl From<&RoomFit> for FittedEntry {
+    fn from(fit: &RoomFit) -> Self {
+        Self {
+            room: fit.room.to_string(),
+            room_revision: fit.room_revision,
+            base: fit
+                .base
+                .as_ref()
+                .map(|base| (base.name.clone(), base.revision)),
+        }
+    }
 }
 
 impl From<&FeatureSource> for SourceEntry {

@@ -15,10 +15,11 @@ mod error_model;
 mod format;
 mod manifest;
 mod room_files;
+mod room_fit;
 mod rooms;
 mod tensors;
 
-pub use adapters::StoredAdapter;
+pub use adapters::{BaseAdapter, RoomFit, StoredAdapter};
 pub use rooms::{RoomSummary, StoredRoom, check_features};
 
 use std::sync::Arc;

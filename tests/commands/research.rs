@@ -575,3 +575,65 @@ fn what_is_trained_is_evaluated() {
         &["mlp-9", "mlp-3"],
     );
 }
+
+/// Oracle: the keys that the manual promises to scripts; what stands still has the true motion for
+/// its error; a view is located no worse than by the nearest frame; a name that is taken is kept.
+#[test]
+fn an_adapter_is_fitted_and_its_views_are_located() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = stored(folder.path());
+    let file = folder.path().join("found.json");
+    let in_room = |words: &[&str]| {
+        let common = ["--store", &store, "--room", "a", "--json", text(&file)];
+        succeeds(&[words, &common[..]].concat());
+        json(&file)
+    };
+
+    let found = in_room(&["evaluate", "localization", "--fit", "--map-every", "5"]);
+    for row in ["ours", "nearest_frame", "nearest_pose", "fitted"] {
+        for part in ["translation_m", "rotation_deg"] {
+            let errors = &found[row][part];
+            assert!(
+                number(&errors["median"]) <= number(&errors["p90"]),
+                "{row} {part}"
+            );
+        }
+    }
+    assert_eq!(
+        found["n"].as_u64().unwrap() + found["mapped"].as_u64().unwrap(),
+        600
+    );
+    let median = |row: &str| number(&found[row]["translation_m"]["median"]);
+    assert!(median("ours") <= median("nearest_frame"));
+
+    succeeds(&[
+        "train", "--store", &store, "--room", "b", "--epochs", "5", "--name", "b",
+    ]);
+    let motion = in_room(&["evaluate", "motion", "--adapter", "b", "--stride", "10"]);
+    assert_eq!(motion["n"].as_u64(), Some(590));
+    assert!(number(&motion["no_motion"]["translation_m"]["median"]) > 0.0);
+    assert!(number(&motion["ours"]["rotation_deg"]["median"]).is_finite());
+
+    let evaluated = in_room(&["evaluate", "--adapter", "b"]);
+    let baselines = &evaluated["baselines"];
+    assert!(number(&baselines["constant_r2"]) < 1.0 && number(&baselines["variance_ratio"]) > 0.0);
+    assert!(
+        baselines["nearest_pose"].is_null(),
+        "the adapter never saw the room"
+    );
+    assert!(baselines["optimiser_steps"].as_u64().unwrap() > 0);
+
+    let fit = ["fit", "--store", &store, "--room", "a", "--name", "fitted"];
+    let printed = succeeds(&fit);
+    assert!(
+        printed.contains("published adapter 'fitted' revision 1"),
+        "{printed}"
+    );
+    assert!(succeeds(&fit).contains("unchanged"));
+
+    refuses(
+        &["evaluate", "localization", "--store", &store, "--room", "a"],
+        &["--adapter", "--fit"],
+    );
+    refuses(&["fit", "--store", &store, "--room", "c"], &["'c'"]);
+}

@@ -40,6 +40,7 @@ mod dying;
 mod correctors;
 mod datasets;
 mod encoders;
+mod fitting;
 mod formulations;
 mod geometry;
 mod index_contract;

@@ -11,6 +11,7 @@
 mod support;
 
 mod answers;
+mod fitted;
 mod goals;
 mod harness;
 mod images;

@@ -81,6 +81,7 @@
 //! | [`localization`] | from a view to the frames that look like it |
 //! | [`tracking`] | a camera followed frame by frame, with covariances |
 //! | [`calibration`] | how large an adapter's errors are in rooms that it did not learn from |
+//! | [`fitting`] | an adapter fitted to one mapped room, and single views located in it |
 //! | [`eval`] | Hit@ε on held-out motions, and whether a score leaks |
 //!
 //! Nothing here reads files, the network, the clock or the environment; randomness enters as a
@@ -104,6 +105,7 @@ pub mod navigation;
 pub mod localization;
 pub mod tracking;
 pub mod calibration;
+pub mod fitting;
 pub mod eval;
 
 /// Vectors and matrices of poses and twists.

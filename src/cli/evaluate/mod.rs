@@ -1,6 +1,8 @@
 //! `seese3 evaluate`: the paper's navigation table on a room's held-out pairs, and the errors of
 //! estimated trajectories.
 
+mod localization;
+mod motion;
 mod odometry;
 mod trajectory;
 
@@ -16,13 +18,19 @@ use super::{check_writable, say, write_json};
 use crate::store::{Store, StoredAdapter};
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::cancel::Cancellation;
-use seese3_core::eval::{Leak, Protocol, TrainedOn, evaluate, is_calibrated_in};
+use seese3_core::eval::{
+    Baselines, Leak, Protocol, TestPairs, TrainedOn, evaluate, is_calibrated_in,
+};
+use seese3_core::features::Features;
+use seese3_core::motion_scores::MotionScores;
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{IndexKind, Mode, Navigator};
 use seese3_core::room::RoomId;
 use seese3_core::splits::Split;
+use seese3_core::training::{motions, predictions};
 use seese3_lab::report::{
-    AdapterJson, EvaluationContext, RoomJson, evaluation_json, evaluation_table,
+    AdapterJson, EvaluationContext, MotionBaselines, RoomJson, baselines_text, evaluation_json,
+    evaluation_table,
 };
 
 #[derive(Debug, Args)]
@@ -38,6 +46,11 @@ pub struct Evaluate {
 enum What {
     /// Track held-out frames of rooms: path errors, covariances, tracking status, relocalisation
     Odometry(odometry::Odometry),
+    /// Locate single views in a partly mapped room: an adapter, also one fitted to the mapped
+    /// frames, beside the nearest frame
+    Localization(localization::Localization),
+    /// Read the motion between two views of a room, beside no motion and the mean motion
+    Motion(motion::Motion),
     /// APE and RPE of an estimated trajectory against the true one, as evo defines them
     Trajectory(trajectory::EvaluateTrajectory),
 }
@@ -46,6 +59,8 @@ impl Evaluate {
     pub async fn run(self) -> anyhow::Result<()> {
         match (self.what, self.navigation) {
             (Some(What::Odometry(odometry)), _) => odometry.run().await,
+            (Some(What::Localization(localization)), _) => localization.run().await,
+            (Some(What::Motion(motion)), _) => motion.run().await,
             (Some(What::Trajectory(trajectory)), _) => trajectory.run(),
             (None, Some(navigation)) => navigation.run().await,
             (None, None) => {
@@ -177,6 +192,10 @@ impl Navigation {
         say_caveats(&protocol, &record, navigator.room().id(), leak);
         say(evaluation_table(&report).trim_end());
 
+        let learned_here = trained_on == TrainedOn::TheseFrames;
+        let motion = motion_baselines(&navigator, &features, &record, &protocol, learned_here)?;
+        say(baselines_text(&motion));
+
         if let Some(path) = &self.json {
             // The file says what was evaluated and whether it leaks, so that it can be judged by
             // itself.
@@ -197,7 +216,7 @@ impl Navigation {
                 in_room,
                 leaks: leak.is_some(),
             };
-            write_json(path, &evaluation_json(&report, context))?;
+            write_json(path, &evaluation_json(&report, &motion, context))?;
 
             say(format_args!("wrote {}", path.display()));
         }
@@ -218,6 +237,29 @@ impl Navigation {
             navigators: navigators_named(&self.navigators)?,
         })
     }
+}
+
+/// How well the adapter reads the motions of the test pairs, beside the simplest answers.
+fn motion_baselines(
+    navigator: &Navigator,
+    features: &Features,
+    record: &TrainingRecord,
+    protocol: &Protocol,
+    learned_here: bool,
+) -> anyhow::Result<MotionBaselines> {
+    let room = navigator.room();
+    let adapter = navigator.adapter();
+    let test = TestPairs {
+        split: protocol.split,
+        stride: protocol.stride,
+    };
+
+    let pairs = test.split.test_pairs(room.timeline(), test.stride)?;
+    let predicted = predictions(adapter, features.rows(), &pairs)?;
+    Ok(MotionBaselines {
+        motion: MotionScores::of(&motions(room.poses(), &pairs), &predicted),
+        baselines: Baselines::of(adapter, record, room, &test, learned_here)?,
+    })
 }
 
 /// Prints what a reader of the table must know: several steps per motion, and leaks.
@@ -295,7 +337,9 @@ async fn choose(
                 .rooms
                 .iter()
                 .any(|(room, _)| room.as_str() == wanted.room)
-            && split.is_none_or(|split| split == stored.record.split);
+            && split.is_none_or(|split| split == stored.record.split)
+            // A fitted adapter has learned from every frame: its scores here would say nothing.
+            && stored.room_fit.is_none();
 
         if fits {
             fitting.push(stored);

@@ -241,7 +241,10 @@ impl Layers {
 
     fn layer_protocol(&self) -> LayerProtocol {
         let mut plan = TrainingPlan::of(self.preset, self.split, self.stride, 0);
-        plan.config.epochs = self.epochs.unwrap_or(plan.config.epochs);
+        if let Some(epochs) = self.epochs {
+            plan.config.epochs = epochs;
+            plan.least_steps = 0;
+        }
 
         LayerProtocol {
             mutual_knn: MutualKnn {

@@ -238,6 +238,13 @@ impl<T: Real> Mixture<T> {
         }
     }
 
+    /// Undoes [`Mixture::fold_standardisation`].
+    pub(super) fn unfold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
+        for chart in &mut self.charts {
+            chart.phi.unfold_standardisation(mean, deviation);
+        }
+    }
+
     /// How the charts are mixed.
     pub fn mixing(&self) -> Mixing {
         if self.charts.len() > 1 && self.gate.is_none() {

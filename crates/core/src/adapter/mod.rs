@@ -39,9 +39,9 @@ pub use phi::{Phi, Widths};
 pub use preset::{PairPlan, Preset};
 pub use real::Real;
 pub use record::TrainingRecord;
-pub use samples::Samples;
+pub use samples::{Samples, column_scale};
 pub use siamese::{Siamese, TENSOR_NAMES};
-pub use train::{EpochProgress, StepReport, TrainConfig, Trainer, train};
+pub use train::{EpochProgress, StepReport, TrainConfig, Trainer, train, train_further};
 pub use trained::Adapter;
 pub use whitener::Whitener;
 

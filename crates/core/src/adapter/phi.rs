@@ -91,6 +91,11 @@ impl<T: Real> Phi<T> {
         self.tensors[0].ncols()
     }
 
+    /// Width of the hidden layer.
+    pub fn hidden_dim(&self) -> usize {
+        self.tensors[0].nrows()
+    }
+
     /// Columns of a latent, k.
     pub fn latent_dim(&self) -> usize {
         self.tensors[4].nrows()
@@ -138,6 +143,17 @@ impl<T: Real> Phi<T> {
         let bias = wide(first_bias) - wide(mean).dot(&weight.t());
         *first_weight = weight.mapv(T::of);
 
+        *first_bias = bias.mapv(T::of);
+    }
+
+    /// Undoes [`Phi::fold_standardisation`]: a φ of features z becomes one of (z − m)/s.
+    pub(super) fn unfold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
+        let [first_weight, first_bias, ..] = &mut self.tensors;
+
+        let wide = |tensor: &Array2<T>| tensor.mapv(|x| x.f64());
+        let weight = wide(first_weight);
+        let bias = wide(first_bias) + wide(mean).dot(&weight.t());
+        *first_weight = (weight * &wide(deviation)).mapv(T::of);
         *first_bias = bias.mapv(T::of);
     }
 

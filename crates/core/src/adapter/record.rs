@@ -1,6 +1,6 @@
 //! How an adapter was trained, recorded with it so that the run can be reproduced.
 
-use super::{PairPlan, TrainConfig};
+use super::{Mixing, PairPlan, TrainConfig};
 use crate::motion_scores::MotionScores;
 use crate::room::RoomId;
 use crate::splits::Split;
@@ -34,4 +34,20 @@ pub struct TrainingRecord {
     /// R² on the test pairs of a constant prediction, the mean of the training twists. The mean
     /// over rooms.
     pub train_mean_r2: f64,
+}
+
+impl TrainingRecord {
+    /// How many steps the optimiser took: the batches of an epoch times the epochs. The charts of an
+    /// ensemble share the epochs.
+    pub fn optimiser_steps(&self) -> u64 {
+        let batches = self.pair_count.div_ceil(self.config.batch.max(1)) as u64;
+        let is_ensemble = self.config.charts > 1 && self.config.mixing == Mixing::Even;
+        let epochs = if is_ensemble {
+            self.config.epochs.div_ceil(self.config.charts) * self.config.charts
+        } else {
+            self.config.epochs
+        };
+
+        batches * epochs as u64
+    }
 }

@@ -1,6 +1,6 @@
 //! Training data: features, poses and pairs of frames.
 
-use ndarray::{Array2, ArrayBase, ArrayView2, Axis, Data, Ix2};
+use ndarray::{Array1, Array2, ArrayBase, ArrayView2, Axis, Data, Ix2};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -67,6 +67,22 @@ impl<T: Real> Samples<T> {
     pub fn through_zero(self) -> Result<Self, Error> {
         let scale = TargetScale::about_zero(&self.twists);
 
+        let Self {
+            features,
+            poses,
+            pairs,
+            twists,
+            ..
+        } = self;
+
+        Self::scaled(features, poses, pairs, twists, scale)
+    }
+
+    /// The same samples with targets of another scale, that of a network which goes on learning.
+    ///
+    /// # Errors
+    /// [`Error::NoMotion`] when the camera moves by the scale's mean in every pair.
+    pub fn with_scale(self, scale: TargetScale) -> Result<Self, Error> {
         let Self {
             features,
             poses,
@@ -199,16 +215,8 @@ impl Samples<f32> {
 
         let rows: Vec<usize> = (0..used.len()).filter(|&row| used[row]).collect();
         let known = self.features.select(Axis(0), &rows).mapv(f64::from);
-        let count = rows.len().max(1) as f64;
-        let mean = known.sum_axis(Axis(0)) / count;
-        let variance = (&known - &mean).mapv(|x| x * x).sum_axis(Axis(0)) / count;
-
-        // A column that hardly varies in these frames holds rounding errors. Scaled up to unit
-        // variance, it would dominate the others in a room in which it does vary.
-        let spreads: Vec<f64> = variance.iter().map(|x| x.sqrt()).collect();
-        let least = (LEAST_SPREAD * median(&spreads)).max(f64::MIN_POSITIVE);
-        let deviation = variance.mapv(|x| x.sqrt().max(least));
-        let row = |values: ndarray::Array1<f64>| values.mapv(|x| x as f32).insert_axis(Axis(0));
+        let (mean, deviation) = column_scale(known.view());
+        let row = |values: Array1<f64>| values.mapv(|x| x as f32).insert_axis(Axis(0));
         let mean = row(mean);
 
         let deviation = row(deviation);
@@ -283,6 +291,35 @@ impl<T: Real> Batch<T> {
 
         d_rows
     }
+}
+
+/// The mean and the deviation of each column of `rows` (n, d), by which features are z-scored, each
+/// (d,).
+///
+/// A column that hardly varies in these rows holds rounding errors. Scaled up to unit variance, it
+/// would dominate the others in a room in which it does vary: its deviation is a thousandth of the
+/// median of the columns'.
+pub fn column_scale(rows: ArrayView2<'_, f64>) -> (Array1<f64>, Array1<f64>) {
+    let count = rows.nrows().max(1) as f64;
+    let mean = rows.sum_axis(Axis(0)) / count;
+    let variance = (&rows - &mean).mapv(|x| x * x).sum_axis(Axis(0)) / count;
+
+    let spreads: Vec<f64> = variance.iter().map(|x| x.sqrt()).collect();
+    let middle = match median(&spreads) {
+        // Most columns are constant: the median of the others has to do, if there are any.
+        0.0 => {
+            let known: Vec<f64> = spreads.iter().copied().filter(|&x| x > 0.0).collect();
+            if known.is_empty() {
+                1.0
+            } else {
+                median(&known)
+            }
+        }
+        middle => middle,
+    };
+
+    let deviation = variance.mapv(|x| x.sqrt().max(LEAST_SPREAD * middle));
+    (mean, deviation)
 }
 
 #[cfg(test)]

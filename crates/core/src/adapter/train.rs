@@ -266,6 +266,40 @@ pub fn train(
     Mixture::even(charts)
 }
 
+/// Goes on training a network of one chart, on samples whose targets have the network's own scale.
+/// The settings' widths, charts and seed of weights play no role.
+///
+/// # Errors
+/// [`Error::Diverged`] when the loss stops being finite, [`Error::Charts`] when the network has
+/// more than one chart.
+pub fn train_further(
+    samples: &Samples<f32>,
+    start: &Mixture<f32>,
+    config: &TrainConfig,
+    progress: &mut dyn FnMut(EpochProgress),
+) -> Result<Mixture<f32>, Error> {
+    if start.chart_count() != 1 {
+        return Err(Error::Charts {
+            count: start.chart_count(),
+        });
+    }
+
+    let mut random = Seeded::new(config.seed);
+    if !config.standardise {
+        return fit(samples, start.clone(), config, &mut random, progress);
+    }
+
+    // The network takes features as the encoder gives them: it is turned into one of z-scored
+    // features, trained, and turned back.
+    let (standardised, [mean, deviation]) = samples.standardised();
+    let mut unfolded = start.clone();
+    unfolded.unfold_standardisation(&mean, &deviation);
+
+    let mut network = fit(&standardised, unfolded, config, &mut random, progress)?;
+    network.fold_standardisation(&mean, &deviation);
+    Ok(network)
+}
+
 /// Distance between the seeds of two successive members of an ensemble.
 const MEMBER_SEED_STEP: u32 = 0x0100_0193;
 

@@ -24,6 +24,8 @@ mod robust_covariance;
 
 use std::sync::Arc;
 
+pub use robust_covariance::robust_covariance;
+
 use error_covariance::error_covariance;
 use map_pose_factor::map_pose_factor;
 

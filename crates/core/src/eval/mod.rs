@@ -1,10 +1,12 @@
 //! Hit@ε on held-out pairs: every navigator beside baselines that put its numbers into perspective.
 
+mod baselines;
 mod leak;
 mod navigators;
 mod predictions;
 mod retrieval;
 
+pub use baselines::{Baselines, LEAST_CONSTANT_R2, TestPairs};
 pub use leak::{Leak, TrainedOn, has_seen, is_calibrated_in};
 pub use navigators::{Protocol, Report, Row, evaluate};
 pub use predictions::{Prediction, PredictionScope, score_predictions};

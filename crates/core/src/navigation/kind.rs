@@ -41,15 +41,15 @@ impl NavigatorKind {
     }
 
     /// The default rows of the table for an adapter: the baselines, the three readings of inverse
-    /// Poincaré, the adapter's correctors, the refits on unscaled motions, and inverse Poincaré
+    /// Poincaré, the adapter's correctors, the refits on z-scored and on unscaled motions, and inverse Poincaré
     /// under the other metrics that the adapter supports.
     pub fn table(adapter: &Adapter) -> Vec<Self> {
         let full = |step: StepKind| Self::Step(step, RetrievalMetric::Full);
         let corrector = |kind: CorrectorKind| full(StepKind::Corrector(kind));
 
-        let refit = |in_sample: bool| {
+        let refit = |z_scored: bool, in_sample: bool| {
             full(StepKind::Refit(Refit {
-                z_scored: false,
+                z_scored,
                 intercept: false,
                 in_sample,
             }))
@@ -72,7 +72,12 @@ impl NavigatorKind {
         let mut rows = vec![Self::Identity, Self::Random, Self::Oracle];
         rows.extend(Reading::ALL.map(|reading| full(StepKind::InversePoincare(reading))));
         rows.extend(adapter.correctors().map(|known| corrector(known.kind())));
-        rows.extend([refit(false), refit(true)]);
+        rows.extend([
+            refit(true, false),
+            refit(true, true),
+            refit(false, false),
+            refit(false, true),
+        ]);
 
         rows.extend(others.map(|metric| Self::Step(affine, metric)));
 

@@ -83,6 +83,8 @@ pub struct TrainingPlan {
     /// The optimiser's settings, and the seed of the weights, of the order of pairs, and of drawn
     /// pairs.
     pub config: TrainConfig,
+    /// The fewest optimiser steps: where the epochs of `config` are fewer, there are more of them.
+    pub least_steps: usize,
     /// Correctors to train after the adapter for [`CORRECTOR_EPOCHS`] epochs, by mean squared error
     /// on its latents, with the adapter's learning rate, weight decay, batch size and seed.
     pub correctors: Vec<CorrectorKind>,
@@ -100,6 +102,7 @@ impl TrainingPlan {
             stride,
             pairs,
             config,
+            least_steps: preset.least_steps(),
             correctors: Vec::new(),
         }
     }
@@ -110,6 +113,15 @@ impl TrainingPlan {
         let mut plan = self.clone();
         plan.config.seed = seed;
         plan
+    }
+
+    /// The optimiser's settings for so many pairs: with the epochs that the fewest steps take.
+    pub fn config_for(&self, pair_count: usize) -> TrainConfig {
+        let batches = pair_count.div_ceil(self.config.batch.max(1)).max(1);
+        TrainConfig {
+            epochs: self.config.epochs.max(self.least_steps.div_ceil(batches)),
+            ..self.config.clone()
+        }
     }
 
     /// Checks that the settings are in range and fit together.
@@ -228,7 +240,8 @@ pub fn train_adapter(
     // Test pairs are taken before training, so that a room that is too short is refused at once.
     let tests = test_pairs(room_data, plan)?;
     let samples = samples(room_data, plan)?;
-    let network = train(&samples, &plan.config, progress)?;
+    let trained_with = plan.config_for(samples.pair_count());
+    let network = train(&samples, &trained_with, progress)?;
     let adapter = Adapter::new(
         room_data[0].features.source().clone(),
         network,
@@ -279,7 +292,7 @@ pub fn train_adapter(
             .map(|data| (data.room.id().clone(), data.revision))
             .collect(),
         calibrated_on: Vec::new(),
-        config: plan.config.clone(),
+        config: trained_with,
         pair_count: samples.pair_count(),
         test: MotionScores::mean(&room_tests),
         room_tests,

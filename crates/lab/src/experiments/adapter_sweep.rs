@@ -192,6 +192,7 @@ fn settings(plan: &TrainingPlan) -> String {
         stride,
         pairs,
         config,
+        least_steps,
         correctors,
     } = plan;
     let TrainConfig {
@@ -214,7 +215,7 @@ fn settings(plan: &TrainingPlan) -> String {
 
     let correctors: Vec<&str> = correctors.iter().map(|kind| kind.name()).collect();
     format!(
-        "preset={} split={} stride={stride} pairs=[{}] epochs={epochs} batch={batch} \
+        "preset={} split={} stride={stride} pairs=[{}] epochs={epochs} least_steps={least_steps} batch={batch} \
          learning_rate={learning_rate:e} weight_decay={weight_decay:e} clip_norm={clip_norm:e} \
          hidden={hidden} geo_dim={latent} charts={charts} mixing={} loss={} \
          standardise={standardise} noise={noise:e} average={average:e} \

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use seese3_core::adapter::{Adapter, TrainingRecord};
 use seese3_core::calibration::calibrate_retrieval;
 use seese3_core::cancel::Cancellation;
-use seese3_core::eval::{Protocol, Row, evaluate};
+use seese3_core::eval::{Baselines, Protocol, Row, TestPairs, evaluate};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::navigation::{IndexKind, Navigator, NavigatorKind};
 use seese3_core::room::RoomId;
@@ -36,6 +36,8 @@ pub struct RoomOutcome {
     pub rows: Vec<Row>,
     /// Number of frames among which answers were searched for.
     pub candidate_count: usize,
+    /// What R² has to be read beside.
+    pub baselines: Baselines,
 }
 
 impl RoomOutcome {
@@ -153,6 +155,7 @@ pub fn train_and_test(
     };
     for outcome in outcomes(
         &Arc::new(adapter.clone()),
+        &record,
         held_out,
         plan.protocol,
         progress.room,
@@ -181,13 +184,14 @@ fn names(rooms: &[RoomData<'_>]) -> Vec<String> {
 /// rooms; a room that cannot be evaluated gives its error. `done` is called after each room.
 pub fn outcomes(
     adapter: &Arc<Adapter>,
+    record: &TrainingRecord,
     room_data: &[RoomData<'_>],
     protocol: &Protocol,
     done: &(dyn Fn() + Sync),
 ) -> Vec<Result<RoomOutcome, (RoomId, Error)>> {
     let of = |data: &RoomData<'_>| {
-        let outcome =
-            outcome(adapter, data, protocol).map_err(|error| (data.room.id().clone(), error));
+        let outcome = outcome(adapter, record, data, protocol)
+            .map_err(|error| (data.room.id().clone(), error));
         done();
         outcome
     };
@@ -196,6 +200,7 @@ pub fn outcomes(
 
 fn outcome(
     adapter: &Arc<Adapter>,
+    record: &TrainingRecord,
     data: &RoomData<'_>,
     protocol: &Protocol,
 ) -> Result<RoomOutcome, Error> {
@@ -225,6 +230,16 @@ fn outcome(
         motion: MotionScores::of(&motions(room.poses(), &pairs), &predicted),
         rows: report.rows,
         candidate_count: report.candidate_count,
+        baselines: Baselines::of(
+            adapter,
+            record,
+            &room,
+            &TestPairs {
+                split: protocol.split,
+                stride: protocol.stride,
+            },
+            false,
+        )?,
     })
 }
 
@@ -259,8 +274,10 @@ pub struct MotionSummary {
     pub above_0_3: Rate,
     /// The largest overall R².
     pub best: f64,
-    /// Mean of max(R², −1).
+    /// Mean of max(R², −1), ours: it still tells bad from worse.
     pub clipped: RoomMean,
+    /// Mean of max(R², 0), the paper's.
+    pub clipped_at_zero: RoomMean,
 }
 
 impl MotionSummary {
@@ -270,13 +287,17 @@ impl MotionSummary {
         let known: Vec<f64> = r2.iter().copied().filter(|r2| !r2.is_nan()).collect();
         let above =
             |least: f64| Rate::of(known.iter().filter(|&&r2| r2 > least).count(), known.len());
-        let clipped: Vec<f64> = known.iter().map(|r2| r2.max(CLIPPED_R2)).collect();
+        let clipped_at = |least: f64| {
+            let clipped: Vec<f64> = known.iter().map(|r2| r2.max(least)).collect();
+            bootstrap_mean(&clipped, seed)
+        };
 
         (!known.is_empty()).then(|| Self {
             positive: above(0.0),
             above_0_3: above(0.3),
             best: known.iter().copied().fold(f64::NEG_INFINITY, f64::max),
-            clipped: bootstrap_mean(&clipped, seed),
+            clipped: clipped_at(CLIPPED_R2),
+            clipped_at_zero: clipped_at(0.0),
         })
     }
 }
@@ -326,6 +347,12 @@ mod tests {
             motion: MotionScores::of(&[], &[]),
             rows: vec![row("identity", identity), row("ours", ours)],
             candidate_count: 10,
+            baselines: Baselines {
+                constant_r2: 0.0,
+                variance_ratio: 1.0,
+                nearest_pose: None,
+                optimiser_steps: 1,
+            },
         };
         let won = wins(&[outcome(5, 4), outcome(3, 4), outcome(4, 4)], "ours").unwrap();
 

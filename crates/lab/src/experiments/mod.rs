@@ -5,6 +5,8 @@
 //! - [`formulations`]: the adapter beside the paper's alternatives.
 //! - [`adapter_sweep`]: a grid of adapters, one row per run.
 //! - [`cross_room`]: an adapter in rooms that it never saw.
+//! - [`localization`]: single views in a partly mapped room.
+//! - [`motion`]: the motion between two views, beside the simplest answers.
 //! - [`odometry`]: a tracker along held-out frames.
 //! - [`path_comparison`]: an estimated path against a reference.
 //!
@@ -15,12 +17,16 @@ pub mod adapter_sweep;
 pub mod cross_room;
 pub mod formulations;
 pub mod layers;
+pub mod localization;
+pub mod motion;
 pub mod odometry;
 pub mod path_comparison;
 pub mod probe;
 pub mod seeds;
 
-use seese3_core::{adapter, calibration, eval, navigation, splits, tracking, training, trajectory};
+use seese3_core::{
+    adapter, calibration, eval, fitting, navigation, splits, tracking, training, trajectory,
+};
 
 use crate::probes;
 
@@ -37,6 +43,9 @@ pub enum Error {
     /// An adapter's errors could not be measured.
     #[error(transparent)]
     Calibration(#[from] calibration::Error),
+    /// An adapter could not be fitted to a room, or a view not located in it.
+    #[error(transparent)]
+    Fitting(#[from] fitting::Error),
     /// A room could not be navigated in.
     #[error(transparent)]
     Navigation(#[from] navigation::Error),

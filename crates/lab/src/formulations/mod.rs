@@ -117,7 +117,7 @@ pub fn train_formulation(
     // One seeded stream draws the initial weights and then the order of the pairs, as PyTorch does
     // after `torch.manual_seed`.
     let mut random = Seeded::new(seed);
-    let config = &plan.config;
+    let config = &plan.config_for(samples.pair_count());
 
     let mut run = Run {
         room_data,

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::json::{MotionJson, RateJson, RoomMeanJson};
+use super::json::{BaselinesJson, MotionJson, RateJson, RoomMeanJson};
 use super::table::aligned;
 use crate::experiments::cross_room::{CrossRoomRun, MotionSummary, RoomOutcome, wins};
 use seese3_core::statistics::{RoomMean, bootstrap_mean, paired_difference};
@@ -63,6 +63,7 @@ pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str, threshold: f64) -> S
         "R² > 0.3",
         "best R²",
         "mean max(R², −1)",
+        "mean max(R², 0)",
     ]
     .map(str::to_owned)
     .to_vec();
@@ -80,6 +81,7 @@ pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str, threshold: f64) -> S
             above_0_3,
             best,
             clipped,
+            clipped_at_zero,
         } = summary;
 
         lines.push(vec![
@@ -94,6 +96,7 @@ pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str, threshold: f64) -> S
             format!("{:.0} %", 100.0 * above_0_3.rate),
             format!("{best:.3}"),
             room_mean_text(&clipped),
+            room_mean_text(&clipped_at_zero),
             room_mean_text(&bootstrap_mean(&run.hit_rates(baseline), 0)),
         ]);
     }
@@ -101,11 +104,11 @@ pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str, threshold: f64) -> S
     aligned(&lines)
 }
 
-/// One line per room: the number of pairs, R², and each navigator's hit rate.
+/// One line per room: the number of pairs, R², that of the constant, and each navigator's hit rate.
 pub fn rooms_table(run: &CrossRoomRun) -> String {
     let names = run.navigators();
     let mut lines = vec![
-        ["room", "n", "R²"]
+        ["room", "n", "R²", "constant's R²"]
             .into_iter()
             .chain(names.iter().copied())
             .map(str::to_owned)
@@ -117,6 +120,7 @@ pub fn rooms_table(run: &CrossRoomRun) -> String {
             outcome.room.to_string(),
             outcome.motion.n.to_string(),
             format!("{:.3}", outcome.motion.overall),
+            format!("{:.3}", outcome.baselines.constant_r2),
         ];
 
         let rate = |name: &&str| {
@@ -145,6 +149,8 @@ struct RunJson {
     calibration_rooms: Vec<String>,
     seed: u64,
     r2: Option<SummaryJson>,
+    /// Medians over the rooms.
+    baselines: Option<BaselinesJson>,
     navigators: Vec<NavigatorJson>,
     rooms: Vec<RoomJson>,
     skipped: Vec<SkippedJson>,
@@ -156,7 +162,10 @@ struct SummaryJson {
     #[serde(rename = "above_0.3")]
     above_0_3: RateJson,
     best: f64,
+    /// The mean of max(R², −1).
     clipped_mean: RoomMeanJson,
+    /// The mean of max(R², 0), as the paper takes it.
+    clipped_mean_at_0: RoomMeanJson,
 }
 
 #[derive(Debug, Serialize)]
@@ -172,6 +181,7 @@ struct RoomJson {
     room: String,
     candidates: usize,
     motion: MotionJson,
+    baselines: BaselinesJson,
     /// By navigator.
     hit: BTreeMap<String, RateJson>,
 }
@@ -207,6 +217,7 @@ fn run_json(run: &CrossRoomRun, baseline: &str) -> RunJson {
         above_0_3: (&summary.above_0_3).into(),
         best: summary.best,
         clipped_mean: (&summary.clipped).into(),
+        clipped_mean_at_0: (&summary.clipped_at_zero).into(),
     });
 
     let skipped = run.skipped.iter().map(|(room, why)| SkippedJson {
@@ -219,6 +230,7 @@ fn run_json(run: &CrossRoomRun, baseline: &str) -> RunJson {
         calibration_rooms: run.calibration_rooms.clone(),
         seed: run.seed,
         r2: summary,
+        baselines: BaselinesJson::medians(run.outcomes.iter().map(|outcome| &outcome.baselines)),
         navigators: run.navigators().into_iter().map(navigator).collect(),
         rooms: run.outcomes.iter().map(room_json).collect(),
         skipped: skipped.collect(),
@@ -235,6 +247,7 @@ fn room_json(outcome: &RoomOutcome) -> RoomJson {
         room: outcome.room.to_string(),
         candidates: outcome.candidate_count,
         motion: (&outcome.motion).into(),
+        baselines: (&outcome.baselines).into(),
         hit: rates.collect(),
     }
 }

@@ -4,9 +4,10 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::json::RateJson;
+use super::json::{BaselinesJson, MotionJson, RateJson};
 use super::table::aligned;
-use seese3_core::eval::{PoseRecall, Report, RetrievalScores, Row};
+use seese3_core::eval::{Baselines, PoseRecall, Report, RetrievalScores, Row};
+use seese3_core::motion_scores::MotionScores;
 use seese3_core::statistics::Rate;
 
 /// Two tables with one line per navigator: first Hit@ε with 95 % intervals beside the scores of the
@@ -121,9 +122,49 @@ pub struct AdapterJson {
     pub seed: u64,
 }
 
+/// How well the adapter reads the motions of the test pairs, and what that has to be read beside.
+#[derive(Debug, Clone, Copy)]
+pub struct MotionBaselines {
+    /// R² of the read motions.
+    pub motion: MotionScores,
+    /// The simplest answers, and how much there was to learn from.
+    pub baselines: Baselines,
+}
+
+/// The adapter's R² of motions beside the constant's, as a line of text.
+pub fn baselines_text(found: &MotionBaselines) -> String {
+    let Baselines {
+        constant_r2,
+        variance_ratio,
+        nearest_pose,
+        optimiser_steps,
+    } = found.baselines;
+
+    let nearest = nearest_pose.map_or_else(String::new, |nearest| {
+        format!(
+            ", nearest training pose {:.2} m and {:.0}°",
+            nearest.translation_m,
+            nearest.rotation_rad.to_degrees()
+        )
+    });
+    let verdict = if found.baselines.can_tell() {
+        ""
+    } else {
+        "; the constant is so far below 0 that these pairs cannot tell how good the adapter is"
+    };
+
+    format!(
+        "R² of motions {:.3}; of always answering the mean training motion {constant_r2:.3} (variance of test over \
+         training motions {variance_ratio:.2}{nearest}; {optimiser_steps} optimiser steps){verdict}",
+        found.motion.overall
+    )
+}
+
 /// The record of `seese3 evaluate`.
 #[derive(Debug, Serialize)]
 pub struct EvaluationJson {
+    motion: MotionJson,
+    baselines: BaselinesJson,
     navigators: Vec<NavigatorJson>,
     protocol: ProtocolJson,
 }
@@ -183,10 +224,16 @@ struct RecallJson {
 }
 
 /// The record of an evaluation.
-pub fn evaluation_json(report: &Report, context: EvaluationContext) -> EvaluationJson {
+pub fn evaluation_json(
+    report: &Report,
+    motion: &MotionBaselines,
+    context: EvaluationContext,
+) -> EvaluationJson {
     let protocol = &report.protocol;
 
     EvaluationJson {
+        motion: (&motion.motion).into(),
+        baselines: (&motion.baselines).into(),
         navigators: report.rows.iter().map(navigator_json).collect(),
         protocol: ProtocolJson {
             split: protocol.split.name(),

@@ -2,8 +2,9 @@
 
 use serde::Serialize;
 
+use seese3_core::eval::Baselines;
 use seese3_core::motion_scores::MotionScores;
-use seese3_core::statistics::{Rate, RoomMean, deviation, mean};
+use seese3_core::statistics::{Rate, RoomMean, deviation, mean, median};
 
 /// A rate with Wilson's 95 % interval.
 #[derive(Debug, Clone, Serialize)]
@@ -119,5 +120,52 @@ impl PartsJson {
             direction: spread(|run| run.direction),
             magnitude: spread(|run| run.magnitude),
         }
+    }
+}
+
+/// What an R² has to be read beside.
+#[derive(Debug, Clone, Serialize)]
+pub struct BaselinesJson {
+    constant_r2: f64,
+    variance_ratio: f64,
+    nearest_pose: Option<NearestPoseJson>,
+    optimiser_steps: u64,
+    /// False where the constant is so far below zero that the recording tells nothing of an adapter.
+    can_tell: bool,
+}
+
+/// Medians from the tested frames to the nearest training poses.
+#[derive(Debug, Clone, Serialize)]
+struct NearestPoseJson {
+    m: f64,
+    deg: f64,
+}
+
+impl From<&Baselines> for BaselinesJson {
+    fn from(baselines: &Baselines) -> Self {
+        Self {
+            constant_r2: baselines.constant_r2,
+            variance_ratio: baselines.variance_ratio,
+            nearest_pose: baselines.nearest_pose.map(|nearest| NearestPoseJson {
+                m: nearest.translation_m,
+                deg: nearest.rotation_rad.to_degrees(),
+            }),
+            optimiser_steps: baselines.optimiser_steps,
+            can_tell: baselines.can_tell(),
+        }
+    }
+}
+
+impl BaselinesJson {
+    /// The medians over rooms that one adapter never saw; none without rooms.
+    pub fn medians<'a>(rooms: impl Iterator<Item = &'a Baselines> + Clone) -> Option<Self> {
+        let first = *rooms.clone().next()?;
+        let middle = |of: fn(&Baselines) -> f64| median(&rooms.clone().map(of).collect::<Vec<_>>());
+
+        Some(Self::from(&Baselines {
+            constant_r2: middle(|room| room.constant_r2),
+            variance_ratio: middle(|room| room.variance_ratio),
+            ..first
+        }))
     }
 }

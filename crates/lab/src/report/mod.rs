@@ -12,6 +12,7 @@ mod evaluation;
 mod formulations;
 mod json;
 mod layers;
+mod localization;
 mod odometry;
 mod path_errors;
 mod plot;
@@ -31,11 +32,16 @@ pub use cross_room::{
 pub use curves::{Curves, Series, curves_svg};
 pub use document::{Block, Document, Picture, Section};
 pub use evaluation::{
-    AdapterJson, EvaluationContext, EvaluationJson, RoomJson, evaluation_json, evaluation_table,
+    AdapterJson, EvaluationContext, EvaluationJson, MotionBaselines, RoomJson, baselines_text,
+    evaluation_json, evaluation_table,
 };
 pub use formulations::{FormulationsJson, formulations_json, formulations_table};
-pub use json::{MotionJson, PartsJson, RateJson, RoomMeanJson};
+pub use json::{BaselinesJson, MotionJson, PartsJson, RateJson, RoomMeanJson};
 pub use layers::{LayersJson, encoders_table, layers_json, layers_table};
+pub use localization::{
+    LocalizationContext, LocalizationJson, MotionEvaluationJson, localization_json,
+    localization_table, motion_evaluation_json, motion_table,
+};
 pub use odometry::{
     OdometryJson, coverage_table, odometry_json, odometry_table, other_rooms_text,
     relocalisation_text,

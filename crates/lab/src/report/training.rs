@@ -110,6 +110,7 @@ struct ProtocolJson {
     /// The shortest and the longest stride of the training pairs, if they were drawn from a range.
     drawn_from_strides: Option<[u32; 2]>,
     epochs: usize,
+    optimiser_steps: u64,
     batch: usize,
     learning_rate: f64,
     weight_decay: f64,
@@ -185,6 +186,7 @@ fn protocol_json(record: &TrainingRecord) -> ProtocolJson {
             PairPlan::Range(range) => Some([range.low, range.high]),
         },
         epochs: config.epochs,
+        optimiser_steps: record.optimiser_steps(),
         batch: config.batch,
         learning_rate: config.learning_rate,
         weight_decay: config.weight_decay,

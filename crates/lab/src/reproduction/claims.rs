@@ -23,6 +23,8 @@ pub enum Verdict {
     Contradicted,
     /// The claim holds for some feature sets or rooms and not for others.
     Mixed,
+    /// No case could have come out otherwise: the simplest answers fail there too.
+    CannotTell,
     /// There was no case to test the claim on.
     Untested,
 }
@@ -39,14 +41,38 @@ impl Verdict {
         }
     }
 
+    /// As [`Verdict::of`], over the cases that can tell: `None` is a case in which no method could
+    /// have succeeded.
+    pub fn of_telling(cases: &[Option<bool>]) -> Self {
+        let telling: Vec<bool> = cases.iter().copied().flatten().collect();
+        if telling.is_empty() && !cases.is_empty() {
+            return Self::CannotTell;
+        }
+        Self::of(&telling)
+    }
+
     fn word(self) -> &'static str {
         match self {
             Self::Confirmed => "confirmed",
             Self::Contradicted => "contradicted",
             Self::Mixed => "mixed",
+            Self::CannotTell => "cannot be told here",
             Self::Untested => "not tested",
         }
     }
+}
+
+/// How many cases a claim holds in, and how many cannot tell, in words.
+pub fn count_words(cases: &[Option<bool>], of_what: &str) -> String {
+    let telling: Vec<bool> = cases.iter().copied().flatten().collect();
+    let held = telling.iter().filter(|&&held| held).count();
+    let silent = cases.len() - telling.len();
+
+    let mut words = format!("so in {held} of {} {of_what}", telling.len());
+    if silent > 0 {
+        words.push_str(&format!("; {silent} more cannot tell"));
+    }
+    words
 }
 
 /// The table of claims, one row per claim.
@@ -87,4 +113,25 @@ pub fn records(claims: &[Claim]) -> Vec<ClaimRecord> {
     };
 
     claims.iter().map(record).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the words of the verdicts.
+    #[test]
+    fn cases_that_cannot_tell_decide_nothing() {
+        let word = |cases: &[Option<bool>]| Verdict::of_telling(cases).word();
+        assert_eq!(word(&[Some(true), None]), "confirmed");
+        assert_eq!(word(&[Some(false), None]), "contradicted");
+        assert_eq!(word(&[Some(false), Some(true)]), "mixed");
+        assert_eq!(word(&[None, None]), "cannot be told here");
+        assert_eq!(word(&[]), "not tested");
+
+        assert_eq!(
+            count_words(&[Some(true), Some(false), None], "rooms"),
+            "so in 1 of 2 rooms; 1 more cannot tell"
+        );
+    }
 }

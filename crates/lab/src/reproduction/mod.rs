@@ -265,7 +265,7 @@ pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced
 
 impl Reproduction<'_> {
     /// A preset at a stride. Its epochs are the command's `--epochs`, else `epochs`, else the
-    /// preset's own.
+    /// preset's own; only the last have a floor in steps.
     fn plan(
         &self,
         preset: Preset,
@@ -277,9 +277,20 @@ impl Reproduction<'_> {
         let mut plan = TrainingPlan::of(preset, split, stride, seed);
         if let Some(epochs) = self.options.epochs.or(epochs) {
             plan.config.epochs = epochs;
+            plan.least_steps = 0;
         }
 
         plan
+    }
+}
+
+impl Reproduction<'_> {
+    /// How long the adapters within a room are trained, in words.
+    fn training_words(&self) -> String {
+        match self.options.epochs {
+            Some(epochs) => format!("Preset base, cut to {epochs} epochs."),
+            None => "Preset base: at least 400 optimiser steps.".to_owned(),
+        }
     }
 }
 

@@ -269,17 +269,20 @@ fn training_plan(given: &Reproduction<'_>, kind: PlanKind) -> TrainingPlan {
 fn navigators(is_calibrated: bool) -> Vec<NavigatorKind> {
     let affine = StepKind::InversePoincare(Reading::Affine);
     let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
-    let refit = StepKind::Refit(Refit {
-        z_scored: false,
-        intercept: false,
-        in_sample: true,
-    });
+    let refit = |z_scored: bool| {
+        StepKind::Refit(Refit {
+            z_scored,
+            intercept: false,
+            in_sample: true,
+        })
+    };
 
     let mut navigators = vec![
         NavigatorKind::Identity,
         NavigatorKind::Step(affine, RetrievalMetric::Full),
         NavigatorKind::Step(homogeneous, RetrievalMetric::Full),
-        NavigatorKind::Step(refit, RetrievalMetric::Full),
+        NavigatorKind::Step(refit(true), RetrievalMetric::Full),
+        NavigatorKind::Step(refit(false), RetrievalMetric::Full),
         NavigatorKind::Step(affine, RetrievalMetric::RowSpace),
         NavigatorKind::Step(affine, RetrievalMetric::Whitened),
     ];

@@ -1,0 +1,151 @@
+//! What an R² of motions has to be read beside: it divides by the variance of the tested motions, so
+//! that it says as much of the recording as of the adapter.
+
+use nalgebra::Vector6;
+
+use crate::adapter::{Adapter, TrainingRecord};
+use crate::geometry::{Pose, PoseError};
+use crate::motion_scores::constant_r2;
+use crate::room::{FrameId, Room};
+use crate::splits::{self, Pair, Split};
+use crate::statistics::{mean_of_known, median};
+use crate::training::motions;
+
+/// A constant that scores below this leaves an adapter no chance: its R² is not informative.
+pub const LEAST_CONSTANT_R2: f64 = -1.0;
+
+/// What an R² of motions has to be read beside.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Baselines {
+    /// R² of answering the mean training motion μ for every pair. Far below zero the tested motions
+    /// are unlike the trained ones, and no adapter can do well.
+    pub constant_r2: f64,
+    /// The variance of the tested motions over that of the trained ones, mean over the components
+    /// that move.
+    pub variance_ratio: f64,
+    /// Median distance and angle from a tested frame to the training frame whose pose is nearest
+    /// (metres and radians alike); none where the adapter did not learn from these frames.
+    pub nearest_pose: Option<PoseError>,
+    /// How many steps the optimiser took.
+    pub optimiser_steps: u64,
+}
+
+impl Baselines {
+    /// The baselines of an adapter's scores on the test pairs of a room; `learned_here` says whether
+    /// it learned from these very frames.
+    ///
+    /// # Errors
+    /// [`splits::Error`] when the room has no test pairs.
+    pub fn of(
+        adapter: &Adapter,
+        record: &TrainingRecord,
+        room: &Room,
+        test: &TestPairs,
+        learned_here: bool,
+    ) -> Result<Self, splits::Error> {
+        let pairs = test.split.test_pairs(room.timeline(), test.stride)?;
+        let truth = motions(room.poses(), &pairs);
+        let scale = adapter.scale();
+
+        let count = truth.len() as f64;
+        let mean = truth
+            .iter()
+            .map(|twist| twist.to_vector())
+            .sum::<Vector6<f64>>()
+            / count;
+        let squares = truth
+            .iter()
+            .map(|twist| (twist.to_vector() - mean).map(|x| x * x));
+        let variance = squares.sum::<Vector6<f64>>() / count;
+        let ratios: Vec<f64> = (0..6)
+            .map(|c| variance[c] / (scale.deviation[c] * scale.deviation[c]))
+            .collect();
+
+        let training_pairs = test.split.train_pairs(room.timeline(), test.stride);
+        let nearest_pose = match training_pairs {
+            Ok(training) if learned_here => nearest_pose(room.poses(), &training, &pairs),
+            _ => None,
+        };
+
+        Ok(Self {
+            constant_r2: constant_r2(&truth, &scale.mean),
+            variance_ratio: mean_of_known(&ratios),
+            nearest_pose,
+            optimiser_steps: record.optimiser_steps(),
+        })
+    }
+
+    /// Whether the recording can tell a good adapter from a bad one at all.
+    pub fn can_tell(&self) -> bool {
+        self.constant_r2 >= LEAST_CONSTANT_R2
+    }
+}
+
+/// Which pairs of a room are tested.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TestPairs {
+    /// How training and test are kept apart.
+    pub split: Split,
+    /// Frames from source to target.
+    pub stride: u32,
+}
+
+/// Medians over the tested frames; none without training frames.
+fn nearest_pose(poses: &[Pose], training: &[Pair], tested: &[Pair]) -> Option<PoseError> {
+    let known = frames(training);
+    let apart = |error: &PoseError| error.translation_m + error.rotation_rad;
+
+    let nearest: Vec<PoseError> = frames(tested)
+        .iter()
+        .filter_map(|frame| {
+            let errors = known
+                .iter()
+                .map(|other| PoseError::between(&poses[frame.row()], &poses[other.row()]));
+            errors.min_by(|a, b| apart(a).total_cmp(&apart(b)))
+        })
+        .collect();
+    if nearest.is_empty() {
+        return None;
+    }
+
+    let metres: Vec<f64> = nearest.iter().map(|error| error.translation_m).collect();
+    let radians: Vec<f64> = nearest.iter().map(|error| error.rotation_rad).collect();
+    Some(PoseError {
+        translation_m: median(&metres),
+        rotation_rad: median(&radians),
+    })
+}
+
+/// The frames at the ends of pairs, each once.
+fn frames(pairs: &[Pair]) -> Vec<FrameId> {
+    let mut frames: Vec<FrameId> = pairs
+        .iter()
+        .flat_map(|pair| [pair.source, pair.target])
+        .collect();
+    frames.sort_unstable();
+    frames.dedup();
+    frames
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand: of a camera that walks on by a metre a frame, tested frames 8 and 9 are one
+    /// and two metres from the last training frame.
+    #[test]
+    fn the_nearest_training_pose_is_found() {
+        let poses: Vec<Pose> = (0..10)
+            .map(|x| Pose::translation(f64::from(x), 0.0, 0.0))
+            .collect();
+        let pair = |source: u32, target: u32| Pair {
+            source: FrameId(source),
+            target: FrameId(target),
+        };
+        let training: Vec<Pair> = (0..7).map(|row| pair(row, row + 1)).collect();
+
+        let found = nearest_pose(&poses, &training, &[pair(8, 9)]).unwrap();
+        assert!((found.translation_m - 1.5).abs() < 1e-12 && found.rotation_rad == 0.0);
+        assert!(nearest_pose(&poses, &[], &[pair(8, 9)]).is_none());
+    }
+}

@@ -1,0 +1,198 @@
+//! Single views located in a partly mapped room, for `seese3 evaluate localization`, and motions
+//! between two views, for `seese3 evaluate motion`.
+
+use serde::Serialize;
+
+use super::table::aligned;
+use crate::experiments::localization::{ErrorQuantiles, Localization, LocalizationErrors};
+use crate::experiments::motion::{MotionErrors, MotionEvaluation};
+
+/// One line per way to locate a view: medians and 90 % quantiles of the errors.
+pub fn localization_table(found: &Localization) -> String {
+    let mut lines = vec![head("located by")];
+    let mut add = |name: &str, errors: &LocalizationErrors| {
+        lines.push(line(name, &errors.translation_m, &errors.rotation_deg));
+    };
+
+    add("ours", &found.ours);
+    add("nearest frame", &found.nearest_frame);
+    add(
+        "nearest pose (the best that retrieval can do)",
+        &found.nearest_pose,
+    );
+    if let Some(zero_shot) = &found.zero_shot {
+        add("the adapter's whole reading", zero_shot);
+    }
+    if let Some(fitted) = &found.fitted {
+        add("the fitted adapter's whole reading", fitted);
+    }
+
+    aligned(&lines)
+}
+
+/// One line per way to read a motion: medians and 90 % quantiles of the errors.
+pub fn motion_table(found: &MotionEvaluation) -> String {
+    let mut lines = vec![head("motion by")];
+    for (name, errors) in [
+        ("the adapter", &found.ours),
+        ("the adapter without its mean motion", &found.without_mean),
+        ("its mean motion alone", &found.constant),
+        ("no motion", &found.no_motion),
+    ] {
+        lines.push(line(name, &errors.translation_m, &errors.rotation_deg));
+    }
+
+    aligned(&lines)
+}
+
+fn head(first: &str) -> Vec<String> {
+    [first, "median m", "90 % m", "median °", "90 % °"]
+        .map(str::to_owned)
+        .to_vec()
+}
+
+fn line(name: &str, metres: &ErrorQuantiles, degrees: &ErrorQuantiles) -> Vec<String> {
+    vec![
+        name.to_owned(),
+        format!("{:.4}", metres.median),
+        format!("{:.3}", metres.p90),
+        format!("{:.2}", degrees.median),
+        format!("{:.1}", degrees.p90),
+    ]
+}
+
+/// What was evaluated.
+#[derive(Debug, Clone, Serialize)]
+pub struct LocalizationContext {
+    /// The room.
+    pub room: String,
+    /// The name of the features.
+    pub features: String,
+    /// The adapter of other rooms, if one was given.
+    pub adapter: Option<String>,
+    /// Every so many frames one was mapped.
+    pub map_every: usize,
+    /// Whether blocks of the recording were not mapped.
+    pub map_blocks: bool,
+    /// The seed of the fitted adapter.
+    pub seed: u64,
+}
+
+/// The record of `seese3 evaluate localization`.
+#[derive(Debug, Serialize)]
+pub struct LocalizationJson {
+    n: usize,
+    mapped: usize,
+    ours: ErrorsJson,
+    nearest_frame: ErrorsJson,
+    nearest_pose: ErrorsJson,
+    zero_shot: Option<ErrorsJson>,
+    fitted: Option<ErrorsJson>,
+    rules: Option<RulesJson>,
+    protocol: LocalizationContext,
+}
+
+/// The record of `seese3 evaluate motion`.
+#[derive(Debug, Serialize)]
+pub struct MotionEvaluationJson {
+    n: usize,
+    ours: ErrorsJson,
+    without_mean: ErrorsJson,
+    constant: ErrorsJson,
+    no_motion: ErrorsJson,
+    room: String,
+    adapter: String,
+    stride: u32,
+    /// Whether the adapter was trained in this room.
+    in_room: bool,
+}
+
+#[derive(Debug, Serialize)]
+struct ErrorsJson {
+    translation_m: QuantilesJson,
+    rotation_deg: QuantilesJson,
+}
+
+#[derive(Debug, Serialize)]
+struct QuantilesJson {
+    median: f64,
+    p90: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct RulesJson {
+    /// The shares of views whose translation and rotation were the nearest frame's own.
+    translation_unread: f64,
+    rotation_unread: f64,
+    /// The shares of errors within the stated 68 % and 95 % ellipsoids.
+    coverage_68: f64,
+    coverage_95: f64,
+}
+
+impl From<&LocalizationErrors> for ErrorsJson {
+    fn from(errors: &LocalizationErrors) -> Self {
+        Self {
+            translation_m: (&errors.translation_m).into(),
+            rotation_deg: (&errors.rotation_deg).into(),
+        }
+    }
+}
+
+impl From<&MotionErrors> for ErrorsJson {
+    fn from(errors: &MotionErrors) -> Self {
+        Self {
+            translation_m: (&errors.translation_m).into(),
+            rotation_deg: (&errors.rotation_deg).into(),
+        }
+    }
+}
+
+impl From<&ErrorQuantiles> for QuantilesJson {
+    fn from(quantiles: &ErrorQuantiles) -> Self {
+        Self {
+            median: quantiles.median,
+            p90: quantiles.p90,
+        }
+    }
+}
+
+/// The record of located views.
+pub fn localization_json(found: &Localization, protocol: LocalizationContext) -> LocalizationJson {
+    LocalizationJson {
+        n: found.asked,
+        mapped: found.mapped,
+        ours: (&found.ours).into(),
+        nearest_frame: (&found.nearest_frame).into(),
+        nearest_pose: (&found.nearest_pose).into(),
+        zero_shot: found.zero_shot.as_ref().map(ErrorsJson::from),
+        fitted: found.fitted.as_ref().map(ErrorsJson::from),
+        rules: found.rules.map(|rules| RulesJson {
+            translation_unread: rules.translation_unread,
+            rotation_unread: rules.rotation_unread,
+            coverage_68: rules.coverage.within_68,
+            coverage_95: rules.coverage.within_95,
+        }),
+        protocol,
+    }
+}
+
+/// The record of read motions.
+pub fn motion_evaluation_json(
+    found: &MotionEvaluation,
+    room: &str,
+    adapter: &str,
+    stride: u32,
+    in_room: bool,
+) -> MotionEvaluationJson {
+    MotionEvaluationJson {
+        n: found.n,
+        ours: (&found.ours).into(),
+        without_mean: (&found.without_mean).into(),
+        constant: (&found.constant).into(),
+        no_motion: (&found.no_motion).into(),
+        room: room.to_owned(),
+        adapter: adapter.to_owned(),
+        stride,
+        in_room,
+    }
+}
