@@ -52,6 +52,18 @@ def kitchen(folder):
         print(f"{features} {stride} time: R² {found:.2f} (reference {reference}; out of distribution, not gated)")
 
 
+def localization(folder):
+    """A fitted adapter is nowhere farther from the truth than the nearest frame, and XFeat's target (docs/localization.md)."""
+    for features in ("effnet", "xfeat"):
+        for mapped in ("every", "blocks", "dense"):
+            found = json.loads((folder / f"located-{features}-{mapped}.json").read_text())
+            ours, nearest = (found[row]["translation_m"]["median"] for row in ("ours", "nearest_frame"))
+            print(f"{features} {mapped}: ours {ours:.4f} m, nearest frame {nearest:.4f} m, of {found['n']} views")
+            assert ours <= nearest
+            if (features, mapped) == ("xfeat", "every"):
+                assert ours <= 0.02 and found["ours"]["rotation_deg"]["median"] <= 0.8
+
+
 def npy(path):
     """Rows of a float32 NumPy file (n, d) in C order."""
     content = path.read_bytes()
@@ -104,5 +116,7 @@ if __name__ == "__main__":
         sweep(sys.argv[2], int(sys.argv[3]))
     elif sys.argv[1] == "features":
         features(pathlib.Path(sys.argv[2]), pathlib.Path(sys.argv[3]))
+    elif sys.argv[1] == "localization":
+        localization(pathlib.Path(sys.argv[2]))
     else:
         kitchen(pathlib.Path(sys.argv[2]))

@@ -68,10 +68,10 @@ fn views_between_mapped_frames_are_located() {
     assert!(found.within_68 > 0.5 && found.within_95 > 0.8, "{found:?}");
 }
 
-/// Oracle: what the rules promise of a view that resembles nothing in the map: nobody's reading is
-/// believed, and the covariance is as wide as the largest errors that were seen.
+/// Oracle: what the rules promise of a view that resembles nothing in the map: its covariance grows
+/// with the distance, however little the readings disagree.
 #[test]
-fn far_from_the_map_nobody_is_believed() {
+fn far_from_the_map_a_place_is_unsure() {
     let (room, features) = served("hall");
     let Fitted { adapter, rules, .. } = fitted(&room, &features, None);
     let mapped = every_tenth(&room);
@@ -85,8 +85,7 @@ fn far_from_the_map_nobody_is_believed() {
     let elsewhere: Vec<f32> = features.rows().row(5).iter().map(|x| x + 50.0).collect();
     let view = localizer.locate(&elsewhere, &rules).unwrap();
     assert!(view.nearest.distance > 10.0 * own.nearest.distance);
-    assert!(view.translation.gain <= own.translation.gain);
-    assert!(view.pose.covariance.trace() > own.pose.covariance.trace());
+    assert!(view.pose.covariance.trace() > 100.0 * own.pose.covariance.trace());
 }
 
 /// Oracle: the definition of going on: an adapter of other rooms gives the scale of the fitted one,
