@@ -2,17 +2,18 @@
 
 use std::sync::Arc;
 
+use anyhow::bail;
 use clap::Args;
 use indicatif::ProgressBar;
 
 use seese3_core::adapter::Adapter;
-use seese3_core::fitting::{FITTING_EPOCHS, PartRule, fit};
-use seese3_core::room::FrameId;
+use seese3_core::fitting::{FITTING_EPOCHS, Fitted, PartRule, fit};
+use seese3_core::room::{FrameId, RoomId, is_plain_name};
 use seese3_core::training::RoomData;
 
 use super::progress::bar;
 use super::say;
-use crate::store::{BaseAdapter, RoomFit, Store};
+use crate::store::{BaseAdapter, RoomFit, Store, StoredAdapter};
 
 #[derive(Debug, Args)]
 pub struct Fit {
@@ -45,11 +46,21 @@ impl Fit {
             None => None,
         };
 
+        if let Some(base) = &base {
+            check_base(base, &self.room)?;
+        }
+
         let of_base = base
             .as_ref()
             .map(|stored| stored.adapter.source().name.clone());
         let wanted = self.features.clone().or(of_base);
         let (stored, features) = store.load_room_with(&self.room, wanted.as_deref()).await?;
+        let name = self
+            .name
+            .clone()
+            .unwrap_or_else(|| format!("{}.{}.fitted", self.room, features.source().name));
+        check_name(&store, &name, stored.room.id()).await?;
+
         let data = RoomData {
             room: &stored.room,
             revision: stored.revision,
@@ -59,8 +70,20 @@ impl Fit {
         let mapped: Vec<FrameId> = (0..stored.room.frame_count() as u32).map(FrameId).collect();
         let progress = fitting_bar(true);
         let network: Option<&Arc<Adapter>> = base.as_ref().map(|stored| &stored.adapter);
-        let fitted = fit(&data, &mapped, network, self.seed, &|_| progress.inc(1))?;
+        let mut fitted = fit(&data, &mapped, network, self.seed, &|_| progress.inc(1))?;
         progress.finish_and_clear();
+
+        // What the base has seen, the fitted adapter has seen too.
+        if let Some(base) = &base {
+            fitted
+                .record
+                .rooms
+                .extend(base.record.rooms.iter().cloned());
+            fitted
+                .record
+                .calibrated_on
+                .extend(base.record.calibrated_on.iter().cloned());
+        }
 
         let room_fit = RoomFit {
             room: stored.room.id().clone(),
@@ -72,31 +95,11 @@ impl Fit {
             rules: fitted.rules.clone(),
         };
 
-        let name = self
-            .name
-            .unwrap_or_else(|| format!("{}.{}.fitted", self.room, features.source().name));
         let published = store
             .publish_fitted(&name, &fitted, &room_fit, features.rows())
             .await?;
 
-        say(format_args!(
-            "room '{}' revision {}, features '{}': fitted to {} frames, train R² {:.3}",
-            self.room,
-            stored.revision,
-            features.source().name,
-            mapped.len(),
-            fitted.record.train.overall
-        ));
-        say("measured on frames left out, by the distance of a view from the map:");
-        for rule in fitted.rules.rules() {
-            say(format_args!(
-                "  up to {:.3}: translation {}, rotation {}",
-                rule.up_to,
-                part_words(rule.translation),
-                part_words(rule.rotation)
-            ));
-        }
-
+        say_fitted(&fitted, &data, mapped.len());
         let state = if published.is_new {
             "published"
         } else {
@@ -111,6 +114,67 @@ impl Fit {
 
         Ok(())
     }
+}
+
+/// Refuses a base that has seen the room: measured there, it would look better than it is.
+fn check_base(base: &StoredAdapter, room: &str) -> anyhow::Result<()> {
+    let has_seen = base
+        .record
+        .rooms
+        .iter()
+        .any(|(name, _)| name.as_str() == room);
+    if has_seen || base.room_fit.is_some() {
+        bail!(
+            "adapter '{}' has seen room '{room}' or was itself fitted to a room; begin from one that learned from other \
+             rooms alone, or leave out --adapter",
+            base.name
+        );
+    }
+
+    Ok(())
+}
+
+/// Prints what was fitted, and the rules that were measured.
+fn say_fitted(fitted: &Fitted, data: &RoomData<'_>, mapped: usize) {
+    say(format_args!(
+        "room '{}' revision {}, features '{}': fitted to {mapped} frames, train R² {:.3}",
+        data.room.id(),
+        data.revision,
+        data.features.source().name,
+        fitted.record.train.overall
+    ));
+
+    say("measured on frames left out, by the distance of a view from the map:");
+    for rule in fitted.rules.rules() {
+        say(format_args!(
+            "  up to {:.3}: translation {}, rotation {}",
+            rule.up_to,
+            part_words(rule.translation),
+            part_words(rule.rotation)
+        ));
+    }
+}
+
+/// Refuses, before anything is fitted, a name that cannot be published or that other adapters have.
+async fn check_name(store: &Store, name: &str, room: &RoomId) -> anyhow::Result<()> {
+    if !is_plain_name(name) {
+        bail!("--name '{name}' is not valid: letters, digits, '.', '_' and '-', at most 100");
+    }
+
+    if store
+        .adapter_names()
+        .await?
+        .iter()
+        .any(|known| known == name)
+    {
+        let newest = store.load_adapter(name, None).await?;
+        let is_of_this_room = newest.room_fit.is_some_and(|fit| fit.room == *room);
+        if !is_of_this_room {
+            bail!("--name '{name}' is taken by an adapter that was not fitted to room '{room}'");
+        }
+    }
+
+    Ok(())
 }
 
 /// A bar over the epochs of a fit and of its folds; without a fit it stays empty.

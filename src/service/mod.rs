@@ -118,6 +118,16 @@ pub enum RunError {
         room: String,
         problem: seese3_core::navigation::Error,
     },
+    #[error(
+        "adapter '{adapter}' was fitted from revision {revision} of adapter '{base}', which cannot be read: {problem}; \
+         publish that again, or fit anew"
+    )]
+    Base {
+        adapter: String,
+        base: String,
+        revision: u64,
+        problem: Box<store::Error>,
+    },
     #[error("adapter '{adapter}' does not locate views in room '{room}': {problem}")]
     Localizer {
         adapter: String,

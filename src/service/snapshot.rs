@@ -153,6 +153,15 @@ impl Snapshot {
             .iter()
             .find(|navigator| navigator.adapter.name == wanted.name)
             .ok_or_else(|| {
+                if let Some(fit) = &wanted.room_fit
+                    && fit.room != *served.room.id()
+                {
+                    return Error::Precondition(format!(
+                        "adapter '{adapter}' was fitted to room '{}' and serves no other",
+                        fit.room
+                    ));
+                }
+
                 let source = &wanted.adapter.source().name;
                 Error::Precondition(format!(
                     "room '{room}' has no features '{source}', which adapter '{adapter}' needs"
@@ -299,7 +308,13 @@ async fn fitted_localizer(
 ) -> Result<FittedLocalizer, RunError> {
     let base = match &fit.base {
         Some(base) => {
-            let stored = store.load_adapter(&base.name, Some(base.revision)).await?;
+            let loaded = store.load_adapter(&base.name, Some(base.revision)).await;
+            let stored = loaded.map_err(|problem| RunError::Base {
+                adapter: adapter.name.clone(),
+                base: base.name.clone(),
+                revision: base.revision,
+                problem: Box::new(problem),
+            })?;
             Some(stored.adapter)
         }
         None => None,
@@ -321,15 +336,20 @@ async fn fitted_localizer(
     })
 }
 
-/// Adapters in order of preference, of which the first that fits is a room's default: those trained
-/// in this room first, then the newest.
+/// Adapters in order of preference, of which the first that fits is a room's default: those fitted
+/// to this room first, then those trained in it, then the newest.
 fn by_preference(
     adapters: &BTreeMap<String, Arc<StoredAdapter>>,
     room: &RoomId,
 ) -> Vec<Arc<StoredAdapter>> {
     let rank = |adapter: &StoredAdapter| {
         let is_trained_here = adapter.record.rooms.iter().any(|(name, _)| name == room);
+        let is_fitted_here = adapter
+            .room_fit
+            .as_ref()
+            .is_some_and(|fit| fit.room == *room);
         (
+            is_fitted_here,
             is_trained_here,
             adapter.created.clone(),
             adapter.name.clone(),

@@ -636,4 +636,19 @@ fn an_adapter_is_fitted_and_its_views_are_located() {
         &["--adapter", "--fit"],
     );
     refuses(&["fit", "--store", &store, "--room", "c"], &["'c'"]);
+
+    // What would be measured too well, or replace another adapter, is refused before it is fitted.
+    let from_b = ["fit", "--store", &store, "--adapter", "b"];
+    refuses(
+        &[&from_b[..], &["--room", "b"]].concat(),
+        &["'b'", "has seen"],
+    );
+    refuses(
+        &["fit", "--store", &store, "--room", "a", "--name", "b"],
+        &["'b'", "taken"],
+    );
+    refuses(
+        &["fit", "--store", &store, "--room", "a", "--name", "a/b"],
+        &["--name 'a/b'"],
+    );
 }

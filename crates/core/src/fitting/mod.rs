@@ -38,6 +38,9 @@ pub enum Error {
     /// A row that the room does not have, or one that is named twice.
     #[error("the mapped frames must be rows of the room in rising order")]
     MappedFrames,
+    /// No view can be told from another.
+    #[error("the features of the mapped frames are all alike: no view can be told from another")]
+    AllAlike,
     /// The rules were stored in a form that makes no sense.
     #[error("the rules of a fitted adapter are not sound: {what}")]
     Rules {

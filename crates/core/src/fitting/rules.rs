@@ -12,6 +12,8 @@ use crate::statistics::{Rate, median};
 const FEWEST_MATCHES: usize = 25;
 /// The largest number of rules.
 const MOST_RULES: usize = 8;
+/// An error, metres or radians, that is assumed once in every direction.
+const LEAST_ERROR: f64 = 1e-3;
 /// Gains that are tried: tenths.
 const GAINS: usize = 10;
 
@@ -163,6 +165,9 @@ impl ReadingRules {
     pub(super) fn measured(mut trials: Vec<Trial>) -> Result<Self, Error> {
         // Between repeated images there is nothing to read.
         trials.retain(|trial| trial.readings.distance > 0.0);
+        if trials.is_empty() {
+            return Err(Error::AllAlike);
+        }
         trials.sort_by(|a, b| a.readings.distance.total_cmp(&b.readings.distance));
 
         let count = (trials.len() / FEWEST_MATCHES).clamp(1, MOST_RULES);
@@ -191,13 +196,17 @@ impl ReadingRules {
             // A view between mapped frames is located better than one beyond them, also where their
             // features are as far: errors are measured in the size that the disagreement of readings
             // lets expect.
-            let residuals: Vec<Vector6<f64>> = judging
+            let mut residuals: Vec<Vector6<f64>> = judging
                 .into_iter()
                 .map(|trial| {
                     let size = rule.squared_size(trial.readings.disagreement).sqrt();
                     residual(trial, translation, rotation) / size
                 })
                 .collect();
+
+            // A robot on wheels has no error in some directions; a covariance needs one in each.
+            let size = rule.squared_size(rule.least_disagreement).sqrt();
+            residuals.extend((0..6).map(|axis| Vector6::ith(axis, LEAST_ERROR / size)));
             rule.covariance = robust_covariance(&residuals)?;
 
             // Trials at one distance may fall into two parts: the later one is as good.

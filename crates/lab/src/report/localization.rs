@@ -16,10 +16,7 @@ pub fn localization_table(found: &Localization) -> String {
 
     add("ours", &found.ours);
     add("nearest frame", &found.nearest_frame);
-    add(
-        "nearest pose (the best that retrieval can do)",
-        &found.nearest_pose,
-    );
+    add("nearest pose (by metres plus radians)", &found.nearest_pose);
     if let Some(zero_shot) = &found.zero_shot {
         add("the adapter's whole reading", zero_shot);
     }
