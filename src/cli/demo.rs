@@ -12,7 +12,8 @@ use tokio::net::TcpListener;
 
 use super::ask::say_navigation;
 use super::progress::bar;
-use super::train::{default_name, say_published, train_with_progress};
+use super::say_published;
+use super::train::{default_name, train_with_progress};
 use super::{say, write_file};
 use crate::encoder::{BUILTIN_DIM, builtin_source, encode_builtin};
 use crate::service;

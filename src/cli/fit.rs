@@ -12,7 +12,7 @@ use seese3_core::room::{FrameId, RoomId, is_plain_name};
 use seese3_core::training::RoomData;
 
 use super::progress::bar;
-use super::say;
+use super::{say, say_published};
 use crate::store::{BaseAdapter, RoomFit, Store, StoredAdapter};
 
 #[derive(Debug, Args)]
@@ -100,17 +100,7 @@ impl Fit {
             .await?;
 
         say_fitted(&fitted, &data, mapped.len());
-        let state = if published.is_new {
-            "published"
-        } else {
-            "already there, unchanged:"
-        };
-        say(format_args!(
-            "{state} adapter '{name}' revision {}: {}/{}",
-            published.revision,
-            store.location(),
-            published.manifest
-        ));
+        say_published(&store, &name, &published);
 
         Ok(())
     }

@@ -149,6 +149,22 @@ fn say(line: impl std::fmt::Display) {
     let _ = writeln!(std::io::stdout(), "{line}");
 }
 
+/// Prints where an adapter was published.
+fn say_published(store: &crate::store::Store, name: &str, published: &crate::store::Published) {
+    let state = if published.is_new {
+        "published"
+    } else {
+        "already there, unchanged:"
+    };
+
+    say(format_args!(
+        "{state} adapter '{name}' revision {}: {}/{}",
+        published.revision,
+        store.location(),
+        published.manifest
+    ));
+}
+
 /// Rejects an output file whose folder does not exist, before any long computation is started for
 /// it.
 fn check_writable(path: &std::path::Path) -> anyhow::Result<()> {

@@ -16,8 +16,8 @@ use seese3_lab::report::{training_json, training_table};
 use super::progress::bar;
 use super::protocol::ProtocolOptions;
 use super::rooms::{data, load_rooms, room_words};
-use super::{check_writable, say, write_json};
-use crate::store::{Published, Store, StoredRoom};
+use super::{check_writable, say, say_published, write_json};
+use crate::store::{Store, StoredRoom};
 
 /// The largest number of seeds in one command.
 const MAX_SEEDS: u64 = 1_000;
@@ -257,20 +257,4 @@ pub fn default_name(rooms: &[(StoredRoom, Features)], plan: &TrainingPlan) -> St
     }
 
     name
-}
-
-/// Prints where an adapter was published.
-pub fn say_published(store: &Store, name: &str, published: &Published) {
-    let state = if published.is_new {
-        "published"
-    } else {
-        "already there, unchanged:"
-    };
-
-    say(format_args!(
-        "{state} adapter '{name}' revision {}: {}/{}",
-        published.revision,
-        store.location(),
-        published.manifest
-    ));
 }

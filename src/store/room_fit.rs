@@ -11,9 +11,9 @@ use super::tensors::{TensorReader, TensorWriter};
 use seese3_core::fitting::{MotionReader, PartRule, ReadingRule, ReadingRules};
 use seese3_core::room::RoomId;
 
-/// One row per rule: the largest distance; the reader and the gain of the translation, then those of
-/// the rotation; the least disagreement; and the 36 entries of the covariance on (v, ω), row by row. A reader is its
-/// position in [`MotionReader::ALL`].
+/// One row per rule: the largest distance; the reader and the gain of the translation, then those
+/// of the rotation; the least disagreement; and the 36 entries of the covariance on (v, ω), row by
+/// row. A reader is its position in [`MotionReader::ALL`].
 const RULES: &str = "fit.rules";
 /// The columns of [`RULES`] before the covariance.
 const COLUMNS_BEFORE_COVARIANCE: usize = 6;

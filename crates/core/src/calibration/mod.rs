@@ -85,8 +85,8 @@ pub struct CalibrationReport {
 }
 
 /// Calibrates an adapter for retrieval and, with two or more rooms, for tracking. `record` is how
-/// the adapter was trained; the caller adds the rooms of the report to its `calibrated_on`, by which
-/// leaks are told.
+/// the adapter was trained; the caller adds the rooms of the report to its `calibrated_on`, by
+/// which leaks are told.
 ///
 /// # Errors
 /// [`Error`], when the adapter learned from one of the rooms, a room is too short, or its features

@@ -23,8 +23,8 @@ pub struct RoomPair {
     pub pair: Pair,
 }
 
-/// The strides that a tracker's motions are measured at: the Fibonacci numbers 1, 2, 3, 5, 8, … below
-/// the longest stride that the adapter was trained on, and that one. Errors change with the
+/// The strides that a tracker's motions are measured at: the Fibonacci numbers 1, 2, 3, 5, 8, …
+/// below the longest stride that the adapter was trained on, and that one. Errors change with the
 /// logarithm of the stride, so that short strides are measured more closely than long ones.
 pub fn fibonacci_strides(plan: &PairPlan) -> Vec<u32> {
     let longest = match plan {

@@ -1,5 +1,5 @@
-//! What an R² of motions has to be read beside: it divides by the variance of the tested motions, so
-//! that it says as much of the recording as of the adapter.
+//! What an R² of motions has to be read beside: it divides by the variance of the tested motions,
+//! so that it says as much of the recording as of the adapter.
 
 use nalgebra::Vector6;
 
@@ -31,8 +31,8 @@ pub struct Baselines {
 }
 
 impl Baselines {
-    /// The baselines of an adapter's scores on the test pairs of a room; `learned_here` says whether
-    /// it learned from these very frames.
+    /// The baselines of an adapter's scores on the test pairs of a room; `learned_here` says
+    /// whether it learned from these very frames.
     ///
     /// # Errors
     /// [`splits::Error`] when the room has no test pairs.

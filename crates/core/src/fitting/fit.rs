@@ -46,7 +46,8 @@ pub struct Fitted {
 /// # Errors
 /// [`Error::FewFrames`] or [`Error::MappedFrames`] for the mapped frames, [`Error::Training`] when
 /// features and room do not fit together, [`Error::Adapter`] when `base` is for other features or
-/// training fails, [`Error::Calibration`] when the camera hardly moves in the mapped frames.
+/// training fails, among others because the camera does not move, [`Error::AllAlike`] when the
+/// mapped frames cannot be told apart.
 pub fn fit(
     data: &RoomData<'_>,
     mapped: &[FrameId],

@@ -18,8 +18,8 @@ pub struct Fold {
     pub is_interleaved: bool,
 }
 
-/// The folds of a map: every second frame, two fifths in blocks, and a quarter in one piece are left
-/// out, so that there are views at all distances from what is mapped.
+/// The folds of a map: every second frame, two fifths in blocks, and a quarter in one piece are
+/// left out, so that there are views at all distances from what is mapped.
 pub fn folds(mapped: &[FrameId]) -> Vec<Fold> {
     let count = mapped.len();
     let block = |at: usize| at * BLOCKS / count.max(1) % 5;

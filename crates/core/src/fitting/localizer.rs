@@ -34,9 +34,9 @@ pub struct Readings {
     pub zero_shot: Option<Twist>,
     /// The same, as the fitted adapter reads it.
     pub fitted: Option<Twist>,
-    /// How far apart the view's poses are when it is read from other mapped frames than the nearest,
-    /// by the best informed reader: the median over the next ones, ‖(v, ω)‖, metres and radians
-    /// mixed. The size of an error is expected from it.
+    /// How far apart the view's poses are when it is read from other mapped frames than the
+    /// nearest, by the best informed reader: the median over the next ones, ‖(v, ω)‖, metres and
+    /// radians mixed. The size of an error is expected from it.
     pub disagreement: f64,
 }
 

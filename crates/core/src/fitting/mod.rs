@@ -4,8 +4,8 @@
 //! the mapped frames of the room itself. Near a mapped frame it reads better than anything else;
 //! where nothing near is mapped it can be worse than no reading at all. So it is measured: networks
 //! that were fitted without some of the mapped frames locate those, and [`ReadingRules`] keep, by
-//! the distance of a view from the map, which reader to believe and how far. A [`Localizer`] answers
-//! by these rules.
+//! the distance of a view from the map, which reader to believe and how far. A [`Localizer`]
+//! answers by these rules.
 //!
 //! Distances are those of features, z-scored by the mapped frames, so that all readers start from
 //! the same mapped frame.
@@ -21,7 +21,7 @@ pub use localizer::{Localizer, LocatedView, Readings};
 pub use rules::{MotionReader, PartRule, ReadingRule, ReadingRules};
 
 use crate::room::{FrameId, Room};
-use crate::{adapter, calibration, training};
+use crate::{adapter, training};
 
 /// Why an adapter cannot be fitted to a room, or a view cannot be located in it.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -53,9 +53,6 @@ pub enum Error {
     /// An adapter refused its input, or training failed.
     #[error(transparent)]
     Adapter(#[from] adapter::Error),
-    /// Errors could not be measured.
-    #[error(transparent)]
-    Calibration(#[from] calibration::Error),
 }
 
 /// Refuses mapped frames that are too few, unknown, or not in rising order.

@@ -9,7 +9,7 @@ use crate::statistics::median;
 
 /// How many pairs are drawn.
 pub const PAIRS: usize = 30_000;
-/// Pairs that follow one another in time reach over so many rows, as those of the paper's range do …
+/// Pairs that follow one another in time reach over so many rows, as the paper's longest do …
 const LONGEST_ROWS: f64 = 40.0;
 /// … but over so many mapped frames at least.
 const FEWEST_STEPS: usize = 5;

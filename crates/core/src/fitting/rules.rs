@@ -71,15 +71,15 @@ pub struct ReadingRule {
     /// The covariance of the located pose's error in its body frame, on (v, ω), metres and radians,
     /// over u² + u₀²: the squares of the [`Readings::disagreement`] and of `least_disagreement`.
     pub covariance: Matrix6<f64>,
-    /// u₀: a quarter of the median disagreement of the trials, so that errors are not taken for zero where
-    /// readings happen to agree.
+    /// u₀: a quarter of the median disagreement of the trials, so that errors are not taken for
+    /// zero where readings happen to agree.
     pub least_disagreement: f64,
 }
 
 impl ReadingRule {
-    /// The covariance of the error of a pose that was located at a distance from the map, by readings
-    /// that disagree so far. Beyond the distance that the rule was made for, errors are taken to grow
-    /// with it.
+    /// The covariance of the error of a pose that was located at a distance from the map, by
+    /// readings that disagree so far. Beyond the distance that the rule was made for, errors are
+    /// taken to grow with it.
     pub fn covariance_at(&self, distance: f64, disagreement: f64) -> Matrix6<f64> {
         let beyond = (distance / self.up_to).max(1.0);
         self.covariance * (self.squared_size(disagreement) * beyond * beyond)
@@ -157,11 +157,13 @@ impl ReadingRules {
     /// A reader is believed only where it comes nearer to the truth than the mapped frame itself in
     /// more than half of the trials, and surely so (Wilson's lower bound).
     ///
-    /// Between two mapped frames of one path a view is located better than anywhere else at the same
-    /// distance. Covariances are therefore those of the other trials, wherever these are enough.
+    /// Between two mapped frames of one path a view is located better than anywhere else at the
+    /// same distance. Covariances are therefore those of the other trials, wherever these are
+    /// enough.
     ///
     /// # Errors
-    /// [`Error::Calibration`] when the errors do not span all six directions.
+    /// [`Error::AllAlike`] when no trial is at a distance, [`Error::Adapter`] when the errors make no
+    /// covariance.
     pub(super) fn measured(mut trials: Vec<Trial>) -> Result<Self, Error> {
         // Between repeated images there is nothing to read.
         trials.retain(|trial| trial.readings.distance > 0.0);
@@ -194,8 +196,8 @@ impl ReadingRules {
             };
 
             // A view between mapped frames is located better than one beyond them, also where their
-            // features are as far: errors are measured in the size that the disagreement of readings
-            // lets expect.
+            // features are as far: errors are measured in the size that the disagreement of
+            // readings lets expect.
             let mut residuals: Vec<Vector6<f64>> = judging
                 .into_iter()
                 .map(|trial| {

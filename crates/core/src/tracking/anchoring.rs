@@ -75,14 +75,16 @@ impl Tracker {
         frame: &Observation,
         view: &BestMap,
     ) -> Correction {
-        // While a stream is lost no place is a candidate. Frames that miss the room or match several
-        // rooms do not come here, so that anchors "in a row" may have such frames between them.
+        // While a stream is lost no place is a candidate. Frames that miss the room or match
+        // several rooms do not come here, so that anchors "in a row" may have such frames between
+        // them.
         let earlier_candidate = state.candidate.take();
         if state.health.is_lost() {
             return Correction::NONE;
         }
 
-        // The filter takes the inflated covariance; what is reported is measured with the plain one.
+        // The filter takes the inflated covariance; what is reported is measured with the plain
+        // one.
         let anchor = Belief {
             pose: view.matched.anchor.pose,
             covariance: view.matched.anchor.covariance * ANCHOR_INFLATION,

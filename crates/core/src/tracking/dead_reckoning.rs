@@ -21,8 +21,8 @@ const ORIGIN_DEVIATION: f64 = 1e-6;
 pub(super) enum MotionReading {
     /// All of it.
     Complete,
-    /// Frames of it are missing, but the view after them matches the map, where latents are known to
-    /// be read well.
+    /// Frames of it are missing, but the view after them matches the map, where latents are known
+    /// to be read well.
     Partial,
     /// Nothing that can be relied on: the view jumped, or a gap led away from the map.
     Unseen,

@@ -5,7 +5,8 @@
 //! the room, and each view follows from the one before, the camera has only left the mapped part.
 //! If the stream was never confirmed, or the view jumped, nobody knows where the camera is.
 
-/// Frames in a row that must match the room with certainty before a lost stream's health is consistent again.
+/// Frames in a row that must match the room with certainty before a lost stream's health is
+/// consistent again.
 pub const FRAMES_TO_RECOVER: u32 = 5;
 /// The score at which a stream is confirmed to be in the room: each matching frame adds one, each
 /// other frame takes away [`MISMATCH_COST`].
@@ -22,7 +23,8 @@ pub enum TrackingHealth {
     /// Each frame follows from the one before, back to one that matched the room or whose pose was
     /// given.
     Consistent {
-        /// Matching frames, less two for each other one; not counted on once the stream is confirmed.
+        /// Matching frames, less two for each other one; not counted on once the stream is
+        /// confirmed.
         score: i32,
         /// Whether the stream is certainly in this room, so that frames unlike the map show parts
         /// of the room that are not mapped.

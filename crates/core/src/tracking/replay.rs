@@ -106,7 +106,8 @@ fn start(tracker: &Tracker, segments: &[Segment<'_>], initial_pose: InitialPose)
 /// The map poses of a replay.
 #[derive(Debug, Clone)]
 pub struct MapPath {
-    /// `map_from_camera` of the frames for which a map pose was reported, LOST and RELOCALIZING ones included.
+    /// `map_from_camera` of the frames for which a map pose was reported, LOST and RELOCALIZING
+    /// ones included.
     pub path: Trajectory,
     /// The rows of those frames in the replay.
     pub rows: Vec<usize>,
@@ -122,7 +123,8 @@ pub struct MotionSurprise {
 }
 
 impl Replay {
-    /// `map_from_camera` of the frames for which a map pose was reported, LOST and RELOCALIZING ones included.
+    /// `map_from_camera` of the frames for which a map pose was reported, LOST and RELOCALIZING
+    /// ones included.
     pub fn map_path(&self) -> MapPath {
         let mut path = Trajectory::default();
         let mut rows = Vec::new();
@@ -180,8 +182,8 @@ impl Replay {
                 continue;
             };
 
-            // A motion of exactly zero was not read: the stream's first frame, or a half turn. Motions
-            // over a jump are counted, with the covariance of a motion that was not seen.
+            // A motion of exactly zero was not read: the stream's first frame, or a half turn.
+            // Motions over a jump are counted, with the covariance of a motion that was not seen.
             let length = update.motion.norm();
             if length > 0.0 {
                 let true_motion = body_twist(&self.truth.poses[keyframe], truth);

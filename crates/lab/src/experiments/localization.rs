@@ -106,8 +106,8 @@ pub struct Localization {
     pub ours: LocalizationErrors,
     /// The pose of the mapped frame whose feature is nearest.
     pub nearest_frame: LocalizationErrors,
-    /// The pose of the mapped frame that is truly nearest, by metres plus radians: about what retrieval
-    /// alone can reach.
+    /// The pose of the mapped frame that is truly nearest, by metres plus radians: about what
+    /// retrieval alone can reach.
     pub nearest_pose: LocalizationErrors,
     /// The given adapter's whole reading from the nearest frame.
     pub zero_shot: Option<LocalizationErrors>,

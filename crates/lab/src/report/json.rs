@@ -130,7 +130,8 @@ pub struct BaselinesJson {
     variance_ratio: f64,
     nearest_pose: Option<NearestPoseJson>,
     optimiser_steps: u64,
-    /// False where the constant is so far below zero that the recording tells nothing of an adapter.
+    /// False where the constant is so far below zero that the recording tells nothing of an
+    /// adapter.
     can_tell: bool,
 }
 
