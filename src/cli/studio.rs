@@ -10,6 +10,7 @@ use rayon::prelude::*;
 
 use super::encode::{by_layer, check_names, has, same_poses};
 use super::encoder::{EncoderOptions, RuntimeOptions};
+use super::named::{ClosedSet, one_of};
 use super::progress::bar;
 use super::{check_writable, say, write_file};
 use crate::encoder::{Encoder, Error, OnBadImage, Task, encode_png, encode_room, read_image};
@@ -17,8 +18,8 @@ use crate::store::{Store, StoredRoom};
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
-use seese3_core::room::{Frames, Provenance, Room, RoomId, Timeline};
-use seese3_lab::studio::{Camera, SuiteRoom, render};
+use seese3_core::room::{Frames, Provenance, Room, RoomId};
+use seese3_lab::studio::{Film, Suite};
 
 /// The largest number of rooms on a contact sheet; below, its columns and the size of a tile,
 /// pixels.
@@ -37,12 +38,15 @@ pub struct Studio {
         required_unless_present = "sheet"
     )]
     out: Option<String>,
+    /// How the rooms are filmed
+    #[arg(long, default_value = "visits", value_parser = one_of::<Suite>())]
+    suite: Suite,
     /// Number of rooms, 1 to 100000
-    #[arg(long, default_value_t = 231, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    #[arg(long, default_value_t = 131, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     rooms: u32,
-    /// Number of frames per room, 2 to 100000
-    #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u32).range(2..=100_000))]
-    frames: u32,
+    /// Number of frames per room, 2 to 100000; 1000 of visits and 400 of walks if omitted
+    #[arg(long, value_parser = clap::value_parser!(u32).range(2..=100_000))]
+    frames: Option<u32>,
     /// Seed of the suite; the same seed gives the same rooms
     #[arg(long, default_value_t = 7)]
     seed: u64,
@@ -105,7 +109,7 @@ impl Studio {
         say(format_args!(
             "{} rooms of {} frames at {width}x{height}, encoder {} by {}",
             self.rooms,
-            self.frames,
+            self.frame_count(),
             encoder.id(),
             encoder.runtime()
         ));
@@ -150,7 +154,7 @@ impl Studio {
             .num_threads(self.runtime.threads())
             .build()?;
 
-        let progress = bar(u64::from(self.rooms) * u64::from(self.frames), "drawing");
+        let progress = bar(u64::from(self.rooms) * self.frame_count() as u64, "drawing");
         let mut spent = Spent::default();
         let mut drawn = 0;
         let mut there = 0;
@@ -164,8 +168,8 @@ impl Studio {
 
             // A room follows from seed and number alone. An interrupted command therefore
             // continues by skipping the rooms that are complete in the store.
-            let suite = SuiteRoom::new(self.seed, number);
-            let mut room = self.room(&name, &suite)?;
+            let film = self.film(number);
+            let mut room = self.room(&name, &film)?;
             let before = stored(store, &room).await?;
             let images_kept = before
                 .as_ref()
@@ -186,10 +190,11 @@ impl Studio {
                 }
 
                 let told = |done: usize| {
-                    progress.set_position(u64::from(number) * u64::from(self.frames) + done as u64);
+                    progress
+                        .set_position(u64::from(number) * self.frame_count() as u64 + done as u64);
                 };
                 let rows =
-                    pool.install(|| self.encode_room(&room, &suite, encoder, &spent, &told))?;
+                    pool.install(|| self.encode_room(&room, &film, encoder, &spent, &told))?;
                 store
                     .publish_room(&room, &by_layer(sources, &rows)?)
                     .await?;
@@ -198,7 +203,7 @@ impl Studio {
                 spent.wall += begun.elapsed();
             }
 
-            progress.set_position(u64::from(number + 1) * u64::from(self.frames));
+            progress.set_position(u64::from(number + 1) * self.frame_count() as u64);
         }
 
         progress.finish_and_clear();
@@ -218,23 +223,35 @@ impl Studio {
         self.prefix.clone().or_else(stem).unwrap_or_default()
     }
 
+    fn frame_count(&self) -> usize {
+        let default = match self.suite {
+            Suite::Visits => 1_000,
+            Suite::Walks => 400,
+        };
+        self.frames.unwrap_or(default) as usize
+    }
+
+    fn film(&self, number: u32) -> Film {
+        self.suite.film(self.seed, number, self.frame_count())
+    }
+
     fn room_name(&self, number: u32) -> String {
         format!("studio{}-{number:04}", self.seed)
     }
 
     /// The room with its camera path and, with --keep-images, the paths of its images; without
     /// features.
-    fn room(&self, name: &str, suite: &SuiteRoom) -> anyhow::Result<Room> {
-        let poses = suite.path(self.frames as usize);
-
+    fn room(&self, name: &str, film: &Film) -> anyhow::Result<Room> {
         let mut provenance = Provenance {
-            format: format!("studio {}", suite.walk.name()),
+            format: format!("studio {}", film.kind),
             licence: "CC0-1.0".to_owned(),
             ..Provenance::default()
         };
 
         let mut frames = Frames {
-            poses,
+            poses: film.poses.clone(),
+            timestamps_ns: film.timestamps_ns(),
+            sequences: film.sequences(),
             ..Frames::default()
         };
 
@@ -251,7 +268,7 @@ impl Studio {
                 .context("the store's path is not UTF-8")?
                 .to_owned();
 
-            frames.images = (0..self.frames)
+            frames.images = (0..self.frame_count())
                 .map(|frame| format!("{name}/frame-{frame:06}.png"))
                 .collect();
         }
@@ -262,21 +279,20 @@ impl Studio {
     fn encode_room(
         &self,
         room: &Room,
-        suite: &SuiteRoom,
+        film: &Film,
         encoder: &Encoder,
         spent: &Spent,
         told: &(dyn Fn(usize) + Sync),
     ) -> anyhow::Result<ndarray::Array2<f32>> {
         let (width, height) = encoder.render_size();
-        let camera = Camera::sized(width, height);
 
         let image = |row: usize| -> Result<RgbImage, Error> {
             let begun = Instant::now();
 
             // An image kept by an earlier run is read back instead of being rendered again.
-            let drawn = match drawn_before(room, row, camera)? {
+            let drawn = match drawn_before(room, row, (width, height))? {
                 Some(kept) => kept,
-                None => render(&suite.scene, camera, &room.poses()[row]),
+                None => film.image(row, width, height),
             };
 
             spent
@@ -287,8 +303,8 @@ impl Studio {
             Ok(drawn)
         };
 
-        // A suite room is one unbroken camera path, so clips may span any of its frames.
-        let timeline = Timeline::unbroken(room.frame_count());
+        // Clips stay within a visit.
+        let timeline = room.timeline();
         let cancel = Cancellation::default();
         let batch = self.batch as usize;
 
@@ -332,19 +348,12 @@ impl Studio {
 
         // Images are rendered at twice the tile's size; `tiled` averages 2×2 pixels against
         // aliasing.
-        let camera = Camera::sized(SHEET_SIZE.0 * 2, SHEET_SIZE.1 * 2);
-        let frame = self.frames as usize / 2;
+        let (width, height) = (SHEET_SIZE.0 * 2, SHEET_SIZE.1 * 2);
+        let frame = self.frame_count() / 2;
 
         let images: Vec<RgbImage> = (0..count)
             .into_par_iter()
-            .map(|number| {
-                let suite = SuiteRoom::new(self.seed, number);
-                render(
-                    &suite.scene,
-                    camera,
-                    &suite.path(self.frames as usize)[frame],
-                )
-            })
+            .map(|number| self.film(number).image(frame, width, height))
             .collect();
 
         write_file(file, &encode_png(&tiled(&images, SHEET_COLUMNS))?)?;
@@ -360,19 +369,43 @@ impl Studio {
     }
 }
 
+impl ClosedSet for Suite {
+    fn all() -> Vec<Self> {
+        Self::ALL.to_vec()
+    }
+
+    fn name(self) -> &'static str {
+        self.name()
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            Self::Visits => {
+                "Filmed twice by a person with a camera in the hand, in other light: photographs \
+                 with blur, noise and an exposure of their own"
+            }
+            Self::Walks => "Plain images of one calm walk each: the hard class",
+        }
+    }
+}
+
 /// The image that an earlier run kept, or none if there is none that can be read. An image of
 /// another size is an error: it would not give the features that a fresh rendering gives.
-fn drawn_before(room: &Room, row: usize, camera: Camera) -> Result<Option<RgbImage>, Error> {
+fn drawn_before(
+    room: &Room,
+    row: usize,
+    (width, height): (usize, usize),
+) -> Result<Option<RgbImage>, Error> {
     let Some(image) = room.images().get(row) else {
         return Ok(None);
     };
     match read_image(Path::new(&room.provenance().images_root), image) {
-        Ok(kept) if (kept.width, kept.height) == (camera.width, camera.height) => Ok(Some(kept)),
+        Ok(kept) if (kept.width, kept.height) == (width, height) => Ok(Some(kept)),
         Ok(kept) => Err(Error::BadImage {
             image: image.clone(),
             problem: format!(
                 "was kept at {}×{}, but this encoder takes {}×{}; render into another store",
-                kept.width, kept.height, camera.width, camera.height
+                kept.width, kept.height, width, height
             ),
         }),
         Err(_) => Ok(None),

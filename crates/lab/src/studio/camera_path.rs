@@ -165,7 +165,7 @@ pub(super) fn along(way: &Way, frame_count: usize, random: &mut ChaCha8Rng) -> V
     (0..frame_count).map(pose).collect()
 }
 
-fn posed(at: Vector3<f64>, orientation: Rotation3<f64>) -> Pose {
+pub(super) fn posed(at: Vector3<f64>, orientation: Rotation3<f64>) -> Pose {
     Isometry3::from_parts(
         Translation3::from(at),
         UnitQuaternion::from_rotation_matrix(&orientation),
@@ -174,7 +174,7 @@ fn posed(at: Vector3<f64>, orientation: Rotation3<f64>) -> Pose {
 
 /// `world_from_camera` of a camera that looks along `yaw` from the x axis, `pitch` above the
 /// horizon, tilted by `roll` about its own view; radians.
-fn looking(yaw: f64, pitch: f64, roll: f64) -> Rotation3<f64> {
+pub(super) fn looking(yaw: f64, pitch: f64, roll: f64) -> Rotation3<f64> {
     let forward = Vector3::new(
         yaw.cos() * pitch.cos(),
         yaw.sin() * pitch.cos(),

@@ -7,15 +7,15 @@ use nalgebra::{Point3, Vector3};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
+use super::solid::Solid;
 use super::texture::{Colour, Material};
-use super::{Piece, Solid};
 
 /// A box of a piece: low corner, high corner, material.
 type Block = ([f64; 3], [f64; 3], Material);
 
 /// Furnishes a room of `size`, metres.
-pub(super) fn furnish(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Piece> {
-    let mut pieces = Vec::new();
+pub(super) fn furnish(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Solid> {
+    let mut solids = Vec::new();
     let quarter = std::f64::consts::FRAC_PI_2;
 
     // Two pieces stand at each wall, turned so that their backs are 2 cm from it. Walls are
@@ -33,13 +33,14 @@ pub(super) fn furnish(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Piece>
                 2 => [size.x - along, size.y - 0.02],
                 _ => [0.02, size.y - along],
             };
-            pieces.push(Piece::new(&blocks, at, turn, random));
+            solids.extend(placed(&blocks, at, turn, random));
         }
     }
 
     let centre = [size.x * 0.5, size.y * 0.5];
     let turn = random.random_range(-0.4..0.4);
-    pieces.push(Piece::new(&table(random), centre, turn, random));
+    let blocks = table(random);
+    solids.extend(placed(&blocks, centre, turn, random));
 
     // Three chairs stand around the table, about 120° apart.
     for side in 0..3 {
@@ -48,16 +49,17 @@ pub(super) fn furnish(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Piece>
             centre[0] + 0.85 * angle.cos(),
             centre[1] + 0.75 * angle.sin(),
         ];
-        pieces.push(Piece::new(&chair(random), at, angle + quarter, random));
+        let blocks = chair(random);
+        solids.extend(placed(&blocks, at, angle + quarter, random));
     }
 
-    pieces
+    solids
 }
 
 /// Furnishes a room of `size`, metres, with a random number of pieces along each wall, and in most
 /// rooms with a table and chairs.
-pub(super) fn furnish_loosely(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Piece> {
-    let mut pieces = Vec::new();
+pub(super) fn furnish_loosely(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Solid> {
+    let mut solids = Vec::new();
     let quarter = std::f64::consts::FRAC_PI_2;
     for wall in 0..4u8 {
         let length = if wall % 2 == 0 { size.x } else { size.y };
@@ -80,7 +82,7 @@ pub(super) fn furnish_loosely(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Ve
                 2 => [size.x - along, size.y - 0.02],
                 _ => [0.02, size.y - along],
             };
-            pieces.push(Piece::new(&blocks, at, turn, random));
+            solids.extend(placed(&blocks, at, turn, random));
         }
     }
 
@@ -91,7 +93,8 @@ pub(super) fn furnish_loosely(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Ve
         ];
 
         let turn = random.random_range(-0.6..0.6);
-        pieces.push(Piece::new(&table(random), centre, turn, random));
+        let blocks = table(random);
+        solids.extend(placed(&blocks, centre, turn, random));
 
         // One to four chairs stand around the table, about 90° apart.
         for side in 0..random.random_range(1..5) {
@@ -100,16 +103,17 @@ pub(super) fn furnish_loosely(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Ve
                 centre[0] + 0.85 * angle.cos(),
                 centre[1] + 0.75 * angle.sin(),
             ];
-            pieces.push(Piece::new(&chair(random), at, angle + quarter, random));
+            let blocks = chair(random);
+            solids.extend(placed(&blocks, at, angle + quarter, random));
         }
     }
 
-    pieces
+    solids
 }
 
 /// Furnishes a corridor along x, of `size`, metres, with shallow pieces on its long sides.
-pub(super) fn furnish_corridor(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Piece> {
-    let mut pieces = Vec::new();
+pub(super) fn furnish_corridor(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Solid> {
+    let mut solids = Vec::new();
     let mut along = random.random_range(0.9..1.8);
     while along < size.x - 0.9 {
         // Beds, sofas and desks are too deep for a corridor.
@@ -126,12 +130,12 @@ pub(super) fn furnish_corridor(size: Vector3<f64>, random: &mut ChaCha8Rng) -> V
         } else {
             ([along, 0.02], 0.0)
         };
-        pieces.push(Piece::new(&blocks, at, turn, random));
+        solids.extend(placed(&blocks, at, turn, random));
 
         along += random.random_range(1.5..2.8);
     }
 
-    pieces
+    solids
 }
 
 fn wall_piece(random: &mut ChaCha8Rng) -> Vec<Block> {
@@ -371,55 +375,119 @@ fn chair(random: &mut ChaCha8Rng) -> Vec<Block> {
     ]
 }
 
-impl Piece {
-    /// A piece of these blocks that stands at `at` on the floor, metres, turned about the vertical
-    /// axis by `turn`, radians.
-    fn new(blocks: &[Block], at: [f64; 2], turn: f64, random: &mut ChaCha8Rng) -> Self {
-        let (sin, cos) = turn.sin_cos();
-        let solids: Vec<Solid> = blocks
-            .iter()
-            .map(|&(low, high, material)| {
-                let low = Vector3::from(low);
-                let high = Vector3::from(high);
-                let middle = (low + high) / 2.0;
-                let half = (high - low) / 2.0;
+/// Small things on the furniture's level tops, and larger ones on the floor along the walls of a
+/// room of `size`, metres.
+pub(super) fn things(
+    furniture: &[Solid],
+    size: Vector3<f64>,
+    random: &mut ChaCha8Rng,
+) -> Vec<Solid> {
+    let mut things = Vec::new();
 
-                // From the piece's coordinates into those of the room.
-                let centre = Point3::new(
-                    at[0] + cos * middle.x - sin * middle.y,
-                    at[1] + sin * middle.x + cos * middle.y,
-                    middle.z,
-                );
+    // What stands on a top as high as a table ends below the camera; what stands higher is on a
+    // shelf at the wall.
+    for top in furniture
+        .iter()
+        .filter(|solid| solid.half.xy().min() > 0.14)
+    {
+        let height = top.centre.z + top.half.z;
+        if !(0.35..=1.95).contains(&height) {
+            continue;
+        }
 
-                Solid {
-                    centre,
-                    half,
-                    cos,
-                    sin,
-                    material,
-                    seed: random.random(),
-                }
-            })
-            .collect();
+        let area = 4.0 * top.half.x * top.half.y;
+        let most = 1 + (area * 9.0) as u32;
+        for _ in 0..random.random_range(0..=most) {
+            let half = Vector3::new(
+                random.random_range(0.02..0.12),
+                random.random_range(0.02..0.12),
+                random.random_range(0.015..0.14),
+            );
+            let off = Vector3::new(
+                (top.half.x - half.x).max(0.0) * random.random_range(-1.0..1.0),
+                (top.half.y - half.y).max(0.0) * random.random_range(-1.0..1.0),
+                top.half.z + half.z,
+            );
+            let turned = Vector3::new(
+                top.cos * off.x - top.sin * off.y,
+                top.sin * off.x + top.cos * off.y,
+                off.z,
+            );
 
-        // The bounding sphere: its centre is the mean of the boxes' centres, and its radius holds
-        // the corners of every box.
-        let count = solids.len().max(1) as f64;
-        let centre = Point3::from(
-            solids
-                .iter()
-                .map(|solid| solid.centre.coords)
-                .sum::<Vector3<f64>>()
-                / count,
-        );
-
-        let reach = |solid: &Solid| (solid.centre - centre).norm() + solid.half.norm();
-        let radius = solids.iter().map(reach).fold(0.0, f64::max);
-
-        Self {
-            centre,
-            radius,
-            solids,
+            things.push(thing(top.centre + turned, half, random));
         }
     }
+
+    for _ in 0..random.random_range(3..14) {
+        let half = Vector3::from_fn(|_, _| random.random_range(0.05..0.22));
+        let along = random.random_range(0.3..0.7);
+        let deep = random.random_range(0.3..0.8);
+        let at = match random.random_range(0..4) {
+            0 => [along * size.x, deep],
+            1 => [size.x - deep, along * size.y],
+            2 => [along * size.x, size.y - deep],
+            _ => [deep, along * size.y],
+        };
+
+        things.push(thing(Point3::new(at[0], at[1], half.z), half, random));
+    }
+
+    things
+}
+
+/// A box of a material and a turn that are drawn.
+fn thing(centre: Point3<f64>, half: Vector3<f64>, random: &mut ChaCha8Rng) -> Solid {
+    let (sin, cos) = random.random_range(-1.5f64..1.5).sin_cos();
+    let strength = random.random_range(0.2..0.8);
+    let material = match random.random_range(0..7) {
+        0 => Material::Books,
+        1 => cloth(random),
+        2 => timber(random),
+        3 => Material::Plain(hue(random, strength, 0.6)),
+        4 => Material::Plain(Colour::WHITE.scaled(strength)),
+        _ => Material::Printed(hue(random, 0.4, 0.75), hue(random, 0.7, 0.3)),
+    };
+
+    Solid {
+        centre,
+        half,
+        cos,
+        sin,
+        material,
+        seed: random.random(),
+    }
+}
+
+/// The boxes of a piece that stands at `at` on the floor, metres, turned about the vertical axis by
+/// `turn`, radians.
+fn placed<'a>(
+    blocks: &'a [Block],
+    at: [f64; 2],
+    turn: f64,
+    random: &'a mut ChaCha8Rng,
+) -> impl Iterator<Item = Solid> + 'a {
+    let (sin, cos) = turn.sin_cos();
+
+    blocks.iter().map(move |&(low, high, material)| {
+        let low = Vector3::from(low);
+        let high = Vector3::from(high);
+        let middle = (low + high) / 2.0;
+        let half = (high - low) / 2.0;
+
+        // From the piece's coordinates into those of the room.
+        let centre = Point3::new(
+            at[0] + cos * middle.x - sin * middle.y,
+            at[1] + sin * middle.x + cos * middle.y,
+            middle.z,
+        );
+
+        Solid {
+            centre,
+            half,
+            cos,
+            sin,
+            material,
+            seed: random.random(),
+        }
+    })
 }

@@ -6,13 +6,21 @@
 //! - Everything follows from a seed. Images are those of a pinhole camera with square pixels.
 
 mod camera_path;
+mod candidates;
+mod film;
 mod furniture;
+mod hand_held;
+mod light;
+mod photograph;
 mod render;
+mod solid;
 mod suite;
 mod surfaces;
 mod texture;
+mod visits;
 
 pub use camera_path::camera_path;
+pub use film::{Film, Suite};
 pub use render::{Camera, Sampling, render};
 pub use suite::{SuiteRoom, Walk};
 
@@ -20,7 +28,12 @@ use nalgebra::{Point3, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use texture::{Colour, Material};
+use candidates::Shade;
+use solid::Solid;
+use texture::Colour;
+
+/// Frames per second of a recording.
+const FRAMES_PER_SECOND: f64 = 30.0;
 
 /// A furnished room.
 #[derive(Debug, Clone)]
@@ -28,9 +41,13 @@ pub struct Scene {
     /// Width (x), depth (y) and height (z), metres.
     size: Vector3<f64>,
     shell: Shell,
-    pieces: Vec<Piece>,
+    solids: Vec<Solid>,
     lamp: Point3<f64>,
     light: Light,
+    /// Which boxes may be between the lamp and a point.
+    shade: Shade,
+    /// Strength of the fine detail of all surfaces, 0 to 1.
+    detail: f64,
 }
 
 /// How a room is lit.
@@ -42,6 +59,12 @@ struct Light {
     lamp_tint: [f64; 3],
     /// Ambient light, which comes from all directions.
     sky: f64,
+    /// The middle of a window and the light that comes through it, or none at night.
+    window: Option<(Point3<f64>, f64)>,
+    /// Factor of the light that the lamp's own panel shines with.
+    panel: f64,
+    /// Factor of the light of the view out of a window.
+    daylight: f64,
 }
 
 impl Light {
@@ -49,6 +72,9 @@ impl Light {
         lamp: 1.9,
         lamp_tint: [1.0; 3],
         sky: 0.30,
+        window: None,
+        panel: 1.0,
+        daylight: 1.0,
     };
 }
 
@@ -96,6 +122,7 @@ enum PanelKind {
     Picture,
     Window,
     Door,
+    Note,
 }
 
 /// A rectangle on the floor.
@@ -104,25 +131,6 @@ struct Rug {
     low: [f64; 2],
     high: [f64; 2],
     colours: [Colour; 2],
-}
-
-/// A box, turned about the vertical axis.
-#[derive(Debug, Clone, Copy)]
-struct Solid {
-    centre: Point3<f64>,
-    half: Vector3<f64>,
-    cos: f64,
-    sin: f64,
-    material: Material,
-    seed: u32,
-}
-
-/// A piece of furniture: boxes inside a bounding sphere, so that one test rules out most rays.
-#[derive(Debug, Clone)]
-struct Piece {
-    centre: Point3<f64>,
-    radius: f64,
-    solids: Vec<Solid>,
 }
 
 impl Scene {
@@ -137,7 +145,7 @@ impl Scene {
         );
         let shell = Shell::new(size, &mut random);
 
-        let pieces = furniture::furnish(size, &mut random);
+        let solids = furniture::furnish(size, &mut random);
 
         let lamp = Point3::new(
             size.x * random.random_range(0.4..0.6),
@@ -145,13 +153,34 @@ impl Scene {
             size.z - 0.25,
         );
 
-        Self {
+        Self::lit_by(size, shell, solids, lamp, Light::PLAIN)
+    }
+
+    /// A room of `size`, metres, whose lamp hangs at `lamp`.
+    fn lit_by(
+        size: Vector3<f64>,
+        shell: Shell,
+        solids: Vec<Solid>,
+        lamp: Point3<f64>,
+        light: Light,
+    ) -> Self {
+        let mut scene = Self {
             size,
             shell,
-            pieces,
+            solids,
             lamp,
-            light: Light::PLAIN,
-        }
+            light,
+            shade: Shade::default(),
+            detail: 0.0,
+        };
+        scene.shade_lamp();
+
+        scene
+    }
+
+    /// Notes which boxes are around the lamp. It must be called whenever a box has moved.
+    fn shade_lamp(&mut self) {
+        self.shade = Shade::new(self.lamp, &self.solids, light::LIFT_M);
     }
 
     /// Width (x), depth (y) and height (z), metres.
@@ -221,6 +250,43 @@ impl Shell {
             floor,
             panels,
             rug,
+        }
+    }
+}
+
+impl Shell {
+    /// Takes colour out of the walls; a `share` of 0 leaves grey.
+    fn fade(&mut self, share: f64) {
+        for colour in &mut self.wall_colours {
+            let grey = colour.0.iter().sum::<f64>() / 3.0;
+            *colour = Colour([grey; 3]).mixed(*colour, share);
+        }
+    }
+
+    /// Pins notes and prints to the walls, three or fewer per metre.
+    fn pin_up(&mut self, size: Vector3<f64>, random: &mut ChaCha8Rng) {
+        for (wall, panels) in self.panels.iter_mut().enumerate() {
+            let length = if wall.is_multiple_of(2) {
+                size.x
+            } else {
+                size.y
+            };
+            let notes = length * random.random_range(0.2..3.0);
+
+            for _ in 0..notes as usize {
+                let [width, height] = [0, 1].map(|_| random.random_range(0.08..0.4));
+                let low = [
+                    random.random_range(0.1..length - width - 0.1),
+                    random.random_range(0.4..(size.z - height - 0.2)),
+                ];
+
+                panels.push(Panel {
+                    low,
+                    high: [low[0] + width, low[1] + height],
+                    kind: PanelKind::Note,
+                    seed: random.random(),
+                });
+            }
         }
     }
 }

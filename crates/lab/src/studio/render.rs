@@ -1,15 +1,17 @@
-//! Ray casting: what a camera in a scene sees, lit by a lamp that casts shadows and by ambient
-//! light.
+//! Ray casting: what a camera in a scene sees, pixel by pixel.
 
 use nalgebra::{Point3, Vector3};
 
-use super::texture::Colour;
-use super::{Piece, Scene, Solid};
+use super::Scene;
+use super::candidates::Spheres;
+use super::light::Seen;
+use super::solid::{Ray, Solid};
 use seese3_core::geometry::Pose;
 use seese3_core::image::RgbImage;
 
 /// Rays along each side of a pixel: 2 × 2 in all.
 const SUPERSAMPLING: usize = 2;
+
 /// The largest difference of light between a pixel's corners that needs no rays inside the pixel.
 const CALM: f64 = 0.04;
 
@@ -21,6 +23,9 @@ pub enum Sampling {
     /// Four rays at the corners, shared with the neighbouring pixels; where these differ, four rays
     /// inside the pixel instead.
     Adaptive,
+    /// Four rays at the corners, shared with the neighbouring pixels; where these differ, one more
+    /// in the middle, which counts as much as the four: softer, at half of the rays.
+    Quincunx,
 }
 
 /// A pinhole camera with square pixels.
@@ -58,13 +63,13 @@ impl Camera {
     }
 
     /// The side of a pixel on the image plane at distance 1.
-    fn pixel(&self) -> f64 {
+    pub(super) fn pixel(&self) -> f64 {
         2.0 * (self.field_of_view_rad / 2.0).tan() / self.width as f64
     }
 
     /// The ray through a point of the image, in pixels from the top left corner; `scale` is
     /// [`Camera::pixel`].
-    fn ray(&self, scale: f64, world_from_camera: &Pose, column: f64, row: f64) -> Ray {
+    pub(super) fn ray(&self, scale: f64, world_from_camera: &Pose, column: f64, row: f64) -> Ray {
         let x = (column - self.width as f64 / 2.0) * scale;
         let y = (row - self.height as f64 / 2.0) * scale;
         let direction = world_from_camera * Vector3::new(x, y, 1.0).normalize();
@@ -76,371 +81,249 @@ impl Camera {
     }
 }
 
-struct Ray {
-    origin: Point3<f64>,
-    direction: Vector3<f64>,
-}
-
-struct Surface {
-    distance: f64,
-    normal: Vector3<f64>,
-    colour: Colour,
-    /// Emitted light, as a factor of the colour: windows, and the lamp's panel on the ceiling.
-    glow: f64,
+/// The light of an image before a camera develops it, and how far away each pixel's surface is.
+#[derive(Debug, Clone)]
+pub(super) struct Radiance {
+    pub width: usize,
+    pub height: usize,
+    /// Linear light in red, green and blue, row by row; 1 is the white of a plain image.
+    pub light: Vec<[f64; 3]>,
+    /// From the camera's centre, metres, row by row.
+    pub distance: Vec<f32>,
 }
 
 /// The image that `camera` takes at `world_from_camera`, which must lie inside the room.
 pub fn render(scene: &Scene, camera: Camera, world_from_camera: &Pose) -> RgbImage {
+    let radiance = radiance(scene, &[], camera, world_from_camera);
+
+    RgbImage {
+        width: radiance.width,
+        height: radiance.height,
+        bytes: radiance
+            .light
+            .iter()
+            .flat_map(|light| light.map(to_srgb))
+            .collect(),
+    }
+}
+
+/// The light that reaches `camera` at `world_from_camera` from a room and from `others`, boxes that
+/// cast no shadow.
+pub(super) fn radiance(
+    scene: &Scene,
+    others: &[Solid],
+    camera: Camera,
+    world_from_camera: &Pose,
+) -> Radiance {
     let Camera { width, height, .. } = camera;
-    let scale = camera.pixel();
-    let seen = |column: f64, row: f64| {
-        scene
-            .seen(&camera.ray(scale, world_from_camera, column, row))
-            .0
+    let view = View {
+        scene,
+        others,
+        camera,
+        scale: camera.pixel(),
+        world_from_camera,
+        tiles: Tiles::new(&scene.solids, camera, world_from_camera),
     };
 
-    // The mean light of a regular grid of rays inside the pixel.
-    let inner = |column: usize, row: usize| {
-        let mut light = [0.0; 3];
-        for sample in 0..SUPERSAMPLING * SUPERSAMPLING {
-            let shift = |part: usize| (part as f64 + 0.5) / SUPERSAMPLING as f64;
-            let ray = seen(
-                column as f64 + shift(sample % SUPERSAMPLING),
-                row as f64 + shift(sample / SUPERSAMPLING),
-            );
-            (0..3).for_each(|c| light[c] += ray[c]);
-        }
+    let mut light = Vec::with_capacity(width * height);
+    let mut distance = Vec::with_capacity(width * height);
 
-        light.map(|channel| channel / (SUPERSAMPLING * SUPERSAMPLING) as f64)
-    };
-
-    let corners = |row: usize| -> Vec<[f64; 3]> {
-        (0..=width)
-            .map(|column| seen(column as f64, row as f64))
-            .collect()
-    };
-
-    let mut bytes = Vec::with_capacity(width * height * 3);
-
-    // Adaptive sampling shares the rays through corners: of every row only the lower corners are
-    // new.
-    let mut above = if camera.sampling == Sampling::Adaptive {
-        corners(0)
-    } else {
-        Vec::new()
-    };
-
+    // Rays through corners are shared: of every row only the lower corners are new.
+    let mut above = view.corners(0);
     for row in 0..height {
-        let below = if camera.sampling == Sampling::Adaptive {
-            corners(row + 1)
-        } else {
-            Vec::new()
-        };
+        let below = view.corners(row + 1);
 
         for column in 0..width {
-            let light = match camera.sampling {
-                Sampling::Full => inner(column, row),
-                Sampling::Adaptive => {
-                    let around = [
-                        above[column],
-                        above[column + 1],
-                        below[column],
-                        below[column + 1],
-                    ];
-                    calm(&around).unwrap_or_else(|| inner(column, row))
-                }
+            let pixel = if camera.sampling == Sampling::Full {
+                view.inner(column, row)
+            } else {
+                let around = [
+                    above[column],
+                    above[column + 1],
+                    below[column],
+                    below[column + 1],
+                ];
+                view.shared(&around, column, row)
             };
 
-            bytes.extend(light.map(to_srgb));
+            light.push(pixel.light);
+            distance.push(pixel.distance as f32);
         }
 
         above = below;
     }
 
-    RgbImage {
+    Radiance {
         width,
         height,
-        bytes,
+        light,
+        distance,
     }
 }
 
-/// The mean light of a pixel's corners, if they differ by no more than [`CALM`].
-fn calm(corners: &[[f64; 3]; 4]) -> Option<[f64; 3]> {
-    let mut mean = [0.0; 3];
-    for (c, value) in mean.iter_mut().enumerate() {
-        // The image clips light at 1, so that differences above it do not show.
-        let of = corners.map(|corner| corner[c].min(1.0));
-        let low = of.into_iter().fold(f64::INFINITY, f64::min);
-        let high = of.into_iter().fold(0.0, f64::max);
-        if high - low > CALM {
-            return None;
-        }
+/// A scene as one camera sees it.
+struct View<'a> {
+    scene: &'a Scene,
+    others: &'a [Solid],
+    camera: Camera,
+    /// [`Camera::pixel`].
+    scale: f64,
+    world_from_camera: &'a Pose,
+    tiles: Tiles,
+}
 
-        *value = of.iter().sum::<f64>() / 4.0;
+impl View<'_> {
+    /// What is seen through a point of the image, in pixels from the top left corner.
+    fn seen(&self, column: f64, row: f64) -> Seen {
+        let ray = self
+            .camera
+            .ray(self.scale, self.world_from_camera, column, row);
+        let candidates = self
+            .tiles
+            .at(column, row)
+            .iter()
+            .map(|&solid| &self.scene.solids[usize::from(solid)])
+            .chain(self.others);
+
+        self.scene.seen(&ray, candidates, self.scale)
     }
 
-    Some(mean)
+    /// What the corners over a row of pixels see; nothing if pixels share no rays.
+    fn corners(&self, row: usize) -> Vec<Seen> {
+        if self.camera.sampling == Sampling::Full {
+            return Vec::new();
+        }
+
+        (0..=self.camera.width)
+            .map(|column| self.seen(column as f64, row as f64))
+            .collect()
+    }
+
+    /// A pixel by the four corners around it, and by rays inside it where these differ.
+    fn shared(&self, around: &[Seen; 4], column: usize, row: usize) -> Seen {
+        if calm(around) {
+            return mean(around);
+        }
+        if self.camera.sampling == Sampling::Adaptive {
+            return self.inner(column, row);
+        }
+
+        let corners = mean(around);
+        let middle = self.seen(column as f64 + 0.5, row as f64 + 0.5);
+
+        Seen {
+            light: std::array::from_fn(|c| (corners.light[c] + middle.light[c]) / 2.0),
+            distance: corners.distance.min(middle.distance),
+        }
+    }
+
+    /// A pixel by a regular grid of rays inside it.
+    fn inner(&self, column: usize, row: usize) -> Seen {
+        let mut light = [0.0; 3];
+        let mut distance = f64::INFINITY;
+        for sample in 0..SUPERSAMPLING * SUPERSAMPLING {
+            let shift = |part: usize| (part as f64 + 0.5) / SUPERSAMPLING as f64;
+            let ray = self.seen(
+                column as f64 + shift(sample % SUPERSAMPLING),
+                row as f64 + shift(sample / SUPERSAMPLING),
+            );
+            (0..3).for_each(|c| light[c] += ray.light[c]);
+            distance = distance.min(ray.distance);
+        }
+
+        let light = light.map(|channel| channel / (SUPERSAMPLING * SUPERSAMPLING) as f64);
+        Seen { light, distance }
+    }
+}
+
+/// The boxes that the rays of each part of an image may meet.
+struct Tiles {
+    across: usize,
+    down: usize,
+    solids: Vec<Vec<u16>>,
+}
+
+impl Tiles {
+    /// Pixels along each side of a tile.
+    const SIDE: usize = 16;
+
+    fn new(solids: &[Solid], camera: Camera, world_from_camera: &Pose) -> Self {
+        let across = camera.width.div_ceil(Self::SIDE);
+        let down = camera.height.div_ceil(Self::SIDE);
+        let scale = camera.pixel();
+        let apex = Point3::from(world_from_camera.translation.vector);
+
+        let spheres = Spheres::around(apex, solids, 0.0);
+        let solids = (0..across * down)
+            .map(|tile| {
+                let left = (tile % across * Self::SIDE) as f64;
+                let top = (tile / across * Self::SIDE) as f64;
+                let side = Self::SIDE as f64;
+                let towards = |right: f64, below: f64| {
+                    camera
+                        .ray(scale, world_from_camera, left + right, top + below)
+                        .direction
+                };
+                let corners = [
+                    towards(0.0, 0.0),
+                    towards(side, 0.0),
+                    towards(0.0, side),
+                    towards(side, side),
+                ];
+
+                spheres.met(towards(side / 2.0, side / 2.0), &corners)
+            })
+            .collect();
+
+        Self {
+            across,
+            down,
+            solids,
+        }
+    }
+
+    /// The boxes for the ray through a point of the image, pixels from the top left corner.
+    fn at(&self, column: f64, row: f64) -> &[u16] {
+        // The image's right and lower edges belong to its last tiles.
+        let across = (column as usize / Self::SIDE).min(self.across - 1);
+        let down = (row as usize / Self::SIDE).min(self.down - 1);
+
+        &self.solids[down * self.across + across]
+    }
+}
+
+/// Whether the light of a pixel's corners differs by no more than [`CALM`].
+fn calm(corners: &[Seen; 4]) -> bool {
+    (0..3).all(|c| {
+        // The image clips light at 1, so that differences above it do not show.
+        let of = corners.map(|corner| corner.light[c].min(1.0));
+        let low = of.into_iter().fold(f64::INFINITY, f64::min);
+        let high = of.into_iter().fold(0.0, f64::max);
+
+        high - low <= CALM
+    })
+}
+
+/// The mean light of a pixel's corners, clipped as the image clips it, and the distance of the
+/// nearest.
+fn mean(corners: &[Seen; 4]) -> Seen {
+    let light = std::array::from_fn(|c| {
+        corners
+            .iter()
+            .map(|corner| corner.light[c].min(1.0))
+            .sum::<f64>()
+            / 4.0
+    });
+    let distance = corners
+        .iter()
+        .map(|corner| corner.distance)
+        .fold(f64::INFINITY, f64::min);
+
+    Seen { light, distance }
 }
 
 fn to_srgb(light: f64) -> u8 {
     (255.0 * light.clamp(0.0, 1.0).powf(1.0 / 2.2)).round() as u8
-}
-
-impl Scene {
-    fn seen(&self, ray: &Ray) -> Colour {
-        // A ray always ends at the shell. That distance limits the search for nearer furniture,
-        // and every hit limits it further.
-        let (mut limit, axis) = self.shell_reach(ray);
-        let mut nearest = None;
-        for piece in &self.pieces {
-            if let Some(nearer) = piece.touch(ray, limit) {
-                limit = nearer.distance;
-                nearest = Some(nearer);
-            }
-        }
-
-        let surface = match nearest {
-            Some(touch) => touch.surface(),
-            None => self.shell_surface(ray, limit, axis),
-        };
-
-        self.lit(&surface, ray)
-    }
-
-    fn lit(&self, surface: &Surface, ray: &Ray) -> Colour {
-        // Diffuse (Lambertian) light: the cosine of the angle to the lamp, and a falloff with
-        // distance that is softened near the lamp. The shadow ray begins 1 mm off the surface,
-        // which would otherwise shadow itself.
-        let at = ray.origin + ray.direction * surface.distance;
-        let normal = surface.normal;
-        let to_lamp = self.lamp - at;
-        let distance = to_lamp.norm();
-        let facing = normal.dot(&to_lamp).max(0.0) / distance;
-        let shadowed =
-            facing > 0.0 && self.blocked(at + normal * 1e-3, to_lamp / distance, distance - 0.05);
-
-        let light = &self.light;
-        let lamp = if shadowed {
-            0.0
-        } else {
-            light.lamp * facing / (0.7 + 0.35 * distance * distance)
-        };
-
-        // Ambient light is stronger on surfaces that face up, and weaker within some 20 cm of
-        // floor, walls and ceiling, as an approximation of ambient occlusion.
-        let sky = light.sky + 0.12 * normal.z;
-
-        let edge = [
-            at.x,
-            self.size.x - at.x,
-            at.y,
-            self.size.y - at.y,
-            at.z,
-            self.size.z - at.z,
-        ];
-
-        let corner: f64 = edge
-            .iter()
-            .map(|d| 1.0 - 0.35 * (-d.max(0.0) / 0.22).exp())
-            .product();
-
-        // A surface of the shell lies on one of these planes itself, which has darkened it by 0.65:
-        // that factor is taken back. The limit of 1 is for furniture, which lies on none of them.
-        let ambient = sky * (corner / 0.65).min(1.0);
-        let lit =
-            |c: usize| surface.colour.0[c] * (ambient + lamp * light.lamp_tint[c] + surface.glow);
-
-        Colour(std::array::from_fn(lit))
-    }
-
-    fn blocked(&self, origin: Point3<f64>, direction: Vector3<f64>, distance: f64) -> bool {
-        let ray = Ray { origin, direction };
-        self.pieces.iter().any(|piece| piece.is_met(&ray, distance))
-    }
-
-    /// Distance from inside the room to the first plane (floor, ceiling or wall) through which the
-    /// ray leaves, and the axis of that plane.
-    fn shell_reach(&self, ray: &Ray) -> (f64, usize) {
-        let mut distance = f64::INFINITY;
-        let mut axis = 0;
-        for candidate in 0..3 {
-            let speed = ray.direction[candidate];
-            let edge = if speed > 0.0 {
-                self.size[candidate]
-            } else {
-                0.0
-            };
-            let reach = (edge - ray.origin[candidate]) / speed;
-
-            // A ray parallel to a plane has an infinite or undefined reach, which is never the
-            // smallest positive one.
-            if reach > 0.0 && reach < distance {
-                distance = reach;
-                axis = candidate;
-            }
-        }
-
-        (distance, axis)
-    }
-
-    fn shell_surface(&self, ray: &Ray, distance: f64, axis: usize) -> Surface {
-        let at = ray.origin + ray.direction * distance;
-        let mut normal = Vector3::zeros();
-        normal[axis] = -ray.direction[axis].signum();
-
-        // Axis and direction name the plane. Along each wall the coordinate runs
-        // counterclockwise, seen from above, as the walls are numbered.
-        let (colour, glow) = match (axis, ray.direction[axis] > 0.0) {
-            (2, false) => (self.floor_colour(at.x, at.y), 0.0),
-            (2, true) => self.ceiling_colour(at.x, at.y),
-            (1, false) => self.wall_colour(0, at.x, at.z),
-            (0, true) => self.wall_colour(1, at.y, at.z),
-            (1, true) => self.wall_colour(2, self.size.x - at.x, at.z),
-            (_, _) => self.wall_colour(3, self.size.y - at.y, at.z),
-        };
-
-        Surface {
-            distance,
-            normal,
-            colour,
-            glow,
-        }
-    }
-}
-
-impl Piece {
-    /// Whether a ray may meet the piece within `limit`, metres: whether it crosses the bounding
-    /// sphere.
-    fn is_near(&self, ray: &Ray, limit: f64) -> bool {
-        let to_centre = self.centre - ray.origin;
-        let along = to_centre.dot(&ray.direction);
-
-        // `off` is the squared distance of the centre from the ray's line.
-        let off = to_centre.norm_squared() - along * along;
-        !(off > self.radius * self.radius || along < -self.radius || along - self.radius > limit)
-    }
-
-    /// Whether a ray meets any box of the piece within `limit`, metres.
-    fn is_met(&self, ray: &Ray, limit: f64) -> bool {
-        self.is_near(ray, limit)
-            && self
-                .solids
-                .iter()
-                .any(|solid| solid.touch(ray, limit).is_some())
-    }
-
-    /// Where a ray first enters a box of the piece, if within `limit`, metres.
-    fn touch(&self, ray: &Ray, limit: f64) -> Option<Touch<'_>> {
-        if !self.is_near(ray, limit) {
-            return None;
-        }
-
-        let mut nearest: Option<Touch<'_>> = None;
-        for solid in &self.solids {
-            let limit = nearest.as_ref().map_or(limit, |touch| touch.distance);
-            nearest = solid.touch(ray, limit).or(nearest);
-        }
-
-        nearest
-    }
-}
-
-impl Solid {
-    /// Where a ray enters the box, if within `limit`, metres.
-    fn touch(&self, ray: &Ray, limit: f64) -> Option<Touch<'_>> {
-        // The inverse of the box's rotation about the vertical axis.
-        let turn_back = |v: Vector3<f64>| {
-            Vector3::new(
-                self.cos * v.x + self.sin * v.y,
-                self.cos * v.y - self.sin * v.x,
-                v.z,
-            )
-        };
-
-        let origin = turn_back(ray.origin - self.centre);
-        let direction = turn_back(ray.direction);
-        let mut enter = f64::NEG_INFINITY;
-        let mut leave = f64::INFINITY;
-
-        let mut axis = 0;
-
-        // The slab method: the ray is inside the box from the last of the three front planes that
-        // it passes to the first of the three back planes.
-        for candidate in 0..3 {
-            let inverse = direction[candidate].recip();
-            let a = (-self.half[candidate] - origin[candidate]) * inverse;
-            let b = (self.half[candidate] - origin[candidate]) * inverse;
-            if a.min(b) > enter {
-                enter = a.min(b);
-                axis = candidate;
-            }
-
-            leave = leave.min(a.max(b));
-        }
-
-        // A ray that begins inside the box or on its surface does not count as entering it.
-        if !(enter > 1e-6 && enter < leave && enter < limit) {
-            return None;
-        }
-
-        Some(Touch {
-            solid: self,
-            distance: enter,
-            axis,
-            origin,
-            direction,
-        })
-    }
-}
-
-/// Where a ray enters a box; origin and direction are in the box's own coordinates.
-struct Touch<'a> {
-    solid: &'a Solid,
-    distance: f64,
-    axis: usize,
-    origin: Vector3<f64>,
-    direction: Vector3<f64>,
-}
-
-impl Touch<'_> {
-    fn surface(&self) -> Surface {
-        let &Touch {
-            solid,
-            distance,
-            axis,
-            origin,
-            direction,
-        } = self;
-
-        let at = origin + direction * distance;
-        let mut normal = Vector3::zeros();
-        normal[axis] = -direction[axis].signum();
-        let front = axis == 1 && normal.y > 0.0;
-
-        let (u, v) = match axis {
-            0 => (at.y, at.z),
-            1 => (at.x, at.z),
-            _ => (at.x, at.y),
-        };
-
-        // Heights are counted from the bottom of the box, so that rows of books and boards line up.
-        let v = if axis == 2 { v } else { v + solid.half.z };
-        let colour = solid.material.colour(u, v, front, solid.seed);
-
-        // Back into world coordinates, by the box's rotation about the vertical axis.
-        let normal = Vector3::new(
-            solid.cos * normal.x - solid.sin * normal.y,
-            solid.sin * normal.x + solid.cos * normal.y,
-            normal.z,
-        );
-
-        Surface {
-            distance,
-            normal,
-            colour,
-            glow: 0.0,
-        }
-    }
 }
 
 #[cfg(test)]
@@ -452,7 +335,7 @@ mod tests {
     #[test]
     fn the_far_wall_is_half_a_room_away() {
         let mut scene = Scene::new(3);
-        scene.pieces.clear();
+        scene.solids.clear();
         let origin = Point3::from(scene.size() / 2.0);
         let ray = Ray {
             origin,

@@ -62,12 +62,12 @@ impl SuiteRoom {
             9..15 => Walk::SinglePass,
             _ => Walk::Corridor,
         };
-        let size = size(walk, &mut random);
+        let size = room_size(walk, &mut random);
         let mut shell = Shell::new(size, &mut random);
 
         decorate(&mut shell, walk, size, &mut random);
 
-        let pieces = match walk {
+        let solids = match walk {
             Walk::Corridor => furniture::furnish_corridor(size, &mut random),
             Walk::Revisits | Walk::SinglePass => furniture::furnish_loosely(size, &mut random),
         };
@@ -85,16 +85,11 @@ impl SuiteRoom {
             lamp: random.random_range(1.0..2.6) * if walk == Walk::Corridor { 1.6 } else { 1.0 },
             lamp_tint: [1.08, 1.0 - 0.06 * warm, 1.05 - 0.38 * warm],
             sky: random.random_range(0.18..0.42),
+            ..Light::PLAIN
         };
 
         Self {
-            scene: Scene {
-                size,
-                shell,
-                pieces,
-                lamp,
-                light,
-            },
+            scene: Scene::lit_by(size, shell, solids, lamp, light),
             walk,
             seed,
         }
@@ -150,7 +145,7 @@ impl SuiteRoom {
 }
 
 /// Width (x), depth (y) and height (z), metres.
-fn size(walk: Walk, random: &mut ChaCha8Rng) -> Vector3<f64> {
+pub(super) fn room_size(walk: Walk, random: &mut ChaCha8Rng) -> Vector3<f64> {
     let height = random.random_range(2.4..3.1);
     if walk == Walk::Corridor {
         return Vector3::new(
@@ -173,7 +168,7 @@ fn size(walk: Walk, random: &mut ChaCha8Rng) -> Vector3<f64> {
 
 /// Adds variety that [`Scene::new`] does not have: carpets, wallpapers, a runner in corridors, and
 /// rooms without a rug.
-fn decorate(shell: &mut Shell, walk: Walk, size: Vector3<f64>, random: &mut ChaCha8Rng) {
+pub(super) fn decorate(shell: &mut Shell, walk: Walk, size: Vector3<f64>, random: &mut ChaCha8Rng) {
     if random.random_bool(0.3) {
         shell.floor = Floor::Carpet(Colour::of_hue(
             random.random_range(0.0..1.0),
@@ -221,7 +216,7 @@ mod tests {
                     );
                 }
 
-                for solid in room.scene.pieces.iter().flat_map(|piece| &piece.solids) {
+                for solid in &room.scene.solids {
                     let v = at - solid.centre;
                     let turned = [
                         solid.cos * v.x + solid.sin * v.y,

@@ -1,6 +1,6 @@
 //! Colours of floor, ceiling and walls, by position in metres.
 
-use super::texture::{Colour, fractal, hash2, noise, picture, wood};
+use super::texture::{Colour, fractal, hash2, noise, note, picture, wood};
 use super::{Floor, Panel, PanelKind, Scene, Wallpaper};
 
 impl Scene {
@@ -70,7 +70,7 @@ impl Scene {
         let beam = (x / 1.3).rem_euclid(1.0) < 0.07;
         let colour = Colour::WHITE.scaled(if beam { 0.7 } else { 0.95 });
 
-        (colour, if lamp { 1.0 } else { 0.0 })
+        (colour, if lamp { self.light.panel } else { 0.0 })
     }
 
     pub(super) fn wall_colour(&self, wall: usize, along: f64, up: f64) -> (Colour, f64) {
@@ -80,7 +80,8 @@ impl Scene {
         // the wall.
         let on = |panel: &&Panel| inside([along, up], panel.low, panel.high);
         if let Some(panel) = shell.panels[wall].iter().find(on) {
-            return panel_colour(panel, along, up);
+            let (colour, glow) = panel_colour(panel, along, up);
+            return (colour, glow * self.light.daylight);
         }
         if up < 0.1 {
             return (Colour::WHITE.scaled(0.8), 0.0);
@@ -146,6 +147,7 @@ fn panel_colour(panel: &Panel, along: f64, up: f64) -> (Colour, f64) {
     );
 
     match panel.kind {
+        PanelKind::Note => (note(u, v, panel.seed), 0.0),
         PanelKind::Picture if framed => (Colour([0.12, 0.09, 0.06]), 0.0),
         PanelKind::Picture => (picture(u, v, panel.seed), 0.0),
         PanelKind::Window => {

@@ -37,6 +37,8 @@ pub(super) enum Material {
     Doors(Colour),
     Screen,
     Leaves(Colour),
+    /// Cardboard with print on it.
+    Printed(Colour, Colour),
 }
 
 impl Material {
@@ -81,6 +83,7 @@ impl Material {
             }
             Self::Screen => Colour([0.06, 0.06, 0.06]),
             Self::Leaves(colour) => colour.scaled(0.45 + 0.75 * fractal(u * 14.0, v * 14.0, seed)),
+            Self::Printed(paper, ink) => printed(paper, ink, u, v, seed),
         }
     }
 }
@@ -118,6 +121,55 @@ fn books(u: f64, v: f64, seed: u32) -> Colour {
     }
 }
 
+/// A sheet on a wall: half of them small paintings, half of them printed paper.
+pub(super) fn note(u: f64, v: f64, seed: u32) -> Colour {
+    if unit(seed, 5) < 0.5 {
+        return picture(2.0 * u, 2.0 * v, seed);
+    }
+
+    let paper = Colour::of_hue(unit(seed, 8), 0.3 * unit(seed, 9), 0.8);
+    let ink = Colour::of_hue(unit(seed, 10), 0.7, 0.3);
+    printed(paper, ink, u, v, seed)
+}
+
+/// Blocks of print, 4 by 2.5 cm: plain, lines of text, or a field of ink.
+fn printed(paper: Colour, ink: Colour, u: f64, v: f64, seed: u32) -> Colour {
+    let column = (u / 0.04).floor() as i64;
+    let row = (v / 0.025).floor() as i64;
+    let kind = hash2(column, row, seed);
+
+    let line = (v / 0.006).rem_euclid(1.0) < 0.5 && hash2((u / 0.005) as i64, row, seed) < 0.7;
+    if kind > 0.7 || (kind > 0.35 && line) {
+        ink
+    } else {
+        paper
+    }
+}
+
+/// The fine detail of a surface, as a factor of its colour: grain, wear and dirt in three octaves from
+/// 11 cm down to `finest`, metres, which is the size of a pixel there. `strength` is 0 to 1.
+pub(super) fn detail(u: f64, v: f64, finest: f64, strength: f64, seed: u32) -> f64 {
+    // Some surfaces are smooth, and others are rough.
+    let rough = strength * (0.3 + 0.7 * unit(seed, 23));
+    let mut sum = 0.0;
+
+    for (octave, (per_metre, amplitude)) in [(9.0, 0.2), (33.0, 0.35), (120.0, 0.45)]
+        .into_iter()
+        .enumerate()
+    {
+        // An octave fades out where its cells are as small as two pixels: it would only flicker.
+        let shown = (2.0 - 3.0 * per_metre * finest).clamp(0.0, 1.0);
+        if shown <= 0.0 {
+            break;
+        }
+
+        let cell = noise(u * per_metre, v * per_metre, seed ^ (octave as u32 + 11));
+        sum += shown * amplitude * (2.0 * cell - 1.0);
+    }
+
+    (1.0 + rough * sum).max(0.05)
+}
+
 /// A painting that follows from its seed: soft shapes in three colours.
 pub(super) fn picture(u: f64, v: f64, seed: u32) -> Colour {
     let a = fractal(u * 5.0, v * 5.0, seed);
@@ -145,28 +197,28 @@ pub(super) fn fractal(x: f64, y: f64, seed: u32) -> f64 {
 
 /// Smooth value noise with cells of size 1, 0 to 1.
 pub(super) fn noise(x: f64, y: f64, seed: u32) -> f64 {
-    let i = x.floor();
-    let j = y.floor();
+    let i = floor(x);
+    let j = floor(y);
 
     // The smoothstep polynomial has slope zero at 0 and 1, so that the noise has no creases at
     // the edges of its cells.
     let smooth = |t: f64| t * t * (3.0 - 2.0 * t);
-    let s = smooth(x - i);
+    let s = smooth(x - i as f64);
+    let t = smooth(y - j as f64);
 
-    let t = smooth(y - j);
-
-    let corner = |di: i64, dj: i64| {
-        hash2(
-            (i as i64).wrapping_add(di),
-            (j as i64).wrapping_add(dj),
-            seed,
-        )
-    };
+    let corner = |di: i64, dj: i64| hash2(i.wrapping_add(di), j.wrapping_add(dj), seed);
 
     let low = corner(0, 0) * (1.0 - s) + corner(1, 0) * s;
     let high = corner(0, 1) * (1.0 - s) + corner(1, 1) * s;
 
     low * (1.0 - t) + high * t
+}
+
+/// The largest integer up to `x`. A cast cuts towards zero, which the processor does faster than
+/// [`f64::floor`].
+fn floor(x: f64) -> i64 {
+    let cut = x as i64;
+    if (cut as f64) > x { cut - 1 } else { cut }
 }
 
 /// A pseudo-random number, 0 to 1, for a cell (i, j).

@@ -1,0 +1,189 @@
+//! What a ray sees: the nearest surface, lit by a lamp that casts shadows, by a window, and by
+//! ambient light.
+
+use nalgebra::{Point3, Vector3};
+
+use super::Scene;
+use super::solid::{Place, Ray, Solid, Surface};
+use super::texture::{Colour, detail};
+
+/// The height over a surface at which its shadow ray begins, so that it does not shadow itself,
+/// metres.
+pub(super) const LIFT_M: f64 = 1e-3;
+
+/// What a ray sees.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Seen {
+    pub light: [f64; 3],
+    /// From the ray's origin, metres.
+    pub distance: f64,
+}
+
+impl Scene {
+    /// What a ray sees of the room and of `candidates`, the boxes that it may meet.
+    ///
+    /// `spread` is the size of a pixel at distance 1: finer detail is not drawn.
+    pub(super) fn seen<'a>(
+        &'a self,
+        ray: &Ray,
+        candidates: impl Iterator<Item = &'a Solid>,
+        spread: f64,
+    ) -> Seen {
+        // A ray always ends at the shell. That distance limits the search for nearer furniture,
+        // and every hit limits it further.
+        let (mut limit, axis) = self.shell_reach(ray);
+        let mut nearest = None;
+        for solid in candidates {
+            if let Some(nearer) = solid.touch(ray, limit) {
+                limit = nearer.distance;
+                nearest = Some(nearer);
+            }
+        }
+
+        let mut surface = match nearest {
+            Some(touch) => touch.surface(),
+            None => self.shell_surface(ray, limit, axis),
+        };
+
+        if self.detail > 0.0 && surface.glow == 0.0 {
+            let Place { u, v, seed } = surface.place;
+            let finest = surface.distance * spread;
+            surface.colour = surface
+                .colour
+                .scaled(detail(u, v, finest, self.detail, seed));
+        }
+
+        Seen {
+            light: self.lit(&surface, ray),
+            distance: surface.distance,
+        }
+    }
+
+    fn lit(&self, surface: &Surface, ray: &Ray) -> [f64; 3] {
+        // Diffuse (Lambertian) light: the cosine of the angle to the lamp, and a falloff with
+        // distance that is softened near the lamp.
+        let at = ray.origin + ray.direction * surface.distance;
+        let normal = surface.normal;
+        let light = &self.light;
+
+        let to_lamp = self.lamp - at;
+        let distance = to_lamp.norm();
+        let facing = normal.dot(&to_lamp).max(0.0) / distance;
+        let dark = facing <= 0.0
+            || light.lamp <= 0.0
+            || self.blocked(at + normal * LIFT_M, to_lamp / distance, distance - 0.05);
+
+        let lamp = if dark {
+            0.0
+        } else {
+            light.lamp * facing / (0.7 + 0.35 * distance * distance)
+        };
+
+        // A window is large, so that its shadows are soft: they are left out.
+        let window = light.window.map_or(0.0, |(from, brightness)| {
+            let to_window = from - at;
+            let distance = to_window.norm();
+            let facing = normal.dot(&to_window).max(0.0) / distance.max(1e-6);
+
+            brightness * (0.15 + facing) / (1.0 + 0.3 * distance * distance)
+        });
+
+        // Ambient light is stronger on surfaces that face up, and weaker within some 20 cm of
+        // floor, walls and ceiling, as an approximation of ambient occlusion.
+        let sky = light.sky + 0.12 * normal.z;
+
+        let edge = [
+            at.x,
+            self.size.x - at.x,
+            at.y,
+            self.size.y - at.y,
+            at.z,
+            self.size.z - at.z,
+        ];
+
+        let corner: f64 = edge
+            .iter()
+            .map(|d| 1.0 - 0.35 * (-d.max(0.0) / 0.22).exp())
+            .product();
+
+        // A surface of the shell lies on one of these planes itself, which has darkened it by 0.65:
+        // that factor is taken back. The limit of 1 is for furniture, which lies on none of them.
+        let ambient = sky * (corner / 0.65).min(1.0);
+
+        std::array::from_fn(|c| {
+            surface.colour.0[c] * (ambient + lamp * light.lamp_tint[c] + window + surface.glow)
+        })
+    }
+
+    fn blocked(&self, origin: Point3<f64>, direction: Vector3<f64>, distance: f64) -> bool {
+        let ray = Ray { origin, direction };
+        self.shade.towards(-direction).iter().any(|&solid| {
+            self.solids[usize::from(solid)]
+                .touch(&ray, distance)
+                .is_some()
+        })
+    }
+
+    /// Distance from inside the room to the first plane (floor, ceiling or wall) through which the
+    /// ray leaves, and the axis of that plane.
+    pub(super) fn shell_reach(&self, ray: &Ray) -> (f64, usize) {
+        let mut distance = f64::INFINITY;
+        let mut axis = 0;
+        for candidate in 0..3 {
+            let speed = ray.direction[candidate];
+            let edge = if speed > 0.0 {
+                self.size[candidate]
+            } else {
+                0.0
+            };
+            let reach = (edge - ray.origin[candidate]) / speed;
+
+            // A ray parallel to a plane has an infinite or undefined reach, which is never the
+            // smallest positive one.
+            if reach > 0.0 && reach < distance {
+                distance = reach;
+                axis = candidate;
+            }
+        }
+
+        (distance, axis)
+    }
+
+    pub(super) fn shell_surface(&self, ray: &Ray, distance: f64, axis: usize) -> Surface {
+        let at = ray.origin + ray.direction * distance;
+        let mut normal = Vector3::zeros();
+        normal[axis] = -ray.direction[axis].signum();
+
+        // Axis and direction name the plane. Along each wall the coordinate runs
+        // counterclockwise, seen from above, as the walls are numbered.
+        let on_wall = |wall: u32, along: f64| {
+            let (colour, glow) = self.wall_colour(wall as usize, along, at.z);
+            (colour, glow, along, at.z, wall)
+        };
+
+        let (colour, glow, u, v, plane): (Colour, f64, f64, f64, u32) =
+            match (axis, ray.direction[axis] > 0.0) {
+                (2, false) => (self.floor_colour(at.x, at.y), 0.0, at.x, at.y, 4),
+                (2, true) => {
+                    let (colour, glow) = self.ceiling_colour(at.x, at.y);
+                    (colour, glow, at.x, at.y, 5)
+                }
+                (1, false) => on_wall(0, at.x),
+                (0, true) => on_wall(1, at.y),
+                (1, true) => on_wall(2, self.size.x - at.x),
+                (_, _) => on_wall(3, self.size.y - at.y),
+            };
+
+        Surface {
+            distance,
+            normal,
+            colour,
+            glow,
+            place: Place {
+                u,
+                v,
+                seed: self.shell.seed ^ (plane << 8),
+            },
+        }
+    }
+}

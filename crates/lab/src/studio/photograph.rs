@@ -1,0 +1,269 @@
+//! What a camera makes of the light: motion blur, exposure, white balance, a lens that darkens
+//! towards the corners, and a sensor that is noisy.
+
+use nalgebra::{Isometry3, Matrix4, Vector4};
+
+use super::render::{Camera, Radiance};
+use super::texture::hash2;
+use seese3_core::image::RgbImage;
+
+/// How one photograph is taken.
+#[derive(Debug, Clone)]
+pub(super) struct Shot {
+    /// The camera's motion while the shutter is open: the pose at its end in the frame of its
+    /// beginning, metres.
+    pub motion: Isometry3<f64>,
+    /// Factor of the exposure beside the one that the camera's meter sets.
+    pub exposure: f64,
+    /// Factors of red, green and blue.
+    pub white: [f64; 3],
+    /// Darkening of the image's corners, as a share.
+    pub vignette: f64,
+    /// Standard deviation of the noise of a white pixel, and that of a black one; 1 is white.
+    pub noise: [f64; 2],
+    pub seed: u32,
+}
+
+/// The mean light that the meter aims at, linear, and the share of the way (in the logarithm) that
+/// it goes there.
+const METER: (f64, f64) = (0.2, 0.75);
+
+/// Samples along the path of a pixel while the shutter is open.
+const BLUR: usize = 6;
+
+/// The photograph of `radiance`, which `camera` sees in the middle of the exposure.
+pub(super) fn photograph(radiance: &Radiance, camera: Camera, shot: &Shot) -> RgbImage {
+    let Radiance { width, height, .. } = *radiance;
+    let gain = shot.exposure * metered(radiance);
+    let tone = Tone::new();
+    let blur = Blur::new(radiance, camera, shot.motion);
+    let corner = (width * width + height * height) as f64 / 4.0;
+    let mut bytes = Vec::with_capacity(width * height * 3);
+
+    for row in 0..height {
+        for column in 0..width {
+            let light = blur.light(column, row);
+
+            // The lens darkens with the square of the distance from the image's middle.
+            let right = column as f64 - width as f64 / 2.0;
+            let down = row as f64 - height as f64 / 2.0;
+            let lens = 1.0 - shot.vignette * (right * right + down * down) / corner;
+
+            for (channel, &light) in light.iter().enumerate() {
+                let exposed = (gain * lens * shot.white[channel] * light).min(1.5);
+
+                // The variance of light counted in photons grows with the light, beside that of
+                // the electronics.
+                let [white, black] = shot.noise;
+                let deviation = (white * white * exposed + black * black).sqrt();
+                let place = (row * width + column) * 3 + channel;
+
+                bytes.push(tone.of(exposed + deviation * grain(place, shot.seed)));
+            }
+        }
+    }
+
+    RgbImage {
+        width,
+        height,
+        bytes,
+    }
+}
+
+/// The gain that the camera's meter sets: part of what would bring the mean to its aim.
+fn metered(radiance: &Radiance) -> f64 {
+    let sum: f64 = radiance
+        .light
+        .iter()
+        .map(|[red, green, blue]| (0.3 * red + 0.6 * green + 0.1 * blue).min(2.0))
+        .sum();
+    let mean = sum / radiance.light.len() as f64;
+    let (aim, share) = METER;
+
+    (aim / mean.max(1e-3)).powf(share)
+}
+
+/// The smear of an image while the shutter is open.
+struct Blur<'a> {
+    radiance: &'a Radiance,
+    /// The size of a pixel at distance 1.
+    scale: f64,
+    /// From the camera at the beginning to the camera at the end.
+    end_from_begin: Matrix4<f64>,
+}
+
+impl<'a> Blur<'a> {
+    fn new(radiance: &'a Radiance, camera: Camera, motion: Isometry3<f64>) -> Self {
+        Self {
+            radiance,
+            scale: camera.pixel(),
+            end_from_begin: motion.inverse().to_homogeneous(),
+        }
+    }
+
+    /// The mean light along the way of a pixel's surface.
+    fn light(&self, column: usize, row: usize) -> [f64; 3] {
+        let Radiance { width, height, .. } = *self.radiance;
+        let still = self.radiance.light[row * width + column];
+        let [right, down] = self.way(column, row);
+
+        // Less than a pixel is no smear; more than a fifth of the image is of a surface at the
+        // camera's very eye.
+        let length = right * right + down * down;
+        let limit = (width as f64 / 5.0).powi(2);
+        if !(0.5..limit).contains(&length) {
+            return still;
+        }
+
+        let mut sum = [0.0; 3];
+        for sample in 0..BLUR {
+            let share = (sample as f64 + 0.5) / BLUR as f64 - 0.5;
+            let beside = |from: usize, by: f64, size: usize| {
+                ((from as f64 + by * share + 0.5) as usize).min(size - 1)
+            };
+            let at = beside(row, down, height) * width + beside(column, right, width);
+            let light = self.radiance.light[at];
+            (0..3).for_each(|c| sum[c] += light[c]);
+        }
+
+        sum.map(|channel| channel / BLUR as f64)
+    }
+
+    /// How far a pixel's surface moves in the image, pixels to the right and down.
+    fn way(&self, column: usize, row: usize) -> [f64; 2] {
+        let Radiance { width, height, .. } = *self.radiance;
+
+        // Where the surface is in the camera's frame, and where the camera sees it at the end.
+        let x = (column as f64 + 0.5 - width as f64 / 2.0) * self.scale;
+        let y = (row as f64 + 0.5 - height as f64 / 2.0) * self.scale;
+        let distance = f64::from(self.radiance.distance[row * width + column]);
+        let depth = distance / (1.0 + x * x + y * y).sqrt();
+        let after = self.end_from_begin * Vector4::new(x * depth, y * depth, depth, 1.0);
+
+        [
+            (after.x / after.z - x) / self.scale,
+            (after.y / after.z - y) / self.scale,
+        ]
+    }
+}
+
+/// Noise of mean 0 and deviation 1 for a place in the image: the sum of four uniform numbers.
+fn grain(place: usize, seed: u32) -> f64 {
+    let bits = (hash2(place as i64, 0, seed) * f64::from(u32::MAX)) as u32;
+    let sum: u32 = bits.to_le_bytes().into_iter().map(u32::from).sum();
+
+    // A byte has the variance (256² − 1) / 12.
+    (f64::from(sum) - 510.0) / (4.0 * 65_535.0 / 12.0_f64).sqrt()
+}
+
+/// The curve from linear light to the bytes of an image, the power 1 / 2.2, as a table.
+struct Tone {
+    bytes: Vec<u8>,
+}
+
+impl Tone {
+    const STEPS: usize = 8_192;
+
+    fn new() -> Self {
+        let bytes = (0..=Self::STEPS)
+            .map(|step| {
+                let light = step as f64 / Self::STEPS as f64;
+                (255.0 * light.powf(1.0 / 2.2)).round() as u8
+            })
+            .collect();
+
+        Self { bytes }
+    }
+
+    fn of(&self, light: f64) -> u8 {
+        self.bytes[(light.clamp(0.0, 1.0) * Self::STEPS as f64) as usize]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A camera of 40 × 30 pixels whose focal length is 20 pixels.
+    fn camera() -> Camera {
+        Camera {
+            field_of_view_rad: std::f64::consts::FRAC_PI_2,
+            ..Camera::sized(40, 30)
+        }
+    }
+
+    fn shot(motion: Isometry3<f64>) -> Shot {
+        Shot {
+            motion,
+            exposure: 1.0,
+            white: [1.0; 3],
+            vignette: 0.0,
+            noise: [0.0; 2],
+            seed: 1,
+        }
+    }
+
+    /// A white column of pixels on black, everywhere `distance` metres away.
+    fn stripe(distance: f32) -> Radiance {
+        let light = (0..40 * 30)
+            .map(|at| if at % 40 == 20 { [1.0; 3] } else { [0.0; 3] })
+            .collect();
+
+        Radiance {
+            width: 40,
+            height: 30,
+            light,
+            distance: vec![distance; 40 * 30],
+        }
+    }
+
+    /// Oracle: the pinhole camera by hand. A step of 0.3 m to the right at 1 m and a focal length of
+    /// 20 pixels moves the image by 6 pixels, so that a line is smeared over about 6; at 4 m over
+    /// a quarter of that, which touches up to 3.
+    #[test]
+    fn what_is_near_blurs_more() {
+        let motion = Isometry3::translation(0.3, 0.0, 0.0);
+        let smeared = |metres: f32| {
+            let radiance = stripe(metres);
+            let blur = Blur::new(&radiance, camera(), motion);
+            (0..40)
+                .filter(|&column| blur.light(column, 15)[0] > 0.0)
+                .count()
+        };
+
+        assert!((5..=7).contains(&smeared(1.0)), "{}", smeared(1.0));
+        assert!((1..=3).contains(&smeared(4.0)), "{}", smeared(4.0));
+    }
+
+    /// Oracle: the meter's definition. A scene twice as bright comes out brighter, but by less than
+    /// half as much as without a meter.
+    #[test]
+    fn the_meter_takes_back_most_of_a_change_of_light() {
+        let grey = |light: f64| Radiance {
+            width: 40,
+            height: 30,
+            light: vec![[light; 3]; 40 * 30],
+            distance: vec![1.0; 40 * 30],
+        };
+        let taken = |light: f64| {
+            let image = photograph(&grey(light), camera(), &shot(Isometry3::identity()));
+            (f64::from(image.pixel(20, 15)[0]) / 255.0).powf(2.2)
+        };
+
+        let ratio = taken(0.4) / taken(0.2);
+        assert!((ratio - 2f64.powf(0.25)).abs() < 0.02, "{ratio}");
+    }
+
+    /// Oracle: the definitions of mean and deviation.
+    #[test]
+    fn grain_has_mean_zero_and_deviation_one() {
+        let noise: Vec<f64> = (0..20_000).map(|place| grain(place, 5)).collect();
+        let mean = noise.iter().sum::<f64>() / 20_000.0;
+        let square = noise.iter().map(|value| value * value).sum::<f64>() / 20_000.0;
+
+        assert!(
+            mean.abs() < 0.03 && (square - 1.0).abs() < 0.04,
+            "{mean} {square}"
+        );
+    }
+}

@@ -1,0 +1,148 @@
+//! Boxes, and where rays meet them.
+
+use nalgebra::{Point3, Vector3};
+
+use super::texture::{Colour, Material};
+
+/// A box, turned about the vertical axis.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Solid {
+    pub centre: Point3<f64>,
+    /// Half of the length of each side, metres.
+    pub half: Vector3<f64>,
+    /// Cosine and sine of the turn.
+    pub cos: f64,
+    pub sin: f64,
+    pub material: Material,
+    pub seed: u32,
+}
+
+/// A ray; its direction has length 1.
+pub(super) struct Ray {
+    pub origin: Point3<f64>,
+    pub direction: Vector3<f64>,
+}
+
+/// What a ray ends at.
+pub(super) struct Surface {
+    /// From the ray's origin, metres.
+    pub distance: f64,
+    pub normal: Vector3<f64>,
+    pub colour: Colour,
+    /// Emitted light, as a factor of the colour: windows, and the lamp's panel on the ceiling.
+    pub glow: f64,
+    /// Coordinates on the surface, metres, and the seed of its texture.
+    pub place: Place,
+}
+
+/// A place on a surface: coordinates in metres, and the seed of the surface's texture.
+pub(super) struct Place {
+    pub u: f64,
+    pub v: f64,
+    pub seed: u32,
+}
+
+impl Solid {
+    /// A vector of the room in the box's own axes: the inverse of its turn.
+    pub fn turned_back(&self, v: Vector3<f64>) -> Vector3<f64> {
+        Vector3::new(
+            self.cos * v.x + self.sin * v.y,
+            self.cos * v.y - self.sin * v.x,
+            v.z,
+        )
+    }
+
+    /// Where a ray enters the box, if within `limit`, metres.
+    pub fn touch(&self, ray: &Ray, limit: f64) -> Option<Touch<'_>> {
+        let origin = self.turned_back(ray.origin - self.centre);
+        let direction = self.turned_back(ray.direction);
+        let mut enter = f64::NEG_INFINITY;
+        let mut leave = f64::INFINITY;
+
+        let mut axis = 0;
+
+        // The slab method: the ray is inside the box from the last of the three front planes that
+        // it passes to the first of the three back planes.
+        for candidate in 0..3 {
+            let inverse = direction[candidate].recip();
+            let a = (-self.half[candidate] - origin[candidate]) * inverse;
+            let b = (self.half[candidate] - origin[candidate]) * inverse;
+            if a.min(b) > enter {
+                enter = a.min(b);
+                axis = candidate;
+            }
+
+            leave = leave.min(a.max(b));
+        }
+
+        // A ray that begins inside the box or on its surface does not count as entering it.
+        if !(enter > 1e-6 && enter < leave && enter < limit) {
+            return None;
+        }
+
+        Some(Touch {
+            solid: self,
+            distance: enter,
+            axis,
+            origin,
+            direction,
+        })
+    }
+}
+
+/// Where a ray enters a box; origin and direction are in the box's own coordinates.
+pub(super) struct Touch<'a> {
+    solid: &'a Solid,
+    /// From the ray's origin, metres.
+    pub distance: f64,
+    axis: usize,
+    origin: Vector3<f64>,
+    direction: Vector3<f64>,
+}
+
+impl Touch<'_> {
+    /// The surface there.
+    pub fn surface(&self) -> Surface {
+        let &Touch {
+            solid,
+            distance,
+            axis,
+            origin,
+            direction,
+        } = self;
+
+        let at = origin + direction * distance;
+        let mut normal = Vector3::zeros();
+        normal[axis] = -direction[axis].signum();
+        let front = axis == 1 && normal.y > 0.0;
+
+        let (u, v) = match axis {
+            0 => (at.y, at.z),
+            1 => (at.x, at.z),
+            _ => (at.x, at.y),
+        };
+
+        // Heights are counted from the bottom of the box, so that rows of books and boards line up.
+        let v = if axis == 2 { v } else { v + solid.half.z };
+        let colour = solid.material.colour(u, v, front, solid.seed);
+
+        // Back into world coordinates, by the box's rotation about the vertical axis.
+        let normal = Vector3::new(
+            solid.cos * normal.x - solid.sin * normal.y,
+            solid.sin * normal.x + solid.cos * normal.y,
+            normal.z,
+        );
+
+        Surface {
+            distance,
+            normal,
+            colour,
+            glow: 0.0,
+            place: Place {
+                u,
+                v,
+                seed: solid.seed,
+            },
+        }
+    }
+}
