@@ -52,6 +52,19 @@ def kitchen(folder):
         print(f"{features} {stride} time: R² {found:.2f} (reference {reference}; out of distribution, not gated)")
 
 
+def two_views(folder):
+    """The motion between two photographs is read better than as none, in metres and in degrees (docs/two-views.md)."""
+    for stride in (1, 2, 4):
+        found = json.loads((folder / f"motion-{stride}.json").read_text())
+        for unit in ("translation_m", "rotation_deg"):
+            for share in ("median", "p90"):
+                ours, still = (found[row][unit][share] for row in ("two_view", "no_motion"))
+                print(f"stride {5 * stride}, {unit} {share}: {ours:.3f}, no motion {still:.3f}")
+                assert ours < still
+        degrees = found["two_view"]["rotation_deg"]["median"]
+        assert degrees < 0.3 * found["no_motion"]["rotation_deg"]["median"] or stride == 1, degrees
+
+
 def localization(folder):
     """A fitted adapter is nowhere farther from the truth than the nearest frame, and XFeat's target (docs/localization.md)."""
     for features in ("effnet", "xfeat"):
@@ -116,6 +129,8 @@ if __name__ == "__main__":
         sweep(sys.argv[2], int(sys.argv[3]))
     elif sys.argv[1] == "features":
         features(pathlib.Path(sys.argv[2]), pathlib.Path(sys.argv[3]))
+    elif sys.argv[1] == "two_views":
+        two_views(pathlib.Path(sys.argv[2]))
     elif sys.argv[1] == "localization":
         localization(pathlib.Path(sys.argv[2]))
     else:

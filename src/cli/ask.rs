@@ -418,9 +418,23 @@ pub struct Motion {
         conflicts_with = "features"
     )]
     frames: Option<Vec<u32>>,
-    /// Two JPEG or PNG files, A,B; the server must have been started with --encoder
+    /// Two JPEG or PNG files, A,B; the server must have been started with --encoder or --two-view
     #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "features"])]
     images: Option<Vec<PathBuf>>,
+    /// Focal length of the camera of --images in image widths: fx in pixels over the image's width.
+    /// With it, a server started with --two-view compares the images themselves
+    #[arg(long, value_name = "WIDTHS", requires = "images")]
+    focal: Option<f64>,
+    /// Principal point of that camera in image widths, cx/width and cy/width; the middle of an image
+    /// of 4 by 3 if omitted
+    #[arg(
+        long,
+        value_name = "X,Y",
+        value_delimiter = ',',
+        num_args = 2,
+        requires = "focal"
+    )]
+    principal_point: Option<Vec<f64>>,
     /// A NumPy file of features, shape (n, d); --rows chooses two
     #[arg(long, value_name = "FILE", requires = "rows")]
     features: Option<PathBuf>,
@@ -442,11 +456,22 @@ impl Motion {
             },
         };
 
+        let [centre_x, centre_y] = match self.principal_point.as_deref() {
+            Some(&[x, y]) => [x, y],
+            _ => [0.5, 0.375],
+        };
+        let camera = self.focal.map(|focal| pb::Pinhole {
+            focal,
+            centre_x,
+            centre_y,
+        });
+
         let request = pb::EstimateMotionRequest {
             adapter: self.adapter,
             room: self.room,
             first: Some(first),
             second: Some(second),
+            camera,
             ..pb::EstimateMotionRequest::default()
         };
 
@@ -461,15 +486,31 @@ impl Motion {
             .as_ref()
             .context("the server sent no motion")?;
 
-        say(format_args!(
-            "adapter {}",
-            revision(answer.adapter.as_ref())
-        ));
+        match answer.reader() {
+            pb::MotionReader::TwoView => say("read from where things are in both images"),
+            pb::MotionReader::None => {
+                say("the images show too little in common: no motion is read");
+            }
+            pb::MotionReader::Adapter | pb::MotionReader::Unspecified => say(format_args!(
+                "adapter {}",
+                revision(answer.adapter.as_ref())
+            )),
+        }
 
         say(format_args!(
             "motion {} in the body frame of the first camera",
             motion_text(motion)
         ));
+
+        // Standard deviations: the roots of the means of the covariance's diagonal.
+        if let Some(variances) = diagonal(&answer.covariance) {
+            let deviation = |part: &[f64]| (part.iter().sum::<f64>() / 3.0).sqrt();
+            say(format_args!(
+                "give or take {:.3} m, {:.1}° along each axis",
+                deviation(&variances[..3]),
+                deviation(&variances[3..]).to_degrees()
+            ));
+        }
 
         // The true motion is only known when both views are frames of the room, whose poses were
         // recorded.
@@ -483,6 +524,11 @@ impl Motion {
 
         Ok(())
     }
+}
+
+/// The diagonal of a 6×6 matrix, row by row; none for another length.
+fn diagonal(matrix: &[f64]) -> Option<[f64; 6]> {
+    (matrix.len() == 36).then(|| std::array::from_fn(|row| matrix[7 * row]))
 }
 
 #[derive(Debug, Args)]

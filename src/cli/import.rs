@@ -12,6 +12,7 @@ use super::say;
 use crate::datasets::{self, Dropped, Reader, Recording, SevenScenes, Unusable};
 use crate::store::{Store, check_features};
 use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::Pinhole;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 
 /// The number of dropped frames that are listed one by one; beyond that they are only counted.
@@ -107,6 +108,20 @@ struct Destination {
     /// Licence of the recording, stored with the room
     #[arg(long, default_value = "")]
     licence: String,
+    /// Focal length of the camera in image widths: fx in pixels over the image's width. Motions
+    /// between two views are read with it
+    #[arg(long, value_name = "WIDTHS")]
+    focal: Option<f64>,
+    /// Principal point of the camera in image widths from the image's top left corner, cx/width and
+    /// cy/width; the middle of an image of 4 by 3 if omitted
+    #[arg(
+        long,
+        value_name = "X,Y",
+        value_delimiter = ',',
+        num_args = 2,
+        requires = "focal"
+    )]
+    principal_point: Option<Vec<f64>>,
 }
 
 impl Import {
@@ -263,6 +278,7 @@ impl Destination {
             licence: either(&self.licence, &stated.licence),
             images_root: recording.images_root.clone(),
             worst_rotation_deviation: recording.worst_rotation_deviation,
+            camera: self.camera()?.or(stated.camera),
         };
 
         // The name given wins, then the bundle's own, then one derived from the path.
@@ -273,6 +289,19 @@ impl Destination {
         };
         let id = RoomId::new(&name).context("give another name with --name")?;
         Ok(Room::new(id, frames, provenance)?)
+    }
+
+    fn camera(&self) -> anyhow::Result<Option<Pinhole>> {
+        let Some(focal) = self.focal else {
+            return Ok(None);
+        };
+        let centre = match self.principal_point.as_deref() {
+            Some(&[x, y]) => [x, y],
+            _ => [0.5, 0.375],
+        };
+
+        let camera = Pinhole::new(focal, centre.into()).context("--focal, --principal-point")?;
+        Ok(Some(camera))
     }
 
     /// Prints what was read.

@@ -37,6 +37,10 @@ pub struct Serve {
         value_delimiter = ','
     )]
     encoders: Vec<String>,
+    /// XFeat's ONNX file: the motion between two images of a known camera is then read from where
+    /// things are in both, in rooms that nobody has mapped
+    #[arg(long, value_name = "FILE", env = "SEESE3_TWO_VIEW")]
+    two_view: Option<PathBuf>,
     /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
     #[arg(long, env = "SEESE3_RUNTIME", value_enum, default_value_t = RuntimeName::Tract)]
     runtime: RuntimeName,
@@ -113,18 +117,21 @@ impl Serve {
                 IndexName::Exact => IndexKind::Exact,
                 IndexName::Hnsw => IndexKind::Hnsw(HnswParameters::default()),
             },
-            encoders: (!self.encoders.is_empty()).then(|| ImageEncoders {
-                models: self.encoders.clone(),
-                runtime: Runtime {
-                    kind: self.runtime.into(),
-                    threads,
-                    library: self.library.clone(),
-                },
-                bounds: Bounds {
-                    // An image arrives within a single message, so it cannot be larger than that.
-                    bytes: self.max_message_bytes as u64,
-                    pixels: self.max_image_pixels,
-                },
+            encoders: (!self.encoders.is_empty() || self.two_view.is_some()).then(|| {
+                ImageEncoders {
+                    models: self.encoders.clone(),
+                    two_view: self.two_view.clone(),
+                    runtime: Runtime {
+                        kind: self.runtime.into(),
+                        threads,
+                        library: self.library.clone(),
+                    },
+                    bounds: Bounds {
+                        // An image arrives within a single message, so it cannot be larger than that.
+                        bytes: self.max_message_bytes as u64,
+                        pixels: self.max_image_pixels,
+                    },
+                }
             }),
             limits: Limits {
                 steps: self.max_steps,

@@ -169,7 +169,7 @@ impl Studio {
             // A room follows from seed and number alone. An interrupted command therefore
             // continues by skipping the rooms that are complete in the store.
             let film = self.film(number);
-            let mut room = self.room(&name, &film)?;
+            let mut room = self.room(&name, &film, encoder.render_size())?;
             let before = stored(store, &room).await?;
             let images_kept = before
                 .as_ref()
@@ -241,10 +241,16 @@ impl Studio {
 
     /// The room with its camera path and, with --keep-images, the paths of its images; without
     /// features.
-    fn room(&self, name: &str, film: &Film) -> anyhow::Result<Room> {
+    fn room(
+        &self,
+        name: &str,
+        film: &Film,
+        (width, height): (usize, usize),
+    ) -> anyhow::Result<Room> {
         let mut provenance = Provenance {
             format: format!("studio {}", film.kind),
             licence: "CC0-1.0".to_owned(),
+            camera: Some(film.camera(width, height)?),
             ..Provenance::default()
         };
 
@@ -303,13 +309,12 @@ impl Studio {
             Ok(drawn)
         };
 
-        // Clips stay within a visit.
-        let timeline = room.timeline();
         let cancel = Cancellation::default();
         let batch = self.batch as usize;
 
         let task = Task {
-            timeline: &timeline,
+            // Clips stay within a visit.
+            timeline: room.timeline(),
             image: &image,
             batch,
             on_bad: OnBadImage::Stop,

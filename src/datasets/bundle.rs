@@ -22,6 +22,7 @@ use super::{
     Error, Recording, Stated, entries, read_bytes, read_features, read_poses, read_timestamps,
 };
 use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::Pinhole;
 use seese3_core::room::Room;
 
 const FORMAT: &str = "seese3 bundle 1";
@@ -47,6 +48,9 @@ struct Bundle {
     sequences: Vec<u32>,
     held_out: Vec<bool>,
     worst_rotation_deviation: f64,
+    /// The camera's focal length and principal point (x, y), image widths, if known.
+    #[serde(default)]
+    camera: Option<[f64; 3]>,
     features: Vec<Made>,
 }
 
@@ -125,6 +129,7 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
         sequences,
         held_out,
         worst_rotation_deviation,
+        camera,
         features,
     } = bundle;
 
@@ -161,16 +166,27 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
 
     check_lengths(&file, &recording)?;
 
+    let camera = camera
+        .map(|[focal, x, y]| Pinhole::new(focal, [x, y].into()))
+        .transpose()
+        .map_err(|error| malformed(format!("camera: {error}")))?;
+
     recording.stated = Stated {
         name,
         format: recorded_as,
         licence,
+        camera,
     };
 
     let read = std::mem::take(&mut recording.features);
     recording.features = with_sources(read, &features, &file)?;
 
     Ok(recording)
+}
+
+fn focal_and_centre(camera: Pinhole) -> [f64; 3] {
+    let centre = camera.centre();
+    [camera.focal(), centre.x, centre.y]
 }
 
 /// Replaces the placeholder source of every array by the one that `bundle.json` states. Arrays and
@@ -286,10 +302,28 @@ pub fn write_numpy(
         )?);
     }
 
+    let file = folder.join(SAYS);
+    let text = serde_json::to_vec_pretty(&described(room, features)).map_err(|error| {
+        Error::Malformed {
+            file: file.clone(),
+            problem: error.to_string(),
+        }
+    })?;
+    std::fs::write(&file, text).map_err(|cause| Error::Io {
+        file: file.clone(),
+        cause,
+    })?;
+
+    files.push(file);
+    Ok(files)
+}
+
+/// What `bundle.json` says of a room.
+fn described(room: &Room, features: &[Features]) -> Bundle {
     let frames = room.frames();
     let provenance = room.provenance();
 
-    let bundle = Bundle {
+    Bundle {
         format: FORMAT.to_owned(),
         name: room.id().to_string(),
         recorded_as: provenance.format.clone(),
@@ -301,21 +335,9 @@ pub fn write_numpy(
         sequences: frames.sequences.clone(),
         held_out: frames.held_out.clone(),
         worst_rotation_deviation: provenance.worst_rotation_deviation,
+        camera: provenance.camera.map(focal_and_centre),
         features: features.iter().map(|set| made(set.source())).collect(),
-    };
-
-    let file = folder.join(SAYS);
-    let text = serde_json::to_vec_pretty(&bundle).map_err(|error| Error::Malformed {
-        file: file.clone(),
-        problem: error.to_string(),
-    })?;
-    std::fs::write(&file, text).map_err(|cause| Error::Io {
-        file: file.clone(),
-        cause,
-    })?;
-
-    files.push(file);
-    Ok(files)
+    }
 }
 
 fn made(source: &FeatureSource) -> Made {

@@ -27,6 +27,7 @@ pub use twelve_scenes::read_twelve_scenes;
 use std::path::{Path, PathBuf};
 
 use seese3_core::features::Features;
+use seese3_core::geometry::Pinhole;
 use seese3_core::room::{Frames, Timeline};
 
 /// The largest entry of |RRᵀ − I| that is accepted as rounding and projected away. A matrix with a
@@ -116,7 +117,7 @@ pub struct Recording {
 }
 
 /// Metadata that only a bundle contains; empty for all other formats.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Stated {
     /// The room's name.
     pub name: String,
@@ -124,6 +125,8 @@ pub struct Stated {
     pub format: String,
     /// The terms under which it may be used.
     pub licence: String,
+    /// The camera that took its images.
+    pub camera: Option<Pinhole>,
 }
 
 impl Recording {

@@ -58,6 +58,16 @@ impl Pooling {
         }
     }
 
+    /// Channels, rows and columns of a feature of `width` numbers, if it is a grid.
+    pub fn map_shape(self, width: usize) -> Option<[usize; 3]> {
+        match self {
+            Self::Grid { columns, rows, .. } => {
+                Some([width.checked_div(columns * rows)?, rows, columns])
+            }
+            Self::Vector | Self::Cls | Self::Mean { .. } => None,
+        }
+    }
+
     /// Its text without the number of skipped tokens, for the names of features.
     pub(super) fn short(self) -> String {
         self.after(0).to_string()

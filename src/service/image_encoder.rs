@@ -2,6 +2,7 @@
 //! the same encoder that made the adapter's features.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use super::{Error, RunError};
@@ -14,6 +15,9 @@ use seese3_core::features::FeatureSource;
 pub struct ImageEncoders {
     /// `builtin`, `pixels`, or paths of ONNX files: the encoders that made the adapters' features.
     pub models: Vec<String>,
+    /// XFeat's ONNX file, whose feature maps tell the motion between two images; none if the server
+    /// does not read it.
+    pub two_view: Option<PathBuf>,
     /// The runtime that executes ONNX models.
     pub runtime: Runtime,
     /// The largest size of one image, encoded and decoded.
@@ -27,6 +31,11 @@ pub struct ImageEncoder {
 }
 
 impl ImageEncoder {
+    /// Encodes images of at most the size of `bounds` by `encoder`.
+    pub fn new(encoder: Encoder, bounds: Bounds) -> Self {
+        Self { encoder, bounds }
+    }
+
     /// The feature of one JPEG or PNG image. `field` is the name of the image's field in the
     /// request, for error messages.
     ///
@@ -67,6 +76,7 @@ pub fn open(
         models,
         runtime,
         bounds,
+        ..
     }) = encoders
     else {
         return Ok(image_encoders);
@@ -85,10 +95,7 @@ pub fn open(
         }
 
         if let Some(encoder) = open_for(name, source, models, runtime)? {
-            let image_encoder = Arc::new(ImageEncoder {
-                encoder,
-                bounds: *bounds,
-            });
+            let image_encoder = Arc::new(ImageEncoder::new(encoder, *bounds));
             opened.push((source, image_encoder.clone()));
             image_encoders.insert(name.clone(), image_encoder);
         }

@@ -22,6 +22,7 @@ mod snapshot;
 mod status;
 mod telemetry;
 mod track;
+mod two_views;
 mod workers;
 
 pub use image_encoder::ImageEncoders;
@@ -143,6 +144,11 @@ pub enum RunError {
     Model {
         model: String,
         problem: crate::encoder::Error,
+    },
+    #[error("--two-view {}: {problem}; give XFeat's ONNX file (`seese3 encoders` says how to export it)", file.display())]
+    TwoView {
+        file: std::path::PathBuf,
+        problem: String,
     },
     #[error("the server failed: {0}")]
     Transport(#[from] tonic::transport::Error),

@@ -12,7 +12,7 @@ use crate::store::StoredAdapter;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::odometry_service_server::OdometryService;
 use seese3_core::cancel::Cancellation;
-use seese3_core::geometry::{body_twist, exp};
+use seese3_core::geometry::{Pinhole, body_twist, exp};
 use seese3_core::navigation::{Source, StepError};
 use seese3_core::room::FrameId;
 use seese3_core::tracking::View;
@@ -49,12 +49,25 @@ fn answer(
     request: pb::EstimateMotionRequest,
     cancel: &Cancellation,
 ) -> Result<pb::EstimateMotionResponse, Error> {
+    match compared(snapshot, &request)? {
+        Some(answer) => Ok(answer),
+        None => by_adapter(snapshot, request, cancel),
+    }
+}
+
+/// The motion that an adapter reads from two latents.
+fn by_adapter(
+    snapshot: &Snapshot,
+    request: pb::EstimateMotionRequest,
+    cancel: &Cancellation,
+) -> Result<pb::EstimateMotionResponse, Error> {
     let pb::EstimateMotionRequest {
         adapter,
         room,
         first,
         second,
         thresholds,
+        camera: _,
     } = request;
 
     let thresholds = convert::thresholds(thresholds)?;
@@ -132,7 +145,68 @@ fn answer(
             revision: stored.revision,
         }),
         motion: Some(convert::twist_to_wire(&twist)),
+        reader: pb::MotionReader::Adapter.into(),
+        covariance: Vec::new(),
     })
+}
+
+/// The answer of the two-view reader; none if this server has none, a view is not an image, or the
+/// camera is not known.
+fn compared(
+    snapshot: &Snapshot,
+    request: &pb::EstimateMotionRequest,
+) -> Result<Option<pb::EstimateMotionResponse>, Error> {
+    // What is stated must hold, whoever reads the motion.
+    let stated = request.camera.as_ref().map(pinhole).transpose()?;
+    convert::thresholds(request.thresholds.clone())?;
+
+    let image = |view: &Option<pb::View>| match view.as_ref()?.view.as_ref()? {
+        pb::view::View::Image(image) => Some(image.clone()),
+        _ => None,
+    };
+    let (Some(reader), Some(first), Some(second)) = (
+        snapshot.two_views(),
+        image(&request.first),
+        image(&request.second),
+    ) else {
+        return Ok(None);
+    };
+
+    let of_room = if request.room.is_empty() {
+        None
+    } else {
+        snapshot.room(&request.room)?.room.provenance().camera
+    };
+    let Some(camera) = stated.or(of_room) else {
+        return Ok(None);
+    };
+
+    let reading = reader.read(&first, &second, &camera)?;
+    let reader = if reading.is_told {
+        pb::MotionReader::TwoView
+    } else {
+        pb::MotionReader::None
+    };
+
+    Ok(Some(pb::EstimateMotionResponse {
+        adapter: None,
+        motion: Some(convert::twist_to_wire(&reading.twist())),
+        true_motion: None,
+        error: None,
+        reader: reader.into(),
+        covariance: convert::matrix_to_wire(&reading.covariance),
+    }))
+}
+
+fn pinhole(camera: &pb::Pinhole) -> Result<Pinhole, Error> {
+    let pb::Pinhole {
+        focal,
+        centre_x,
+        centre_y,
+    } = *camera;
+
+    Pinhole::new(focal, [centre_x, centre_y].into())
+        .map_err(|problem| Error::invalid("camera", problem))
 }
 
 /// The adapter of a request that names no room: the one it names, or the only one.

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use sha2::{Digest, Sha256};
 
 use super::image_encoder::{self, ImageEncoder, ImageEncoders};
+use super::two_views::TwoViewReader;
 use super::{Error, RunError};
 use crate::store::{RoomFit, Store, StoredAdapter, StoredRoom};
 use seese3_core::adapter::{ErrorStatistics, Network};
@@ -65,9 +66,15 @@ pub struct Snapshot {
     rooms: BTreeMap<String, ServedRoom>,
     adapters: BTreeMap<String, Arc<StoredAdapter>>,
     image_encoders: BTreeMap<String, Arc<ImageEncoder>>,
+    two_views: Option<TwoViewReader>,
 }
 
 impl Snapshot {
+    /// The reader of motions between two images, if this server has one.
+    pub fn two_views(&self) -> Option<&TwoViewReader> {
+        self.two_views.as_ref()
+    }
+
     /// The image encoder of an adapter.
     ///
     /// # Errors
@@ -204,6 +211,7 @@ async fn load_all(
     }
 
     let image_encoders = image_encoder::open(encoders, &adapters)?;
+    let two_views = TwoViewReader::open(encoders)?;
     let mut rooms = BTreeMap::new();
     for summary in store.rooms().await? {
         let served = load_room(store, index, &adapters, &summary.room).await?;
@@ -220,6 +228,7 @@ async fn load_all(
         rooms,
         adapters,
         image_encoders,
+        two_views,
     })
 }
 

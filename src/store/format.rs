@@ -6,6 +6,7 @@ use super::adapters::RoomFit;
 use super::manifest::ObjectRef;
 use seese3_core::adapter::{Adapter, Loss, Mixing, PairPlan, TrainConfig, TrainingRecord};
 use seese3_core::features::{FeatureSource, UNSPECIFIED};
+use seese3_core::geometry::{Pinhole, PinholeError};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::room::{Provenance, RoomId};
 use seese3_core::splits::{Split, StrideRange};
@@ -59,6 +60,38 @@ pub struct ProvenanceEntry {
     #[serde(default)]
     images_root: String,
     worst_rotation_deviation: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    camera: Option<PinholeEntry>,
+}
+
+/// A pinhole camera that was checked when it was read.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "PinholeFields", into = "PinholeFields")]
+pub struct PinholeEntry(Pinhole);
+
+/// A pinhole camera as the manifest states it: lengths in image widths, the principal point from the
+/// top left corner.
+#[derive(Serialize, Deserialize)]
+struct PinholeFields {
+    focal: f64,
+    centre: [f64; 2],
+}
+
+impl TryFrom<PinholeFields> for PinholeEntry {
+    type Error = PinholeError;
+
+    fn try_from(fields: PinholeFields) -> Result<Self, PinholeError> {
+        Pinhole::new(fields.focal, fields.centre.into()).map(Self)
+    }
+}
+
+impl From<PinholeEntry> for PinholeFields {
+    fn from(PinholeEntry(camera): PinholeEntry) -> Self {
+        Self {
+            focal: camera.focal(),
+            centre: camera.centre().into(),
+        }
+    }
 }
 
 /// The body of an adapter's manifest.
@@ -254,6 +287,7 @@ impl From<&Provenance> for ProvenanceEntry {
             licence,
             images_root,
             worst_rotation_deviation,
+            camera,
         } = provenance.clone();
 
         Self {
@@ -261,6 +295,7 @@ impl From<&Provenance> for ProvenanceEntry {
             licence,
             images_root,
             worst_rotation_deviation,
+            camera: camera.map(PinholeEntry),
         }
     }
 }
@@ -272,6 +307,7 @@ impl From<ProvenanceEntry> for Provenance {
             licence,
             images_root,
             worst_rotation_deviation,
+            camera,
         } = entry;
 
         Self {
@@ -279,6 +315,7 @@ impl From<ProvenanceEntry> for Provenance {
             licence,
             images_root,
             worst_rotation_deviation,
+            camera: camera.map(|entry| entry.0),
         }
     }
 }

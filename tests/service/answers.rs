@@ -264,6 +264,9 @@ async fn frames_of_a_room_are_answered_with_the_truth() {
         .await
         .unwrap();
 
+    assert_eq!(answer.reader(), pb::MotionReader::Adapter);
+    assert!(answer.covariance.is_empty());
+
     let six = |twist: pb::Twist| {
         let v = twist.linear.unwrap();
         let w = twist.angular.unwrap();

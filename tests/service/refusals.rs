@@ -500,6 +500,24 @@ async fn the_other_calls_name_the_field() {
         "room",
     );
 
+    // A focal length in pixels is refused, whoever would read the motion.
+    refused(
+        "focal length in pixels",
+        c.estimate_motion(pb::EstimateMotionRequest {
+            first: feature(feature_row(1)),
+            second: feature(feature_row(2)),
+            camera: Some(pb::Pinhole {
+                focal: 585.0,
+                centre_x: 320.0,
+                centre_y: 240.0,
+            }),
+            ..m()
+        })
+        .await,
+        InvalidArgument,
+        "camera",
+    );
+
     refused(
         "narrow second",
         c.estimate_motion(pb::EstimateMotionRequest {

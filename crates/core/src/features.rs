@@ -26,7 +26,7 @@ pub enum Error {
 }
 
 /// The largest number of columns of a feature.
-pub const MAX_COLUMNS: usize = 65_536;
+pub const MAX_COLUMNS: usize = 131_072;
 
 /// The word that a [`FeatureSource`] holds where the origin of its features is not known.
 pub const UNSPECIFIED: &str = "unspecified";

@@ -82,6 +82,7 @@
 //! | [`tracking`] | a camera followed frame by frame, with covariances |
 //! | [`calibration`] | how large an adapter's errors are in rooms that it did not learn from |
 //! | [`fitting`] | an adapter fitted to one mapped room, and single views located in it |
+//! | [`two_view`] | the motion between two views from where things are in both images |
 //! | [`eval`] | Hit@ε on held-out motions, and whether a score leaks |
 //!
 //! Nothing here reads files, the network, the clock or the environment; randomness enters as a
@@ -106,6 +107,7 @@ pub mod localization;
 pub mod tracking;
 pub mod calibration;
 pub mod fitting;
+pub mod two_view;
 pub mod eval;
 
 /// Vectors and matrices of poses and twists.

@@ -5,7 +5,7 @@
 
 use std::fmt;
 
-use crate::geometry::Pose;
+use crate::geometry::{Pinhole, Pose};
 
 /// Why a room, its name or a reference to one of its frames is refused.
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -122,6 +122,8 @@ pub struct Provenance {
     pub images_root: String,
     /// The largest entry of |RRᵀ − I| over all rotations, before they were projected to SO(3).
     pub worst_rotation_deviation: f64,
+    /// The camera that took the images, if known.
+    pub camera: Option<Pinhole>,
 }
 
 /// The data of a room's frames, column by column. [`Room::new`] checks them.

@@ -1,15 +1,20 @@
-//! `seese3 evaluate motion`: how well an adapter reads the motion between two views of a room.
+//! `seese3 evaluate motion`: how well the motion between two views of a room is read.
 
 use std::path::PathBuf;
 
+use anyhow::Context;
 use clap::Args;
 
 use seese3_core::eval::has_seen;
-use seese3_core::training::RoomData;
-use seese3_lab::experiments::motion::evaluate;
+use seese3_core::features::Features;
+use seese3_core::geometry::Pinhole;
+use seese3_core::room::Room;
+use seese3_lab::experiments::motion::{Maps, evaluate};
 use seese3_lab::report::{motion_evaluation_json, motion_table};
 
+use super::super::progress::bar;
 use super::super::{check_writable, say, write_json};
+use crate::encoder::{Pooling, Preparation};
 use crate::store::Store;
 
 #[derive(Debug, Args)]
@@ -21,8 +26,16 @@ pub struct Motion {
     #[arg(long)]
     room: String,
     /// The adapter
-    #[arg(long)]
-    adapter: String,
+    #[arg(long, required_unless_present = "two_view")]
+    adapter: Option<String>,
+    /// Also read each motion from where things are in both images, by these features: a grid of an
+    /// encoder's feature map that is as fine as the map, for instance xfeat-fusion-grid40x30
+    #[arg(long, value_name = "FEATURES")]
+    two_view: Option<String>,
+    /// Focal length of the camera in image widths (fx in pixels over the image's width), for
+    /// --two-view; the room's own if omitted
+    #[arg(long, value_name = "WIDTHS", requires = "two_view")]
+    focal: Option<f64>,
     /// Frames from the first view to the second
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
     stride: u32,
@@ -38,40 +51,108 @@ impl Motion {
         }
 
         let store = Store::open(&self.store)?;
-        let stored_adapter = store.load_adapter(&self.adapter, None).await?;
-        let source = stored_adapter.adapter.source().name.clone();
-        let (stored, features) = store.load_room_with(&self.room, Some(&source)).await?;
-        let data = RoomData {
-            room: &stored.room,
-            revision: stored.revision,
-            features: &features,
+        let adapter = match &self.adapter {
+            Some(name) => {
+                let stored = store.load_adapter(name, None).await?;
+                let source = stored.adapter.source().name.clone();
+                let (_, features) = store.load_room_with(&self.room, Some(&source)).await?;
+                Some((stored, features))
+            }
+            None => None,
+        };
+        let dense = match &self.two_view {
+            Some(name) => Some(store.load_room_with(&self.room, Some(name)).await?.1),
+            None => None,
         };
 
-        let found = evaluate(&data, &stored_adapter.adapter, self.stride)?;
-        let in_room = has_seen(&stored_adapter.record, stored.room.id());
-        say(format_args!(
-            "room '{}' revision {}, adapter '{}' revision {} ({}), stride {}: {} pairs",
-            self.room,
-            stored.revision,
-            self.adapter,
-            stored_adapter.revision,
-            if in_room {
-                "LEAK: it has seen this room"
-            } else {
-                "never saw this room"
-            },
+        let stored = store.load_room(&self.room, None).await?;
+        let maps = dense
+            .as_ref()
+            .map(|dense| self.maps(&stored.room, dense))
+            .transpose()?;
+        let progress = bar(stored.room.frame_count() as u64, "reading");
+        let found = evaluate(
+            &stored.room,
+            adapter
+                .as_ref()
+                .map(|(stored, features)| (stored.adapter.as_ref(), features)),
+            maps,
             self.stride,
-            found.n
+            &|| progress.inc(1),
+        )?;
+        progress.finish_and_clear();
+
+        let in_room = adapter
+            .as_ref()
+            .map(|(adapter, _)| has_seen(&adapter.record, stored.room.id()));
+        say(format_args!(
+            "room '{}' revision {}, stride {}: {} pairs",
+            self.room, stored.revision, self.stride, found.n
         ));
+        if let Some((adapter, _)) = &adapter {
+            say(format_args!(
+                "adapter '{}' revision {} ({})",
+                adapter.name,
+                adapter.revision,
+                if in_room == Some(true) {
+                    "LEAK: it has seen this room"
+                } else {
+                    "never saw this room"
+                },
+            ));
+        }
         say(motion_table(&found).trim_end());
 
         if let Some(path) = &self.json {
-            let record =
-                motion_evaluation_json(&found, &self.room, &self.adapter, self.stride, in_room);
+            let named = self.adapter.as_deref().zip(in_room);
+            let record = motion_evaluation_json(&found, &self.room, named, self.stride);
             write_json(path, &record)?;
             say(format_args!("wrote {}", path.display()));
         }
 
         Ok(())
+    }
+
+    /// The room's frames as feature maps, and the camera that took them.
+    fn maps<'a>(&self, room: &Room, dense: &'a Features) -> anyhow::Result<Maps<'a>> {
+        let source = dense.source();
+        let shape = source
+            .pooling
+            .parse::<Pooling>()
+            .ok()
+            .and_then(|pooling| pooling.map_shape(source.dim))
+            .with_context(|| {
+                format!(
+                    "--two-view {}: is pooled as '{}', and a grid of the whole feature map is \
+                     needed: encode the room with --pool gridCxR, C and R the columns and rows of \
+                     the layer's map",
+                    source.name, source.pooling
+                )
+            })?;
+
+        // A crop would change where the image's middle and edges are.
+        if let Ok((Preparation { crop: Some(_), .. }, _)) = Preparation::parse(&source.preprocess) {
+            anyhow::bail!(
+                "--two-view {}: its images were cropped, so that the camera's focal length does \
+                 not hold for them; encode them whole",
+                source.name
+            );
+        }
+
+        let height = shape[1] as f64 / shape[2] as f64;
+        let camera = match (self.focal, room.provenance().camera) {
+            (Some(focal), _) => Pinhole::centred(focal, height).context("--focal")?,
+            (None, Some(camera)) => camera,
+            (None, None) => anyhow::bail!(
+                "room '{}' states no camera: give --focal, or import the room with --focal",
+                self.room
+            ),
+        };
+
+        Ok(Maps {
+            features: dense,
+            shape,
+            camera,
+        })
     }
 }

@@ -9,10 +9,12 @@
 //!   log(P₁⁻¹ P₂), v in metres, ω in radians with |ω| ≤ π.
 //! - v is the translation part of the logarithm, V(ω)⁻¹ t, not the translation t itself.
 
+mod pinhole;
 mod pose_error;
 mod rotation;
 mod se3;
 
+pub use pinhole::{Pinhole, PinholeError};
 pub use pose_error::PoseError;
 pub use rotation::{NearestRotation, nearest_rotation};
 pub use se3::{Twist, adjoint, body_twist, exp, left_jacobian_inverse, log};

@@ -26,6 +26,7 @@ pub mod seeds;
 
 use seese3_core::{
     adapter, calibration, eval, fitting, navigation, splits, tracking, training, trajectory,
+    two_view,
 };
 
 use crate::probes;
@@ -61,6 +62,9 @@ pub enum Error {
     /// Features could not be probed.
     #[error(transparent)]
     Probe(#[from] probes::Error),
+    /// The motion between two views could not be read.
+    #[error(transparent)]
+    TwoView(#[from] two_view::Error),
     /// A room gives no pairs.
     #[error(transparent)]
     Splits(#[from] splits::Error),

@@ -1,9 +1,18 @@
-//! The motion between two views of a room, as an adapter reads it, beside the simplest answers.
+//! The motion between two views of a room, as an adapter or a two-view reader reads it, beside the
+//! simplest answers.
+
+use ndarray::ArrayView3;
+use rayon::prelude::*;
 
 use seese3_core::adapter::Adapter;
-use seese3_core::geometry::{Twist, exp};
+use seese3_core::features::Features;
+use seese3_core::geometry::{Pinhole, Twist, exp, log};
+use seese3_core::nalgebra::Cholesky;
+use seese3_core::room::Room;
 use seese3_core::splits::{Pair, Split};
-use seese3_core::training::{RoomData, motions};
+use seese3_core::statistics::{Coverage, coverage};
+use seese3_core::training::motions;
+use seese3_core::two_view;
 
 use super::Error;
 use super::localization::ErrorQuantiles;
@@ -22,34 +31,86 @@ pub struct MotionErrors {
 pub struct MotionEvaluation {
     /// How many pairs of frames were read.
     pub n: usize,
+    /// What an adapter read, if one was asked.
+    pub adapter: Option<AdapterErrors>,
+    /// What a two-view reader read, if one was asked.
+    pub two_view: Option<TwoViewErrors>,
+    /// No motion at all.
+    pub no_motion: MotionErrors,
+}
+
+/// The errors of an adapter.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdapterErrors {
     /// What `EstimateMotion` answers: the adapter's reading with the mean training motion μ.
     pub ours: MotionErrors,
     /// The adapter's reading without μ, as trackers take it.
     pub without_mean: MotionErrors,
     /// μ, whatever the views show.
     pub constant: MotionErrors,
-    /// No motion at all.
-    pub no_motion: MotionErrors,
 }
 
-/// Reads the motion between the frames of every pair of a room at a stride.
+/// The errors of a two-view reader.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TwoViewErrors {
+    /// Over all pairs; where the reader cannot tell it answers no motion.
+    pub ours: MotionErrors,
+    /// The share of pairs whose motion it could tell.
+    pub told: f64,
+    /// Over the pairs that it could tell, how often its covariance holds.
+    pub coverage: Coverage,
+}
+
+/// The frames of a room as feature maps, for a two-view reader.
+#[derive(Debug, Clone, Copy)]
+pub struct Maps<'a> {
+    /// One map per row, in the order (channels, rows, columns).
+    pub features: &'a Features,
+    /// Channels, rows and columns of a map; their product is the width of a feature.
+    pub shape: [usize; 3],
+    /// The camera that took the images.
+    pub camera: Pinhole,
+}
+
+/// Reads the motion between the frames of every pair of a room at a stride. `read` is told each pair
+/// that the two-view reader has read.
 ///
 /// # Errors
-/// [`Error::Adapter`] when the features are not the adapter's, [`Error::Splits`] when the room is
-/// too short for the stride.
+/// [`Error::Adapter`] when the features are not the adapter's, [`Error::TwoView`] when the maps are
+/// too small, [`Error::Splits`] when the room is too short for the stride.
 pub fn evaluate(
-    data: &RoomData<'_>,
-    adapter: &Adapter,
+    room: &Room,
+    adapter: Option<(&Adapter, &Features)>,
+    maps: Option<Maps<'_>>,
     stride: u32,
+    read: &(dyn Fn() + Sync),
 ) -> Result<MotionEvaluation, Error> {
-    adapter.check_source(data.features.source())?;
-    let pairs = Split::Whole.test_pairs(data.room.timeline(), stride)?;
-    let truth = motions(data.room.poses(), &pairs);
-    let latents = adapter.embed(data.features.rows())?;
+    let pairs = Split::Whole.test_pairs(room.timeline(), stride)?;
+    let truth = motions(room.poses(), &pairs);
 
+    Ok(MotionEvaluation {
+        n: pairs.len(),
+        adapter: adapter
+            .map(|(adapter, features)| by_adapter(adapter, features, &pairs, &truth))
+            .transpose()?,
+        two_view: maps
+            .map(|maps| by_two_views(maps, &pairs, &truth, read))
+            .transpose()?,
+        no_motion: errors(&truth, &vec![Twist::default(); truth.len()]),
+    })
+}
+
+fn by_adapter(
+    adapter: &Adapter,
+    features: &Features,
+    pairs: &[Pair],
+    truth: &[Twist],
+) -> Result<AdapterErrors, Error> {
+    adapter.check_source(features.source())?;
+    let latents = adapter.embed(features.rows())?;
     let read = |of: &dyn Fn(&Pair) -> Twist| {
         let read: Vec<Twist> = pairs.iter().map(of).collect();
-        errors(&truth, &read)
+        errors(truth, &read)
     };
     let ends = |pair: &Pair| {
         (
@@ -59,8 +120,7 @@ pub fn evaluate(
     };
     let mean = Twist::from_vector(&adapter.scale().mean);
 
-    Ok(MotionEvaluation {
-        n: pairs.len(),
+    Ok(AdapterErrors {
         ours: read(&|pair| {
             let (from, to) = ends(pair);
             adapter.motion(from, to)
@@ -70,7 +130,51 @@ pub fn evaluate(
             adapter.motion_without_mean(from, to)
         }),
         constant: read(&|_| mean),
-        no_motion: read(&|_| Twist::default()),
+    })
+}
+
+fn by_two_views(
+    maps: Maps<'_>,
+    pairs: &[Pair],
+    truth: &[Twist],
+    told: &(dyn Fn() + Sync),
+) -> Result<TwoViewErrors, Error> {
+    let rows = maps.features.rows();
+    let map = |row: usize| {
+        let numbers = rows.row(row).to_slice().unwrap_or_default();
+        ArrayView3::from_shape(maps.shape, numbers).map_err(|_| two_view::Error::Shape {
+            first: maps.shape,
+            second: maps.shape,
+        })
+    };
+    let readings: Vec<two_view::Reading> = pairs
+        .par_iter()
+        .map(|pair| {
+            let first = map(pair.source.row())?;
+            let second = map(pair.target.row())?;
+            let reading = two_view::read(first, second, &maps.camera);
+            told();
+
+            reading
+        })
+        .collect::<Result<_, _>>()?;
+
+    let read: Vec<Twist> = readings.iter().map(two_view::Reading::twist).collect();
+    let lengths: Vec<f64> = readings
+        .iter()
+        .zip(truth)
+        .filter(|(reading, _)| reading.is_told)
+        .filter_map(|(reading, truth)| {
+            let off = log(&reading.motion.inv_mul(&exp(truth))).to_vector();
+            Some(off.dot(&Cholesky::new(reading.covariance)?.solve(&off)))
+        })
+        .collect();
+    let told = readings.iter().filter(|reading| reading.is_told).count();
+
+    Ok(TwoViewErrors {
+        ours: errors(truth, &read),
+        told: told as f64 / readings.len() as f64,
+        coverage: coverage(&lengths),
     })
 }
 

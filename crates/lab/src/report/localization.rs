@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use super::table::aligned;
 use crate::experiments::localization::{ErrorQuantiles, Localization, LocalizationErrors};
-use crate::experiments::motion::{MotionErrors, MotionEvaluation};
+use crate::experiments::motion::{AdapterErrors, MotionErrors, MotionEvaluation, TwoViewErrors};
 
 /// One line per way to locate a view: medians and 90 % quantiles of the errors.
 pub fn localization_table(found: &Localization) -> String {
@@ -30,16 +30,32 @@ pub fn localization_table(found: &Localization) -> String {
 /// One line per way to read a motion: medians and 90 % quantiles of the errors.
 pub fn motion_table(found: &MotionEvaluation) -> String {
     let mut lines = vec![head("motion by")];
-    for (name, errors) in [
-        ("the adapter", &found.ours),
-        ("the adapter without its mean motion", &found.without_mean),
-        ("its mean motion alone", &found.constant),
-        ("no motion", &found.no_motion),
-    ] {
+    let mut add = |name: &str, errors: &MotionErrors| {
         lines.push(line(name, &errors.translation_m, &errors.rotation_deg));
+    };
+
+    if let Some(adapter) = &found.adapter {
+        add("the adapter", &adapter.ours);
+        add("the adapter without its mean motion", &adapter.without_mean);
+        add("its mean motion alone", &adapter.constant);
+    }
+    if let Some(two_view) = &found.two_view {
+        add("the two-view reader", &two_view.ours);
+    }
+    add("no motion", &found.no_motion);
+
+    let mut table = aligned(&lines);
+    if let Some(TwoViewErrors { told, coverage, .. }) = &found.two_view {
+        table += &format!(
+            "the two-view reader could tell {:.1} % of the motions; {:.2} and {:.2} of these lie \
+             within its 68 and 95 % ellipsoids\n",
+            100.0 * told,
+            coverage.within_68,
+            coverage.within_95
+        );
     }
 
-    aligned(&lines)
+    table
 }
 
 fn head(first: &str) -> Vec<String> {
@@ -93,15 +109,27 @@ pub struct LocalizationJson {
 #[derive(Debug, Serialize)]
 pub struct MotionEvaluationJson {
     n: usize,
-    ours: ErrorsJson,
-    without_mean: ErrorsJson,
-    constant: ErrorsJson,
+    /// The adapter's errors; with these two of its parts.
+    ours: Option<ErrorsJson>,
+    without_mean: Option<ErrorsJson>,
+    constant: Option<ErrorsJson>,
+    two_view: Option<TwoViewJson>,
     no_motion: ErrorsJson,
     room: String,
-    adapter: String,
+    adapter: Option<String>,
     stride: u32,
     /// Whether the adapter was trained in this room.
-    in_room: bool,
+    in_room: Option<bool>,
+}
+
+#[derive(Debug, Serialize)]
+struct TwoViewJson {
+    #[serde(flatten)]
+    errors: ErrorsJson,
+    /// The share of motions that it could tell.
+    told: f64,
+    coverage_68: f64,
+    coverage_95: f64,
 }
 
 #[derive(Debug, Serialize)]
@@ -173,23 +201,35 @@ pub fn localization_json(found: &Localization, protocol: LocalizationContext) ->
     }
 }
 
-/// The record of read motions.
+/// The record of read motions; the adapter by its name and whether it was trained in this room.
 pub fn motion_evaluation_json(
     found: &MotionEvaluation,
     room: &str,
-    adapter: &str,
+    adapter: Option<(&str, bool)>,
     stride: u32,
-    in_room: bool,
 ) -> MotionEvaluationJson {
+    let of_adapter = |errors: fn(&AdapterErrors) -> &MotionErrors| {
+        found
+            .adapter
+            .as_ref()
+            .map(|found| ErrorsJson::from(errors(found)))
+    };
+
     MotionEvaluationJson {
         n: found.n,
-        ours: (&found.ours).into(),
-        without_mean: (&found.without_mean).into(),
-        constant: (&found.constant).into(),
+        ours: of_adapter(|adapter| &adapter.ours),
+        without_mean: of_adapter(|adapter| &adapter.without_mean),
+        constant: of_adapter(|adapter| &adapter.constant),
+        two_view: found.two_view.as_ref().map(|two_view| TwoViewJson {
+            errors: (&two_view.ours).into(),
+            told: two_view.told,
+            coverage_68: two_view.coverage.within_68,
+            coverage_95: two_view.coverage.within_95,
+        }),
         no_motion: (&found.no_motion).into(),
         room: room.to_owned(),
-        adapter: adapter.to_owned(),
+        adapter: adapter.map(|(name, _)| name.to_owned()),
         stride,
-        in_room,
+        in_room: adapter.map(|(_, in_room)| in_room),
     }
 }

@@ -6,7 +6,7 @@ use super::photograph::{Shot, photograph};
 use super::render::{Camera, Sampling, radiance};
 use super::solid::Solid;
 use super::{FRAMES_PER_SECOND, Scene, SuiteRoom, render, visits};
-use seese3_core::geometry::Pose;
+use seese3_core::geometry::{Pinhole, PinholeError, Pose};
 use seese3_core::image::RgbImage;
 
 /// A suite of rooms: how they look, and how the camera moves in them.
@@ -118,6 +118,15 @@ impl Film {
                 (seconds * 1e9).round() as i64
             })
             .collect()
+    }
+
+    /// The camera that takes images of this size.
+    ///
+    /// # Errors
+    /// [`PinholeError`] for an image that is far higher than it is wide.
+    pub fn camera(&self, width: usize, height: usize) -> Result<Pinhole, PinholeError> {
+        let focal = 0.5 / (self.field_of_view_rad / 2.0).tan();
+        Pinhole::centred(focal, height as f64 / width as f64)
     }
 
     /// The image of a frame.

@@ -1,0 +1,111 @@
+"""The classical peer of the two-view reader: SIFT, an essential matrix, and the true length.
+
+    seese3 export numpy --store STORE --room ROOM --out FOLDER
+    python two_view_sift.py FOLDER --stride 10 [--width 320] [--focal WIDTHS]
+
+Reads the pairs that `seese3 evaluate motion --stride 10` reads, and prints the same errors: medians and
+90 % quantiles in metres and degrees. SIFT (2,000 features, ratio test at 0.8) and MAGSAC with a threshold
+of one pixel in 640; a pair with fewer than 8 matches or inliers counts as no motion. An essential matrix
+has no scale: the true length of the translation is given to it. Needs numpy and opencv-python-headless.
+"""
+
+import argparse
+import json
+import pathlib
+
+import cv2
+import numpy as np
+
+
+def angle(rotation):
+    return np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1)))
+
+
+def relative(first, second):
+    """The second camera in the frame of the first."""
+    return np.linalg.inv(first) @ second
+
+
+def read(first, second, camera, width, true_length):
+    """Rotation and translation from two sets of keypoints, or none."""
+    (points, descriptors), (other_points, other_descriptors) = first, second
+    if descriptors is None or other_descriptors is None:
+        return None
+    pairs = cv2.BFMatcher().knnMatch(descriptors, other_descriptors, k=2)
+    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < 0.8 * p[1].distance]
+    if len(good) < 8:
+        return None
+    x = np.float64([points[m.queryIdx].pt for m in good])
+    y = np.float64([other_points[m.trainIdx].pt for m in good])
+    essential, inliers = cv2.findEssentialMat(
+        x, y, camera, cv2.USAC_MAGSAC, 0.999, width / 640
+    )
+    if essential is None or essential.shape != (3, 3) or inliers.sum() < 8:
+        return None
+    _, rotation, translation, _ = cv2.recoverPose(essential, x, y, camera, mask=inliers)
+
+    # recoverPose gives second_from_first: x2 = R x1 + t.
+    motion = np.eye(4)
+    motion[:3, :3] = rotation.T
+    motion[:3, 3] = true_length * (-rotation.T @ translation)[:, 0]
+    return motion
+
+
+def main():
+    options = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    options.add_argument("folder", type=pathlib.Path)
+    options.add_argument("--stride", type=int, default=10)
+    options.add_argument("--width", type=int, default=0, help="resize images to this width")
+    options.add_argument("--focal", type=float, help="focal length in image widths")
+    options.add_argument("--every", type=int, default=1, help="read every so many pairs")
+    given = options.parse_args()
+
+    bundle = json.loads((given.folder / "bundle.json").read_text())
+    poses = np.load(given.folder / "poses.npy")
+    root = pathlib.Path(bundle["images_root"])
+    root = root if root.is_absolute() else given.folder / root
+    sequences = bundle["sequences"] or [0] * len(poses)
+    focal, centre_x, centre_y = bundle["camera"] or (None, 0.5, None)
+    focal = given.focal or focal
+
+    sift = cv2.SIFT_create(2000)
+    found = {}
+
+    def features(row):
+        if row not in found:
+            image = cv2.imread(str(root / bundle["images"][row]), cv2.IMREAD_GRAYSCALE)
+            if given.width:
+                size = (given.width, round(image.shape[0] * given.width / image.shape[1]))
+                image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            found[row] = (*sift.detectAndCompute(image, None), image.shape)
+            found.pop(row - 200, None)
+        return found[row]
+
+    errors, still, failed = [], [], 0
+    for row in range(0, len(poses) - given.stride, given.every):
+        if sequences[row] != sequences[row + given.stride]:
+            continue
+        truth = relative(poses[row], poses[row + given.stride])
+        *first, (height, width) = features(row)
+        *second, _ = features(row + given.stride)
+        y = centre_y * width if centre_y else height / 2
+        camera = np.array([[focal * width, 0, centre_x * width], [0, focal * width, y], [0, 0, 1.0]])
+        motion = read(first, second, camera, width, np.linalg.norm(truth[:3, 3]))
+        failed += motion is None
+        off = relative(np.eye(4) if motion is None else motion, truth)
+        errors.append((np.linalg.norm(off[:3, 3]), angle(off[:3, :3])))
+        still.append((np.linalg.norm(truth[:3, 3]), angle(truth[:3, :3])))
+
+    print(f"{len(errors)} pairs, {failed} without an answer")
+    print("motion by                          median m  90 % m  median °  90 % °")
+    for name, rows in (("SIFT, with the true length", errors), ("no motion", still)):
+        metres, degrees = np.array(rows).T
+        q = lambda values, share: np.quantile(values, share)
+        print(
+            f"{name:34} {q(metres, .5):8.4f} {q(metres, .9):7.3f}"
+            f" {q(degrees, .5):9.2f} {q(degrees, .9):7.1f}"
+        )
+
+
+if __name__ == "__main__":
+    main()
