@@ -1,9 +1,9 @@
 """The classical peer of the two-view reader: SIFT, an essential matrix, and the true length.
 
     seese3 export numpy --store STORE --room ROOM --out FOLDER
-    python two_view_sift.py FOLDER --stride 10 [--width 320] [--focal WIDTHS]
+    python two_view_sift.py FOLDER --stride 10 [--width 320] [--focal WIDTHS] [--every N]
 
-Reads the pairs that `seese3 evaluate motion --stride 10` reads, and prints the same errors: medians and
+Reads the pairs that `seese3 evaluate motion --stride 10` reads, or every N-th of them, and prints the same errors: medians and
 90 % quantiles in metres and degrees. SIFT (2,000 features, ratio test at 0.8) and MAGSAC with a threshold
 of one pixel in 640; a pair with fewer than 8 matches or inliers counts as no motion. An essential matrix
 has no scale: the true length of the translation is given to it. Needs numpy and opencv-python-headless.
@@ -65,8 +65,10 @@ def main():
     root = pathlib.Path(bundle["images_root"])
     root = root if root.is_absolute() else given.folder / root
     sequences = bundle["sequences"] or [0] * len(poses)
-    focal, centre_x, centre_y = bundle["camera"] or (None, 0.5, None)
+    focal, _, centre_x, centre_y = bundle.get("camera") or (None, None, 0.5, None)
     focal = given.focal or focal
+    if focal is None:
+        raise SystemExit("the room states no camera: give --focal, fx in pixels over the image's width")
 
     sift = cv2.SIFT_create(2000)
     found = {}

@@ -6,6 +6,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use clap::Args;
 
+use super::camera::CameraOption;
 use super::named::one_of;
 use super::say;
 use crate::datasets::read_features;
@@ -421,20 +422,10 @@ pub struct Motion {
     /// Two JPEG or PNG files, A,B; the server must have been started with --encoder or --two-view
     #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "features"])]
     images: Option<Vec<PathBuf>>,
-    /// Focal length of the camera of --images in image widths: fx in pixels over the image's width.
-    /// With it, a server started with --two-view compares the images themselves
-    #[arg(long, value_name = "WIDTHS", requires = "images")]
-    focal: Option<f64>,
-    /// Principal point of that camera in image widths, cx/width and cy/width; the middle of an image
-    /// of 4 by 3 if omitted
-    #[arg(
-        long,
-        value_name = "X,Y",
-        value_delimiter = ',',
-        num_args = 2,
-        requires = "focal"
-    )]
-    principal_point: Option<Vec<f64>>,
+    /// The camera that took --images, in pixels. With it, a server started with --two-view compares
+    /// the images themselves, unless --adapter names who reads the motion
+    #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]", requires = "images")]
+    camera: Option<CameraOption>,
     /// A NumPy file of features, shape (n, d); --rows chooses two
     #[arg(long, value_name = "FILE", requires = "rows")]
     features: Option<PathBuf>,
@@ -456,14 +447,12 @@ impl Motion {
             },
         };
 
-        let [centre_x, centre_y] = match self.principal_point.as_deref() {
-            Some(&[x, y]) => [x, y],
-            _ => [0.5, 0.375],
-        };
-        let camera = self.focal.map(|focal| pb::Pinhole {
-            focal,
-            centre_x,
-            centre_y,
+        let camera = self.camera.map(|CameraOption(camera)| pb::Pinhole {
+            width: camera.width,
+            height: camera.height,
+            focal: camera.focal,
+            centre_x: camera.centre.map(|centre| centre.x),
+            centre_y: camera.centre.map(|centre| centre.y),
         });
 
         let request = pb::EstimateMotionRequest {

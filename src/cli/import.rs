@@ -6,13 +6,13 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
 
+use super::camera::CameraOption;
 use super::encode::same_poses;
 use super::progress::bar;
 use super::say;
 use crate::datasets::{self, Dropped, Reader, Recording, SevenScenes, Unusable};
 use crate::store::{Store, check_features};
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::Pinhole;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 
 /// The number of dropped frames that are listed one by one; beyond that they are only counted.
@@ -108,20 +108,9 @@ struct Destination {
     /// Licence of the recording, stored with the room
     #[arg(long, default_value = "")]
     licence: String,
-    /// Focal length of the camera in image widths: fx in pixels over the image's width. Motions
-    /// between two views are read with it
-    #[arg(long, value_name = "WIDTHS")]
-    focal: Option<f64>,
-    /// Principal point of the camera in image widths from the image's top left corner, cx/width and
-    /// cy/width; the middle of an image of 4 by 3 if omitted
-    #[arg(
-        long,
-        value_name = "X,Y",
-        value_delimiter = ',',
-        num_args = 2,
-        requires = "focal"
-    )]
-    principal_point: Option<Vec<f64>>,
+    /// The camera of the images, in pixels; motions between two images are read with it
+    #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]")]
+    camera: Option<CameraOption>,
 }
 
 impl Import {
@@ -205,17 +194,17 @@ impl Import {
 impl Destination {
     /// Refuses to replace a room of the same name by one with other frames, unless --replace was
     /// given.
-    async fn check_same(&self, store: &Store, room: &Room) -> anyhow::Result<()> {
+    async fn check_same(&self, store: &Store, room: Room) -> anyhow::Result<Room> {
         let before = match store.load_room(room.id().as_str(), None).await {
             Ok(before) => before.room,
-            Err(crate::store::Error::Unknown { .. }) => return Ok(()),
+            Err(crate::store::Error::Unknown { .. }) => return Ok(room),
             Err(error) => return Err(error.into()),
         };
 
         // Features belong to frames: new frames would silently lose the features that were
         // computed for the old ones.
-        if self.replace || same_poses(&before, room) {
-            return Ok(());
+        if self.replace || same_poses(&before, &room) {
+            return Ok(with_known_camera(room, &before)?);
         }
 
         bail!(
@@ -278,7 +267,11 @@ impl Destination {
             licence: either(&self.licence, &stated.licence),
             images_root: recording.images_root.clone(),
             worst_rotation_deviation: recording.worst_rotation_deviation,
-            camera: self.camera()?.or(stated.camera),
+            camera: self
+                .camera
+                .map(CameraOption::pinhole)
+                .transpose()?
+                .or(stated.camera),
         };
 
         // The name given wins, then the bundle's own, then one derived from the path.
@@ -289,19 +282,6 @@ impl Destination {
         };
         let id = RoomId::new(&name).context("give another name with --name")?;
         Ok(Room::new(id, frames, provenance)?)
-    }
-
-    fn camera(&self) -> anyhow::Result<Option<Pinhole>> {
-        let Some(focal) = self.focal else {
-            return Ok(None);
-        };
-        let centre = match self.principal_point.as_deref() {
-            Some(&[x, y]) => [x, y],
-            _ => [0.5, 0.375],
-        };
-
-        let camera = Pinhole::new(focal, centre.into()).context("--focal, --principal-point")?;
-        Ok(Some(camera))
     }
 
     /// Prints what was read.
@@ -387,7 +367,7 @@ impl Destination {
         // was.
         check_features(&room, &features)?;
         let store = Store::create(&self.store)?;
-        self.check_same(&store, &room).await?;
+        let room = self.check_same(&store, room).await?;
         let published = store.publish_room(&room, &features).await?;
 
         self.say_read(&room, &features, &recording, read_count);
@@ -509,4 +489,14 @@ fn read_features(given: &str) -> anyhow::Result<Features> {
     let dim = rows.ncols();
 
     Features::new(FeatureSource::imported(name, dim), rows).with_context(|| file.to_owned())
+}
+/// A room with the camera that an earlier import stated, if this one states none.
+fn with_known_camera(room: Room, before: &Room) -> Result<Room, seese3_core::room::Error> {
+    let stated = room.provenance().camera;
+    let provenance = Provenance {
+        camera: stated.or(before.provenance().camera),
+        ..room.provenance().clone()
+    };
+
+    Room::new(room.id().clone(), room.frames().clone(), provenance)
 }

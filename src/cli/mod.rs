@@ -2,6 +2,7 @@
 //! the results.
 
 mod ask;
+mod camera;
 #[cfg(feature = "lab")]
 mod cross_room;
 #[cfg(feature = "lab")]

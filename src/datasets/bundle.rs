@@ -22,7 +22,7 @@ use super::{
     Error, Recording, Stated, entries, read_bytes, read_features, read_poses, read_timestamps,
 };
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::Pinhole;
+use seese3_core::geometry::{Pinhole, PixelCamera};
 use seese3_core::room::Room;
 
 const FORMAT: &str = "seese3 bundle 1";
@@ -48,9 +48,10 @@ struct Bundle {
     sequences: Vec<u32>,
     held_out: Vec<bool>,
     worst_rotation_deviation: f64,
-    /// The camera's focal length and principal point (x, y), image widths, if known.
+    /// The camera's focal length, the height of its images and its principal point (x, y), all in
+    /// image widths, if known.
     #[serde(default)]
-    camera: Option<[f64; 3]>,
+    camera: Option<[f64; 4]>,
     features: Vec<Made>,
 }
 
@@ -167,7 +168,14 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     check_lengths(&file, &recording)?;
 
     let camera = camera
-        .map(|[focal, x, y]| Pinhole::new(focal, [x, y].into()))
+        .map(|[focal, height, x, y]| {
+            Pinhole::new(PixelCamera {
+                width: 1.0,
+                height,
+                focal,
+                centre: Some([x, y].into()),
+            })
+        })
         .transpose()
         .map_err(|error| malformed(format!("camera: {error}")))?;
 
@@ -184,9 +192,10 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     Ok(recording)
 }
 
-fn focal_and_centre(camera: Pinhole) -> [f64; 3] {
+/// A camera as `bundle.json` states it.
+fn stated_camera(camera: Pinhole) -> [f64; 4] {
     let centre = camera.centre();
-    [camera.focal(), centre.x, centre.y]
+    [camera.focal(), camera.height(), centre.x, centre.y]
 }
 
 /// Replaces the placeholder source of every array by the one that `bundle.json` states. Arrays and
@@ -335,7 +344,7 @@ fn described(room: &Room, features: &[Features]) -> Bundle {
         sequences: frames.sequences.clone(),
         held_out: frames.held_out.clone(),
         worst_rotation_deviation: provenance.worst_rotation_deviation,
-        camera: provenance.camera.map(focal_and_centre),
+        camera: provenance.camera.map(stated_camera),
         features: features.iter().map(|set| made(set.source())).collect(),
     }
 }

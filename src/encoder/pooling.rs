@@ -62,7 +62,10 @@ impl Pooling {
     pub fn map_shape(self, width: usize) -> Option<[usize; 3]> {
         match self {
             Self::Grid { columns, rows, .. } => {
-                Some([width.checked_div(columns * rows)?, rows, columns])
+                let cells = columns * rows;
+                width
+                    .is_multiple_of(cells)
+                    .then(|| [width / cells, rows, columns])
             }
             Self::Vector | Self::Cls | Self::Mean { .. } => None,
         }

@@ -9,6 +9,7 @@ use super::{Error, RunError};
 use crate::encoder::{self, Bounds, Encoder, Runtime, decode};
 use crate::store::StoredAdapter;
 use seese3_core::features::FeatureSource;
+use seese3_core::image::RgbImage;
 
 /// The encoders that a server may use for images.
 #[derive(Debug, Clone, PartialEq)]
@@ -43,20 +44,40 @@ impl ImageEncoder {
     /// [`Error::Invalid`] on `field` if the image cannot be decoded or its feature is not finite;
     /// [`Error::Internal`] if the encoder fails.
     pub fn feature(&self, field: &str, image: &[u8]) -> Result<Vec<f32>, Error> {
-        let encoded = decode("image", image, self.bounds)
-            .and_then(|image| self.encoder.prepare(image))
-            .and_then(|image| self.encoder.encode(&[vec![&image]]));
+        let image = self.decoded(field, image)?;
+        self.feature_of(field, image)
+    }
 
-        // A bad image is the caller's error and names the field. Anything else is a failure of
-        // this server, which only its log explains.
-        match encoded {
-            Ok(rows) => Ok(rows.row(0).to_vec()),
-            Err(encoder::Error::BadImage { problem, .. }) => Err(Error::invalid(field, problem)),
-            Err(error @ encoder::Error::NotFinite { .. }) => Err(Error::invalid(field, error)),
-            Err(error) => {
-                tracing::error!(%error, "an image could not be encoded");
-                Err(Error::Internal)
-            }
+    /// The pixels of one JPEG or PNG image.
+    ///
+    /// # Errors
+    /// As [`ImageEncoder::feature`].
+    pub fn decoded(&self, field: &str, image: &[u8]) -> Result<RgbImage, Error> {
+        decode("image", image, self.bounds).map_err(|error| told(field, error))
+    }
+
+    /// The feature of decoded pixels.
+    ///
+    /// # Errors
+    /// As [`ImageEncoder::feature`].
+    pub fn feature_of(&self, field: &str, image: RgbImage) -> Result<Vec<f32>, Error> {
+        self.encoder
+            .prepare(image)
+            .and_then(|image| self.encoder.encode(&[vec![&image]]))
+            .map(|rows| rows.row(0).to_vec())
+            .map_err(|error| told(field, error))
+    }
+}
+
+/// A bad image is the caller's error and names the field. Anything else is a failure of this server,
+/// which only its log explains.
+fn told(field: &str, error: encoder::Error) -> Error {
+    match error {
+        encoder::Error::BadImage { problem, .. } => Error::invalid(field, problem),
+        error @ encoder::Error::NotFinite { .. } => Error::invalid(field, error),
+        error => {
+            tracing::error!(%error, "an image could not be encoded");
+            Error::Internal
         }
     }
 }

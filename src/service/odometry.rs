@@ -12,7 +12,7 @@ use crate::store::StoredAdapter;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::odometry_service_server::OdometryService;
 use seese3_core::cancel::Cancellation;
-use seese3_core::geometry::{Pinhole, body_twist, exp};
+use seese3_core::geometry::{Pinhole, PixelCamera, body_twist, exp};
 use seese3_core::navigation::{Source, StepError};
 use seese3_core::room::FrameId;
 use seese3_core::tracking::View;
@@ -49,7 +49,10 @@ fn answer(
     request: pb::EstimateMotionRequest,
     cancel: &Cancellation,
 ) -> Result<pb::EstimateMotionResponse, Error> {
-    match compared(snapshot, &request)? {
+    // Thresholds are checked whoever reads the motion.
+    convert::thresholds(request.thresholds.clone())?;
+
+    match by_two_views(snapshot, &request, cancel)? {
         Some(answer) => Ok(answer),
         None => by_adapter(snapshot, request, cancel),
     }
@@ -150,24 +153,21 @@ fn by_adapter(
     })
 }
 
-/// The answer of the two-view reader; none if this server has none, a view is not an image, or the
-/// camera is not known.
-fn compared(
+/// The answer of the two-view reader; none if the request names an adapter, this server has no
+/// reader, a view is not an image, or the camera is not known.
+fn by_two_views(
     snapshot: &Snapshot,
     request: &pb::EstimateMotionRequest,
+    cancel: &Cancellation,
 ) -> Result<Option<pb::EstimateMotionResponse>, Error> {
     // What is stated must hold, whoever reads the motion.
     let stated = request.camera.as_ref().map(pinhole).transpose()?;
-    convert::thresholds(request.thresholds.clone())?;
 
-    let image = |view: &Option<pb::View>| match view.as_ref()?.view.as_ref()? {
-        pb::view::View::Image(image) => Some(image.clone()),
-        _ => None,
-    };
-    let (Some(reader), Some(first), Some(second)) = (
+    let (Some(reader), Some(first), Some(second), "") = (
         snapshot.two_views(),
-        image(&request.first),
-        image(&request.second),
+        image(request.first.as_ref()),
+        image(request.second.as_ref()),
+        request.adapter.as_str(),
     ) else {
         return Ok(None);
     };
@@ -178,11 +178,18 @@ fn compared(
         snapshot.room(&request.room)?.room.provenance().camera
     };
     let Some(camera) = stated.or(of_room) else {
+        if request.room.is_empty() && snapshot.adapters().is_empty() {
+            return Err(Error::invalid(
+                "camera",
+                "is required to compare two images: this server has no adapter to read them",
+            ));
+        }
+
         return Ok(None);
     };
 
-    let reading = reader.read(&first, &second, &camera)?;
-    let reader = if reading.is_told {
+    let estimate = reader.read(first, second, &camera, cancel)?;
+    let reader = if estimate.is_estimated {
         pb::MotionReader::TwoView
     } else {
         pb::MotionReader::None
@@ -190,23 +197,39 @@ fn compared(
 
     Ok(Some(pb::EstimateMotionResponse {
         adapter: None,
-        motion: Some(convert::twist_to_wire(&reading.twist())),
+        motion: Some(convert::twist_to_wire(&estimate.twist())),
         true_motion: None,
         error: None,
         reader: reader.into(),
-        covariance: convert::matrix_to_wire(&reading.covariance),
+        covariance: convert::matrix_to_wire(&estimate.covariance),
     }))
+}
+
+fn image(view: Option<&pb::View>) -> Option<&[u8]> {
+    match view?.view.as_ref()? {
+        pb::view::View::Image(image) => Some(image),
+        _ => None,
+    }
 }
 
 fn pinhole(camera: &pb::Pinhole) -> Result<Pinhole, Error> {
     let pb::Pinhole {
+        width,
+        height,
         focal,
         centre_x,
         centre_y,
     } = *camera;
+    let middle = [width / 2.0, height / 2.0];
+    let centre = [centre_x.unwrap_or(middle[0]), centre_y.unwrap_or(middle[1])];
 
-    Pinhole::new(focal, [centre_x, centre_y].into())
-        .map_err(|problem| Error::invalid("camera", problem))
+    Pinhole::new(PixelCamera {
+        width,
+        height,
+        focal,
+        centre: Some(centre.into()),
+    })
+    .map_err(|problem| Error::invalid("camera", problem))
 }
 
 /// The adapter of a request that names no room: the one it names, or the only one.

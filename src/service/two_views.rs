@@ -1,16 +1,20 @@
 //! The motion between two images that callers send, read from where things are in both.
 
-use ndarray::ArrayView3;
+use ndarray::Array3;
 
 use super::image_encoder::{ImageEncoder, ImageEncoders};
 use super::{Error, RunError};
 use crate::encoder::{Encoder, Layer, ModelTask, Pooling, recipe};
+use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::Pinhole;
-use seese3_core::two_view::{self, Reading};
+use seese3_core::two_view::{self, MotionEstimate};
 
 /// The layer of XFeat whose maps are compared, and its channels, rows and columns.
 const LAYER: &str = "fusion";
 const MAP: [usize; 3] = [64, 30, 40];
+
+/// How far the shape of an image may be from that of the camera's images, as a share.
+const SHAPE_TOLERANCE: f64 = 0.02;
 
 /// Compares two images.
 pub struct TwoViewReader {
@@ -77,17 +81,39 @@ impl TwoViewReader {
     /// The motion between two images of one camera.
     ///
     /// # Errors
-    /// [`Error::Invalid`] for an image that cannot be decoded, on its field.
-    pub fn read(&self, first: &[u8], second: &[u8], camera: &Pinhole) -> Result<Reading, Error> {
-        let first = self.encoder.feature("first.image", first)?;
-        let second = self.encoder.feature("second.image", second)?;
-        let [first, second] = [&first, &second].map(|row| ArrayView3::from_shape(MAP, row));
+    /// [`Error::Invalid`] on the field of an image that cannot be decoded, or is not of the shape of
+    /// the camera's images.
+    pub fn read(
+        &self,
+        first: &[u8],
+        second: &[u8],
+        camera: &Pinhole,
+        cancel: &Cancellation,
+    ) -> Result<MotionEstimate, Error> {
+        let map = |field: &str, image: &[u8]| {
+            cancel.check()?;
+            let image = self.encoder.decoded(field, image)?;
+            let [width, height] = [image.width, image.height];
+            let shape = height as f64 / width as f64;
+            if (shape / camera.height() - 1.0).abs() > SHAPE_TOLERANCE {
+                return Err(Error::invalid(
+                    field,
+                    format!(
+                        "is {width}×{height}, but the camera's images are {:.3} times as high as \
+                         wide; send whole images of this camera",
+                        camera.height()
+                    ),
+                ));
+            }
 
-        // The encoder's width was checked when it was opened.
-        let (Ok(first), Ok(second)) = (first, second) else {
-            return Err(Error::Internal);
+            // The encoder's width was checked when it was opened.
+            let row = self.encoder.feature_of(field, image)?;
+            Array3::from_shape_vec(MAP, row).map_err(|_| Error::Internal)
         };
+        let first = map("first.image", first)?;
+        let second = map("second.image", second)?;
 
-        two_view::read(first, second, camera).map_err(|_| Error::Internal)
+        cancel.check()?;
+        two_view::read(first.view(), second.view(), camera).map_err(|_| Error::Internal)
     }
 }

@@ -6,7 +6,7 @@ use super::adapters::RoomFit;
 use super::manifest::ObjectRef;
 use seese3_core::adapter::{Adapter, Loss, Mixing, PairPlan, TrainConfig, TrainingRecord};
 use seese3_core::features::{FeatureSource, UNSPECIFIED};
-use seese3_core::geometry::{Pinhole, PinholeError};
+use seese3_core::geometry::{Pinhole, PinholeError, PixelCamera};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::room::{Provenance, RoomId};
 use seese3_core::splits::{Split, StrideRange};
@@ -70,10 +70,11 @@ pub struct ProvenanceEntry {
 pub struct PinholeEntry(Pinhole);
 
 /// A pinhole camera as the manifest states it: lengths in image widths, the principal point from the
-/// top left corner.
+/// top left corner, the height that of the images.
 #[derive(Serialize, Deserialize)]
 struct PinholeFields {
     focal: f64,
+    height: f64,
     centre: [f64; 2],
 }
 
@@ -81,7 +82,13 @@ impl TryFrom<PinholeFields> for PinholeEntry {
     type Error = PinholeError;
 
     fn try_from(fields: PinholeFields) -> Result<Self, PinholeError> {
-        Pinhole::new(fields.focal, fields.centre.into()).map(Self)
+        Pinhole::new(PixelCamera {
+            width: 1.0,
+            height: fields.height,
+            focal: fields.focal,
+            centre: Some(fields.centre.into()),
+        })
+        .map(Self)
     }
 }
 
@@ -89,6 +96,7 @@ impl From<PinholeEntry> for PinholeFields {
     fn from(PinholeEntry(camera): PinholeEntry) -> Self {
         Self {
             focal: camera.focal(),
+            height: camera.height(),
             centre: camera.centre().into(),
         }
     }

@@ -9,7 +9,7 @@ use seese3::datasets::{
     read_scannet, read_sens, read_seven_scenes, read_tum, read_twelve_scenes, write_numpy,
 };
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::Pinhole;
+use seese3_core::geometry::{Pinhole, PixelCamera};
 use seese3_core::room::{Provenance, Room, RoomId};
 use serde_json::Value;
 
@@ -377,7 +377,15 @@ fn exported(out: &Path) -> (Room, Features) {
         licence: "test only".to_owned(),
         images_root: found.images_root.clone(),
         worst_rotation_deviation: found.worst_rotation_deviation,
-        camera: Some(Pinhole::new(0.9, [0.5, 0.37].into()).unwrap()),
+        camera: Some(
+            Pinhole::new(PixelCamera {
+                width: 640.0,
+                height: 480.0,
+                focal: 585.0,
+                centre: Some([330.0, 250.0].into()),
+            })
+            .unwrap(),
+        ),
     };
     let room = Room::new(RoomId::new("tiny").unwrap(), found.frames, provenance).unwrap();
 

@@ -8,7 +8,7 @@ use nalgebra::{Matrix6, Vector6};
 use seese3::store::{Error, Store};
 use seese3_core::adapter::{Adapter, CorrectorKind, Loss, Mixing, PairPlan, Preset, TrainConfig};
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::Pinhole;
+use seese3_core::geometry::{Pinhole, PixelCamera};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::{Split, StrideRange};
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
@@ -26,7 +26,15 @@ fn room(name: &str) -> Room {
         licence: "CC0".to_owned(),
         images_root: "/recordings/a".to_owned(),
         worst_rotation_deviation: 1e-4,
-        camera: Some(Pinhole::new(0.9, [0.5, 0.37].into()).unwrap()),
+        camera: Some(
+            Pinhole::new(PixelCamera {
+                width: 640.0,
+                height: 480.0,
+                focal: 585.0,
+                centre: Some([330.0, 250.0].into()),
+            })
+            .unwrap(),
+        ),
     };
 
     Room::new(

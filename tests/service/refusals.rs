@@ -500,16 +500,17 @@ async fn the_other_calls_name_the_field() {
         "room",
     );
 
-    // A focal length in pixels is refused, whoever would read the motion.
+    // A focal length in image widths is refused, whoever would read the motion.
     refused(
-        "focal length in pixels",
+        "focal length in widths",
         c.estimate_motion(pb::EstimateMotionRequest {
             first: feature(feature_row(1)),
             second: feature(feature_row(2)),
             camera: Some(pb::Pinhole {
-                focal: 585.0,
-                centre_x: 320.0,
-                centre_y: 240.0,
+                width: 640.0,
+                height: 480.0,
+                focal: 0.914,
+                ..pb::Pinhole::default()
             }),
             ..m()
         })

@@ -7,15 +7,16 @@ use clap::Args;
 
 use seese3_core::eval::has_seen;
 use seese3_core::features::Features;
-use seese3_core::geometry::Pinhole;
 use seese3_core::room::Room;
+use seese3_core::splits::Split;
 use seese3_lab::experiments::motion::{Maps, evaluate};
 use seese3_lab::report::{motion_evaluation_json, motion_table};
 
+use super::super::camera::CameraOption;
 use super::super::progress::bar;
 use super::super::{check_writable, say, write_json};
 use crate::encoder::{Pooling, Preparation};
-use crate::store::Store;
+use crate::store::{Store, StoredAdapter};
 
 #[derive(Debug, Args)]
 pub struct Motion {
@@ -32,10 +33,9 @@ pub struct Motion {
     /// encoder's feature map that is as fine as the map, for instance xfeat-fusion-grid40x30
     #[arg(long, value_name = "FEATURES")]
     two_view: Option<String>,
-    /// Focal length of the camera in image widths (fx in pixels over the image's width), for
-    /// --two-view; the room's own if omitted
-    #[arg(long, value_name = "WIDTHS", requires = "two_view")]
-    focal: Option<f64>,
+    /// The camera of the images, in pixels, for --two-view; the room's own if omitted
+    #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]", requires = "two_view")]
+    camera: Option<CameraOption>,
     /// Frames from the first view to the second
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
     stride: u32,
@@ -51,33 +51,44 @@ impl Motion {
         }
 
         let store = Store::open(&self.store)?;
+        let stored = store.load_room(&self.room, None).await?;
+        let features = async |name: &str| -> anyhow::Result<Features> {
+            let (other, features) = store.load_room_with(&self.room, Some(name)).await?;
+            anyhow::ensure!(
+                other.revision == stored.revision,
+                "room '{}' was published again meanwhile; try again",
+                self.room
+            );
+
+            Ok(features)
+        };
+
         let adapter = match &self.adapter {
             Some(name) => {
-                let stored = store.load_adapter(name, None).await?;
-                let source = stored.adapter.source().name.clone();
-                let (_, features) = store.load_room_with(&self.room, Some(&source)).await?;
-                Some((stored, features))
+                let adapter = store.load_adapter(name, None).await?;
+                let features = features(&adapter.adapter.source().name).await?;
+                Some((adapter, features))
             }
             None => None,
         };
         let dense = match &self.two_view {
-            Some(name) => Some(store.load_room_with(&self.room, Some(name)).await?.1),
+            Some(name) => Some(features(name).await?),
             None => None,
         };
 
-        let stored = store.load_room(&self.room, None).await?;
         let maps = dense
             .as_ref()
             .map(|dense| self.maps(&stored.room, dense))
             .transpose()?;
-        let progress = bar(stored.room.frame_count() as u64, "reading");
+        let pairs = Split::Whole.test_pairs(stored.room.timeline(), self.stride)?;
+        let progress = bar(pairs.len() as u64, "reading");
         let found = evaluate(
             &stored.room,
             adapter
                 .as_ref()
                 .map(|(stored, features)| (stored.adapter.as_ref(), features)),
             maps,
-            self.stride,
+            &pairs,
             &|| progress.inc(1),
         )?;
         progress.finish_and_clear();
@@ -90,16 +101,7 @@ impl Motion {
             self.room, stored.revision, self.stride, found.n
         ));
         if let Some((adapter, _)) = &adapter {
-            say(format_args!(
-                "adapter '{}' revision {} ({})",
-                adapter.name,
-                adapter.revision,
-                if in_room == Some(true) {
-                    "LEAK: it has seen this room"
-                } else {
-                    "never saw this room"
-                },
-            ));
+            say_adapter(adapter, in_room == Some(true));
         }
         say(motion_table(&found).trim_end());
 
@@ -139,12 +141,11 @@ impl Motion {
             );
         }
 
-        let height = shape[1] as f64 / shape[2] as f64;
-        let camera = match (self.focal, room.provenance().camera) {
-            (Some(focal), _) => Pinhole::centred(focal, height).context("--focal")?,
+        let camera = match (self.camera, room.provenance().camera) {
+            (Some(camera), _) => camera.pinhole()?,
             (None, Some(camera)) => camera,
             (None, None) => anyhow::bail!(
-                "room '{}' states no camera: give --focal, or import the room with --focal",
+                "room '{}' states no camera: give --camera, or import the room with --camera",
                 self.room
             ),
         };
@@ -155,4 +156,16 @@ impl Motion {
             camera,
         })
     }
+}
+
+fn say_adapter(adapter: &StoredAdapter, in_room: bool) {
+    let seen = if in_room {
+        "LEAK: it has seen this room"
+    } else {
+        "never saw this room"
+    };
+    say(format_args!(
+        "adapter '{}' revision {} ({seen})",
+        adapter.name, adapter.revision
+    ));
 }

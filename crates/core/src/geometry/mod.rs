@@ -14,7 +14,7 @@ mod pose_error;
 mod rotation;
 mod se3;
 
-pub use pinhole::{Pinhole, PinholeError};
+pub use pinhole::{Pinhole, PinholeError, PixelCamera};
 pub use pose_error::PoseError;
 pub use rotation::{NearestRotation, nearest_rotation};
 pub use se3::{Twist, adjoint, body_twist, exp, left_jacobian_inverse, log};

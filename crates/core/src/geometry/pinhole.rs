@@ -7,15 +7,33 @@ use nalgebra::Vector2;
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum PinholeError {
     #[error(
-        "the focal length is {0} image widths; it must be between 0.1 and 10: divide the focal \
-         length in pixels by the width of the image"
+        "images are {width} by {height} pixels; both must be above 0, and neither ten times the other"
     )]
-    Focal(f64),
+    Size { width: f64, height: f64 },
     #[error(
-        "the principal point is ({0}, {1}) image widths from the top left corner; it must lie \
-         inside the image"
+        "the focal length is {focal} pixels in images {width} wide; it must be a tenth of that to ten times that"
     )]
-    Centre(f64, f64),
+    Focal { focal: f64, width: f64 },
+    #[error("the principal point ({x}, {y}) lies outside images of {width} by {height} pixels")]
+    Centre {
+        x: f64,
+        y: f64,
+        width: f64,
+        height: f64,
+    },
+}
+
+/// A pinhole camera as its calibration states it, in pixels of its images.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PixelCamera {
+    /// The size of the images.
+    pub width: f64,
+    /// The size of the images.
+    pub height: f64,
+    /// The focal length, the same along both axes.
+    pub focal: f64,
+    /// The principal point from the image's top left corner; the middle if `None`.
+    pub centre: Option<Vector2<f64>>,
 }
 
 /// A pinhole camera with square pixels. Lengths are in image widths, so that they stay when the
@@ -23,33 +41,47 @@ pub enum PinholeError {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pinhole {
     focal: f64,
+    height: f64,
     centre: Vector2<f64>,
 }
 
 impl Pinhole {
-    /// A camera of this focal length and principal point, counted from the image's top left corner.
+    /// Checks a camera.
     ///
     /// # Errors
-    /// [`PinholeError`] for what no camera of a robot has.
-    pub fn new(focal: f64, centre: Vector2<f64>) -> Result<Self, PinholeError> {
-        if !(0.1..=10.0).contains(&focal) {
-            return Err(PinholeError::Focal(focal));
+    /// [`PinholeError`] if a number is out of its range.
+    pub fn new(camera: PixelCamera) -> Result<Self, PinholeError> {
+        let PixelCamera {
+            width,
+            height,
+            focal,
+            centre,
+        } = camera;
+
+        // Not a number is outside every range.
+        if !(width.is_finite() && width > 0.0 && (0.1..=10.0).contains(&(height / width))) {
+            return Err(PinholeError::Size { width, height });
+        }
+        if !(0.1..=10.0).contains(&(focal / width)) {
+            return Err(PinholeError::Focal { focal, width });
         }
 
-        let inside = |part: f64, size: f64| (0.0..=size).contains(&part);
-        if !inside(centre.x, 1.0) || !inside(centre.y, 4.0) {
-            return Err(PinholeError::Centre(centre.x, centre.y));
+        let centre = centre.unwrap_or(Vector2::new(width, height) / 2.0);
+        let [x, y] = [centre.x, centre.y];
+        if !(0.0..=width).contains(&x) || !(0.0..=height).contains(&y) {
+            return Err(PinholeError::Centre {
+                x,
+                y,
+                width,
+                height,
+            });
         }
 
-        Ok(Self { focal, centre })
-    }
-
-    /// A camera that looks through the middle of an image of `height` image widths.
-    ///
-    /// # Errors
-    /// As [`Pinhole::new`].
-    pub fn centred(focal: f64, height: f64) -> Result<Self, PinholeError> {
-        Self::new(focal, Vector2::new(0.5, height / 2.0))
+        Ok(Self {
+            focal: focal / width,
+            height: height / width,
+            centre: centre / width,
+        })
     }
 
     /// The focal length, image widths.
@@ -57,14 +89,19 @@ impl Pinhole {
         self.focal
     }
 
-    /// The principal point, image widths from the top left corner.
+    /// The height of the images, image widths.
+    pub fn height(&self) -> f64 {
+        self.height
+    }
+
+    /// The principal point from the top left corner, image widths.
     pub fn centre(&self) -> Vector2<f64> {
         self.centre
     }
 
     /// Where a point of the image, image widths from its top left corner, lies on the plane at
     /// distance 1 before the camera.
-    pub fn plane(&self, point: Vector2<f64>) -> Vector2<f64> {
+    pub fn to_image_plane(&self, point: Vector2<f64>) -> Vector2<f64> {
         (point - self.centre) / self.focal
     }
 }
@@ -73,26 +110,55 @@ impl Pinhole {
 mod tests {
     use super::*;
 
+    const KITCHEN: PixelCamera = PixelCamera {
+        width: 640.0,
+        height: 480.0,
+        focal: 585.0,
+        centre: None,
+    };
+
     /// Oracle: by hand. A camera that sees 90° across has a focal length of half a width: the edge
     /// of its image is 45° from the middle.
     #[test]
     fn the_edge_of_a_right_angle_is_one_away_on_the_plane() {
-        let camera = Pinhole::centred(0.5, 0.75).unwrap();
+        let camera = Pinhole::new(PixelCamera {
+            focal: 320.0,
+            ..KITCHEN
+        })
+        .unwrap();
         assert_eq!(
-            camera.plane(Vector2::new(1.0, 0.375)),
+            camera.to_image_plane(Vector2::new(1.0, 0.375)),
             Vector2::new(1.0, 0.0)
         );
     }
 
-    /// Oracle: a focal length in pixels, or none, is a mistake of the caller.
+    /// Oracle: a focal length in image widths, none, or a principal point of other images is a
+    /// mistake of the caller.
     #[test]
     fn what_no_camera_has_is_refused() {
-        for focal in [585.0, 0.0, -1.0, f64::NAN] {
+        for focal in [0.9, 0.0, -585.0, f64::NAN, f64::INFINITY] {
+            let camera = PixelCamera { focal, ..KITCHEN };
             assert!(matches!(
-                Pinhole::centred(focal, 0.75),
-                Err(PinholeError::Focal(_))
+                Pinhole::new(camera),
+                Err(PinholeError::Focal { .. })
             ));
         }
-        assert!(Pinhole::new(1.0, Vector2::new(320.0, 240.0)).is_err());
+
+        let outside = PixelCamera {
+            centre: Some(Vector2::new(960.0, 540.0)),
+            ..KITCHEN
+        };
+        assert!(matches!(
+            Pinhole::new(outside),
+            Err(PinholeError::Centre { .. })
+        ));
+
+        for width in [0.0, -640.0, f64::NAN] {
+            let camera = PixelCamera { width, ..KITCHEN };
+            assert!(matches!(
+                Pinhole::new(camera),
+                Err(PinholeError::Size { .. })
+            ));
+        }
     }
 }

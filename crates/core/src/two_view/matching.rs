@@ -9,12 +9,16 @@ use crate::geometry::Pinhole;
 /// Standard deviation of a match of usual margin and curvature, image widths: 0.8 pixels of 320.
 const DEVIATION: f64 = 0.8 / 320.0;
 
-/// The usual margin and curvature, and the powers by which a match with less of them is less exact.
+/// The deviation of a match is [`DEVIATION`] · (margin / 0.1)^−0.7 · (curvature / 0.05)^−0.5: the usual
+/// values, and the powers.
 const MARGIN: (f64, f64) = (0.1, 0.7);
 const CURVATURE: (f64, f64) = (0.05, 0.5);
 
-/// Matches are at least and at most so many times less exact than usual.
-const EXACTNESS: (f64, f64) = (0.4, 8.0);
+/// The least and the largest factor of [`DEVIATION`].
+const FACTORS: (f64, f64) = (0.4, 8.0);
+
+/// The factor up to which a match is sharp.
+const SHARP: f64 = 2.0;
 
 /// The shape of a feature map.
 #[derive(Clone, Copy)]
@@ -34,10 +38,10 @@ pub(super) fn matches(
         columns: first.shape()[2],
     };
     let similar = similarity(first, second, cells);
-    let nearest_second: Vec<usize> = similar.outer_iter().map(|row| most(row.iter())).collect();
+    let nearest_second: Vec<usize> = similar.outer_iter().map(|row| argmax(row.iter())).collect();
     let nearest_first: Vec<usize> = similar
         .axis_iter(Axis(1))
-        .map(|column| most(column.iter()))
+        .map(|column| argmax(column.iter()))
         .collect();
 
     let mutual = nearest_second
@@ -49,21 +53,26 @@ pub(super) fn matches(
         .filter_map(|(from, &to)| {
             let row = similar.row(from);
             let peak = Peak::of(row.as_slice()?, to, cells)?;
-            let scale = 1.0 / cells.columns as f64;
-            let middle = |column: f64, row: f64| Vector2::new(column + 0.5, row + 0.5) * scale;
+            let middle = |column: f64, row: f64| {
+                Vector2::new(
+                    (column + 0.5) / cells.columns as f64,
+                    (row + 0.5) / cells.rows as f64 * camera.height(),
+                )
+            };
 
             let at = middle((from % cells.columns) as f64, (from / cells.columns) as f64);
             Some(Match {
-                direction: camera.plane(at).push(1.0),
-                point: camera.plane(middle(peak.column, peak.row)),
-                deviation: peak.deviation() / camera.focal(),
+                direction: camera.to_image_plane(at).push(1.0),
+                point: camera.to_image_plane(middle(peak.column, peak.row)),
+                deviation: DEVIATION * peak.factor() / camera.focal(),
+                is_sharp: peak.factor() <= SHARP,
             })
         })
         .collect()
 }
 
 /// The place of the first of the largest values.
-fn most<'a>(values: impl Iterator<Item = &'a f32>) -> usize {
+fn argmax<'a>(values: impl Iterator<Item = &'a f32>) -> usize {
     let mut best = (0, f32::NEG_INFINITY);
     for (place, &value) in values.enumerate() {
         if value > best.1 {
@@ -165,7 +174,7 @@ impl Peak {
 
         // Least squares on the nine cells: each coefficient is a sum of its own.
         let mut slope = Vector2::zeros();
-        let [mut across, mut mixed, mut along] = [0.0; 3];
+        let [mut second_xx, mut second_xy, mut second_yy] = [0.0; 3];
         for (dy, dx) in (-1i32..=1).flat_map(|dy| (-1i32..=1).map(move |dx| (dy, dx))) {
             let y = row.saturating_add_signed(dy as isize);
             let x = column.saturating_add_signed(dx as isize);
@@ -173,15 +182,15 @@ impl Peak {
             let [dx, dy] = [f64::from(dx), f64::from(dy)];
 
             slope += Vector2::new(dx, dy) * value / 6.0;
-            across += (dx * dx - 2.0 / 3.0) * value;
-            along += (dy * dy - 2.0 / 3.0) * value;
-            mixed += dx * dy * value / 4.0;
+            second_xx += (dx * dx - 2.0 / 3.0) * value;
+            second_yy += (dy * dy - 2.0 / 3.0) * value;
+            second_xy += dx * dy * value / 4.0;
         }
 
-        let determinant = across * along - mixed * mixed;
-        let (right, below) = if across < 0.0 && determinant > 1e-9 {
-            let right = (mixed * slope.y - along * slope.x) / determinant;
-            let below = (mixed * slope.x - across * slope.y) / determinant;
+        let determinant = second_xx * second_yy - second_xy * second_xy;
+        let (right, below) = if second_xx < 0.0 && determinant > 1e-9 {
+            let right = (second_xy * slope.y - second_yy * slope.x) / determinant;
+            let below = (second_xy * slope.x - second_xx * slope.y) / determinant;
             (right.clamp(-1.0, 1.0), below.clamp(-1.0, 1.0))
         } else {
             (
@@ -194,20 +203,21 @@ impl Peak {
             column: column as f64 + right,
             row: row as f64 + below,
             margin: f64::from(similar[best] - elsewhere(similar, best, cells)),
-            curvature: -f64::midpoint(across, along) - ((across - along) / 2.0).hypot(mixed),
+            curvature: -f64::midpoint(second_xx, second_yy)
+                - ((second_xx - second_yy) / 2.0).hypot(second_xy),
         };
         let inside = |at: f64, count: usize| at > 0.2 && at < count as f64 - 1.2;
 
         (inside(peak.column, columns) && inside(peak.row, rows)).then_some(peak)
     }
 
-    /// The standard deviation of the place, image widths: a peak that is flat, or has a rival, is
-    /// less exact.
-    fn deviation(&self) -> f64 {
+    /// How many times less exact than usual the place is: a peak that is flat, or has a rival, is less
+    /// exact.
+    fn factor(&self) -> f64 {
         let less = |value: f64, (usual, power): (f64, f64)| (value.max(0.003) / usual).powf(-power);
-        let (least, most) = EXACTNESS;
+        let (least, most) = FACTORS;
 
-        DEVIATION * (less(self.margin, MARGIN) * less(self.curvature, CURVATURE)).clamp(least, most)
+        (less(self.margin, MARGIN) * less(self.curvature, CURVATURE)).clamp(least, most)
     }
 }
 

@@ -1,4 +1,5 @@
-//! The motion that explains matches best, and how sure that is.
+//! The motion that explains matches best, and how sure that is. A motion (R, t) is `first_from_second`:
+//! the second camera in the frame of the first; small steps (v, ω) follow it.
 
 use nalgebra::{
     Cholesky, Matrix2x6, Matrix3, Matrix6, Rotation3, Translation3, UnitQuaternion, Vector2,
@@ -16,7 +17,7 @@ const LOG_INVERSE_DEPTH: [f64; 6] = [-0.9446, -0.1065, -0.0705, 0.4672, 0.0214, 
 const DEPTH_SPREADS: [f64; 2] = [0.15, 0.3];
 
 /// Degrees of freedom of the Student-t distribution of a match.
-const FREEDOM: f64 = 4.0;
+const DEGREES_OF_FREEDOM: f64 = 4.0;
 
 /// Standard deviation of the rotation before anything is seen, radians.
 const ROTATION_PRIOR: f64 = 1.0;
@@ -38,7 +39,7 @@ const ANNEALING: [(f64, usize); 2] = [(8.0, 4), (3.0, 4)];
 const FINISHED: usize = 2;
 const LAST_STEPS: usize = 12;
 
-/// The scale of the rotation's first guess beyond which a match counts little, radians.
+/// The Cauchy scale of the first rotation: a match that is farther off counts little, radians.
 const FIRST_GUESS_SCALE: f64 = 0.05;
 
 /// Neighbouring matches err together: so many count as one.
@@ -54,10 +55,12 @@ mod spread {
     pub const MATCHES: f64 = 0.47;
     /// The length of the translation, as a share of it: the depths have a scale of their own.
     pub const SCALE: f64 = 0.31;
-    /// Every component, as a share of the translation, then metres and radians.
-    pub const SHARE: f64 = 0.031;
-    pub const METRES: f64 = 0.005;
-    pub const RADIANS: f64 = 0.0005;
+    /// Every component of the translation: as a share of it, and metres.
+    pub const SHARE: f64 = 0.10;
+    pub const METRES: f64 = 0.006;
+    /// Every component of the rotation: as a share of it, and radians.
+    pub const TURN_SHARE: f64 = 0.06;
+    pub const RADIANS: f64 = 0.004;
     /// Factor of all.
     pub const ALL: f64 = 1.165;
 }
@@ -211,7 +214,8 @@ impl<'a> Found<'a> {
         let mut cost = rotation.scaled_axis().norm_squared() / ROTATION_PRIOR.powi(2);
         for (matched, seen) in matches.iter().zip(&seen) {
             let distance = seen.distance(matched.deviation * factor, depth_spread);
-            cost += (FREEDOM + 2.0) * (distance / FREEDOM).ln_1p() + seen.depth_share.ln_1p();
+            cost += (DEGREES_OF_FREEDOM + 2.0) * (distance / DEGREES_OF_FREEDOM).ln_1p()
+                + seen.depth_share.ln_1p();
         }
 
         Self {
@@ -330,13 +334,13 @@ impl<'a> Found<'a> {
 
     /// How many matches agree with the motion: the sum of their weights, 0 to 1 each.
     pub fn support(&self) -> f64 {
-        let most = (FREEDOM + 2.0) / FREEDOM;
+        let most = (DEGREES_OF_FREEDOM + 2.0) / DEGREES_OF_FREEDOM;
         self.seen.iter().map(|seen| seen.weight / most).sum()
     }
 
     /// The motion, drawn towards no translation where the matches leave it open, and the covariance
-    /// of ξ in true = motion · exp(ξ), ordered (v, ω).
-    pub fn tempered(&self) -> (Pose, Matrix6<f64>) {
+    /// of ξ in true = motion · exp(ξ), ordered (v, ω). None if the matches are degenerate.
+    pub fn shrunk_with_covariance(&self) -> Option<(Pose, Matrix6<f64>)> {
         let (share, metres) = SHRINKAGE;
         let (information, ..) = self.normal_equations();
         let shift = self.rotation.inverse() * self.translation;
@@ -349,18 +353,19 @@ impl<'a> Found<'a> {
             pull[row] = -towards_none * shift[row];
         }
 
-        // The information is positive definite: the rotation has a prior, the translation a pull.
-        let covariance = Cholesky::new(posterior).map_or_else(Matrix6::zeros, |c| c.inverse());
+        let covariance = Cholesky::new(posterior)?.inverse();
         let step = covariance * pull;
         let drawn = self.moved(&step);
         let shift = drawn.rotation.inverse() * drawn.translation;
 
+        let turned =
+            spread::RADIANS.powi(2) + (spread::TURN_SHARE * drawn.rotation.angle()).powi(2);
         let even = spread::SHARE.powi(2) * shift.norm_squared() + spread::METRES.powi(2);
         let mut spread = covariance * spread::MATCHES;
         let along = shift * shift.transpose() * spread::SCALE.powi(2);
         for row in 0..3 {
             spread[(row, row)] += even;
-            spread[(3 + row, 3 + row)] += spread::RADIANS.powi(2);
+            spread[(3 + row, 3 + row)] += turned;
             for column in 0..3 {
                 spread[(row, column)] += along[(row, column)];
             }
@@ -370,7 +375,7 @@ impl<'a> Found<'a> {
             Translation3::from(drawn.translation),
             UnitQuaternion::from_rotation_matrix(&drawn.rotation),
         );
-        (motion, spread * spread::ALL)
+        Some((motion, spread * spread::ALL))
     }
 }
 
@@ -417,7 +422,8 @@ impl Seen {
             seen = at((seen.excess + step).clamp(-3.0 * depth_spread, 3.0 * depth_spread));
         }
 
-        seen.weight = (FREEDOM + 2.0) / (FREEDOM + seen.distance(deviation, depth_spread));
+        seen.weight = (DEGREES_OF_FREEDOM + 2.0)
+            / (DEGREES_OF_FREEDOM + seen.distance(deviation, depth_spread));
         seen
     }
 

@@ -9,7 +9,7 @@ use seese3_core::features::Features;
 use seese3_core::geometry::{Pinhole, Twist, exp, log};
 use seese3_core::nalgebra::Cholesky;
 use seese3_core::room::Room;
-use seese3_core::splits::{Pair, Split};
+use seese3_core::splits::Pair;
 use seese3_core::statistics::{Coverage, coverage};
 use seese3_core::training::motions;
 use seese3_core::two_view;
@@ -26,7 +26,7 @@ pub struct MotionErrors {
     pub rotation_deg: ErrorQuantiles,
 }
 
-/// The results in one room at one stride.
+/// The results in one room.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionEvaluation {
     /// How many pairs of frames were read.
@@ -53,11 +53,11 @@ pub struct AdapterErrors {
 /// The errors of a two-view reader.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TwoViewErrors {
-    /// Over all pairs; where the reader cannot tell it answers no motion.
+    /// Over all pairs; where the reader cannot read it answers no motion.
     pub ours: MotionErrors,
-    /// The share of pairs whose motion it could tell.
-    pub told: f64,
-    /// Over the pairs that it could tell, how often its covariance holds.
+    /// The share of pairs whose motion it could read.
+    pub answered: f64,
+    /// Over the pairs that it could read, how often its covariance holds.
     pub coverage: Coverage,
 }
 
@@ -72,29 +72,28 @@ pub struct Maps<'a> {
     pub camera: Pinhole,
 }
 
-/// Reads the motion between the frames of every pair of a room at a stride. `read` is told each pair
-/// that the two-view reader has read.
+/// Reads the motion between the frames of every pair. `on_pair_read` is called after each pair that
+/// the two-view reader has read.
 ///
 /// # Errors
 /// [`Error::Adapter`] when the features are not the adapter's, [`Error::TwoView`] when the maps are
-/// too small, [`Error::Splits`] when the room is too short for the stride.
+/// too small.
 pub fn evaluate(
     room: &Room,
     adapter: Option<(&Adapter, &Features)>,
     maps: Option<Maps<'_>>,
-    stride: u32,
-    read: &(dyn Fn() + Sync),
+    pairs: &[Pair],
+    on_pair_read: &(dyn Fn() + Sync),
 ) -> Result<MotionEvaluation, Error> {
-    let pairs = Split::Whole.test_pairs(room.timeline(), stride)?;
-    let truth = motions(room.poses(), &pairs);
+    let truth = motions(room.poses(), pairs);
 
     Ok(MotionEvaluation {
         n: pairs.len(),
         adapter: adapter
-            .map(|(adapter, features)| by_adapter(adapter, features, &pairs, &truth))
+            .map(|(adapter, features)| by_adapter(adapter, features, pairs, &truth))
             .transpose()?,
         two_view: maps
-            .map(|maps| by_two_views(maps, &pairs, &truth, read))
+            .map(|maps| by_two_views(maps, pairs, &truth, on_pair_read))
             .transpose()?,
         no_motion: errors(&truth, &vec![Twist::default(); truth.len()]),
     })
@@ -137,7 +136,7 @@ fn by_two_views(
     maps: Maps<'_>,
     pairs: &[Pair],
     truth: &[Twist],
-    told: &(dyn Fn() + Sync),
+    on_pair_read: &(dyn Fn() + Sync),
 ) -> Result<TwoViewErrors, Error> {
     let rows = maps.features.rows();
     let map = |row: usize| {
@@ -147,33 +146,39 @@ fn by_two_views(
             second: maps.shape,
         })
     };
-    let readings: Vec<two_view::Reading> = pairs
+    let readings: Vec<two_view::MotionEstimate> = pairs
         .par_iter()
         .map(|pair| {
             let first = map(pair.source.row())?;
             let second = map(pair.target.row())?;
             let reading = two_view::read(first, second, &maps.camera);
-            told();
+            on_pair_read();
 
             reading
         })
         .collect::<Result<_, _>>()?;
 
-    let read: Vec<Twist> = readings.iter().map(two_view::Reading::twist).collect();
+    let read: Vec<Twist> = readings
+        .iter()
+        .map(two_view::MotionEstimate::twist)
+        .collect();
     let lengths: Vec<f64> = readings
         .iter()
         .zip(truth)
-        .filter(|(reading, _)| reading.is_told)
+        .filter(|(reading, _)| reading.is_estimated)
         .filter_map(|(reading, truth)| {
             let off = log(&reading.motion.inv_mul(&exp(truth))).to_vector();
             Some(off.dot(&Cholesky::new(reading.covariance)?.solve(&off)))
         })
         .collect();
-    let told = readings.iter().filter(|reading| reading.is_told).count();
+    let answered = readings
+        .iter()
+        .filter(|reading| reading.is_estimated)
+        .count();
 
     Ok(TwoViewErrors {
         ours: errors(truth, &read),
-        told: told as f64 / readings.len() as f64,
+        answered: answered as f64 / readings.len() as f64,
         coverage: coverage(&lengths),
     })
 }

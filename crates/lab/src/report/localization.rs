@@ -45,14 +45,21 @@ pub fn motion_table(found: &MotionEvaluation) -> String {
     add("no motion", &found.no_motion);
 
     let mut table = aligned(&lines);
-    if let Some(TwoViewErrors { told, coverage, .. }) = &found.two_view {
+    if let Some(TwoViewErrors {
+        answered, coverage, ..
+    }) = &found.two_view
+    {
         table += &format!(
-            "the two-view reader could tell {:.1} % of the motions; {:.2} and {:.2} of these lie \
-             within its 68 and 95 % ellipsoids\n",
-            100.0 * told,
-            coverage.within_68,
-            coverage.within_95
+            "the two-view reader could read {:.1} % of the motions",
+            100.0 * answered
         );
+        if *answered > 0.0 {
+            table += &format!(
+                "; {:.2} and {:.2} of these lie within its 68 and 95 % ellipsoids",
+                coverage.within_68, coverage.within_95
+            );
+        }
+        table.push('\n');
     }
 
     table
@@ -126,8 +133,8 @@ pub struct MotionEvaluationJson {
 struct TwoViewJson {
     #[serde(flatten)]
     errors: ErrorsJson,
-    /// The share of motions that it could tell.
-    told: f64,
+    /// The share of motions that it could read.
+    answered: f64,
     coverage_68: f64,
     coverage_95: f64,
 }
@@ -222,7 +229,7 @@ pub fn motion_evaluation_json(
         constant: of_adapter(|adapter| &adapter.constant),
         two_view: found.two_view.as_ref().map(|two_view| TwoViewJson {
             errors: (&two_view.ours).into(),
-            told: two_view.told,
+            answered: two_view.answered,
             coverage_68: two_view.coverage.within_68,
             coverage_95: two_view.coverage.within_95,
         }),

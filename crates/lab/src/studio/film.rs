@@ -6,7 +6,7 @@ use super::photograph::{Shot, photograph};
 use super::render::{Camera, Sampling, radiance};
 use super::solid::Solid;
 use super::{FRAMES_PER_SECOND, Scene, SuiteRoom, render, visits};
-use seese3_core::geometry::{Pinhole, PinholeError, Pose};
+use seese3_core::geometry::{Pinhole, PinholeError, PixelCamera, Pose};
 use seese3_core::image::RgbImage;
 
 /// A suite of rooms: how they look, and how the camera moves in them.
@@ -56,7 +56,7 @@ impl Suite {
 /// A recording of one room, of one visit or of several, one after the other.
 #[derive(Debug, Clone)]
 pub struct Film {
-    /// What the difficulty of the room is called.
+    /// How the room is filmed: a part of it, all of it, a corridor.
     pub kind: &'static str,
     /// Angle of view of the camera across the width, radians; its pixels are square.
     pub field_of_view_rad: f64,
@@ -125,8 +125,14 @@ impl Film {
     /// # Errors
     /// [`PinholeError`] for an image that is far higher than it is wide.
     pub fn camera(&self, width: usize, height: usize) -> Result<Pinhole, PinholeError> {
-        let focal = 0.5 / (self.field_of_view_rad / 2.0).tan();
-        Pinhole::centred(focal, height as f64 / width as f64)
+        let width = width as f64;
+
+        Pinhole::new(PixelCamera {
+            width,
+            height: height as f64,
+            focal: 0.5 * width / (self.field_of_view_rad / 2.0).tan(),
+            centre: None,
+        })
     }
 
     /// The image of a frame.
@@ -170,8 +176,8 @@ impl Film {
             .saturating_sub(1)
     }
 
-    /// The camera's motion while the shutter is open, by its motion to a neighbouring frame of the
-    /// same visit.
+    /// The camera's motion while the shutter is open, by its motion from the frame before; none for
+    /// the first frame of a visit.
     fn motion_of(&self, frame: usize, visit: &Visit) -> Isometry3<f64> {
         let Some(before) = frame.checked_sub(1).filter(|&before| before >= visit.begin) else {
             return Isometry3::identity();

@@ -19,7 +19,8 @@ pub(super) struct Shot {
     pub white: [f64; 3],
     /// Darkening of the image's corners, as a share.
     pub vignette: f64,
-    /// Standard deviation of the noise of a white pixel, and that of a black one; 1 is white.
+    /// Standard deviation of the noise of light in a white pixel, and that of the electronics; 1 is
+    /// white.
     pub noise: [f64; 2],
     pub seed: u32,
 }
@@ -107,11 +108,11 @@ impl<'a> Blur<'a> {
         let still = self.radiance.light[row * width + column];
         let [right, down] = self.way(column, row);
 
-        // Less than a pixel is no smear; more than a fifth of the image is of a surface at the
-        // camera's very eye.
-        let length = right * right + down * down;
+        // Less than 0.7 pixels is no smear; more than a fifth of the image is of a surface that is
+        // nearer than a camera's lens can be.
+        let squared_length = right * right + down * down;
         let limit = (width as f64 / 5.0).powi(2);
-        if !(0.5..limit).contains(&length) {
+        if !(0.5..limit).contains(&squared_length) {
             return still;
         }
 

@@ -24,7 +24,7 @@ const CLEARANCE_M: f64 = 0.85;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Tour {
     /// A part of a room, from nearby standpoints.
-    Corner,
+    Part,
     /// All of a room.
     Room,
     /// A corridor, to and fro.
@@ -39,7 +39,7 @@ pub(super) fn film(seed: u64, number: u32, frame_count: usize) -> Film {
     random.set_stream((1 << 32) + u64::from(number));
 
     let tour = match random.random_range(0..20) {
-        0..9 => Tour::Corner,
+        0..9 => Tour::Part,
         9..16 => Tour::Room,
         _ => Tour::Corridor,
     };
@@ -67,7 +67,7 @@ pub(super) fn film(seed: u64, number: u32, frame_count: usize) -> Film {
     }
 
     let kind = match tour {
-        Tour::Corner => "corner",
+        Tour::Part => "part",
         Tour::Room => "room",
         Tour::Corridor => "corridor",
     };
@@ -114,7 +114,7 @@ fn habit(tour: Tour, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Habit {
     let mut up_to = |low: f64, high: f64, free: f64| random.random_range(low..high).min(free);
 
     let mut reach = match tour {
-        Tour::Corner => Vector3::new(up_to(0.3, 0.9, free.x), up_to(0.25, 0.7, free.y), 0.0),
+        Tour::Part => Vector3::new(up_to(0.3, 0.9, free.x), up_to(0.25, 0.7, free.y), 0.0),
         Tour::Room => Vector3::new(up_to(0.6, 1.5, free.x), up_to(0.6, 1.5, free.y), 0.0),
         Tour::Corridor => Vector3::new(up_to(1.0, 2.5, free.x), up_to(0.1, 0.2, free.y), 0.0),
     };
@@ -130,7 +130,7 @@ fn habit(tour: Tour, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Habit {
     middle.z = random.random_range(1.22..1.5) + reach.z;
 
     let (yaw, speed, turning) = match tour {
-        Tour::Corner => (
+        Tour::Part => (
             random.random_range(20f64..50.0),
             random.random_range(0.2..0.5),
             random.random_range(12f64..40.0),
@@ -166,7 +166,7 @@ fn habit(tour: Tour, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Habit {
 }
 
 /// The room as one visit finds it: in other light, and after the first with a quarter of the small
-/// things moved by up to 20 cm.
+/// things moved by up to 20 cm each way, wherever that is.
 fn changed(scene: &Scene, moved: bool, random: &mut ChaCha8Rng) -> Scene {
     let mut scene = scene.clone();
     let small = |solid: &&mut Solid| moved && solid.half.max() < 0.16;
@@ -250,11 +250,11 @@ fn visited(scene: &Scene, begin: usize, frames: usize, random: &mut ChaCha8Rng) 
     }
 }
 
-/// Somebody who walks along one of the long walls during the visit.
+/// Somebody who walks along one of the long walls during the visit, through what stands there.
 fn passer_by(scene: &Scene, begin: usize, frames: usize, random: &mut ChaCha8Rng) -> PasserBy {
     let size = scene.size;
-    let speed = random.random_range(0.02..0.04);
-    let seconds = (size.x / speed) as usize;
+    let step_m = random.random_range(0.02..0.04);
+    let crossing_frames = (size.x / step_m) as usize;
     let from = begin + random.random_range(0..frames.max(1));
     let far = random.random_bool(0.5);
     let aside = if far { size.y - 0.4 } else { 0.4 };
@@ -287,8 +287,8 @@ fn passer_by(scene: &Scene, begin: usize, frames: usize, random: &mut ChaCha8Rng
                 seed: random.random(),
             })
             .to_vec(),
-        step: Vector3::new(speed, 0.0, 0.0),
-        frames: from..(from + seconds).min(begin + frames),
+        step: Vector3::new(step_m, 0.0, 0.0),
+        frames: from..(from + crossing_frames).min(begin + frames),
     }
 }
 
