@@ -2,8 +2,8 @@
 //! both images.
 //!
 //! The paper reads a motion from two averaged features, which know little of where things are. Here
-//! the cells of two unpooled feature maps are matched ([`matching`]), and the motion is what explains
-//! the matches best ([`solver`]):
+//! the cells of two unpooled feature maps are matched (`matching`), and the motion is what explains
+//! the matches best (`solver`):
 //!
 //! - A match says that the direction b in the first image is the point u of the second. Under the
 //!   motion (R, t), a point at inverse depth ρ is seen in the direction Rᵀ(b − ρt).
