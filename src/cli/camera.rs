@@ -31,7 +31,8 @@ impl FromStr for CameraOption {
             Some(&[width, height, focal]) => (width, height, focal, None),
             Some(&[width, height, focal, x, y]) => (width, height, focal, Some([x, y].into())),
             _ => bail!(
-                "is not WIDTHxHEIGHT,FOCAL or WIDTHxHEIGHT,FOCAL,CX,CY in pixels, for instance 640x480,585"
+                "is not WIDTHxHEIGHT,FOCAL or WIDTHxHEIGHT,FOCAL,CX,CY in pixels, for instance \
+                 640x480,585"
             ),
         };
 

@@ -9,8 +9,8 @@ use crate::geometry::Pinhole;
 /// Standard deviation of a match of usual margin and curvature, image widths: 0.8 pixels of 320.
 const DEVIATION: f64 = 0.8 / 320.0;
 
-/// The deviation of a match is [`DEVIATION`] · (margin / 0.1)^−0.7 · (curvature / 0.05)^−0.5: the usual
-/// values, and the powers.
+/// The deviation of a match is [`DEVIATION`] · (margin / 0.1)^−0.7 · (curvature / 0.05)^−0.5: the
+/// usual values, and the powers.
 const MARGIN: (f64, f64) = (0.1, 0.7);
 const CURVATURE: (f64, f64) = (0.05, 0.5);
 

@@ -8,10 +8,10 @@
 //! - A match says that the direction b in the first image is the point u of the second. Under the
 //!   motion (R, t), a point at inverse depth ρ is seen in the direction Rᵀ(b − ρt).
 //! - Each ρ is unknown. Its logarithm has a prior whose mean depends on the place in the image: what
-//!   is low in an image of a room is near. This prior alone gives the translation its length in
-//!   metres.
-//! - The most probable motion is found by Levenberg–Marquardt steps, each ρ eliminated, with Student-t
-//!   weights against wrong matches.
+//!   is at the edges of an image of a room is nearer than what is in its middle. This prior alone
+//!   gives the translation its length in metres.
+//! - The most probable motion is found by Levenberg–Marquardt steps, each ρ eliminated, with
+//!   Student-t weights against wrong matches.
 //!
 //! Where the images say little, the translation is drawn towards none, and the covariance grows. How
 //! the parameters were chosen is in `docs/two-views.md`.

@@ -1,5 +1,7 @@
-//! The motion that explains matches best, and how sure that is. A motion (R, t) is `first_from_second`:
-//! the second camera in the frame of the first; small steps (v, ω) follow it.
+//! The motion that explains matches best, and how sure that is.
+//!
+//! A motion (R, t) is `first_from_second`: the second camera in the frame of the first; small steps
+//! (v, ω) follow it.
 
 use nalgebra::{
     Cholesky, Matrix2x6, Matrix3, Matrix6, Rotation3, Translation3, UnitQuaternion, Vector2,

@@ -108,7 +108,7 @@ fn furnished(walk: Walk, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Scene {
 /// Where the person of a room stands and looks.
 ///
 /// The kitchen of 7-Scenes, whose camera films a part of a room, moves by 0.14 m and 7° in 20
-/// frames; the desk and room recordings of TUM RGB-D move at 0.33 to 0.41 m/s and 23 to 30°/s.
+/// frames. Rooms that are filmed in whole are turned about in faster.
 fn habit(tour: Tour, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Habit {
     let free = (size / 2.0 - Vector3::repeat(CLEARANCE_M)).map(|reach| reach.max(0.15));
     let mut up_to = |low: f64, high: f64, free: f64| random.random_range(low..high).min(free);
@@ -323,10 +323,9 @@ mod tests {
     }
 
     /// Oracle: the recordings that the suite imitates. The kitchen of 7-Scenes moves by 0.139 m and
-    /// 6.6° in 20 frames, and its fifths are 0.12 to 0.30 m and 9 to 17° from the rest of it; the
-    /// desk and room recordings of TUM RGB-D move at 0.33 to 0.41 m/s and 23 to 30°/s, as 0.2 m and
-    /// 18° in 20 frames at most. Half of the rooms lie around these, and none moves faster than a
-    /// hand.
+    /// 6.6° in 20 frames, and its fifths are 0.12 to 0.30 m and 9 to 17° from the rest of it. The
+    /// median room lies around that, turning at most three times as fast, and none moves faster than
+    /// a hand.
     #[test]
     fn visits_move_as_people_do() {
         let mut moved = Vec::new();
