@@ -158,7 +158,7 @@ impl Film {
             sampling: Sampling::Quincunx,
             ..camera
         };
-        let radiance = radiance(scene, &others, camera, pose);
+        let radiance = radiance(scene, &others, camera, pose, f64::INFINITY);
         let shot = Shot {
             motion: self.motion_of(frame, visit),
             seed: visit.shot.seed.wrapping_add(frame as u32),

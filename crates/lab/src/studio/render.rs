@@ -94,7 +94,7 @@ pub(super) struct Radiance {
 
 /// The image that `camera` takes at `world_from_camera`, which must lie inside the room.
 pub fn render(scene: &Scene, camera: Camera, world_from_camera: &Pose) -> RgbImage {
-    let radiance = radiance(scene, &[], camera, world_from_camera);
+    let radiance = radiance(scene, &[], camera, world_from_camera, 1.0);
 
     RgbImage {
         width: radiance.width,
@@ -108,12 +108,14 @@ pub fn render(scene: &Scene, camera: Camera, world_from_camera: &Pose) -> RgbIma
 }
 
 /// The light that reaches `camera` at `world_from_camera` from a room and from `others`, boxes that
-/// cast no shadow.
+/// cast no shadow. Rays that a pixel shares with its neighbours count no brighter than `ceiling`:
+/// 1 for an image that clips light there, infinity for a camera that sets its exposure afterwards.
 pub(super) fn radiance(
     scene: &Scene,
     others: &[Solid],
     camera: Camera,
     world_from_camera: &Pose,
+    ceiling: f64,
 ) -> Radiance {
     let Camera { width, height, .. } = camera;
     let view = View {
@@ -122,6 +124,7 @@ pub(super) fn radiance(
         camera,
         scale: camera.pixel(),
         world_from_camera,
+        ceiling,
         tiles: Tiles::new(&scene.solids, camera, world_from_camera),
     };
 
@@ -169,6 +172,8 @@ struct View<'a> {
     /// [`Camera::pixel`].
     scale: f64,
     world_from_camera: &'a Pose,
+    /// The brightest that a shared ray counts.
+    ceiling: f64,
     tiles: Tiles,
 }
 
@@ -201,6 +206,10 @@ impl View<'_> {
 
     /// A pixel by the four corners around it, and by rays inside it where these differ.
     fn shared(&self, around: &[Seen; 4], column: usize, row: usize) -> Seen {
+        let around = &around.map(|corner| Seen {
+            light: corner.light.map(|channel| channel.min(self.ceiling)),
+            ..corner
+        });
         if calm(around) {
             return mean(around);
         }
@@ -295,8 +304,7 @@ impl Tiles {
 /// Whether the light of a pixel's corners differs by no more than [`CALM`].
 fn calm(corners: &[Seen; 4]) -> bool {
     (0..3).all(|c| {
-        // The image clips light at 1, so that differences above it do not show.
-        let of = corners.map(|corner| corner.light[c].min(1.0));
+        let of = corners.map(|corner| corner.light[c]);
         let low = of.into_iter().fold(f64::INFINITY, f64::min);
         let high = of.into_iter().fold(0.0, f64::max);
 
@@ -304,16 +312,10 @@ fn calm(corners: &[Seen; 4]) -> bool {
     })
 }
 
-/// The mean light of a pixel's corners, clipped as the image clips it, and the distance of the
-/// nearest.
+/// The mean light of a pixel's corners, and the distance of the nearest.
 fn mean(corners: &[Seen; 4]) -> Seen {
-    let light = std::array::from_fn(|c| {
-        corners
-            .iter()
-            .map(|corner| corner.light[c].min(1.0))
-            .sum::<f64>()
-            / 4.0
-    });
+    let light =
+        std::array::from_fn(|c| corners.iter().map(|corner| corner.light[c]).sum::<f64>() / 4.0);
     let distance = corners
         .iter()
         .map(|corner| corner.distance)
