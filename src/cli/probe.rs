@@ -118,8 +118,8 @@ impl Probe {
         }
 
         // Seed 0 is a placeholder: `probe_adapters` sets the seed of each run.
-        let base = self.protocol.plan(0)?;
-        let plans = self.plans(&base)?;
+        let plans = self.plans()?;
+        let base = &plans[0];
         let pooled = self.pooled && self.metrics.contains(&MetricName::M4);
         let progress = bar((rooms.len() + usize::from(pooled)) as u64, "probing");
         let protocol = self.probe_protocol(&plans);
@@ -147,7 +147,7 @@ impl Probe {
             "{}, features '{}'; M3, M4: split {}; M4: {}, {} seeds",
             room_words(&rooms),
             rooms[0].1.source().name,
-            base.split,
+            self.protocol.split_name(),
             base.preset.name(),
             self.seeds
         ));
@@ -192,7 +192,7 @@ impl Probe {
         if let Some(file) = &self.json {
             let context = ProbeContext {
                 features: rooms[0].1.source().name.clone(),
-                split: base.split.name(),
+                split: self.protocol.split_name(),
                 preset: base.preset.name(),
                 skipped,
             };
@@ -204,13 +204,19 @@ impl Probe {
         Ok(())
     }
 
-    /// One training recipe per stride: those of --sweep-strides, or the base recipe alone.
-    fn plans(&self, base: &TrainingPlan) -> anyhow::Result<Vec<TrainingPlan>> {
+    /// One training recipe per stride: those of --sweep-strides, or that of --stride alone. The
+    /// probes replace their splits.
+    fn plans(&self) -> anyhow::Result<Vec<TrainingPlan>> {
+        let first = |protocol: &ProtocolOptions| {
+            let plans = protocol.plans(0)?;
+            plans.into_iter().next().context("no split was given")
+        };
+
         match self.sweep.as_slice() {
-            [] => Ok(vec![base.clone()]),
+            [] => Ok(vec![first(&self.protocol)?]),
             strides => strides
                 .iter()
-                .map(|&stride| self.protocol.at_stride(stride).plan(0))
+                .map(|&stride| first(&self.protocol.at_stride(stride)))
                 .collect(),
         }
     }
@@ -255,6 +261,7 @@ impl Probe {
             m2: wants(MetricName::M2).then_some(dimension),
             m3: plans_for(MetricName::M3),
             m4: plans_for(MetricName::M4),
+            splits: self.protocol.splits(),
             seeds: self.seeds,
         }
     }

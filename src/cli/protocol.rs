@@ -6,7 +6,7 @@ use clap::Args;
 use super::named::{ClosedSet, one_of};
 
 use seese3_core::adapter::{Loss, Mixing, PairPlan, Preset};
-use seese3_core::splits::{Split, StrideRange};
+use seese3_core::splits::{Fifth, Split, StrideRange};
 use seese3_core::training::TrainingPlan;
 
 /// A preset, and options that override single settings of it.
@@ -20,8 +20,8 @@ pub struct ProtocolOptions {
     #[arg(long, default_value_t = 40)]
     stride: u32,
     /// How training and test pairs are kept apart
-    #[arg(long, value_parser = one_of::<Split>(), default_value = "time")]
-    split: Split,
+    #[arg(long, value_parser = one_of::<SplitChoice>(), default_value = "time")]
+    split: SplitChoice,
     /// Number of epochs, 1 to 100000; the preset's if omitted
     #[arg(long)]
     epochs: Option<usize>,
@@ -64,7 +64,7 @@ impl ProtocolOptions {
     /// Rejects `--split whole`, which has no test pairs, for commands that score on test pairs.
     pub fn needs_test_pairs(&self) -> anyhow::Result<()> {
         anyhow::ensure!(
-            self.split != Split::Whole,
+            self.split != SplitChoice::One(Split::Whole),
             "--split whole has no test pairs; choose another split"
         );
 
@@ -96,8 +96,39 @@ impl ProtocolOptions {
         }
     }
 
+    /// The splits that were asked for: one, or the five folds.
+    pub fn splits(&self) -> Vec<Split> {
+        self.split.splits()
+    }
+
+    /// The split by its name, `folds` for the five folds.
+    pub fn split_name(&self) -> &'static str {
+        self.split.name()
+    }
+
     /// The preset's training plan, with the given options in place of its settings.
+    ///
+    /// # Errors
+    /// For a setting out of range, and for `--split folds`, which is not one plan.
     pub fn plan(&self, seed: u64) -> anyhow::Result<TrainingPlan> {
+        let SplitChoice::One(split) = self.split else {
+            anyhow::bail!(
+                "--split folds trains an adapter for each of five folds, and this command trains one: take one of \
+                 fold1 to fold5"
+            );
+        };
+        self.plan_under(split, seed)
+    }
+
+    /// The training plan for each split that was asked for.
+    pub fn plans(&self, seed: u64) -> anyhow::Result<Vec<TrainingPlan>> {
+        self.splits()
+            .into_iter()
+            .map(|split| self.plan_under(split, seed))
+            .collect()
+    }
+
+    fn plan_under(&self, split: Split, seed: u64) -> anyhow::Result<TrainingPlan> {
         anyhow::ensure!(
             (1..=MAX_STRIDE).contains(&self.stride),
             "--stride must be 1 to {MAX_STRIDE}, got {}",
@@ -105,7 +136,7 @@ impl ProtocolOptions {
         );
 
         // The preset comes first; every option that was given replaces one of its settings.
-        let mut plan = TrainingPlan::of(self.preset, self.split, self.stride, seed);
+        let mut plan = TrainingPlan::of(self.preset, split, self.stride, seed);
         let config = &mut plan.config;
         let put = |into: &mut usize, given: Option<usize>| given.map_or((), |given| *into = given);
         put(&mut config.epochs, self.epochs);
@@ -204,6 +235,47 @@ impl ClosedSet for Preset {
     }
 }
 
+/// How a command that trains adapters of its own keeps training and test apart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SplitChoice {
+    One(Split),
+    /// The five folds, each trained and tested by itself.
+    Folds,
+}
+
+impl SplitChoice {
+    /// The splits, in order.
+    pub fn splits(self) -> Vec<Split> {
+        match self {
+            Self::One(split) => vec![split],
+            Self::Folds => Split::FOLDS.to_vec(),
+        }
+    }
+}
+
+impl ClosedSet for SplitChoice {
+    fn all() -> Vec<Self> {
+        let one = Split::ALL.into_iter().map(Self::One);
+        one.chain([Self::Folds]).collect()
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::One(split) => split.name(),
+            Self::Folds => "folds",
+        }
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            Self::One(split) => split.help(),
+            Self::Folds => {
+                "Each contiguous fifth of the frames tests once, by adapters that the other four trained; the test pairs of all five are scored together"
+            }
+        }
+    }
+}
+
 impl ClosedSet for Split {
     fn all() -> Vec<Self> {
         Self::ALL.to_vec()
@@ -216,6 +288,11 @@ impl ClosedSet for Split {
     fn help(self) -> &'static str {
         match self {
             Self::Time => "The first 80 % of the frames train, the rest test",
+            Self::Fold(Fifth::First) => "The first fifth of the frames tests, the others train",
+            Self::Fold(Fifth::Second) => "The second fifth tests, the others train",
+            Self::Fold(Fifth::Third) => "The third fifth tests, the others train",
+            Self::Fold(Fifth::Fourth) => "The fourth fifth tests, the others train",
+            Self::Fold(Fifth::Last) => "The last fifth tests, the others train: as time",
             Self::Blocks => "Every fifth block of 50 frames tests, the others train",
             Self::Pairs => {
                 "Every fifth source frame gives a test pair. Training and test pairs share frames: only for checking an implementation, not for measuring generalisation"

@@ -57,6 +57,9 @@ pub struct Reproduce {
     /// How many seeds, from 0 on, where a table averages over seeds
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
     seeds: u64,
+    /// The same for the table of the alternatives A to D, in which the paper takes 15
+    #[arg(long, default_value_t = 15, value_parser = clap::value_parser!(u64).range(1..=100))]
+    formulation_seeds: u64,
     /// Epochs, in place of every preset's own: for a quick trial of the command
     #[arg(long)]
     epochs: Option<usize>,
@@ -147,6 +150,7 @@ impl Reproduce {
             sizes: self.sizes.clone(),
             calibration_rooms: self.calibration_rooms,
             seeds: self.seeds,
+            formulation_seeds: self.formulation_seeds,
             epochs: self.epochs,
         }
     }

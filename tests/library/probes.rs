@@ -213,7 +213,9 @@ fn the_ridge_probe_matches_scikit_learn(name: &str, folder: PathBuf) {
 
     let z = features(&folder, name);
     for stride in [10, 20, 40] {
-        let found = ridge_probe(z.view(), &room, Split::Time, stride).unwrap();
+        let found = ridge_probe(z.view(), &room, Split::Time, stride)
+            .unwrap()
+            .scores();
         let expected = &expected[name][format!("stride_{stride}")]["test"];
         near("overall", found.overall, number(&expected["overall"]), 1e-9);
 

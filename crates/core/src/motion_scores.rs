@@ -105,6 +105,47 @@ impl MotionScores {
     }
 }
 
+/// The motions of the test pairs of a room: true, as read, and as the mean of the training motions,
+/// pair by pair.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ReadMotions {
+    /// The true motions.
+    pub truth: Vec<Twist>,
+    /// The motions as read.
+    pub read: Vec<Twist>,
+    /// The mean training motion, repeated.
+    pub constant: Vec<Twist>,
+}
+
+impl ReadMotions {
+    /// True motions beside those that were read, and the mean training motion.
+    pub fn new(truth: Vec<Twist>, read: Vec<Twist>, mean: &Vector6<f64>) -> Self {
+        let constant = vec![Twist::from_vector(mean); truth.len()];
+        Self {
+            truth,
+            read,
+            constant,
+        }
+    }
+
+    /// Adds the motions of another fold of the same room.
+    pub fn append(&mut self, mut other: Self) {
+        self.truth.append(&mut other.truth);
+        self.read.append(&mut other.read);
+        self.constant.append(&mut other.constant);
+    }
+
+    /// R² of the motions as read.
+    pub fn scores(&self) -> MotionScores {
+        MotionScores::of(&self.truth, &self.read)
+    }
+
+    /// R² of always answering the mean training motion.
+    pub fn constant_r2(&self) -> f64 {
+        MotionScores::of(&self.truth, &self.constant).overall
+    }
+}
+
 /// Mean of R² over the components when `constant` is predicted for every pair.
 pub fn constant_r2(truth: &[Twist], constant: &Vector6<f64>) -> f64 {
     let predicted = vec![Twist::from_vector(constant); truth.len()];

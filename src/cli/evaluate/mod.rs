@@ -258,7 +258,13 @@ fn motion_baselines(
     let predicted = predictions(adapter, features.rows(), &pairs)?;
     Ok(MotionBaselines {
         motion: MotionScores::of(&motions(room.poses(), &pairs), &predicted),
-        baselines: Baselines::of(adapter, record, room, &test, learned_here)?,
+        baselines: Baselines::of(
+            adapter.scale(),
+            record.optimiser_steps(),
+            room,
+            &test,
+            learned_here,
+        )?,
     })
 }
 

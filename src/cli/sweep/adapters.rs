@@ -160,12 +160,13 @@ impl Adapters {
 
     /// Prints the tables of this grid, and the rooms without scores.
     fn say_summary(&self, rows: &[SweepRow]) -> anyhow::Result<()> {
-        let base = self.protocol.plan(0)?;
+        let plans = self.protocol.plans(0)?;
+        let base = &plans[0];
         say(format_args!(
             "preset {} with {} epochs, split {}, stride {}; of each room the best run counts, chosen by its test score:",
             base.preset.name(),
             base.config.epochs,
-            base.split,
+            self.protocol.split_name(),
             base.stride
         ));
 
@@ -234,11 +235,25 @@ impl Adapters {
             grid = chosen.into_iter().map(|place| grid[place]).collect();
         }
 
-        let base = self.protocol.plan(0)?;
+        let plans = self.plans(&grid)?;
         let mut tasks = Vec::new();
         for room in rooms {
             let content = content(&data(room));
-            for &(latent, charts, learning_rate, loss) in &grid {
+            for plan in &plans {
+                let plan = plan.clone();
+                let row = row(&data(room), &content, &plan);
+                tasks.push(Task { room, plan, row });
+            }
+        }
+
+        Ok(tasks)
+    }
+
+    /// The plans of every point of the grid with every seed, under every split.
+    fn plans(&self, grid: &[(usize, usize, f64, Loss)]) -> anyhow::Result<Vec<TrainingPlan>> {
+        let mut plans = Vec::new();
+        for base in self.protocol.plans(0)? {
+            for &(latent, charts, learning_rate, loss) in grid {
                 for seed in 0..self.seeds {
                     let config = TrainConfig {
                         latent,
@@ -248,7 +263,6 @@ impl Adapters {
                         seed,
                         ..base.config.clone()
                     };
-
                     let plan = TrainingPlan {
                         config,
                         ..base.clone()
@@ -257,13 +271,11 @@ impl Adapters {
                     // All settings are checked before the first run starts, not hours into the
                     // sweep.
                     plan.check().context("the grid")?;
-
-                    let row = row(&data(room), &content, &plan);
-                    tasks.push(Task { room, plan, row });
+                    plans.push(plan);
                 }
             }
         }
 
-        Ok(tasks)
+        Ok(plans)
     }
 }

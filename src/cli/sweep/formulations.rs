@@ -47,7 +47,9 @@ impl Formulations {
         self.protocol.needs_test_pairs()?;
         let store = Store::open(&self.store)?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
-        let plan = self.protocol.plan(0)?;
+        // The plans of several folds differ in their split alone.
+        let plans = self.protocol.plans(0)?;
+        let plan = &plans[0];
 
         // A setting out of range is refused here, before any task has started.
         plan.check()?;
@@ -63,7 +65,14 @@ impl Formulations {
 
         let count = Formulation::ALL.len() as u64 * self.seeds;
         let progress = bar(count, "formulations");
-        let scores = compare(&room_data, &plan, self.seeds, pooling, &|| progress.inc(1))?;
+        let comparison = compare(
+            &room_data,
+            plan,
+            &self.protocol.splits(),
+            self.seeds,
+            pooling,
+            &|| progress.inc(1),
+        )?;
         progress.finish_and_clear();
 
         say(format_args!(
@@ -74,15 +83,18 @@ impl Formulations {
             plan.preset.name(),
             plan.config.epochs,
             plan.stride,
-            plan.split,
+            self.protocol.split_name(),
             self.seeds,
             if self.pooled { ", rooms together" } else { "" },
-            scores[0].runs.first().map_or(0, |run| run.n),
+            comparison.formulations[0]
+                .runs
+                .first()
+                .map_or(0, |run| run.n),
         ));
 
-        say(formulations_table(&scores).trim_end());
+        say(formulations_table(&comparison).trim_end());
         if let Some(file) = &self.json {
-            write_json(file, &formulations_json(&scores))?;
+            write_json(file, &formulations_json(&comparison))?;
             say(format_args!("wrote {}", file.display()));
         }
 

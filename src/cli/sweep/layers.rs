@@ -6,8 +6,9 @@ use anyhow::{Context, bail, ensure};
 use clap::Args;
 use rayon::prelude::*;
 
-use super::super::named::one_of;
+use super::super::named::{ClosedSet, one_of};
 use super::super::progress::bar;
+use super::super::protocol::SplitChoice;
 use super::super::{check_writable, say, write_json};
 use crate::store::{Store, StoredRoom};
 use seese3_core::adapter::Preset;
@@ -34,8 +35,8 @@ pub struct Layers {
     #[arg(long, default_value_t = 40)]
     stride: u32,
     /// How frames are split into training and test, in M3 and M4
-    #[arg(long, value_parser = one_of::<Split>(), default_value = "time")]
-    split: Split,
+    #[arg(long, value_parser = one_of::<SplitChoice>(), default_value = "time")]
+    split: SplitChoice,
     /// The training preset of M4
     #[arg(long, value_parser = one_of::<Preset>(), default_value = "paper-base")]
     preset: Preset,
@@ -80,7 +81,7 @@ impl Layers {
         }
 
         ensure!(
-            self.split != Split::Whole,
+            self.split != SplitChoice::One(Split::Whole),
             "--split whole sets no test pairs apart; take another split"
         );
 
@@ -136,7 +137,7 @@ impl Layers {
 
         progress.finish_and_clear();
         let scores: Vec<LayerScores> = scored.into_iter().map(|(_, scores)| scores).collect();
-        let split = self.split;
+        let split = self.split.name();
         let preset = self.preset;
 
         // The table alone would not say how its numbers were measured.
@@ -240,7 +241,8 @@ impl Layers {
     }
 
     fn layer_protocol(&self) -> LayerProtocol {
-        let mut plan = TrainingPlan::of(self.preset, self.split, self.stride, 0);
+        let splits = self.split.splits();
+        let mut plan = TrainingPlan::of(self.preset, splits[0], self.stride, 0);
         if let Some(epochs) = self.epochs {
             plan.config.epochs = epochs;
             plan.least_steps = 0;
@@ -256,6 +258,7 @@ impl Layers {
             },
             gap: self.m2_gap,
             plan,
+            splits,
             seeds: self.seeds,
         }
     }

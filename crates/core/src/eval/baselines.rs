@@ -3,7 +3,7 @@
 
 use nalgebra::Vector6;
 
-use crate::adapter::{Adapter, TrainingRecord};
+use crate::adapter::TargetScale;
 use crate::geometry::{Pose, PoseError};
 use crate::motion_scores::constant_r2;
 use crate::room::{FrameId, Room};
@@ -26,26 +26,26 @@ pub struct Baselines {
     /// Median distance and angle from a tested frame to the training frame whose pose is nearest
     /// (metres and radians alike); none where the adapter did not learn from these frames.
     pub nearest_pose: Option<PoseError>,
-    /// How many steps the optimiser took.
+    /// How many steps the optimiser took; 0 for a fit in closed form.
     pub optimiser_steps: u64,
 }
 
 impl Baselines {
-    /// The baselines of an adapter's scores on the test pairs of a room; `learned_here` says
-    /// whether it learned from these very frames.
+    /// The baselines of scores on the test pairs of a room, by an adapter that learned from motions
+    /// of this scale in so many optimiser steps; `learned_here` says whether it learned from these
+    /// very frames.
     ///
     /// # Errors
     /// [`splits::Error`] when the room has no test pairs.
     pub fn of(
-        adapter: &Adapter,
-        record: &TrainingRecord,
+        scale: &TargetScale,
+        optimiser_steps: u64,
         room: &Room,
         test: &TestPairs,
         learned_here: bool,
     ) -> Result<Self, splits::Error> {
         let pairs = test.split.test_pairs(room.timeline(), test.stride)?;
         let truth = motions(room.poses(), &pairs);
-        let scale = adapter.scale();
 
         let count = truth.len() as f64;
         let mean = truth
@@ -71,8 +71,24 @@ impl Baselines {
             constant_r2: constant_r2(&truth, &scale.mean),
             variance_ratio: mean_of_known(&ratios),
             nearest_pose,
-            optimiser_steps: record.optimiser_steps(),
+            optimiser_steps,
         })
+    }
+
+    /// The baselines of scores on the test pairs of a room, by what learned from its training pairs
+    /// at the same stride.
+    ///
+    /// # Errors
+    /// [`splits::Error`] when the room has no training or no test pairs.
+    pub fn within(
+        room: &Room,
+        test: &TestPairs,
+        optimiser_steps: u64,
+    ) -> Result<Self, splits::Error> {
+        let training = test.split.train_pairs(room.timeline(), test.stride)?;
+        let scale = TargetScale::of(&motions(room.poses(), &training));
+
+        Self::of(&scale, optimiser_steps, room, test, true)
     }
 
     /// Whether the recording can tell a good adapter from a bad one at all.

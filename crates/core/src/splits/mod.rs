@@ -4,8 +4,10 @@
 //! A pair (i, j) is two frames of one room, j = i + stride. Frame i is the source, frame j the
 //! target.
 
+mod fifth;
 mod hold_out;
 
+pub use fifth::Fifth;
 pub use hold_out::{HoldOut, is_in_left_out_block};
 
 use rand::{RngExt, SeedableRng};
@@ -54,6 +56,9 @@ pub enum Split {
     /// The first 80 % of the frames are for training, the rest for testing; both ends of a pair lie
     /// on the same side. The paper's split.
     Time,
+    /// A contiguous fifth of the frames is for testing, the others for training; both ends of a pair
+    /// lie on the same side. The last fifth is [`Split::Time`]'s.
+    Fold(Fifth),
     /// Blocks of 50 frames, of which block b is for testing when b mod 5 = 2. A test pair lies
     /// within one block; both ends of a training pair lie outside the test blocks.
     Blocks,
@@ -70,18 +75,33 @@ pub enum Split {
 
 impl Split {
     /// Every split.
-    pub const ALL: [Self; 5] = [
+    pub const ALL: [Self; 10] = [
         Self::Time,
+        Self::FOLDS[0],
+        Self::FOLDS[1],
+        Self::FOLDS[2],
+        Self::FOLDS[3],
+        Self::FOLDS[4],
         Self::Blocks,
         Self::Pairs,
         Self::Dataset,
         Self::Whole,
     ];
 
+    /// The five folds of a recording: each frame is tested in one of them.
+    pub const FOLDS: [Self; 5] = [
+        Self::Fold(Fifth::First),
+        Self::Fold(Fifth::Second),
+        Self::Fold(Fifth::Third),
+        Self::Fold(Fifth::Fourth),
+        Self::Fold(Fifth::Last),
+    ];
+
     /// Its name on the command line, on the wire and in a manifest.
     pub fn name(self) -> &'static str {
         match self {
             Self::Time => "time",
+            Self::Fold(fifth) => fifth.fold_name(),
             Self::Blocks => "blocks",
             Self::Pairs => "pairs",
             Self::Dataset => "dataset",
@@ -228,7 +248,7 @@ impl Split {
             } else {
                 Side::Train
             }),
-            Self::Time | Self::Blocks | Self::Dataset | Self::Whole => {
+            Self::Time | Self::Fold(_) | Self::Blocks | Self::Dataset | Self::Whole => {
                 match (tested(pair.source), tested(pair.target)) {
                     (false, false) => Some(Side::Train),
                     // Two different test blocks have training blocks between them, so a test pair
@@ -246,7 +266,8 @@ impl Split {
 
     fn tests_frame(self, timeline: &Timeline, frame: FrameId) -> bool {
         match self {
-            Self::Time => frame.row() >= timeline.frame_count * 4 / 5,
+            Self::Time => Fifth::Last.holds(frame, timeline.frame_count),
+            Self::Fold(fifth) => fifth.holds(frame, timeline.frame_count),
             Self::Dataset => timeline.held_out.get(frame.row()).copied().unwrap_or(false),
             Self::Blocks => (frame.row() / BLOCK_FRAMES) % 5 == 2,
             Self::Pairs | Self::Whole => false,
@@ -354,6 +375,39 @@ mod tests {
         assert_eq!(
             Split::Time.candidates(&Timeline::unbroken(503))[0],
             FrameId(402)
+        );
+    }
+
+    /// Oracle: the definition: every frame is tested in one fold, and in no fold do a training and a
+    /// test pair share a frame; a pair of test frames has both ends in one fifth.
+    #[test]
+    fn each_frame_is_tested_in_one_fold() {
+        let room = Timeline::unbroken(503);
+        let mut tested = vec![0; 503];
+
+        for split in Split::FOLDS {
+            let candidates = split.candidates(&room);
+            for frame in &candidates {
+                tested[frame.row()] += 1;
+            }
+
+            let test = split.test_pairs(&room, 10).unwrap();
+            assert_eq!(test.len(), candidates.len() - 10, "{split}");
+
+            let is_tested = |frame: &FrameId| candidates.contains(frame);
+            let train = split.train_pairs(&room, 10).unwrap();
+            assert!(
+                train
+                    .iter()
+                    .all(|pair| !is_tested(&pair.source) && !is_tested(&pair.target)),
+                "{split}"
+            );
+        }
+
+        assert_eq!(tested, vec![1; 503]);
+        assert_eq!(
+            Split::FOLDS[4].test_pairs(&room, 10),
+            Split::Time.test_pairs(&room, 10)
         );
     }
 

@@ -231,8 +231,8 @@ fn outcome(
         rows: report.rows,
         candidate_count: report.candidate_count,
         baselines: Baselines::of(
-            adapter,
-            record,
+            adapter.scale(),
+            record.optimiser_steps(),
             &room,
             &TestPairs {
                 split: protocol.split,

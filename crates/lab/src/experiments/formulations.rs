@@ -1,14 +1,26 @@
-//! The adapter beside the paper's alternatives A to D, over several seeds.
+//! The adapter beside the paper's alternatives A to D and the constant, over several seeds.
 
 use rayon::prelude::*;
 
-use seese3_core::motion_scores::MotionScores;
+use seese3_core::motion_scores::{MotionScores, ReadMotions};
+use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan};
 
 use super::Error;
+use super::folds::FoldedMotions;
 use crate::formulations::{Formulation, train_formulation};
 
-/// Scores of one formulation, one per seed, each the mean over rooms.
+/// How the formulations do, and what the simplest answer does on the same pairs.
+#[derive(Debug, Clone)]
+pub struct Comparison {
+    /// One entry per formulation, the adapter first.
+    pub formulations: Vec<FormulationScores>,
+    /// R² of always answering the mean training motion, mean over rooms.
+    pub constant_r2: f64,
+}
+
+/// Scores of one formulation, one per seed, each over the test pairs of all splits of a room
+/// together, and then the mean over rooms.
 #[derive(Debug, Clone)]
 pub struct FormulationScores {
     /// The formulation's name.
@@ -26,7 +38,8 @@ pub enum RoomPooling {
     Together,
 }
 
-/// Trains every formulation with seeds 0 to `seeds`, on all cores; `done` hears of each run.
+/// Trains every formulation under every split of `splits` (that of `plan` is replaced) with seeds 0
+/// to `seeds`, on all cores; `done` hears of each seed of a formulation.
 ///
 /// # Errors
 /// [`Error::Training`] when a room is too short or the plan has settings that only the adapter
@@ -34,21 +47,29 @@ pub enum RoomPooling {
 pub fn compare(
     rooms: &[RoomData<'_>],
     plan: &TrainingPlan,
+    splits: &[Split],
     seeds: u64,
     room_pooling: RoomPooling,
     done: &(dyn Fn() + Sync),
-) -> Result<Vec<FormulationScores>, Error> {
+) -> Result<Comparison, Error> {
     let tasks: Vec<(Formulation, u64)> = Formulation::ALL
         .into_iter()
         .flat_map(|which| (0..seeds).map(move |seed| (which, seed)))
         .collect();
 
-    let runs: Vec<(Formulation, MotionScores)> = tasks
+    let runs: Vec<(Formulation, MotionScores, f64)> = tasks
         .into_par_iter()
         .map(|(which, seed)| {
-            let scores = one_run(which, rooms, &plan.with_seed(seed), room_pooling)?;
+            let read = FoldedMotions::of(splits, |split| {
+                let plan = TrainingPlan {
+                    split,
+                    ..plan.with_seed(seed)
+                };
+                one_run(which, rooms, &plan, room_pooling)
+            })?;
             done();
-            Ok((which, scores))
+
+            Ok((which, read.scores(), read.constant_r2()))
         })
         .collect::<Result<_, Error>>()?;
 
@@ -57,32 +78,34 @@ pub fn compare(
         name: which.name(),
         runs: runs
             .iter()
-            .filter(|(other, _)| *other == which)
-            .map(|(_, scores)| *scores)
+            .filter(|(other, ..)| *other == which)
+            .map(|(_, scores, _)| *scores)
             .collect(),
     };
 
-    Ok(Formulation::ALL.map(scores_of).to_vec())
+    Ok(Comparison {
+        formulations: Formulation::ALL.map(scores_of).to_vec(),
+        // The constant is the same for every formulation and seed.
+        constant_r2: runs.first().map_or(f64::NAN, |&(_, _, constant)| constant),
+    })
 }
 
-/// The mean over rooms of one formulation with one seed.
+/// The motions of each room's test pairs by one formulation with one seed.
 fn one_run(
     which: Formulation,
     rooms: &[RoomData<'_>],
     plan: &TrainingPlan,
     room_pooling: RoomPooling,
-) -> Result<MotionScores, Error> {
-    let scores = match room_pooling {
-        RoomPooling::Together => train_formulation(which, rooms, plan, &mut |_| ())?,
+) -> Result<Vec<ReadMotions>, Error> {
+    match room_pooling {
+        RoomPooling::Together => Ok(train_formulation(which, rooms, plan, &mut |_| ())?),
         RoomPooling::RoomByRoom => {
-            let mut scores = Vec::with_capacity(rooms.len());
+            let mut motions = Vec::with_capacity(rooms.len());
             for data in rooms {
                 let room = std::slice::from_ref(data);
-                scores.extend(train_formulation(which, room, plan, &mut |_| ())?);
+                motions.extend(train_formulation(which, room, plan, &mut |_| ())?);
             }
-            scores
+            Ok(motions)
         }
-    };
-
-    Ok(MotionScores::mean(&scores))
+    }
 }

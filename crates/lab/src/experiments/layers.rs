@@ -3,10 +3,13 @@
 use rayon::prelude::*;
 
 use seese3_core::motion_scores::MotionScores;
+use seese3_core::splits::Split;
 use seese3_core::statistics::{deviation, mean};
-use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
+use seese3_core::training::{RoomData, TrainingPlan};
 
 use super::Error;
+use super::folds::FoldedMotions;
+use crate::formulations::read_by_adapter;
 use crate::probes::{Duplicates, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
 
 /// What decides the numbers of a row besides its room and features.
@@ -16,9 +19,12 @@ pub struct LayerProtocol {
     pub mutual_knn: MutualKnn,
     /// Frames to each side that M2 leaves out as neighbours.
     pub gap: usize,
-    /// Split and stride of M3 and M4, and how M4 is trained; its seed is replaced.
+    /// Stride of M3 and M4, and how M4 is trained; its split and its seed are replaced.
     pub plan: TrainingPlan,
-    /// Adapters of M4, from seed 0 on.
+    /// How training and test pairs are kept apart in M3 and M4: one split, or the folds of a
+    /// recording.
+    pub splits: Vec<Split>,
+    /// Adapters of M4 under each split, from seed 0 on.
     pub seeds: u64,
 }
 
@@ -41,6 +47,9 @@ pub struct LayerScores {
     pub m2_mle: f64,
     /// Rows that M2 dropped because they equal another row.
     pub m2_dropped: usize,
+    /// R² of always answering the mean training motion. This and the R² below are over the test
+    /// pairs of all splits together.
+    pub constant_r2: f64,
     /// R² of ridge regression.
     pub m3_r2: f64,
     /// Mean over seeds of the adapter's R².
@@ -66,11 +75,21 @@ pub fn score_layer(data: &RoomData<'_>, protocol: &LayerProtocol) -> Result<Laye
 
     let m1 = mutual_knn(rows, room.poses(), &protocol.mutual_knn)?;
     let m2 = intrinsic_dimension(rows, protocol.gap, Duplicates::DropRows)?;
-    let m3 = ridge_probe(rows, room, plan.split, plan.stride)?;
+
+    let splits = &protocol.splits;
+    let ridge = FoldedMotions::of(splits, |split| {
+        Ok(vec![ridge_probe(rows, room, split, plan.stride)?])
+    })?;
 
     let adapter = |seed: u64| -> Result<MotionScores, Error> {
-        let (_, record) = train_adapter(&[*data], &plan.with_seed(seed), &mut |_| ())?;
-        Ok(record.test)
+        let run = FoldedMotions::of(splits, |split| {
+            let plan = TrainingPlan {
+                split,
+                ..plan.with_seed(seed)
+            };
+            Ok(read_by_adapter(&[*data], &plan, &mut |_| ())?.0)
+        })?;
+        Ok(run.scores())
     };
     let adapters: Vec<MotionScores> = (0..protocol.seeds)
         .into_par_iter()
@@ -89,7 +108,8 @@ pub fn score_layer(data: &RoomData<'_>, protocol: &LayerProtocol) -> Result<Laye
         m2_two_nn: m2.two_nn.linear,
         m2_mle: m2.mle_biased.harmonic,
         m2_dropped: m2.dropped,
-        m3_r2: m3.overall,
+        constant_r2: ridge.constant_r2(),
+        m3_r2: ridge.scores().overall,
         m4_r2: mean(&m4_runs),
         m4_translation: m4.translation,
         m4_rotation: m4.rotation,

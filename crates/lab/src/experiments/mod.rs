@@ -1,6 +1,6 @@
 //! What researchers run: each experiment computes its results and owns their types.
 //!
-//! - [`seeds`]: one training plan with several seeds.
+//! - [`seeds`]: one training plan with several seeds; [`folds`]: under several splits.
 //! - [`probe`] and [`layers`]: M1 to M4 of features in rooms, and over the layers of an encoder.
 //! - [`formulations`]: the adapter beside the paper's alternatives.
 //! - [`adapter_sweep`]: a grid of adapters, one row per run.
@@ -15,6 +15,7 @@
 
 pub mod adapter_sweep;
 pub mod cross_room;
+pub mod folds;
 pub mod formulations;
 pub mod layers;
 pub mod localization;

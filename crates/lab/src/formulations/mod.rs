@@ -22,9 +22,11 @@ use ndarray::ArrayView2;
 use seese3_core::adapter::building_blocks::{Seeded, fit};
 use seese3_core::adapter::{EpochProgress, Objective, Samples, TrainConfig, Widths};
 use seese3_core::geometry::{Pose, Twist, log};
-use seese3_core::motion_scores::MotionScores;
+use seese3_core::motion_scores::ReadMotions;
 use seese3_core::splits::Pair;
-use seese3_core::training::{self, RoomData, TrainingPlan, check_rooms, motions, test_pairs};
+use seese3_core::training::{
+    self, RoomData, TrainingPlan, check_rooms, motions, predictions, test_pairs,
+};
 
 /// A model that predicts a motion from two features.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,7 +65,7 @@ impl Formulation {
     }
 }
 
-/// Trains one formulation on all rooms together and scores it on each room's test pairs.
+/// Trains one formulation on all rooms together and reads the motions of each room's test pairs.
 ///
 /// # Errors
 /// As [`training::train_adapter`]; [`training::Error::NotPlain`] when a setting is one that only
@@ -75,13 +77,11 @@ pub fn train_formulation(
     room_data: &[RoomData<'_>],
     plan: &TrainingPlan,
     progress: &mut dyn FnMut(EpochProgress),
-) -> Result<Vec<MotionScores>, training::Error> {
+) -> Result<Vec<ReadMotions>, training::Error> {
     if formulation == Formulation::Poincare {
         // Settings that only the adapter supports would favour it in the comparison, so the other
         // formulations refuse them below.
-        return Ok(training::train_adapter(room_data, plan, progress)?
-            .1
-            .room_tests);
+        return read_by_adapter(room_data, plan, progress).map(|(read, _)| read);
     }
 
     plan.check()?;
@@ -130,19 +130,19 @@ pub fn train_formulation(
     Ok(match formulation {
         Formulation::Unanchored => {
             let start = UnanchoredMotion(WorldPose::random(widths, &mut random));
-            run.scores(start, &mut random, progress, |network, ends| {
+            run.read(start, &mut random, progress, |network, ends| {
                 network.0.motion(ends)
             })?
         }
         Formulation::Absolute => {
             let start = AbsolutePose(WorldPose::random(widths, &mut random));
-            run.scores(start, &mut random, progress, |network, ends| {
+            run.read(start, &mut random, progress, |network, ends| {
                 network.0.motion(ends)
             })?
         }
         Formulation::GeodesicHead => {
             let start = GeodesicHead::random(widths, &mut random);
-            run.scores(start, &mut random, progress, |network, ends| {
+            run.read(start, &mut random, progress, |network, ends| {
                 network.motions(ends.features)
             })?
         }
@@ -152,11 +152,38 @@ pub fn train_formulation(
             let start = DifferenceInput::random(widths, &mut random);
             let scale = samples.scale();
 
-            run.scores(start, &mut random, progress, |network, ends| {
+            run.read(start, &mut random, progress, |network, ends| {
                 network.motions(ends.features, scale)
             })?
         }
     })
+}
+
+/// Trains an adapter on all rooms together and reads the motions of each room's test pairs; also how
+/// many steps its optimiser took.
+///
+/// # Errors
+/// As [`training::train_adapter`].
+pub fn read_by_adapter(
+    room_data: &[RoomData<'_>],
+    plan: &TrainingPlan,
+    progress: &mut dyn FnMut(EpochProgress),
+) -> Result<(Vec<ReadMotions>, u64), training::Error> {
+    let (adapter, record) = training::train_adapter(room_data, plan, progress)?;
+
+    let mean = &adapter.scale().mean;
+    let read = |(data, pairs): (&RoomData<'_>, &Vec<Pair>)| {
+        let truth = motions(data.room.poses(), pairs);
+        let read = predictions(&adapter, data.features.rows(), pairs)?;
+        Ok(ReadMotions::new(truth, read, mean))
+    };
+    let tests = test_pairs(room_data, plan)?;
+    let read = room_data.iter().zip(&tests).map(read);
+
+    Ok((
+        read.collect::<Result<_, training::Error>>()?,
+        record.optimiser_steps(),
+    ))
 }
 
 /// The two ends of pairs, as a formulation sees them.
@@ -175,15 +202,16 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    fn scores<N: Objective<f32, Data = Samples<f32>>>(
+    fn read<N: Objective<f32, Data = Samples<f32>>>(
         &mut self,
         start: N,
         random: &mut Seeded,
         progress: &mut dyn FnMut(EpochProgress),
         predict: impl Fn(&N, Ends<'_>) -> Vec<Twist>,
-    ) -> Result<Vec<MotionScores>, training::Error> {
+    ) -> Result<Vec<ReadMotions>, training::Error> {
         let network = fit(self.samples, start, self.config, random, progress)?;
-        let score = |(data, pairs): (&RoomData<'_>, &Vec<Pair>)| {
+        let mean = self.samples.scale().mean;
+        let read = |(data, pairs): (&RoomData<'_>, &Vec<Pair>)| {
             let rows = |end: fn(&Pair) -> usize| {
                 let rows: Vec<usize> = pairs.iter().map(end).collect();
                 data.features.rows().select(ndarray::Axis(0), &rows)
@@ -201,10 +229,11 @@ impl Run<'_> {
                 sources: &poses,
             };
 
-            MotionScores::of(&motions(data.room.poses(), pairs), &predict(&network, ends))
+            let truth = motions(data.room.poses(), pairs);
+            ReadMotions::new(truth, predict(&network, ends), &mean)
         };
 
-        Ok(self.room_data.iter().zip(self.tests).map(score).collect())
+        Ok(self.room_data.iter().zip(self.tests).map(read).collect())
     }
 }
 

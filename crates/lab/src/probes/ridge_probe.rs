@@ -3,14 +3,15 @@
 use ndarray::{Array2, ArrayView2, Axis};
 
 use super::Error;
+use seese3_core::adapter::TargetScale;
 use seese3_core::geometry::{Twist, body_twist};
-use seese3_core::motion_scores::MotionScores;
+use seese3_core::motion_scores::ReadMotions;
 use seese3_core::ridge::{Intercept, Ridge};
 use seese3_core::room::Room;
 use seese3_core::splits::{Pair, Split};
 
-/// R² on the test pairs of a ridge regression (α = 1, with intercept) from feature differences to
-/// motions.
+/// The motions of the test pairs by a ridge regression (α = 1, with intercept) from feature
+/// differences.
 ///
 /// `rows` are the room's features (n, d), one a frame. Differences are taken in f64.
 ///
@@ -23,7 +24,7 @@ pub fn ridge_probe(
     room: &Room,
     split: Split,
     stride: u32,
-) -> Result<MotionScores, Error> {
+) -> Result<ReadMotions, Error> {
     let train = split.train_pairs(room.timeline(), stride)?;
     let test = split.test_pairs(room.timeline(), stride)?;
     let (train_x, train_y) = samples(rows, room, &train);
@@ -31,7 +32,7 @@ pub fn ridge_probe(
     let fit = Ridge::fit(train_x.view(), targets.view(), 1.0, Intercept::Fitted)?;
 
     let (test_x, truth) = samples(rows, room, &test);
-    let predicted: Vec<Twist> = test_x
+    let read: Vec<Twist> = test_x
         .outer_iter()
         .map(|x| {
             let y = fit.predict(x);
@@ -39,7 +40,8 @@ pub fn ridge_probe(
         })
         .collect();
 
-    Ok(MotionScores::of(&truth, &predicted))
+    let mean = TargetScale::of(&train_y).mean;
+    Ok(ReadMotions::new(truth, read, &mean))
 }
 
 fn samples(rows: ArrayView2<'_, f32>, room: &Room, pairs: &[Pair]) -> (Array2<f64>, Vec<Twist>) {

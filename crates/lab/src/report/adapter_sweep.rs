@@ -151,8 +151,8 @@ pub fn difficulty_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
 }
 
 /// The paper's sweep table: by part of the motion, the best R², the share of runs above 0 and 0.5,
-/// and the standard deviation over seeds, averaged over all pairs of room and configuration that
-/// have several seeds.
+/// and the standard deviation over seeds, averaged over all rooms, splits, strides and
+/// configurations that have several seeds.
 pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     type Part = fn(&SweepRow) -> Option<f64>;
 
@@ -181,7 +181,7 @@ pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
         let mut by_configuration: BTreeMap<_, Vec<f64>> = BTreeMap::new();
         for row in rows {
             let seeds = by_configuration
-                .entry((row.room.clone(), row.configuration()))
+                .entry((&row.room, &row.split, row.stride, row.configuration()))
                 .or_default();
             seeds.extend(part(row));
         }

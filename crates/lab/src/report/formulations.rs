@@ -5,13 +5,13 @@ use serde::Serialize;
 
 use super::json::{MotionJson, PartsJson};
 use super::table::aligned;
-use crate::experiments::formulations::FormulationScores;
+use crate::experiments::formulations::{Comparison, FormulationScores};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::statistics::{deviation, mean_of_known};
 
 /// One line per formulation: R² by part of the motion, averaged over seeds; the overall R² with its
-/// sample standard deviation.
-pub fn formulations_table(scores: &[FormulationScores]) -> String {
+/// sample standard deviation; below them the constant's.
+pub fn formulations_table(comparison: &Comparison) -> String {
     let head = [
         "formulation",
         "overall",
@@ -22,7 +22,7 @@ pub fn formulations_table(scores: &[FormulationScores]) -> String {
     ];
 
     let mut lines = vec![head.map(str::to_owned).to_vec()];
-    for score in scores {
+    for score in &comparison.formulations {
         let column = |of: fn(&MotionScores) -> f64| score.runs.iter().map(of).collect::<Vec<f64>>();
         let overall = column(|run| run.overall);
 
@@ -53,6 +53,11 @@ pub fn formulations_table(scores: &[FormulationScores]) -> String {
         lines.push(cells);
     }
 
+    lines.push(vec![
+        "mean training motion".to_owned(),
+        format!("{:.3}", comparison.constant_r2),
+    ]);
+
     aligned(&lines)
 }
 
@@ -60,6 +65,8 @@ pub fn formulations_table(scores: &[FormulationScores]) -> String {
 #[derive(Debug, Serialize)]
 pub struct FormulationsJson {
     formulations: Vec<FormulationJson>,
+    /// R² of always answering the mean training motion, mean over rooms.
+    constant_r2: f64,
 }
 
 #[derive(Debug, Serialize)]
@@ -70,7 +77,7 @@ struct FormulationJson {
 }
 
 /// The record of formulations.
-pub fn formulations_json(scores: &[FormulationScores]) -> FormulationsJson {
+pub fn formulations_json(comparison: &Comparison) -> FormulationsJson {
     let entry = |score: &FormulationScores| FormulationJson {
         name: score.name,
         by_part: PartsJson::of(&score.runs),
@@ -78,6 +85,7 @@ pub fn formulations_json(scores: &[FormulationScores]) -> FormulationsJson {
     };
 
     FormulationsJson {
-        formulations: scores.iter().map(entry).collect(),
+        formulations: comparison.formulations.iter().map(entry).collect(),
+        constant_r2: comparison.constant_r2,
     }
 }

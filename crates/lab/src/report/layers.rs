@@ -7,7 +7,8 @@ use crate::experiments::layers::LayerScores;
 use seese3_core::statistics::mean;
 
 /// One line per layer with means over rooms. A star marks the best layer by each metric, which for
-/// the intrinsic dimension is the one nearest to 6.
+/// the intrinsic dimension is the one nearest to 6. The last column is the R² of always answering
+/// the mean training motion.
 pub fn layers_table(scores: &[LayerScores]) -> String {
     // A list instead of a set keeps the layers in the order of the scores.
     let mut layers: Vec<&str> = Vec::new();
@@ -46,10 +47,11 @@ pub fn layers_table(scores: &[LayerScores]) -> String {
     ];
 
     let spread = column(|score| score.m4_deviation);
+    let constant = column(|score| score.constant_r2);
 
     let mut lines = vec![
         [
-            "features", "columns", "M1", "TwoNN", "MLE", "M3 R²", "M4 R²",
+            "features", "columns", "M1", "TwoNN", "MLE", "M3 R²", "M4 R²", "constant",
         ]
         .map(str::to_owned)
         .to_vec(),
@@ -84,6 +86,7 @@ pub fn layers_table(scores: &[LayerScores]) -> String {
             ));
         }
 
+        cells.push(format!("{:.3}", constant[row]));
         lines.push(cells);
     }
 
@@ -179,6 +182,8 @@ struct LayerJson {
     m2: M2Json,
     m3: M3Json,
     m4: M4Json,
+    /// R² of always answering the mean training motion.
+    constant_r2: f64,
 }
 
 #[derive(Debug, Serialize)]
@@ -229,6 +234,7 @@ pub fn layers_json(scores: &[LayerScores]) -> LayersJson {
             deviation: score.m4_deviation,
             runs: score.m4_runs.clone(),
         },
+        constant_r2: score.constant_r2,
     };
 
     LayersJson {
@@ -252,6 +258,7 @@ mod tests {
             m2_two_nn: dimension,
             m2_mle: dimension,
             m2_dropped: 0,
+            constant_r2: -3.0,
             m3_r2: r2,
             encoder: "e".to_owned(),
             m4_r2: r2,

@@ -2,13 +2,15 @@
 
 use serde::Serialize;
 
-use super::json::{MotionJson, PartsJson};
+use super::json::{BaselinesJson, MotionJson, PartsJson};
 use super::table::aligned;
 use crate::experiments::probe::{
     AtStride, DimensionProtocol, DimensionScore, MutualKnnScore, ProbeScores,
 };
 use crate::probes::{Counted, Duplicates, Limit, Mle, MutualKnn};
+use seese3_core::eval::Baselines;
 use seese3_core::motion_scores::MotionScores;
+use seese3_core::splits::Split;
 use seese3_core::statistics::{deviation, mean_of_known};
 
 /// The record of `seese3 probe`.
@@ -95,7 +97,20 @@ struct StrideJson {
     #[serde(flatten)]
     spread: Option<SeedSpreadJson>,
     n: usize,
+    /// One entry per seed, over the test pairs of all splits together.
     runs: Vec<MotionJson>,
+    baselines: Option<BaselinesJson>,
+    /// One entry per split: one, or five folds.
+    splits: Vec<SplitJson>,
+}
+
+/// The scores under one split, and what they have to be read beside.
+#[derive(Debug, Clone, Serialize)]
+struct SplitJson {
+    split: &'static str,
+    /// Mean over seeds.
+    r2: f64,
+    baselines: Option<BaselinesJson>,
 }
 
 #[derive(Debug, Clone, Serialize)]
@@ -219,13 +234,31 @@ fn stride_json(at: &AtStride) -> StrideJson {
         spread,
         n: at.runs.first().map_or(0, |run| run.n),
         runs: at.runs.iter().map(MotionJson::from).collect(),
+        baselines: at
+            .baselines
+            .as_ref()
+            .map(|baselines| (&baselines.together).into()),
+        splits: split_jsons(at),
     }
+}
+
+fn split_jsons(at: &AtStride) -> Vec<SplitJson> {
+    let of = |(place, &(split, r2)): (usize, &(Split, f64))| SplitJson {
+        split: split.name(),
+        r2,
+        baselines: at
+            .baselines
+            .as_ref()
+            .map(|baselines| (&baselines.by_split[place]).into()),
+    };
+    at.by_split.iter().enumerate().map(of).collect()
 }
 
 /// One line per room and metric, for M3 and M4 per stride.
 pub fn probe_table(scores: &[ProbeScores]) -> String {
     let head = [
         "room", "metric", "value", "sd", "transl.", "rotation", "direct.", "magnit.", "n",
+        "constant", "nearest",
     ];
     let mut lines = vec![head.map(str::to_owned).to_vec()];
 
@@ -273,6 +306,17 @@ pub fn probe_table(scores: &[ProbeScores]) -> String {
         for (name, strides) in [("M3", &score.m3), ("M4", &score.m4)] {
             for at in strides.iter() {
                 line(format!("{name} s{}", at.stride), &stride_cells(at));
+
+                // What the folds' pairs score together does not say how unlike the folds are.
+                if at.by_split.len() > 1 {
+                    for (place, (split, r2)) in at.by_split.iter().enumerate() {
+                        let mut cells = vec![format!("{r2:.3}")];
+                        cells.resize(7, String::new());
+                        let baselines = at.baselines.as_ref();
+                        cells.extend(baseline_cells(baselines.map(|all| &all.by_split[place])));
+                        line(format!("{name} s{} {split}", at.stride), &cells);
+                    }
+                }
             }
         }
     }
@@ -304,5 +348,24 @@ fn stride_cells(at: &AtStride) -> Vec<String> {
     );
 
     cells.push(at.runs.first().map_or(0, |run| run.n).to_string());
+    let baselines = at.baselines.as_ref();
+    cells.extend(baseline_cells(baselines.map(|all| &all.together)));
     cells
+}
+
+/// The R² of the mean training motion, and the distance to the nearest training pose; empty where no
+/// room stands alone.
+fn baseline_cells(baselines: Option<&Baselines>) -> [String; 2] {
+    let Some(baselines) = baselines else {
+        return [String::new(), String::new()];
+    };
+
+    let nearest = baselines.nearest_pose.map_or_else(String::new, |pose| {
+        format!(
+            "{:.2} m {:.0}°",
+            pose.translation_m,
+            pose.rotation_rad.to_degrees()
+        )
+    });
+    [format!("{:.3}", baselines.constant_r2), nearest]
 }

@@ -5,7 +5,7 @@ use serde::Serialize;
 use seese3_core::statistics::{RoomMean, bootstrap_mean, paired_difference};
 
 use super::Found;
-use super::claims::{Claim, Verdict};
+use super::claims::{Claim, Verdict, count_words, is_above_zero};
 use super::cross::{AFFINE, HOMOGENEOUS, rate_text};
 use super::notes::published_name;
 use super::plans::{MEMBERS, PlanKind, PlanResult, SetResults};
@@ -46,9 +46,11 @@ pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<Bet
 
             // Two rows decide the claims: the calibrated navigator, and preset steady.
             match result.plan.kind {
-                PlanKind::PaperRangeCalibrated => navigator_wins
-                    .push(compared.over_affine.low > 0.0 && compared.over_homogeneous.low > 0.0),
-                PlanKind::Steady => recipe_wins.push(compared.clipped_r2.low > 0.0),
+                PlanKind::PaperRangeCalibrated => {
+                    let over = [&compared.over_affine, &compared.over_homogeneous];
+                    navigator_wins.push(all_of(over.map(is_above_zero)));
+                }
+                PlanKind::Steady => recipe_wins.push(is_above_zero(&compared.clipped_r2)),
                 _ => {}
             }
         }
@@ -62,30 +64,34 @@ pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<Bet
          adapter's epochs. No pose of a held-out room is used but to score."
     ));
 
-    let count = |held: &[bool]| {
-        format!(
-            "for {} of {} features",
-            held.iter().filter(|&&h| h).count(),
-            held.len()
-        )
-    };
-
     claims.push(Claim {
         claim: "ours: the calibrated navigator hits more often than inverse Poincaré in rooms never seen",
-        verdict: Verdict::of(&navigator_wins),
-        found: format!("both differences' intervals are above zero {}", count(&navigator_wins)),
+        verdict: Verdict::of_telling(&navigator_wins),
+        found: format!(
+            "both differences' intervals are above zero: {}",
+            count_words(&navigator_wins, "feature sets")
+        ),
     });
 
     claims.push(Claim {
         claim: "ours: preset steady reads motion better than paper-range in rooms never seen",
-        verdict: Verdict::of(&recipe_wins),
+        verdict: Verdict::of_telling(&recipe_wins),
         found: format!(
-            "the interval of the difference of clipped R² is above zero {}",
-            count(&recipe_wins)
+            "the interval of the difference of clipped R² is above zero: {}",
+            count_words(&recipe_wins, "feature sets")
         ),
     });
 
     Found { section, record }
+}
+
+/// Whether both hold; false as soon as one of them does not.
+fn all_of(both: [Option<bool>; 2]) -> Option<bool> {
+    match both {
+        [Some(true), Some(true)] => Some(true),
+        [Some(false), _] | [_, Some(false)] => Some(false),
+        _ => None,
+    }
 }
 
 /// A row of the section in `record.json`.

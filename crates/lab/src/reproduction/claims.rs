@@ -2,6 +2,8 @@
 
 use serde::Serialize;
 
+use seese3_core::statistics::{Rate, RoomMean};
+
 use crate::report::Section;
 
 /// A claim and the evidence found for or against it.
@@ -62,6 +64,28 @@ impl Verdict {
     }
 }
 
+/// Whether a mean over rooms is above zero, if its interval can tell.
+pub fn is_above_zero(mean: &RoomMean) -> Option<bool> {
+    if mean.low > 0.0 {
+        Some(true)
+    } else if mean.high < 0.0 {
+        Some(false)
+    } else {
+        None
+    }
+}
+
+/// Whether a share of rooms is above one half, if its interval can tell.
+pub fn is_most(share: &Rate) -> Option<bool> {
+    if share.low > 0.5 {
+        Some(true)
+    } else if share.high < 0.5 {
+        Some(false)
+    } else {
+        None
+    }
+}
+
 /// How many cases a claim holds in, and how many cannot tell, in words.
 pub fn count_words(cases: &[Option<bool>], of_what: &str) -> String {
     let telling: Vec<bool> = cases.iter().copied().flatten().collect();
@@ -118,6 +142,15 @@ pub fn records(claims: &[Claim]) -> Vec<ClaimRecord> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Oracle: three rooms of three are too few for Wilson's interval, 0.44 to 1, to say that most
+    /// rooms are won; ten of ten are enough, and none of ten says that most are not.
+    #[test]
+    fn few_rooms_cannot_tell_what_most_do() {
+        assert_eq!(is_most(&Rate::of(3, 3)), None);
+        assert_eq!(is_most(&Rate::of(10, 10)), Some(true));
+        assert_eq!(is_most(&Rate::of(0, 10)), Some(false));
+    }
 
     /// Oracle: the words of the verdicts.
     #[test]

@@ -3,9 +3,9 @@
 
 use serde::Serialize;
 
-use seese3_core::statistics::{Rate, bootstrap_mean, mean};
+use seese3_core::statistics::{Rate, bootstrap_mean, mean, paired_difference};
 
-use super::claims::{Claim, Verdict};
+use super::claims::{Claim, Verdict, count_words, is_above_zero, is_most};
 use super::notes::published_name;
 use super::plans::SetResults;
 use super::render::plotted;
@@ -55,6 +55,7 @@ pub fn section(
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     let mut hits = Vec::new();
     let mut fractions = Vec::new();
+    let mut means = Vec::new();
     let mut record = Vec::new();
 
     let mut zero_shot = Vec::new();
@@ -65,9 +66,12 @@ pub fn section(
         let whole = &set.baseline().run;
         rows.extend(zero_shot_rows(features, whole));
 
-        // Wilson's lower bound has to be above one half, not only the share of rooms itself.
-        zero_shot.push(wins(&whole.outcomes, AFFINE).is_some_and(|rate| rate.low > 0.5));
-        refitted.push(mean_hit(whole, REFIT) > mean_hit(whole, AFFINE));
+        // The interval has to tell, not only the share of rooms or the mean itself.
+        zero_shot.push(wins(&whole.outcomes, AFFINE).as_ref().and_then(is_most));
+        let over = |ours: &CrossRoomRun, name: &str, theirs: &CrossRoomRun| {
+            paired_difference(&ours.hit_rates(name), &theirs.hit_rates(AFFINE), 0)
+        };
+        refitted.push(is_above_zero(&over(whole, REFIT, whole)));
 
         // The scaling curve: one preset, by the number of training rooms.
         let points = |of: &dyn Fn(&CrossRoomRun) -> f64| {
@@ -82,8 +86,14 @@ pub fn section(
         let fraction =
             points(&|run| MotionSummary::of(&run.r2(), 0).map_or(f64::NAN, |s| s.positive.rate));
 
+        let mean_at_zero = points(&|run| {
+            MotionSummary::of(&run.r2(), 0).map_or(f64::NAN, |s| s.clipped_at_zero.mean)
+        });
+
         // Only the ends of the curve are compared: a plateau in between goes unnoticed.
-        grows.push(hit.last().map(|p| p[1]) > hit.first().map(|p| p[1]));
+        if let [fewest, .., all] = set.by_size.as_slice() {
+            grows.push(is_above_zero(&over(&all.run, AFFINE, &fewest.run)));
+        }
 
         hits.push(Series {
             name: features.to_owned(),
@@ -94,6 +104,12 @@ pub fn section(
         fractions.push(Series {
             name: features.to_owned(),
             points: fraction,
+            joined: true,
+        });
+
+        means.push(Series {
+            name: features.to_owned(),
+            points: mean_at_zero,
             joined: true,
         });
 
@@ -133,52 +149,45 @@ pub fn section(
         given.options.stride
     ));
 
-    add_curves(&mut section, hits, fractions)?;
-
-    // Each verdict is over feature sets: the claim holds for a set or it does not.
-    let count = |held: &[bool]| {
-        format!(
-            "so for {} of {} features",
-            held.iter().filter(|&&h| h).count(),
-            held.len()
-        )
-    };
+    add_curves(&mut section, hits, fractions, means)?;
 
     claims.push(Claim {
         claim: "zero-shot navigation beats Identity in most rooms never seen (Hit@0.1)",
-        verdict: Verdict::of(&zero_shot),
+        verdict: Verdict::of_telling(&zero_shot),
         found: format!(
             "Wilson's interval of the share of rooms is above one half: {}",
-            count(&zero_shot)
+            count_words(&zero_shot, "feature sets")
         ),
     });
 
     claims.push(Claim {
         claim: "refitting the linear step in the room itself does better than zero-shot",
-        verdict: Verdict::of(&refitted),
+        verdict: Verdict::of_telling(&refitted),
         found: format!(
-            "mean Hit@0.1 of the z-scored refit is higher, in sample: {}",
-            count(&refitted)
+            "the interval of the difference in Hit@0.1 of the z-scored refit, in sample, is above zero: {}",
+            count_words(&refitted, "feature sets")
         ),
     });
 
     claims.push(Claim {
         claim: "more training rooms transfer better, without a plateau",
-        verdict: Verdict::of(&grows),
+        verdict: Verdict::of_telling(&grows),
         found: format!(
-            "Hit@0.1 with all rooms is above that with the fewest: {}",
-            count(&grows)
+            "the interval of the difference in Hit@0.1 of all rooms over the fewest is above zero: {}",
+            count_words(&grows, "feature sets")
         ),
     });
 
     Ok(Found { section, record })
 }
 
-/// Adds the scaling curves of hit rates and of the share of rooms with R² above 0.
+/// Adds the scaling curves of hit rates, of the share of rooms with R² above 0, and of the paper's
+/// clipped mean.
 fn add_curves(
     section: &mut Section,
     hits: Vec<Series>,
     fractions: Vec<Series>,
+    means: Vec<Series>,
 ) -> Result<(), Error> {
     let plot = |title: &str, y: &str, series: Vec<Series>| {
         let title = title.to_owned();
@@ -205,6 +214,13 @@ fn add_curves(
     section.picture(
         "scaling-r2.svg",
         plot("Rooms with R² > 0", "share of held-out rooms", fractions)?,
+        caption,
+    );
+
+    let caption = "Mean over held-out rooms of max(R², 0) by how many rooms were learned from";
+    section.picture(
+        "scaling-mean.svg",
+        plot("R², negative ones as 0", "mean of max(R², 0)", means)?,
         caption,
     );
 

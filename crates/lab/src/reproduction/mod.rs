@@ -14,6 +14,7 @@ mod pictures;
 mod plans;
 mod probes;
 mod render;
+mod settings;
 mod strides;
 mod success;
 
@@ -47,6 +48,8 @@ pub struct Options {
     pub calibration_rooms: usize,
     /// How many seeds, from 0 on, where a table averages over seeds.
     pub seeds: u64,
+    /// The same for the table of the alternatives A to D, in which the paper takes 15.
+    pub formulation_seeds: u64,
     /// Epochs in place of every preset's own, for a trial.
     pub epochs: Option<usize>,
 }
@@ -105,11 +108,12 @@ pub struct ReproductionRecord {
     probes: Vec<probes::ProbeRecord>,
     strides: Vec<strides::StrideRecord>,
     rooms_alone: Vec<SweepRow>,
+    settings: settings::SettingsRecord,
     formulations: Vec<formulations::FormulationRecord>,
     navigation: Vec<navigation::NavigationRecord>,
     cross_room: Vec<cross::ZeroShotRecord>,
     better: Vec<better::BetterRecord>,
-    pictures: Vec<pictures::WalkRecord>,
+    pictures: pictures::PicturesRecord,
     theory: TheoryJson,
     claims: Vec<claims::ClaimRecord>,
     protocol: ProtocolRecord,
@@ -124,6 +128,7 @@ struct ProtocolRecord {
     sizes: Vec<usize>,
     aside: usize,
     seeds: u64,
+    formulation_seeds: u64,
     epochs_instead_of_the_presets: Option<usize>,
     train: Vec<(String, u64)>,
     test: Vec<(String, u64)>,
@@ -131,7 +136,7 @@ struct ProtocolRecord {
 }
 
 /// How many experiments [`reproduce`] runs.
-pub const EXPERIMENTS: u64 = 9;
+pub const EXPERIMENTS: u64 = 10;
 
 /// What an experiment found: a section of the report, and the same for programs.
 struct Found<R> {
@@ -206,6 +211,8 @@ pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced
     done();
     let rooms_alone = success::section(given)?;
     done();
+    let settings = settings::section(given)?;
+    done();
     let formulations = formulations::section(given, &mut notes.claims)?;
     done();
     let navigation = navigation::section(given, &mut notes)?;
@@ -230,6 +237,7 @@ pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced
         probes.section,
         strides.section,
         rooms_alone.section,
+        settings.section,
         formulations.section,
         navigation.section,
         cross_room.section,
@@ -243,6 +251,7 @@ pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced
         probes: probes.record,
         strides: strides.record,
         rooms_alone: rooms_alone.record,
+        settings: settings.record,
         formulations: formulations.record,
         navigation: navigation.record,
         cross_room: cross_room.record,
@@ -312,6 +321,7 @@ fn protocol(given: &Reproduction<'_>) -> ProtocolRecord {
         sizes: options.sizes.clone(),
         aside: options.calibration_rooms,
         seeds: options.seeds,
+        formulation_seeds: options.formulation_seeds,
         epochs_instead_of_the_presets: options.epochs,
         train: names(&set.train),
         test: names(&set.test),

@@ -1,0 +1,150 @@
+//! Training and testing under one split or under the folds of a recording.
+//!
+//! The motions of all folds' test pairs are scored together. The R² of a single fold divides by the
+//! variance of that fifth, which may be a small part of the recording's; that of all folds together
+//! divides by the variance of all that was filmed.
+
+use seese3_core::eval::{Baselines, TestPairs};
+use seese3_core::geometry::PoseError;
+use seese3_core::motion_scores::{MotionScores, ReadMotions};
+use seese3_core::room::Room;
+use seese3_core::splits::{self, Split};
+use seese3_core::statistics::mean_of_known;
+
+use super::Error;
+
+/// The motions of the test pairs of several rooms under one split after the other.
+#[derive(Debug, Clone)]
+pub struct FoldedMotions {
+    /// For each split the motions of each room.
+    pub by_split: Vec<Vec<ReadMotions>>,
+}
+
+impl FoldedMotions {
+    /// Reads the motions of each room under each of `splits`.
+    ///
+    /// # Errors
+    /// That of `read`.
+    pub fn of(
+        splits: &[Split],
+        read: impl Fn(Split) -> Result<Vec<ReadMotions>, Error>,
+    ) -> Result<Self, Error> {
+        Ok(Self {
+            by_split: splits
+                .iter()
+                .map(|&split| read(split))
+                .collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// The scores of each room over the pairs of all splits together, averaged over rooms.
+    pub fn scores(&self) -> MotionScores {
+        let rooms: Vec<MotionScores> = self.rooms().iter().map(ReadMotions::scores).collect();
+        MotionScores::mean(&rooms)
+    }
+
+    /// As [`FoldedMotions::scores`], of always answering the mean training motion: the overall R².
+    pub fn constant_r2(&self) -> f64 {
+        let rooms: Vec<f64> = self.rooms().iter().map(ReadMotions::constant_r2).collect();
+        mean_of_known(&rooms)
+    }
+
+    /// The overall R² under each split, averaged over rooms.
+    pub fn r2_by_split(&self) -> Vec<f64> {
+        let of = |rooms: &Vec<ReadMotions>| {
+            let r2: Vec<f64> = rooms.iter().map(|room| room.scores().overall).collect();
+            mean_of_known(&r2)
+        };
+        self.by_split.iter().map(of).collect()
+    }
+
+    /// The motions of each room, of all splits one after the other.
+    fn rooms(&self) -> Vec<ReadMotions> {
+        let mut rooms = vec![ReadMotions::default(); self.by_split.first().map_or(0, Vec::len)];
+        for split in &self.by_split {
+            for (room, motions) in rooms.iter_mut().zip(split) {
+                room.append(motions.clone());
+            }
+        }
+        rooms
+    }
+}
+
+/// What R² under `splits` has to be read beside: of each split, and of all together.
+#[derive(Debug, Clone)]
+pub struct FoldedBaselines {
+    /// The constant's R² over the pairs of all splits together; otherwise means over the splits.
+    pub together: Baselines,
+    /// One entry per split.
+    pub by_split: Vec<Baselines>,
+}
+
+impl FoldedBaselines {
+    /// The baselines of what learned from the room's own training pairs in so many steps.
+    ///
+    /// # Errors
+    /// [`splits::Error`] when the room has no training or no test pairs under a split.
+    pub fn of(
+        room: &Room,
+        splits: &[Split],
+        stride: u32,
+        optimiser_steps: u64,
+        constant_r2: f64,
+    ) -> Result<Self, splits::Error> {
+        let within =
+            |&split: &Split| Baselines::within(room, &TestPairs { split, stride }, optimiser_steps);
+        let by_split: Vec<Baselines> = splits.iter().map(within).collect::<Result<_, _>>()?;
+
+        let ratios: Vec<f64> = by_split.iter().map(|split| split.variance_ratio).collect();
+        let nearest: Vec<PoseError> = by_split
+            .iter()
+            .filter_map(|split| split.nearest_pose)
+            .collect();
+        let mean =
+            |of: fn(&PoseError) -> f64| mean_of_known(&nearest.iter().map(of).collect::<Vec<_>>());
+
+        Ok(Self {
+            together: Baselines {
+                constant_r2,
+                variance_ratio: mean_of_known(&ratios),
+                nearest_pose: (!nearest.is_empty()).then(|| PoseError {
+                    translation_m: mean(|pose| pose.translation_m),
+                    rotation_rad: mean(|pose| pose.rotation_rad),
+                }),
+                optimiser_steps,
+            },
+            by_split,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use seese3_core::geometry::Twist;
+
+    use super::*;
+
+    /// Oracle: by hand: two folds that each move along one value of x only have no R² of their own,
+    /// and together R² 1 − (0.25 + 0.25) / 2 = 0.75; the constants, each the other fold's mean, miss
+    /// by 2 each: 1 − 8 / 2 = −3.
+    #[test]
+    fn folds_are_scored_together() {
+        let along =
+            |x: f64| Twist::from_vector(&nalgebra::Vector6::new(x, 0.0, 0.0, 0.0, 0.0, 0.0));
+        let fold = |truth: f64, read: f64, mean: f64| {
+            vec![ReadMotions::new(
+                vec![along(truth)],
+                vec![along(read)],
+                &along(mean).to_vector(),
+            )]
+        };
+        let folded = FoldedMotions {
+            by_split: vec![fold(-1.0, -0.5, 1.0), fold(1.0, 0.5, -1.0)],
+        };
+
+        assert!(folded.r2_by_split().iter().all(|r2| r2.is_nan()));
+        assert!((folded.scores().overall - 0.75).abs() < 1e-12);
+        assert!((folded.constant_r2() + 3.0).abs() < 1e-12);
+        assert_eq!(folded.scores().n, 2);
+    }
+}

@@ -1,0 +1,98 @@
+//! Pictures: walks as strips of images and plans, pairs of images by stride, and a recording's path
+//! before and after the adapter.
+
+mod plane;
+mod strip;
+mod unrolled;
+mod walks;
+
+use std::sync::Arc;
+
+use serde::Serialize;
+
+use seese3_core::training::RoomData;
+
+use super::notes::Notes;
+use super::plans::steady_adapter;
+use super::{Error, Found, Reproduction};
+use crate::report::Section;
+use walks::{Length, WalkRecord};
+
+/// The walks in `record.json`.
+#[derive(Debug, Serialize)]
+#[serde(transparent)]
+pub struct PicturesRecord {
+    walks: Vec<WalkRecord>,
+}
+
+/// The section of walks in rooms that have images, and of the paths of features and latents.
+pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<PicturesRecord>, Error> {
+    let mut section = Section::new("Walks in rooms never seen, and a recording unrolled");
+    // Pictures are of the first feature set alone.
+    let set = &given.sets[0];
+    let adapter = notes
+        .adapter(&steady_adapter(set), &set.features)
+        .ok_or_else(|| Error::Input("the steady adapter was not trained".to_owned()))?;
+    let adapter = Arc::new(adapter.clone());
+    section.text(
+        "Adapter of preset steady, learned from all rooms that are learned together; it saw no frame of the rooms shown.",
+    );
+
+    let is_drawn = |data: &&RoomData<'_>| data.room.provenance().format.starts_with("studio");
+    let has_images = |data: &&RoomData<'_>| !data.room.images().is_empty();
+    let mut walks = Vec::new();
+
+    // A held-out drawn room, with a motion that is short for it, a middle one and a long one.
+    let drawn = set.test.iter().filter(is_drawn).find(has_images);
+    for length in Length::ALL {
+        if let Some(data) = drawn {
+            walks.push(walks::add(&mut section, given, data, &adapter, length)?);
+        }
+    }
+
+    // A real room that the adapter did not learn from.
+    let is_unseen = |data: &&RoomData<'_>| {
+        let mut learned = set.train.iter();
+        learned.all(|other| other.room.id() != data.room.id())
+    };
+    let rooms = set.test.iter().chain(&set.in_room);
+    let mut real = rooms.filter(|data| !is_drawn(data) && is_unseen(data));
+    let real = real.find(has_images);
+    if let Some(data) = real {
+        walks.push(walks::add(
+            &mut section,
+            given,
+            data,
+            &adapter,
+            Length::Middle,
+        )?);
+    }
+    if walks.is_empty() {
+        section.text("No such room has images; walks are not shown.");
+    }
+
+    // What a stride looks like.
+    if let Some(data) = real.or(drawn) {
+        let source = data.room.frame_count() as u32 / 4;
+        let strides = given.options.strides.iter().copied();
+        let frames: Vec<u32> = std::iter::once(0)
+            .chain(strides)
+            .map(|stride| (source + stride).min(data.room.frame_count() as u32 - 1))
+            .collect();
+        section.picture(
+            "strides.png",
+            strip::strip(given.images, data, &frames)?,
+            format!(
+                "Room {}: a source, and the targets {:?} frames on",
+                data.room.id(),
+                given.options.strides
+            ),
+        );
+    }
+
+    unrolled::add(&mut section, &set.test[0], &adapter)?;
+    Ok(Found {
+        section,
+        record: PicturesRecord { walks },
+    })
+}

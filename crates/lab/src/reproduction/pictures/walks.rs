@@ -1,0 +1,207 @@
+//! Walks: a motion in several steps, as a strip of images and as a plan.
+
+use std::sync::Arc;
+
+use serde::Serialize;
+
+use seese3_core::adapter::{Adapter, Reading};
+use seese3_core::cancel::Cancellation;
+use seese3_core::geometry::{PoseError, Twist, body_twist, exp};
+use seese3_core::navigation::{
+    Displacement, FitOn, IndexKind, Limits, Mode, Navigator, Query, RetrievalMetric, Source,
+    SourceAt, StepKind,
+};
+use seese3_core::room::FrameId;
+use seese3_core::splits::{Pair, Split};
+use seese3_core::training::RoomData;
+
+use super::super::{Error, Reproduction};
+use super::plane::Plane;
+use super::strip::strip;
+use crate::report::{PathPlot, Section, path_svg};
+
+/// Equal parts of a walk, as in the paper.
+const STEPS: u32 = 4;
+/// Frames from the source to the target of a walk: farther than any training pair of preset steady.
+const FAR: u32 = 50;
+
+/// Which of a room's pairs is walked, by the share of pairs whose translation is shorter.
+#[derive(Debug, Clone, Copy)]
+pub enum Length {
+    Short,
+    Middle,
+    Long,
+}
+
+impl Length {
+    pub const ALL: [Self; 3] = [Self::Short, Self::Middle, Self::Long];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Short => "short",
+            Self::Middle => "middle",
+            Self::Long => "long",
+        }
+    }
+
+    fn share(self) -> f64 {
+        match self {
+            Self::Short => 0.1,
+            Self::Middle => 0.5,
+            Self::Long => 0.9,
+        }
+    }
+}
+
+/// A walk in `record.json`.
+#[derive(Debug, Serialize)]
+pub struct WalkRecord {
+    room: String,
+    /// Which of the room's pairs.
+    length: &'static str,
+    frames: Vec<u32>,
+    metres_off: f64,
+    degrees_off: f64,
+    /// The same of standing still: the motion itself.
+    metres: f64,
+    degrees: f64,
+}
+
+/// Walks a room's pair of this length, and adds its strip and its plan to the section.
+pub fn add(
+    section: &mut Section,
+    given: &Reproduction<'_>,
+    data: &RoomData<'_>,
+    adapter: &Arc<Adapter>,
+    length: Length,
+) -> Result<WalkRecord, Error> {
+    let room = Arc::new(data.room.clone());
+    let navigator = Navigator::new(room, data.features, adapter.clone(), IndexKind::Exact)?;
+    let pair = chosen(data, length)?;
+    let frames = walked(&navigator, pair)?;
+
+    let poses = data.room.poses();
+    let between = |a: u32, b: u32| PoseError::between(&poses[a as usize], &poses[b as usize]);
+    let last = frames[frames.len() - 1];
+    let off = between(last, pair.target.0);
+    let still = between(pair.source.0, pair.target.0);
+
+    let shown: Vec<u32> = frames.iter().copied().chain([pair.target.0]).collect();
+    let name = format!("walk-{}-{}", data.room.id(), length.name());
+    let caption = format!(
+        "Room {}, a {} motion ({:.2} m and {:.0}°): source, {STEPS} steps in an open loop, target; the last step is {:.2} m \
+         and {:.0}° from it",
+        data.room.id(),
+        length.name(),
+        still.translation_m,
+        still.rotation_rad.to_degrees(),
+        off.translation_m,
+        off.rotation_rad.to_degrees()
+    );
+    section.picture(
+        format!("{name}.png"),
+        strip(given.images, data, &shown)?,
+        caption,
+    );
+
+    let plan = path_svg(&plan(data, pair, &frames, length))
+        .map_err(|problem| Error::Rendering(problem.into()))?;
+    section.picture(
+        format!("{name}.svg"),
+        plan.into_bytes(),
+        "The same in the plane of the path",
+    );
+
+    Ok(WalkRecord {
+        room: data.room.id().to_string(),
+        length: length.name(),
+        frames: shown,
+        metres_off: off.translation_m,
+        degrees_off: off.rotation_rad.to_degrees(),
+        metres: still.translation_m,
+        degrees: still.rotation_rad.to_degrees(),
+    })
+}
+
+/// The pair of the room whose translation is longer than the length's share of all pairs at [`FAR`].
+fn chosen(data: &RoomData<'_>, length: Length) -> Result<Pair, Error> {
+    let mut pairs = Split::Whole.test_pairs(data.room.timeline(), FAR)?;
+    let poses = data.room.poses();
+    let metres = |pair: &Pair| {
+        let [source, target] = [pair.source, pair.target].map(|frame| &poses[frame.row()]);
+        PoseError::between(source, target).translation_m
+    };
+    pairs.sort_by(|a, b| metres(a).total_cmp(&metres(b)));
+
+    let place = (length.share() * (pairs.len() - 1) as f64).round() as usize;
+    Ok(pairs[place])
+}
+
+/// The source, and the frame that each step retrieves.
+fn walked(navigator: &Navigator, pair: Pair) -> Result<Vec<u32>, Error> {
+    let query = Query {
+        source: SourceAt {
+            source: Source::Frame(pair.source),
+            pose: None,
+        },
+        displacement: Displacement::TargetFrame(pair.target),
+        steps: STEPS,
+        mode: Mode::OpenLoop,
+        step: StepKind::InversePoincare(Reading::Homogeneous),
+        metric: RetrievalMetric::Full,
+        // Only a refit is fitted on pairs of the room; inverse Poincaré ignores this.
+        fit_on: FitOn {
+            split: Split::Time,
+            stride: FAR,
+        },
+        hit_count: 1,
+        exclude_source: None,
+    };
+
+    let answer = navigator.answer(&query, Limits::default(), &Cancellation::default())?;
+    let steps = answer
+        .steps
+        .iter()
+        .map(|step| step.hits[0].neighbour.frame.0);
+    Ok([pair.source.0].into_iter().chain(steps).collect())
+}
+
+/// The walk in the plane in which the recording's positions vary most.
+fn plan(data: &RoomData<'_>, pair: Pair, frames: &[u32], length: Length) -> PathPlot {
+    let plane = Plane::of(data.room.poses());
+    let poses = data.room.poses();
+    let place = |frame: FrameId| plane.place(&poses[frame.row()]);
+
+    let source = &poses[pair.source.row()];
+    let motion = body_twist(source, &poses[pair.target.row()]);
+    let requested = (1..=STEPS).map(|step| {
+        let share = f64::from(step) / f64::from(STEPS);
+        let part = Twist {
+            linear: motion.linear * share,
+            angular: motion.angular * share,
+        };
+        plane.place(&(source * exp(&part)))
+    });
+
+    PathPlot {
+        title: format!(
+            "{}: a {} motion, {STEPS} steps",
+            data.room.id(),
+            length.name()
+        ),
+        map: poses
+            .iter()
+            .map(|pose| {
+                let [x, y, _] = plane.place(pose);
+                [x, y]
+            })
+            .collect(),
+        source: place(pair.source),
+        target: place(pair.target),
+        requested: requested.collect(),
+        retrieved: frames[1..]
+            .iter()
+            .map(|&frame| place(FrameId(frame)))
+            .collect(),
+    }
+}

@@ -1,0 +1,167 @@
+//! What the settings of the adapter are worth within a room: both losses, the width of the latent
+//! and the learning rate.
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use seese3_core::adapter::{Loss, Preset};
+use seese3_core::motion_scores::MotionScores;
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan};
+
+use super::render::spread;
+use super::{Error, FeatureSet, Found, Reproduction};
+use crate::experiments::folds::FoldedMotions;
+use crate::formulations::read_by_adapter;
+use crate::report::Section;
+
+/// Columns of a latent, and learning rates.
+const GEO_DIMS: [usize; 4] = [6, 20, 80, 320];
+const LEARNING_RATES: [f64; 4] = [3e-4, 1e-3, 3e-3, 1e-2];
+
+/// The tables in `record.json`.
+#[derive(Debug, Serialize)]
+pub struct SettingsRecord {
+    features: String,
+    losses: Vec<LossRecord>,
+    grid: Vec<GridRecord>,
+}
+
+/// The scores of a loss; one value per seed.
+#[derive(Debug, Serialize)]
+struct LossRecord {
+    loss: &'static str,
+    translation: Vec<f64>,
+    rotation: Vec<f64>,
+}
+
+/// A point of the grid, one seed.
+#[derive(Debug, Serialize)]
+struct GridRecord {
+    geo_dim: usize,
+    learning_rate: f64,
+    r2: f64,
+}
+
+/// The section of the paper's tables "joint against rotation only" and of its sweep, with the first
+/// feature set.
+pub fn section(given: &Reproduction<'_>) -> Result<Found<SettingsRecord>, Error> {
+    let mut section = Section::new("Settings of the adapter, within a room");
+    let set = &given.sets[0];
+
+    let losses = losses(given, set)?;
+    let mut rows = vec![
+        ["loss", "translation", "rotation"]
+            .map(str::to_owned)
+            .to_vec(),
+    ];
+    for found in &losses {
+        rows.push(vec![
+            found.loss.to_owned(),
+            spread(&found.translation),
+            spread(&found.rotation),
+        ]);
+    }
+    section.text(format!(
+        "Features {}: the loss on all six components, and on the rotation alone, which leaves the translation untrained:",
+        set.features
+    ));
+    section.table(rows);
+
+    let grid = grid(given, set)?;
+    let mut head = vec!["geo_dim".to_owned()];
+    head.extend(LEARNING_RATES.map(|rate| format!("rate {rate}")));
+    let mut rows = vec![head];
+    for of_dim in grid.chunks(LEARNING_RATES.len()) {
+        let mut row = vec![of_dim[0].geo_dim.to_string()];
+        row.extend(of_dim.iter().map(|point| format!("{:.2}", point.r2)));
+        rows.push(row);
+    }
+    section.text("Overall R² by columns of the latent and learning rate, one seed:");
+    section.table(rows);
+
+    section.text(format!(
+        "Means over the rooms that are learned alone, stride {}: R² over the pairs of all five folds of a recording \
+         together. {}",
+        given.options.stride,
+        given.training_words()
+    ));
+
+    Ok(Found {
+        section,
+        record: SettingsRecord {
+            features: set.features.clone(),
+            losses,
+            grid,
+        },
+    })
+}
+
+fn losses(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Result<Vec<LossRecord>, Error> {
+    let of = |loss: Loss| {
+        let by_seed: Vec<MotionScores> = (0..given.options.seeds)
+            .map(|seed| {
+                let mut plan = base_plan(given, seed);
+                plan.config.loss = loss;
+                scores(set, &plan)
+            })
+            .collect::<Result<_, Error>>()?;
+
+        Ok(LossRecord {
+            loss: loss.name(),
+            translation: by_seed.iter().map(|scores| scores.translation).collect(),
+            rotation: by_seed.iter().map(|scores| scores.rotation).collect(),
+        })
+    };
+
+    [Loss::MeanSquaredError, Loss::Rotation]
+        .into_iter()
+        .map(of)
+        .collect()
+}
+
+/// Every point, the learning rate varying fastest.
+fn grid(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Result<Vec<GridRecord>, Error> {
+    let mut points = Vec::new();
+    for geo_dim in GEO_DIMS {
+        for learning_rate in LEARNING_RATES {
+            let mut plan = base_plan(given, 0);
+            plan.config.latent = geo_dim;
+            plan.config.learning_rate = learning_rate;
+
+            points.push(GridRecord {
+                geo_dim,
+                learning_rate,
+                r2: scores(set, &plan)?.overall,
+            });
+        }
+    }
+
+    Ok(points)
+}
+
+/// The plan of every run here; the folds replace its split.
+fn base_plan(given: &Reproduction<'_>, seed: u64) -> TrainingPlan {
+    given.plan(Preset::Base, Split::Time, given.options.stride, seed, None)
+}
+
+/// The mean over rooms that are learned alone.
+fn scores(set: &FeatureSet<'_>, plan: &TrainingPlan) -> Result<MotionScores, Error> {
+    let of_room = |room: &RoomData<'_>| {
+        let read = FoldedMotions::of(&Split::FOLDS, |split| {
+            let plan = TrainingPlan {
+                split,
+                ..plan.clone()
+            };
+            Ok(read_by_adapter(&[*room], &plan, &mut |_| ())?.0)
+        })?;
+        Ok(read.scores())
+    };
+    let rooms: Vec<MotionScores> = set
+        .in_room
+        .par_iter()
+        .map(of_room)
+        .collect::<Result<_, Error>>()?;
+
+    Ok(MotionScores::mean(&rooms))
+}
