@@ -131,17 +131,24 @@ fn answer(
 
 /// Where the camera of a feature is, if the adapter was fitted to the room.
 fn located(served: &ServedNavigator, feature: &[f32]) -> Result<Option<pb::LocatedPose>, Error> {
-    let Some(FittedLocalizer { localizer, rules }) = &served.localizer else {
-        return Ok(None);
-    };
+    let located = |localizer| located_by(localizer, feature, served.navigator.room().id());
+    served.localizer.as_ref().map(located).transpose()
+}
 
-    // The feature was embedded before, so that it fits the adapter.
-    let view = localizer
-        .locate(feature, rules)
+/// Where the camera of a feature, which was embedded before, is in a room.
+pub(super) fn located_by(
+    fitted: &FittedLocalizer,
+    feature: &[f32],
+    room: &room::RoomId,
+) -> Result<pb::LocatedPose, Error> {
+    // The feature fits the adapter's, so that nothing can be wrong with it.
+    let view = fitted
+        .localizer
+        .locate(feature, &fitted.rules)
         .map_err(|_| Error::Internal)?;
-    let room = served.navigator.room().id().as_str();
+    let room = room.as_str();
 
-    Ok(Some(pb::LocatedPose {
+    Ok(pb::LocatedPose {
         pose: Some(convert::pose_to_wire(&view.pose.pose, room)),
         covariance: convert::matrix_to_wire(&view.pose.ros_covariance()),
         frame_id: view.nearest.frame.0,
@@ -150,7 +157,7 @@ fn located(served: &ServedNavigator, feature: &[f32]) -> Result<Option<pb::Locat
         translation_gain: view.translation.gain,
         rotation_reader: view.rotation.reader.name().to_owned(),
         rotation_gain: view.rotation.gain,
-    }))
+    })
 }
 
 /// The rooms to search, all under one adapter; at least one. An empty `rooms` means every room that

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use super::convert;
-use super::localization::rooms_under;
+use super::localization::{located_by, rooms_under};
 use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
 use super::status::view_error;
 use super::{Error, Handlers};
@@ -74,6 +74,7 @@ fn answer(
     let maps = maps(&served)?;
     let stored = &served[0].adapter;
     let mut latents = Vec::with_capacity(views.len());
+    let mut newest = None;
 
     // Views are embedded one by one, with a check for cancellation before each, since an image
     // may have to be encoded.
@@ -92,6 +93,11 @@ fn answer(
             }
         };
 
+        newest = match &view {
+            View::Feature(feature) => Some(feature.clone()),
+            View::Latent(_) => None,
+        };
+
         latents.push(
             view.latent(&stored.adapter)
                 .map_err(|error| view_error(&error).within(&field))?,
@@ -103,14 +109,13 @@ fn answer(
         _ => Error::Internal,
     })?;
 
+    let newest = newest.as_deref();
+    let shown = found.rooms.iter().take(shown);
+    let rooms = shown.map(|room| room_to_wire(room, &served, snapshot, newest));
+
     Ok(pb::RelocalizeResponse {
         adapter: Some(convert::adapter_revision(&served[0])),
-        rooms: found
-            .rooms
-            .iter()
-            .take(shown)
-            .map(|room| room_to_wire(room, &served))
-            .collect(),
+        rooms: rooms.collect::<Result<_, _>>()?,
         room_count: served.len() as u32,
         margin: found.margin.is_finite().then_some(found.margin),
         ambiguous: found.ambiguous,
@@ -225,9 +230,23 @@ pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
     served.iter().map(map).collect()
 }
 
-fn room_to_wire(found: &RoomMatch, served: &[Arc<ServedNavigator>]) -> pb::RoomMatch {
+/// A room of the answer; `newest` is the feature of the newest view, if it has one.
+fn room_to_wire(
+    found: &RoomMatch,
+    served: &[Arc<ServedNavigator>],
+    snapshot: &Snapshot,
+    newest: Option<&[f32]>,
+) -> Result<pb::RoomMatch, Error> {
     let served = &served[found.map];
     let room = served.navigator.room();
+
+    // An adapter that was fitted to the room reads it better than the one that tells rooms apart.
+    let source = served.adapter.adapter.source();
+    let localizer = snapshot.room(room.id().as_str())?.localizer(source);
+    let located = match (localizer, newest) {
+        (Some(localizer), Some(feature)) => Some(located_by(localizer, feature, room.id())?),
+        _ => None,
+    };
 
     // The distances of these hits are in standard deviations of frame noise, unlike those of
     // Localize.
@@ -239,14 +258,26 @@ fn room_to_wire(found: &RoomMatch, served: &[Arc<ServedNavigator>]) -> pb::RoomM
         convert::hit_to_wire(&hit, room)
     };
 
-    // The pose and covariance are those of the newest view, read from its nearest frame.
-    let anchor = &found.last.anchor;
-    pb::RoomMatch {
+    // Else the pose and covariance are those of the newest view, read from its nearest frame.
+    let (pose, covariance) = match &located {
+        Some(located) => (located.pose.clone(), located.covariance.clone()),
+        None => {
+            let anchor = &found.last.anchor;
+            let pose = convert::pose_to_wire(&anchor.pose, room.id().as_str());
+            (
+                Some(pose),
+                convert::matrix_to_wire(&anchor.ros_covariance()),
+            )
+        }
+    };
+
+    Ok(pb::RoomMatch {
         room: Some(convert::room_revision(served)),
         distance: found.distance,
         out_of_distribution: found.out_of_distribution,
-        pose: Some(convert::pose_to_wire(&anchor.pose, room.id().as_str())),
-        covariance: convert::matrix_to_wire(&anchor.ros_covariance()),
+        pose,
+        covariance,
         hits: found.last.nearest.iter().map(hit).collect(),
-    }
+        located,
+    })
 }

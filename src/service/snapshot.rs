@@ -53,6 +53,17 @@ pub struct ServedNavigator {
     pub localizer: Option<FittedLocalizer>,
 }
 
+impl ServedRoom {
+    /// The localizer of the adapter that was fitted to this room, if there is one for features of
+    /// this source; the newest of several.
+    pub fn localizer(&self, source: &FeatureSource) -> Option<&FittedLocalizer> {
+        self.navigators
+            .iter()
+            .filter(|served| served.adapter.adapter.source().is_like(source))
+            .find_map(|served| served.localizer.as_ref())
+    }
+}
+
 /// A room's localizer, and the rules that were measured for it.
 pub struct FittedLocalizer {
     /// Reads where a view is from the frame that it resembles most.

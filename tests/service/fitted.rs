@@ -13,7 +13,7 @@ use seese3_core::room::FrameId;
 use seese3_core::training::RoomData;
 use tonic::Code;
 
-use crate::harness::{TestServer, feature, frame, start_on};
+use crate::harness::{TestServer, feature, frame, latent, start_on};
 use crate::support::world::{calibrated, served};
 
 /// The places hall and attic, an adapter of both, and one that goes on from it in the hall.
@@ -126,4 +126,47 @@ async fn a_fitted_adapter_serves_no_other_room() {
 
     let hall = server.client.localize(by_default("hall")).await.unwrap();
     assert_eq!(hall.adapter.unwrap().name, "hall.fitted");
+}
+
+/// Oracle: the promise of the protocol: the room that an adapter was fitted to answers with the pose
+/// that it locates, the other room with that of its nearest frame; a latent has no feature to locate.
+#[tokio::test]
+async fn a_fitted_room_is_relocalised_by_its_own_adapter() {
+    let server = server().await;
+    let (room, features) = served("hall");
+    let ask = |view: Option<pb::View>| pb::RelocalizeRequest {
+        views: vec![view.unwrap()],
+        ..pb::RelocalizeRequest::default()
+    };
+
+    // Noise keeps the view apart from the frame that it resembles.
+    let view: Vec<f32> = features.rows().row(100).iter().map(|x| x + 0.01).collect();
+    let found = server.client.relocalize(ask(feature(view.clone()))).await;
+    let found = found.unwrap();
+
+    let [hall, attic] = found.rooms.as_slice() else {
+        panic!("{found:?}")
+    };
+    assert_eq!(hall.room.as_ref().unwrap().name, "hall");
+    assert!(attic.located.is_none() && attic.pose.is_some());
+
+    let located = hall.located.as_ref().unwrap();
+    assert_eq!(
+        (&hall.pose, &hall.covariance),
+        (&located.pose, &located.covariance)
+    );
+    let alone = server
+        .client
+        .localize(localize("hall", feature(view)))
+        .await;
+    assert_eq!(alone.unwrap().located.as_ref(), Some(located));
+
+    let pose = convert::pose(hall.pose.as_ref().unwrap()).unwrap();
+    let error = PoseError::between(&pose, &room.poses()[100]);
+    assert!(error.translation_m < 0.05, "{error:?}");
+
+    let row = features.rows().row(100).to_vec();
+    let view = latent(calibrated().0.embed_one(&row).unwrap().to_vec());
+    let found = server.client.relocalize(ask(view)).await.unwrap();
+    assert!(found.rooms.iter().all(|room| room.located.is_none()));
 }
