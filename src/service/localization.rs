@@ -6,12 +6,13 @@ use std::sync::Arc;
 use tonic::{Request, Response, Status};
 
 use super::convert;
-use super::snapshot::{FittedLocalizer, ServedNavigator};
+use super::snapshot::ServedNavigator;
 use super::status::view_error;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::localization_service_server::LocalizationService;
 use seese3_core::cancel::Cancellation;
+use seese3_core::fitting::RoomReader;
 use seese3_core::localization::localize;
 use seese3_core::navigation::{Error as E, Source, StepError};
 use seese3_core::room;
@@ -131,21 +132,21 @@ fn answer(
 
 /// Where the camera of a feature is, if the adapter was fitted to the room.
 fn located(served: &ServedNavigator, feature: &[f32]) -> Result<Option<pb::LocatedPose>, Error> {
-    let located = |localizer| located_by(localizer, feature, served.navigator.room().id());
-    served.localizer.as_ref().map(located).transpose()
+    let room = served.navigator.room().id();
+    let located = served.reader.as_ref();
+    located
+        .map(|reader| located_by(reader, feature, room))
+        .transpose()
 }
 
 /// Where the camera of a feature, which was embedded before, is in a room.
 pub(super) fn located_by(
-    fitted: &FittedLocalizer,
+    reader: &RoomReader,
     feature: &[f32],
     room: &room::RoomId,
 ) -> Result<pb::LocatedPose, Error> {
     // The feature fits the adapter's, so that nothing can be wrong with it.
-    let view = fitted
-        .localizer
-        .locate(feature, &fitted.rules)
-        .map_err(|_| Error::Internal)?;
+    let view = reader.locate(feature).map_err(|_| Error::Internal)?;
     let room = room.as_str();
 
     Ok(pb::LocatedPose {

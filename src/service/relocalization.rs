@@ -242,9 +242,9 @@ fn room_to_wire(
 
     // An adapter that was fitted to the room reads it better than the one that tells rooms apart.
     let source = served.adapter.adapter.source();
-    let localizer = snapshot.room(room.id().as_str())?.localizer(source);
-    let located = match (localizer, newest) {
-        (Some(localizer), Some(feature)) => Some(located_by(localizer, feature, room.id())?),
+    let reader = snapshot.room(room.id().as_str())?.reader(source);
+    let located = match (reader, newest) {
+        (Some(reader), Some(feature)) => Some(located_by(reader, feature, room.id())?),
         _ => None,
     };
 

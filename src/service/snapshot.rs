@@ -10,10 +10,10 @@ use super::image_encoder::{self, ImageEncoder, ImageEncoders};
 use super::two_views::TwoViewReader;
 use super::{Error, RunError};
 use crate::store::{RoomFit, Store, StoredAdapter, StoredRoom};
-use seese3_core::adapter::{ErrorStatistics, Network};
+use seese3_core::adapter::{Adapter, ErrorStatistics, Network};
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::FeatureSource;
-use seese3_core::fitting::{Localizer, ReadingRules};
+use seese3_core::fitting::{Localizer, PartRule, ReadingRule, RoomReader};
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Room, RoomId};
 use seese3_core::tracking::Map;
@@ -50,26 +50,25 @@ pub struct ServedNavigator {
     /// What the adapter has seen of this room.
     pub trained_on: TrainedOn,
     /// Locates single views, where the adapter was fitted to these very frames.
-    pub localizer: Option<FittedLocalizer>,
+    pub reader: Option<Arc<RoomReader>>,
 }
 
 impl ServedRoom {
-    /// The localizer of the adapter that was fitted to this room, if there is one for features of
-    /// this source; the newest of several.
-    pub fn localizer(&self, source: &FeatureSource) -> Option<&FittedLocalizer> {
-        self.navigators
-            .iter()
-            .filter(|served| served.adapter.adapter.source().is_like(source))
-            .find_map(|served| served.localizer.as_ref())
+    /// The reader of the adapter that was fitted to this room, if there is one for features of this
+    /// source; that of the newest of several.
+    pub fn reader(&self, source: &FeatureSource) -> Option<&RoomReader> {
+        reader_of(&self.navigators, source).map(Arc::as_ref)
     }
 }
 
-/// A room's localizer, and the rules that were measured for it.
-pub struct FittedLocalizer {
-    /// Reads where a view is from the frame that it resembles most.
-    pub localizer: Localizer,
-    /// How far it is believed.
-    pub rules: ReadingRules,
+fn reader_of<'a>(
+    navigators: &'a [Arc<ServedNavigator>],
+    source: &FeatureSource,
+) -> Option<&'a Arc<RoomReader>> {
+    navigators
+        .iter()
+        .filter(|served| served.adapter.adapter.source().is_like(source))
+        .find_map(|served| served.reader.as_ref())
 }
 
 /// The newest revision of every room and adapter of a store.
@@ -292,18 +291,21 @@ async fn load_room(
             revision,
             features,
         };
-        let localizer = match &adapter.room_fit {
-            Some(fit) if trained_on == TrainedOn::TheseFrames => {
-                Some(fitted_localizer(store, &adapter, fit, &room_data).await?)
-            }
+        let reader = match &adapter.room_fit {
+            Some(fit) if trained_on == TrainedOn::TheseFrames => Some(Arc::new(
+                room_reader(store, &adapter, fit, &room_data).await?,
+            )),
             _ => None,
         };
 
+        // Fitted adapters come first, so that the reader that trackers are to use is known.
+        let tracking_reader = reader_of(&navigators, source);
+
         navigators.push(Arc::new(ServedNavigator {
-            map: map(&navigator),
-            content: content(&navigator),
+            map: map(&navigator, tracking_reader),
+            content: content(&navigator, tracking_reader.map(Arc::as_ref)),
             trained_on,
-            localizer,
+            reader,
             room_revision: revision,
             adapter,
             navigator,
@@ -319,13 +321,13 @@ async fn load_room(
     })
 }
 
-/// The localizer of a fitted adapter, with the adapter that it began from as a second reader.
-async fn fitted_localizer(
+/// The reader of a fitted adapter, with the adapter that it began from as a second one.
+async fn room_reader(
     store: &Store,
     adapter: &StoredAdapter,
     fit: &RoomFit,
     data: &RoomData<'_>,
-) -> Result<FittedLocalizer, RunError> {
+) -> Result<RoomReader, RunError> {
     let base = match &fit.base {
         Some(base) => {
             let loaded = store.load_adapter(&base.name, Some(base.revision)).await;
@@ -350,7 +352,7 @@ async fn fitted_localizer(
             }
         })?;
 
-    Ok(FittedLocalizer {
+    Ok(RoomReader {
         localizer,
         rules: fit.rules.clone(),
     })
@@ -383,7 +385,7 @@ fn by_preference(
 
 /// SHA-256 of the numbers that answers are computed from. Name and revision do not identify a room
 /// or adapter across stores: two stores may use the same ones for different content.
-fn content(navigator: &Navigator) -> [u8; 32] {
+fn content(navigator: &Navigator, reader: Option<&RoomReader>) -> [u8; 32] {
     let mut digest = ContentDigest(Sha256::new());
 
     // Every number enters with all its bits, so that states resume only where the tracker would
@@ -395,11 +397,16 @@ fn content(navigator: &Navigator) -> [u8; 32] {
     digest.numbers(navigator.latents());
 
     let adapter = navigator.adapter();
-    for parameter in adapter.network().parameters() {
-        digest.numbers(&parameter.mapv(f64::from));
+    digest.adapter(adapter);
+
+    if let Some(reader) = reader {
+        for adapter in reader.localizer.adapters() {
+            digest.adapter(adapter);
+        }
+        for rule in reader.rules.rules() {
+            digest.reading_rule(rule);
+        }
     }
-    digest.numbers(&adapter.scale().mean);
-    digest.numbers(&adapter.scale().deviation);
 
     if let Some(error_model) = adapter.error_model() {
         digest.error_statistics(error_model.statistics());
@@ -415,6 +422,32 @@ impl ContentDigest {
     fn numbers<'a>(&mut self, numbers: impl IntoIterator<Item = &'a f64>) {
         for number in numbers {
             self.0.update(number.to_le_bytes());
+        }
+    }
+
+    fn adapter(&mut self, adapter: &Adapter) {
+        for parameter in adapter.network().parameters() {
+            self.numbers(&parameter.mapv(f64::from));
+        }
+        self.numbers(&adapter.scale().mean);
+        self.numbers(&adapter.scale().deviation);
+    }
+
+    fn reading_rule(&mut self, rule: &ReadingRule) {
+        // Destructured with no `..`, so that a new field breaks the build here.
+        let ReadingRule {
+            up_to,
+            translation,
+            rotation,
+            covariance,
+            least_disagreement,
+        } = rule;
+
+        self.numbers([up_to, least_disagreement]);
+        self.numbers(covariance);
+        for PartRule { reader, gain } in [translation, rotation] {
+            self.0.update(reader.name());
+            self.numbers([gain]);
         }
     }
 
@@ -460,15 +493,19 @@ fn log_audit(navigator: &Navigator, adapter: &str) {
 }
 
 /// The map of all frames of a room; none if the adapter is not calibrated. A room that is too small
-/// to track in also gives none, which is logged.
-fn map(navigator: &Arc<Navigator>) -> Option<Arc<Map>> {
+/// to track in also gives none, which is logged. Where an adapter was fitted to the room, its reader
+/// gives the anchors.
+fn map(navigator: &Arc<Navigator>, reader: Option<&Arc<RoomReader>>) -> Option<Arc<Map>> {
     navigator.adapter().error_model()?;
     let frames: Vec<FrameId> = (0..navigator.room().frame_count() as u32)
         .map(FrameId)
         .collect();
 
     match Map::new(navigator.clone(), &frames) {
-        Ok(map) => Some(Arc::new(map)),
+        Ok(map) => Some(Arc::new(match reader {
+            Some(reader) => map.with_pose_reader(reader.clone()),
+            None => map,
+        })),
         Err(error) => {
             tracing::warn!(room = %navigator.room().id(), %error, "the room cannot be tracked in");
             None

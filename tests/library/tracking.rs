@@ -9,11 +9,17 @@ use seese3_core::geometry::{Pose, PoseError, body_twist};
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Frames, Room, RoomId};
 use seese3_core::tracking::{
-    Belief, Map, Observation, State, Status, Tracker, TrackerSettings, Update,
+    Belief, Map, Observation, PoseReader, State, Status, Tracker, TrackerSettings, Update,
 };
 
 /// A tracker in a room of these poses, all of whose even frames are mapped.
 fn tracker(adapter: &Arc<Adapter>, poses: Vec<Pose>, features: &Features) -> Tracker {
+    let map = map(adapter, poses, features);
+    Tracker::new(vec![Arc::new(map)], TrackerSettings::of(adapter)).unwrap()
+}
+
+/// A map of the even frames of a room of these poses.
+fn map(adapter: &Arc<Adapter>, poses: Vec<Pose>, features: &Features) -> Map {
     let room = served("hall").0;
 
     let frames = Frames {
@@ -31,9 +37,7 @@ fn tracker(adapter: &Arc<Adapter>, poses: Vec<Pose>, features: &Features) -> Tra
         Navigator::new(Arc::new(room), features, adapter.clone(), IndexKind::Exact).unwrap();
 
     let mapped: Vec<FrameId> = (0..FRAMES as u32).step_by(2).map(FrameId).collect();
-    let map = Map::new(Arc::new(navigator), &mapped).unwrap();
-
-    Tracker::new(vec![Arc::new(map)], TrackerSettings::of(adapter)).unwrap()
+    Map::new(Arc::new(navigator), &mapped).unwrap()
 }
 
 fn observe(tracker: &Tracker, state: &mut State, features: &Features, row: usize) -> Update {
@@ -46,6 +50,7 @@ fn observe(tracker: &Tracker, state: &mut State, features: &Features, row: usize
         time_ns: row as i64 * 33_000_000,
         sequence: row as u64,
         latent,
+        feature: None,
     };
 
     tracker.observe(state, &observation).unwrap()
@@ -120,6 +125,7 @@ fn odom_never_jumps() {
                     time_ns,
                     sequence,
                     latent,
+                    feature: None,
                 },
             )
             .unwrap();
@@ -171,6 +177,7 @@ fn what_a_gap_hid_is_not_taken_on_trust() {
             time_ns: sequence as i64 * 33_000_000,
             sequence,
             latent: adapter.embed_one(&view.to_vec()).unwrap(),
+            feature: None,
         };
         tracker.observe(state, &observation).unwrap()
     };
@@ -197,4 +204,63 @@ fn what_a_gap_hid_is_not_taken_on_trust() {
     let mut again = in_the_room;
     let update = observe(&tracker, &mut again, &features, 61);
     assert_eq!(update.status, Status::Tracking, "in the room again");
+}
+
+/// A reader that knows where the camera is, to a centimetre and a hundredth of a radian.
+struct Knowing(Vec<Pose>);
+
+impl PoseReader for Knowing {
+    /// The feature's only number is the frame's row.
+    fn read_pose(&self, feature: &[f32]) -> Option<Belief> {
+        let pose = *self.0.get(feature[0] as usize)?;
+        Some(Belief::known(pose, 0.01, 0.01))
+    }
+}
+
+/// Oracle: the reader's own poses and covariance: frames that bring their feature are corrected by it
+/// and reported with its covariance, frames without one by the frame that they match.
+#[test]
+fn the_reader_of_a_room_gives_the_anchors() {
+    let adapter = Arc::new(calibrated().0);
+    let (room, features) = served("hall");
+    let truth = room.poses().to_vec();
+
+    // The map's own poses are off by a metre, so that only the reader can be right.
+    let mut shifted = truth.clone();
+    for pose in &mut shifted {
+        pose.translation.vector.x += 1.0;
+    }
+    let map = map(&adapter, shifted, &features).with_pose_reader(Arc::new(Knowing(truth.clone())));
+    let tracker = Tracker::new(vec![Arc::new(map)], TrackerSettings::of(&adapter)).unwrap();
+
+    let run = |has_feature: bool| {
+        let mut state = tracker.start(None);
+        let mut last = None;
+        for row in (41..101).step_by(2) {
+            let latent = adapter.embed_one(&features.rows().row(row).to_vec());
+            let observation = Observation {
+                time_ns: row as i64 * 33_000_000,
+                sequence: row as u64,
+                latent: latent.unwrap(),
+                feature: has_feature.then(|| vec![row as f32]),
+            };
+            let update = tracker.observe(&mut state, &observation).unwrap();
+            if update.match_used {
+                last = Some((row, update.map_pose.unwrap()));
+            }
+        }
+        last.expect("no match was used")
+    };
+
+    let (row, with) = run(true);
+    let error = PoseError::between(&with.pose, &truth[row]);
+    assert!(error.translation_m < 0.1, "{error:?}");
+    assert_eq!(
+        with.covariance,
+        Belief::known(truth[row], 0.01, 0.01).covariance
+    );
+
+    let (row, without) = run(false);
+    let error = PoseError::between(&without.pose, &truth[row]);
+    assert!(error.translation_m > 0.8, "{error:?}");
 }

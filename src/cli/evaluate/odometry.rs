@@ -46,6 +46,10 @@ pub struct Odometry {
     /// Dead reckoning alone: the map never corrects the pose
     #[arg(long)]
     no_fusion: bool,
+    /// Fit an adapter to each room's mapped frames, from the weights of --adapter, and correct the
+    /// pose by what it reads
+    #[arg(long)]
+    fit: bool,
     /// Write each room's paths to this folder, as TUM and KITTI files: ROOM.truth, ROOM.fused and
     /// ROOM.odom
     #[arg(long)]
@@ -85,7 +89,11 @@ impl Odometry {
         let hold_out = self.hold_out;
         let settings = self.settings(TrackerSettings::of(&adapter));
         let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
-        let protocol = OdometryProtocol { hold_out, settings };
+        let protocol = OdometryProtocol {
+            hold_out,
+            settings,
+            is_fitted: self.fit,
+        };
         let trackers = trackers(&room_data, &adapter, &protocol)?;
 
         // Paths are written as the rooms are done; the first failure is reported at the end.
@@ -121,6 +129,8 @@ impl Odometry {
             hold_out.name(),
             if self.no_fusion {
                 "dead reckoning"
+            } else if self.fit {
+                "fused with what an adapter fitted to the mapped frames reads"
             } else {
                 "fused with places that look alike"
             },

@@ -368,10 +368,15 @@ impl Session {
         let latent = view
             .latent(&adapter.adapter)
             .map_err(|error| view_refused(view_error(&error).within("frame.view")))?;
+        let feature = match view {
+            View::Feature(feature) => Some(feature),
+            View::Latent(_) => None,
+        };
         let observation = Observation {
             time_ns,
             sequence,
             latent,
+            feature,
         };
 
         // Late and duplicate frames are refused too. A refused frame leaves the state as it was.

@@ -72,6 +72,7 @@ fn tracker(adapter: &Arc<Adapter>, data: &RoomData<'_>) -> Result<Tracker, Error
 fn replayed_surprises(tracker: &Tracker, data: &RoomData<'_>) -> Vec<f64> {
     let segment = Segment {
         latents: tracker.maps()[0].navigator().latents(),
+        features: None,
         poses: data.room.poses(),
         frames: &HoldOut::Blocks.tracked(data.room.frame_count()),
     };

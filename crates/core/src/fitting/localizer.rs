@@ -237,6 +237,15 @@ impl Localizer {
         })
     }
 
+    /// The adapters that read motions here: that of other rooms, and the fitted one.
+    pub fn adapters(&self) -> impl Iterator<Item = &Arc<Adapter>> {
+        let readers = [&self.zero_shot, &self.fitted];
+        readers
+            .into_iter()
+            .flatten()
+            .map(|embedded| &embedded.adapter)
+    }
+
     /// The pose of a mapped frame, `world_from_camera`.
     pub fn pose(&self, frame: FrameId) -> &Pose {
         &self.poses[frame.row()]

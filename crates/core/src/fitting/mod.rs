@@ -14,10 +14,12 @@ mod fit;
 mod folds;
 mod localizer;
 mod pairs;
+mod room_reader;
 mod rules;
 
 pub use fit::{FEWEST_MAPPED_FRAMES, FITTED_PRESET, FITTING_EPOCHS, Fitted, fit};
 pub use localizer::{Localizer, LocatedView, Readings};
+pub use room_reader::RoomReader;
 pub use rules::{MotionReader, PartRule, ReadingRule, ReadingRules};
 
 use crate::room::{FrameId, Room};

@@ -25,9 +25,18 @@ pub(super) struct BestMap {
     pub matched: MapMatch,
 }
 
+/// A pose that a view was read to have, to correct the map pose by.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Anchor {
+    pub belief: Belief,
+    /// The covariance of a map pose that was corrected by it, over its own.
+    pub reported_factor: f64,
+}
+
 /// What an anchor did to the map pose.
 pub(super) struct Correction {
-    pub is_applied: bool,
+    /// The anchor, if it was applied.
+    pub applied: Option<Anchor>,
     /// The squared Mahalanobis distance of the anchor from the believed pose, if there was one.
     pub surprise: Option<f64>,
 }
@@ -35,7 +44,7 @@ pub(super) struct Correction {
 impl Correction {
     /// No anchor was tried.
     const NONE: Self = Self {
-        is_applied: false,
+        applied: None,
         surprise: None,
     };
 }
@@ -59,9 +68,28 @@ impl Tracker {
 
         state.frames_since_anchor = 0;
         if view.is_clear {
-            self.correct(state, poses, frame, view)
+            let anchor = self.anchor(frame, view);
+            self.correct(state, poses, frame, view.room, anchor)
         } else {
             Correction::NONE
+        }
+    }
+
+    /// The pose of a view by the reader of its room if there is one and the view certainly shows the
+    /// room, else by the frame that it matches: beyond the mapped part a reader is surer than it
+    /// should be.
+    fn anchor(&self, frame: &Observation, view: &BestMap) -> Anchor {
+        let feature = frame.feature.as_deref().filter(|_| view.matched.is_certain);
+        match self.maps[view.room].pose_by_reader(feature) {
+            // Its covariance was measured on the errors of single views of this room.
+            Some(belief) => Anchor {
+                belief,
+                reported_factor: 1.0,
+            },
+            None => Anchor {
+                belief: view.matched.anchor,
+                reported_factor: self.map_pose_factor,
+            },
         }
     }
 
@@ -73,7 +101,8 @@ impl Tracker {
         state: &mut State,
         poses: &mut Poses,
         frame: &Observation,
-        view: &BestMap,
+        room: usize,
+        given: Anchor,
     ) -> Correction {
         // While a stream is lost no place is a candidate. Frames that miss the room or match
         // several rooms do not come here, so that anchors "in a row" may have such frames between
@@ -86,8 +115,8 @@ impl Tracker {
         // The filter takes the inflated covariance; what is reported is measured with the plain
         // one.
         let anchor = Belief {
-            pose: view.matched.anchor.pose,
-            covariance: view.matched.anchor.covariance * ANCHOR_INFLATION,
+            pose: given.belief.pose,
+            covariance: given.belief.covariance * ANCHOR_INFLATION,
         };
         let surprise_at = |belief: &Belief| {
             belief
@@ -95,21 +124,21 @@ impl Tracker {
                 .map_or(f64::INFINITY, |innovation| innovation.squared_length)
         };
 
-        let believed = poses.map_pose.filter(|_| state.room == Some(view.room));
+        let believed = poses.map_pose.filter(|_| state.room == Some(room));
         let surprise = believed.as_ref().map(surprise_at);
         if let (Some(believed), Some(surprise)) = (believed, surprise)
             && surprise <= GATE
         {
             poses.map_pose = Some(believed.corrected(&anchor));
             return Correction {
-                is_applied: true,
+                applied: Some(given),
                 surprise: Some(surprise),
             };
         }
 
         // The earlier candidate was seen some frames ago: carry it to this frame, then compare.
         let carried = earlier_candidate
-            .filter(|candidate| candidate.room == view.room)
+            .filter(|candidate| candidate.room == room)
             .map(|candidate| self.carried_candidate(candidate, frame));
         let (map_pose, agreeing_anchors) = match carried {
             Some((map_pose, agreeing)) if surprise_at(&map_pose) <= GATE => {
@@ -120,11 +149,11 @@ impl Tracker {
 
         let is_applied = agreeing_anchors >= ANCHORS_TO_AGREE;
         if is_applied {
-            state.room = Some(view.room);
+            state.room = Some(room);
             poses.map_pose = Some(map_pose);
         } else {
             state.candidate = Some(Candidate {
-                room: view.room,
+                room,
                 sequence: frame.sequence,
                 latent: frame.latent.to_vec(),
                 map_pose,
@@ -133,7 +162,7 @@ impl Tracker {
         }
 
         Correction {
-            is_applied,
+            applied: is_applied.then_some(given),
             surprise,
         }
     }
@@ -151,11 +180,11 @@ impl Tracker {
     }
 
     /// A corrected map pose as it is reported: with the covariance of the anchor that corrected it,
-    /// times the factor that calibration found. The filter would combine many anchors into one very
-    /// sure pose, but anchors on the same part of a path err alike.
-    pub(super) fn reported(&self, map_pose: Belief, anchor: &Belief) -> Belief {
+    /// times its factor. The filter would combine many anchors into one very sure pose, but anchors
+    /// on the same part of a path err alike.
+    pub(super) fn reported(map_pose: Belief, anchor: &Anchor) -> Belief {
         Belief {
-            covariance: anchor.covariance * self.map_pose_factor,
+            covariance: anchor.belief.covariance * anchor.reported_factor,
             ..map_pose
         }
     }

@@ -15,6 +15,13 @@ use crate::statistics::median;
 /// How many mapped frames are asked, at most, how far their nearest others are.
 const SAMPLED_FRAMES: usize = 1_000;
 
+/// Reads where a view is in one room better than the adapter that several rooms share.
+pub trait PoseReader: Send + Sync {
+    /// The pose of a view, `world_from_camera`, from its raw feature of shape (d,); none if the
+    /// feature cannot be read.
+    fn read_pose(&self, feature: &[f32]) -> Option<Belief>;
+}
+
 /// The mapped frames of a room under an adapter with an error model.
 pub struct Map {
     navigator: Arc<Navigator>,
@@ -24,6 +31,7 @@ pub struct Map {
     extent_m: f64,
     motion_errors: MotionErrors,
     anchor_factor: f64,
+    pose_reader: Option<Arc<dyn PoseReader>>,
 }
 
 /// How a view matches a map.
@@ -83,7 +91,23 @@ impl Map {
             typical_distance,
             motion_errors,
             anchor_factor,
+            pose_reader: None,
         })
+    }
+
+    /// The same map with a reader of its own room, which gives anchors wherever a frame brings its
+    /// raw feature.
+    #[must_use]
+    pub fn with_pose_reader(self, pose_reader: Arc<dyn PoseReader>) -> Self {
+        Self {
+            pose_reader: Some(pose_reader),
+            ..self
+        }
+    }
+
+    /// The pose of a view by the reader of this room; none without one, or without a feature.
+    pub(super) fn pose_by_reader(&self, feature: Option<&[f32]>) -> Option<Belief> {
+        self.pose_reader.as_ref()?.read_pose(feature?)
     }
 
     /// The room and its adapter.

@@ -23,7 +23,7 @@ mod view;
 pub use anchoring::ANCHORS_TO_AGREE;
 pub use belief::{Belief, Innovation};
 pub use health::{Continuity, FrameEvidence, TrackingHealth};
-pub use map::{Map, MapMatch};
+pub use map::{Map, MapMatch, PoseReader};
 pub use relocalize::{ROOM_RATIO, Relocalization, RoomMatch, relocalize};
 pub use replay::{InitialPose, MapPath, MotionSurprise, Replay, Segment, replay};
 pub use state::{Candidate, Keyframe, LastFrame, Observation, Refusal, State, Update};

@@ -19,6 +19,8 @@ const FOUND_WITHIN_DEG: f64 = 15.0;
 pub struct Segment<'a> {
     /// Latents of the whole recording under the tracker's adapter, row by frame, shape (n, k).
     pub latents: ArrayView2<'a, f64>,
+    /// Raw features of the same frames, shape (n, d), for maps with a [`super::PoseReader`].
+    pub features: Option<ArrayView2<'a, f32>>,
     /// Poses of the whole recording, `world_from_camera`, row by frame.
     pub poses: &'a [Pose],
     /// The frames to replay, in order.
@@ -73,6 +75,9 @@ pub fn replay(
                 time_ns,
                 sequence,
                 latent: segment.latents.row(frame.row()).to_owned(),
+                feature: segment
+                    .features
+                    .map(|features| features.row(frame.row()).to_vec()),
             };
 
             // These are latents of the tracker's own adapter, in order: it refuses none.

@@ -16,6 +16,9 @@ pub struct Observation {
     pub sequence: u64,
     /// Its latent under the tracker's adapter, shape (k,).
     pub latent: Array1<f64>,
+    /// The raw feature of that latent, shape (d,), if it is known: the [`super::PoseReader`] of a map
+    /// reads it.
+    pub feature: Option<Vec<f32>>,
 }
 
 /// Everything that a tracker knows of a stream.

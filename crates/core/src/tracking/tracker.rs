@@ -219,10 +219,10 @@ impl Tracker {
 
         // 4. Correction: every few frames the mapped frame that looks alike is tried as an anchor.
         let correction = self.correct_when_due(state, &mut poses, frame, &best);
-        if correction.is_applied {
+        if let Some(anchor) = &correction.applied {
             poses.reported_pose = poses
                 .map_pose
-                .map(|map_pose| self.reported(map_pose, &best.matched.anchor));
+                .map(|map_pose| Self::reported(map_pose, anchor));
         }
 
         // 5. What is remembered for the next frame.
@@ -234,8 +234,8 @@ impl Tracker {
             .last
             .as_ref()
             .map(|last| mean_velocity(last, frame, &poses.odom));
-        let is_keyframe =
-            correction.is_applied || self.is_keyframe_due(state, frame.sequence, &prediction);
+        let is_keyframe = correction.applied.is_some()
+            || self.is_keyframe_due(state, frame.sequence, &prediction);
         remember(state, frame, &poses, is_keyframe);
 
         // 6. The answer. The status judges the reported pose, but only while the filter still
@@ -256,7 +256,7 @@ impl Tracker {
             out_of_distribution: best.matched.out_of_distribution,
             room: state.room,
             best_match: (best.room, best.matched.nearest[0]),
-            match_used: correction.is_applied,
+            match_used: correction.applied.is_some(),
             surprise: correction.surprise,
             candidate: state.candidate.clone(),
         }

@@ -6,10 +6,12 @@
 
 use std::sync::Arc;
 
+use ndarray::ArrayView2;
 use rayon::prelude::*;
 
 use seese3_core::adapter::Adapter;
 use seese3_core::cancel::Cancellation;
+use seese3_core::fitting::{RoomReader, fit};
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::Room;
 use seese3_core::splits::HoldOut;
@@ -36,11 +38,16 @@ pub struct OdometryProtocol {
     pub hold_out: HoldOut,
     /// Settings of the trackers.
     pub settings: TrackerSettings,
+    /// Whether an adapter is fitted to each room's mapped frames, from the given one's weights, and
+    /// gives the anchors.
+    pub is_fitted: bool,
 }
 
 /// A tracker over one room.
-pub struct TrackedRoom {
+pub struct TrackedRoom<'a> {
     room: Arc<Room>,
+    /// Raw features, row by frame, shape (n, d).
+    features: ArrayView2<'a, f32>,
     map: Arc<Map>,
     tracker: Tracker,
 }
@@ -144,12 +151,12 @@ pub struct Relocalisation {
 ///
 /// # Errors
 /// [`Error`] when a room is too small or the adapter has no error model.
-pub fn trackers(
-    rooms: &[RoomData<'_>],
+pub fn trackers<'a>(
+    rooms: &[RoomData<'a>],
     adapter: &Arc<Adapter>,
     protocol: &OdometryProtocol,
-) -> Result<Vec<TrackedRoom>, Error> {
-    let tracker = |data: &RoomData<'_>| {
+) -> Result<Vec<TrackedRoom<'a>>, Error> {
+    let tracker = |data: &RoomData<'a>| {
         let room = Arc::new(data.room.clone());
         let mapped = protocol.hold_out.mapped(room.frame_count());
         let navigator = Navigator::new(
@@ -160,9 +167,21 @@ pub fn trackers(
         )?;
 
         let what = || format!("room '{}'", room.id());
-        let map = Arc::new(Map::new(Arc::new(navigator), &mapped).within(what)?);
+        let mut map = Map::new(Arc::new(navigator), &mapped).within(what)?;
+        if protocol.is_fitted {
+            let fitted = fit(data, &mapped, Some(adapter), 0, &|_| ()).within(what)?;
+            let reader = RoomReader::new(data, &mapped, Some(adapter.clone()), &fitted);
+            map = map.with_pose_reader(Arc::new(reader.within(what)?));
+        }
+
+        let map = Arc::new(map);
         let tracker = Tracker::new(vec![map.clone()], protocol.settings).within(what)?;
-        Ok(TrackedRoom { room, map, tracker })
+        Ok(TrackedRoom {
+            room,
+            features: data.features.rows(),
+            map,
+            tracker,
+        })
     };
 
     rooms.iter().map(tracker).collect()
@@ -173,11 +192,11 @@ pub fn trackers(
 /// # Errors
 /// [`Error`] when a room's path cannot be compared with the true one.
 pub fn evaluate(
-    rooms: &[TrackedRoom],
+    rooms: &[TrackedRoom<'_>],
     hold_out: HoldOut,
     done: &(dyn Fn(&RoomOdometry, &Replay) + Sync),
 ) -> Result<Vec<RoomOdometry>, Error> {
-    let one = |room: &TrackedRoom| {
+    let one = |room: &TrackedRoom<'_>| {
         let own = own_replay(room, hold_out, InitialPose::Given);
         let found = room_odometry(room, rooms, hold_out, &own)?;
         done(&found, &own);
@@ -191,10 +210,13 @@ pub fn evaluate(
 ///
 /// # Errors
 /// [`Error`] of matching the views.
-pub fn relocalisation(rooms: &[TrackedRoom], hold_out: HoldOut) -> Result<Relocalisation, Error> {
+pub fn relocalisation(
+    rooms: &[TrackedRoom<'_>],
+    hold_out: HoldOut,
+) -> Result<Relocalisation, Error> {
     let maps: Vec<Arc<Map>> = rooms.iter().map(|room| room.map.clone()).collect();
 
-    let of_room = |(place, room): (usize, &TrackedRoom)| {
+    let of_room = |(place, room): (usize, &TrackedRoom<'_>)| {
         let mut found = Relocalisation::default();
         let tracked = hold_out.tracked(room.room.frame_count());
 
@@ -230,8 +252,8 @@ pub fn relocalisation(rooms: &[TrackedRoom], hold_out: HoldOut) -> Result<Reloca
 }
 
 fn room_odometry(
-    room: &TrackedRoom,
-    all: &[TrackedRoom],
+    room: &TrackedRoom<'_>,
+    all: &[TrackedRoom<'_>],
     hold_out: HoldOut,
     own: &Replay,
 ) -> Result<RoomOdometry, Error> {
@@ -296,9 +318,10 @@ fn path_errors(estimate: &Trajectory, reference: &Trajectory) -> Result<PathErro
 }
 
 /// The tracked frames of a room, replayed through its own tracker.
-fn own_replay(room: &TrackedRoom, hold_out: HoldOut, initial_pose: InitialPose) -> Replay {
+fn own_replay(room: &TrackedRoom<'_>, hold_out: HoldOut, initial_pose: InitialPose) -> Replay {
     let segment = Segment {
         latents: room.map.navigator().latents(),
+        features: Some(room.features),
         poses: room.room.poses(),
         frames: &hold_out.tracked(room.room.frame_count()),
     };
@@ -309,7 +332,11 @@ fn own_replay(room: &TrackedRoom, hold_out: HoldOut, initial_pose: InitialPose) 
 /// Frames of every other room, played to a room's tracker: as the beginning of a stream, or after
 /// the last frames that the hold-out tracks in the room itself. A tracker that knows when it is
 /// lost answers LOST to all of them.
-fn lost_frames(room: &TrackedRoom, all: &[TrackedRoom], own: Option<HoldOut>) -> LostFrames {
+fn lost_frames(
+    room: &TrackedRoom<'_>,
+    all: &[TrackedRoom<'_>],
+    own: Option<HoldOut>,
+) -> LostFrames {
     let own_frames = own.map(|hold_out| {
         let mut frames = hold_out.tracked(room.room.frame_count());
         frames.split_off(frames.len().saturating_sub(OTHER_ROOM_FRAMES))
@@ -321,6 +348,7 @@ fn lost_frames(room: &TrackedRoom, all: &[TrackedRoom], own: Option<HoldOut>) ->
         frames.truncate(OTHER_ROOM_FRAMES);
         let theirs = Segment {
             latents: other.map.navigator().latents(),
+            features: Some(other.features),
             poses: other.room.poses(),
             frames: &frames,
         };
@@ -330,6 +358,7 @@ fn lost_frames(room: &TrackedRoom, all: &[TrackedRoom], own: Option<HoldOut>) ->
             Some(own_frames) => {
                 let ours = Segment {
                     latents: room.map.navigator().latents(),
+                    features: Some(room.features),
                     poses: room.room.poses(),
                     frames: own_frames,
                 };
