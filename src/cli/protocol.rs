@@ -270,7 +270,7 @@ impl ClosedSet for SplitChoice {
         match self {
             Self::One(split) => split.help(),
             Self::Folds => {
-                "Each contiguous fifth of the frames tests once, by adapters that the other four trained; the test pairs of all five are scored together"
+                "Each contiguous fifth of the frames tests once, by adapters that the other four trained; the test pairs of all five are scored together. Of commands that train one adapter for each split: probe, sweep layers, sweep formulations"
             }
         }
     }

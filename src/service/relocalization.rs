@@ -258,8 +258,12 @@ fn room_to_wire(
         convert::hit_to_wire(&hit, room)
     };
 
-    // Else the pose and covariance are those of the newest view, read from its nearest frame.
-    let (pose, covariance) = match &located {
+    // It is believed where the views look like the room. Else the pose and covariance are those of the
+    // newest view, read from its nearest frame.
+    let believed = located
+        .as_ref()
+        .filter(|_| found.out_of_distribution <= 1.0);
+    let (pose, covariance) = match believed {
         Some(located) => (located.pose.clone(), located.covariance.clone()),
         None => {
             let anchor = &found.last.anchor;

@@ -80,6 +80,11 @@ impl Adapters {
         let (part, parts) = self.shard()?;
         self.protocol.needs_test_pairs()?;
         self.protocol.leaves_to_the_grid()?;
+        ensure!(
+            self.protocol.splits().len() == 1,
+            "--split folds: the tables of this sweep take the best run of a room, which would be its easiest fold; take one \
+             of fold1 to fold5, or `seese3 probe --split folds`"
+        );
         ensure!(self.sample != Some(0), "--sample must be at least 1");
 
         let store = Store::open(&self.store)?;

@@ -66,7 +66,7 @@ pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<Bet
 
     claims.push(Claim {
         claim: "ours: the calibrated navigator hits more often than inverse Poincaré in rooms never seen",
-        verdict: Verdict::of_telling(&navigator_wins),
+        verdict: Verdict::of_intervals(&navigator_wins),
         found: format!(
             "both differences' intervals are above zero: {}",
             count_words(&navigator_wins, "feature sets")
@@ -75,7 +75,7 @@ pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<Bet
 
     claims.push(Claim {
         claim: "ours: preset steady reads motion better than paper-range in rooms never seen",
-        verdict: Verdict::of_telling(&recipe_wins),
+        verdict: Verdict::of_intervals(&recipe_wins),
         found: format!(
             "the interval of the difference of clipped R² is above zero: {}",
             count_words(&recipe_wins, "feature sets")

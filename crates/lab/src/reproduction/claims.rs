@@ -25,7 +25,7 @@ pub enum Verdict {
     Contradicted,
     /// The claim holds for some feature sets or rooms and not for others.
     Mixed,
-    /// No case could have come out otherwise: the simplest answers fail there too.
+    /// No case tells: the simplest answers fail there too, or every interval holds the limit.
     CannotTell,
     /// There was no case to test the claim on.
     Untested,
@@ -53,6 +53,15 @@ impl Verdict {
         Self::of(&telling)
     }
 
+    /// The verdict over cases that are told by intervals: `None` is an interval that holds the limit.
+    /// Only where every interval tells the same is a claim confirmed or contradicted.
+    pub fn of_intervals(cases: &[Option<bool>]) -> Self {
+        match Self::of_telling(cases) {
+            Self::Confirmed | Self::Contradicted if cases.contains(&None) => Self::Mixed,
+            verdict => verdict,
+        }
+    }
+
     fn word(self) -> &'static str {
         match self {
             Self::Confirmed => "confirmed",
@@ -64,9 +73,15 @@ impl Verdict {
     }
 }
 
+/// The fewest rooms whose resampled means say something: five of the same sign happen by chance in
+/// one of sixteen cases.
+const FEWEST_ROOMS: usize = 6;
+
 /// Whether a mean over rooms is above zero, if its interval can tell.
 pub fn is_above_zero(mean: &RoomMean) -> Option<bool> {
-    if mean.low > 0.0 {
+    if mean.rooms < FEWEST_ROOMS {
+        None
+    } else if mean.low > 0.0 {
         Some(true)
     } else if mean.high < 0.0 {
         Some(false)
@@ -160,6 +175,13 @@ mod tests {
         assert_eq!(word(&[Some(false), None]), "contradicted");
         assert_eq!(word(&[Some(false), Some(true)]), "mixed");
         assert_eq!(word(&[None, None]), "cannot be told here");
+
+        let word = |cases: &[Option<bool>]| Verdict::of_intervals(cases).word();
+        assert_eq!(word(&[Some(true), None]), "mixed");
+        assert_eq!(word(&[Some(true), Some(true)]), "confirmed");
+        assert_eq!(word(&[None]), "cannot be told here");
+
+        let word = |cases: &[Option<bool>]| Verdict::of_telling(cases).word();
         assert_eq!(word(&[]), "not tested");
 
         assert_eq!(

@@ -153,7 +153,7 @@ pub fn section(
 
     claims.push(Claim {
         claim: "zero-shot navigation beats Identity in most rooms never seen (Hit@0.1)",
-        verdict: Verdict::of_telling(&zero_shot),
+        verdict: Verdict::of_intervals(&zero_shot),
         found: format!(
             "Wilson's interval of the share of rooms is above one half: {}",
             count_words(&zero_shot, "feature sets")
@@ -162,7 +162,7 @@ pub fn section(
 
     claims.push(Claim {
         claim: "refitting the linear step in the room itself does better than zero-shot",
-        verdict: Verdict::of_telling(&refitted),
+        verdict: Verdict::of_intervals(&refitted),
         found: format!(
             "the interval of the difference in Hit@0.1 of the z-scored refit, in sample, is above zero: {}",
             count_words(&refitted, "feature sets")
@@ -171,7 +171,7 @@ pub fn section(
 
     claims.push(Claim {
         claim: "more training rooms transfer better, without a plateau",
-        verdict: Verdict::of_telling(&grows),
+        verdict: Verdict::of_intervals(&grows),
         found: format!(
             "the interval of the difference in Hit@0.1 of all rooms over the fewest is above zero: {}",
             count_words(&grows, "feature sets")

@@ -77,7 +77,9 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<SettingsRecord>, Error>
         row.extend(of_dim.iter().map(|point| format!("{:.2}", point.r2)));
         rows.push(row);
     }
-    section.text("Overall R² by columns of the latent and learning rate, one seed:");
+    section.text(
+        "Overall R² by columns of the latent and learning rate, one seed; NaN where the training failed:",
+    );
     section.table(rows);
 
     section.text(format!(
@@ -132,7 +134,8 @@ fn grid(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Result<Vec<GridRecord
             points.push(GridRecord {
                 geo_dim,
                 learning_rate,
-                r2: scores(set, &plan)?.overall,
+                // A point of the grid whose training diverges has no score, and ends nothing.
+                r2: scores(set, &plan).map_or(f64::NAN, |scores| scores.overall),
             });
         }
     }
