@@ -165,13 +165,12 @@ impl Adapters {
 
     /// Prints the tables of this grid, and the rooms without scores.
     fn say_summary(&self, rows: &[SweepRow]) -> anyhow::Result<()> {
-        let plans = self.protocol.plans(0)?;
-        let base = &plans[0];
+        let base = self.protocol.plan(0)?;
         say(format_args!(
             "preset {} with {} epochs, split {}, stride {}; of each room the best run counts, chosen by its test score:",
             base.preset.name(),
             base.config.epochs,
-            self.protocol.split_name(),
+            base.split,
             base.stride
         ));
 
@@ -254,30 +253,29 @@ impl Adapters {
         Ok(tasks)
     }
 
-    /// The plans of every point of the grid with every seed, under every split.
+    /// The plans of every point of the grid with every seed.
     fn plans(&self, grid: &[(usize, usize, f64, Loss)]) -> anyhow::Result<Vec<TrainingPlan>> {
+        let base = self.protocol.plan(0)?;
         let mut plans = Vec::new();
-        for base in self.protocol.plans(0)? {
-            for &(latent, charts, learning_rate, loss) in grid {
-                for seed in 0..self.seeds {
-                    let config = TrainConfig {
-                        latent,
-                        charts,
-                        learning_rate,
-                        loss,
-                        seed,
-                        ..base.config.clone()
-                    };
-                    let plan = TrainingPlan {
-                        config,
-                        ..base.clone()
-                    };
+        for &(latent, charts, learning_rate, loss) in grid {
+            for seed in 0..self.seeds {
+                let config = TrainConfig {
+                    latent,
+                    charts,
+                    learning_rate,
+                    loss,
+                    seed,
+                    ..base.config.clone()
+                };
+                let plan = TrainingPlan {
+                    config,
+                    ..base.clone()
+                };
 
-                    // All settings are checked before the first run starts, not hours into the
-                    // sweep.
-                    plan.check().context("the grid")?;
-                    plans.push(plan);
-                }
+                // All settings are checked before the first run starts, not hours into the
+                // sweep.
+                plan.check().context("the grid")?;
+                plans.push(plan);
             }
         }
 

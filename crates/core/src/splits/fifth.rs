@@ -4,12 +4,16 @@ use crate::room::FrameId;
 
 /// A contiguous fifth of a recording's frames: frames ⌊kN/5⌋ to ⌊(k+1)N/5⌋ − 1 of N, k from 0 to 4.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[allow(missing_docs, reason = "the variants are numbered")]
 pub enum Fifth {
+    /// k = 0.
     First,
+    /// k = 1.
     Second,
+    /// k = 2.
     Third,
+    /// k = 3.
     Fourth,
+    /// k = 4.
     Last,
 }
 

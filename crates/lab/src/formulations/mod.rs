@@ -17,10 +17,11 @@ pub use difference_input::DifferenceInput;
 pub use geodesic_head::GeodesicHead;
 pub use world_pose::{AbsolutePose, UnanchoredMotion, WorldPose};
 
+use nalgebra::Vector6;
 use ndarray::ArrayView2;
 
 use seese3_core::adapter::building_blocks::{Seeded, fit};
-use seese3_core::adapter::{EpochProgress, Objective, Samples, TrainConfig, Widths};
+use seese3_core::adapter::{EpochProgress, Objective, Samples, TargetScale, TrainConfig, Widths};
 use seese3_core::geometry::{Pose, Twist, log};
 use seese3_core::motion_scores::ReadMotions;
 use seese3_core::splits::Pair;
@@ -121,6 +122,7 @@ pub fn train_formulation(
 
     let mut run = Run {
         room_data,
+        plan,
         tests: &tests,
         samples: &samples,
         config,
@@ -171,11 +173,10 @@ pub fn read_by_adapter(
 ) -> Result<(Vec<ReadMotions>, u64), training::Error> {
     let (adapter, record) = training::train_adapter(room_data, plan, progress)?;
 
-    let mean = &adapter.scale().mean;
     let read = |(data, pairs): (&RoomData<'_>, &Vec<Pair>)| {
         let truth = motions(data.room.poses(), pairs);
         let read = predictions(&adapter, data.features.rows(), pairs)?;
-        Ok(ReadMotions::new(truth, read, mean))
+        Ok(ReadMotions::new(truth, read, &mean_motion(data, plan)?))
     };
     let tests = test_pairs(room_data, plan)?;
     let read = room_data.iter().zip(&tests).map(read);
@@ -184,6 +185,13 @@ pub fn read_by_adapter(
         read.collect::<Result<_, training::Error>>()?,
         record.optimiser_steps(),
     ))
+}
+
+/// The mean motion of a room's training pairs at the tested stride. An adapter's own μ is another
+/// number where it learned from other strides, and zero where it was made to pass through zero.
+fn mean_motion(data: &RoomData<'_>, plan: &TrainingPlan) -> Result<Vector6<f64>, training::Error> {
+    let training = plan.split.train_pairs(data.room.timeline(), plan.stride)?;
+    Ok(TargetScale::of(&motions(data.room.poses(), &training)).mean)
 }
 
 /// The two ends of pairs, as a formulation sees them.
@@ -196,6 +204,7 @@ pub struct Ends<'a> {
 
 struct Run<'a> {
     room_data: &'a [RoomData<'a>],
+    plan: &'a TrainingPlan,
     tests: &'a [Vec<Pair>],
     samples: &'a Samples<f32>,
     config: &'a TrainConfig,
@@ -210,7 +219,6 @@ impl Run<'_> {
         predict: impl Fn(&N, Ends<'_>) -> Vec<Twist>,
     ) -> Result<Vec<ReadMotions>, training::Error> {
         let network = fit(self.samples, start, self.config, random, progress)?;
-        let mean = self.samples.scale().mean;
         let read = |(data, pairs): (&RoomData<'_>, &Vec<Pair>)| {
             let rows = |end: fn(&Pair) -> usize| {
                 let rows: Vec<usize> = pairs.iter().map(end).collect();
@@ -230,10 +238,11 @@ impl Run<'_> {
             };
 
             let truth = motions(data.room.poses(), pairs);
-            ReadMotions::new(truth, predict(&network, ends), &mean)
+            let mean = mean_motion(data, self.plan)?;
+            Ok(ReadMotions::new(truth, predict(&network, ends), &mean))
         };
 
-        Ok(self.room_data.iter().zip(self.tests).map(read).collect())
+        self.room_data.iter().zip(self.tests).map(read).collect()
     }
 }
 
