@@ -130,6 +130,11 @@ mod tests {
         let truth = ndarray::array![[-1.0, -1.0], [2.0, -1.0], [-1.0, 2.0]];
         let rows = ndarray::array![[-2.0, -2.0], [-2.0, 4.0], [4.0, -2.0]];
         assert!(off(&truth, &laid_over(&truth, &rows)) < 1e-9);
+
+        // Turned by a quarter and doubled alone: unlike a mirror, that is not its own inverse.
+        let rows = ndarray::array![[2.0, -2.0], [2.0, 4.0], [-4.0, -2.0]];
+        assert!(off(&truth, &laid_over(&truth, &rows)) < 1e-9);
+
         assert!((off(&truth, &Array2::zeros((3, 2))) - 2.0).abs() < 1e-12);
     }
 
