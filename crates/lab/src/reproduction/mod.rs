@@ -165,6 +165,17 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
     }
 
     // Every set holds the same rooms, so the first one stands for all.
+    if let Some(set) = given.sets.first() {
+        let Options {
+            stride, strides, ..
+        } = &given.options;
+        has_pairs_in_every_fold(
+            &set.in_room,
+            "--in-room",
+            &[&strides[..], &[*stride]].concat(),
+        )?;
+        has_pairs_in_every_fold(&set.test, "--test", &[*stride])?;
+    }
     let rooms = given.sets.first().map_or(0, |set| set.train.len());
     let is_out_of_range = |size: &&usize| **size == 0 || **size > rooms;
     if let Some(size) = given.options.sizes.iter().find(is_out_of_range) {
@@ -178,6 +189,29 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
         return Err(Error::Input(format!(
             "--calibration-rooms must leave rooms to train on: {calibration_rooms} of {rooms} were set aside"
         )));
+    }
+
+    Ok(())
+}
+
+/// Refuses a recording that is too short to be cut into folds at one of the strides.
+fn has_pairs_in_every_fold(
+    rooms: &[RoomData<'_>],
+    option: &str,
+    strides: &[u32],
+) -> Result<(), Error> {
+    for data in rooms {
+        let timeline = data.room.timeline();
+        for &stride in strides {
+            for split in Split::FOLDS {
+                let pairs = split
+                    .train_pairs(timeline, stride)
+                    .and_then(|_| split.test_pairs(timeline, stride));
+                pairs.map_err(|error| {
+                    Error::Input(format!("{option}: room '{}': {error}", data.room.id()))
+                })?;
+            }
+        }
     }
 
     Ok(())
