@@ -9,6 +9,10 @@ test:
 large:
     cargo test --workspace --features full -- --ignored
 
+# The long form of what the tests show in short: a thousand reloads under load.
+soak:
+    SEESE3_RELOADS=1000 cargo test --release --test service swapped
+
 # What differs without the features: a model is answered with the line that builds them in; and the server builds without
 # the laboratory.
 lean:

@@ -20,7 +20,7 @@ pub struct Server {
     /// The server's address, HOST:PORT
     #[arg(long, env = "SEESE3_SERVER", default_value = "127.0.0.1:50051")]
     server: String,
-    /// Deadline of each call, seconds, 1 to 86400; streams (`track`) have none
+    /// Deadline of each call, seconds, 1 to 86400; of a stream (`track`) only until it is open
     #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     deadline: u64,
 }

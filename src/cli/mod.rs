@@ -16,6 +16,7 @@ mod export;
 mod fit;
 mod health;
 mod import;
+mod log;
 mod named;
 #[cfg(feature = "lab")]
 mod probe;
@@ -184,19 +185,36 @@ fn check_writable(path: &std::path::Path) -> anyhow::Result<()> {
     }
 }
 
-/// Writes a file atomically: readers see either the old file or the complete new one.
+/// Writes a file atomically: readers see either the old file or the complete new one. What is no
+/// regular file, such as a device or a pipe, is written into and never replaced.
 fn write_file(path: &std::path::Path, content: &[u8]) -> anyhow::Result<()> {
     use anyhow::Context;
 
+    let failed = || format!("{} cannot be written", path.display());
+
+    // A symbolic link stays, and what it points to is replaced.
+    let target = std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+    if std::fs::metadata(&target).is_ok_and(|found| !found.is_file()) {
+        return std::fs::OpenOptions::new()
+            .write(true)
+            .open(&target)
+            .and_then(|mut file| std::io::Write::write_all(&mut file, content))
+            .with_context(failed);
+    }
+
     // The content goes into a neighbouring file first: renaming within one folder replaces the
     // target in a single step.
-    let mut partial = path.as_os_str().to_owned();
+    let mut partial = target.as_os_str().to_owned();
     partial.push(".partial");
     let partial = std::path::PathBuf::from(partial);
-    std::fs::write(&partial, content)
-        .with_context(|| format!("{} cannot be written", path.display()))?;
 
-    std::fs::rename(&partial, path).with_context(|| format!("{} cannot be written", path.display()))
+    let written =
+        std::fs::write(&partial, content).and_then(|()| std::fs::rename(&partial, &target));
+    if written.is_err() {
+        // Half a file is of no use, and on a full disk it takes what space there is.
+        let _ = std::fs::remove_file(&partial);
+    }
+    written.with_context(failed)
 }
 
 /// Writes indented JSON, with a newline at the end.

@@ -1,18 +1,19 @@
 //! `seese3 serve`: answers over gRPC until SIGTERM or Ctrl-C.
 
-use std::io::IsTerminal;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
-use tracing_subscriber::fmt::format::FmtSpan;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 use tokio::net::TcpListener;
+use tokio::sync::Notify;
 
 use super::encoder::RuntimeName;
+use super::log::{LogFormat, start_log};
 use super::say;
 use crate::encoder::{Bounds, Runtime};
-use crate::service::{Config, ImageEncoders, TokenKey, run, shutdown_signal};
+use crate::service::{Config, ImageEncoders, Reload, TokenKey, run, shutdown_signal};
 use crate::store::Store;
 use seese3_core::index::HnswParameters;
 use seese3_core::navigation::{IndexKind, Limits};
@@ -47,20 +48,21 @@ pub struct Serve {
     /// Path of the shared library of onnxruntime
     #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
     library: Option<std::path::PathBuf>,
-    /// Largest accepted image, pixels after decoding
-    #[arg(long, env = "SEESE3_MAX_IMAGE_PIXELS", default_value_t = 16_000_000)]
+    /// Largest accepted image, 1 to 1000000000 pixels after decoding
+    #[arg(long, env = "SEESE3_MAX_IMAGE_PIXELS", default_value_t = 16_000_000, value_parser = clap::value_parser!(u64).range(1..=1_000_000_000))]
     max_image_pixels: u64,
     /// Largest number of steps in one navigation
-    #[arg(long, env = "SEESE3_MAX_STEPS", default_value_t = Limits::default().steps)]
+    #[arg(long, env = "SEESE3_MAX_STEPS", default_value_t = Limits::default().steps, value_parser = clap::value_parser!(u32).range(1..))]
     max_steps: u32,
     /// Largest number of frames returned for one step or one localisation
-    #[arg(long, env = "SEESE3_MAX_HITS", default_value_t = Limits::default().hits)]
+    #[arg(long, env = "SEESE3_MAX_HITS", default_value_t = Limits::default().hits, value_parser = clap::value_parser!(u32).range(1..))]
     max_hits: u32,
     /// Largest number of frames in one answer (steps times frames per step)
-    #[arg(long, env = "SEESE3_MAX_HITS_IN_ALL", default_value_t = Limits::default().hits_in_all)]
+    #[arg(long, env = "SEESE3_MAX_HITS_IN_ALL", default_value_t = Limits::default().hits_in_all, value_parser = clap::value_parser!(u64).range(1..))]
     max_hits_in_all: u64,
-    /// Largest message accepted from a client, bytes; also the size limit of an encoded image
-    #[arg(long, env = "SEESE3_MAX_MESSAGE_BYTES", default_value_t = Config::default().message_bytes)]
+    /// Largest message accepted from a client, 1024 to 1073741824 bytes; also the size limit of an
+    /// encoded image
+    #[arg(long, env = "SEESE3_MAX_MESSAGE_BYTES", default_value_t = Config::default().message_bytes, value_parser = bounded(1_024, 1 << 30))]
     max_message_bytes: usize,
     /// Time limit of a request, seconds, 1 to 86400, whatever deadline the client sets
     #[arg(long, env = "SEESE3_MAX_REQUEST_SECONDS", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=86_400))]
@@ -68,8 +70,13 @@ pub struct Serve {
     /// Time that running requests get to finish after SIGTERM or Ctrl-C, seconds, 0 to 86400
     #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = 10, value_parser = clap::value_parser!(u64).range(0..=86_400))]
     drain_seconds: u64,
-    /// Largest number of tracking streams at a time; one more is refused
-    #[arg(long, env = "SEESE3_MAX_STREAMS", default_value_t = Config::default().streams)]
+    /// Seconds between two looks for changes of the store, 0 to 86400; new revisions are then served
+    /// without a restart. 0 looks only when the process gets SIGHUP, which also tries again what was
+    /// refused
+    #[arg(long, env = "SEESE3_RELOAD_SECONDS", default_value_t = 5, value_parser = clap::value_parser!(u64).range(0..=86_400))]
+    reload_seconds: u64,
+    /// Largest number of tracking streams at a time, 1 to 1000000; one more is refused
+    #[arg(long, env = "SEESE3_MAX_STREAMS", default_value_t = Config::default().streams, value_parser = bounded(1, 1_000_000))]
     max_streams: usize,
     /// File with a secret of at least 16 bytes that signs the resume tokens of tracking streams.
     /// Servers with the same secret can continue each other's streams; if omitted, the key is
@@ -96,23 +103,90 @@ enum IndexName {
     Hnsw,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum LogFormat {
-    Text,
-    Json,
+/// Parses a count that must lie in a range.
+fn bounded(least: u64, most: u64) -> clap::builder::RangedU64ValueParser<usize> {
+    clap::builder::RangedU64ValueParser::new().range(least..=most)
 }
 
 impl Serve {
     pub async fn run(self) -> anyhow::Result<()> {
-        start_log(self.log_format);
+        let log = start_log(self.log_format);
         let store = Store::open(&self.store)?;
+        let config = self.config()?;
+
+        // The port is opened before the store is loaded: health checks are answered at once,
+        // NOT_SERVING until everything is loaded.
+        let listener = TcpListener::bind(&self.listen)
+            .await
+            .with_context(|| format!("cannot listen on {}", self.listen))?;
+
+        // With port 0 the system chose the port; the line on standard output tells scripts which
+        // one.
+        let address = listener
+            .local_addr()
+            .context("the listener has no address")?;
+        say(format_args!("listening on {address}"));
+
+        let (asked, again) = tokio::sync::oneshot::channel();
+        let stopping = async move {
+            shutdown_signal().await;
+            // An error means that the server ended by itself.
+            let _ = asked.send(());
+        };
+        let signalled_twice = async move {
+            match again.await {
+                Ok(()) => shutdown_signal().await,
+                Err(_) => std::future::pending().await,
+            }
+        };
+
+        tokio::select! {
+            ended = run(listener, store, config, stopping) => ended?,
+            // Whoever signals twice does not want to wait for requests in flight.
+            () = signalled_twice => bail!("a second signal came: requests in flight were given up"),
+        }
+
+        match log.losses().count() {
+            0 => say("stopped"),
+            lost => say(format_args!("stopped; {lost} lines of the log were lost")),
+        }
+
+        Ok(())
+    }
+}
+
+/// Notified whenever the process gets SIGHUP.
+fn reload_on_hangup() -> Arc<Notify> {
+    let asked = Arc::new(Notify::new());
+
+    #[cfg(unix)]
+    {
+        use tokio::signal::unix::{SignalKind, signal};
+
+        let asked = asked.clone();
+        tokio::spawn(async move {
+            // Where the handler cannot be installed, the server still looks from time to time.
+            let Ok(mut hangup) = signal(SignalKind::hangup()) else {
+                return;
+            };
+            while hangup.recv().await.is_some() {
+                asked.notify_one();
+            }
+        });
+    }
+
+    asked
+}
+
+impl Serve {
+    fn config(&self) -> anyhow::Result<Config> {
         let defaults = Config::default();
 
         // One number bounds both the requests computed at a time and the threads of an
         // onnxruntime session.
         let threads = self.threads.map_or(defaults.threads, usize::from);
 
-        let config = Config {
+        Ok(Config {
             index: match self.index {
                 IndexName::Exact => IndexKind::Exact,
                 IndexName::Hnsw => IndexKind::Hnsw(HnswParameters::default()),
@@ -145,30 +219,14 @@ impl Serve {
             streams: self.max_streams,
             token_key: self.token_key()?,
             drain: Duration::from_secs(self.drain_seconds),
+            reload: Reload {
+                every: (self.reload_seconds > 0).then(|| Duration::from_secs(self.reload_seconds)),
+                asked: reload_on_hangup(),
+            },
             ..defaults
-        };
-
-        // The port is opened before the store is loaded: health checks are answered at once,
-        // NOT_SERVING until everything is loaded.
-        let listener = TcpListener::bind(&self.listen)
-            .await
-            .with_context(|| format!("cannot listen on {}", self.listen))?;
-
-        // With port 0 the system chose the port; the line on standard output tells scripts which
-        // one.
-        let address = listener
-            .local_addr()
-            .context("the listener has no address")?;
-        say(format_args!("listening on {address}"));
-
-        run(listener, store, config, shutdown_signal()).await?;
-        say("stopped");
-
-        Ok(())
+        })
     }
-}
 
-impl Serve {
     fn token_key(&self) -> anyhow::Result<TokenKey> {
         let Some(file) = &self.token_key_file else {
             return Ok(TokenKey::random());
@@ -178,21 +236,5 @@ impl Serve {
 
         TokenKey::new(&secret)
             .map_err(|problem| anyhow::anyhow!("--token-key-file: {} {problem}", file.display()))
-    }
-}
-
-fn start_log(format: LogFormat) {
-    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,hnsw_rs=warn"));
-    let log = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        // A request is logged once, when its span closes.
-        .with_span_events(FmtSpan::CLOSE)
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal());
-
-    match format {
-        LogFormat::Text => log.init(),
-        LogFormat::Json => log.json().flatten_event(true).init(),
     }
 }

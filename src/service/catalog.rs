@@ -30,7 +30,7 @@ impl CatalogService for Handlers {
 
         let snapshot = self.snapshot()?;
         let (page, next_page_token) = page(snapshot.rooms(), page_size, &page_token)?;
-        let rooms = page.into_iter().map(room).collect();
+        let rooms = page.into_iter().map(|served| room(served)).collect();
 
         Ok(Response::new(pb::ListRoomsResponse {
             rooms,

@@ -11,6 +11,7 @@ use tracing::Instrument;
 
 use super::convert;
 use super::snapshot::ServedNavigator;
+use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::evaluation_service_server::EvaluationService;
@@ -56,7 +57,7 @@ impl EvaluationService for Handlers {
 
         let answer = self
             .workers
-            .run(budget, move |cancel| {
+            .run(Lane::Long, budget, move |cancel| {
                 score(&snapshot, request, most, cancel)
             })
             .await?;
@@ -96,7 +97,7 @@ impl Handlers {
 
         // If the caller closes the stream, `run` is dropped, which cancels the computation.
         let finished = tokio::select! {
-            finished = self.workers.run(budget, work) => finished,
+            finished = self.workers.run(Lane::Long, budget, work) => finished,
             () = heard.closed() => return,
         };
 

@@ -38,18 +38,25 @@ pub fn service(phase: watch::Receiver<Phase>) -> HealthServer<HealthOf> {
 }
 
 /// The status of the service or room `name`; none if the name is unknown. Rooms are unknown until
-/// the store is loaded.
+/// the store is loaded; one that is in the store and cannot be served is NOT_SERVING.
 fn status(phase: &Phase, name: &str) -> Option<ServingStatus> {
-    let has_room = |snapshot: &super::Snapshot| {
-        name.strip_prefix("rooms/")
-            .is_some_and(|room| snapshot.rooms().contains_key(room))
-    };
+    if SERVICES.contains(&name) {
+        return Some(match phase {
+            Phase::Serving(_) => ServingStatus::Serving,
+            Phase::Loading | Phase::Draining(_) | Phase::Stopping => ServingStatus::NotServing,
+        });
+    }
 
-    let known = SERVICES.contains(&name);
+    let room = name.strip_prefix("rooms/")?;
+    let (Phase::Serving(snapshot) | Phase::Draining(snapshot)) = phase else {
+        return None;
+    };
+    let is_served = snapshot.rooms().contains_key(room);
+    let is_refused = snapshot.refused().rooms.contains_key(room);
+
     match phase {
-        Phase::Serving(snapshot) if known || has_room(snapshot) => Some(ServingStatus::Serving),
-        Phase::Draining(snapshot) if known || has_room(snapshot) => Some(ServingStatus::NotServing),
-        Phase::Loading | Phase::Stopping if known => Some(ServingStatus::NotServing),
+        Phase::Serving(_) if is_served => Some(ServingStatus::Serving),
+        _ if is_served || is_refused => Some(ServingStatus::NotServing),
         _ => None,
     }
 }

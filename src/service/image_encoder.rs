@@ -82,60 +82,28 @@ fn told(field: &str, error: encoder::Error) -> Error {
     }
 }
 
-/// One image encoder for every adapter whose own encoder is among `encoders`. Adapters without one
-/// are left out, with a warning in the log.
+/// Reads every model before any adapter is looked at, so that a wrong path ends the server at once.
 ///
 /// # Errors
-/// [`RunError::Model`] if a model cannot be read, [`RunError::Encoder`] if an adapter's encoder
-/// cannot be built or gives features of another width.
-pub fn open(
-    encoders: Option<&ImageEncoders>,
-    adapters: &BTreeMap<String, Arc<StoredAdapter>>,
-) -> Result<BTreeMap<String, Arc<ImageEncoder>>, RunError> {
-    let mut image_encoders = BTreeMap::new();
-    let Some(ImageEncoders {
-        models,
-        runtime,
-        bounds,
-        ..
-    }) = encoders
-    else {
-        return Ok(image_encoders);
-    };
-
-    check_models(models, adapters)?;
-
-    // Adapters that were trained on features of the same source share one encoder, because loading
-    // a model is expensive.
-    let mut opened: Vec<(&FeatureSource, Arc<ImageEncoder>)> = Vec::new();
-    for (name, adapter) in adapters {
-        let source = adapter.adapter.source();
-        if let Some((_, image_encoder)) = opened.iter().find(|(other, _)| other.is_like(source)) {
-            image_encoders.insert(name.clone(), image_encoder.clone());
-            continue;
-        }
-
-        if let Some(encoder) = open_for(name, source, models, runtime)? {
-            let image_encoder = Arc::new(ImageEncoder::new(encoder, *bounds));
-            opened.push((source, image_encoder.clone()));
-            image_encoders.insert(name.clone(), image_encoder);
-        }
-    }
-
-    Ok(image_encoders)
-}
-
-/// Reads every model before any adapter is looked at, so that a wrong path ends the server at once.
-/// A model that no adapter needs is probably a mistake of the operator.
-fn check_models(
-    models: &[String],
-    adapters: &BTreeMap<String, Arc<StoredAdapter>>,
-) -> Result<(), RunError> {
+/// [`RunError::Model`] if a model cannot be read.
+pub fn check_models(models: &[String]) -> Result<(), RunError> {
     for model in models {
-        let id = encoder::identity(model).map_err(|problem| RunError::Model {
+        encoder::identity(model).map_err(|problem| RunError::Model {
             model: model.clone(),
             problem,
         })?;
+    }
+
+    Ok(())
+}
+
+/// Warns of models that no adapter needs: probably a mistake of the operator.
+pub fn warn_of_unneeded(models: &[String], adapters: &BTreeMap<String, Arc<StoredAdapter>>) {
+    for model in models {
+        // Every model was read before, by `check_models`.
+        let Ok(id) = encoder::identity(model) else {
+            continue;
+        };
 
         let is_needed = adapters
             .values()
@@ -144,24 +112,20 @@ fn check_models(
             tracing::warn!(model, id, "no adapter's features were made by this encoder");
         }
     }
-
-    Ok(())
 }
 
 /// The encoder that made an adapter's features; none if it is not at hand or takes clips, which the
 /// log says.
-fn open_for(
+///
+/// # Errors
+/// [`encoder::Error`] if it cannot be built or gives features of another width.
+pub fn open_for(
     adapter: &str,
     source: &FeatureSource,
-    models: &[String],
-    runtime: &Runtime,
-) -> Result<Option<Encoder>, RunError> {
-    let failed = |problem| RunError::Encoder {
-        adapter: adapter.to_owned(),
-        problem,
-    };
-
-    let Some(encoder) = Encoder::of_source(source, models, runtime).map_err(failed)? else {
+    encoders: &ImageEncoders,
+) -> Result<Option<ImageEncoder>, encoder::Error> {
+    let made_by = Encoder::of_source(source, &encoders.models, &encoders.runtime)?;
+    let Some(encoder) = made_by else {
         tracing::warn!(
             adapter,
             encoder = source.encoder,
@@ -180,7 +144,7 @@ fn open_for(
 
     // One layer, as wide as the adapter's input.
     if encoder.dims() != [source.dim] {
-        return Err(failed(encoder::Error::Option {
+        return Err(encoder::Error::Option {
             what: "encoder",
             given: encoder.id().to_owned(),
             problem: format!(
@@ -188,7 +152,7 @@ fn open_for(
                 encoder.dims(),
                 source.dim
             ),
-        }));
+        });
     }
 
     tracing::info!(
@@ -197,5 +161,5 @@ fn open_for(
         runtime = encoder.runtime(),
         "takes images"
     );
-    Ok(Some(encoder))
+    Ok(Some(ImageEncoder::new(encoder, encoders.bounds)))
 }

@@ -8,6 +8,7 @@ use tonic::{Request, Response, Status};
 use super::convert;
 use super::snapshot::ServedNavigator;
 use super::status::view_error;
+use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::localization_service_server::LocalizationService;
@@ -34,10 +35,11 @@ impl LocalizationService for Handlers {
         let most = self.config.limits.hits;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
+        let lane = Lane::of(&request.view);
 
         let answer = self
             .workers
-            .run(budget, move |cancel| {
+            .run(lane, budget, move |cancel| {
                 answer(&snapshot, request, most, cancel)
             })
             .await?;

@@ -1,7 +1,7 @@
 //! The gRPC service: package `seese3.v1`, standard health and reflection.
 //!
 //! - A request answers from the [`Snapshot`] that was current when it began; a snapshot never
-//!   changes.
+//!   changes. When the store has, a new one takes its place.
 //! - Computation runs on blocking threads, a bounded number at a time; a panic there fails only
 //!   that one request.
 //! - Long work checks between its pieces whether the deadline passed or the caller went away, and
@@ -16,6 +16,7 @@ mod health;
 mod localization;
 mod navigation;
 mod odometry;
+mod reload;
 mod relocalization;
 mod shutdown;
 mod snapshot;
@@ -26,6 +27,7 @@ mod two_views;
 mod workers;
 
 pub use image_encoder::ImageEncoders;
+pub use reload::Reload;
 pub use shutdown::shutdown_signal;
 pub use snapshot::Snapshot;
 pub use status::Error;
@@ -51,6 +53,7 @@ use seese3_client::proto::v1::localization_service_server::LocalizationServiceSe
 use seese3_client::proto::v1::navigation_service_server::NavigationServiceServer;
 use seese3_client::proto::v1::odometry_service_server::OdometryServiceServer;
 use seese3_core::navigation::{IndexKind, Limits};
+use snapshot::Loader;
 use workers::Workers;
 
 /// After the drain time, how long the server still waits for callers to receive the error of their
@@ -84,6 +87,8 @@ pub struct Config {
     pub token_key: TokenKey,
     /// How long requests in flight may continue after the shutdown signal.
     pub drain: Duration,
+    /// When the server looks for changes of its store.
+    pub reload: Reload,
 }
 
 impl Default for Config {
@@ -101,6 +106,7 @@ impl Default for Config {
             streams: 4_096,
             token_key: TokenKey::random(),
             drain: Duration::from_secs(10),
+            reload: Reload::default(),
         }
     }
 }
@@ -113,33 +119,8 @@ pub enum RunError {
     Store(#[from] store::Error),
     #[error("store '{location}' has no room; import one first")]
     NoRoom { location: String },
-    #[error("adapter '{adapter}' does not serve room '{room}': {problem}")]
-    Navigator {
-        adapter: String,
-        room: String,
-        problem: seese3_core::navigation::Error,
-    },
-    #[error(
-        "adapter '{adapter}' was fitted from revision {revision} of adapter '{base}', which cannot be read: {problem}; \
-         publish that again, or fit anew"
-    )]
-    Base {
-        adapter: String,
-        base: String,
-        revision: u64,
-        problem: Box<store::Error>,
-    },
-    #[error("adapter '{adapter}' does not locate views in room '{room}': {problem}")]
-    Localizer {
-        adapter: String,
-        room: String,
-        problem: Box<seese3_core::fitting::Error>,
-    },
-    #[error("adapter '{adapter}' cannot be given images: {problem}")]
-    Encoder {
-        adapter: String,
-        problem: crate::encoder::Error,
-    },
+    #[error("no room of the store can be served; room '{room}': {reason}")]
+    NoneServed { room: String, reason: String },
     #[error("--encoder {model}: {problem}")]
     Model {
         model: String,
@@ -190,8 +171,9 @@ impl Handlers {
 /// with NOT_SERVING until the whole store is loaded.
 ///
 /// # Errors
-/// [`RunError`] if the store cannot be loaded and verified, in which case the server ends before it
-/// serves, or if the transport fails.
+/// [`RunError`] if the store cannot be read, or none of its rooms can be served, in which case the
+/// server ends before it serves; or if the transport fails. A single room or adapter that cannot be
+/// served is refused by itself.
 pub async fn run(
     listener: TcpListener,
     store: Store,
@@ -216,11 +198,15 @@ pub async fn run(
     })?;
 
     tokio::pin!(server, shutdown);
-    let loading = snapshot::load(store, config.index, config.encoders);
+    let loading = async {
+        let loader = Loader::open(store, config.index, config.encoders).await?;
+        let first = loader.first().await?;
+        Ok::<_, RunError>((loader, first))
+    };
 
     // The server future has to be polled while the store loads, or no health check would be
     // answered.
-    let loaded = tokio::select! {
+    let (loader, first) = tokio::select! {
         loaded = loading => loaded?,
         ended = &mut server => return ended,
         () = &mut shutdown => {
@@ -229,27 +215,33 @@ pub async fn run(
         }
     };
 
-    let loaded = Arc::new(loaded);
     tracing::info!(
-        rooms = loaded.room_count(),
-        adapters = loaded.adapter_count(),
+        rooms = first.rooms().len(),
+        adapters = first.adapters().len(),
+        refused_rooms = first.refused().rooms.len(),
+        refused_adapters = first.refused().adapters.len(),
         "serving"
     );
 
     // From here on requests are answered. The function waits for the shutdown signal or for a
     // failure of the server.
-    phase.send_replace(Phase::Serving(loaded.clone()));
+    phase.send_replace(Phase::Serving(Arc::new(first)));
 
     tokio::select! {
         ended = &mut server => return ended,
         () = &mut shutdown => {}
+        () = reload::keep_current(loader, config.reload, &phase) => {}
     }
 
     tracing::info!(bound_s = config.drain.as_secs_f64(), "draining");
 
     // Health turns to NOT_SERVING and open Track streams end, so that load balancers and robots
     // move to another server while short requests finish here.
-    phase.send_replace(Phase::Draining(loaded));
+    phase.send_modify(|phase| {
+        if let Phase::Serving(snapshot) = phase {
+            *phase = Phase::Draining(snapshot.clone());
+        }
+    });
 
     // An error means the server has ended already.
     let _ = stop.send(());

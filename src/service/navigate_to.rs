@@ -12,6 +12,7 @@ use tracing::Instrument;
 use super::convert;
 use super::snapshot::{ServedNavigator, Snapshot};
 use super::status::view_error;
+use super::workers::Lane;
 use super::{Error, Handlers};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::navigate_to_request::Goal;
@@ -45,6 +46,7 @@ impl Handlers {
         let most = self.config.limits.steps;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
+        let lane = Lane::of(&request.source);
 
         let begun = Instant::now();
 
@@ -52,7 +54,7 @@ impl Handlers {
         // request's time.
         let ready = self
             .workers
-            .run(budget, move |_| ready(&snapshot, request, most))
+            .run(lane, budget, move |_| ready(&snapshot, request, most))
             .await?;
 
         // One feedback event before the first step, one after each, and the result all fit in the
@@ -113,7 +115,7 @@ impl Handlers {
 
         // If the caller closes the stream, `run` is dropped, which cancels the pursuit.
         let finished = tokio::select! {
-            finished = self.workers.run(budget, work) => finished,
+            finished = self.workers.run(Lane::Short, budget, work) => finished,
             () = heard.closed() => return,
         };
         let last = finished

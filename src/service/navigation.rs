@@ -4,6 +4,7 @@ use tonic::{Request, Response, Status};
 
 use super::convert;
 use super::status::brief;
+use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::navigation_service_server::NavigationService;
@@ -20,10 +21,11 @@ impl NavigationService for Handlers {
         let limits = self.config.limits;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
+        let lane = Lane::of(&request.source);
 
         let answer = self
             .workers
-            .run(budget, move |cancel| {
+            .run(lane, budget, move |cancel| {
                 navigate(&snapshot, request, limits, cancel)
             })
             .await?;
@@ -73,6 +75,14 @@ impl NavigationService for Handlers {
             return Err(Error::invalid("requests", problem).into());
         }
 
+        let lane = match Lane::of(
+            requests
+                .iter()
+                .filter_map(|request| request.source.as_ref()),
+        ) {
+            Lane::Images => Lane::Images,
+            Lane::Short | Lane::Long => Lane::Long,
+        };
         let work = move |cancel: &Cancellation| {
             let mut results = Vec::with_capacity(requests.len());
             for request in requests {
@@ -93,7 +103,7 @@ impl NavigationService for Handlers {
             Ok(results)
         };
 
-        let results = self.workers.run(budget, work).await?;
+        let results = self.workers.run(lane, budget, work).await?;
         let results = results
             .into_iter()
             .map(|result| pb::BatchNavigateResult {

@@ -7,6 +7,7 @@ use tonic::{Request, Response, Status};
 
 use super::convert;
 use super::status::view_error;
+use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
 use crate::store::StoredAdapter;
 use seese3_client::proto::v1 as pb;
@@ -35,9 +36,12 @@ impl OdometryService for Handlers {
         let snapshot = self.snapshot()?;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
+        let lane = Lane::of(request.first.iter().chain(&request.second));
         let answer = self
             .workers
-            .run(budget, move |cancel| answer(&snapshot, request, cancel))
+            .run(lane, budget, move |cancel| {
+                answer(&snapshot, request, cancel)
+            })
             .await?;
 
         Ok(Response::new(answer))

@@ -7,6 +7,7 @@ use super::convert;
 use super::localization::{located_by, rooms_under};
 use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
 use super::status::view_error;
+use super::workers::Lane;
 use super::{Error, Handlers};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
@@ -28,9 +29,10 @@ impl Handlers {
         let most = self.config.limits.hits;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
+        let lane = Lane::of(&request.views);
 
         self.workers
-            .run(budget, move |cancel| {
+            .run(lane, budget, move |cancel| {
                 answer(&snapshot, request, most, cancel)
             })
             .await
@@ -174,7 +176,7 @@ fn adapters_that_track_anywhere(snapshot: &Snapshot) -> Vec<&str> {
     let mut names: Vec<&str> = snapshot
         .rooms()
         .values()
-        .flat_map(adapters_that_track)
+        .flat_map(|room| adapters_that_track(room))
         .collect();
     names.sort_unstable();
     names.dedup();
@@ -186,7 +188,7 @@ fn default_that_tracks<'a>(snapshot: &'a Snapshot, room: &str) -> Vec<&'a str> {
     let mut names = snapshot
         .rooms()
         .get(room)
-        .map_or_else(Vec::new, adapters_that_track);
+        .map_or_else(Vec::new, |room| adapters_that_track(room));
     names.truncate(1);
     names
 }
@@ -195,7 +197,9 @@ fn default_that_tracks<'a>(snapshot: &'a Snapshot, room: &str) -> Vec<&'a str> {
 /// order of preference, so the names are sorted.
 fn adapters_that_track_in_all<'a>(snapshot: &'a Snapshot, rooms: &[String]) -> Vec<&'a str> {
     let mut named = rooms.iter().filter_map(|room| snapshot.rooms().get(room));
-    let mut names = named.next().map_or_else(Vec::new, adapters_that_track);
+    let mut names = named
+        .next()
+        .map_or_else(Vec::new, |room| adapters_that_track(room));
     for room in named {
         let here = adapters_that_track(room);
         names.retain(|name| here.contains(name));

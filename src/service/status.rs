@@ -20,8 +20,8 @@ pub enum Error {
     Precondition(String),
     #[error("the server is not ready: it is loading its store or stopping; try again")]
     Loading,
-    #[error("the server is busy: too many requests wait; try again later")]
-    Busy,
+    #[error("the server is busy: as many {what} as it takes are waiting or open; try again later")]
+    Full { what: &'static str },
     #[error("the deadline passed before the answer was ready")]
     Deadline,
     #[error("the request was cancelled")]
@@ -76,7 +76,7 @@ impl Error {
             Self::NotFound { .. } => Code::NotFound,
             Self::Precondition(_) => Code::FailedPrecondition,
             Self::Loading => Code::Unavailable,
-            Self::Busy => Code::ResourceExhausted,
+            Self::Full { .. } => Code::ResourceExhausted,
             Self::Deadline => Code::DeadlineExceeded,
             Self::Cancelled => Code::Cancelled,
             Self::Internal => Code::Internal,
@@ -89,7 +89,7 @@ impl Error {
             Self::NotFound { .. } => "NOT_SERVED",
             Self::Precondition(_) => "PRECONDITION",
             Self::Loading => "NOT_READY",
-            Self::Busy => "BUSY",
+            Self::Full { .. } => "BUSY",
             Self::Deadline => "DEADLINE",
             Self::Cancelled => "CANCELLED",
             Self::Internal => "INTERNAL",
@@ -100,7 +100,11 @@ impl Error {
 impl From<Error> for Status {
     fn from(error: Error) -> Self {
         let mut details = ErrorDetails::new();
-        details.set_error_info(error.reason(), DOMAIN, std::collections::HashMap::new());
+        let mut metadata = std::collections::HashMap::new();
+        if let Error::Full { what } = &error {
+            metadata.insert("full".to_owned(), (*what).to_owned());
+        }
+        details.set_error_info(error.reason(), DOMAIN, metadata);
 
         // Details in the standard types of google.rpc, so that a client learns the field to
         // change, the missing resource, or when to retry, without reading the message.
@@ -111,7 +115,7 @@ impl From<Error> for Status {
             Error::NotFound { field, name } => {
                 details.set_resource_info(brief(field), brief(name), "", "is not served");
             }
-            Error::Busy => {
+            Error::Full { .. } => {
                 details.set_retry_info(Some(std::time::Duration::from_millis(500)));
             }
             _ => {}

@@ -1,5 +1,9 @@
-//! Where answers are computed: on blocking threads, a bounded number at a time, each
-//! within its caller's deadline.
+//! Where answers are computed: on blocking threads, a bounded number at a time, each within its
+//! caller's deadline.
+//!
+//! Short answers, images and long work have lanes of their own, each with its threads and its queue,
+//! so that an evaluation of minutes, or a slow encoder, holds up nobody who asks for something short.
+//! The lanes share the processor by the operating system's rules.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,13 +12,66 @@ use tokio::sync::{Semaphore, watch};
 use tonic::metadata::MetadataMap;
 
 use super::{Config, Error};
+use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
+
+/// What kind of work a request is, which decides the threads that compute it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Lane {
+    /// Milliseconds at most: somebody waits for it in the middle of a motion.
+    Short,
+    /// Images have to be decoded and encoded.
+    Images,
+    /// Batches and evaluations.
+    Long,
+}
+
+impl Lane {
+    /// The lane of a request with these views that is short but for its images.
+    pub fn of<'a>(views: impl IntoIterator<Item = &'a pb::View>) -> Self {
+        let is_image = |view: &pb::View| matches!(view.view, Some(pb::view::View::Image(_)));
+
+        if views.into_iter().any(is_image) {
+            Self::Images
+        } else {
+            Self::Short
+        }
+    }
+
+    /// What its requests are called where one is refused.
+    fn words(self) -> &'static str {
+        match self {
+            Self::Short => "short requests",
+            Self::Images => "requests with images",
+            Self::Long => "batches and evaluations",
+        }
+    }
+}
+
+/// The threads and the queue of a lane.
+#[derive(Clone)]
+struct Pool {
+    threads: Arc<Semaphore>,
+    admitted: Arc<Semaphore>,
+}
+
+impl Pool {
+    fn new(threads: usize, queue: usize) -> Self {
+        Self {
+            threads: Arc::new(Semaphore::new(threads)),
+            // A request holds this permit while it waits and while it is computed; `try_acquire`
+            // refuses it once threads and queue are full.
+            admitted: Arc::new(Semaphore::new(threads + queue)),
+        }
+    }
+}
 
 /// Runs the computation of requests on blocking threads, apart from the async ones.
 #[derive(Clone)]
 pub struct Workers {
-    threads: Arc<Semaphore>,
-    admitted: Arc<Semaphore>,
+    short: Pool,
+    images: Pool,
+    long: Pool,
     longest: Duration,
     halted: watch::Sender<bool>,
 }
@@ -31,13 +88,22 @@ impl Drop for CancelOnDrop {
 impl Workers {
     pub fn new(config: &Config) -> Self {
         let threads = config.threads.max(1);
+        let pool = |threads| Pool::new(threads, config.queue);
         Self {
-            threads: Arc::new(Semaphore::new(threads)),
-            // A request holds this permit while it waits and while it is computed; `try_acquire`
-            // refuses it once threads and queue are full.
-            admitted: Arc::new(Semaphore::new(threads + config.queue)),
+            short: pool(threads),
+            images: pool(threads),
+            // Long work is content with half of the processor.
+            long: pool(threads.div_ceil(2)),
             longest: config.longest,
             halted: watch::Sender::new(false),
+        }
+    }
+
+    fn pool(&self, lane: Lane) -> &Pool {
+        match lane {
+            Lane::Short => &self.short,
+            Lane::Images => &self.images,
+            Lane::Long => &self.long,
         }
     }
 
@@ -57,19 +123,20 @@ impl Workers {
     /// when it has stopped.
     ///
     /// # Errors
-    /// [`Error::Busy`] if too many requests wait, [`Error::Deadline`] if the budget is spent,
+    /// [`Error::Full`] if too many requests of the lane wait, [`Error::Deadline`] if the budget is spent,
     /// [`Error::Loading`] if the server abandoned the work while stopping, [`Error::Internal`] if
     /// it panicked, or the error of the work itself.
     pub async fn run<T: Send + 'static>(
         &self,
+        lane: Lane,
         budget: Duration,
         work: impl FnOnce(&Cancellation) -> Result<T, Error> + Send + 'static,
     ) -> Result<T, Error> {
-        let admitted = self
+        let pool = self.pool(lane).clone();
+        let admitted = pool
             .admitted
-            .clone()
             .try_acquire_owned()
-            .map_err(|_| Error::Busy)?;
+            .map_err(|_| Error::Full { what: lane.words() })?;
 
         // The guard lives in this future. If the caller goes away the future is dropped, and the
         // guard cancels the work that is still running on its thread.
@@ -77,12 +144,8 @@ impl Workers {
         let guard = CancelOnDrop(cancel.clone());
 
         let computed = async {
-            let thread = self
-                .threads
-                .clone()
-                .acquire_owned()
-                .await
-                .map_err(|_| Error::Internal)?;
+            let thread = pool.threads.acquire_owned().await;
+            let thread = thread.map_err(|_| Error::Internal)?;
 
             // Both permits move into the blocking task, because the task goes on when this future
             // is dropped: they are free only when the computation has really ended.
@@ -119,17 +182,15 @@ impl Workers {
     /// it panicked.
     pub async fn run_admitted<T: Send + 'static>(
         &self,
+        lane: Lane,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, Error> {
         let mut halted = self.halted.subscribe();
 
         let computed = async {
-            let thread = self
-                .threads
-                .clone()
-                .acquire_owned()
-                .await
-                .map_err(|_| Error::Internal)?;
+            let threads = self.pool(lane).threads.clone();
+            let thread = threads.acquire_owned().await;
+            let thread = thread.map_err(|_| Error::Internal)?;
 
             // There is no cancellation, because the work is short; a dropped future only discards
             // its result.
@@ -194,11 +255,13 @@ mod tests {
     async fn a_panic_costs_one_request() {
         let workers = workers(1, 0);
         assert_eq!(
-            workers.run::<()>(LONG, |_| panic!("on purpose")).await,
+            workers
+                .run::<()>(Lane::Short, LONG, |_| panic!("on purpose"))
+                .await,
             Err(Error::Internal)
         );
 
-        assert_eq!(workers.run(LONG, |_| Ok(7)).await, Ok(7));
+        assert_eq!(workers.run(Lane::Short, LONG, |_| Ok(7)).await, Ok(7));
     }
 
     /// Oracle: the contract itself. The work loops until it is cancelled, and it reports that it
@@ -220,7 +283,9 @@ mod tests {
         let begun = std::time::Instant::now();
 
         assert_eq!(
-            workers.run(Duration::from_millis(20), work).await,
+            workers
+                .run(Lane::Short, Duration::from_millis(20), work)
+                .await,
             Err(Error::Deadline)
         );
 
@@ -232,8 +297,8 @@ mod tests {
         );
     }
 
-    /// Oracle: the definition of a bounded queue. With one thread and no room in the queue, the
-    /// second request is refused.
+    /// Oracle: the definition of a bounded queue. With one thread and no place in the queue, the
+    /// second request of the lane is refused; another lane has a thread of its own.
     #[tokio::test]
     async fn a_full_queue_refuses() {
         let workers = workers(1, 0);
@@ -242,7 +307,7 @@ mod tests {
         let (begun, begins) = tokio::sync::oneshot::channel();
 
         let first = tokio::spawn(async move {
-            busy.run(LONG, move |_| {
+            busy.run(Lane::Short, LONG, move |_| {
                 let _ = begun.send(());
                 let _ = wait.recv();
                 Ok(1)
@@ -251,7 +316,14 @@ mod tests {
         });
 
         begins.await.unwrap();
-        assert_eq!(workers.run(LONG, |_| Ok(2)).await, Err(Error::Busy));
+        let full = Error::Full {
+            what: "short requests",
+        };
+        assert_eq!(workers.run(Lane::Short, LONG, |_| Ok(2)).await, Err(full));
+
+        // The other lanes are free.
+        assert_eq!(workers.run(Lane::Long, LONG, |_| Ok(3)).await, Ok(3));
+        assert_eq!(workers.run(Lane::Images, LONG, |_| Ok(4)).await, Ok(4));
 
         release.send(()).unwrap();
         assert_eq!(first.await.unwrap(), Ok(1));

@@ -22,6 +22,7 @@ mod tensors;
 pub use adapters::{BaseAdapter, RoomFit, StoredAdapter};
 pub use rooms::{RoomSummary, StoredRoom, check_features};
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use object_store::local::LocalFileSystem;
@@ -123,6 +124,8 @@ const ATTEMPTS: u64 = 16;
 pub struct Store {
     objects: Arc<dyn ObjectStore>,
     location: String,
+    /// The folder of a local store.
+    folder: Option<PathBuf>,
 }
 
 /// The two kinds of content in a store.
@@ -187,6 +190,7 @@ impl Store {
             return Ok(Self {
                 objects: Arc::new(objects),
                 location: location.to_owned(),
+                folder: None,
             });
         }
 
@@ -206,6 +210,7 @@ impl Store {
         Ok(Self {
             objects: Arc::new(objects),
             location: location.to_owned(),
+            folder: Some(PathBuf::from(location)),
         })
     }
 
@@ -214,6 +219,7 @@ impl Store {
         Self {
             objects,
             location: location.to_owned(),
+            folder: None,
         }
     }
 
@@ -243,6 +249,16 @@ impl Store {
     }
 
     async fn read(&self, path: &Path) -> Result<Vec<u8>, Error> {
+        // Opening a pipe would wait for someone to write into it.
+        if let Some(folder) = &self.folder
+            && std::fs::metadata(folder.join(path.as_ref())).is_ok_and(|found| !found.is_file())
+        {
+            return Err(Error::Damaged {
+                file: self.shown(path),
+                problem: "is not a regular file; restore it, or publish again".to_owned(),
+            });
+        }
+
         let io = |error| self.io(path, &error);
         let bytes = self
             .objects
@@ -339,26 +355,34 @@ impl Store {
 
     /// The names of all rooms, or of all adapters, that have at least one revision; sorted.
     async fn names(&self, kind: Kind) -> Result<Vec<String>, Error> {
+        let newest = self.newest(kind).await?;
+        Ok(newest.into_iter().map(|(name, _)| name).collect())
+    }
+
+    /// The same, each with its newest revision.
+    async fn newest(&self, kind: Kind) -> Result<Vec<(String, u64)>, Error> {
         let folder = Path::from(kind.folder());
         let listed = self.objects.list_with_delimiter(Some(&folder)).await;
         let listed = listed.map_err(|error| self.io(&folder, &error))?;
-        let mut names = Vec::new();
+        let mut newest = Vec::new();
 
         for prefix in listed.common_prefixes {
             let Some(name) = prefix.filename().map(str::to_owned) else {
                 continue;
             };
+            if !seese3_core::room::is_plain_name(&name) {
+                continue;
+            }
 
             // A folder without a revision was left by an interrupted publication, since the
             // manifest is written last. It does not count as published.
-            if seese3_core::room::is_plain_name(&name) && !self.revisions(&prefix).await?.is_empty()
-            {
-                names.push(name);
+            if let Some(&revision) = self.revisions(&prefix).await?.last() {
+                newest.push((name, revision));
             }
         }
 
-        names.sort();
-        Ok(names)
+        newest.sort();
+        Ok(newest)
     }
 
     /// The revision numbers of a room or an adapter, in ascending order.
@@ -369,10 +393,12 @@ impl Store {
         while let Some(entry) = listed.next().await {
             let entry = entry.map_err(|error| self.io(&prefix, &error))?;
             let name = entry.location.filename().unwrap_or_default();
-            revisions.extend(
-                name.strip_suffix(".json")
-                    .and_then(|number| number.parse::<u64>().ok()),
-            );
+            let number = name
+                .strip_suffix(".json")
+                .and_then(|number| number.parse::<u64>().ok());
+
+            // Only names that publishing gives count: a copy such as `2.json` is no revision.
+            revisions.extend(number.filter(|&revision| name == manifest_name(revision)));
         }
 
         revisions.sort_unstable();
@@ -422,7 +448,11 @@ fn revision_path(folder: &Path, revision: u64) -> Path {
     folder
         .clone()
         .join("revisions")
-        .join(format!("{revision:06}.json"))
+        .join(manifest_name(revision))
+}
+
+fn manifest_name(revision: u64) -> String {
+    format!("{revision:06}.json")
 }
 
 /// The first 16 hexadecimal digits of a text's SHA-256, for use in file names.

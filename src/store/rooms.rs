@@ -338,6 +338,14 @@ impl Store {
         Ok(one.frames == other.frames)
     }
 
+    /// The names of all rooms, sorted, each with its newest revision. No file is read.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if the store cannot be listed.
+    pub async fn newest_rooms(&self) -> Result<Vec<(String, u64)>, Error> {
+        self.newest(Kind::Room).await
+    }
+
     /// A summary of the newest revision of every room, sorted by name.
     ///
     /// # Errors

@@ -18,4 +18,5 @@ mod images;
 mod lifecycle;
 mod navigators;
 mod refusals;
+mod reload;
 mod tracking;

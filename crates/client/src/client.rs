@@ -87,7 +87,8 @@ pub struct Client {
 }
 
 impl Client {
-    /// Connects to `address`, HOST:PORT or a URL. Every call but `track` gets `deadline`.
+    /// Connects to `address`, HOST:PORT or a URL. Every call gets `deadline`; of `track` only its
+    /// opening.
     ///
     /// # Errors
     /// [`Error::Address`] if the address cannot be parsed, [`Error::Connect`] if no connection is
@@ -223,17 +224,20 @@ impl Client {
     }
 
     /// Opens a tracking stream: sends `requests` as they are made and returns the stream of
-    /// answers. There is no deadline, because a stream lasts as long as the robot moves.
+    /// answers. The deadline holds until the server accepts the configuration, the first of the
+    /// requests; the stream itself has none, because it lasts as long as the robot moves.
     ///
     /// # Errors
-    /// [`Error::Refused`] if the stream cannot be opened; later errors are items of the stream.
+    /// [`Error::Refused`] if the stream cannot be opened, [`Error::Deadline`] if the server says
+    /// nothing; later errors are items of the stream.
     pub async fn track(
         &self,
         requests: impl Stream<Item = pb::TrackRequest> + Send + 'static,
     ) -> Result<Streaming<pb::TrackResponse>, Error> {
         let mut service = OdometryServiceClient::new(self.channel.clone())
             .max_decoding_message_size(MESSAGE_BYTES);
-        Ok(service.track(requests).await?.into_inner())
+        let opened = tokio::time::timeout(self.deadline, service.track(requests)).await;
+        Ok(opened.map_err(|_| Error::Deadline)??.into_inner())
     }
 
     /// All rooms, page by page.

@@ -19,6 +19,7 @@ use tokio_stream::{Stream, StreamExt};
 use tonic::{Status, Streaming};
 use tracing::Instrument;
 
+use super::workers::Lane;
 use super::{Error, Handlers, Phase};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::track_request::Message;
@@ -53,7 +54,7 @@ impl Handlers {
     ///
     /// # Errors
     /// [`Error::Loading`] if the server does not serve, [`Error::Deadline`] if no first message
-    /// comes, [`Error::Invalid`] if it is no valid configuration, [`Error::Busy`] if too many
+    /// comes, [`Error::Invalid`] if it is no valid configuration, [`Error::Full`] if too many
     /// streams are open, or as [`Session::open`].
     pub(super) async fn follow(
         &self,
@@ -82,12 +83,14 @@ impl Handlers {
             .streams
             .clone()
             .try_acquire_owned()
-            .map_err(|_| Error::Busy)?;
+            .map_err(|_| Error::Full {
+                what: "Track streams",
+            })?;
 
         let key = self.config.token_key.clone();
         let session = self
             .workers
-            .run(self.config.longest, move |_| {
+            .run(Lane::Short, self.config.longest, move |_| {
                 Session::open(&snapshot, config, &key)
             })
             .await?;
@@ -177,8 +180,12 @@ impl Handlers {
         message: Message,
         since: Instant,
     ) -> Result<(Session, Result<pb::TrackResponse, Error>), Error> {
+        let lane = match &message {
+            Message::Frame(frame) => Lane::of(&frame.view),
+            _ => Lane::Short,
+        };
         self.workers
-            .run_admitted(move || {
+            .run_admitted(lane, move || {
                 let answer = match message {
                     Message::Frame(frame) => session.take(frame, since.elapsed()),
                     Message::SetInitialPose(given) => Ok(session.put(given)),
