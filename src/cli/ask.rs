@@ -10,8 +10,8 @@ use super::camera::CameraOption;
 use super::named::one_of;
 use super::say;
 use crate::datasets::read_features;
-use seese3_client::Client;
 use seese3_client::proto::v1 as pb;
+use seese3_client::{Client, ClientTls, ConnectOptions};
 use seese3_core::adapter::Reading;
 use seese3_core::navigation::Mode;
 
@@ -23,12 +23,57 @@ pub struct Server {
     /// Deadline of each call, seconds, 1 to 86400; of a stream (`track`) only until it is open
     #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     deadline: u64,
+    /// File with the token that the server asks for
+    #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_FILE")]
+    token_file: Option<PathBuf>,
+    /// Authorities of the server's certificate, in PEM: the connection is TLS
+    #[arg(long, value_name = "FILE", env = "SEESE3_TLS_CA")]
+    tls_ca: Option<PathBuf>,
+    /// This client's certificate in PEM, if the server asks for one
+    #[arg(long, value_name = "FILE", requires_all = ["tls_key", "tls_ca"])]
+    tls_cert: Option<PathBuf>,
+    /// The private key of the certificate, in PEM
+    #[arg(long, value_name = "FILE", requires = "tls_cert")]
+    tls_key: Option<PathBuf>,
 }
 
 impl Server {
     /// Connects to the server, with the deadline for every later call.
     pub async fn connect(&self) -> anyhow::Result<Client> {
-        Ok(Client::connect(&self.server, Duration::from_secs(self.deadline)).await?)
+        let read = |option: &str, file: &PathBuf| {
+            std::fs::read(file)
+                .with_context(|| format!("{option}: {} cannot be read", file.display()))
+        };
+
+        let token = match &self.token_file {
+            None => None,
+            Some(file) => {
+                let text = String::from_utf8(read("--token-file", file)?);
+                let text = text.ok().filter(|text| !text.trim().is_empty());
+                let text =
+                    text.with_context(|| format!("--token-file: {} has no token", file.display()))?;
+                Some(text.trim().to_owned())
+            }
+        };
+
+        let identity = match (&self.tls_cert, &self.tls_key) {
+            (Some(cert), Some(key)) => Some((read("--tls-cert", cert)?, read("--tls-key", key)?)),
+            _ => None,
+        };
+        let tls = match &self.tls_ca {
+            None => None,
+            Some(file) => Some(ClientTls {
+                authorities: read("--tls-ca", file)?,
+                identity,
+            }),
+        };
+
+        let options = ConnectOptions {
+            deadline: Duration::from_secs(self.deadline),
+            token,
+            tls,
+        };
+        Ok(Client::connect_with(&self.server, options).await?)
     }
 }
 

@@ -13,7 +13,10 @@ use super::encoder::RuntimeName;
 use super::log::{LogFormat, start_log};
 use super::say;
 use crate::encoder::{Bounds, Runtime};
-use crate::service::{Config, ImageEncoders, Reload, TokenKey, run, shutdown_signal};
+use crate::service::{
+    Config, ImageEncoders, Keyring, Listeners, Reload, Tls, TlsFiles, TokenKey, run,
+    shutdown_signal,
+};
 use crate::store::Store;
 use seese3_core::index::HnswParameters;
 use seese3_core::navigation::{IndexKind, Limits};
@@ -26,6 +29,40 @@ pub struct Serve {
     /// Address to listen on, HOST:PORT; port 0 takes a free port
     #[arg(long, env = "SEESE3_LISTEN", default_value = "127.0.0.1:50051")]
     listen: String,
+    /// Address for those who operate the server, HOST:PORT: /metrics for Prometheus, /livez and
+    /// /readyz, over plain HTTP; none if omitted. Whoever reaches it may read it
+    #[arg(long, value_name = "ADDR", env = "SEESE3_METRICS_LISTEN")]
+    metrics_listen: Option<String>,
+    /// File with the callers and their rights, in TOML; everybody may call everything if omitted
+    #[arg(long, value_name = "FILE", env = "SEESE3_AUTH_FILE")]
+    auth_file: Option<PathBuf>,
+    /// The server's certificate and those above it, in PEM; plain text if omitted
+    #[arg(
+        long,
+        value_name = "FILE",
+        env = "SEESE3_TLS_CERT",
+        requires = "tls_key"
+    )]
+    tls_cert: Option<PathBuf>,
+    /// The private key of the certificate, in PEM
+    #[arg(
+        long,
+        value_name = "FILE",
+        env = "SEESE3_TLS_KEY",
+        requires = "tls_cert"
+    )]
+    tls_key: Option<PathBuf>,
+    /// Authorities in PEM: only clients with a certificate of theirs may connect
+    #[arg(
+        long,
+        value_name = "FILE",
+        env = "SEESE3_TLS_CLIENT_CA",
+        requires = "tls_cert"
+    )]
+    tls_client_ca: Option<PathBuf>,
+    /// Largest number of connections at a time, 1 to 1000000; one more is closed at once
+    #[arg(long, env = "SEESE3_MAX_CONNECTIONS", default_value_t = Config::default().connections, value_parser = bounded(1, 1_000_000))]
+    max_connections: usize,
     /// How the nearest frames are searched
     #[arg(long, env = "SEESE3_INDEX", value_enum, default_value_t = IndexName::Exact)]
     index: IndexName,
@@ -113,6 +150,12 @@ impl Serve {
         let log = start_log(self.log_format);
         let store = Store::open(&self.store)?;
         let config = self.config()?;
+        let losses = log.losses();
+        config.metrics.count_elsewhere(
+            "log_lines_lost",
+            "Lines of the log that could not be written",
+            move || losses.count(),
+        );
 
         // The port is opened before the store is loaded: health checks are answered at once,
         // NOT_SERVING until everything is loaded.
@@ -126,6 +169,24 @@ impl Serve {
             .local_addr()
             .context("the listener has no address")?;
         say(format_args!("listening on {address}"));
+
+        let operations = match &self.metrics_listen {
+            None => None,
+            Some(address) => {
+                let listener = TcpListener::bind(address).await;
+                let listener = listener
+                    .with_context(|| format!("--metrics-listen: cannot listen on {address}"))?;
+                let address = listener
+                    .local_addr()
+                    .context("the listener has no address")?;
+                say(format_args!("metrics on {address}"));
+                Some(listener)
+            }
+        };
+        let listeners = Listeners {
+            grpc: listener,
+            operations,
+        };
 
         let (asked, again) = tokio::sync::oneshot::channel();
         let stopping = async move {
@@ -141,7 +202,7 @@ impl Serve {
         };
 
         tokio::select! {
-            ended = run(listener, store, config, stopping) => ended?,
+            ended = run(listeners, store, config, stopping) => ended?,
             // Whoever signals twice does not want to wait for requests in flight.
             () = signalled_twice => bail!("a second signal came: requests in flight were given up"),
         }
@@ -153,6 +214,46 @@ impl Serve {
 
         Ok(())
     }
+}
+
+/// Files that a server has open besides its connections: the store's, the log, listeners.
+const FILES_KEPT: u64 = 128;
+
+/// As many connections as were asked for, or as the system lets this process have. The limit is
+/// raised as far as that goes: by default it is lower than one server needs.
+fn connections_within_file_limit(asked: usize) -> usize {
+    #[cfg(unix)]
+    {
+        use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+
+        let limit = getrlimit(Resource::Nofile);
+        let raised = Rlimit {
+            current: limit.maximum,
+            maximum: limit.maximum,
+        };
+
+        // Where it cannot be raised, the current limit holds.
+        let now = match setrlimit(Resource::Nofile, raised) {
+            Ok(()) => limit.maximum,
+            Err(_) => limit.current,
+        };
+        let Some(files) = now else {
+            return asked;
+        };
+
+        let possible = usize::try_from(files.saturating_sub(FILES_KEPT)).unwrap_or(usize::MAX);
+        if possible < asked {
+            tracing::warn!(
+                asked,
+                possible,
+                "fewer connections: raise the limit of open files (LimitNOFILE, ulimit -n)"
+            );
+        }
+        asked.min(possible.max(1))
+    }
+
+    #[cfg(not(unix))]
+    asked
 }
 
 /// Notified whenever the process gets SIGHUP.
@@ -219,12 +320,41 @@ impl Serve {
             streams: self.max_streams,
             token_key: self.token_key()?,
             drain: Duration::from_secs(self.drain_seconds),
+            connections: connections_within_file_limit(self.max_connections),
+            tls: self.tls()?.map(Arc::new),
+            keyring: self.keyring()?.map(Arc::new),
             reload: Reload {
                 every: (self.reload_seconds > 0).then(|| Duration::from_secs(self.reload_seconds)),
                 asked: reload_on_hangup(),
             },
             ..defaults
         })
+    }
+
+    fn tls(&self) -> anyhow::Result<Option<Tls>> {
+        let (Some(cert), Some(key)) = (&self.tls_cert, &self.tls_key) else {
+            return Ok(None);
+        };
+        let files = TlsFiles {
+            cert: cert.clone(),
+            key: key.clone(),
+            client_ca: self.tls_client_ca.clone(),
+        };
+
+        Ok(Some(Tls::open(files)?))
+    }
+
+    fn keyring(&self) -> anyhow::Result<Option<Keyring>> {
+        let Some(file) = &self.auth_file else {
+            return Ok(None);
+        };
+        if self.tls_cert.is_none() {
+            tracing::warn!(
+                "tokens travel in plain text: give --tls-cert, or listen on loopback behind a proxy"
+            );
+        }
+
+        Ok(Some(Keyring::open(file.clone())?))
     }
 
     fn token_key(&self) -> anyhow::Result<TokenKey> {

@@ -23,12 +23,11 @@ impl CatalogService for Handlers {
         &self,
         request: Request<pb::ListRoomsRequest>,
     ) -> Result<Response<pb::ListRoomsResponse>, Status> {
+        let snapshot = self.snapshot(&request)?;
         let pb::ListRoomsRequest {
             page_size,
             page_token,
         } = request.into_inner();
-
-        let snapshot = self.snapshot()?;
         let (page, next_page_token) = page(snapshot.rooms(), page_size, &page_token)?;
         let rooms = page.into_iter().map(|served| room(served)).collect();
 
@@ -42,7 +41,7 @@ impl CatalogService for Handlers {
         &self,
         request: Request<pb::GetRoomRequest>,
     ) -> Result<Response<pb::GetRoomResponse>, Status> {
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(&request)?;
         let room = room(snapshot.room(&request.into_inner().room)?);
         Ok(Response::new(pb::GetRoomResponse { room: Some(room) }))
     }
@@ -51,12 +50,11 @@ impl CatalogService for Handlers {
         &self,
         request: Request<pb::ListAdaptersRequest>,
     ) -> Result<Response<pb::ListAdaptersResponse>, Status> {
+        let snapshot = self.snapshot(&request)?;
         let pb::ListAdaptersRequest {
             page_size,
             page_token,
         } = request.into_inner();
-
-        let snapshot = self.snapshot()?;
         let (page, next_page_token) = page(snapshot.adapters(), page_size, &page_token)?;
         let adapters = page.into_iter().map(|stored| adapter(stored)).collect();
 
@@ -70,7 +68,7 @@ impl CatalogService for Handlers {
         &self,
         request: Request<pb::GetAdapterRequest>,
     ) -> Result<Response<pb::GetAdapterResponse>, Status> {
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(&request)?;
         let adapter = adapter(snapshot.adapter(&request.into_inner().adapter)?);
 
         Ok(Response::new(pb::GetAdapterResponse {

@@ -30,7 +30,7 @@ impl EvaluationService for Handlers {
         &self,
         request: Request<pb::EvaluateRequest>,
     ) -> Result<Response<Self::EvaluateStream>, Status> {
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(&request)?;
         let budget = self.workers.budget(request.metadata());
         let (served, protocol) =
             protocol(&snapshot, request.into_inner(), self.config.limits.steps)?;
@@ -50,7 +50,7 @@ impl EvaluationService for Handlers {
         &self,
         request: Request<pb::ScorePredictionsRequest>,
     ) -> Result<Response<pb::ScorePredictionsResponse>, Status> {
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(&request)?;
         let most = self.config.predictions;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();

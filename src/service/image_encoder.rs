@@ -4,7 +4,9 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Instant;
 
+use super::metrics::Metrics;
 use super::{Error, RunError};
 use crate::encoder::{self, Bounds, Encoder, Runtime, decode};
 use crate::store::StoredAdapter;
@@ -29,12 +31,25 @@ pub struct ImageEncoders {
 pub struct ImageEncoder {
     encoder: Encoder,
     bounds: Bounds,
+    metrics: Option<Metrics>,
 }
 
 impl ImageEncoder {
     /// Encodes images of at most the size of `bounds` by `encoder`.
     pub fn new(encoder: Encoder, bounds: Bounds) -> Self {
-        Self { encoder, bounds }
+        Self {
+            encoder,
+            bounds,
+            metrics: None,
+        }
+    }
+
+    /// The same, with the time of each image counted.
+    pub fn counted_in(self, metrics: Metrics) -> Self {
+        Self {
+            metrics: Some(metrics),
+            ..self
+        }
     }
 
     /// The feature of one JPEG or PNG image. `field` is the name of the image's field in the
@@ -61,10 +76,16 @@ impl ImageEncoder {
     /// # Errors
     /// As [`ImageEncoder::feature`].
     pub fn feature_of(&self, field: &str, image: RgbImage) -> Result<Vec<f32>, Error> {
-        self.encoder
+        let began = Instant::now();
+        let rows = self
+            .encoder
             .prepare(image)
-            .and_then(|image| self.encoder.encode(&[vec![&image]]))
-            .map(|rows| rows.row(0).to_vec())
+            .and_then(|image| self.encoder.encode(&[vec![&image]]));
+
+        if let Some(metrics) = &self.metrics {
+            metrics.image_encoded(began.elapsed());
+        }
+        rows.map(|rows| rows.row(0).to_vec())
             .map_err(|error| told(field, error))
     }
 }

@@ -31,7 +31,7 @@ impl LocalizationService for Handlers {
         &self,
         request: Request<pb::LocalizeRequest>,
     ) -> Result<Response<pb::LocalizeResponse>, Status> {
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(&request)?;
         let most = self.config.limits.hits;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
@@ -43,6 +43,11 @@ impl LocalizationService for Handlers {
                 answer(&snapshot, request, most, cancel)
             })
             .await?;
+
+        let found = answer.places.first().and_then(|place| place.hit.as_ref());
+        if let Some(hit) = found {
+            self.config.metrics.retrieved(hit.distance);
+        }
 
         Ok(Response::new(answer))
     }
@@ -89,10 +94,9 @@ fn answer(
         .start(&source, None)
         .map_err(|error| match error {
             E::Adapter(problem) => view_error(&problem).within("view"),
-            E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => Error::NotFound {
-                field: "view.frame_id".to_owned(),
-                name: frame.to_string(),
-            },
+            E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => {
+                Error::no_frame("view.frame_id", frame)
+            }
             other => Error::from(other),
         })?;
 

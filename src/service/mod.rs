@@ -7,45 +7,58 @@
 //! - Long work checks between its pieces whether the deadline passed or the caller went away, and
 //!   stops if so.
 
+mod auth;
 mod catalog;
+mod connections;
 mod convert;
 mod evaluation;
 mod image_encoder;
 mod navigate_to;
 mod health;
 mod localization;
+mod measure;
+mod metrics;
 mod navigation;
 mod odometry;
+mod operations;
 mod reload;
 mod relocalization;
 mod shutdown;
 mod snapshot;
 mod status;
 mod telemetry;
+mod tls;
 mod track;
 mod two_views;
 mod workers;
 
+pub use auth::{AuthError, Keyring};
 pub use image_encoder::ImageEncoders;
+pub use metrics::Metrics;
 pub use reload::Reload;
 pub use shutdown::shutdown_signal;
 pub use snapshot::Snapshot;
-pub use status::Error;
+pub use status::{Error, Full};
+pub use tls::{Tls, TlsError, TlsFiles};
 pub use track::TokenKey;
 
+use std::convert::Infallible;
 use std::future::Future;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, oneshot, watch};
+use tonic::Request;
 use tonic::transport::Server;
-use tonic::transport::server::TcpIncoming;
 use tower::util::MapRequestLayer;
 use tower_http::request_id::{PropagateRequestIdLayer, SetRequestIdLayer};
 use tower_http::trace::TraceLayer;
 
 use crate::store::{self, Store};
+use auth::{AuthLayer, Principal};
+use measure::MeasureLayer;
 use seese3_client::proto::FILE_DESCRIPTOR_SET;
 use seese3_client::proto::v1::catalog_service_server::CatalogServiceServer;
 use seese3_client::proto::v1::evaluation_service_server::EvaluationServiceServer;
@@ -89,6 +102,14 @@ pub struct Config {
     pub drain: Duration,
     /// When the server looks for changes of its store.
     pub reload: Reload,
+    /// What the server counts.
+    pub metrics: Metrics,
+    /// The largest number of connections at a time; a further one is closed at once.
+    pub connections: usize,
+    /// The server's certificate; none to speak plain text.
+    pub tls: Option<Arc<Tls>>,
+    /// Who may call; none to answer everybody.
+    pub keyring: Option<Arc<Keyring>>,
 }
 
 impl Default for Config {
@@ -107,6 +128,10 @@ impl Default for Config {
             token_key: TokenKey::random(),
             drain: Duration::from_secs(10),
             reload: Reload::default(),
+            metrics: Metrics::default(),
+            connections: 4_096,
+            tls: None,
+            keyring: None,
         }
     }
 }
@@ -133,10 +158,30 @@ pub enum RunError {
     },
     #[error("the server failed: {0}")]
     Transport(#[from] tonic::transport::Error),
+    #[error("the listener of metrics failed: {0}")]
+    Operations(std::io::Error),
     #[error("the reflection service cannot be made: {0}")]
     Reflection(String),
     #[error("loading the store failed: {0}")]
     Loading(String),
+}
+
+/// Where a server listens.
+#[derive(Debug)]
+pub struct Listeners {
+    /// For gRPC.
+    pub grpc: TcpListener,
+    /// For `/metrics`, `/livez` and `/readyz` over HTTP, if anywhere.
+    pub operations: Option<TcpListener>,
+}
+
+impl From<TcpListener> for Listeners {
+    fn from(grpc: TcpListener) -> Self {
+        Self {
+            grpc,
+            operations: None,
+        }
+    }
 }
 
 /// The stage of a server's life, which health and every handler read.
@@ -159,12 +204,24 @@ struct Handlers {
 }
 
 impl Handlers {
-    fn snapshot(&self) -> Result<Arc<Snapshot>, Error> {
-        match &*self.phase.borrow() {
-            Phase::Serving(snapshot) | Phase::Draining(snapshot) => Ok(snapshot.clone()),
-            Phase::Loading | Phase::Stopping => Err(Error::Loading),
-        }
+    /// What is served now, as far as the caller of the request may see it.
+    fn snapshot<T>(&self, request: &Request<T>) -> Result<Arc<Snapshot>, Error> {
+        let snapshot = match &*self.phase.borrow() {
+            Phase::Serving(snapshot) | Phase::Draining(snapshot) => snapshot.clone(),
+            Phase::Loading | Phase::Stopping => return Err(Error::Loading),
+        };
+
+        let scope = principal(request).map(|principal| principal.rooms());
+        Ok(match scope.filter(|scope| !scope.is_all()) {
+            Some(scope) => Arc::new(snapshot.seen_by(scope)),
+            None => snapshot,
+        })
     }
+}
+
+/// Who a request is from; none if the server answers everybody.
+fn principal<T>(request: &Request<T>) -> Option<&Arc<Principal>> {
+    request.extensions().get()
 }
 
 /// Serves a store until `shutdown` completes. The health service answers from the first moment,
@@ -175,14 +232,16 @@ impl Handlers {
 /// server ends before it serves; or if the transport fails. A single room or adapter that cannot be
 /// served is refused by itself.
 pub async fn run(
-    listener: TcpListener,
+    listeners: impl Into<Listeners>,
     store: Store,
     config: Config,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), RunError> {
     // Health, reflection and the other services listen at once and read the phase from this
     // channel. Until the store is loaded, requests are refused as UNAVAILABLE.
+    let Listeners { grpc, operations } = listeners.into();
     let (phase, watched) = watch::channel(Phase::Loading);
+    let metrics = config.metrics.clone();
     let (stop, stopped) = oneshot::channel::<()>();
     let workers = Workers::new(&config);
 
@@ -192,14 +251,23 @@ pub async fn run(
         config: Arc::new(config.clone()),
         streams: Arc::new(Semaphore::new(config.streams)),
     };
-    let server = server(handlers, watched, listener, async {
+    let answering = server(handlers, watched.clone(), grpc, async {
         // An error means that `run` was dropped; the server must stop then, too.
         let _ = stopped.await;
     })?;
+    let operating = operate(operations, metrics.clone(), watched);
+    let following = follow_files(config.tls.clone(), config.keyring.clone());
+    let server = async {
+        tokio::select! {
+            ended = answering => ended,
+            failed = operating => Err(failed),
+            never = following => match never {},
+        }
+    };
 
     tokio::pin!(server, shutdown);
     let loading = async {
-        let loader = Loader::open(store, config.index, config.encoders).await?;
+        let loader = Loader::open(store, config.index, config.encoders, metrics.clone()).await?;
         let first = loader.first().await?;
         Ok::<_, RunError>((loader, first))
     };
@@ -223,6 +291,8 @@ pub async fn run(
         "serving"
     );
 
+    metrics.serving(&first);
+
     // From here on requests are answered. The function waits for the shutdown signal or for a
     // failure of the server.
     phase.send_replace(Phase::Serving(Arc::new(first)));
@@ -230,7 +300,7 @@ pub async fn run(
     tokio::select! {
         ended = &mut server => return ended,
         () = &mut shutdown => {}
-        () = reload::keep_current(loader, config.reload, &phase) => {}
+        () = reload::keep_current(loader, config.reload, &phase, &metrics) => {}
     }
 
     tracing::info!(bound_s = config.drain.as_secs_f64(), "draining");
@@ -245,17 +315,72 @@ pub async fn run(
 
     // An error means the server has ended already.
     let _ = stop.send(());
-    if let Ok(ended) = tokio::time::timeout(config.drain, &mut server).await {
-        return ended;
+    drained(server, config.drain, &workers, &metrics).await
+}
+
+/// Waits until a server that was told to stop has ended: at most `bound`, and then a moment.
+async fn drained(
+    mut server: Pin<&mut impl Future<Output = Result<(), RunError>>>,
+    bound: Duration,
+    workers: &Workers,
+    metrics: &Metrics,
+) -> Result<(), RunError> {
+    tokio::select! {
+        ended = &mut server => return ended,
+        // Callers that answer nothing keep their connections open. Without a request they are not
+        // waited for.
+        () = idle(metrics) => {}
+        () = tokio::time::sleep(bound) => {
+            tracing::warn!("the drain bound passed; requests still in flight are given up");
+            workers.halt();
+        }
     }
 
-    tracing::warn!("the drain bound passed; requests still in flight are given up");
-    workers.halt();
-
-    // The abandoned requests now end with UNAVAILABLE. Wait a moment for callers to read that.
+    // Wait a moment for callers to read their last answers; of abandoned requests that is
+    // UNAVAILABLE.
     tokio::time::timeout(LAST_WORDS, server)
         .await
         .unwrap_or(Ok(()))
+}
+
+/// Completes when no request is being answered.
+async fn idle(metrics: &Metrics) {
+    while metrics.in_flight() > 0 {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
+/// Notices new certificates and credentials; never completes.
+async fn follow_files(tls: Option<Arc<Tls>>, keyring: Option<Arc<Keyring>>) -> Infallible {
+    let of_tls = async {
+        if let Some(tls) = &tls {
+            tls.follow_files().await;
+        }
+    };
+    let of_keyring = async {
+        if let Some(keyring) = &keyring {
+            keyring.follow_file().await;
+        }
+    };
+
+    tokio::join!(of_tls, of_keyring);
+    std::future::pending().await
+}
+
+/// Answers those who operate the server, if there is a listener for them. Completes only if that
+/// fails.
+async fn operate(
+    listener: Option<TcpListener>,
+    metrics: Metrics,
+    phase: watch::Receiver<Phase>,
+) -> RunError {
+    match listener {
+        None => std::future::pending().await,
+        Some(listener) => match operations::serve(listener, metrics, phase).await {
+            Ok(()) => std::future::pending().await,
+            Err(problem) => RunError::Operations(problem),
+        },
+    }
 }
 
 fn server(
@@ -264,7 +389,14 @@ fn server(
     listener: TcpListener,
     stopped: impl Future<Output = ()> + Send,
 ) -> Result<impl Future<Output = Result<(), RunError>> + Send, RunError> {
-    let most = handlers.config.message_bytes;
+    let Config {
+        message_bytes: most,
+        connections,
+        tls,
+        keyring,
+        metrics,
+        ..
+    } = handlers.config.as_ref().clone();
 
     // Reflection is offered in both versions, because some clients speak only v1alpha.
     let reflection = || {
@@ -297,6 +429,11 @@ fn server(
                 .on_failure(()),
         )
         .layer(PropagateRequestIdLayer::new(telemetry::REQUEST_ID))
+        .layer(MeasureLayer(metrics.clone()))
+        .layer(AuthLayer {
+            keyring,
+            metrics: metrics.clone(),
+        })
         .add_service(health::service(phase))
         .add_service(v1)
         .add_service(v1alpha)
@@ -308,7 +445,7 @@ fn server(
         .add_service(CatalogServiceServer::new(handlers.clone()).max_decoding_message_size(most))
         .add_service(EvaluationServiceServer::new(handlers).max_decoding_message_size(most));
 
-    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+    let incoming = connections::incoming(listener, connections, tls, metrics);
     Ok(async move {
         Ok(router
             .serve_with_incoming_shutdown(incoming, stopped)

@@ -42,7 +42,7 @@ impl Handlers {
         &self,
         request: tonic::Request<pb::NavigateToRequest>,
     ) -> Result<Events, Error> {
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(&request)?;
         let most = self.config.limits.steps;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
@@ -205,10 +205,7 @@ fn ready(
 fn goal_pose(goal: Option<Goal>, navigator: &Navigator, room: &str) -> Result<Pose, Error> {
     match goal {
         Some(Goal::GoalFrameId(frame)) => {
-            let unknown = |_| Error::NotFound {
-                field: "goal_frame_id".to_owned(),
-                name: FrameId(frame).to_string(),
-            };
+            let unknown = |_| Error::no_frame("goal_frame_id", FrameId(frame));
             Ok(*navigator.room().pose(FrameId(frame)).map_err(unknown)?)
         }
         Some(Goal::GoalPose(pose)) => {

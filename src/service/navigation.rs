@@ -17,7 +17,7 @@ impl NavigationService for Handlers {
         &self,
         request: Request<pb::NavigateRequest>,
     ) -> Result<Response<pb::NavigateResponse>, Status> {
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(&request)?;
         let limits = self.config.limits;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
@@ -29,6 +29,11 @@ impl NavigationService for Handlers {
                 navigate(&snapshot, request, limits, cancel)
             })
             .await?;
+
+        let found = answer.steps.iter().filter_map(|step| step.hits.first());
+        for hit in found {
+            self.config.metrics.retrieved(hit.distance);
+        }
 
         Ok(Response::new(answer))
     }
@@ -46,7 +51,7 @@ impl NavigationService for Handlers {
         &self,
         request: Request<pb::BatchNavigateRequest>,
     ) -> Result<Response<pb::BatchNavigateResponse>, Status> {
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(&request)?;
         let limits = self.config.limits;
         let most = self.config.batch;
         let budget = self.workers.budget(request.metadata());

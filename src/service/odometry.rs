@@ -26,14 +26,14 @@ impl OdometryService for Handlers {
         &self,
         request: Request<tonic::Streaming<pb::TrackRequest>>,
     ) -> Result<Response<Self::TrackStream>, Status> {
-        Ok(Response::new(self.follow(request.into_inner()).await?))
+        Ok(Response::new(self.follow(request).await?))
     }
 
     async fn estimate_motion(
         &self,
         request: Request<pb::EstimateMotionRequest>,
     ) -> Result<Response<pb::EstimateMotionResponse>, Status> {
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(&request)?;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
         let lane = Lane::of(request.first.iter().chain(&request.second));
@@ -112,10 +112,7 @@ fn by_adapter(
                     Error::invalid("room", format!("is required: {field} is a frame"))
                 })?;
 
-                let unknown = |_| Error::NotFound {
-                    field: format!("{field}.frame_id"),
-                    name: frame.to_string(),
-                };
+                let unknown = |_| Error::no_frame(&format!("{field}.frame_id"), frame);
                 served.navigator.room().pose(frame).map_err(unknown)?;
 
                 View::Latent(served.navigator.latents().row(frame.row()).to_vec())

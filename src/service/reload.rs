@@ -9,6 +9,7 @@ use std::time::Duration;
 use tokio::sync::{Notify, watch};
 
 use super::Phase;
+use super::metrics::{Metrics, ReloadOutcome};
 use super::snapshot::{Loader, Refused, Snapshot};
 
 /// When a server looks for changes of its store.
@@ -30,7 +31,12 @@ impl Default for Reload {
 }
 
 /// Keeps the served snapshot up to date for as long as the server serves; never completes.
-pub(super) async fn keep_current(loader: Loader, reload: Reload, phase: &watch::Sender<Phase>) {
+pub(super) async fn keep_current(
+    loader: Loader,
+    reload: Reload,
+    phase: &watch::Sender<Phase>,
+    metrics: &Metrics,
+) {
     // Trouble that lasts is logged once.
     let mut trouble = String::new();
 
@@ -48,20 +54,27 @@ pub(super) async fn keep_current(loader: Loader, reload: Reload, phase: &watch::
         match now {
             Ok(now) => {
                 trouble.clear();
-                if !now.is_like(&before) {
-                    log_changes(&before, &now);
-                    phase.send_replace(Phase::Serving(Arc::new(now)));
+                if now.is_like(&before) {
+                    metrics.reloaded(ReloadOutcome::Unchanged);
+                    continue;
                 }
+
+                log_changes(&before, &now);
+                metrics.serving(&now);
+                metrics.reloaded(ReloadOutcome::Changed);
+                phase.send_replace(Phase::Serving(Arc::new(now)));
             }
             // A store that cannot be reached, or is gone, takes nothing from what is served.
-            Err(problem) if problem != trouble => {
-                tracing::error!(
-                    problem,
-                    "the store could not be read again; serving goes on"
-                );
-                trouble = problem;
+            Err(problem) => {
+                metrics.reloaded(ReloadOutcome::Failed);
+                if problem != trouble {
+                    tracing::error!(
+                        problem,
+                        "the store could not be read again; serving goes on"
+                    );
+                    trouble = problem;
+                }
             }
-            Err(_) => {}
         }
     }
 }

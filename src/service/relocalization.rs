@@ -25,7 +25,7 @@ impl Handlers {
         &self,
         request: tonic::Request<pb::RelocalizeRequest>,
     ) -> Result<pb::RelocalizeResponse, Error> {
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(&request)?;
         let most = self.config.limits.hits;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();

@@ -3,25 +3,90 @@
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
+use seese3_core::room::FrameId;
 use seese3_core::{adapter, cancel, eval, navigation, room, splits};
+
+/// How like a served name one has to be to be taken for a misspelling of it, 0 to 1: one wrong letter
+/// in four.
+const NEARLY: f64 = 0.75;
 
 /// The domain of this service's error reasons.
 const DOMAIN: &str = "seese3.v1";
 
+/// What can be full, so that a request is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Full {
+    /// The lane of short requests.
+    ShortRequests,
+    /// The lane of requests with images.
+    Images,
+    /// The lane of batches and evaluations.
+    LongRequests,
+    /// The server's Track streams.
+    Streams,
+    /// The Track streams of one caller.
+    CallersStreams,
+    /// The requests and streams of one caller.
+    CallersRequests,
+    /// The connections; who is refused hears nothing.
+    Connections,
+}
+
+impl Full {
+    /// All of them.
+    pub const ALL: [Self; 7] = [
+        Self::ShortRequests,
+        Self::Images,
+        Self::LongRequests,
+        Self::Streams,
+        Self::CallersStreams,
+        Self::CallersRequests,
+        Self::Connections,
+    ];
+
+    /// The words of messages and metrics.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::ShortRequests => "short requests",
+            Self::Images => "requests with images",
+            Self::LongRequests => "batches and evaluations",
+            Self::Streams => "Track streams",
+            Self::CallersStreams => "Track streams of this caller",
+            Self::CallersRequests => "requests of this caller",
+            Self::Connections => "connections",
+        }
+    }
+}
+
+impl std::fmt::Display for Full {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.words())
+    }
+}
+
 /// Why a request is refused or fails.
-#[derive(Debug, thiserror::Error, PartialEq)]
+#[derive(Debug, Clone, thiserror::Error, PartialEq)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
     #[error("{field}: {problem}")]
     Invalid { field: String, problem: String },
-    #[error("{field}: '{name}' is not served")]
-    NotFound { field: String, name: String },
+    #[error("{field}: '{name}' is not served{}", meant(nearest.as_ref()))]
+    NotFound {
+        field: String,
+        name: String,
+        /// The served name that is most like it, if one nearly is.
+        nearest: Option<String>,
+    },
     #[error("{0}")]
     Precondition(String),
     #[error("the server is not ready: it is loading its store or stopping; try again")]
     Loading,
     #[error("the server is busy: as many {what} as it takes are waiting or open; try again later")]
-    Full { what: &'static str },
+    Full { what: Full },
+    #[error("{problem}")]
+    Unauthenticated { problem: &'static str },
+    #[error("the caller has no right to {verb}: the operator gives it in the server's --auth-file")]
+    Forbidden { verb: &'static str },
     #[error("the deadline passed before the answer was ready")]
     Deadline,
     #[error("the request was cancelled")]
@@ -39,6 +104,35 @@ impl Error {
         }
     }
 
+    /// A name that is none of the `served` ones.
+    pub fn not_found<'a>(
+        field: &str,
+        name: &str,
+        served: impl IntoIterator<Item = &'a String>,
+    ) -> Self {
+        let likeness = |served: &String| strsim::normalized_damerau_levenshtein(served, name);
+        let nearest = served
+            .into_iter()
+            .map(|served| (likeness(served), served))
+            .filter(|(likeness, _)| *likeness >= NEARLY)
+            .max_by(|a, b| a.0.total_cmp(&b.0));
+
+        Self::NotFound {
+            field: field.to_owned(),
+            name: name.to_owned(),
+            nearest: nearest.map(|(_, name)| name.clone()),
+        }
+    }
+
+    /// A frame that the room does not have.
+    pub fn no_frame(field: &str, frame: FrameId) -> Self {
+        Self::NotFound {
+            field: field.to_owned(),
+            name: frame.to_string(),
+            nearest: None,
+        }
+    }
+
     /// The same error with its field prefixed by the field that contains it.
     pub fn within(self, parent: &str) -> Self {
         match self {
@@ -46,9 +140,14 @@ impl Error {
                 field: format!("{parent}.{field}"),
                 problem,
             },
-            Self::NotFound { field, name } => Self::NotFound {
+            Self::NotFound {
+                field,
+                name,
+                nearest,
+            } => Self::NotFound {
                 field: format!("{parent}.{field}"),
                 name,
+                nearest,
             },
             other => other,
         }
@@ -61,9 +160,14 @@ impl Error {
                 field: name.to_owned(),
                 problem,
             },
-            Self::NotFound { name: missing, .. } => Self::NotFound {
+            Self::NotFound {
+                name: missing,
+                nearest,
+                ..
+            } => Self::NotFound {
                 field: name.to_owned(),
                 name: missing,
+                nearest,
             },
             other => other,
         }
@@ -77,6 +181,8 @@ impl Error {
             Self::Precondition(_) => Code::FailedPrecondition,
             Self::Loading => Code::Unavailable,
             Self::Full { .. } => Code::ResourceExhausted,
+            Self::Unauthenticated { .. } => Code::Unauthenticated,
+            Self::Forbidden { .. } => Code::PermissionDenied,
             Self::Deadline => Code::DeadlineExceeded,
             Self::Cancelled => Code::Cancelled,
             Self::Internal => Code::Internal,
@@ -90,6 +196,8 @@ impl Error {
             Self::Precondition(_) => "PRECONDITION",
             Self::Loading => "NOT_READY",
             Self::Full { .. } => "BUSY",
+            Self::Unauthenticated { .. } => "UNAUTHENTICATED",
+            Self::Forbidden { .. } => "FORBIDDEN",
             Self::Deadline => "DEADLINE",
             Self::Cancelled => "CANCELLED",
             Self::Internal => "INTERNAL",
@@ -97,13 +205,19 @@ impl Error {
     }
 }
 
+fn meant(nearest: Option<&String>) -> String {
+    nearest.map_or_else(String::new, |name| format!("; did you mean '{name}'?"))
+}
+
 impl From<Error> for Status {
     fn from(error: Error) -> Self {
         let mut details = ErrorDetails::new();
         let mut metadata = std::collections::HashMap::new();
-        if let Error::Full { what } = &error {
-            metadata.insert("full".to_owned(), (*what).to_owned());
-        }
+        match &error {
+            Error::Full { what } => metadata.insert("full".to_owned(), what.words().to_owned()),
+            Error::Forbidden { verb } => metadata.insert("verb".to_owned(), (*verb).to_owned()),
+            _ => None,
+        };
         details.set_error_info(error.reason(), DOMAIN, metadata);
 
         // Details in the standard types of google.rpc, so that a client learns the field to
@@ -112,7 +226,7 @@ impl From<Error> for Status {
             Error::Invalid { field, problem } => {
                 details.add_bad_request_violation(brief(field), brief(problem));
             }
-            Error::NotFound { field, name } => {
+            Error::NotFound { field, name, .. } => {
                 details.set_resource_info(brief(field), brief(name), "", "is not served");
             }
             Error::Full { .. } => {
@@ -157,17 +271,10 @@ impl From<navigation::Error> for Error {
         // return early.
         let field = match &error {
             E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => {
-                return Self::NotFound {
-                    field: "source.frame_id".to_owned(),
-                    name: frame.to_string(),
-                };
+                return Self::no_frame("source.frame_id", *frame);
             }
             E::TargetFrame(room::Error::UnknownFrame { frame, .. }) => {
-                let field = "displacement.target_frame_id".to_owned();
-                return Self::NotFound {
-                    field,
-                    name: frame.to_string(),
-                };
+                return Self::no_frame("displacement.target_frame_id", *frame);
             }
             E::Cancelled(_) => return Self::Cancelled,
             // Features were checked when the store was loaded, so a misfit now is the server's
@@ -256,5 +363,24 @@ impl From<eval::Error> for Error {
         };
 
         Self::invalid(field, error)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand: a letter left out is one edit of seven, 0.86; another name shares hardly
+    /// a letter.
+    #[test]
+    fn a_name_that_is_nearly_right_is_suggested() {
+        let served = ["kitchen".to_owned(), "office".to_owned()];
+        let message = |name: &str| Error::not_found("room", name, &served).to_string();
+
+        assert_eq!(
+            message("kitchn"),
+            "room: 'kitchn' is not served; did you mean 'kitchen'?"
+        );
+        assert_eq!(message("hallway"), "room: 'hallway' is not served");
     }
 }

@@ -12,6 +12,8 @@ use http::{HeaderMap, HeaderName, HeaderValue, Request, Response};
 use tower_http::request_id::{MakeRequestId, RequestId};
 use tracing::{Span, field};
 
+use super::connections::Peer;
+
 /// The metadata key of the request id, in requests and responses.
 pub const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 /// The longest id that is accepted from a caller, bytes.
@@ -45,10 +47,13 @@ impl MakeRequestId for RandomId {
 /// The span of a request; its status is recorded once it is known.
 pub fn span<B>(request: &Request<B>) -> Span {
     let id = request.headers().get(REQUEST_ID);
+    let peer = request.extensions().get::<Peer>();
     tracing::info_span!(
         "request",
         id = id.and_then(|id| id.to_str().ok()).unwrap_or_default(),
         method = request.uri().path(),
+        peer = peer.map(|peer| field::display(peer.address)),
+        principal = field::Empty,
         grpc_status = field::Empty,
     )
 }

@@ -11,6 +11,8 @@ use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
 use tonic::metadata::MetadataMap;
 
+use super::metrics::Metrics;
+use super::status::Full;
 use super::{Config, Error};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
@@ -38,12 +40,12 @@ impl Lane {
         }
     }
 
-    /// What its requests are called where one is refused.
-    fn words(self) -> &'static str {
+    /// What is full if this lane is.
+    fn full(self) -> Full {
         match self {
-            Self::Short => "short requests",
-            Self::Images => "requests with images",
-            Self::Long => "batches and evaluations",
+            Self::Short => Full::ShortRequests,
+            Self::Images => Full::Images,
+            Self::Long => Full::LongRequests,
         }
     }
 }
@@ -74,6 +76,7 @@ pub struct Workers {
     long: Pool,
     longest: Duration,
     halted: watch::Sender<bool>,
+    metrics: Metrics,
 }
 
 /// Cancels the work when it is dropped: the future that waited for the result is gone.
@@ -96,6 +99,7 @@ impl Workers {
             long: pool(threads.div_ceil(2)),
             longest: config.longest,
             halted: watch::Sender::new(false),
+            metrics: config.metrics.clone(),
         }
     }
 
@@ -105,6 +109,12 @@ impl Workers {
             Lane::Images => &self.images,
             Lane::Long => &self.long,
         }
+    }
+
+    /// The refusal of a request because `what` is full, which is counted.
+    pub fn full(&self, what: Full) -> Error {
+        self.metrics.shed(what);
+        Error::Full { what }
     }
 
     /// Abandons all work, running and waiting. Its callers receive [`Error::Loading`], which is
@@ -133,10 +143,8 @@ impl Workers {
         work: impl FnOnce(&Cancellation) -> Result<T, Error> + Send + 'static,
     ) -> Result<T, Error> {
         let pool = self.pool(lane).clone();
-        let admitted = pool
-            .admitted
-            .try_acquire_owned()
-            .map_err(|_| Error::Full { what: lane.words() })?;
+        let admitted = pool.admitted.try_acquire_owned();
+        let admitted = admitted.map_err(|_| self.full(lane.full()))?;
 
         // The guard lives in this future. If the caller goes away the future is dropped, and the
         // guard cancels the work that is still running on its thread.
@@ -317,7 +325,7 @@ mod tests {
 
         begins.await.unwrap();
         let full = Error::Full {
-            what: "short requests",
+            what: Full::ShortRequests,
         };
         assert_eq!(workers.run(Lane::Short, LONG, |_| Ok(2)).await, Err(full));
 

@@ -17,6 +17,8 @@ mod harness;
 mod images;
 mod lifecycle;
 mod navigators;
+mod operations;
 mod refusals;
 mod reload;
+mod security;
 mod tracking;

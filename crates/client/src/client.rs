@@ -3,7 +3,10 @@
 use std::time::Duration;
 
 use tokio_stream::Stream;
-use tonic::transport::{Channel, Endpoint};
+use tonic::metadata::{Ascii, MetadataValue};
+use tonic::service::Interceptor;
+use tonic::service::interceptor::InterceptedService;
+use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 use tonic::{Code, Status, Streaming};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
@@ -28,6 +31,8 @@ pub enum Error {
     Address { address: String, problem: String },
     #[error("cannot connect to {address}: {problem}")]
     Connect { address: String, problem: String },
+    #[error("the token cannot be sent: it has to be visible ASCII characters")]
+    Token,
     #[error("the server refused ({:?}): {}", .0.code(), .0.message())]
     Refused(Box<Status>),
     #[error("no answer came before the deadline")]
@@ -82,8 +87,42 @@ impl From<Status> for Error {
 /// A connection to a server. Cloning it is cheap and shares the connection.
 #[derive(Debug, Clone)]
 pub struct Client {
-    channel: Channel,
+    channel: InterceptedService<Channel, Token>,
     deadline: Duration,
+}
+
+/// How to connect to a server.
+#[derive(Debug, Clone)]
+pub struct ConnectOptions {
+    /// The deadline of every call; of `track` only that of its opening.
+    pub deadline: Duration,
+    /// The bearer token of every call, if the server asks for one.
+    pub token: Option<String>,
+    /// TLS, if the server speaks it.
+    pub tls: Option<ClientTls>,
+}
+
+/// Certificates for a connection with TLS, in PEM.
+#[derive(Debug, Clone)]
+pub struct ClientTls {
+    /// The authorities that the server's certificate must come from.
+    pub authorities: Vec<u8>,
+    /// The client's certificate and its private key, if the server asks for one.
+    pub identity: Option<(Vec<u8>, Vec<u8>)>,
+}
+
+/// Adds the token to every call.
+#[derive(Debug, Clone)]
+struct Token(Option<MetadataValue<Ascii>>);
+
+impl Interceptor for Token {
+    fn call(&mut self, mut request: tonic::Request<()>) -> Result<tonic::Request<()>, Status> {
+        if let Some(authorization) = &self.0 {
+            let metadata = request.metadata_mut();
+            metadata.insert("authorization", authorization.clone());
+        }
+        Ok(request)
+    }
 }
 
 impl Client {
@@ -94,19 +133,63 @@ impl Client {
     /// [`Error::Address`] if the address cannot be parsed, [`Error::Connect`] if no connection is
     /// made within the deadline or 10 s.
     pub async fn connect(address: &str, deadline: Duration) -> Result<Self, Error> {
-        let url = if address.contains("://") {
-            address.to_owned()
-        } else {
-            format!("http://{address}")
+        let options = ConnectOptions {
+            deadline,
+            token: None,
+            tls: None,
+        };
+        Self::connect_with(address, options).await
+    }
+
+    /// Connects to `address`, HOST:PORT or a URL, with a token or TLS.
+    ///
+    /// # Errors
+    /// As [`Client::connect`]; also [`Error::Token`] if the token cannot be sent, and
+    /// [`Error::Connect`] if the certificates cannot be used.
+    pub async fn connect_with(address: &str, options: ConnectOptions) -> Result<Self, Error> {
+        let ConnectOptions {
+            deadline,
+            token,
+            tls,
+        } = options;
+
+        let token = match token {
+            None => None,
+            Some(token) => {
+                let mut value =
+                    MetadataValue::try_from(format!("Bearer {token}")).map_err(|_| Error::Token)?;
+                value.set_sensitive(true);
+                Some(value)
+            }
+        };
+
+        let url = match &tls {
+            _ if address.contains("://") => address.to_owned(),
+            Some(_) => format!("https://{address}"),
+            None => format!("http://{address}"),
         };
         let endpoint = Endpoint::from_shared(url).map_err(|error| Error::Address {
             address: address.to_owned(),
             problem: error.to_string(),
         })?;
 
-        let endpoint = endpoint
+        let mut endpoint = endpoint
             .connect_timeout(deadline.min(Duration::from_secs(10)))
             .tcp_nodelay(true);
+        if let Some(tls) = tls {
+            let mut config =
+                ClientTlsConfig::new().ca_certificate(Certificate::from_pem(tls.authorities));
+            if let Some((certificate, key)) = tls.identity {
+                config = config.identity(Identity::from_pem(certificate, key));
+            }
+
+            endpoint = endpoint
+                .tls_config(config)
+                .map_err(|error| Error::Connect {
+                    address: address.to_owned(),
+                    problem: format!("the certificates cannot be used: {error}"),
+                })?;
+        }
 
         // The error of tonic only says that the transport failed; its source has the reason.
         let channel = endpoint.connect().await.map_err(|error| {
@@ -118,7 +201,10 @@ impl Client {
             }
         })?;
 
-        Ok(Self { channel, deadline })
+        Ok(Self {
+            channel: InterceptedService::new(channel, Token(token)),
+            deadline,
+        })
     }
 
     /// Navigates from a view by a motion.

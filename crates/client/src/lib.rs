@@ -45,7 +45,7 @@ pub mod proto;
 pub mod convert;
 mod client;
 
-pub use client::{Client, Error};
+pub use client::{Client, ClientTls, ConnectOptions, Error};
 /// The types that [`convert`] speaks.
 pub use nalgebra;
 /// The types that streams and statuses are made of.

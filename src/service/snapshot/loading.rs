@@ -11,6 +11,7 @@ use std::sync::Arc;
 
 use super::super::RunError;
 use super::super::image_encoder::{self, ImageEncoder, ImageEncoders};
+use super::super::metrics::Metrics;
 use super::super::two_views::TwoViewReader;
 use super::content::content;
 use super::{Refusal, ServedNavigator, ServedRoom, Snapshot, reader_of};
@@ -65,6 +66,7 @@ pub struct Loader {
     index: IndexKind,
     encoders: Option<ImageEncoders>,
     two_views: Option<Arc<TwoViewReader>>,
+    metrics: Metrics,
 }
 
 impl Loader {
@@ -76,6 +78,7 @@ impl Loader {
         store: Store,
         index: IndexKind,
         encoders: Option<ImageEncoders>,
+        metrics: Metrics,
     ) -> Result<Self, RunError> {
         blocking(move || {
             if let Some(encoders) = &encoders {
@@ -87,6 +90,7 @@ impl Loader {
                 index,
                 encoders,
                 two_views,
+                metrics,
             })
         })
         .await
@@ -209,7 +213,8 @@ impl Loader {
             let encoder = match opened.iter().find(|(other, _)| other.is_like(source)) {
                 Some((_, encoder)) => encoder.clone(),
                 None => {
-                    let encoder = opened_for(name, source, encoders);
+                    let encoder = opened_for(name, source, encoders)
+                        .map(|encoder| Arc::new(encoder.counted_in(self.metrics.clone())));
                     opened.push((source.clone(), encoder.clone()));
                     encoder
                 }
@@ -437,14 +442,12 @@ fn opened_for(
     adapter: &str,
     source: &FeatureSource,
     encoders: &ImageEncoders,
-) -> Option<Arc<ImageEncoder>> {
+) -> Option<ImageEncoder> {
     let opened: Result<_, encoder::Error> = image_encoder::open_for(adapter, source, encoders);
-    opened
-        .unwrap_or_else(|problem| {
-            tracing::error!(adapter, %problem, "the adapter is served without images");
-            None
-        })
-        .map(Arc::new)
+    opened.unwrap_or_else(|problem| {
+        tracing::error!(adapter, %problem, "the adapter is served without images");
+        None
+    })
 }
 
 /// The adapters that fit a room with features of these sources, in order of preference; the first is

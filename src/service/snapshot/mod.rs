@@ -11,6 +11,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::Error;
+use super::auth::RoomScope;
 use super::image_encoder::ImageEncoder;
 use super::two_views::TwoViewReader;
 use crate::store::StoredAdapter;
@@ -154,6 +155,27 @@ impl Snapshot {
         &self.refused
     }
 
+    /// The same with the rooms of `scope` alone, and without adapters that were fitted to others.
+    pub fn seen_by(&self, scope: &RoomScope) -> Self {
+        let rooms = self.rooms.iter().filter(|(name, _)| scope.contains(name));
+        let is_seen = |(_, adapter): &(&String, &Arc<StoredAdapter>)| {
+            let fit = adapter.room_fit.as_ref();
+            fit.is_none_or(|fit| scope.contains(fit.room.as_str()))
+        };
+        let refused_rooms = self.refused.rooms.iter();
+
+        Self {
+            rooms: owned(rooms),
+            adapters: owned(self.adapters.iter().filter(is_seen)),
+            image_encoders: self.image_encoders.clone(),
+            two_views: self.two_views.clone(),
+            refused: Refusals {
+                rooms: owned(refused_rooms.filter(|(name, _)| scope.contains(name))),
+                adapters: self.refused.adapters.clone(),
+            },
+        }
+    }
+
     /// Whether both snapshots answer alike: every room and adapter was taken over unchanged.
     pub fn is_like(&self, other: &Self) -> bool {
         fn same<T>(ours: &BTreeMap<String, Arc<T>>, theirs: &BTreeMap<String, Arc<T>>) -> bool {
@@ -223,10 +245,7 @@ impl Snapshot {
         let room = self.rooms.get(name).map(Arc::as_ref);
         room.ok_or_else(|| match self.refused.rooms.get(name) {
             Some(refusal) => refused_error("room", name, refusal),
-            None => Error::NotFound {
-                field: "room".to_owned(),
-                name: name.to_owned(),
-            },
+            None => Error::not_found("room", name, self.rooms.keys()),
         })
     }
 
@@ -244,10 +263,7 @@ impl Snapshot {
             .get(name)
             .ok_or_else(|| match self.refused.adapters.get(name) {
                 Some(refusal) => refused_error("adapter", name, refusal),
-                None => Error::NotFound {
-                    field: "adapter".to_owned(),
-                    name: name.to_owned(),
-                },
+                None => Error::not_found("adapter", name, self.adapters.keys()),
             })
     }
 
@@ -290,6 +306,14 @@ impl Snapshot {
                 ))
             })
     }
+}
+
+fn owned<'a, T: Clone + 'a>(
+    entries: impl Iterator<Item = (&'a String, &'a T)>,
+) -> BTreeMap<String, T> {
+    entries
+        .map(|(name, entry)| (name.clone(), entry.clone()))
+        .collect()
 }
 
 /// The caller learns that it is the operator's turn. The reason stays in the log: it may name files.

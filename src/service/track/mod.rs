@@ -16,13 +16,15 @@ use std::time::Instant;
 use tokio::sync::{mpsc, watch};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::{Stream, StreamExt};
-use tonic::{Status, Streaming};
+use tonic::{Request, Status, Streaming};
 use tracing::Instrument;
 
+use super::status::Full;
 use super::workers::Lane;
-use super::{Error, Handlers, Phase};
+use super::{Error, Handlers, Phase, principal};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::track_request::Message;
+use seese3_client::proto::v1::track_response::Answer;
 use session::Session;
 
 /// The stream of answers.
@@ -58,9 +60,11 @@ impl Handlers {
     /// streams are open, or as [`Session::open`].
     pub(super) async fn follow(
         &self,
-        mut requests: Streaming<pb::TrackRequest>,
+        request: Request<Streaming<pb::TrackRequest>>,
     ) -> Result<Answers, Status> {
-        let snapshot = self.snapshot()?;
+        let snapshot = self.snapshot(&request)?;
+        let caller = principal(&request).cloned();
+        let mut requests = request.into_inner();
 
         // A stream has no deadline, but its configuration must arrive in time, or streams that
         // never send one would stay open for ever.
@@ -83,9 +87,16 @@ impl Handlers {
             .streams
             .clone()
             .try_acquire_owned()
-            .map_err(|_| Error::Full {
-                what: "Track streams",
-            })?;
+            .map_err(|_| self.workers.full(Full::Streams))?;
+
+        let callers_place = match &caller {
+            None => None,
+            Some(caller) => Some(
+                caller
+                    .stream_place()
+                    .ok_or_else(|| self.workers.full(Full::CallersStreams))?,
+            ),
+        };
 
         let key = self.config.token_key.clone();
         let session = self
@@ -113,7 +124,7 @@ impl Handlers {
                 }
             }
 
-            drop(place);
+            drop((place, callers_place));
         };
 
         tokio::spawn(run.instrument(tracing::Span::current()));
@@ -151,6 +162,9 @@ impl Handlers {
                 Ok(message) => match self.handled(session, message, since).await {
                     Ok((back, answer)) => {
                         session = back;
+                        if let Some(outcome) = answer.as_ref().ok().and_then(outcome) {
+                            self.config.metrics.frame_answered(outcome, since.elapsed());
+                        }
                         answer.map_err(Status::from)
                     }
                     Err(error) => {
@@ -199,6 +213,16 @@ impl Handlers {
                 (session, answer)
             })
             .await
+    }
+}
+
+/// What became of a frame, for the metrics: the tracking status, or why it was refused; none if the
+/// answer is to no frame.
+fn outcome(answer: &pb::TrackResponse) -> Option<&'static str> {
+    match answer.answer.as_ref()? {
+        Answer::Update(update) => Some(update.status().as_str_name()),
+        Answer::Refusal(refusal) => Some(refusal.reason().as_str_name()),
+        Answer::Started(_) | Answer::Acknowledged(_) => None,
     }
 }
 

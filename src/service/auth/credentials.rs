@@ -1,0 +1,342 @@
+//! The file of credentials.
+//!
+//! ```toml
+//! [[principal]]
+//! name = "robot-7"
+//! token_sha256 = "2bb80d537b1da3e38bd30361aa855686bde0eacd7162fef6a25fe97bf527a25b"
+//! verbs = ["navigate", "localize", "track"]
+//! rooms = ["kitchen", "lab-*"]
+//! streams = 4       # Track streams at a time; 4 if absent
+//! requests = 64     # requests and streams at a time; 64 if absent
+//! ```
+//!
+//! The file has no secret in it: of a token it has the SHA-256 (`printf %s "$TOKEN" | sha256sum`),
+//! of a client's certificate the fingerprint (`certificate_sha256`, that of its DER).
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, PoisonError, RwLock};
+use std::time::Duration;
+
+use serde::Deserialize;
+use sha2::{Digest, Sha256};
+use subtle::ConstantTimeEq;
+use tokio::sync::Semaphore;
+
+use super::{Principal, RoomScope, Verb};
+
+/// The time between two looks at the file.
+const LOOK: Duration = Duration::from_secs(5);
+
+const MOST_STREAMS: usize = 4;
+const MOST_REQUESTS: usize = 64;
+/// The largest limit that can be given.
+const LARGEST_LIMIT: usize = 1_000_000;
+
+/// Why a file of credentials cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum AuthError {
+    #[error("--auth-file: {} cannot be read: {problem}", file.display())]
+    Unreadable {
+        file: PathBuf,
+        problem: std::io::Error,
+    },
+    #[error("--auth-file: {}: {problem}", file.display())]
+    Syntax { file: PathBuf, problem: String },
+    #[error("--auth-file: {}: principal '{name}': {problem}", file.display())]
+    Principal {
+        file: PathBuf,
+        name: String,
+        problem: String,
+    },
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FileForm {
+    #[serde(default)]
+    principal: Vec<PrincipalForm>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct PrincipalForm {
+    name: String,
+    token_sha256: Option<String>,
+    certificate_sha256: Option<String>,
+    verbs: Vec<Verb>,
+    rooms: Vec<String>,
+    streams: Option<usize>,
+    requests: Option<usize>,
+}
+
+/// What proves who is calling.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Proof {
+    /// SHA-256 of a bearer token.
+    Token([u8; 32]),
+    /// SHA-256 of a client's certificate.
+    Certificate([u8; 32]),
+}
+
+/// The principals of a server.
+#[derive(Debug, Default)]
+pub struct Credentials {
+    known: Vec<(Proof, Arc<Principal>)>,
+}
+
+impl Credentials {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// [`AuthError`], naming the principal and the key. A file without a principal is refused: it
+    /// would lock everybody out.
+    pub fn read(file: &Path) -> Result<Self, AuthError> {
+        let text = std::fs::read_to_string(file).map_err(|problem| AuthError::Unreadable {
+            file: file.to_owned(),
+            problem,
+        })?;
+
+        Self::of(file, &text)
+    }
+
+    fn of(file: &Path, text: &str) -> Result<Self, AuthError> {
+        let syntax = |problem: String| AuthError::Syntax {
+            file: file.to_owned(),
+            problem,
+        };
+
+        let form: FileForm = toml::from_str(text).map_err(|error| syntax(error.to_string()))?;
+        if form.principal.is_empty() {
+            return Err(syntax("has no [[principal]]: nobody could call".to_owned()));
+        }
+
+        let mut names = BTreeSet::new();
+        let mut known: Vec<(Proof, Arc<Principal>)> = Vec::new();
+        for form in form.principal {
+            let name = form.name.clone();
+            let unfit = |problem: String| AuthError::Principal {
+                file: file.to_owned(),
+                name: name.clone(),
+                problem,
+            };
+
+            if !names.insert(name.clone()) {
+                return Err(unfit("is given twice".to_owned()));
+            }
+            let (proof, principal) = principal(form).map_err(unfit)?;
+
+            // Two principals with one token would be one caller with an arbitrary choice of rights.
+            if known.iter().any(|(other, _)| *other == proof) {
+                return Err(unfit(
+                    "has the token or certificate of another one".to_owned(),
+                ));
+            }
+            known.push((proof, Arc::new(principal)));
+        }
+
+        Ok(Self { known })
+    }
+
+    /// The principal with this token.
+    pub fn by_token(&self, token: &[u8]) -> Option<Arc<Principal>> {
+        self.by_proof(&Sha256::digest(token).into(), |proof| match proof {
+            Proof::Token(digest) => Some(digest),
+            Proof::Certificate(_) => None,
+        })
+    }
+
+    /// The principal with the certificate of this fingerprint.
+    pub fn by_certificate(&self, fingerprint: &[u8; 32]) -> Option<Arc<Principal>> {
+        self.by_proof(fingerprint, |proof| match proof {
+            Proof::Certificate(digest) => Some(digest),
+            Proof::Token(_) => None,
+        })
+    }
+
+    /// All digests are compared, each in constant time: how long it takes tells nothing of a token.
+    fn by_proof(
+        &self,
+        given: &[u8; 32],
+        of_kind: impl Fn(&Proof) -> Option<&[u8; 32]>,
+    ) -> Option<Arc<Principal>> {
+        let mut found = None;
+        for (proof, principal) in &self.known {
+            let is_equal = of_kind(proof).is_some_and(|digest| digest.ct_eq(given).into());
+            if is_equal {
+                found = Some(principal.clone());
+            }
+        }
+
+        found
+    }
+}
+
+fn principal(form: PrincipalForm) -> Result<(Proof, Principal), String> {
+    let PrincipalForm {
+        name,
+        token_sha256,
+        certificate_sha256,
+        verbs,
+        rooms,
+        streams,
+        requests,
+    } = form;
+
+    let proof = match (token_sha256, certificate_sha256) {
+        (Some(token), None) => Proof::Token(digest("token_sha256", &token)?),
+        (None, Some(certificate)) => {
+            Proof::Certificate(digest("certificate_sha256", &certificate)?)
+        }
+        _ => return Err("needs either token_sha256 or certificate_sha256".to_owned()),
+    };
+
+    if name.is_empty() || name.chars().any(char::is_control) {
+        return Err("name must be one line of text".to_owned());
+    }
+    if verbs.is_empty() {
+        return Err("verbs is empty: it could call nothing".to_owned());
+    }
+    if rooms.is_empty() {
+        return Err("rooms is empty; give names, or \"*\" for all".to_owned());
+    }
+    for room in &rooms {
+        let plain = room.strip_suffix('*').unwrap_or(room);
+        if plain.contains('*') {
+            return Err(format!("rooms: '{room}' has a * that is not at its end"));
+        }
+    }
+
+    let limit = |key: &str, given: Option<usize>, default| match given.unwrap_or(default) {
+        limit if (1..=LARGEST_LIMIT).contains(&limit) => Ok(Arc::new(Semaphore::new(limit))),
+        limit => Err(format!("{key} must be 1 to {LARGEST_LIMIT}, got {limit}")),
+    };
+    let principal = Principal {
+        streams: limit("streams", streams, MOST_STREAMS)?,
+        requests: limit("requests", requests, MOST_REQUESTS)?,
+        name,
+        verbs,
+        rooms: RoomScope(rooms),
+    };
+
+    Ok((proof, principal))
+}
+
+fn digest(key: &str, text: &str) -> Result<[u8; 32], String> {
+    let bytes = hex::decode(text).ok();
+    bytes
+        .and_then(|bytes| bytes.try_into().ok())
+        .ok_or_else(|| format!("{key} must be 64 hexadecimal digits"))
+}
+
+/// The credentials of a server, as their file is now.
+#[derive(Debug)]
+pub struct Keyring {
+    file: PathBuf,
+    current: RwLock<Arc<Credentials>>,
+}
+
+impl Keyring {
+    /// Reads the file.
+    ///
+    /// # Errors
+    /// As [`Credentials::read`].
+    pub fn open(file: PathBuf) -> Result<Self, AuthError> {
+        let current = RwLock::new(Arc::new(Credentials::read(&file)?));
+        Ok(Self { file, current })
+    }
+
+    /// The credentials of now.
+    pub fn current(&self) -> Arc<Credentials> {
+        let current = self.current.read();
+        current.unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Looks from time to time whether the file has changed; never completes. A file that cannot be
+    /// used changes nothing.
+    pub async fn follow_file(&self) {
+        let mut seen = std::fs::read(&self.file).ok();
+
+        loop {
+            tokio::time::sleep(LOOK).await;
+
+            let now = std::fs::read(&self.file).ok();
+            if now == seen {
+                continue;
+            }
+            seen = now;
+
+            match Credentials::read(&self.file) {
+                Ok(credentials) => {
+                    let current = self.current.write();
+                    *current.unwrap_or_else(PoisonError::into_inner) = Arc::new(credentials);
+                    tracing::info!("the credentials were replaced");
+                }
+                Err(error) => {
+                    tracing::error!(%error, "the new credentials cannot be used; those before stay");
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// SHA-256 of "secret", as `printf %s secret | sha256sum` prints it.
+    const SECRET: &str = "2bb80d537b1da3e38bd30361aa855686bde0eacd7162fef6a25fe97bf527a25b";
+
+    fn read(text: &str) -> Result<Credentials, AuthError> {
+        Credentials::of(Path::new("auth.toml"), text)
+    }
+
+    fn principal(extra: &str) -> String {
+        format!(
+            "[[principal]]\nname = \"robot\"\ntoken_sha256 = \"{SECRET}\"\nverbs = [\"track\"]\nrooms = [\"kitchen\", \"lab-*\"]\n{extra}"
+        )
+    }
+
+    /// Oracle: sha256sum, and the meaning of the file's keys.
+    #[test]
+    fn a_token_is_known_by_its_digest() {
+        let credentials = read(&principal("")).unwrap();
+        let robot = credentials.by_token(b"secret").unwrap();
+
+        assert_eq!(robot.name(), "robot");
+        assert!(robot.may(Verb::Track) && !robot.may(Verb::Navigate));
+        assert!(robot.rooms().contains("kitchen") && robot.rooms().contains("lab-2"));
+        assert!(!robot.rooms().contains("kitchen2") && !robot.rooms().is_all());
+
+        assert!(credentials.by_token(b"Secret").is_none());
+        assert!(credentials.by_token(b"").is_none());
+
+        // A certificate with the digest of a token is no token.
+        let digest = hex::decode(SECRET).unwrap().try_into().unwrap();
+        assert!(credentials.by_certificate(&digest).is_none());
+    }
+
+    /// Oracle: the promise: what is wrong is refused, and the message has the key.
+    #[test]
+    fn a_file_that_is_wrong_names_what_is() {
+        let twice = principal("") + &principal("").replace("robot", "other");
+        for (text, word) in [
+            (String::new(), "principal"),
+            (principal("").replace(SECRET, "abc"), "token_sha256"),
+            (principal("").replace("track", "fly"), "fly"),
+            (principal("").replace("lab-*", "l*b"), "l*b"),
+            (principal("streams = 0"), "streams"),
+            (principal("secret = \"x\""), "secret"),
+            (principal("").replace("[\"track\"]", "[]"), "verbs"),
+            (twice, "another"),
+            (principal("") + &principal(""), "twice"),
+        ] {
+            let error = read(&text).unwrap_err().to_string();
+            assert!(
+                error.contains(word) && error.contains("auth.toml"),
+                "{error}"
+            );
+        }
+    }
+}

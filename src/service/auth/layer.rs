@@ -1,0 +1,209 @@
+//! The check of every request, before any of it is decoded.
+
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use http::{HeaderMap, Request, Response, header};
+use http_body::{Frame, SizeHint};
+use tokio::sync::OwnedSemaphorePermit;
+use tonic::Status;
+use tonic::body::Body;
+use tower::{Layer, Service};
+
+use super::super::Error;
+use super::super::connections::Peer;
+use super::super::metrics::Metrics;
+use super::super::status::Full;
+use super::{Keyring, Principal, Verb};
+
+/// Which verb an RPC needs, by the beginning of its path. Longer beginnings stand first.
+const VERBS: [(&str, Need); 7] = [
+    // Probes of containers and load balancers carry no token.
+    ("/grpc.health.v1.Health/", Need::Nothing),
+    ("/grpc.reflection.", Need::Verb(Verb::Catalog)),
+    ("/seese3.v1.NavigationService/", Need::Verb(Verb::Navigate)),
+    (
+        "/seese3.v1.LocalizationService/",
+        Need::Verb(Verb::Localize),
+    ),
+    ("/seese3.v1.OdometryService/", Need::Verb(Verb::Track)),
+    ("/seese3.v1.EvaluationService/", Need::Verb(Verb::Evaluate)),
+    ("/seese3.v1.CatalogService/", Need::Verb(Verb::Catalog)),
+];
+
+/// What a caller has to have for an RPC.
+#[derive(Debug, Clone, Copy)]
+enum Need {
+    Nothing,
+    Verb(Verb),
+}
+
+/// Wraps a service so that only known callers reach it, if there are credentials.
+#[derive(Debug, Clone)]
+pub struct AuthLayer {
+    /// None to let everybody pass.
+    pub keyring: Option<Arc<Keyring>>,
+    /// Counts what is refused because a caller has as many requests open as it may.
+    pub metrics: Metrics,
+}
+
+impl<S> Layer<S> for AuthLayer {
+    type Service = Auth<S>;
+
+    fn layer(&self, inner: S) -> Self::Service {
+        Auth {
+            inner,
+            layer: self.clone(),
+        }
+    }
+}
+
+/// A service that only known callers reach.
+#[derive(Debug, Clone)]
+pub struct Auth<S> {
+    inner: S,
+    layer: AuthLayer,
+}
+
+impl<S, B> Service<Request<B>> for Auth<S>
+where
+    S: Service<Request<B>, Response = Response<Body>>,
+    S::Future: Send + 'static,
+{
+    type Response = Response<Body>;
+    type Error = S::Error;
+    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, S::Error>> + Send>>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), S::Error>> {
+        self.inner.poll_ready(context)
+    }
+
+    fn call(&mut self, mut request: Request<B>) -> Self::Future {
+        let place = match self.layer.admit(&mut request) {
+            Ok(place) => place,
+            Err(error) => {
+                let refused = Status::from(error).into_http();
+                return Box::pin(async move { Ok(refused) });
+            }
+        };
+        let answer = self.inner.call(request);
+
+        Box::pin(async move {
+            let response = answer.await?;
+            Ok(match place {
+                None => response,
+                Some(place) => response.map(|body| {
+                    Body::new(HoldingBody {
+                        body,
+                        _place: place,
+                    })
+                }),
+            })
+        })
+    }
+}
+
+impl AuthLayer {
+    /// Checks a request and notes who it is from. Returns the caller's place, to be held until the
+    /// answer has ended.
+    fn admit<B>(&self, request: &mut Request<B>) -> Result<Option<OwnedSemaphorePermit>, Error> {
+        let Some(keyring) = &self.keyring else {
+            return Ok(None);
+        };
+
+        let path = request.uri().path();
+        let need = VERBS
+            .iter()
+            .find(|(beginning, _)| path.starts_with(beginning));
+        let verb = match need {
+            Some((_, Need::Nothing)) => return Ok(None),
+            Some((_, Need::Verb(verb))) => Some(*verb),
+            // A path that nobody answers: known callers are told so, others learn nothing.
+            None => None,
+        };
+
+        let principal = caller(keyring, request)?;
+        tracing::Span::current().record("principal", principal.name());
+
+        if let Some(verb) = verb.filter(|&verb| !principal.may(verb)) {
+            return Err(Error::Forbidden { verb: verb.name() });
+        }
+
+        let full = Full::CallersRequests;
+        let place = principal.request_place().ok_or_else(|| {
+            self.metrics.shed(full);
+            Error::Full { what: full }
+        })?;
+        request.extensions_mut().insert(principal);
+
+        Ok(Some(place))
+    }
+}
+
+/// Who a request is from. A token goes before a certificate: the certificate may be that of a
+/// gateway that many callers share.
+fn caller<B>(keyring: &Keyring, request: &Request<B>) -> Result<Arc<Principal>, Error> {
+    let credentials = keyring.current();
+
+    if let Some(token) = bearer(request.headers())? {
+        return credentials.by_token(token).ok_or(Error::Unauthenticated {
+            problem: "the token is not known",
+        });
+    }
+
+    let peer = request.extensions().get::<Peer>();
+    let certificate = peer.and_then(|peer| peer.certificate);
+    certificate
+        .and_then(|certificate| credentials.by_certificate(&certificate))
+        .ok_or(Error::Unauthenticated {
+            problem: "a token is needed, as metadata `authorization: Bearer TOKEN`",
+        })
+}
+
+/// The bearer token of a request (RFC 6750, section 2.1), if it has any authorization.
+fn bearer(headers: &HeaderMap) -> Result<Option<&[u8]>, Error> {
+    let Some(given) = headers.get(header::AUTHORIZATION) else {
+        return Ok(None);
+    };
+
+    let malformed = Error::Unauthenticated {
+        problem: "the metadata `authorization` must be `Bearer TOKEN`",
+    };
+    let (scheme, token) = given
+        .as_bytes()
+        .split_at_checked(7)
+        .ok_or(malformed.clone())?;
+    if !scheme.eq_ignore_ascii_case(b"Bearer ") || token.is_empty() {
+        return Err(malformed);
+    }
+
+    Ok(Some(token))
+}
+
+/// A body that holds its caller's place until it has ended.
+struct HoldingBody {
+    body: Body,
+    _place: OwnedSemaphorePermit,
+}
+
+impl http_body::Body for HoldingBody {
+    type Data = <Body as http_body::Body>::Data;
+    type Error = <Body as http_body::Body>::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Self::Data>, Self::Error>>> {
+        Pin::new(&mut self.body).poll_frame(context)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}

@@ -1,0 +1,255 @@
+//! The connections of a server: how many there may be, and how long one may take to begin.
+//!
+//! tonic accepts connections without a bound, and keeps one that never says a word. Here each takes
+//! a place before it is accepted, and has to finish its TLS handshake and say that it speaks HTTP/2
+//! in time; only then does tonic see it.
+
+use std::io;
+use std::net::SocketAddr;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use sha2::{Digest, Sha256};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, ReadBuf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::task::JoinSet;
+use tokio_rustls::server::TlsStream;
+use tokio_stream::Stream;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::server::Connected;
+
+use super::metrics::Metrics;
+use super::status::Full;
+use super::tls::Tls;
+
+/// What every HTTP/2 connection begins with (RFC 9113, section 3.4), bytes.
+const PREFACE: usize = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".len();
+/// How long a connection may take until it has sent that.
+const OPENING: Duration = Duration::from_secs(10);
+/// The pause after the system refused to accept a connection, for instance because the process has
+/// as many files open as it may.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
+
+/// Who is at the other end of a connection.
+#[derive(Debug, Clone)]
+pub struct Peer {
+    /// Where it comes from.
+    pub address: SocketAddr,
+    /// SHA-256 of the certificate that it proved to have, if it was asked for one.
+    pub certificate: Option<[u8; 32]>,
+}
+
+/// An open connection; its place is free again when it is dropped.
+pub struct Connection {
+    transport: Transport,
+    /// What was read while the connection was opened, and how much of it has been handed on.
+    preface: io::Cursor<[u8; PREFACE]>,
+    peer: Peer,
+    _place: OwnedSemaphorePermit,
+}
+
+enum Transport {
+    Plain(TcpStream),
+    Tls(Box<TlsStream<TcpStream>>),
+}
+
+/// What opening a connection needs.
+#[derive(Clone)]
+struct Opener {
+    places: Arc<Semaphore>,
+    tls: Option<Arc<Tls>>,
+    metrics: Metrics,
+}
+
+/// The connections that `listener` accepts, at most `most` at a time; a further one is closed at
+/// once. When the stream is dropped, so are the listener and connections that are being opened.
+pub fn incoming(
+    listener: TcpListener,
+    most: usize,
+    tls: Option<Arc<Tls>>,
+    metrics: Metrics,
+) -> impl Stream<Item = io::Result<Connection>> {
+    let opener = Opener {
+        places: Arc::new(Semaphore::new(most)),
+        tls,
+        metrics,
+    };
+    let (opened, stream) = mpsc::channel(1);
+    tokio::spawn(accept_all(listener, opener, opened));
+
+    ReceiverStream::new(stream)
+}
+
+async fn accept_all(
+    listener: TcpListener,
+    opener: Opener,
+    opened: mpsc::Sender<io::Result<Connection>>,
+) {
+    let mut opening = JoinSet::new();
+
+    // Trouble that lasts is logged once.
+    let mut is_refused = false;
+    let mut is_full = false;
+
+    loop {
+        while opening.try_join_next().is_some() {}
+
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            () = opened.closed() => return,
+        };
+        let (tcp, address) = match accepted {
+            Ok(accepted) => accepted,
+            Err(error) => {
+                if !is_refused {
+                    tracing::error!(%error, "no connection can be accepted");
+                }
+                is_refused = true;
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+                continue;
+            }
+        };
+        is_refused = false;
+
+        let Ok(place) = opener.places.clone().try_acquire_owned() else {
+            opener.metrics.shed(Full::Connections);
+            if !is_full {
+                tracing::warn!("all connections are taken; further ones are closed at once");
+            }
+            is_full = true;
+            continue;
+        };
+        is_full = false;
+
+        let opener = opener.clone();
+        let opened = opened.clone();
+        opening.spawn(async move {
+            match tokio::time::timeout(OPENING, opener.open(tcp, address, place)).await {
+                // An error means that the server stops.
+                Ok(Ok(connection)) => drop(opened.send(Ok(connection)).await),
+                Ok(Err(error)) => tracing::debug!(%address, %error, "a connection was not opened"),
+                Err(_) => tracing::debug!(%address, "a connection was not opened in time"),
+            }
+        });
+    }
+}
+
+impl Opener {
+    /// Opens a connection, as far as its first words.
+    async fn open(
+        &self,
+        tcp: TcpStream,
+        address: SocketAddr,
+        place: OwnedSemaphorePermit,
+    ) -> io::Result<Connection> {
+        tcp.set_nodelay(true)?;
+
+        let mut certificate = None;
+        let mut transport = match &self.tls {
+            None => Transport::Plain(tcp),
+            Some(tls) => {
+                let stream = tls.acceptor().accept(tcp).await?;
+                let chain = stream.get_ref().1.peer_certificates();
+                certificate = chain
+                    .and_then(|chain| chain.first())
+                    .map(|first| Sha256::digest(first).into());
+                Transport::Tls(Box::new(stream))
+            }
+        };
+
+        let mut preface = [0; PREFACE];
+        match &mut transport {
+            Transport::Plain(stream) => stream.read_exact(&mut preface).await?,
+            Transport::Tls(stream) => stream.read_exact(&mut preface).await?,
+        };
+
+        Ok(Connection {
+            transport,
+            preface: io::Cursor::new(preface),
+            peer: Peer {
+                address,
+                certificate,
+            },
+            _place: place,
+        })
+    }
+}
+
+impl Connected for Connection {
+    type ConnectInfo = Peer;
+
+    fn connect_info(&self) -> Peer {
+        self.peer.clone()
+    }
+}
+
+impl AsyncRead for Connection {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        let read = self.preface.position() as usize;
+        let rest = &self.preface.get_ref()[read..];
+
+        if !rest.is_empty() {
+            let count = rest.len().min(buffer.remaining());
+            buffer.put_slice(&rest[..count]);
+            self.preface.set_position((read + count) as u64);
+            return Poll::Ready(Ok(()));
+        }
+
+        match &mut self.transport {
+            Transport::Plain(stream) => Pin::new(stream).poll_read(context, buffer),
+            Transport::Tls(stream) => Pin::new(stream).poll_read(context, buffer),
+        }
+    }
+}
+
+impl AsyncWrite for Connection {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
+        match &mut self.transport {
+            Transport::Plain(stream) => Pin::new(stream).poll_write(context, bytes),
+            Transport::Tls(stream) => Pin::new(stream).poll_write(context, bytes),
+        }
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        slices: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        match &mut self.transport {
+            Transport::Plain(stream) => Pin::new(stream).poll_write_vectored(context, slices),
+            Transport::Tls(stream) => Pin::new(stream).poll_write_vectored(context, slices),
+        }
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        match &self.transport {
+            Transport::Plain(stream) => stream.is_write_vectored(),
+            Transport::Tls(stream) => stream.is_write_vectored(),
+        }
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        match &mut self.transport {
+            Transport::Plain(stream) => Pin::new(stream).poll_flush(context),
+            Transport::Tls(stream) => Pin::new(stream).poll_flush(context),
+        }
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        match &mut self.transport {
+            Transport::Plain(stream) => Pin::new(stream).poll_shutdown(context),
+            Transport::Tls(stream) => Pin::new(stream).poll_shutdown(context),
+        }
+    }
+}

@@ -1,0 +1,132 @@
+//! Counts every request from its arrival to the last byte of its answer, with the code it ended
+//! with.
+
+use std::future::Future;
+use std::pin::Pin;
+use std::task::{Context, Poll};
+use std::time::Instant;
+
+use http::{HeaderMap, Request, Response};
+use http_body::{Frame, SizeHint};
+use tonic::Code;
+use tonic::body::Body;
+use tower::{Layer, Service};
+
+use super::metrics::Metrics;
+
+/// Wraps a service so that its requests are counted.
+#[derive(Debug, Clone)]
+pub struct MeasureLayer(pub Metrics);
+
+impl<S> Layer<S> for MeasureLayer {
+    type Service = Measure<S>;
+
+    fn layer(&self, inner: S) -> Self::Service {
+        Measure {
+            inner,
+            metrics: self.0.clone(),
+        }
+    }
+}
+
+/// A service whose requests are counted.
+#[derive(Debug, Clone)]
+pub struct Measure<S> {
+    inner: S,
+    metrics: Metrics,
+}
+
+impl<S, B> Service<Request<B>> for Measure<S>
+where
+    S: Service<Request<B>, Response = Response<Body>>,
+    S::Future: Send + 'static,
+{
+    type Response = Response<Body>;
+    type Error = S::Error;
+    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, S::Error>> + Send>>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), S::Error>> {
+        self.inner.poll_ready(context)
+    }
+
+    fn call(&mut self, request: Request<B>) -> Self::Future {
+        let mut open = OpenRequest::new(self.metrics.clone(), request.uri().path());
+        let answer = self.inner.call(request);
+
+        Box::pin(async move {
+            let response = answer.await?;
+
+            // A request that is refused at once has its code in the headers.
+            open.hear(response.headers());
+            Ok(response.map(|body| Body::new(MeasuredBody { body, open })))
+        })
+    }
+}
+
+/// A request that has not ended. Dropping it ends it: with the code that was heard, or as cancelled,
+/// since a caller that goes away hears none.
+struct OpenRequest {
+    metrics: Metrics,
+    method: String,
+    began: Instant,
+    code: Option<Code>,
+}
+
+impl OpenRequest {
+    fn new(metrics: Metrics, method: &str) -> Self {
+        metrics.request_began();
+        Self {
+            metrics,
+            method: method.to_owned(),
+            began: Instant::now(),
+            code: None,
+        }
+    }
+
+    fn hear(&mut self, headers: &HeaderMap) {
+        if let Some(code) = headers.get("grpc-status") {
+            self.code = Some(Code::from_bytes(code.as_bytes()));
+        }
+    }
+}
+
+impl Drop for OpenRequest {
+    fn drop(&mut self) {
+        let code = self.code.unwrap_or(Code::Cancelled);
+        self.metrics
+            .request_ended(&self.method, code, self.began.elapsed());
+    }
+}
+
+/// The body of an answer; its trailers have the code.
+struct MeasuredBody {
+    body: Body,
+    open: OpenRequest,
+}
+
+impl http_body::Body for MeasuredBody {
+    type Data = <Body as http_body::Body>::Data;
+    type Error = <Body as http_body::Body>::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Self::Data>, Self::Error>>> {
+        let polled = Pin::new(&mut self.body).poll_frame(context);
+        if let Poll::Ready(Some(Ok(frame))) = &polled
+            && let Some(trailers) = frame.trailers_ref()
+        {
+            self.open.hear(trailers);
+        }
+
+        polled
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
