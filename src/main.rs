@@ -4,13 +4,17 @@ use std::io::Write;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use clap::Parser;
-
 /// How long blocking work that cannot be cancelled may delay the exit.
 const LAST_WORK: Duration = Duration::from_secs(1);
 
 fn main() -> ExitCode {
-    let cli = seese3::cli::Cli::parse();
+    let cli = match seese3::cli::parse() {
+        Ok(cli) => cli,
+        Err(error) => {
+            complain(&format_args!("{error:#}"));
+            return ExitCode::FAILURE;
+        }
+    };
 
     let runtime = match tokio::runtime::Runtime::new() {
         Ok(runtime) => runtime,

@@ -3,6 +3,7 @@
 
 mod ask;
 mod camera;
+mod config;
 #[cfg(feature = "lab")]
 mod cross_room;
 #[cfg(feature = "lab")]
@@ -37,6 +38,8 @@ mod theory;
 mod track;
 #[cfg(feature = "lab")]
 mod train;
+
+pub use config::parse;
 
 use clap::{Parser, Subcommand};
 
@@ -90,7 +93,9 @@ enum Command {
     /// Check the paper's theorems numerically: the measured value against the bound
     Theory(theory::Theory),
     /// Answer over gRPC until SIGTERM or Ctrl-C
-    Serve(serve::Serve),
+    Serve(Box<serve::Serve>),
+    /// Check or print the settings of `serve`
+    Config(Box<config::Config>),
     /// Ask a server for the frames that a camera motion leads to
     Navigate(ask::Navigate),
     /// Ask a server for the frames of its rooms that look most like a view
@@ -103,6 +108,14 @@ enum Command {
     Catalog(ask::Catalog),
     /// Exit successfully if a server is serving, for containers and supervisors
     Health(health::Health),
+}
+
+impl Cli {
+    fn remember(&mut self, matches: &clap::ArgMatches) {
+        if let Command::Config(config) = &mut self.command {
+            config.remember(matches);
+        }
+    }
 }
 
 /// Runs a command. Results go to standard output; a failure is returned as the error.
@@ -135,6 +148,7 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         #[cfg(feature = "lab")]
         Command::Theory(arguments) => arguments.run(),
         Command::Serve(arguments) => arguments.run().await,
+        Command::Config(arguments) => arguments.run(),
         Command::Navigate(arguments) => arguments.run().await,
         Command::Localize(arguments) => arguments.run().await,
         Command::Motion(arguments) => arguments.run().await,

@@ -23,6 +23,10 @@ use seese3_core::navigation::{IndexKind, Limits};
 
 #[derive(Debug, Args)]
 pub struct Serve {
+    /// File of settings in TOML, each named as its flag without the dashes; flags and the environment
+    /// go before it
+    #[arg(long, value_name = "FILE", env = "SEESE3_CONFIG")]
+    config: Option<PathBuf>,
     /// The store to serve: a folder, or a bucket by its URL
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
@@ -149,7 +153,7 @@ impl Serve {
     pub async fn run(self) -> anyhow::Result<()> {
         let log = start_log(self.log_format);
         let store = Store::open(&self.store)?;
-        let config = self.config()?;
+        let config = self.server_config()?;
         let losses = log.losses();
         config.metrics.count_elsewhere(
             "log_lines_lost",
@@ -280,7 +284,13 @@ fn reload_on_hangup() -> Arc<Notify> {
 }
 
 impl Serve {
-    fn config(&self) -> anyhow::Result<Config> {
+    /// Fails where `serve` would before it opens its port.
+    pub fn check(&self) -> anyhow::Result<()> {
+        Store::open(&self.store)?;
+        self.server_config().map(drop)
+    }
+
+    fn server_config(&self) -> anyhow::Result<Config> {
         let defaults = Config::default();
 
         // One number bounds both the requests computed at a time and the threads of an
@@ -332,8 +342,11 @@ impl Serve {
     }
 
     fn tls(&self) -> anyhow::Result<Option<Tls>> {
-        let (Some(cert), Some(key)) = (&self.tls_cert, &self.tls_key) else {
-            return Ok(None);
+        // Settings of a file are no arguments to clap, so that its own rules do not hold for them.
+        let (cert, key) = match (&self.tls_cert, &self.tls_key) {
+            (Some(cert), Some(key)) => (cert, key),
+            (None, None) if self.tls_client_ca.is_none() => return Ok(None),
+            _ => bail!("--tls-cert and --tls-key belong together, and --tls-client-ca needs both"),
         };
         let files = TlsFiles {
             cert: cert.clone(),

@@ -58,14 +58,9 @@ pub fn section(
     }
 
     section.text(format!(
-        "Means over {}, stride {}: R² over the pairs of all five folds of each recording together, mean ± sd over seeds. \
+        "Means over the rooms, stride {}: R² over the pairs of all five folds of each recording together, mean ± sd over seeds. \
          The verdict compares seed by seed, in these rooms, with the seeds resampled; a training with one seed has no \
          interval and decides nothing.",
-        scenes(&given.sets[0])
-            .iter()
-            .map(|data| data.room.id().as_str())
-            .collect::<Vec<_>>()
-            .join(", "),
         given.options.stride
     ));
 
@@ -166,7 +161,8 @@ fn table_rows(compared: &Comparison) -> Vec<Vec<String>> {
 enum Training {
     /// Preset base, with every seed.
     Base,
-    /// The paper's 200 epochs of 30,000 pairs, which take 30 times as many steps: one seed.
+    /// The paper's 200 epochs of 30,000 pairs, which take 30 times as many steps: one seed, in the
+    /// first room alone.
     Paper,
 }
 
@@ -175,6 +171,14 @@ impl Training {
         match self {
             Self::Base => Preset::Base,
             Self::Paper => Preset::PaperRange,
+        }
+    }
+
+    /// How many of the rooms that are learned alone it takes, from the first on.
+    fn scenes(self) -> usize {
+        match self {
+            Self::Base => SCENES,
+            Self::Paper => 1,
         }
     }
 
@@ -191,10 +195,21 @@ impl Training {
             .epochs
             .map_or_else(String::new, |epochs| format!(" cut to {epochs} epochs"));
         format!(
-            "preset {}{cut}, {} seeds",
+            "preset {}{cut}, {} seeds, rooms {}",
             self.preset().name(),
-            self.seeds(given)
+            self.seeds(given),
+            self.scene_names(given)
         )
+    }
+}
+
+impl Training {
+    fn scene_names(self, given: &Reproduction<'_>) -> String {
+        let names: Vec<&str> = scenes(&given.sets[0], self)
+            .iter()
+            .map(|data| data.room.id().as_str())
+            .collect();
+        names.join(", ")
     }
 }
 
@@ -213,8 +228,8 @@ fn runs<'a>(given: &'a Reproduction<'a>) -> Vec<(Training, &'a FeatureSet<'a>)> 
     runs
 }
 
-fn scenes<'a>(set: &'a FeatureSet<'a>) -> &'a [RoomData<'a>] {
-    &set.in_room[..set.in_room.len().min(SCENES)]
+fn scenes<'a>(set: &'a FeatureSet<'a>, training: Training) -> &'a [RoomData<'a>] {
+    &set.in_room[..set.in_room.len().min(training.scenes())]
 }
 
 fn compared(
@@ -227,7 +242,7 @@ fn compared(
     // The folds replace the plan's split.
     let plan = given.plan(training.preset(), Split::Time, stride, 0, None);
     compare(
-        scenes(set),
+        scenes(set, training),
         &plan,
         &Split::FOLDS,
         training.seeds(given),
