@@ -342,7 +342,8 @@ impl Serve {
     }
 
     fn tls(&self) -> anyhow::Result<Option<Tls>> {
-        // Settings of a file are no arguments to clap, so that its own rules do not hold for them.
+        // Values of the configuration file reach clap as defaults, to which its rules on what belongs
+        // together do not apply.
         let (cert, key) = match (&self.tls_cert, &self.tls_key) {
             (Some(cert), Some(key)) => (cert, key),
             (None, None) if self.tls_client_ca.is_none() => return Ok(None),

@@ -5,9 +5,10 @@ use std::ops::Bound;
 
 use tonic::{Request, Response, Status};
 
+use super::auth::RoomScope;
 use super::convert;
 use super::snapshot::ServedRoom;
-use super::{Error, Handlers};
+use super::{Error, Handlers, principal};
 use crate::store::StoredAdapter;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::catalog_service_server::CatalogService;
@@ -50,13 +51,17 @@ impl CatalogService for Handlers {
         &self,
         request: Request<pb::ListAdaptersRequest>,
     ) -> Result<Response<pb::ListAdaptersResponse>, Status> {
+        let scope = principal(&request).map(|caller| caller.rooms().clone());
         let snapshot = self.snapshot(&request)?;
         let pb::ListAdaptersRequest {
             page_size,
             page_token,
         } = request.into_inner();
         let (page, next_page_token) = page(snapshot.adapters(), page_size, &page_token)?;
-        let adapters = page.into_iter().map(|stored| adapter(stored)).collect();
+        let adapters = page
+            .into_iter()
+            .map(|stored| adapter(stored, scope.as_ref()))
+            .collect();
 
         Ok(Response::new(pb::ListAdaptersResponse {
             adapters,
@@ -69,7 +74,9 @@ impl CatalogService for Handlers {
         request: Request<pb::GetAdapterRequest>,
     ) -> Result<Response<pb::GetAdapterResponse>, Status> {
         let snapshot = self.snapshot(&request)?;
-        let adapter = adapter(snapshot.adapter(&request.into_inner().adapter)?);
+        let scope = principal(&request).map(|caller| caller.rooms().clone());
+        let stored = snapshot.adapter(&request.into_inner().adapter)?;
+        let adapter = adapter(stored, scope.as_ref());
 
         Ok(Response::new(pb::GetAdapterResponse {
             adapter: Some(adapter),
@@ -140,9 +147,14 @@ fn room(served: &ServedRoom) -> pb::Room {
     }
 }
 
-fn revisions(rooms: &[(seese3_core::room::RoomId, u64)]) -> Vec<pb::Revision> {
+/// Rooms and their revisions, of those that the caller may see.
+fn revisions(
+    rooms: &[(seese3_core::room::RoomId, u64)],
+    scope: Option<&RoomScope>,
+) -> Vec<pb::Revision> {
     rooms
         .iter()
+        .filter(|(room, _)| scope.is_none_or(|scope| scope.contains(room.as_str())))
         .map(|(room, revision)| pb::Revision {
             name: room.to_string(),
             revision: *revision,
@@ -150,7 +162,7 @@ fn revisions(rooms: &[(seese3_core::room::RoomId, u64)]) -> Vec<pb::Revision> {
         .collect()
 }
 
-fn adapter(stored: &StoredAdapter) -> pb::Adapter {
+fn adapter(stored: &StoredAdapter, scope: Option<&RoomScope>) -> pb::Adapter {
     let adapter = &stored.adapter;
     let record = &stored.record;
     let scale = adapter.scale();
@@ -162,7 +174,7 @@ fn adapter(stored: &StoredAdapter) -> pb::Adapter {
         }),
         source: Some(convert::source_to_wire(adapter.source())),
         latent_dim: adapter.latent_dim() as u32,
-        training_rooms: revisions(&record.rooms),
+        training_rooms: revisions(&record.rooms, scope),
         preset: record.preset.clone(),
         split: record.split.name().to_owned(),
         stride: record.stride,
@@ -180,7 +192,7 @@ fn adapter(stored: &StoredAdapter) -> pb::Adapter {
         loss: record.config.loss.name().to_owned(),
         navigators: convert::navigator_names(adapter),
         mixing: adapter.network().mixing().name().to_owned(),
-        calibration_rooms: revisions(&record.calibrated_on),
+        calibration_rooms: revisions(&record.calibrated_on, scope),
     }
 }
 

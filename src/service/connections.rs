@@ -1,8 +1,8 @@
 //! The connections of a server: how many there may be, and how long one may take to begin.
 //!
 //! tonic accepts connections without a bound, and keeps one that never says a word. Here each takes
-//! a place before it is accepted, and has to finish its TLS handshake and say that it speaks HTTP/2
-//! in time; only then does tonic see it.
+//! a place as soon as it is accepted, and has to finish its TLS handshake and send as many bytes as
+//! the preface of HTTP/2 has in time; only then does tonic see it, and check them.
 
 use std::io;
 use std::net::SocketAddr;

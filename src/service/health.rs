@@ -30,16 +30,25 @@ const SERVICES: [&str; 6] = [
     <EvaluationServiceServer<Handlers> as NamedService>::NAME,
 ];
 
-pub struct HealthOf(watch::Receiver<Phase>);
+/// The phase, and whether rooms have a status of their own: not where callers need credentials,
+/// which health does not ask for.
+pub struct HealthOf(watch::Receiver<Phase>, RoomHealth);
+
+/// Whether health knows rooms by name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RoomHealth {
+    Shown,
+    Hidden,
+}
 
 /// The health service of a server whose phase this channel carries.
-pub fn service(phase: watch::Receiver<Phase>) -> HealthServer<HealthOf> {
-    HealthServer::new(HealthOf(phase))
+pub fn service(phase: watch::Receiver<Phase>, rooms: RoomHealth) -> HealthServer<HealthOf> {
+    HealthServer::new(HealthOf(phase, rooms))
 }
 
 /// The status of the service or room `name`; none if the name is unknown. Rooms are unknown until
 /// the store is loaded; one that is in the store and cannot be served is NOT_SERVING.
-fn status(phase: &Phase, name: &str) -> Option<ServingStatus> {
+fn status(phase: &Phase, rooms: RoomHealth, name: &str) -> Option<ServingStatus> {
     if SERVICES.contains(&name) {
         return Some(match phase {
             Phase::Serving(_) => ServingStatus::Serving,
@@ -47,6 +56,9 @@ fn status(phase: &Phase, name: &str) -> Option<ServingStatus> {
         });
     }
 
+    if rooms == RoomHealth::Hidden {
+        return None;
+    }
     let room = name.strip_prefix("rooms/")?;
     let (Phase::Serving(snapshot) | Phase::Draining(snapshot)) = phase else {
         return None;
@@ -70,7 +82,7 @@ impl Health for HealthOf {
         request: Request<HealthCheckRequest>,
     ) -> Result<Response<HealthCheckResponse>, Status> {
         let name = request.into_inner().service;
-        match status(&self.0.borrow(), &name) {
+        match status(&self.0.borrow(), self.1, &name) {
             Some(status) => Ok(Response::new(HealthCheckResponse {
                 status: status.into(),
             })),
@@ -84,6 +96,7 @@ impl Health for HealthOf {
     ) -> Result<Response<Self::WatchStream>, Status> {
         let name = request.into_inner().service;
         let mut phase = self.0.clone();
+        let rooms = self.1;
         let (changes, stream) = mpsc::channel(4);
 
         tokio::spawn(async move {
@@ -96,7 +109,7 @@ impl Health for HealthOf {
                     let stopping = matches!(*phase, Phase::Draining(_) | Phase::Stopping);
 
                     (
-                        status(&phase, &name).unwrap_or(ServingStatus::ServiceUnknown),
+                        status(&phase, rooms, &name).unwrap_or(ServingStatus::ServiceUnknown),
                         stopping,
                     )
                 };
@@ -140,13 +153,13 @@ mod tests {
         for phase in [Phase::Loading, Phase::Stopping] {
             for name in SERVICES {
                 assert_eq!(
-                    status(&phase, name),
+                    status(&phase, RoomHealth::Shown, name),
                     Some(ServingStatus::NotServing),
                     "{name:?}"
                 );
             }
 
-            assert_eq!(status(&phase, "rooms/kitchen"), None);
+            assert_eq!(status(&phase, RoomHealth::Shown, "rooms/kitchen"), None);
         }
     }
 }

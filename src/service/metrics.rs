@@ -3,6 +3,7 @@
 //! Every name begins with `seese3_`. Labels come from closed sets: nothing that a caller sends
 //! becomes a label, so that no caller can make the answer grow.
 
+use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -14,6 +15,8 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
+use prost::Message;
+use prost_types::FileDescriptorSet;
 
 use super::snapshot::Snapshot;
 use super::status::Full;
@@ -26,6 +29,8 @@ pub struct Metrics(Arc<Inner>);
 #[derive(Debug)]
 struct Inner {
     registry: Mutex<Registry>,
+    /// The paths of all RPCs: no other path becomes a label.
+    methods: BTreeSet<String>,
     requests: Family<RequestLabels, Histogram>,
     in_flight: Gauge,
     frames: Family<FrameLabels, Histogram>,
@@ -117,6 +122,12 @@ impl Default for Metrics {
             refused: Family::default(),
             reloads: Family::default(),
             registry: Mutex::default(),
+            methods: methods(&[
+                seese3_client::proto::FILE_DESCRIPTOR_SET,
+                tonic_health::pb::FILE_DESCRIPTOR_SET,
+                tonic_reflection::pb::v1::FILE_DESCRIPTOR_SET,
+                tonic_reflection::pb::v1alpha::FILE_DESCRIPTOR_SET,
+            ]),
         };
         metrics.describe(&mut registry);
         metrics.begin_at_zero();
@@ -193,7 +204,7 @@ impl Inner {
         );
         registry.register(
             "refused",
-            "Newest revisions in the store that cannot be served, by kind: room or adapter",
+            "Newest revisions in the store that cannot be served: rooms, adapters, and adapters in one of their rooms",
             self.refused.clone(),
         );
         registry.register(
@@ -242,13 +253,9 @@ impl Metrics {
     pub(super) fn request_ended(&self, method: &str, code: tonic::Code, took: Duration) {
         self.0.in_flight.dec();
 
-        // Whatever path a caller makes up ends here.
-        let method = match code {
-            tonic::Code::Unimplemented => "unknown",
-            _ => method,
-        };
+        let known = self.0.methods.get(method).map(String::as_str);
         let labels = RequestLabels {
-            method: method.to_owned(),
+            method: known.unwrap_or("unknown").to_owned(),
             code: code_name(code),
         };
         let requests = self.0.requests.get_or_create(&labels);
@@ -292,6 +299,7 @@ impl Metrics {
         for (kind, refused) in [
             ("room", refused.rooms.len()),
             ("adapter", refused.adapters.len()),
+            ("adapter of a room", snapshot.refused_in_rooms()),
         ] {
             let gauge = self.0.refused.get_or_create(&KindLabels { kind });
             gauge.set(count(refused));
@@ -328,6 +336,32 @@ impl Collector for Elsewhere {
             encoder.encode_descriptor(self.name, self.help, None, counter.metric_type())?;
         counter.encode(metric)
     }
+}
+
+/// The paths of the RPCs that descriptors describe.
+fn methods(descriptors: &[&[u8]]) -> BTreeSet<String> {
+    let mut paths = BTreeSet::new();
+    for bytes in descriptors {
+        // The descriptors are compiled in: one that cannot be read leaves its RPCs "unknown".
+        let Ok(set) = FileDescriptorSet::decode(*bytes) else {
+            continue;
+        };
+
+        for file in &set.file {
+            for service in &file.service {
+                for method in &service.method {
+                    paths.insert(format!(
+                        "/{}.{}/{}",
+                        file.package(),
+                        service.name(),
+                        method.name()
+                    ));
+                }
+            }
+        }
+    }
+
+    paths
 }
 
 /// The name of a code, as the gRPC specification writes it.
@@ -367,7 +401,7 @@ mod tests {
         let took = Duration::from_millis(3);
         for (method, code) in [
             ("/seese3.v1.NavigationService/Navigate", tonic::Code::Ok),
-            ("/made/up", tonic::Code::Unimplemented),
+            ("/made/up", tonic::Code::Unauthenticated),
         ] {
             metrics.request_began();
             metrics.request_ended(method, code, took);
@@ -380,7 +414,7 @@ mod tests {
             r#"seese3_request_seconds_count{method="/seese3.v1.NavigationService/Navigate",code="OK"} 1"#,
             r#"seese3_request_seconds_bucket{le="0.004",method="/seese3.v1.NavigationService/Navigate",code="OK"} 1"#,
             r#"seese3_request_seconds_bucket{le="0.002",method="/seese3.v1.NavigationService/Navigate",code="OK"} 0"#,
-            r#"seese3_request_seconds_count{method="unknown",code="UNIMPLEMENTED"} 1"#,
+            r#"seese3_request_seconds_count{method="unknown",code="UNAUTHENTICATED"} 1"#,
             r#"seese3_requests_shed_total{full="short requests"} 1"#,
             "seese3_requests_in_flight 0",
             "seese3_log_lines_lost_total 7",

@@ -58,6 +58,7 @@ use tower_http::trace::TraceLayer;
 
 use crate::store::{self, Store};
 use auth::{AuthLayer, Principal};
+use health::RoomHealth;
 use measure::MeasureLayer;
 use seese3_client::proto::FILE_DESCRIPTOR_SET;
 use seese3_client::proto::v1::catalog_service_server::CatalogServiceServer;
@@ -398,6 +399,11 @@ fn server(
         ..
     } = handlers.config.as_ref().clone();
 
+    let room_health = match &keyring {
+        Some(_) => RoomHealth::Hidden,
+        None => RoomHealth::Shown,
+    };
+
     // Reflection is offered in both versions, because some clients speak only v1alpha.
     let reflection = || {
         tonic_reflection::server::Builder::configure()
@@ -434,7 +440,7 @@ fn server(
             keyring,
             metrics: metrics.clone(),
         })
-        .add_service(health::service(phase))
+        .add_service(health::service(phase, room_health))
         .add_service(v1)
         .add_service(v1alpha)
         .add_service(NavigationServiceServer::new(handlers.clone()).max_decoding_message_size(most))

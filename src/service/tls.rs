@@ -50,6 +50,8 @@ pub enum TlsError {
 #[derive(Debug)]
 pub struct Tls {
     files: TlsFiles,
+    /// Digest of the files' content as it was first read.
+    opened: [u8; 32],
     current: RwLock<Arc<ServerConfig>>,
 }
 
@@ -59,9 +61,10 @@ impl Tls {
     /// # Errors
     /// [`TlsError`], naming the option.
     pub fn open(files: TlsFiles) -> Result<Self, TlsError> {
-        let (config, _) = read(&files)?;
+        let (config, opened) = read(&files)?;
         Ok(Self {
             files,
+            opened,
             current: RwLock::new(Arc::new(config)),
         })
     }
@@ -76,13 +79,18 @@ impl Tls {
     /// the new certificate. Files that do not fit together, as while they are being replaced, change
     /// nothing.
     pub async fn follow_files(&self) {
-        let mut seen = read(&self.files).map(|(_, digest)| digest).ok();
+        let mut seen = Some(self.opened);
         let mut trouble = String::new();
 
         loop {
             tokio::time::sleep(LOOK).await;
 
-            match read(&self.files) {
+            // A file system that does not answer must hold up nothing but this.
+            let files = self.files.clone();
+            let Ok(found) = tokio::task::spawn_blocking(move || read(&files)).await else {
+                return;
+            };
+            match found {
                 Ok((config, digest)) => {
                     trouble.clear();
                     if seen.replace(digest) != Some(digest) {

@@ -15,15 +15,15 @@
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::Arc;
 use std::time::Duration;
 
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 use subtle::ConstantTimeEq;
-use tokio::sync::Semaphore;
+use tokio::sync::watch;
 
-use super::{Principal, RoomScope, Verb};
+use super::{Principal, Rights, RoomScope, Verb};
 
 /// The time between two looks at the file.
 const LOOK: Duration = Duration::from_secs(5);
@@ -139,6 +139,27 @@ impl Credentials {
         Ok(Self { known })
     }
 
+    /// The same, with what did not change taken over from `before`: a caller's open streams go on,
+    /// and count towards its limits as before.
+    fn taking_over(mut self, before: &Self) -> Self {
+        for (proof, principal) in &mut self.known {
+            let same = before
+                .known
+                .iter()
+                .find(|(other, old)| other == proof && old.rights == principal.rights);
+            if let Some((_, old)) = same {
+                *principal = old.clone();
+            }
+        }
+        self
+    }
+
+    fn holds(&self, principal: &Arc<Principal>) -> bool {
+        self.known
+            .iter()
+            .any(|(_, known)| Arc::ptr_eq(known, principal))
+    }
+
     /// The principal with this token.
     pub fn by_token(&self, token: &[u8]) -> Option<Arc<Principal>> {
         self.by_proof(&Sha256::digest(token).into(), |proof| match proof {
@@ -209,10 +230,10 @@ fn principal(form: PrincipalForm) -> Result<(Proof, Principal), String> {
     }
 
     let limit = |key: &str, given: Option<usize>, default| match given.unwrap_or(default) {
-        limit if (1..=LARGEST_LIMIT).contains(&limit) => Ok(Arc::new(Semaphore::new(limit))),
+        limit if (1..=LARGEST_LIMIT).contains(&limit) => Ok(limit),
         limit => Err(format!("{key} must be 1 to {LARGEST_LIMIT}, got {limit}")),
     };
-    let principal = Principal {
+    let rights = Rights {
         streams: limit("streams", streams, MOST_STREAMS)?,
         requests: limit("requests", requests, MOST_REQUESTS)?,
         name,
@@ -220,7 +241,7 @@ fn principal(form: PrincipalForm) -> Result<(Proof, Principal), String> {
         rooms: RoomScope(rooms),
     };
 
-    Ok((proof, principal))
+    Ok((proof, Principal::new(rights)))
 }
 
 fn digest(key: &str, text: &str) -> Result<[u8; 32], String> {
@@ -234,43 +255,69 @@ fn digest(key: &str, text: &str) -> Result<[u8; 32], String> {
 #[derive(Debug)]
 pub struct Keyring {
     file: PathBuf,
-    current: RwLock<Arc<Credentials>>,
+    current: watch::Sender<Arc<Credentials>>,
 }
 
 impl Keyring {
     /// Reads the file.
     ///
     /// # Errors
-    /// As [`Credentials::read`].
+    /// [`AuthError`], naming the principal and the key.
     pub fn open(file: PathBuf) -> Result<Self, AuthError> {
-        let current = RwLock::new(Arc::new(Credentials::read(&file)?));
+        let current = watch::Sender::new(Arc::new(Credentials::read(&file)?));
         Ok(Self { file, current })
     }
 
     /// The credentials of now.
     pub fn current(&self) -> Arc<Credentials> {
-        let current = self.current.read();
-        current.unwrap_or_else(PoisonError::into_inner).clone()
+        self.current.borrow().clone()
+    }
+
+    fn replace(&self, credentials: Credentials) {
+        let credentials = credentials.taking_over(&self.current());
+        self.current.send_replace(Arc::new(credentials));
+    }
+
+    /// Completes once the principal has other rights than when it was admitted, or none.
+    pub async fn revoked(&self, principal: &Arc<Principal>) {
+        let mut changes = self.current.subscribe();
+
+        // An error means that the server is gone.
+        let _ = changes
+            .wait_for(|credentials| !credentials.holds(principal))
+            .await
+            .map(drop);
     }
 
     /// Looks from time to time whether the file has changed; never completes. A file that cannot be
     /// used changes nothing.
     pub async fn follow_file(&self) {
-        let mut seen = std::fs::read(&self.file).ok();
+        // A file system that does not answer must hold up nothing but this.
+        let read = || {
+            let file = self.file.clone();
+            tokio::task::spawn_blocking(move || {
+                (std::fs::read(&file).ok(), Credentials::read(&file))
+            })
+        };
+        let mut seen = None;
 
         loop {
-            tokio::time::sleep(LOOK).await;
-
-            let now = std::fs::read(&self.file).ok();
+            let Ok((now, credentials)) = read().await else {
+                return;
+            };
             if now == seen {
+                tokio::time::sleep(LOOK).await;
                 continue;
             }
+            let is_first = seen.is_none();
             seen = now;
 
-            match Credentials::read(&self.file) {
+            match credentials {
+                // What has the same rights is taken over, so that the first look changes nothing
+                // unless the file was replaced since it was opened.
+                Ok(credentials) if is_first => self.replace(credentials),
                 Ok(credentials) => {
-                    let current = self.current.write();
-                    *current.unwrap_or_else(PoisonError::into_inner) = Arc::new(credentials);
+                    self.replace(credentials);
                     tracing::info!("the credentials were replaced");
                 }
                 Err(error) => {
@@ -294,7 +341,7 @@ mod tests {
 
     fn principal(extra: &str) -> String {
         format!(
-            "[[principal]]\nname = \"robot\"\ntoken_sha256 = \"{SECRET}\"\nverbs = [\"track\"]\nrooms = [\"kitchen\", \"lab-*\"]\n{extra}"
+            "[[principal]]\nname = \"robot\"\ntoken_sha256 = \"{SECRET}\"\nverbs = [\"track\"]\nrooms = [\"kitchen\", \"lab-*\"]\n{extra}\n"
         )
     }
 
@@ -338,5 +385,30 @@ mod tests {
                 "{error}"
             );
         }
+    }
+
+    /// Oracle: the promise: who keeps its rights keeps what it has open; who has others, or none, is
+    /// told so.
+    #[tokio::test]
+    async fn only_changed_rights_are_revoked() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("auth.toml");
+        let other = "[[principal]]\nname = \"other\"\ncertificate_sha256 = \"{}\"\nverbs = [\"track\"]\nrooms = [\"*\"]\n"
+            .replace("{}", SECRET);
+        std::fs::write(&file, principal("") + &other).unwrap();
+        let keyring = Keyring::open(file).unwrap();
+
+        let digest = hex::decode(SECRET).unwrap().try_into().unwrap();
+        let robot = keyring.current().by_token(b"secret").unwrap();
+        let other_one = keyring.current().by_certificate(&digest).unwrap();
+
+        let changed = read(&(principal("streams = 2") + &other)).unwrap();
+        keyring.replace(changed);
+        keyring.revoked(&robot).await;
+        let now = keyring.current().by_certificate(&digest).unwrap();
+        assert!(Arc::ptr_eq(&other_one, &now));
+
+        keyring.replace(read(&principal("streams = 2")).unwrap());
+        keyring.revoked(&other_one).await;
     }
 }

@@ -18,7 +18,7 @@ use super::super::metrics::Metrics;
 use super::super::status::Full;
 use super::{Keyring, Principal, Verb};
 
-/// Which verb an RPC needs, by the beginning of its path. Longer beginnings stand first.
+/// Which verb an RPC needs, by the beginning of its path.
 const VERBS: [(&str, Need); 7] = [
     // Probes of containers and load balancers carry no token.
     ("/grpc.health.v1.Health/", Need::Nothing),

@@ -68,29 +68,47 @@ impl RoomScope {
     }
 }
 
-/// A caller that is known.
-#[derive(Debug)]
-pub struct Principal {
+/// What a caller may do, as an operator gave it.
+#[derive(Debug, PartialEq, Eq)]
+struct Rights {
     name: String,
     verbs: Vec<Verb>,
     rooms: RoomScope,
+    /// Track streams at a time.
+    streams: usize,
+    /// Requests and streams at a time.
+    requests: usize,
+}
+
+/// A caller that is known, and what it has open.
+#[derive(Debug)]
+pub struct Principal {
+    rights: Rights,
     streams: Arc<Semaphore>,
     requests: Arc<Semaphore>,
 }
 
 impl Principal {
+    fn new(rights: Rights) -> Self {
+        Self {
+            streams: Arc::new(Semaphore::new(rights.streams)),
+            requests: Arc::new(Semaphore::new(rights.requests)),
+            rights,
+        }
+    }
+
     /// Its name, for the log.
     pub fn name(&self) -> &str {
-        &self.name
+        &self.rights.name
     }
 
     /// The rooms that it may see.
     pub fn rooms(&self) -> &RoomScope {
-        &self.rooms
+        &self.rights.rooms
     }
 
     fn may(&self, verb: Verb) -> bool {
-        self.verbs.contains(&verb)
+        self.rights.verbs.contains(&verb)
     }
 
     /// A place for one more Track stream; none if it has as many as it may.

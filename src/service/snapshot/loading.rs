@@ -4,7 +4,8 @@
 //!   changed and no more.
 //! - A room or an adapter that cannot be loaded is refused by itself. If an older revision of it is
 //!   being served, that goes on.
-//! - A refused revision is not tried again, unless that is asked for: it does not change.
+//! - A revision that is damaged is not tried again, unless that is asked for. One that could not be
+//!   read is tried at every look.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -27,7 +28,7 @@ use seese3_core::training::RoomData;
 
 /// Why a room, or a room under an adapter, cannot be served.
 #[derive(Debug, thiserror::Error)]
-enum Problem {
+pub(super) enum Problem {
     #[error(transparent)]
     Store(#[from] store::Error),
     #[error("adapter '{adapter}' does not serve it: {problem}")]
@@ -50,6 +51,17 @@ enum Problem {
         adapter: String,
         problem: Box<seese3_core::fitting::Error>,
     },
+}
+
+impl Problem {
+    /// Whether it may be gone at the next look.
+    pub(super) fn may_pass(&self) -> bool {
+        match self {
+            Self::Store(error) => matches!(error, store::Error::Io { .. }),
+            Self::Base { problem, .. } => matches!(**problem, store::Error::Io { .. }),
+            Self::Navigator { .. } | Self::Localizer { .. } => false,
+        }
+    }
 }
 
 /// Whether revisions that were refused before are tried again.
@@ -181,8 +193,14 @@ impl Loader {
                     return;
                 }
                 Err(problem) => {
-                    tracing::error!(adapter = name, revision, %problem, "the adapter is not served");
-                    Refusal::new(revision, &problem)
+                    let refusal = Refusal::new(revision, &problem.into());
+                    log_refusal(
+                        "adapter",
+                        &name,
+                        before.refused.adapters.get(&name),
+                        &refusal,
+                    );
+                    refusal
                 }
             },
         };
@@ -252,8 +270,9 @@ impl Loader {
                     return;
                 }
                 Err(problem) => {
-                    tracing::error!(room = name, revision, %problem, "the room is not served");
-                    Refusal::new(revision, &problem)
+                    let refusal = Refusal::new(revision, &problem);
+                    log_refusal("room", &name, before.refused.rooms.get(&name), &refusal);
+                    refusal
                 }
             },
         };
@@ -286,10 +305,13 @@ impl Loader {
             created: stored.created.clone(),
             navigators: Vec::new(),
             refused_adapters: BTreeMap::new(),
+            tried: Vec::new(),
             sources,
         };
 
         for adapter in fitting(adapters, served.room.id(), &served.sources) {
+            served.tried.push((adapter.name.clone(), adapter.revision));
+
             // Fitted adapters come first, so that the reader that trackers are to use is known.
             let source = adapter.adapter.source();
             let tracking_reader = reader_of(&served.navigators, source).cloned();
@@ -306,8 +328,13 @@ impl Loader {
             match navigator {
                 Ok(navigator) => served.navigators.push(navigator),
                 Err(problem) => {
-                    tracing::error!(room = name, revision, %problem, "the room is served without an adapter");
                     let refusal = Refusal::new(adapter.revision, &problem);
+                    let known = before.and_then(|room| room.refused_adapters.get(&adapter.name));
+                    log_refusal("adapter", &adapter.name, known, &refusal);
+
+                    // The revision before goes on serving the room.
+                    let older = before.and_then(|room| room.under_any(&adapter.name));
+                    served.navigators.extend(older.cloned());
                     served
                         .refused_adapters
                         .insert(adapter.name.clone(), refusal);
@@ -423,6 +450,16 @@ async fn blocking<T: Send + 'static>(
         .map_err(|error| RunError::Loading(error.to_string()))?
 }
 
+/// Logs why a revision is refused, unless that has been logged.
+fn log_refusal(kind: &str, name: &str, known: Option<&Refusal>, refusal: &Refusal) {
+    if known != Some(refusal) {
+        let Refusal {
+            revision, reason, ..
+        } = refusal;
+        tracing::error!(kind, name, revision, reason, "a revision cannot be served");
+    }
+}
+
 /// The refusal of a revision that is not to be tried again.
 fn kept(
     before: &BTreeMap<String, Refusal>,
@@ -433,6 +470,7 @@ fn kept(
     before
         .get(name)
         .filter(|refusal| refused == Refused::LeaveOut && refusal.revision == revision)
+        .filter(|refusal| !refusal.may_pass)
         .cloned()
 }
 

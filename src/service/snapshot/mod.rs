@@ -5,6 +5,7 @@
 mod content;
 mod loading;
 
+use loading::Problem;
 pub use loading::{Loader, Refused};
 
 use std::collections::BTreeMap;
@@ -36,6 +37,8 @@ pub struct ServedRoom {
     pub navigators: Vec<Arc<ServedNavigator>>,
     /// Adapters that have the right features and still cannot serve the room, by name.
     refused_adapters: BTreeMap<String, Refusal>,
+    /// The adapters that the room was loaded with, names and revisions, in order of preference.
+    tried: Vec<(String, u64)>,
 }
 
 /// A room under one adapter that fits it.
@@ -69,14 +72,22 @@ impl ServedRoom {
 
     /// Whether this room was loaded with exactly these adapters.
     fn was_tried_with(&self, adapters: &[Arc<StoredAdapter>]) -> bool {
-        let is_known = |adapter: &Arc<StoredAdapter>| {
-            let refused = self.refused_adapters.get(&adapter.name);
-            let is_refused = refused.is_some_and(|refusal| refusal.revision == adapter.revision);
-            is_refused || self.navigators.iter().any(|served| served.is_of(adapter))
-        };
+        let given = adapters
+            .iter()
+            .map(|adapter| (&adapter.name, adapter.revision));
+        let tried = self.tried.iter().map(|(name, revision)| (name, *revision));
+        given.eq(tried)
+            && !self
+                .refused_adapters
+                .values()
+                .any(|refusal| refusal.may_pass)
+    }
 
-        adapters.len() == self.navigators.len() + self.refused_adapters.len()
-            && adapters.iter().all(is_known)
+    /// This room under an earlier revision of an adapter, if there is one.
+    fn under_any(&self, adapter: &str) -> Option<&Arc<ServedNavigator>> {
+        self.navigators
+            .iter()
+            .find(|served| served.adapter.name == adapter)
     }
 
     /// This room under an adapter, if trackers there take their anchors from `tracking_reader`.
@@ -121,13 +132,17 @@ pub struct Refusal {
     pub revision: u64,
     /// Why, in words; it may name files of the store.
     pub reason: String,
+    /// Whether it may be different next time: a file that could not be read, not one that is
+    /// damaged.
+    pub may_pass: bool,
 }
 
 impl Refusal {
-    fn new(revision: u64, problem: &impl ToString) -> Self {
+    fn new(revision: u64, problem: &Problem) -> Self {
         Self {
             revision,
             reason: problem.to_string(),
+            may_pass: problem.may_pass(),
         }
     }
 }
@@ -171,9 +186,16 @@ impl Snapshot {
             two_views: self.two_views.clone(),
             refused: Refusals {
                 rooms: owned(refused_rooms.filter(|(name, _)| scope.contains(name))),
-                adapters: self.refused.adapters.clone(),
+                // An adapter may be named after its room.
+                adapters: BTreeMap::new(),
             },
         }
+    }
+
+    /// How many adapters are refused in one of their rooms, over all rooms.
+    pub fn refused_in_rooms(&self) -> usize {
+        let rooms = self.rooms.values();
+        rooms.map(|room| room.refused_adapters.len()).sum()
     }
 
     /// Whether both snapshots answer alike: every room and adapter was taken over unchanged.

@@ -11,6 +11,7 @@ mod wire;
 pub use token::TokenKey;
 
 use std::pin::Pin;
+use std::sync::Arc;
 use std::time::Instant;
 
 use tokio::sync::{mpsc, watch};
@@ -19,6 +20,7 @@ use tokio_stream::{Stream, StreamExt};
 use tonic::{Request, Status, Streaming};
 use tracing::Instrument;
 
+use super::auth::{Keyring, Principal};
 use super::status::Full;
 use super::workers::Lane;
 use super::{Error, Handlers, Phase, principal};
@@ -68,7 +70,11 @@ impl Handlers {
 
         // A stream has no deadline, but its configuration must arrive in time, or streams that
         // never send one would stay open for ever.
-        let first = tokio::time::timeout(self.config.longest, requests.message()).await;
+        let mut phase = self.phase.clone();
+        let first = tokio::select! {
+            first = tokio::time::timeout(self.config.longest, requests.message()) => first,
+            () = told_to_stop(&mut phase) => return Err(Error::Loading.into()),
+        };
 
         let config = match first.map_err(|_| Error::Deadline)?? {
             Some(pb::TrackRequest {
@@ -117,6 +123,12 @@ impl Handlers {
             let mut phase = handlers.phase.clone();
             tokio::select! {
                 () = handlers.answer_all(session, frames, &answers) => {}
+                () = revoked(handlers.config.keyring.as_ref(), caller.as_ref()) => {
+                    let revoked = Error::Unauthenticated {
+                        problem: "the caller's rights have changed; open the stream again",
+                    };
+                    let _ = answers.try_send(Err(revoked.into()));
+                }
                 () = told_to_stop(&mut phase) => {
                     // The caller can resume on another server with the token of its last answer. A
                     // reader that is too slow to take this error is not waited for.
@@ -223,6 +235,14 @@ fn outcome(answer: &pb::TrackResponse) -> Option<&'static str> {
         Answer::Update(update) => Some(update.status().as_str_name()),
         Answer::Refusal(refusal) => Some(refusal.reason().as_str_name()),
         Answer::Started(_) | Answer::Acknowledged(_) => None,
+    }
+}
+
+/// Completes when the caller of a stream has other rights than when it was opened.
+async fn revoked(keyring: Option<&Arc<Keyring>>, caller: Option<&Arc<Principal>>) {
+    match (keyring, caller) {
+        (Some(keyring), Some(caller)) => keyring.revoked(caller).await,
+        _ => std::future::pending().await,
     }
 }
 
