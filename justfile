@@ -13,6 +13,22 @@ large:
 soak:
     SEESE3_RELOADS=1000 cargo test --release --test service swapped
 
+# The same for publishers and servers that are killed: two hundred each.
+kills:
+    SEESE3_KILLS=200 cargo test --release --test commands kills::
+
+# Every parser of outside bytes gets mutated files for ten minutes.
+fuzz:
+    SEESE3_FUZZ_SECONDS=600 cargo test --release --test library hostile:: -- --nocapture
+
+# docs/api.md, from the protos.
+api:
+    buf build proto -o -#format=json | python3 .ci/api-reference.py > docs/api.md
+
+# Settles the wire as it is now: from here on, CI refuses what breaks it.
+settle-api:
+    buf build proto --exclude-source-info -o proto/settled.binpb
+
 # What differs without the features: a model is answered with the line that builds them in; and the server builds without
 # the laboratory.
 lean:
@@ -25,6 +41,8 @@ lint:
     cargo clippy --workspace --all-targets -- -D warnings
     cargo clippy --workspace --all-targets --features full -- -D warnings
     buf lint proto
+    buf breaking proto --against proto/settled.binpb
+    buf build proto -o -#format=json | python3 .ci/api-reference.py | diff docs/api.md -
     hadolint deploy/Dockerfile
     .ci/lint-unit
 

@@ -125,7 +125,7 @@ fn query(steps: u32) -> Query {
             split: seese3_core::splits::Split::Time,
             stride: 40,
         },
-        hit_count: 10,
+        top_k: 10,
         exclude_source: None,
     }
 }

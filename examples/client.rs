@@ -44,7 +44,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
         .await?;
 
     for step in &answer.steps {
-        let Some(hit) = step.hits.first() else {
+        let Some(hit) = step.frames.first() else {
             continue;
         };
         let world_from_camera = convert::pose(&hit.pose.clone().unwrap_or_default())?;

@@ -76,13 +76,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             split: Split::Time,
             stride: STRIDE,
         },
-        hit_count: 1,
+        top_k: 1,
         exclude_source: None,
     };
     let answer = navigator.answer(&query, Limits::default(), &Cancellation::default())?;
 
     for (number, step) in answer.steps.iter().enumerate() {
-        let hit = &step.hits[0];
+        let hit = &step.frames[0];
         let error_m = step
             .error
             .map_or(f64::NAN, |error| error.pose.translation_m);

@@ -11,6 +11,7 @@
 //! | [`datasets`] | recordings on disk to rooms |
 //! | [`encoder`] | images to features |
 //! | [`store`] | versioned, checksummed rooms and adapters |
+//! | [`refit`] | fitting an adapter to a stored room |
 //! | [`export`] | paths and streams for other programs: TUM, KITTI, MCAP |
 //! | [`service`] | the gRPC service |
 //! | [`cli`] | the commands |
@@ -21,6 +22,7 @@
 pub mod datasets;
 pub mod encoder;
 pub mod store;
+pub mod refit;
 pub mod export;
 pub mod service;
 pub mod cli;

@@ -178,7 +178,7 @@ pub struct Navigate {
     navigator: String,
     /// Number of nearest frames returned for each step
     #[arg(long, default_value_t = 1)]
-    hits: u32,
+    top_k: u32,
     /// Never retrieve the frame that a step starts from
     #[arg(long)]
     exclude_source: bool,
@@ -232,7 +232,7 @@ impl Navigate {
             mode: mode.into(),
             reading: reading.into(),
             navigator: self.navigator,
-            hit_count: Some(self.hits),
+            top_k: Some(self.top_k),
             exclude_source: self.exclude_source,
             ..pb::NavigateRequest::default()
         };
@@ -274,9 +274,9 @@ pub fn say_navigation(answer: &pb::NavigateResponse) {
     }
 
     for step in &answer.steps {
-        // The best hit carries the step's number and its pose error; the other hits are listed
+        // The best frame carries the step's number and its pose error; the others are listed
         // below it.
-        for (rank, hit) in step.hits.iter().enumerate() {
+        for (rank, frame) in step.frames.iter().enumerate() {
             let label = if rank == 0 {
                 format!("step {}", step.step)
             } else {
@@ -288,20 +288,20 @@ pub fn say_navigation(answer: &pb::NavigateResponse) {
                 .as_ref()
                 .filter(|_| rank == 0)
                 .map_or(String::new(), error_text);
-            say(format_args!("{label:8}{}{error}", hit_text(hit)));
+            say(format_args!("{label:8}{}{error}", frame_text(frame)));
         }
     }
 }
 
 fn error_text(error: &pb::PoseError) -> String {
-    let hits: Vec<String> = error
-        .hits
+    let checks: Vec<String> = error
+        .thresholds
         .iter()
-        .map(|hit| {
+        .map(|check| {
             format!(
                 "@{} {}",
-                hit.threshold,
-                if hit.hit { "hit" } else { "miss" }
+                check.threshold,
+                if check.met { "hit" } else { "miss" }
             )
         })
         .collect();
@@ -313,18 +313,18 @@ fn error_text(error: &pb::PoseError) -> String {
         error.translation_m,
         error.rotation_rad.to_degrees(),
         error.twist_norm,
-        hits.join(", ")
+        checks.join(", ")
     )
 }
 
-fn hit_text(hit: &pb::Hit) -> String {
-    let pose = hit.pose.clone().unwrap_or_default();
+fn frame_text(frame: &pb::RetrievedFrame) -> String {
+    let pose = frame.pose.clone().unwrap_or_default();
     let p = pose.position.unwrap_or_default();
     let q = pose.orientation.unwrap_or_default();
 
     format!(
         "frame {:5}  distance {:.4}  at ({:.3}, {:.3}, {:.3}) m, wxyz ({:.3}, {:.3}, {:.3}, {:.3}) in {}",
-        hit.frame_id, hit.distance, p.x, p.y, p.z, q.w, q.x, q.y, q.z, pose.parent_frame
+        frame.frame_id, frame.distance, p.x, p.y, p.z, q.w, q.x, q.y, q.z, pose.parent_frame
     )
 }
 
@@ -397,7 +397,7 @@ pub struct Localize {
     feature: FeatureRow,
     /// Number of frames returned, over all rooms, best first
     #[arg(long, default_value_t = 5)]
-    hits: u32,
+    top_k: u32,
 }
 
 impl Localize {
@@ -414,7 +414,7 @@ impl Localize {
             rooms: self.rooms,
             adapter: self.adapter,
             view: Some(view),
-            hit_count: Some(self.hits),
+            top_k: Some(self.top_k),
             ..pb::LocalizeRequest::default()
         };
 
@@ -431,13 +431,13 @@ impl Localize {
 
         // Only a view that is itself a frame of the room has a recorded pose, and hence an error.
         for place in &answer.places {
-            let hit = place
-                .hit
+            let frame = place
+                .frame
                 .as_ref()
                 .context("the server's answer has a place without a frame")?;
             say(format_args!(
                 "{}{}",
-                hit_text(hit),
+                frame_text(frame),
                 place.error.as_ref().map_or(String::new(), error_text)
             ));
         }

@@ -379,7 +379,7 @@ fn plot_of(room: &Room, answer: &pb::NavigateResponse) -> anyhow::Result<PathPlo
         retrieved: answer
             .steps
             .iter()
-            .map(|step| wire_place(step.hits.first().and_then(|hit| hit.pose.as_ref())))
+            .map(|step| wire_place(step.frames.first().and_then(|hit| hit.pose.as_ref())))
             .collect::<Result<_, _>>()?,
     })
 }

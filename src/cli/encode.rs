@@ -137,7 +137,7 @@ impl Encode {
         }
 
         let (room, features) = whole(newest, &sources, &encoded)?;
-        let published = store.publish_room(&room, &features).await?;
+        let published = store.publish_same_frames(&room, &features).await?;
 
         // The rows are safe in the store, so the journal is no longer needed.
         journal.finish()?;

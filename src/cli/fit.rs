@@ -1,19 +1,15 @@
 //! `seese3 fit`: fits an adapter to one room and publishes it.
 
-use std::sync::Arc;
-
-use anyhow::bail;
 use clap::Args;
 use indicatif::ProgressBar;
 
-use seese3_core::adapter::Adapter;
-use seese3_core::fitting::{FITTING_EPOCHS, Fitted, PartRule, fit};
-use seese3_core::room::{FrameId, RoomId, is_plain_name};
+use seese3_core::fitting::{FITTING_EPOCHS, Fitted, PartRule};
 use seese3_core::training::RoomData;
 
 use super::progress::bar;
 use super::{say, say_published};
-use crate::store::{BaseAdapter, RoomFit, Store, StoredAdapter};
+use crate::refit::{self, Refit};
+use crate::store::Store;
 
 #[derive(Debug, Args)]
 pub struct Fit {
@@ -41,91 +37,30 @@ pub struct Fit {
 impl Fit {
     pub async fn run(self) -> anyhow::Result<()> {
         let store = Store::open(&self.store)?;
-        let base = match &self.adapter {
-            Some(name) => Some(store.load_adapter(name, None).await?),
-            None => None,
+        let request = refit::Request {
+            room: self.room,
+            base: self.adapter,
+            features: self.features,
+            name: self.name,
+            seed: self.seed,
         };
+        let refit = Refit::prepare(&store, request).await?;
 
-        if let Some(base) = &base {
-            check_base(base, &self.room)?;
-        }
-
-        let of_base = base
-            .as_ref()
-            .map(|stored| stored.adapter.source().name.clone());
-        let wanted = self.features.clone().or(of_base);
-        let (stored, features) = store.load_room_with(&self.room, wanted.as_deref()).await?;
-        let name = self
-            .name
-            .clone()
-            .unwrap_or_else(|| format!("{}.{}.fitted", self.room, features.source().name));
-        check_name(&store, &name, stored.room.id()).await?;
-
-        let data = RoomData {
-            room: &stored.room,
-            revision: stored.revision,
-            features: &features,
-        };
-
-        let mapped: Vec<FrameId> = (0..stored.room.frame_count() as u32).map(FrameId).collect();
         let progress = fitting_bar(true);
-        let network: Option<&Arc<Adapter>> = base.as_ref().map(|stored| &stored.adapter);
-        let mut fitted = fit(&data, &mapped, network, self.seed, &|_| progress.inc(1))?;
+        let fitted = refit.fit(&|_| progress.inc(1))?;
         progress.finish_and_clear();
 
-        // What the base has seen, the fitted adapter has seen too.
-        if let Some(base) = &base {
-            fitted
-                .record
-                .rooms
-                .extend(base.record.rooms.iter().cloned());
-            fitted
-                .record
-                .calibrated_on
-                .extend(base.record.calibrated_on.iter().cloned());
-        }
-
-        let room_fit = RoomFit {
-            room: stored.room.id().clone(),
-            room_revision: stored.revision,
-            base: base.map(|stored| BaseAdapter {
-                name: stored.name,
-                revision: stored.revision,
-            }),
-            rules: fitted.rules.clone(),
-        };
-
-        let published = store
-            .publish_fitted(&name, &fitted, &room_fit, features.rows())
-            .await?;
-
-        say_fitted(&fitted, &data, mapped.len());
-        say_published(&store, &name, &published);
+        let published = refit.publish(&store, &fitted).await?;
+        say_fitted(&fitted, &refit.data());
+        say_published(&store, refit.name(), &published);
 
         Ok(())
     }
 }
 
-/// Refuses a base that has seen the room: measured there, it would look better than it is.
-fn check_base(base: &StoredAdapter, room: &str) -> anyhow::Result<()> {
-    let has_seen = base
-        .record
-        .rooms
-        .iter()
-        .any(|(name, _)| name.as_str() == room);
-    if has_seen || base.room_fit.is_some() {
-        bail!(
-            "adapter '{}' has seen room '{room}' or was itself fitted to a room; begin from one that learned from other \
-             rooms alone, or leave out --adapter",
-            base.name
-        );
-    }
-
-    Ok(())
-}
-
 /// Prints what was fitted, and the rules that were measured.
-fn say_fitted(fitted: &Fitted, data: &RoomData<'_>, mapped: usize) {
+fn say_fitted(fitted: &Fitted, data: &RoomData<'_>) {
+    let mapped = data.room.frame_count();
     say(format_args!(
         "room '{}' revision {}, features '{}': fitted to {mapped} frames, train R² {:.3}",
         data.room.id(),
@@ -143,28 +78,6 @@ fn say_fitted(fitted: &Fitted, data: &RoomData<'_>, mapped: usize) {
             part_words(rule.rotation)
         ));
     }
-}
-
-/// Refuses, before anything is fitted, a name that cannot be published or that other adapters have.
-async fn check_name(store: &Store, name: &str, room: &RoomId) -> anyhow::Result<()> {
-    if !is_plain_name(name) {
-        bail!("--name '{name}' is not valid: letters, digits, '.', '_' and '-', at most 100");
-    }
-
-    if store
-        .adapter_names()
-        .await?
-        .iter()
-        .any(|known| known == name)
-    {
-        let newest = store.load_adapter(name, None).await?;
-        let is_of_this_room = newest.room_fit.is_some_and(|fit| fit.room == *room);
-        if !is_of_this_room {
-            bail!("--name '{name}' is taken by an adapter that was not fitted to room '{room}'");
-        }
-    }
-
-    Ok(())
 }
 
 /// A bar over the epochs of a fit and of its folds; without a fit it stays empty.

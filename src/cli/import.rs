@@ -368,7 +368,10 @@ impl Destination {
         check_features(&room, &features)?;
         let store = Store::create(&self.store)?;
         let room = self.check_same(&store, room).await?;
-        let published = store.publish_room(&room, &features).await?;
+        let published = match self.replace {
+            true => store.publish_room(&room, &features).await?,
+            false => store.publish_same_frames(&room, &features).await?,
+        };
 
         self.say_read(&room, &features, &recording, read_count);
 

@@ -22,6 +22,7 @@ mod named;
 #[cfg(feature = "lab")]
 mod probe;
 mod progress;
+mod push;
 #[cfg(feature = "lab")]
 mod protocol;
 #[cfg(feature = "lab")]
@@ -29,6 +30,7 @@ mod reproduce;
 #[cfg(feature = "lab")]
 mod rooms;
 mod serve;
+mod store;
 #[cfg(feature = "lab")]
 mod studio;
 #[cfg(feature = "lab")]
@@ -94,6 +96,10 @@ enum Command {
     Theory(theory::Theory),
     /// Answer over gRPC until SIGTERM or Ctrl-C
     Serve(Box<serve::Serve>),
+    /// Look after a store: list, defaults, removal, garbage, verification
+    Store(store::StoreCommand),
+    /// Upload a room or an adapter of a store to a server that was started with --writable
+    Push(push::Push),
     /// Check or print the settings of `serve`
     Config(Box<config::Config>),
     /// Ask a server for the frames that a camera motion leads to
@@ -148,6 +154,8 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         #[cfg(feature = "lab")]
         Command::Theory(arguments) => arguments.run(),
         Command::Serve(arguments) => arguments.run().await,
+        Command::Store(arguments) => arguments.run().await,
+        Command::Push(arguments) => arguments.run().await,
         Command::Config(arguments) => arguments.run(),
         Command::Navigate(arguments) => arguments.run().await,
         Command::Localize(arguments) => arguments.run().await,

@@ -96,11 +96,23 @@ pub struct Serve {
     #[arg(long, env = "SEESE3_MAX_STEPS", default_value_t = Limits::default().steps, value_parser = clap::value_parser!(u32).range(1..))]
     max_steps: u32,
     /// Largest number of frames returned for one step or one localisation
-    #[arg(long, env = "SEESE3_MAX_HITS", default_value_t = Limits::default().hits, value_parser = clap::value_parser!(u32).range(1..))]
-    max_hits: u32,
+    #[arg(long, env = "SEESE3_MAX_TOP_K", default_value_t = Limits::default().top_k, value_parser = clap::value_parser!(u32).range(1..))]
+    max_top_k: u32,
     /// Largest number of frames in one answer (steps times frames per step)
-    #[arg(long, env = "SEESE3_MAX_HITS_IN_ALL", default_value_t = Limits::default().hits_in_all, value_parser = clap::value_parser!(u64).range(1..))]
-    max_hits_in_all: u64,
+    #[arg(long, env = "SEESE3_MAX_FRAMES_IN_ANSWER", default_value_t = Limits::default().frames_in_answer, value_parser = clap::value_parser!(u64).range(1..))]
+    max_frames_in_answer: u64,
+    /// What all requests in progress may hold in memory together, 16777216 to 1099511627776 bytes:
+    /// what has arrived, what it becomes when it is decoded, and answers that are not sent yet.
+    /// Beyond it requests are refused
+    #[arg(long, env = "SEESE3_MAX_MEMORY_BYTES", default_value_t = Config::default().memory_bytes, value_parser = bounded(16 << 20, 1 << 40))]
+    max_memory_bytes: usize,
+    /// Let callers change the catalog: upload and remove rooms and adapters, fit, choose defaults. With
+    /// --auth-file only those with the verb "write"
+    #[arg(long, env = "SEESE3_WRITABLE")]
+    writable: bool,
+    /// What all uploads in progress may hold in memory together, 1048576 to 1099511627776 bytes
+    #[arg(long, env = "SEESE3_MAX_UPLOAD_BYTES", default_value_t = Config::default().upload_bytes, value_parser = bounded(1 << 20, 1 << 40))]
+    max_upload_bytes: usize,
     /// Largest message accepted from a client, 1024 to 1073741824 bytes; also the size limit of an
     /// encoded image
     #[arg(long, env = "SEESE3_MAX_MESSAGE_BYTES", default_value_t = Config::default().message_bytes, value_parser = bounded(1_024, 1 << 30))]
@@ -108,7 +120,11 @@ pub struct Serve {
     /// Time limit of a request, seconds, 1 to 86400, whatever deadline the client sets
     #[arg(long, env = "SEESE3_MAX_REQUEST_SECONDS", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     max_request_seconds: u64,
-    /// Time that running requests get to finish after SIGTERM or Ctrl-C, seconds, 0 to 86400
+    /// Time for which requests are still accepted after SIGTERM or Ctrl-C while health says
+    /// NOT_SERVING, so that load balancers notice first, seconds, 0 to 86400
+    #[arg(long, env = "SEESE3_LAME_DUCK_SECONDS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=86_400))]
+    lame_duck_seconds: u64,
+    /// Time that running requests then get to finish, seconds, 0 to 86400
     #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = 10, value_parser = clap::value_parser!(u64).range(0..=86_400))]
     drain_seconds: u64,
     /// Seconds between two looks for changes of the store, 0 to 86400; new revisions are then served
@@ -320,15 +336,19 @@ impl Serve {
             }),
             limits: Limits {
                 steps: self.max_steps,
-                hits: self.max_hits,
-                hits_in_all: self.max_hits_in_all,
+                top_k: self.max_top_k,
+                frames_in_answer: self.max_frames_in_answer,
             },
+            memory_bytes: self.max_memory_bytes,
+            writable: self.writable,
+            upload_bytes: self.max_upload_bytes,
             message_bytes: self.max_message_bytes,
             threads,
             queue: self.queue as usize,
             longest: Duration::from_secs(self.max_request_seconds),
             streams: self.max_streams,
             token_key: self.token_key()?,
+            lame_duck: Duration::from_secs(self.lame_duck_seconds),
             drain: Duration::from_secs(self.drain_seconds),
             connections: connections_within_file_limit(self.max_connections),
             tls: self.tls()?.map(Arc::new),

@@ -50,6 +50,23 @@ pub(super) fn pose_of(matrix: &Matrix4<f64>) -> MatrixPose {
     )
 }
 
+/// A camera pose from a homogeneous matrix, and the largest entry of |RRᵀ − I| of its rotation R,
+/// which is projected onto SO(3).
+///
+/// # Errors
+/// What is wrong with the matrix, in words.
+pub fn pose_of_matrix(matrix: &Matrix4<f64>) -> Result<(Pose, f64), String> {
+    match pose_of(matrix) {
+        MatrixPose::Pose(_, deviation) if deviation > MAX_ROTATION_DEVIATION => {
+            Err(deviation_problem(deviation))
+        }
+        MatrixPose::Pose(pose, deviation) => Ok((pose, deviation)),
+        MatrixPose::NotFinite => Err("is not finite".to_owned()),
+        MatrixPose::NotARotation => Err("has no rotation: its matrix is singular".to_owned()),
+        MatrixPose::NotHomogeneous => Err(LAST_ROW_PROBLEM.to_owned()),
+    }
+}
+
 /// Checks that every column of the frames is empty or as long as the poses, so that it can be
 /// indexed by row afterwards.
 pub(super) fn check_lengths(file: &Path, recording: &Recording) -> Result<(), Error> {

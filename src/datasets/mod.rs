@@ -17,6 +17,7 @@ mod twelve_scenes;
 
 pub use arkitscenes::read_arkitscenes;
 pub use bundle::{read_bundle, read_numpy, write_numpy};
+pub use collect::pose_of_matrix;
 pub use numpy::{read_features, read_poses, read_timestamps};
 pub use scannet::read_scannet;
 pub use sens::read_sens;

@@ -38,19 +38,26 @@ impl Tract {
         let fixed = fixed.ok_or_else(|| wrong(open()))?;
         let shape: Vec<usize> = std::iter::once(1).chain(fixed).collect();
 
-        let model = tract_onnx::onnx()
-            .model_for_path(file)
-            .and_then(|mut model| {
-                model.select_outputs_by_name(names)?;
+        let plan = || {
+            tract_onnx::onnx()
+                .model_for_path(file)
+                .and_then(|mut model| {
+                    model.select_outputs_by_name(names)?;
 
-                model.set_input_fact(
-                    0,
-                    InferenceFact::dt_shape(f32::datum_type(), shape.as_slice()),
-                )?;
+                    model.set_input_fact(
+                        0,
+                        InferenceFact::dt_shape(f32::datum_type(), shape.as_slice()),
+                    )?;
 
-                model.into_optimized()?.into_runnable()
-            });
+                    model.into_optimized()?.into_runnable()
+                })
+        };
 
+        // tract panics at some models that are damaged, and leaves nothing behind that anybody else
+        // could see.
+        let model = std::panic::catch_unwind(plan).map_err(|_| {
+            wrong("cannot be run by tract, which stopped while it planned the model".to_owned())
+        })?;
         let model = model.map_err(|error| wrong(format!("cannot be run by tract: {error:#}")))?;
         Ok(Self {
             model,

@@ -10,6 +10,7 @@ use tonic::{Request, Response, Status};
 use tracing::Instrument;
 
 use super::convert;
+use super::memory::hold_answer;
 use super::snapshot::ServedNavigator;
 use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
@@ -62,7 +63,7 @@ impl EvaluationService for Handlers {
             })
             .await?;
 
-        Ok(Response::new(answer))
+        Ok(Response::new(hold_answer(answer)?))
     }
 }
 

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use tonic::{Request, Response, Status};
 
 use super::convert;
+use super::memory::hold_answer;
 use super::snapshot::ServedNavigator;
 use super::status::view_error;
 use super::workers::Lane;
@@ -24,7 +25,8 @@ impl LocalizationService for Handlers {
         &self,
         request: Request<pb::RelocalizeRequest>,
     ) -> Result<Response<pb::RelocalizeResponse>, Status> {
-        Ok(Response::new(self.relocalized(request).await?))
+        let answer = self.relocalized(request).await?;
+        Ok(Response::new(hold_answer(answer)?))
     }
 
     async fn localize(
@@ -32,7 +34,7 @@ impl LocalizationService for Handlers {
         request: Request<pb::LocalizeRequest>,
     ) -> Result<Response<pb::LocalizeResponse>, Status> {
         let snapshot = self.snapshot(&request)?;
-        let most = self.config.limits.hits;
+        let most = self.config.limits.top_k;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
         let lane = Lane::of(&request.view);
@@ -44,12 +46,12 @@ impl LocalizationService for Handlers {
             })
             .await?;
 
-        let found = answer.places.first().and_then(|place| place.hit.as_ref());
-        if let Some(hit) = found {
-            self.config.metrics.retrieved(hit.distance);
+        let found = answer.places.first().and_then(|place| place.frame.as_ref());
+        if let Some(frame) = found {
+            self.config.metrics.retrieved(frame.distance);
         }
 
-        Ok(Response::new(answer))
+        Ok(Response::new(hold_answer(answer)?))
     }
 }
 
@@ -63,15 +65,15 @@ fn answer(
         rooms,
         adapter,
         view,
-        hit_count,
+        top_k,
         thresholds,
     } = request;
 
     let thresholds = convert::thresholds(thresholds)?;
-    let k = hit_count.unwrap_or(1);
+    let k = top_k.unwrap_or(1);
     if k == 0 || k > most {
         return Err(Error::invalid(
-            "hit_count",
+            "top_k",
             format!("must be 1 to {most}, got {k}"),
         ));
     }
@@ -113,11 +115,17 @@ fn answer(
         let served = revision(place.room.as_str()).ok_or(Error::Internal)?;
         Ok(pb::Place {
             room: Some(convert::room_revision(served)),
-            hit: Some(convert::hit_to_wire(&place.hit, served.navigator.room())),
+            frame: Some(convert::retrieved_to_wire(
+                &place.frame,
+                served.navigator.room(),
+            )),
             // The error is taken from the true pose itself, so that its twist is log(true⁻¹ ·
             // found).
             error: start.pose.map(|truth| {
-                convert::error_to_wire(&StepError::of(&truth, &place.hit.pose, &truth), &thresholds)
+                convert::error_to_wire(
+                    &StepError::of(&truth, &place.frame.pose, &truth),
+                    &thresholds,
+                )
             }),
         })
     };

@@ -11,7 +11,7 @@ use prometheus_client::collector::Collector;
 use prometheus_client::encoding::{DescriptorEncoder, EncodeLabelSet, EncodeMetric};
 use prometheus_client::metrics::counter::{ConstCounter, Counter};
 use prometheus_client::metrics::family::Family;
-use prometheus_client::metrics::gauge::Gauge;
+use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
@@ -234,11 +234,30 @@ impl Metrics {
         help: &'static str,
         count: impl Fn() -> u64 + Send + Sync + 'static,
     ) {
-        let collector = Elsewhere {
+        self.register(Elsewhere {
             name,
             help,
-            count: Box::new(count),
-        };
+            value: Box::new(count),
+            kind: Kind::Counter,
+        });
+    }
+
+    /// Adds a value that is kept elsewhere and read at every scrape; it may fall again.
+    pub(super) fn gauge_elsewhere(
+        &self,
+        name: &'static str,
+        help: &'static str,
+        value: impl Fn() -> u64 + Send + Sync + 'static,
+    ) {
+        self.register(Elsewhere {
+            name,
+            help,
+            value: Box::new(value),
+            kind: Kind::Gauge,
+        });
+    }
+
+    fn register(&self, collector: Elsewhere) {
         let registry = self.0.registry.lock();
         let mut registry = registry.unwrap_or_else(PoisonError::into_inner);
         registry.register_collector(Box::new(collector));
@@ -320,7 +339,15 @@ impl Metrics {
 struct Elsewhere {
     name: &'static str,
     help: &'static str,
-    count: Box<dyn Fn() -> u64 + Send + Sync>,
+    value: Box<dyn Fn() -> u64 + Send + Sync>,
+    kind: Kind,
+}
+
+/// Whether a value only grows.
+#[derive(Debug, Clone, Copy)]
+enum Kind {
+    Counter,
+    Gauge,
 }
 
 impl std::fmt::Debug for Elsewhere {
@@ -331,10 +358,19 @@ impl std::fmt::Debug for Elsewhere {
 
 impl Collector for Elsewhere {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), std::fmt::Error> {
-        let counter = ConstCounter::new((self.count)());
-        let metric =
-            encoder.encode_descriptor(self.name, self.help, None, counter.metric_type())?;
-        counter.encode(metric)
+        let value = (self.value)();
+        match self.kind {
+            Kind::Counter => {
+                let counter = ConstCounter::new(value);
+                let kind = counter.metric_type();
+                counter.encode(encoder.encode_descriptor(self.name, self.help, None, kind)?)
+            }
+            Kind::Gauge => {
+                let gauge = ConstGauge::new(i64::try_from(value).unwrap_or(i64::MAX));
+                let kind = gauge.metric_type();
+                gauge.encode(encoder.encode_descriptor(self.name, self.help, None, kind)?)
+            }
+        }
     }
 }
 

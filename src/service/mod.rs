@@ -17,6 +17,7 @@ mod navigate_to;
 mod health;
 mod localization;
 mod measure;
+mod memory;
 mod metrics;
 mod navigation;
 mod odometry;
@@ -58,8 +59,11 @@ use tower_http::trace::TraceLayer;
 
 use crate::store::{self, Store};
 use auth::{AuthLayer, Principal};
+use catalog::Changes;
 use health::RoomHealth;
 use measure::MeasureLayer;
+use memory::{Memory, MemoryLayer};
+use reload::Looks;
 use seese3_client::proto::FILE_DESCRIPTOR_SET;
 use seese3_client::proto::v1::catalog_service_server::CatalogServiceServer;
 use seese3_client::proto::v1::evaluation_service_server::EvaluationServiceServer;
@@ -87,6 +91,14 @@ pub struct Config {
     pub batch: usize,
     /// The largest number of predictions in one ScorePredictions.
     pub predictions: usize,
+    /// What all requests in progress may hold in memory together, bytes.
+    pub memory_bytes: usize,
+    /// How long a request with one message may take to arrive.
+    pub receive_within: Duration,
+    /// Whether callers may change the catalog.
+    pub writable: bool,
+    /// What all uploads in progress may hold in memory together, bytes.
+    pub upload_bytes: usize,
     /// The largest message that is received, bytes.
     pub message_bytes: usize,
     /// The largest number of requests computed at the same time.
@@ -99,7 +111,10 @@ pub struct Config {
     pub streams: usize,
     /// The key that authenticates resume tokens. Servers that share it accept one another's tokens.
     pub token_key: TokenKey,
-    /// How long requests in flight may continue after the shutdown signal.
+    /// How long the server still accepts requests after the shutdown signal, while health says
+    /// NOT_SERVING.
+    pub lame_duck: Duration,
+    /// How long requests in flight may continue after that.
     pub drain: Duration,
     /// When the server looks for changes of its store.
     pub reload: Reload,
@@ -121,12 +136,17 @@ impl Default for Config {
             encoders: None,
             batch: 256,
             predictions: 100_000,
+            memory_bytes: 1 << 30,
+            receive_within: Duration::from_secs(30),
+            writable: false,
+            upload_bytes: 1 << 30,
             message_bytes: 4 << 20,
             threads: std::thread::available_parallelism().map_or(1, usize::from),
             queue: 1_024,
             longest: Duration::from_secs(300),
             streams: 4_096,
             token_key: TokenKey::random(),
+            lame_duck: Duration::ZERO,
             drain: Duration::from_secs(10),
             reload: Reload::default(),
             metrics: Metrics::default(),
@@ -202,6 +222,8 @@ struct Handlers {
     workers: Workers,
     config: Arc<Config>,
     streams: Arc<Semaphore>,
+    /// What changes of the catalog go through; none if this server takes no changes.
+    changes: Option<Arc<Changes>>,
 }
 
 impl Handlers {
@@ -245,12 +267,15 @@ pub async fn run(
     let metrics = config.metrics.clone();
     let (stop, stopped) = oneshot::channel::<()>();
     let workers = Workers::new(&config);
+    let (looks, asked) = Looks::new();
+    let changes = Changes::new(store.clone(), looks, &config);
 
     let handlers = Handlers {
         phase: watched.clone(),
         workers: workers.clone(),
         config: Arc::new(config.clone()),
         streams: Arc::new(Semaphore::new(config.streams)),
+        changes: config.writable.then(|| Arc::new(changes)),
     };
     let answering = server(handlers, watched.clone(), grpc, async {
         // An error means that `run` was dropped; the server must stop then, too.
@@ -269,7 +294,7 @@ pub async fn run(
     tokio::pin!(server, shutdown);
     let loading = async {
         let loader = Loader::open(store, config.index, config.encoders, metrics.clone()).await?;
-        let first = loader.first().await?;
+        let first = loader.first(config.writable).await?;
         Ok::<_, RunError>((loader, first))
     };
 
@@ -301,7 +326,7 @@ pub async fn run(
     tokio::select! {
         ended = &mut server => return ended,
         () = &mut shutdown => {}
-        () = reload::keep_current(loader, config.reload, &phase, &metrics) => {}
+        () = reload::keep_current(loader, config.reload, asked, config.writable, &phase, &metrics) => {}
     }
 
     tracing::info!(bound_s = config.drain.as_secs_f64(), "draining");
@@ -313,6 +338,11 @@ pub async fn run(
             *phase = Phase::Draining(snapshot.clone());
         }
     });
+
+    // Load balancers need a moment to notice; until then they still send requests here.
+    if let Ok(ended) = tokio::time::timeout(config.lame_duck, &mut server).await {
+        return ended;
+    }
 
     // An error means the server has ended already.
     let _ = stop.send(());
@@ -384,6 +414,23 @@ async fn operate(
     }
 }
 
+fn memory_layer(config: &Config) -> MemoryLayer {
+    let memory = Memory::new(config.memory_bytes);
+    let counted = memory.clone();
+    config.metrics.gauge_elsewhere(
+        "memory_held_bytes",
+        "What requests in progress are counted to hold in memory",
+        move || counted.held() as u64,
+    );
+
+    MemoryLayer {
+        memory,
+        message_bytes: config.message_bytes,
+        receive_within: config.receive_within,
+        metrics: config.metrics.clone(),
+    }
+}
+
 fn server(
     handlers: Handlers,
     phase: watch::Receiver<Phase>,
@@ -398,6 +445,8 @@ fn server(
         metrics,
         ..
     } = handlers.config.as_ref().clone();
+
+    let memory = memory_layer(&handlers.config);
 
     let room_health = match &keyring {
         Some(_) => RoomHealth::Hidden,
@@ -440,6 +489,7 @@ fn server(
             keyring,
             metrics: metrics.clone(),
         })
+        .layer(memory)
         .add_service(health::service(phase, room_health))
         .add_service(v1)
         .add_service(v1alpha)

@@ -177,7 +177,7 @@ fn ready(
         navigator
             .nearest(start.latent.view(), 1)
             .first()
-            .map(|hit| hit.pose)
+            .map(|frame| frame.pose)
     });
 
     let goal = goal_pose(goal, navigator, &room)?;
@@ -220,20 +220,19 @@ fn goal_pose(goal: Option<Goal>, navigator: &Navigator, room: &str) -> Result<Po
 
 /// What a request says of the bounds of its pursuit.
 struct Asked {
-    step: f64,
-    tolerance_m: f64,
-    tolerance_rad: f64,
-    max_steps: u32,
+    step: Option<f64>,
+    tolerance_m: Option<f64>,
+    tolerance_rad: Option<f64>,
+    max_steps: Option<u32>,
     max_recoveries: Option<u32>,
 }
 
-/// The bounds of a pursuit: what was asked for, and the room's own where nothing was. On the wire 0
-/// means that the caller leaves the value to the server.
+/// The bounds of a pursuit: what was asked for, and the room's own where nothing was.
 fn bounds(own: Pursuit, asked: Asked, most_steps: u32) -> Result<Pursuit, Error> {
-    let positive_or = |field: &str, given: f64, own: f64| match given {
-        0.0 => Ok(own),
-        given if given.is_finite() && given > 0.0 => Ok(given),
-        given => Err(Error::invalid(
+    let positive_or = |field: &str, given: Option<f64>, own: f64| match given {
+        None => Ok(own),
+        Some(given) if given.is_finite() && given > 0.0 => Ok(given),
+        Some(given) => Err(Error::invalid(
             field,
             format!("must be finite and above 0, got {given}"),
         )),
@@ -242,12 +241,12 @@ fn bounds(own: Pursuit, asked: Asked, most_steps: u32) -> Result<Pursuit, Error>
     // The default is lowered to the server's limit; a number that the caller asks for is refused
     // above it.
     let steps = match asked.max_steps {
-        0 => own.steps.min(most_steps),
-        steps if steps <= most_steps => steps,
-        steps => {
+        None => own.steps.min(most_steps),
+        Some(steps) if (1..=most_steps).contains(&steps) => steps,
+        Some(steps) => {
             return Err(Error::invalid(
                 "max_steps",
-                format!("must be at most {most_steps}, got {steps}"),
+                format!("must be 1 to {most_steps}, got {steps}"),
             ));
         }
     };
@@ -268,16 +267,16 @@ fn feedback_to_wire(
 ) -> pb::NavigateToFeedback {
     let Feedback {
         step,
-        hit,
+        frame,
         remaining,
         recoveries,
     } = feedback;
 
     pb::NavigateToFeedback {
         current_step: *step,
-        current: hit
+        current: frame
             .as_ref()
-            .map(|hit| convert::hit_to_wire(hit, served.navigator.room())),
+            .map(|frame| convert::retrieved_to_wire(frame, served.navigator.room())),
         distance_remaining_m: remaining.translation_m,
         rotation_remaining_rad: remaining.rotation_rad,
         number_of_recoveries: *recoveries,

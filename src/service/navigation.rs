@@ -3,6 +3,7 @@
 use tonic::{Request, Response, Status};
 
 use super::convert;
+use super::memory::hold_answer;
 use super::status::brief;
 use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
@@ -30,12 +31,12 @@ impl NavigationService for Handlers {
             })
             .await?;
 
-        let found = answer.steps.iter().filter_map(|step| step.hits.first());
-        for hit in found {
-            self.config.metrics.retrieved(hit.distance);
+        let found = answer.steps.iter().filter_map(|step| step.frames.first());
+        for frame in found {
+            self.config.metrics.retrieved(frame.distance);
         }
 
-        Ok(Response::new(answer))
+        Ok(Response::new(hold_answer(answer)?))
     }
 
     type NavigateToStream = super::navigate_to::Events;
@@ -72,10 +73,10 @@ impl NavigationService for Handlers {
             .map(hits_asked_for)
             .fold(0, u64::saturating_add);
 
-        if in_all > limits.hits_in_all {
+        if in_all > limits.frames_in_answer {
             let problem = format!(
                 "ask for {in_all} frames together, over the limit of {}",
-                limits.hits_in_all
+                limits.frames_in_answer
             );
             return Err(Error::invalid("requests", problem).into());
         }
@@ -116,11 +117,12 @@ impl NavigationService for Handlers {
             })
             .collect();
 
-        Ok(Response::new(pb::BatchNavigateResponse { results }))
+        let answer = pb::BatchNavigateResponse { results };
+        Ok(Response::new(hold_answer(answer)?))
     }
 }
 
-/// How many frames a request asks for: motions times steps times hits. It only serves the sum over
+/// How many frames a request asks for: motions times steps times frames. It only serves the sum over
 /// a batch; each request is checked in full when it is answered.
 fn hits_asked_for(request: &pb::NavigateRequest) -> u64 {
     let motions = match request
@@ -133,7 +135,7 @@ fn hits_asked_for(request: &pb::NavigateRequest) -> u64 {
     };
 
     let steps = u64::from(request.steps.unwrap_or(1)).saturating_mul(motions);
-    steps.saturating_mul(u64::from(request.hit_count.unwrap_or(1)))
+    steps.saturating_mul(u64::from(request.top_k.unwrap_or(1)))
 }
 
 fn navigate(

@@ -13,7 +13,7 @@ use crate::store::StoredAdapter;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::odometry_service_server::OdometryService;
 use seese3_core::cancel::Cancellation;
-use seese3_core::geometry::{Pinhole, PixelCamera, body_twist, exp};
+use seese3_core::geometry::{body_twist, exp};
 use seese3_core::navigation::{Source, StepError};
 use seese3_core::room::FrameId;
 use seese3_core::tracking::View;
@@ -162,7 +162,7 @@ fn by_two_views(
     cancel: &Cancellation,
 ) -> Result<Option<pb::EstimateMotionResponse>, Error> {
     // What is stated must hold, whoever reads the motion.
-    let stated = request.camera.as_ref().map(pinhole).transpose()?;
+    let stated = request.camera.as_ref().map(convert::pinhole).transpose()?;
 
     let (Some(reader), Some(first), Some(second), "") = (
         snapshot.two_views(),
@@ -211,26 +211,6 @@ fn image(view: Option<&pb::View>) -> Option<&[u8]> {
         pb::view::View::Image(image) => Some(image),
         _ => None,
     }
-}
-
-fn pinhole(camera: &pb::Pinhole) -> Result<Pinhole, Error> {
-    let pb::Pinhole {
-        width,
-        height,
-        focal,
-        centre_x,
-        centre_y,
-    } = *camera;
-    let middle = [width / 2.0, height / 2.0];
-    let centre = [centre_x.unwrap_or(middle[0]), centre_y.unwrap_or(middle[1])];
-
-    Pinhole::new(PixelCamera {
-        width,
-        height,
-        focal,
-        centre: Some(centre.into()),
-    })
-    .map_err(|problem| Error::invalid("camera", problem))
 }
 
 /// The adapter of a request that names no room: the one it names, or the only one.

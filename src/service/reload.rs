@@ -6,7 +6,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::{Notify, watch};
+use tokio::sync::{Notify, mpsc, oneshot, watch};
 
 use super::Phase;
 use super::metrics::{Metrics, ReloadOutcome};
@@ -30,10 +30,35 @@ impl Default for Reload {
     }
 }
 
+/// Asks for a look at the store, and waits for it: for those who changed the store themselves.
+#[derive(Debug, Clone)]
+pub(super) struct Looks(mpsc::UnboundedSender<oneshot::Sender<()>>);
+
+/// Where looks are asked for.
+pub(super) type LookRequests = mpsc::UnboundedReceiver<oneshot::Sender<()>>;
+
+impl Looks {
+    pub fn new() -> (Self, LookRequests) {
+        let (asks, asked) = mpsc::unbounded_channel();
+        (Self(asks), asked)
+    }
+
+    /// Completes after a look that began after this call, or when the server serves no more.
+    pub async fn look(&self) {
+        let (done, looked) = oneshot::channel();
+        if self.0.send(done).is_ok() {
+            // An error means that the server is stopping.
+            let _ = looked.await;
+        }
+    }
+}
+
 /// Keeps the served snapshot up to date for as long as the server serves; never completes.
 pub(super) async fn keep_current(
     loader: Loader,
     reload: Reload,
+    mut asked: LookRequests,
+    is_writable: bool,
     phase: &watch::Sender<Phase>,
     metrics: &Metrics,
 ) {
@@ -41,13 +66,18 @@ pub(super) async fn keep_current(
     let mut trouble = String::new();
 
     loop {
-        let refused = next_look(&reload).await;
+        // They are told when they are dropped, at the end of this look.
+        let mut waiting: Vec<oneshot::Sender<()>> = Vec::new();
+        let refused = next_look(&reload, &mut asked, &mut waiting).await;
         let Phase::Serving(before) = phase.borrow().clone() else {
             continue;
         };
 
         let now = match loader.load(before.clone(), refused).await {
-            Ok(now) if now.rooms().is_empty() => Err("the store has no room any more".to_owned()),
+            // Whoever changes the store through this server may remove the last room.
+            Ok(now) if now.rooms().is_empty() && !is_writable => {
+                Err("the store has no room any more".to_owned())
+            }
             Ok(now) => Ok(now),
             Err(error) => Err(error.to_string()),
         };
@@ -79,8 +109,12 @@ pub(super) async fn keep_current(
     }
 }
 
-/// Waits until it is time for the next look, or until one is asked for.
-async fn next_look(reload: &Reload) -> Refused {
+/// Waits until it is time for the next look, or until one is asked for. Collects who waits for it.
+async fn next_look(
+    reload: &Reload,
+    asked: &mut LookRequests,
+    waiting: &mut Vec<oneshot::Sender<()>>,
+) -> Refused {
     let pause = async {
         match reload.every {
             Some(every) => tokio::time::sleep(every).await,
@@ -88,10 +122,20 @@ async fn next_look(reload: &Reload) -> Refused {
         }
     };
 
-    tokio::select! {
+    let refused = tokio::select! {
         () = pause => Refused::LeaveOut,
         () = reload.asked.notified() => Refused::TryAgain,
+        Some(done) = asked.recv() => {
+            waiting.push(done);
+            Refused::LeaveOut
+        }
+    };
+
+    // Whoever asked up to now is content with this look.
+    while let Ok(done) = asked.try_recv() {
+        waiting.push(done);
     }
+    refused
 }
 
 /// Logs what a reload changed. What is refused has been logged when it was tried.

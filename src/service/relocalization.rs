@@ -11,7 +11,7 @@ use super::workers::Lane;
 use super::{Error, Handlers};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
-use seese3_core::navigation::{Hit, Source};
+use seese3_core::navigation::{RetrievedFrame, Source};
 use seese3_core::tracking::{self, Map, RoomMatch, View, relocalize};
 
 /// Rooms in an answer if the request does not say how many.
@@ -26,7 +26,7 @@ impl Handlers {
         request: tonic::Request<pb::RelocalizeRequest>,
     ) -> Result<pb::RelocalizeResponse, Error> {
         let snapshot = self.snapshot(&request)?;
-        let most = self.config.limits.hits;
+        let most = self.config.limits.top_k;
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
         let lane = Lane::of(&request.views);
@@ -49,8 +49,8 @@ fn answer(
         rooms,
         adapter,
         views,
-        room_count,
-        hit_count,
+        max_rooms,
+        top_k,
     } = request;
 
     let within = |field: &str, given: Option<u32>, plain: u32| match given.unwrap_or(plain) {
@@ -62,8 +62,8 @@ fn answer(
     };
 
     // All rooms are compared; `shown` only limits how many of them the answer lists.
-    let shown = within("room_count", room_count, ROOMS)?;
-    let hits = within("hit_count", hit_count, 1)?;
+    let shown = within("max_rooms", max_rooms, ROOMS)?;
+    let top_k = within("top_k", top_k, 1)?;
 
     if views.is_empty() || views.len() > MAX_VIEWS {
         return Err(Error::invalid(
@@ -106,7 +106,7 @@ fn answer(
         );
     }
 
-    let found = relocalize(&maps, &latents, hits, cancel).map_err(|error| match error {
+    let found = relocalize(&maps, &latents, top_k, cancel).map_err(|error| match error {
         tracking::Error::Cancelled => Error::Cancelled,
         _ => Error::Internal,
     })?;
@@ -163,9 +163,9 @@ pub fn rooms_to_track_in(
 }
 
 /// The names of the adapters that can track in a room, its default first.
-fn adapters_that_track(room: &ServedRoom) -> Vec<&str> {
-    room.navigators
-        .iter()
+fn adapters_that_track<'a>(snapshot: &'a Snapshot, room: &'a ServedRoom) -> Vec<&'a str> {
+    snapshot
+        .navigators(room)
         .filter(|served| served.map.is_some())
         .map(|served| served.adapter.name.as_str())
         .collect()
@@ -176,7 +176,7 @@ fn adapters_that_track_anywhere(snapshot: &Snapshot) -> Vec<&str> {
     let mut names: Vec<&str> = snapshot
         .rooms()
         .values()
-        .flat_map(|room| adapters_that_track(room))
+        .flat_map(|room| adapters_that_track(snapshot, room))
         .collect();
     names.sort_unstable();
     names.dedup();
@@ -188,7 +188,7 @@ fn default_that_tracks<'a>(snapshot: &'a Snapshot, room: &str) -> Vec<&'a str> {
     let mut names = snapshot
         .rooms()
         .get(room)
-        .map_or_else(Vec::new, |room| adapters_that_track(room));
+        .map_or_else(Vec::new, |room| adapters_that_track(snapshot, room));
     names.truncate(1);
     names
 }
@@ -199,9 +199,9 @@ fn adapters_that_track_in_all<'a>(snapshot: &'a Snapshot, rooms: &[String]) -> V
     let mut named = rooms.iter().filter_map(|room| snapshot.rooms().get(room));
     let mut names = named
         .next()
-        .map_or_else(Vec::new, |room| adapters_that_track(room));
+        .map_or_else(Vec::new, |room| adapters_that_track(snapshot, room));
     for room in named {
-        let here = adapters_that_track(room);
+        let here = adapters_that_track(snapshot, room);
         names.retain(|name| here.contains(name));
     }
 
@@ -252,14 +252,14 @@ fn room_to_wire(
         _ => None,
     };
 
-    // The distances of these hits are in standard deviations of frame noise, unlike those of
+    // The distances of these frames are in standard deviations of frame noise, unlike those of
     // Localize.
-    let hit = |neighbour: &seese3_core::index::Neighbour| {
-        let hit = Hit {
+    let retrieved = |neighbour: &seese3_core::index::Neighbour| {
+        let retrieved = RetrievedFrame {
             neighbour: *neighbour,
             pose: room.poses()[neighbour.frame.row()],
         };
-        convert::hit_to_wire(&hit, room)
+        convert::retrieved_to_wire(&retrieved, room)
     };
 
     // It is believed where the views look like the room. Else the pose and covariance are those of the
@@ -285,7 +285,7 @@ fn room_to_wire(
         out_of_distribution: found.out_of_distribution,
         pose,
         covariance,
-        hits: found.last.nearest.iter().map(hit).collect(),
+        frames: found.last.nearest.iter().map(retrieved).collect(),
         located,
     })
 }

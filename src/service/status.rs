@@ -30,11 +30,17 @@ pub enum Full {
     CallersRequests,
     /// The connections; who is refused hears nothing.
     Connections,
+    /// The bytes of all uploads in progress.
+    Uploads,
+    /// The fits in progress, of which there is one.
+    Fits,
+    /// The memory of requests in progress.
+    Memory,
 }
 
 impl Full {
     /// All of them.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 10] = [
         Self::ShortRequests,
         Self::Images,
         Self::LongRequests,
@@ -42,6 +48,9 @@ impl Full {
         Self::CallersStreams,
         Self::CallersRequests,
         Self::Connections,
+        Self::Uploads,
+        Self::Fits,
+        Self::Memory,
     ];
 
     /// The words of messages and metrics.
@@ -54,6 +63,9 @@ impl Full {
             Self::CallersStreams => "Track streams of this caller",
             Self::CallersRequests => "requests of this caller",
             Self::Connections => "connections",
+            Self::Uploads => "bytes of uploads",
+            Self::Fits => "fits",
+            Self::Memory => "bytes of requests",
         }
     }
 }
@@ -85,6 +97,10 @@ pub enum Error {
     Full { what: Full },
     #[error("{problem}")]
     Unauthenticated { problem: &'static str },
+    #[error("{name}: {problem}")]
+    Conflict { name: String, problem: String },
+    #[error("the upload was broken off: {problem}")]
+    Transport { code: Code, problem: String },
     #[error("the caller has no right to {verb}: the operator gives it in the server's --auth-file")]
     Forbidden { verb: &'static str },
     #[error("the deadline passed before the answer was ready")]
@@ -179,6 +195,8 @@ impl Error {
             Self::Invalid { .. } => Code::InvalidArgument,
             Self::NotFound { .. } => Code::NotFound,
             Self::Precondition(_) => Code::FailedPrecondition,
+            Self::Conflict { .. } => Code::Aborted,
+            Self::Transport { code, .. } => *code,
             Self::Loading => Code::Unavailable,
             Self::Full { .. } => Code::ResourceExhausted,
             Self::Unauthenticated { .. } => Code::Unauthenticated,
@@ -194,6 +212,8 @@ impl Error {
             Self::Invalid { .. } => "INVALID_FIELD",
             Self::NotFound { .. } => "NOT_SERVED",
             Self::Precondition(_) => "PRECONDITION",
+            Self::Conflict { .. } => "CONFLICT",
+            Self::Transport { .. } => "TRANSPORT",
             Self::Loading => "NOT_READY",
             Self::Full { .. } => "BUSY",
             Self::Unauthenticated { .. } => "UNAUTHENTICATED",
@@ -291,7 +311,7 @@ impl From<navigation::Error> for Error {
             E::Adapter(problem) => return view_error(problem).within("source"),
             E::Refit(_) | E::Pairs(_) => return Self::Precondition(error.to_string()),
             E::Steps { .. } => "steps",
-            E::HitCount { .. } | E::HitsInAll { .. } => "hit_count",
+            E::TopK { .. } | E::FramesInAnswer { .. } => "top_k",
             E::NoTwist | E::TwistNotFinite { .. } | E::TwistBeyondPi { .. } => "displacement",
             E::PoseNeeded { .. } => "source_pose",
             E::NoCandidates { .. } => "exclude_radius",

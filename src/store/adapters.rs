@@ -7,9 +7,12 @@ use ndarray::{Array2, ArrayView2};
 use object_store::path::Path;
 
 use super::format::{AdapterBody, FittedEntry, TrainingEntry};
-use super::manifest::{self, SCHEMA};
+use super::manifest::{self, ObjectRef, SCHEMA};
 use super::tensors::{TensorReader, TensorWriter};
-use super::{ATTEMPTS, Error, Kind, Published, Store, error_model, revision_path, room_fit};
+use super::{
+    ATTEMPTS, Error, Kind, Published, Store, error_model, folder_of, revision_path, room_fit,
+    sha256,
+};
 use seese3_core::adapter::{
     self, Adapter, Corrector, CorrectorKind, Mixture, Network, TargetScale, TrainingRecord,
 };
@@ -25,6 +28,10 @@ const GOLDEN_ROWS: usize = 8;
 /// The largest accepted difference from a golden output, in units of the larger of 1 and the
 /// magnitude of that output.
 const GOLDEN_TOLERANCE: f64 = 1e-6;
+
+/// What errors call the files of an adapter that come from elsewhere.
+const UPLOADED_MANIFEST: &str = "the manifest";
+const UPLOADED_WEIGHTS: &str = "the weights";
 
 /// An adapter that was loaded from the store and reproduced its golden outputs.
 #[derive(Debug, Clone)]
@@ -120,34 +127,54 @@ impl Store {
             });
         }
 
-        let folder = Path::from(Kind::Adapter.folder()).join(name);
         let bytes = adapter_file(name, adapter, features, room_fit)?;
+        let body = AdapterBody {
+            schema: SCHEMA,
+            source: adapter.source().into(),
+            twist_frame: TWIST_FRAME.to_owned(),
+            // σ of the targets is divided by n, not by n − 1 (A-11).
+            deviation_ddof: 0,
+            training: TrainingEntry::new(record, adapter),
+            fitted_to: room_fit.map(FittedEntry::from),
+            // What follows is set when it is published.
+            adapter: String::new(),
+            revision: 0,
+            created: String::new(),
+            weights: ObjectRef::default(),
+        };
+        self.publish_body(name, body, bytes).await
+    }
+
+    /// Publishes a manifest with its weights under a name. Name, revision, date and the reference to
+    /// the weights are set here.
+    async fn publish_body(
+        &self,
+        name: &str,
+        body: AdapterBody,
+        weights: Vec<u8>,
+    ) -> Result<Published, Error> {
+        let folder = folder_of(Kind::Adapter, name);
 
         // The weights are written before the manifest that makes them visible.
         let weights = self
-            .write_object(&folder, "weights", "safetensors", bytes)
+            .write_object(&folder, "weights", "safetensors", weights)
             .await?;
 
         // As for rooms: try to create the next revision, and start again if another publisher was
         // faster.
         for _ in 0..ATTEMPTS {
-            let newest = match self.revisions(&folder).await?.last() {
+            let numbers = self.revisions(&folder).await?;
+            let newest = match numbers.present.last() {
                 Some(&revision) => Some(self.adapter_body(&folder, revision).await?),
                 None => None,
             };
 
             let body = AdapterBody {
-                schema: SCHEMA,
                 adapter: name.to_owned(),
-                revision: newest.as_ref().map_or(1, |body| body.revision + 1),
+                revision: numbers.highest + 1,
                 created: chrono::Utc::now().to_rfc3339(),
-                source: adapter.source().into(),
                 weights: weights.clone(),
-                twist_frame: TWIST_FRAME.to_owned(),
-                // σ of the targets is divided by n, not by n − 1 (A-11).
-                deviation_ddof: 0,
-                training: TrainingEntry::new(record, adapter),
-                fitted_to: room_fit.map(FittedEntry::from),
+                ..body.clone()
             };
 
             // Content that differs only in the revision number and the date is not published again.
@@ -186,7 +213,7 @@ impl Store {
         })
     }
 
-    /// Loads an adapter, the given revision or else the newest, and checks that its golden inputs
+    /// Loads an adapter, the given revision or else the one that its name alone means, and checks that its golden inputs
     /// still give their stored outputs.
     ///
     /// # Errors
@@ -201,87 +228,52 @@ impl Store {
     ) -> Result<StoredAdapter, Error> {
         let (folder, revision) = self.resolve(Kind::Adapter, name, revision).await?;
         let body = self.adapter_body(&folder, revision).await?;
+        let (file, bytes) = self.read_object(&folder, &body.weights).await?;
 
-        // Motions in another frame or of another scale would be wrong without any other sign, so
-        // the conventions are checked before any tensor is read.
-        if body.twist_frame != TWIST_FRAME || body.deviation_ddof != 0 {
-            let problem = format!(
-                "has twists in the frame '{}' and targets of ddof {}; this program supports only \
-                '{TWIST_FRAME}' and 0",
-                body.twist_frame, body.deviation_ddof
-            );
-            return Err(Error::Damaged {
-                file: self.shown(&revision_path(&folder, revision)),
-                problem,
+        let manifest = self.shown(&revision_path(&folder, revision));
+        assembled(body, &manifest, &file, &bytes)
+    }
+
+    /// Publishes a revision that was taken from another store as a new revision of `name`: its
+    /// manifest and its weights, as they stand in the files there. Both are checked as if they were
+    /// loaded.
+    ///
+    /// # Errors
+    /// [`Error::Damaged`] if the manifest or the weights are truncated, altered or do not belong
+    /// together, otherwise as [`Store::publish_adapter`].
+    pub async fn publish_adapter_files(
+        &self,
+        name: &str,
+        manifest: &[u8],
+        weights: Vec<u8>,
+    ) -> Result<Published, Error> {
+        if !is_plain_name(name) {
+            return Err(Error::Name {
+                what: "an adapter",
+                name: name.to_owned(),
             });
         }
 
-        let (file, bytes) = self.read_object(&folder, &body.weights).await?;
-        let damaged = |problem: String| Error::Damaged {
-            file: file.clone(),
-            problem,
-        };
+        check_adapter_files(manifest, &weights)?;
+        let body = manifest::decode(UPLOADED_MANIFEST, manifest)?;
+        self.publish_body(name, body, weights).await
+    }
 
-        let tensors = TensorReader::new(&file, &bytes)?;
-        let error_model = error_model::read(&tensors, &file)?;
-        let mixing = body.training.mixing().map_err(&damaged)?;
+    /// The files of an adapter, to be published in another store: its manifest and its weights.
+    ///
+    /// # Errors
+    /// As [`Store::load_adapter`].
+    pub async fn adapter_files(
+        &self,
+        name: &str,
+        revision: Option<u64>,
+    ) -> Result<(Vec<u8>, Vec<u8>), Error> {
+        let (folder, revision) = self.resolve(Kind::Adapter, name, revision).await?;
+        let manifest = self.read(&revision_path(&folder, revision)).await?;
+        let body = self.adapter_body(&folder, revision).await?;
+        let (_, weights) = self.read_object(&folder, &body.weights).await?;
 
-        // The names of the tensors follow from the number of charts and their mixing, both of which
-        // stand in the manifest.
-        let network = Mixture::from_tensors(body.training.charts, mixing, |name| {
-            read_weights(&tensors, name)
-        });
-        let network = network.map_err(|error| error.within(&file))?;
-
-        // W predicts z-scored motions; μ and σ turn them back into metres and radians.
-        let scale = TargetScale {
-            mean: vector6(&tensors, "target.mean", &file)?,
-            deviation: vector6(&tensors, "target.deviation", &file)?,
-        };
-
-        let error_covariance = match tensors.has(ERROR_COVARIANCE) {
-            true => Some(matrix6(&tensors, ERROR_COVARIANCE, &file)?),
-            false => None,
-        };
-
-        let correctors =
-            read_correctors(&tensors, &body.training, network.coordinate_count(), &file)?;
-
-        // The optional parts are added one by one, and each is checked as it is added.
-        let adapter = Adapter::new(body.source.into(), network, scale)
-            .and_then(|adapter| adapter.with_correctors(correctors))
-            .and_then(|adapter| match error_covariance {
-                Some(covariance) => adapter.with_error_covariance(covariance),
-                None => Ok(adapter),
-            })
-            .and_then(|adapter| match error_model {
-                Some(error_model) => adapter.with_error_model(error_model),
-                None => Ok(adapter),
-            })
-            .map_err(|error| damaged(error.to_string()))?;
-
-        // The checksums show that the file is intact. The golden vectors show that this program, on
-        // this machine, still computes the same function from it.
-        check_golden(&adapter, &tensors, &file)?;
-        let manifest = self.shown(&revision_path(&folder, revision));
-        let record = body.training.record().map_err(|word| Error::Damaged {
-            file: manifest,
-            problem: format!("has {word}, which this program does not know"),
-        })?;
-
-        let room_fit = match body.fitted_to {
-            Some(entry) => Some(room_fit::read(entry, &tensors, &file)?),
-            None => None,
-        };
-
-        Ok(StoredAdapter {
-            room_fit,
-            name: body.adapter,
-            revision,
-            created: body.created,
-            adapter: Arc::new(adapter),
-            record,
-        })
+        Ok((manifest, weights))
     }
 
     /// The names of all adapters, sorted.
@@ -292,15 +284,20 @@ impl Store {
         self.names(Kind::Adapter).await
     }
 
-    /// The names of all adapters, sorted, each with its newest revision. No file is read.
+    /// The names of all adapters, sorted, each with the revision that its name alone means. No
+    /// manifest is read.
     ///
     /// # Errors
-    /// [`Error::Io`] if the store cannot be listed.
-    pub async fn newest_adapters(&self) -> Result<Vec<(String, u64)>, Error> {
-        self.newest(Kind::Adapter).await
+    /// [`Error::Io`] if the store cannot be listed, otherwise as [`Store::defaults`].
+    pub async fn current_adapters(&self) -> Result<Vec<(String, u64)>, Error> {
+        self.current(Kind::Adapter).await
     }
 
-    async fn adapter_body(&self, folder: &Path, revision: u64) -> Result<AdapterBody, Error> {
+    pub(super) async fn adapter_body(
+        &self,
+        folder: &Path,
+        revision: u64,
+    ) -> Result<AdapterBody, Error> {
         let path = revision_path(folder, revision);
         let file = self.shown(&path);
         let body: AdapterBody = manifest::decode(&file, &self.read(&path).await?)?;
@@ -308,6 +305,129 @@ impl Store {
 
         Ok(body)
     }
+}
+
+/// The size in bytes that the manifest of an adapter states for its weights.
+///
+/// # Errors
+/// [`Error::Damaged`] if the manifest is truncated or altered, [`Error::Schema`] if a newer program
+/// wrote it.
+pub fn stated_weights_size(manifest: &[u8]) -> Result<u64, Error> {
+    let body: AdapterBody = manifest::decode(UPLOADED_MANIFEST, manifest)?;
+    Ok(body.weights.bytes)
+}
+
+/// Checks the manifest and the weights of an adapter that comes from another store, and returns it.
+///
+/// # Errors
+/// [`Error::Damaged`] if one is truncated or altered, they do not belong together, or the adapter was
+/// fitted to a room, since it serves only the revision of the room that its own store has;
+/// [`Error::Schema`] if a newer program wrote the manifest.
+pub fn check_adapter_files(manifest: &[u8], weights: &[u8]) -> Result<StoredAdapter, Error> {
+    let body: AdapterBody = manifest::decode(UPLOADED_MANIFEST, manifest)?;
+    let damaged = |file: &str, problem: &str| Error::Damaged {
+        file: file.to_owned(),
+        problem: problem.to_owned(),
+    };
+
+    if weights.len() as u64 != body.weights.bytes || sha256(weights) != body.weights.sha256 {
+        let problem = "do not have the size and the checksum that the manifest states";
+        return Err(damaged(UPLOADED_WEIGHTS, problem));
+    }
+    if body.fitted_to.is_some() {
+        let problem =
+            "is of an adapter that was fitted to a room of its own store; fit one to the room here";
+        return Err(damaged(UPLOADED_MANIFEST, problem));
+    }
+
+    assembled(body, UPLOADED_MANIFEST, UPLOADED_WEIGHTS, weights)
+}
+
+/// The adapter of a manifest and its weights, after its golden inputs gave their stored outputs.
+/// `manifest` and `file` name the two in errors.
+fn assembled(
+    body: AdapterBody,
+    manifest: &str,
+    file: &str,
+    bytes: &[u8],
+) -> Result<StoredAdapter, Error> {
+    // Motions in another frame or of another scale would be wrong without any other sign, so
+    // the conventions are checked before any tensor is read.
+    if body.twist_frame != TWIST_FRAME || body.deviation_ddof != 0 {
+        let problem = format!(
+            "has twists in the frame '{}' and targets of ddof {}; this program supports only \
+            '{TWIST_FRAME}' and 0",
+            body.twist_frame, body.deviation_ddof
+        );
+        return Err(Error::Damaged {
+            file: manifest.to_owned(),
+            problem,
+        });
+    }
+
+    let damaged = |problem: String| Error::Damaged {
+        file: file.to_owned(),
+        problem,
+    };
+
+    let tensors = TensorReader::new(file, bytes)?;
+    let error_model = error_model::read(&tensors, file)?;
+    let mixing = body.training.mixing().map_err(&damaged)?;
+
+    // The names of the tensors follow from the number of charts and their mixing, both of which
+    // stand in the manifest.
+    let network = Mixture::from_tensors(body.training.charts, mixing, |name| {
+        read_weights(&tensors, name)
+    });
+    let network = network.map_err(|error| error.within(file))?;
+
+    // W predicts z-scored motions; μ and σ turn them back into metres and radians.
+    let scale = TargetScale {
+        mean: vector6(&tensors, "target.mean", file)?,
+        deviation: vector6(&tensors, "target.deviation", file)?,
+    };
+
+    let error_covariance = match tensors.has(ERROR_COVARIANCE) {
+        true => Some(matrix6(&tensors, ERROR_COVARIANCE, file)?),
+        false => None,
+    };
+
+    let correctors = read_correctors(&tensors, &body.training, network.coordinate_count(), file)?;
+
+    // The optional parts are added one by one, and each is checked as it is added.
+    let adapter = Adapter::new(body.source.into(), network, scale)
+        .and_then(|adapter| adapter.with_correctors(correctors))
+        .and_then(|adapter| match error_covariance {
+            Some(covariance) => adapter.with_error_covariance(covariance),
+            None => Ok(adapter),
+        })
+        .and_then(|adapter| match error_model {
+            Some(error_model) => adapter.with_error_model(error_model),
+            None => Ok(adapter),
+        })
+        .map_err(|error| damaged(error.to_string()))?;
+
+    // The checksums show that the file is intact. The golden vectors show that this program, on
+    // this machine, still computes the same function from it.
+    check_golden(&adapter, &tensors, file)?;
+    let record = body.training.record().map_err(|word| Error::Damaged {
+        file: manifest.to_owned(),
+        problem: format!("has {word}, which this program does not know"),
+    })?;
+
+    let room_fit = match body.fitted_to {
+        Some(entry) => Some(room_fit::read(entry, &tensors, file)?),
+        None => None,
+    };
+
+    Ok(StoredAdapter {
+        room_fit,
+        name: body.adapter,
+        revision: body.revision,
+        created: body.created,
+        adapter: Arc::new(adapter),
+        record,
+    })
 }
 
 /// Why weights could not be taken from a file.

@@ -32,6 +32,15 @@ pub struct RoomBody {
     pub provenance: ProvenanceEntry,
 }
 
+impl RoomBody {
+    /// Every object of the revision.
+    pub fn objects(&self) -> impl Iterator<Item = &ObjectRef> {
+        let names = self.frame_names.iter().chain(&self.images);
+        let features = self.features.iter().map(|entry| &entry.object);
+        std::iter::once(&self.frames).chain(names).chain(features)
+    }
+}
+
 /// One set of features of a room. Its object holds the tensor `features` (n, d) f32.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FeaturesEntry {
@@ -123,6 +132,13 @@ pub struct AdapterBody {
     /// The room that the adapter was fitted to; absent for one that is meant for any room.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fitted_to: Option<FittedEntry>,
+}
+
+impl AdapterBody {
+    /// Every object of the revision.
+    pub fn objects(&self) -> impl Iterator<Item = &ObjectRef> {
+        std::iter::once(&self.weights)
+    }
 }
 
 /// The room of a fitted adapter. The weights object also holds the tensor `fit.rules`.

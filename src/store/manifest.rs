@@ -14,7 +14,7 @@ use super::{Error, sha256};
 pub const SCHEMA: u64 = 1;
 
 /// A reference from a manifest to an object file.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ObjectRef {
     /// The name of the file under `objects/`.
     pub file: String,

@@ -4,23 +4,37 @@
 //! rooms/NAME/objects/…               tensors and lists of names; the file name contains the hash
 //! rooms/NAME/revisions/000001.json   the manifest, written last: a revision is visible completely
 //!                                    or not at all
+//! rooms/NAME/revisions/000002.gone   a revision that was removed: its number is not given again
 //! adapters/NAME/…                    the same for an adapter
+//! defaults/000001.json               what an operator chose, see [`Defaults`]
 //! ```
 //!
 //! Tensors are safetensors files; Python reads them with `safetensors.numpy.load_file(path)`.
 //! Published revisions never change.
 
 mod adapters;
+mod contents;
+mod defaults;
 mod error_model;
 mod format;
+mod garbage;
 mod manifest;
+mod removal;
+mod resource;
 mod room_files;
 mod room_fit;
 mod rooms;
 mod tensors;
+mod verification;
 
-pub use adapters::{BaseAdapter, RoomFit, StoredAdapter};
+pub use adapters::{BaseAdapter, RoomFit, StoredAdapter, check_adapter_files, stated_weights_size};
+pub use contents::{Contents, RevisionContents};
+pub use defaults::{Choice, Defaults};
+pub use garbage::{Garbage, GarbageFile};
+pub use removal::Removed;
+pub use resource::{Kind, ResourceName, ResourceNameError};
 pub use rooms::{RoomSummary, StoredRoom, check_features};
+pub use verification::Finding;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -74,6 +88,8 @@ pub enum Error {
     Schema { file: String, schema: u64 },
     #[error("{file}: {cause}")]
     Io { file: String, cause: String },
+    #[error("{file} is missing; restore it, or publish again")]
+    Absent { file: String },
     #[error(
         "could not publish '{name}': another publisher took every revision number that was tried"
     )]
@@ -87,6 +103,14 @@ pub enum Error {
     },
     #[error("features '{name}' were given twice")]
     DuplicateFeatures { name: String },
+    #[error(
+        "room '{room}' has other frames since revision {revision}; give another name, or replace it on purpose"
+    )]
+    OtherFrames { room: String, revision: u64 },
+    #[error("{resource} cannot be removed: {reason}")]
+    InUse { resource: String, reason: String },
+    #[error("no default was ever chosen, so there is nothing to take back")]
+    NothingToTakeBack,
 }
 
 fn several(names: &[String]) -> String {
@@ -128,27 +152,13 @@ pub struct Store {
     folder: Option<PathBuf>,
 }
 
-/// The two kinds of content in a store.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Kind {
-    Room,
-    Adapter,
-}
-
-impl Kind {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Room => "room",
-            Self::Adapter => "adapter",
-        }
-    }
-
-    fn folder(self) -> &'static str {
-        match self {
-            Self::Room => "rooms",
-            Self::Adapter => "adapters",
-        }
-    }
+/// The numbers of the files in a folder of numbered files, such as `revisions/`.
+#[derive(Debug, Default)]
+struct Numbers {
+    /// Those that are there, in ascending order.
+    present: Vec<u64>,
+    /// The highest that was ever given, 0 if none was: the file may have been removed since.
+    highest: u64,
 }
 
 impl Store {
@@ -236,15 +246,13 @@ impl Store {
     /// Converts an error of the object store. A missing object gets a message of its own that says
     /// what to do.
     fn io(&self, path: &Path, error: &object_store::Error) -> Error {
-        let cause = match error {
-            object_store::Error::NotFound { .. } => {
-                "is missing; restore it, or publish again".to_owned()
-            }
-            other => other.to_string(),
-        };
-        Error::Io {
-            file: self.shown(path),
-            cause,
+        let file = self.shown(path);
+        match error {
+            object_store::Error::NotFound { .. } => Error::Absent { file },
+            other => Error::Io {
+                file,
+                cause: other.to_string(),
+            },
         }
     }
 
@@ -337,87 +345,143 @@ impl Store {
         revision: u64,
         bytes: Vec<u8>,
     ) -> Result<bool, Error> {
-        let path = revision_path(folder, revision);
+        self.write_new(&revision_path(folder, revision), bytes)
+            .await
+    }
 
+    /// Writes a file unless it exists. Returns whether it was written.
+    async fn write_new(&self, path: &Path, bytes: Vec<u8>) -> Result<bool, Error> {
         // `Create` fails if the object exists. This one atomic write decides which of several
-        // concurrent publishers gets the revision.
+        // concurrent writers gets the number.
         let options = PutOptions::from(PutMode::Create);
         match self
             .objects
-            .put_opts(&path, PutPayload::from(bytes), options)
+            .put_opts(path, PutPayload::from(bytes), options)
             .await
         {
             Ok(_) => Ok(true),
             Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
-            Err(error) => Err(self.io(&path, &error)),
+            Err(error) => Err(self.io(path, &error)),
         }
     }
 
     /// The names of all rooms, or of all adapters, that have at least one revision; sorted.
     async fn names(&self, kind: Kind) -> Result<Vec<String>, Error> {
-        let newest = self.newest(kind).await?;
-        Ok(newest.into_iter().map(|(name, _)| name).collect())
+        let numbered = self.numbered(kind).await?;
+        Ok(numbered.into_iter().map(|(name, _)| name).collect())
     }
 
-    /// The same, each with its newest revision.
-    async fn newest(&self, kind: Kind) -> Result<Vec<(String, u64)>, Error> {
-        let folder = Path::from(kind.folder());
+    /// The same, each with the revision that its name alone means.
+    async fn current(&self, kind: Kind) -> Result<Vec<(String, u64)>, Error> {
+        let defaults = self.defaults().await?;
+        let current = |(name, numbers): (String, Numbers)| {
+            let chosen = defaults.revision(kind, &name);
+            let newest = numbers.present.last().copied();
+            chosen.or(newest).map(|revision| (name, revision))
+        };
+
+        let numbered = self.numbered(kind).await?;
+        Ok(numbered.into_iter().filter_map(current).collect())
+    }
+
+    /// The names of all rooms, or of all adapters, each with its revisions; sorted.
+    async fn numbered(&self, kind: Kind) -> Result<Vec<(String, Numbers)>, Error> {
+        let mut numbered = Vec::new();
+
+        for (name, folder) in self.folders(kind).await? {
+            // A folder without a revision was left by an interrupted publication, since the
+            // manifest is written last, or by a removal. It does not count as published.
+            let numbers = self.revisions(&folder).await?;
+            if !numbers.present.is_empty() {
+                numbered.push((name, numbers));
+            }
+        }
+
+        Ok(numbered)
+    }
+
+    /// The folders of a kind, whether they have a revision or not, by name; sorted.
+    async fn folders(&self, kind: Kind) -> Result<Vec<(String, Path)>, Error> {
+        let folder = Path::from(kind.collection());
         let listed = self.objects.list_with_delimiter(Some(&folder)).await;
         let listed = listed.map_err(|error| self.io(&folder, &error))?;
-        let mut newest = Vec::new();
 
-        for prefix in listed.common_prefixes {
-            let Some(name) = prefix.filename().map(str::to_owned) else {
+        let named = |prefix: Path| {
+            let name = prefix.filename().map(str::to_owned)?;
+            seese3_core::room::is_plain_name(&name).then_some((name, prefix))
+        };
+        let mut folders: Vec<(String, Path)> = listed
+            .common_prefixes
+            .into_iter()
+            .filter_map(named)
+            .collect();
+
+        folders.sort();
+        Ok(folders)
+    }
+
+    /// The revisions of a room or an adapter.
+    async fn revisions(&self, folder: &Path) -> Result<Numbers, Error> {
+        self.numbered_files(&folder.clone().join("revisions")).await
+    }
+
+    /// The numbers of the files in a folder.
+    async fn numbered_files(&self, folder: &Path) -> Result<Numbers, Error> {
+        let mut listed = self.objects.list(Some(folder));
+        let mut numbers = Numbers::default();
+
+        while let Some(entry) = listed.next().await {
+            let entry = entry.map_err(|error| self.io(folder, &error))?;
+            let name = entry.location.filename().unwrap_or_default();
+            let Some((number, extension)) = name.split_once('.') else {
                 continue;
             };
-            if !seese3_core::room::is_plain_name(&name) {
+            let Ok(number) = number.parse::<u64>() else {
                 continue;
-            }
+            };
 
-            // A folder without a revision was left by an interrupted publication, since the
-            // manifest is written last. It does not count as published.
-            if let Some(&revision) = self.revisions(&prefix).await?.last() {
-                newest.push((name, revision));
+            // Only names that this program gives count: a copy such as `2.json` is no revision.
+            match extension {
+                "json" if name == manifest_name(number) => numbers.present.push(number),
+                "gone" if name == gone_name(number) => {}
+                _ => continue,
             }
+            numbers.highest = numbers.highest.max(number);
         }
 
-        newest.sort();
-        Ok(newest)
+        numbers.present.sort_unstable();
+        Ok(numbers)
     }
 
-    /// The revision numbers of a room or an adapter, in ascending order.
-    async fn revisions(&self, folder: &Path) -> Result<Vec<u64>, Error> {
-        let prefix = folder.clone().join("revisions");
-        let mut listed = self.objects.list(Some(&prefix));
-        let mut revisions = Vec::new();
-        while let Some(entry) = listed.next().await {
-            let entry = entry.map_err(|error| self.io(&prefix, &error))?;
-            let name = entry.location.filename().unwrap_or_default();
-            let number = name
-                .strip_suffix(".json")
-                .and_then(|number| number.parse::<u64>().ok());
-
-            // Only names that publishing gives count: a copy such as `2.json` is no revision.
-            revisions.extend(number.filter(|&revision| name == manifest_name(revision)));
-        }
-
-        revisions.sort_unstable();
-        Ok(revisions)
-    }
-
-    /// The folder of a room or an adapter, and the requested revision or else the newest.
+    /// The folder of a room or an adapter, and the requested revision, or else the one that the name
+    /// alone means: that which an operator chose, or the newest.
     async fn resolve(
         &self,
         kind: Kind,
         name: &str,
         revision: Option<u64>,
     ) -> Result<(Path, u64), Error> {
-        let folder = Path::from(kind.folder()).join(name);
+        let revision = match revision {
+            Some(revision) => Some(revision),
+            None => self.defaults().await?.revision(kind, name),
+        };
+
+        self.published(kind, name, revision).await
+    }
+
+    /// The folder of a room or an adapter, and the requested revision or else the newest.
+    async fn published(
+        &self,
+        kind: Kind,
+        name: &str,
+        revision: Option<u64>,
+    ) -> Result<(Path, u64), Error> {
+        let folder = folder_of(kind, name);
 
         // A name that is not valid cannot have been published. It is treated like an unknown one
         // and never listed as a path.
         let revisions = if seese3_core::room::is_plain_name(name) {
-            self.revisions(&folder).await?
+            self.revisions(&folder).await?.present
         } else {
             Vec::new()
         };
@@ -444,6 +508,10 @@ impl Store {
     }
 }
 
+fn folder_of(kind: Kind, name: &str) -> Path {
+    Path::from(kind.collection()).join(name)
+}
+
 fn revision_path(folder: &Path, revision: u64) -> Path {
     folder
         .clone()
@@ -453,6 +521,11 @@ fn revision_path(folder: &Path, revision: u64) -> Path {
 
 fn manifest_name(revision: u64) -> String {
     format!("{revision:06}.json")
+}
+
+/// The file that stands for a removed revision.
+fn gone_name(revision: u64) -> String {
+    format!("{revision:06}.gone")
 }
 
 /// The first 16 hexadecimal digits of a text's SHA-256, for use in file names.

@@ -7,7 +7,7 @@ use super::manifest::{self, ObjectRef, SCHEMA};
 use super::room_files::{
     features_file, frames_file, names_file, read_features, read_frames, read_names,
 };
-use super::{ATTEMPTS, Error, Kind, Published, Store, revision_path};
+use super::{ATTEMPTS, Error, Kind, Published, Store, folder_of, revision_path};
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::{FeatureSource, Features};
@@ -41,7 +41,7 @@ impl StoredRoom {
 pub struct RoomSummary {
     /// Its name.
     pub room: String,
-    /// The newest revision.
+    /// The revision that the name alone means.
     pub revision: u64,
     /// The number of frames.
     pub frame_count: usize,
@@ -55,6 +55,13 @@ struct RoomObjects {
     frame_names: Option<ObjectRef>,
     images: Option<ObjectRef>,
     features: Vec<FeaturesEntry>,
+}
+
+/// Which frames of a newest revision may be published over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Over {
+    AnyFrames,
+    SameFrames,
 }
 
 /// The features of the newest revision that are not published anew.
@@ -90,8 +97,31 @@ impl Store {
         room: &Room,
         features: &[Features],
     ) -> Result<Published, Error> {
+        self.publish_over(room, features, Over::AnyFrames).await
+    }
+
+    /// Publishes a room as [`Store::publish_room`] does, but not over other frames: of several who
+    /// publish different recordings under one name at the same time, one succeeds.
+    ///
+    /// # Errors
+    /// [`Error::OtherFrames`] if the newest revision has other frames, otherwise as
+    /// [`Store::publish_room`].
+    pub async fn publish_same_frames(
+        &self,
+        room: &Room,
+        features: &[Features],
+    ) -> Result<Published, Error> {
+        self.publish_over(room, features, Over::SameFrames).await
+    }
+
+    async fn publish_over(
+        &self,
+        room: &Room,
+        features: &[Features],
+        over: Over,
+    ) -> Result<Published, Error> {
         check_features(room, features)?;
-        let folder = Path::from(Kind::Room.folder()).join(room.id().as_str());
+        let folder = folder_of(Kind::Room, room.id().as_str());
 
         // A room that is imported again, for instance without its images, must not lose what was
         // known of it. What it leaves empty is filled in from the newest revision.
@@ -106,7 +136,8 @@ impl Store {
         // Optimistic concurrency: build the manifest on the newest revision and try to create the
         // next one. If another publisher was faster, start again from its revision.
         for _ in 0..ATTEMPTS {
-            let newest = match self.revisions(&folder).await?.last() {
+            let numbers = self.revisions(&folder).await?;
+            let newest = match numbers.present.last() {
                 Some(&revision) => Some(self.room_body(&folder, revision).await?),
                 None => None,
             };
@@ -114,7 +145,7 @@ impl Store {
             let mut body = RoomBody {
                 schema: SCHEMA,
                 room: room.id().to_string(),
-                revision: newest.as_ref().map_or(1, |body| body.revision + 1),
+                revision: numbers.highest + 1,
                 created: chrono::Utc::now().to_rfc3339(),
                 frame_count: room.frame_count(),
                 frames: objects.frames.clone(),
@@ -126,11 +157,16 @@ impl Store {
 
             // Row i of the features belongs to frame i. Features published earlier therefore stay
             // valid as long as the poses are the same.
-            if let Some(newest) = &newest
-                && (newest.frames == body.frames || self.has_poses(&folder, newest, room).await?)
-            {
-                body.features
-                    .extend(features_to_keep(newest, &objects.features));
+            if let Some(newest) = &newest {
+                if newest.frames == body.frames || self.has_poses(&folder, newest, room).await? {
+                    let kept = features_to_keep(newest, &objects.features);
+                    body.features.extend(kept);
+                } else if over == Over::SameFrames {
+                    return Err(Error::OtherFrames {
+                        room: room.id().to_string(),
+                        revision: newest.revision,
+                    });
+                }
             }
 
             // In a fixed order the same content compares equal, whoever published it.
@@ -233,7 +269,7 @@ impl Store {
         Ok(Some(object))
     }
 
-    /// Loads a room with all its features: the given revision, or the newest if none is given.
+    /// Loads a room with all its features: the given revision, or the one that the name alone means.
     ///
     /// # Errors
     /// [`Error::Unknown`] if there is no such room, [`Error::UnknownRevision`] if it has no such
@@ -243,8 +279,8 @@ impl Store {
         self.load(name, revision, None).await
     }
 
-    /// Loads the newest revision of a room with one set of features: the named one, or the only one
-    /// if no name is given. The features are returned beside the room, whose own list is empty.
+    /// Loads the revision that a room's name alone means, with one set of features: the named one, or
+    /// the only one if no name is given. The features are returned beside the room, whose own list is empty.
     ///
     /// # Errors
     /// As [`Store::load_room`]; also [`Error::UnknownFeatures`] if the room has no features of this
@@ -322,8 +358,8 @@ impl Store {
             return Ok(true);
         }
 
-        let folder = Path::from(Kind::Room.folder()).join(name);
-        let revisions = self.revisions(&folder).await?;
+        let folder = folder_of(Kind::Room, name);
+        let revisions = self.revisions(&folder).await?.present;
         if ![one, other]
             .iter()
             .all(|revision| revisions.contains(revision))
@@ -338,15 +374,16 @@ impl Store {
         Ok(one.frames == other.frames)
     }
 
-    /// The names of all rooms, sorted, each with its newest revision. No file is read.
+    /// The names of all rooms, sorted, each with the revision that its name alone means. No manifest
+    /// is read.
     ///
     /// # Errors
-    /// [`Error::Io`] if the store cannot be listed.
-    pub async fn newest_rooms(&self) -> Result<Vec<(String, u64)>, Error> {
-        self.newest(Kind::Room).await
+    /// [`Error::Io`] if the store cannot be listed, otherwise as [`Store::defaults`].
+    pub async fn current_rooms(&self) -> Result<Vec<(String, u64)>, Error> {
+        self.current(Kind::Room).await
     }
 
-    /// A summary of the newest revision of every room, sorted by name.
+    /// A summary of every room, of the revision that its name alone means; sorted by name.
     ///
     /// # Errors
     /// [`Error::Damaged`] if a manifest is truncated or altered, [`Error::Schema`] if a newer
@@ -381,7 +418,7 @@ impl Store {
         folder: &Path,
         room: &Room,
     ) -> Result<(Room, Option<ObjectRef>), Error> {
-        let Some(&newest) = self.revisions(folder).await?.last() else {
+        let Some(&newest) = self.revisions(folder).await?.present.last() else {
             return Ok((room.clone(), None));
         };
         let body = self.room_body(folder, newest).await?;
@@ -546,7 +583,7 @@ impl Store {
         read_names(&file, &bytes)
     }
 
-    async fn room_body(&self, folder: &Path, revision: u64) -> Result<RoomBody, Error> {
+    pub(super) async fn room_body(&self, folder: &Path, revision: u64) -> Result<RoomBody, Error> {
         let path = revision_path(folder, revision);
         let file = self.shown(&path);
         let body: RoomBody = manifest::decode(&file, &self.read(&path).await?)?;

@@ -313,7 +313,7 @@ fn a_served_room_is_asked_and_the_server_stops_when_told() {
         text(&features),
         "--row",
         "11",
-        "--hits",
+        "--top-k",
         "1",
     ];
 

@@ -11,6 +11,7 @@
 mod support;
 
 mod basics;
+mod kills;
 mod program;
 mod research;
 mod rooms;

@@ -62,7 +62,7 @@ fn an_open_loop_ends_at_the_same_latent_in_any_number_of_steps() {
                     let plan = Plan {
                         mode: Mode::OpenLoop,
                         steps,
-                        hit_count: 1,
+                        top_k: 1,
                         exclude_source: None,
                     };
 

@@ -493,7 +493,7 @@ fn a_closed_loop_takes_the_mean_off_once() {
     let plan = Plan {
         mode: Mode::ClosedLoop,
         steps: 4,
-        hit_count: 1,
+        top_k: 1,
         exclude_source: None,
     };
 
@@ -670,7 +670,7 @@ fn every_step_of_every_mode_retrieves_the_oracles_frame(room: &str, folder: Path
             let plan = Plan {
                 mode,
                 steps,
-                hit_count: 1,
+                top_k: 1,
                 exclude_source,
             };
 
@@ -705,7 +705,7 @@ fn every_step_of_every_mode_retrieves_the_oracles_frame(room: &str, folder: Path
         let plan = Plan {
             mode: Mode::OpenLoop,
             steps,
-            hit_count: 1,
+            top_k: 1,
             exclude_source: None,
         };
 

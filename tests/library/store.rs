@@ -13,7 +13,7 @@ use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::{Split, StrideRange};
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 
-fn room(name: &str) -> Room {
+pub fn room(name: &str) -> Room {
     let mut poses = poses(&golden().join("rooms/synthetic/poses.npy"));
     poses.truncate(300);
     let names = (0..300).map(|i| format!("seq/frame-{i:06}")).collect();
@@ -53,19 +53,19 @@ fn room(name: &str) -> Room {
     .unwrap()
 }
 
-fn set(name: &str, scale: f32) -> Features {
+pub fn set(name: &str, scale: f32) -> Features {
     let rows = features(&golden(), "synthetic").slice_move(ndarray::s![..300, ..]) * scale;
     Features::new(FeatureSource::imported(name, 0), rows).unwrap()
 }
 
-async fn stored() -> (tempfile::TempDir, Store) {
+pub async fn stored() -> (tempfile::TempDir, Store) {
     let folder = tempfile::tempdir().unwrap();
     let store = Store::create(folder.path().to_str().unwrap()).unwrap();
     (folder, store)
 }
 
 /// The files under a folder whose path contains a word.
-fn files(folder: &Path, word: &str) -> Vec<PathBuf> {
+pub fn files(folder: &Path, word: &str) -> Vec<PathBuf> {
     let mut found = Vec::new();
     let mut folders = vec![folder.to_owned()];
     while let Some(folder) = folders.pop() {
@@ -83,7 +83,10 @@ fn files(folder: &Path, word: &str) -> Vec<PathBuf> {
     found
 }
 
-fn adapter(room: &Room, features: &Features) -> (Adapter, seese3_core::adapter::TrainingRecord) {
+pub fn adapter(
+    room: &Room,
+    features: &Features,
+) -> (Adapter, seese3_core::adapter::TrainingRecord) {
     let mut plan = TrainingPlan::of(Preset::PaperBase, Split::Time, 20, 4);
     plan.config.epochs = 2;
 

@@ -50,7 +50,7 @@ fn compare_hits(what: &str, scores: &pb::NavigatorScores, included: &serde_json:
         1e-9,
     );
 
-    for hit in &scores.hits {
+    for hit in &scores.hit_rates {
         let key = hit.threshold.to_string();
         let rate = hit.rate.unwrap();
         near(what, rate.rate, number(&included["hit"][&key]), 1e-12);
@@ -286,10 +286,10 @@ async fn frames_of_a_room_are_answered_with_the_truth() {
 
     assert!(
         error
-            .hits
+            .thresholds
             .iter()
-            .all(|hit| hit.hit == (error.twist_norm < hit.threshold))
-            && error.hits.len() == 4
+            .all(|hit| hit.met == (error.twist_norm < hit.threshold))
+            && error.thresholds.len() == 4
     );
 
     let blind = server
@@ -306,7 +306,7 @@ async fn frames_of_a_room_are_answered_with_the_truth() {
     let request = pb::LocalizeRequest {
         rooms: vec!["synthetic".to_owned()],
         view: frame(123),
-        hit_count: Some(2),
+        top_k: Some(2),
         ..pb::LocalizeRequest::default()
     };
     let places = server.client.localize(request).await.unwrap().places;
@@ -344,7 +344,7 @@ async fn a_closed_loop_steers_every_motion_to_its_planned_goal() {
         displacement: Some(pb::displacement::Displacement::TargetPose(goal)),
     });
 
-    let reached = both.steps[0].hits[0].frame_id;
+    let reached = both.steps[0].frames[0].frame_id;
     let direct = server
         .client
         .navigate(pb::NavigateRequest {
@@ -355,14 +355,14 @@ async fn a_closed_loop_steers_every_motion_to_its_planned_goal() {
         .unwrap();
 
     assert_eq!(
-        both.steps[1].hits[0].frame_id,
-        direct.steps[0].hits[0].frame_id
+        both.steps[1].frames[0].frame_id,
+        direct.steps[0].frames[0].frame_id
     );
 
     near(
         "distance",
-        both.steps[1].hits[0].distance,
-        direct.steps[0].hits[0].distance,
+        both.steps[1].frames[0].distance,
+        direct.steps[0].frames[0].distance,
         1e-9,
     );
 }
@@ -381,7 +381,10 @@ async fn equal_questions_have_equal_answers() {
     let answer = server.client.navigate(still).await.unwrap();
 
     for step in &answer.steps {
-        assert_eq!((step.hits[0].frame_id, step.hits[0].distance), (500, 0.0));
+        assert_eq!(
+            (step.frames[0].frame_id, step.frames[0].distance),
+            (500, 0.0)
+        );
         assert_eq!(step.error.as_ref().unwrap().twist_norm, 0.0);
     }
 
@@ -410,7 +413,7 @@ async fn equal_questions_have_equal_answers() {
         .await
         .unwrap();
 
-    let pose = target.places[0].hit.clone().unwrap().pose.unwrap();
+    let pose = target.places[0].frame.clone().unwrap().pose.unwrap();
     assert_eq!(pose.parent_frame, "rooms/synthetic");
 
     for displacement in [
@@ -435,12 +438,12 @@ async fn equal_questions_have_equal_answers() {
 
         let same = end(&same);
         let one = end(&one);
-        assert_eq!(same.hits[0].frame_id, one.hits[0].frame_id);
+        assert_eq!(same.frames[0].frame_id, one.frames[0].frame_id);
 
         near(
             "distance",
-            same.hits[0].distance,
-            one.hits[0].distance,
+            same.frames[0].distance,
+            one.frames[0].distance,
             1e-9,
         );
 
@@ -461,7 +464,7 @@ async fn a_feature_answers_as_its_frame_does_but_knows_no_truth() {
     let numbers = [0.1, 0.0, 0.3, 0.0, -0.2, 0.0];
     let by_frame = pb::NavigateRequest {
         displacement: by_twist(numbers),
-        hit_count: Some(3),
+        top_k: Some(3),
         ..question()
     };
 
@@ -489,7 +492,7 @@ async fn a_feature_answers_as_its_frame_does_but_knows_no_truth() {
 
         let frames = |answer: &pb::NavigateResponse| {
             answer.steps[0]
-                .hits
+                .frames
                 .iter()
                 .map(|hit| hit.frame_id)
                 .collect::<Vec<_>>()
@@ -501,13 +504,13 @@ async fn a_feature_answers_as_its_frame_does_but_knows_no_truth() {
     }
 
     let error = frame_answer.steps[0].error.clone().unwrap();
-    assert_eq!(error.hits.len(), 4);
+    assert_eq!(error.thresholds.len(), 4);
 
     assert!(
         error
-            .hits
+            .thresholds
             .iter()
-            .all(|hit| hit.hit == (error.twist_norm < hit.threshold))
+            .all(|hit| hit.met == (error.twist_norm < hit.threshold))
     );
 }
 
@@ -518,14 +521,14 @@ async fn exclusion_counts_and_lists_of_motions() {
 
     let excluded = pb::NavigateRequest {
         displacement: by_twist([0.0; 6]),
-        hit_count: Some(20),
+        top_k: Some(20),
         exclude_source: true,
         exclude_radius: 3,
         ..question()
     };
 
     let hits = server.client.navigate(excluded).await.unwrap().steps[0]
-        .hits
+        .frames
         .clone();
 
     assert_eq!(hits.len(), 20);
@@ -555,7 +558,7 @@ async fn exclusion_counts_and_lists_of_motions() {
 
     let last = &answer.steps[3];
     assert_eq!(
-        last.hits[0].frame_id, 500,
+        last.frames[0].frame_id, 500,
         "there and back is where it began"
     );
 
@@ -610,7 +613,7 @@ async fn a_mapped_feature_is_found_in_its_room() {
 
     let request = pb::LocalizeRequest {
         view: feature(feature_row(123)),
-        hit_count: Some(5),
+        top_k: Some(5),
         ..Default::default()
     };
     let answer = server.client.localize(request).await.unwrap();
@@ -621,12 +624,12 @@ async fn a_mapped_feature_is_found_in_its_room() {
     assert_eq!(
         (
             best.room.as_ref().unwrap().name.as_str(),
-            best.hit.as_ref().unwrap().frame_id
+            best.frame.as_ref().unwrap().frame_id
         ),
         ("synthetic", 123)
     );
 
-    assert!(best.hit.as_ref().unwrap().distance < 1e-12);
+    assert!(best.frame.as_ref().unwrap().distance < 1e-12);
 }
 
 /// Oracle: what was published.
@@ -695,7 +698,7 @@ async fn the_hnsw_index_answers_as_the_exact_one_here_and_says_what_it_is() {
         let request = pb::NavigateRequest {
             source: frame(source),
             displacement: to_frame(source + 40),
-            hit_count: Some(10),
+            top_k: Some(10),
             ..question()
         };
         let a = exact.client.navigate(request.clone()).await.unwrap();

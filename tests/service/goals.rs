@@ -119,9 +119,9 @@ async fn a_pursuit_ends_at_its_bounds() {
     );
 
     let asked = pb::NavigateToRequest {
-        max_steps: 1,
-        tolerance_m: 1e-6,
-        tolerance_rad: 1e-6,
+        max_steps: Some(1),
+        tolerance_m: Some(1e-6),
+        tolerance_rad: Some(1e-6),
         ..question(frame(10), Goal::GoalFrameId(300))
     };
     let mut steps = Vec::new();
@@ -172,7 +172,7 @@ async fn a_pursuit_ends_at_its_bounds() {
         ),
         (
             pb::NavigateToRequest {
-                step: f64::NAN,
+                step: Some(f64::NAN),
                 ..question(frame(1), Goal::GoalFrameId(2))
             },
             Code::InvalidArgument,
@@ -180,7 +180,23 @@ async fn a_pursuit_ends_at_its_bounds() {
         ),
         (
             pb::NavigateToRequest {
-                max_steps: u32::MAX,
+                tolerance_m: Some(0.0),
+                ..question(frame(1), Goal::GoalFrameId(2))
+            },
+            Code::InvalidArgument,
+            "tolerance_m",
+        ),
+        (
+            pb::NavigateToRequest {
+                max_steps: Some(0),
+                ..question(frame(1), Goal::GoalFrameId(2))
+            },
+            Code::InvalidArgument,
+            "max_steps",
+        ),
+        (
+            pb::NavigateToRequest {
+                max_steps: Some(u32::MAX),
                 ..question(frame(1), Goal::GoalFrameId(2))
             },
             Code::InvalidArgument,

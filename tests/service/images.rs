@@ -16,6 +16,7 @@ use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 use seese3_lab::studio::{Camera, Scene, camera_path, render};
+use sha2::{Digest, Sha256};
 use tonic::Code;
 
 use crate::harness::{TestServer, frame, start_on, to_frame};
@@ -148,7 +149,7 @@ async fn an_image_is_answered_as_its_frame_is() {
         .unwrap()
         .places
         .remove(0)
-        .hit
+        .frame
         .unwrap();
 
     assert_eq!(found.frame_id, 33);
@@ -163,8 +164,8 @@ async fn an_image_is_answered_as_its_frame_is() {
 
     let by_frame = server.client.navigate(navigate(frame(50))).await.unwrap();
     assert_eq!(
-        by_image.steps[0].hits[0].frame_id,
-        by_frame.steps[0].hits[0].frame_id
+        by_image.steps[0].frames[0].frame_id,
+        by_frame.steps[0].frames[0].frame_id
     );
 
     let motion = |first, second| pb::EstimateMotionRequest {
@@ -291,5 +292,77 @@ async fn an_encoder_that_is_not_there_ends_the_server() {
     assert!(
         message.contains("--encoder") && message.contains("model.onnx"),
         "{message}"
+    );
+}
+
+/// Oracle: PNG is lossless, so that a room of uploaded images is the room of their features.
+#[tokio::test]
+async fn a_room_can_be_uploaded_as_images() {
+    use pb::create_room_request::Message;
+
+    let config = Config {
+        writable: true,
+        ..with_encoders(&["builtin"])
+    };
+    let (server, drawn) = served(config).await;
+    let (_, frames) = pictures();
+
+    let upload = |alter: &dyn Fn(&mut pb::FrameBatch)| {
+        let poses = frames.poses.iter().flat_map(|pose| {
+            let matrix = pose.to_homogeneous().transpose();
+            let numbers = matrix.iter().flat_map(|number| number.to_le_bytes());
+            numbers.collect::<Vec<u8>>()
+        });
+        let mut batch = pb::FrameBatch {
+            poses: poses.collect(),
+            images: drawn.iter().map(png).collect(),
+            ..pb::FrameBatch::default()
+        };
+        alter(&mut batch);
+
+        let mut digest = Sha256::new();
+        digest.update(&batch.poses);
+        batch.images.iter().for_each(|image| digest.update(image));
+        let messages = [
+            Message::Room(pb::RoomUpload {
+                name: "rooms/uploaded".to_owned(),
+                encode_for: "adapters/eyes".to_owned(),
+                ..pb::RoomUpload::default()
+            }),
+            Message::Frames(batch),
+            Message::End(pb::UploadEnd {
+                frame_count: FRAMES as u32,
+                sha256: digest.finalize().to_vec(),
+            }),
+        ];
+        let messages = messages.map(|message| pb::CreateRoomRequest {
+            message: Some(message),
+        });
+        server.client.create_room(tokio_stream::iter(messages))
+    };
+
+    for alter in [
+        &(|batch: &mut pb::FrameBatch| drop(batch.images.pop())) as &dyn Fn(&mut pb::FrameBatch),
+        &|batch| batch.images[7] = b"no image".to_vec(),
+    ] {
+        let refused = upload(alter).await.unwrap_err();
+        assert_eq!(refused.code(), Some(Code::InvalidArgument), "{refused}");
+        assert_eq!(refused.field().as_deref(), Some("frames.images"));
+    }
+
+    assert!(upload(&|_| ()).await.unwrap().served);
+    let mut request = navigate(frame(50));
+    let drawn = server.client.navigate(request.clone()).await.unwrap();
+    request.room = "uploaded".to_owned();
+    let uploaded = server.client.navigate(request).await.unwrap();
+    assert_eq!(
+        drawn.steps[0].frames[0].frame_id,
+        uploaded.steps[0].frames[0].frame_id
+    );
+    near(
+        "distance",
+        uploaded.steps[0].frames[0].distance,
+        drawn.steps[0].frames[0].distance,
+        1e-5,
     );
 }

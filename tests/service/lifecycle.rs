@@ -16,7 +16,7 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-use crate::harness::{filled_store, question, start};
+use crate::harness::{filled_store, question, start, start_on};
 
 async fn channel(address: &str) -> Channel {
     Endpoint::from_shared(format!("http://{address}"))
@@ -197,8 +197,8 @@ async fn reflection_lists_the_services_in_both_versions() {
 async fn a_deadline_ends_the_work() {
     let limits = seese3_core::navigation::Limits {
         steps: 4_000_000_000,
-        hits: 1_000,
-        hits_in_all: u64::MAX,
+        top_k: 1_000,
+        frames_in_answer: u64::MAX,
     };
 
     let server = start(Config {
@@ -304,8 +304,8 @@ async fn every_answer_carries_a_request_id() {
 async fn stopping_answers_what_is_in_flight_within_a_bound() {
     let limits = seese3_core::navigation::Limits {
         steps: 4_000_000_000,
-        hits: 1_000,
-        hits_in_all: u64::MAX,
+        top_k: 1_000,
+        frames_in_answer: u64::MAX,
     };
 
     let server = start(Config {
@@ -366,4 +366,56 @@ async fn stopping_answers_what_is_in_flight_within_a_bound() {
     );
 
     drop((server.folder, stuck.folder));
+}
+
+/// Oracle: the meaning of the setting: health says NOT_SERVING, requests are still answered, and then
+/// the server ends.
+#[tokio::test]
+async fn a_lame_duck_still_answers() {
+    let server = start(Config {
+        lame_duck: Duration::from_secs(2),
+        ..Config::default()
+    })
+    .await;
+    assert!(server.client.serves("").await.unwrap());
+
+    server.stop.send(()).unwrap();
+    while server.client.serves("").await.unwrap() {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+
+    // A connection that begins now is a client that a load balancer still sends here.
+    let late = Client::connect(&server.address, Duration::from_secs(5))
+        .await
+        .unwrap();
+    assert!(late.navigate(question()).await.is_ok());
+    server.ended.await.unwrap().unwrap();
+}
+
+/// Oracle: the meaning of the flag: a store without a room is of use where rooms can be added.
+#[tokio::test]
+async fn an_empty_store_is_served_where_it_can_be_filled() {
+    let store = async || {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+        (folder, store)
+    };
+
+    let (folder, empty) = store().await;
+    let server = start_on(
+        folder,
+        empty,
+        Config {
+            writable: true,
+            ..Config::default()
+        },
+    )
+    .await;
+    assert!(server.client.rooms().await.unwrap().is_empty());
+    assert!(server.client.serves("").await.unwrap());
+
+    let (_folder, empty) = store().await;
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let ended = run(listener, empty, Config::default(), std::future::pending()).await;
+    assert!(matches!(ended, Err(RunError::NoRoom { .. })));
 }

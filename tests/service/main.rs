@@ -11,11 +11,13 @@
 mod support;
 
 mod answers;
+mod changes;
 mod fitted;
 mod goals;
 mod harness;
 mod images;
 mod lifecycle;
+mod memory;
 mod navigators;
 mod operations;
 mod refusals;

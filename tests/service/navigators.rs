@@ -146,7 +146,7 @@ async fn an_adapters_table_has_its_correctors() {
         );
 
         let hits = &expected[theirs]["source_included"]["hit"];
-        for hit in &row.hits {
+        for hit in &row.hit_rates {
             near(
                 ours,
                 hit.rate.unwrap().rate,
@@ -202,8 +202,8 @@ async fn a_mixture_answers_and_takes_its_own_latents() {
     let places = server.client.localize(place).await.unwrap().places;
 
     assert_eq!(
-        places[0].hit.as_ref().unwrap().frame_id,
-        answer.steps[0].hits[0].frame_id
+        places[0].frame.as_ref().unwrap().frame_id,
+        answer.steps[0].frames[0].frame_id
     );
 
     let mut broken = values;

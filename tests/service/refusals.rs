@@ -304,30 +304,30 @@ async fn navigate_names_the_field() {
         (
             "0 hits",
             pb::NavigateRequest {
-                hit_count: Some(0),
+                top_k: Some(0),
                 ..q()
             },
             InvalidArgument,
-            "hit_count",
+            "top_k",
         ),
         (
             "10⁹ hits",
             pb::NavigateRequest {
-                hit_count: Some(1_000_000_000),
+                top_k: Some(1_000_000_000),
                 ..q()
             },
             InvalidArgument,
-            "hit_count",
+            "top_k",
         ),
         (
             "10⁶ frames in one answer",
             pb::NavigateRequest {
                 steps: Some(1_000),
-                hit_count: Some(1_000),
+                top_k: Some(1_000),
                 ..q()
             },
             InvalidArgument,
-            "hit_count",
+            "top_k",
         ),
         (
             "ε of 0",
@@ -462,12 +462,12 @@ async fn the_other_calls_name_the_field() {
     refused(
         "0 hits",
         c.localize(pb::LocalizeRequest {
-            hit_count: Some(0),
+            top_k: Some(0),
             ..l()
         })
         .await,
         InvalidArgument,
-        "hit_count",
+        "top_k",
     );
 
     refused(
@@ -722,7 +722,7 @@ async fn the_other_calls_name_the_field() {
 
     let wide = pb::NavigateRequest {
         steps: Some(10),
-        hit_count: Some(501),
+        top_k: Some(501),
         ..question()
     };
 
@@ -740,7 +740,7 @@ async fn the_other_calls_name_the_field() {
     });
     let long = pb::NavigateRequest {
         displacement: list,
-        hit_count: Some(6),
+        top_k: Some(6),
         ..question()
     };
 

@@ -16,7 +16,9 @@ use tonic::Code;
 use crate::harness::{TestServer, filled_store, frame, question, start_on, to_frame};
 
 const DEADLINE: Duration = Duration::from_secs(20);
-const VERBS: [&str; 5] = ["navigate", "localize", "track", "evaluate", "catalog"];
+const VERBS: [&str; 6] = [
+    "navigate", "localize", "track", "evaluate", "catalog", "write",
+];
 
 fn hex_digest(bytes: &[u8]) -> String {
     let digest = Sha256::digest(bytes);
@@ -24,7 +26,7 @@ fn hex_digest(bytes: &[u8]) -> String {
 }
 
 /// One principal of a file of credentials, whose token is its name.
-fn principal(name: &str, verbs: &str, rooms: &str) -> String {
+pub fn principal(name: &str, verbs: &str, rooms: &str) -> String {
     format!(
         "[[principal]]\nname = \"{name}\"\ntoken_sha256 = \"{}\"\nverbs = [{verbs}]\nrooms = [{rooms}]\nstreams = 1\n",
         hex_digest(name.as_bytes())
@@ -53,13 +55,14 @@ async fn start_with_credentials() -> TestServer {
     std::fs::write(&file, credentials()).unwrap();
     let config = Config {
         keyring: Some(Arc::new(Keyring::open(file).unwrap())),
+        writable: true,
         ..Config::default()
     };
 
     start_on(folder, store, config).await
 }
 
-async fn client_with(server: &TestServer, token: Option<&str>) -> Client {
+pub async fn client_with(server: &TestServer, token: Option<&str>) -> Client {
     let options = ConnectOptions {
         deadline: DEADLINE,
         token: token.map(str::to_owned),
@@ -78,7 +81,7 @@ fn code_of<T: std::fmt::Debug>(answer: Result<T, seese3_client::Error>) -> Code 
 }
 
 /// Asks one RPC of each verb, in their order.
-async fn asked(client: &Client) -> [Code; 5] {
+async fn asked(client: &Client) -> [Code; 6] {
     let localized = client.localize(pb::LocalizeRequest {
         rooms: vec!["synthetic".to_owned()],
         view: frame(3),
@@ -99,12 +102,18 @@ async fn asked(client: &Client) -> [Code; 5] {
         |_| (),
     );
 
+    let nothing_chosen = client.set_default(pb::SetDefaultRequest {
+        name: "rooms/synthetic".to_owned(),
+        ..pb::SetDefaultRequest::default()
+    });
+
     [
         code_of(client.navigate(question()).await),
         code_of(localized.await),
         code_of(estimated.await),
         code_of(evaluated.await),
         code_of(client.rooms().await),
+        code_of(nothing_chosen.await),
     ]
 }
 
@@ -127,13 +136,13 @@ async fn a_caller_may_what_its_verbs_say_and_nothing_else() {
     }
 
     let everything = client_with(&server, Some("everything")).await;
-    assert_eq!(asked(&everything).await, [Code::Ok; 5]);
+    assert_eq!(asked(&everything).await, [Code::Ok; 6]);
 
     for token in [None, Some("nobody"), Some("Everything")] {
         let client = client_with(&server, token).await;
         assert_eq!(
             asked(&client).await,
-            [Code::Unauthenticated; 5],
+            [Code::Unauthenticated; 6],
             "{token:?}"
         );
         assert!(client.serves("").await.unwrap(), "health needs no token");
@@ -146,7 +155,7 @@ async fn a_caller_may_what_its_verbs_say_and_nothing_else() {
 async fn a_room_out_of_reach_does_not_exist() {
     let server = start_with_credentials().await;
     let client = client_with(&server, Some("one-room")).await;
-    assert_eq!(asked(&client).await, [Code::Ok; 5]);
+    assert_eq!(asked(&client).await, [Code::Ok; 6]);
 
     let names: Vec<String> = client
         .rooms()

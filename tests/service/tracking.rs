@@ -512,12 +512,22 @@ async fn a_stream_is_configured_once_and_first() {
         (
             vec![begin(pb::TrackConfig {
                 keyframes: Some(pb::KeyframePolicy {
-                    displacement: f64::NAN,
-                    frames: 0,
+                    displacement: Some(f64::NAN),
+                    frames: None,
                 }),
                 ..config()
             })],
             "config.keyframes.displacement",
+        ),
+        (
+            vec![begin(pb::TrackConfig {
+                keyframes: Some(pb::KeyframePolicy {
+                    displacement: None,
+                    frames: Some(0),
+                }),
+                ..config()
+            })],
+            "config.keyframes.frames",
         ),
         (
             vec![begin(pb::TrackConfig {
@@ -687,7 +697,7 @@ async fn a_view_is_found_among_rooms_or_called_ambiguous() {
         let view = feature(served(room).1.rows().row(row).to_vec()).unwrap();
         let request = pb::RelocalizeRequest {
             views: vec![view],
-            hit_count: Some(2),
+            top_k: Some(2),
             ..Default::default()
         };
         let found = server.client.relocalize(request).await.unwrap();
@@ -701,7 +711,10 @@ async fn a_view_is_found_among_rooms_or_called_ambiguous() {
         assert_eq!(found.rooms[0].room.as_ref().unwrap().name, room);
 
         assert_eq!(
-            (found.rooms[0].hits.len(), found.rooms[0].hits[0].frame_id),
+            (
+                found.rooms[0].frames.len(),
+                found.rooms[0].frames[0].frame_id
+            ),
             (2, row as u32)
         );
 
@@ -744,10 +757,10 @@ async fn a_view_is_found_among_rooms_or_called_ambiguous() {
         ),
         (
             pb::RelocalizeRequest {
-                room_count: Some(0),
+                max_rooms: Some(0),
                 ..Default::default()
             },
-            "room_count",
+            "max_rooms",
         ),
     ] {
         let error = server.client.relocalize(request).await.unwrap_err();

@@ -1,6 +1,7 @@
 //! An object store whose writes fail after so many: a publisher that is killed, seen from the disk.
 
 use std::fmt;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use std::pin::Pin;
@@ -14,12 +15,12 @@ use tokio_stream::Stream;
 
 type BoxStream<'a, T> = Pin<Box<dyn Stream<Item = T> + Send + 'a>>;
 
-/// Lets `survives` writes through and refuses all others.
+/// Lets `survives` writes and removals through and refuses all others.
 #[derive(Debug)]
 pub struct Dying<S> {
     inner: S,
     survives: usize,
-    writes: AtomicUsize,
+    writes: Arc<AtomicUsize>,
 }
 
 impl<S> Dying<S> {
@@ -27,7 +28,7 @@ impl<S> Dying<S> {
         Self {
             inner,
             survives,
-            writes: AtomicUsize::new(0),
+            writes: Arc::default(),
         }
     }
 }
@@ -75,7 +76,17 @@ impl<S: ObjectStore> ObjectStore for Dying<S> {
         &self,
         locations: BoxStream<'static, Result<Path>>,
     ) -> BoxStream<'static, Result<Path>> {
-        self.inner.delete_stream(locations)
+        use tokio_stream::StreamExt;
+
+        let writes = self.writes.clone();
+        let survives = self.survives;
+        let counted = locations.map(move |location| {
+            if writes.fetch_add(1, Ordering::Relaxed) >= survives {
+                return Err(killed());
+            }
+            location
+        });
+        self.inner.delete_stream(Box::pin(counted))
     }
 
     fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, Result<ObjectMeta>> {

@@ -400,6 +400,104 @@ impl Client {
         Ok(service.get_adapter(request).await?.into_inner().adapter)
     }
 
+    /// Publishes a room from uploaded frames: a `RoomUpload`, then batches of frames, then the
+    /// `UploadEnd`. It has no deadline but the server's.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn create_room(
+        &self,
+        messages: impl Stream<Item = pb::CreateRoomRequest> + Send + 'static,
+    ) -> Result<pb::CreateRoomResponse, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        Ok(service.create_room(messages).await?.into_inner())
+    }
+
+    /// Publishes an adapter that was trained elsewhere: an `AdapterUpload`, then its weights. It has
+    /// no deadline but the server's.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn publish_adapter(
+        &self,
+        messages: impl Stream<Item = pb::PublishAdapterRequest> + Send + 'static,
+    ) -> Result<pb::PublishAdapterResponse, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        Ok(service.publish_adapter(messages).await?.into_inner())
+    }
+
+    /// Fits an adapter to a room on the server; `progress` is called from time to time. It has no
+    /// deadline: a fit takes minutes.
+    ///
+    /// # Errors
+    /// [`Error::Refused`], or [`Error::NoReport`] if the stream ends without a result.
+    pub async fn refit_room(
+        &self,
+        request: pb::RefitRoomRequest,
+        mut progress: impl FnMut(pb::RefitProgress),
+    ) -> Result<pb::RefitResult, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let mut events = service.refit_room(request).await?.into_inner();
+        while let Some(pb::RefitRoomResponse { event }) = events.message().await? {
+            match event {
+                Some(pb::refit_room_response::Event::Result(result)) => return Ok(result),
+                Some(pb::refit_room_response::Event::Progress(step)) => progress(step),
+                None => {}
+            }
+        }
+
+        Err(Error::NoReport)
+    }
+
+    /// Chooses what a name alone means. Returns all defaults that hold now.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn set_default(
+        &self,
+        request: pb::SetDefaultRequest,
+    ) -> Result<Vec<pb::Default>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let answer = service.set_default(self.request(request)).await?;
+        Ok(answer.into_inner().defaults)
+    }
+
+    /// Takes the last choice of a default back. Returns all defaults that hold now.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn roll_back_default(
+        &self,
+        request: pb::RollBackDefaultRequest,
+    ) -> Result<Vec<pb::Default>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let answer = service.roll_back_default(self.request(request)).await?;
+        Ok(answer.into_inner().defaults)
+    }
+
+    /// Removes a room or one revision of it. Returns the revisions that were removed.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn delete_room(&self, request: pb::DeleteRoomRequest) -> Result<Vec<u64>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let answer = service.delete_room(self.request(request)).await?;
+        Ok(answer.into_inner().revisions)
+    }
+
+    /// Removes an adapter or one revision of it. Returns the revisions that were removed.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn delete_adapter(
+        &self,
+        request: pb::DeleteAdapterRequest,
+    ) -> Result<Vec<u64>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone());
+        let answer = service.delete_adapter(self.request(request)).await?;
+        Ok(answer.into_inner().revisions)
+    }
+
     /// Evaluates navigators on a room's test pairs; `progress` is called when each navigator
     /// begins.
     ///

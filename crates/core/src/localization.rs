@@ -5,7 +5,7 @@
 use ndarray::ArrayView1;
 
 use crate::cancel::{Cancellation, Cancelled};
-use crate::navigation::{Hit, Navigator};
+use crate::navigation::{Navigator, RetrievedFrame};
 use crate::room::RoomId;
 
 /// A stored frame that matches the query, and the room it belongs to.
@@ -14,7 +14,7 @@ pub struct Place {
     /// The room.
     pub room: RoomId,
     /// The frame, its distance and its pose, `world_from_camera` in that room's world.
-    pub hit: Hit,
+    pub frame: RetrievedFrame,
 }
 
 /// The `k` nearest frames of all `rooms`, by distance, then room, then frame.
@@ -31,21 +31,21 @@ pub fn localize<'a>(
     for navigator in rooms {
         cancel.check()?;
         let room = navigator.room().id();
-        places.extend(navigator.nearest(latent, k).into_iter().map(|hit| Place {
+        places.extend(navigator.nearest(latent, k).into_iter().map(|frame| Place {
             room: room.clone(),
-            hit,
+            frame,
         }));
 
         // Sorted and cut after every room, so that the list never holds more than 2k frames.
         places.sort_by(|a, b| {
             let distance = a
-                .hit
+                .frame
                 .neighbour
                 .distance
-                .total_cmp(&b.hit.neighbour.distance);
+                .total_cmp(&b.frame.neighbour.distance);
             distance
                 .then_with(|| a.room.cmp(&b.room))
-                .then(a.hit.neighbour.frame.cmp(&b.hit.neighbour.frame))
+                .then(a.frame.neighbour.frame.cmp(&b.frame.neighbour.frame))
         });
 
         places.truncate(k);

@@ -19,7 +19,7 @@ use super::super::status::Full;
 use super::{Keyring, Principal, Verb};
 
 /// Which verb an RPC needs, by the beginning of its path.
-const VERBS: [(&str, Need); 7] = [
+const VERBS: [(&str, Need); 9] = [
     // Probes of containers and load balancers carry no token.
     ("/grpc.health.v1.Health/", Need::Nothing),
     ("/grpc.reflection.", Need::Verb(Verb::Catalog)),
@@ -30,7 +30,10 @@ const VERBS: [(&str, Need); 7] = [
     ),
     ("/seese3.v1.OdometryService/", Need::Verb(Verb::Track)),
     ("/seese3.v1.EvaluationService/", Need::Verb(Verb::Evaluate)),
-    ("/seese3.v1.CatalogService/", Need::Verb(Verb::Catalog)),
+    ("/seese3.v1.CatalogService/List", Need::Verb(Verb::Catalog)),
+    ("/seese3.v1.CatalogService/Get", Need::Verb(Verb::Catalog)),
+    // Everything else in the catalog changes it.
+    ("/seese3.v1.CatalogService/", Need::Verb(Verb::Write)),
 ];
 
 /// What a caller has to have for an RPC.

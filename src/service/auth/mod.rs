@@ -32,8 +32,10 @@ pub enum Verb {
     Track,
     /// EvaluationService.
     Evaluate,
-    /// CatalogService, and reflection.
+    /// What CatalogService lists, and reflection.
     Catalog,
+    /// What CatalogService changes.
+    Write,
 }
 
 impl Verb {
@@ -45,6 +47,7 @@ impl Verb {
             Self::Track => "track",
             Self::Evaluate => "evaluate",
             Self::Catalog => "catalog",
+            Self::Write => "write",
         }
     }
 }

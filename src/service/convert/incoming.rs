@@ -9,7 +9,7 @@ use super::{CAMERA, world_frame};
 use crate::store::StoredAdapter;
 use seese3_client::proto::v1 as pb;
 use seese3_core::eval::{Prediction, check_thresholds, default_thresholds};
-use seese3_core::geometry::{Pose, Twist};
+use seese3_core::geometry::{Pinhole, PixelCamera, Pose, Twist};
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{
     Displacement, FitOn, MAX_TRANSLATION_M, Mode, Query, Reading, RetrievalMetric, Source,
@@ -75,6 +75,30 @@ pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
     }
 
     Ok(pose)
+}
+
+/// A camera as its calibration states it.
+///
+/// # Errors
+/// [`Error::Invalid`] if it is none.
+pub fn pinhole(camera: &pb::Pinhole) -> Result<Pinhole, Error> {
+    let pb::Pinhole {
+        width,
+        height,
+        focal,
+        centre_x,
+        centre_y,
+    } = *camera;
+    let middle = [width / 2.0, height / 2.0];
+    let centre = [centre_x.unwrap_or(middle[0]), centre_y.unwrap_or(middle[1])];
+
+    Pinhole::new(PixelCamera {
+        width,
+        height,
+        focal,
+        centre: Some(centre.into()),
+    })
+    .map_err(|problem| Error::invalid("camera", problem))
 }
 
 /// A view as the source of a query to `adapter`. An image is encoded here. `field` is the name of
@@ -174,7 +198,7 @@ pub fn query(
         steps,
         mode,
         reading,
-        hit_count,
+        top_k,
         exclude_source,
         exclude_radius,
         thresholds: given_thresholds,
@@ -211,7 +235,7 @@ pub fn query(
         step,
         metric,
         fit_on: fit_on(adapter),
-        hit_count: hit_count.unwrap_or(1),
+        top_k: top_k.unwrap_or(1),
         exclude_source,
     };
 

@@ -5,7 +5,7 @@ mod incoming;
 mod outgoing;
 
 pub use incoming::{
-    exclusion, mode_of, navigators, pose, prediction, query, source, split, thresholds,
+    exclusion, mode_of, navigators, pinhole, pose, prediction, query, source, split, thresholds,
 };
 pub use outgoing::*;
 

@@ -11,7 +11,9 @@ use seese3_core::features::FeatureSource;
 use seese3_core::geometry::{Pose, Twist};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::navigation::NavigatorKind;
-use seese3_core::navigation::{AnswerStep, Hit, Mode, Query, Reading, StepError, StepKind};
+use seese3_core::navigation::{
+    AnswerStep, Mode, Query, Reading, RetrievedFrame, StepError, StepKind,
+};
 use seese3_core::room::Room;
 use seese3_core::statistics::Rate;
 
@@ -51,12 +53,12 @@ pub fn pose_to_wire(pose: &Pose, room: &str) -> pb::Pose {
     }
 }
 
-pub fn hit_to_wire(hit: &Hit, room: &Room) -> pb::Hit {
-    let frame = hit.neighbour.frame;
-    pb::Hit {
+pub fn retrieved_to_wire(retrieved: &RetrievedFrame, room: &Room) -> pb::RetrievedFrame {
+    let frame = retrieved.neighbour.frame;
+    pb::RetrievedFrame {
         frame_id: frame.0,
-        distance: hit.neighbour.distance,
-        pose: Some(pose_to_wire(&hit.pose, room.id().as_str())),
+        distance: retrieved.neighbour.distance,
+        pose: Some(pose_to_wire(&retrieved.pose, room.id().as_str())),
         frame_name: room
             .frame_names()
             .get(frame.row())
@@ -74,7 +76,11 @@ pub fn step_to_wire(
 ) -> pb::NavigationStep {
     pb::NavigationStep {
         step: number as u32,
-        hits: step.hits.iter().map(|hit| hit_to_wire(hit, room)).collect(),
+        frames: step
+            .frames
+            .iter()
+            .map(|frame| retrieved_to_wire(frame, room))
+            .collect(),
         requested_pose: step
             .requested_pose
             .map(|pose| pose_to_wire(&pose, room.id().as_str())),
@@ -90,11 +96,11 @@ pub fn error_to_wire(error: &StepError, thresholds: &[f64]) -> pb::PoseError {
         translation_m: error.pose.translation_m,
         rotation_rad: error.pose.rotation_rad,
         twist_norm: error.twist,
-        hits: thresholds
+        thresholds: thresholds
             .iter()
-            .map(|&threshold| pb::ThresholdHit {
+            .map(|&threshold| pb::ThresholdCheck {
                 threshold,
-                hit: error.twist < threshold,
+                met: error.twist < threshold,
             })
             .collect(),
     }
@@ -150,6 +156,15 @@ pub fn adapter_revision(navigator: &ServedNavigator) -> pb::Revision {
         name: navigator.adapter.name.clone(),
         revision: navigator.adapter.revision,
     }
+}
+
+/// A point in time that a manifest states in RFC 3339; none if it states no time.
+pub fn time_to_wire(stated: &str) -> Option<prost_types::Timestamp> {
+    let time = chrono::DateTime::parse_from_rfc3339(stated).ok()?;
+    Some(prost_types::Timestamp {
+        seconds: time.timestamp(),
+        nanos: i32::try_from(time.timestamp_subsec_nanos()).ok()?,
+    })
 }
 
 pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
@@ -213,7 +228,7 @@ pub fn row_to_wire(row: &Row) -> pb::NavigatorScores {
             .map(|latent| latent.r2)
             .filter(|r2| r2.is_finite()),
         top1: Some(rate_to_wire(top1)),
-        hits: hits
+        hit_rates: hits
             .iter()
             .map(|(threshold, rate)| pb::HitRate {
                 threshold: *threshold,

@@ -57,11 +57,15 @@ impl Problem {
     /// Whether it may be gone at the next look.
     pub(super) fn may_pass(&self) -> bool {
         match self {
-            Self::Store(error) => matches!(error, store::Error::Io { .. }),
-            Self::Base { problem, .. } => matches!(**problem, store::Error::Io { .. }),
+            Self::Store(error) => may_pass(error),
+            Self::Base { problem, .. } => may_pass(problem),
             Self::Navigator { .. } | Self::Localizer { .. } => false,
         }
     }
+}
+
+fn may_pass(error: &store::Error) -> bool {
+    matches!(error, store::Error::Io { .. } | store::Error::Absent { .. })
 }
 
 /// Whether revisions that were refused before are tried again.
@@ -108,12 +112,13 @@ impl Loader {
         .await
     }
 
-    /// Loads every room and adapter for the first time.
+    /// Loads every room and adapter for the first time. A store without a room is refused unless
+    /// rooms can be added to it through this server.
     ///
     /// # Errors
     /// [`RunError::Store`] if the store cannot be listed, [`RunError::NoRoom`] if it has no room,
     /// [`RunError::NoneServed`] if none of its rooms can be served.
-    pub async fn first(&self) -> Result<Snapshot, RunError> {
+    pub async fn first(&self, is_writable: bool) -> Result<Snapshot, RunError> {
         let location = self.store.location().to_owned();
         let snapshot = self
             .load(Arc::new(Snapshot::default()), Refused::TryAgain)
@@ -125,13 +130,14 @@ impl Loader {
             }
             return Ok(snapshot);
         }
-        Err(match snapshot.refused.rooms.into_iter().next() {
-            None => RunError::NoRoom { location },
-            Some((room, refusal)) => RunError::NoneServed {
-                room,
-                reason: refusal.reason,
-            },
-        })
+        match snapshot.refused.rooms.iter().next() {
+            None if is_writable => Ok(snapshot),
+            None => Err(RunError::NoRoom { location }),
+            Some((room, refusal)) => Err(RunError::NoneServed {
+                room: room.clone(),
+                reason: refusal.reason.clone(),
+            }),
+        }
     }
 
     /// Loads what differs from `before`, on a blocking thread.
@@ -156,13 +162,19 @@ impl Loader {
             ..Snapshot::default()
         };
 
-        for (name, revision) in self.store.newest_adapters().await? {
+        let defaults = self.store.defaults().await?;
+        for (name, revision) in self.store.current_adapters().await? {
             self.add_adapter(&mut loaded, before, refused, name, revision)
                 .await;
         }
         self.add_image_encoders(&mut loaded, before);
 
-        for (name, revision) in self.store.newest_rooms().await? {
+        for (name, revision) in self.store.current_rooms().await? {
+            if let Some(adapter) = defaults.adapter(&name) {
+                loaded
+                    .default_adapters
+                    .insert(name.clone(), adapter.to_owned());
+            }
             self.add_room(&mut loaded, before, refused, name, revision)
                 .await;
         }
@@ -170,7 +182,7 @@ impl Loader {
         Ok(loaded)
     }
 
-    /// Adds the newest revision of an adapter; if it is refused, the one that was served before.
+    /// Adds the current revision of an adapter; if it is refused, the one that was served before.
     async fn add_adapter(
         &self,
         loaded: &mut Snapshot,
@@ -243,7 +255,7 @@ impl Loader {
         }
     }
 
-    /// Adds the newest revision of a room; if it is refused, the one that was served before.
+    /// Adds the current revision of a room; if it is refused, the one that was served before.
     async fn add_room(
         &self,
         loaded: &mut Snapshot,
@@ -489,7 +501,7 @@ fn opened_for(
 }
 
 /// The adapters that fit a room with features of these sources, in order of preference; the first is
-/// the room's default: those fitted to this room first, then those trained in it, then the newest.
+/// the room's default where an operator chose none: those fitted to this room first, then those trained in it, then the newest.
 fn fitting(
     adapters: &BTreeMap<String, Arc<StoredAdapter>>,
     room: &RoomId,

@@ -33,7 +33,7 @@ pub struct ServedRoom {
     pub created: String,
     /// The sources of the room's features: encoder, layer, pooling and preprocessing.
     pub sources: Vec<FeatureSource>,
-    /// One for each adapter that fits the room, the default first.
+    /// One for each adapter that fits the room, in order of preference.
     pub navigators: Vec<Arc<ServedNavigator>>,
     /// Adapters that have the right features and still cannot serve the room, by name.
     refused_adapters: BTreeMap<String, Refusal>,
@@ -154,10 +154,12 @@ pub struct Refusals {
     pub adapters: BTreeMap<String, Refusal>,
 }
 
-/// The newest revision of every room and adapter of a store that can be served.
+/// The current revision of every room and adapter of a store that can be served.
 #[derive(Default)]
 pub struct Snapshot {
     rooms: BTreeMap<String, Arc<ServedRoom>>,
+    /// The adapters that an operator chose, by room.
+    default_adapters: BTreeMap<String, String>,
     adapters: BTreeMap<String, Arc<StoredAdapter>>,
     image_encoders: BTreeMap<String, Arc<ImageEncoder>>,
     two_views: Option<Arc<TwoViewReader>>,
@@ -179,8 +181,11 @@ impl Snapshot {
         };
         let refused_rooms = self.refused.rooms.iter();
 
+        let chosen = self.default_adapters.iter();
+
         Self {
             rooms: owned(rooms),
+            default_adapters: owned(chosen.filter(|(name, _)| scope.contains(name))),
             adapters: owned(self.adapters.iter().filter(is_seen)),
             image_encoders: self.image_encoders.clone(),
             two_views: self.two_views.clone(),
@@ -211,6 +216,7 @@ impl Snapshot {
         same(&self.rooms, &other.rooms)
             && same(&self.adapters, &other.adapters)
             && same(&self.image_encoders, &other.image_encoders)
+            && self.default_adapters == other.default_adapters
             && self.refused == other.refused
     }
 
@@ -289,6 +295,44 @@ impl Snapshot {
             })
     }
 
+    /// A room under every adapter that fits it, the default first.
+    pub fn navigators<'a>(
+        &'a self,
+        room: &'a ServedRoom,
+    ) -> impl Iterator<Item = &'a Arc<ServedNavigator>> {
+        let chosen = self.default_adapters.get(room.room.id().as_str());
+        let is_chosen = move |served: &&Arc<ServedNavigator>| chosen == Some(&served.adapter.name);
+        let first = room.navigators.iter().filter(is_chosen);
+        let others = room
+            .navigators
+            .iter()
+            .filter(move |served| !is_chosen(served));
+        first.chain(others)
+    }
+
+    /// A room under its default adapter: the one that an operator chose, or the one that is preferred.
+    fn default_navigator<'a>(
+        &'a self,
+        room: &'a ServedRoom,
+    ) -> Result<&'a Arc<ServedNavigator>, Error> {
+        let id = room.room.id();
+        let first = self.navigators(room).next();
+
+        // Another adapter in place of the one that was chosen would be a silent change of answers.
+        match (self.default_adapters.get(id.as_str()), first) {
+            (Some(chosen), first) if first.is_none_or(|first| first.adapter.name != *chosen) => {
+                Err(Error::Precondition(format!(
+                    "adapter '{chosen}' was chosen as the default of room '{id}' and does not serve it; name another, \
+                     or choose another"
+                )))
+            }
+            (_, Some(first)) => Ok(first),
+            (_, None) => Err(Error::Precondition(format!(
+                "no adapter fits room '{id}'; train one"
+            ))),
+        }
+    }
+
     /// A room under the adapter of that name, or under the room's default adapter if the name is
     /// empty.
     ///
@@ -298,9 +342,7 @@ impl Snapshot {
     pub fn navigator(&self, room: &str, adapter: &str) -> Result<&Arc<ServedNavigator>, Error> {
         let served = self.room(room)?;
         if adapter.is_empty() {
-            return served.navigators.first().ok_or_else(|| {
-                Error::Precondition(format!("no adapter fits room '{room}'; train one"))
-            });
+            return self.default_navigator(served);
         }
 
         let wanted = self.adapter(adapter)?;

@@ -213,8 +213,8 @@ impl Session {
                 .map(|room| convert::room_revision(&self.served[room])),
             frames: Some(self.names.clone()),
             keyframes: Some(pb::KeyframePolicy {
-                displacement: settings.keyframe_displacement,
-                frames: settings.keyframe_frames,
+                displacement: Some(settings.keyframe_displacement),
+                frames: Some(settings.keyframe_frames),
             }),
             calibration_rooms: adapter.record.calibrated_on.len() as u32,
         };
@@ -450,7 +450,6 @@ fn settings(
     config: &pb::TrackConfig,
     adapter: &seese3_core::adapter::Adapter,
 ) -> Result<TrackerSettings, Error> {
-    // On the wire 0 means that the caller leaves the value to the adapter's defaults.
     let plain = TrackerSettings::of(adapter);
 
     let pb::KeyframePolicy {
@@ -458,11 +457,14 @@ fn settings(
         frames,
     } = config.keyframes.unwrap_or_default();
 
-    if !(displacement.is_finite() && displacement >= 0.0) {
+    if displacement.is_some_and(|given| !(given.is_finite() && given > 0.0)) {
         return Err(Error::invalid(
             "keyframes.displacement",
-            "must be finite and not negative",
+            "must be finite and above 0",
         ));
+    }
+    if frames == Some(0) {
+        return Err(Error::invalid("keyframes.frames", "must be at least 1"));
     }
 
     let fuse = match pb::Fusion::try_from(config.fusion) {
@@ -477,16 +479,8 @@ fn settings(
     };
 
     Ok(TrackerSettings {
-        keyframe_frames: if frames == 0 {
-            plain.keyframe_frames
-        } else {
-            frames
-        },
-        keyframe_displacement: if displacement == 0.0 {
-            plain.keyframe_displacement
-        } else {
-            displacement
-        },
+        keyframe_frames: frames.unwrap_or(plain.keyframe_frames),
+        keyframe_displacement: displacement.unwrap_or(plain.keyframe_displacement),
         fuse,
     })
 }
@@ -555,10 +549,9 @@ fn known_pose(given: pb::InitialPose, room: &str, names: &pb::FrameNames) -> Res
 
     let pose = convert::pose(pose, room).map_err(|error| error.within("pose"))?;
 
-    // On the wire 0 means that the sender does not state its uncertainty.
-    let deviation = |field: &str, given: f64| match given {
-        0.0 => Ok(KNOWN),
-        given if DEVIATIONS.contains(&given) => Ok(given),
+    let deviation = |field: &str, given: Option<f64>| match given {
+        None => Ok(KNOWN),
+        Some(given) if DEVIATIONS.contains(&given) => Ok(given),
         _ => Err(Error::invalid(
             field,
             format!("must be {:e} to {:e}", DEVIATIONS.start(), DEVIATIONS.end()),

@@ -6,7 +6,7 @@ use super::super::convert;
 use super::super::snapshot::ServedNavigator;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
-use seese3_core::navigation::Hit;
+use seese3_core::navigation::RetrievedFrame;
 use seese3_core::tracking::{ANCHORS_TO_AGREE, Status, Update};
 
 /// An update as a wire message. Its `timestamp_ns`, `sequence` and `elapsed_ns` are left 0; the
@@ -25,7 +25,7 @@ pub fn update(
 
     let (room, neighbour) = update.best_match;
     let navigator = &served[room].navigator;
-    let hit = Hit {
+    let retrieved = RetrievedFrame {
         neighbour,
         pose: navigator.room().poses()[neighbour.frame.row()],
     };
@@ -54,7 +54,7 @@ pub fn update(
         reason: update.reason.clone(),
         out_of_distribution: update.out_of_distribution,
         room: known.map(|served| convert::room_revision(served)),
-        best_match: known.map(|_| convert::hit_to_wire(&hit, navigator.room())),
+        best_match: known.map(|_| convert::retrieved_to_wire(&retrieved, navigator.room())),
         match_used: update.match_used,
         match_surprise: update.surprise,
         elapsed_ns: 0,

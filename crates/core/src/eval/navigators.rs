@@ -263,7 +263,7 @@ impl TableInputs<'_> {
         let plan = Plan {
             mode,
             steps,
-            hit_count: 1,
+            top_k: 1,
             exclude_source,
         };
 

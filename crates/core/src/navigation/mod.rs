@@ -20,7 +20,7 @@ mod stepper;
 pub use crate::adapter::Reading;
 pub use kind::NavigatorKind;
 pub use multi_step::{Leg, Mode, Plan, Space, Start, Step, walk};
-pub use navigator::{Answer, AnswerStep, Hit, Navigator, StepError};
+pub use navigator::{Answer, AnswerStep, Navigator, RetrievedFrame, StepError};
 pub use pursuit::{Feedback, Outcome, Pursuit, pursue};
 pub use query::{Displacement, FitOn, Limits, Query, Source, SourceAt};
 pub use search::{IndexKind, RetrievalMetric, Search};
@@ -63,10 +63,10 @@ pub enum Error {
     },
     #[error("steps must be 1 to {most} in all, got {actual}")]
     Steps { actual: u64, most: u32 },
-    #[error("hit_count must be 1 to {most}, got {actual}")]
-    HitCount { actual: u32, most: u32 },
-    #[error("steps times hit_count is {actual}, over the limit of {most} frames in one answer")]
-    HitsInAll { actual: u64, most: u64 },
+    #[error("top_k must be 1 to {most}, got {actual}")]
+    TopK { actual: u32, most: u32 },
+    #[error("steps times top_k is {actual}, over the limit of {most} frames in one answer")]
+    FramesInAnswer { actual: u64, most: u64 },
     #[error("displacement has no twist; give at least one")]
     NoTwist,
     #[error(

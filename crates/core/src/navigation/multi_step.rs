@@ -42,7 +42,7 @@ pub struct Plan {
     /// Equal parts of the motion, at least 1.
     pub steps: u32,
     /// Frames retrieved for each step, at least 1.
-    pub hit_count: usize,
+    pub top_k: usize,
     /// Excludes the frame that a step starts from, and this many rows to each side of it, from
     /// retrieval; `None` excludes nothing.
     pub exclude_source: Option<u32>,
@@ -175,9 +175,7 @@ pub fn walk(
             .exclude_source
             .zip(at.frame)
             .map(|(radius, centre)| Exclusion { centre, radius });
-        let neighbours = space
-            .search
-            .nearest(latent.view(), plan.hit_count, exclusion);
+        let neighbours = space.search.nearest(latent.view(), plan.top_k, exclusion);
 
         let Some(first) = neighbours.first() else {
             return Err(Error::NoCandidates {

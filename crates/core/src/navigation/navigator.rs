@@ -21,7 +21,7 @@ const MOST_REFITS: usize = 32;
 
 /// A retrieved frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Hit {
+pub struct RetrievedFrame {
     /// The frame and its distance to the latent that was searched for.
     pub neighbour: Neighbour,
     /// Its pose, `world_from_camera`.
@@ -34,7 +34,7 @@ pub struct AnswerStep {
     /// ĝ, the latent that the step aimed at.
     pub latent: Array1<f64>,
     /// The frames nearest to it; at least one.
-    pub hits: Vec<Hit>,
+    pub frames: Vec<RetrievedFrame>,
     /// Where the step should have arrived, `world_from_camera`, if the source's pose is known.
     pub requested_pose: Option<Pose>,
     /// The error of the nearest frame against `requested_pose`, if that is known.
@@ -148,8 +148,8 @@ impl Navigator {
     }
 
     /// The `k` frames nearest to a latent, by all its coordinates.
-    pub fn nearest(&self, latent: ArrayView1<'_, f64>, k: usize) -> Vec<Hit> {
-        self.hits(&self.search.nearest(latent, k, None))
+    pub fn nearest(&self, latent: ArrayView1<'_, f64>, k: usize) -> Vec<RetrievedFrame> {
+        self.retrieved(&self.search.nearest(latent, k, None))
     }
 
     /// The search over all frames under a metric.
@@ -281,7 +281,7 @@ impl Navigator {
         let plan = Plan {
             mode: query.mode,
             steps: query.steps,
-            hit_count: query.hit_count as usize,
+            top_k: query.top_k as usize,
             exclude_source: query.exclude_source,
         };
 
@@ -357,23 +357,23 @@ impl Navigator {
         source: Option<Pose>,
         requested: Option<Pose>,
     ) -> AnswerStep {
-        let hits = self.hits(&step.neighbours);
+        let frames = self.retrieved(&step.neighbours);
         let error = source
             .zip(requested)
-            .map(|(source, requested)| StepError::of(&source, &hits[0].pose, &requested));
+            .map(|(source, requested)| StepError::of(&source, &frames[0].pose, &requested));
 
         AnswerStep {
             latent: step.latent,
-            hits,
+            frames,
             requested_pose: requested,
             error,
         }
     }
 
-    fn hits(&self, neighbours: &[Neighbour]) -> Vec<Hit> {
+    fn retrieved(&self, neighbours: &[Neighbour]) -> Vec<RetrievedFrame> {
         neighbours
             .iter()
-            .map(|&neighbour| Hit {
+            .map(|&neighbour| RetrievedFrame {
                 neighbour,
                 pose: self.room.poses()[neighbour.frame.row()],
             })

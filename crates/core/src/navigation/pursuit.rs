@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 
 use ndarray::Array1;
 
-use super::{Error, Hit, Navigator, Start, Stepper};
+use super::{Error, Navigator, RetrievedFrame, Start, Stepper};
 use crate::cancel::Cancellation;
 use crate::geometry::{Pose, PoseError, Twist, body_twist};
 use crate::room::FrameId;
@@ -38,7 +38,7 @@ pub struct Feedback {
     pub step: u32,
     /// The frame chosen last, which is what the camera would see; `None` until a step has chosen
     /// one.
-    pub hit: Option<Hit>,
+    pub frame: Option<RetrievedFrame>,
     /// The error that remains between the camera's pose and the goal.
     pub remaining: PoseError,
     /// Steps so far whose nearest frame was no progress, so that another frame or a shorter motion
@@ -90,7 +90,7 @@ pub fn pursue(
 
     each(Feedback {
         step: 0,
-        hit: None,
+        frame: None,
         remaining: PoseError::between(&pose, goal),
         recoveries,
     });
@@ -124,33 +124,33 @@ pub fn pursue(
         let left = body_twist(&pose, goal);
         let parts = (left.norm() / pursuit.step).ceil().max(1.0) * f64::from(1u32 << halvings);
         let wanted = wanted_latent(navigator, stepper, &latent, left, parts)?;
-        let hits = navigator.nearest(wanted.view(), CHOICE);
-        let chosen = match progress(&hits, goal, left, &seen) {
-            Progress::Nearest(hit) => Some(hit),
-            Progress::Recovered(hit) => {
+        let frames = navigator.nearest(wanted.view(), CHOICE);
+        let chosen = match progress(&frames, goal, left, &seen) {
+            Progress::Nearest(frame) => Some(frame),
+            Progress::Recovered(frame) => {
                 recoveries += 1;
-                hit
+                frame
             }
         };
 
         // With a frame the camera moves to its pose. Without one it stays where it is, and the next
         // attempt asks for half the motion.
         match chosen {
-            Some(hit) => {
-                pose = hit.pose;
+            Some(frame) => {
+                pose = frame.pose;
                 halvings = 0;
-                at = Some(*hit);
+                at = Some(*frame);
 
                 latent = navigator
                     .latents()
-                    .row(hit.neighbour.frame.row())
+                    .row(frame.neighbour.frame.row())
                     .to_owned();
 
-                seen.insert(hit.neighbour.frame);
+                seen.insert(frame.neighbour.frame);
 
                 each(Feedback {
                     step,
-                    hit: at,
+                    frame: at,
                     remaining: PoseError::between(&pose, goal),
                     recoveries,
                 });
@@ -160,7 +160,7 @@ pub fn pursue(
 
                 each(Feedback {
                     step,
-                    hit: at,
+                    frame: at,
                     remaining,
                     recoveries,
                 });
@@ -191,28 +191,30 @@ fn wanted_latent(
 /// Which of the retrieved frames brings the camera nearer to the goal.
 enum Progress<'a> {
     /// The nearest frame in latent space.
-    Nearest(&'a Hit),
+    Nearest(&'a RetrievedFrame),
     /// Not that one; another one, or none.
-    Recovered(Option<&'a Hit>),
+    Recovered(Option<&'a RetrievedFrame>),
 }
 
 /// The latent proposes frames; their stored poses decide. The nearest frame in latent space is
 /// taken if it is progress. Otherwise the step recovers with the retrieved frame that is nearest to
 /// the goal, if any is nearer than the camera now.
 fn progress<'a>(
-    hits: &'a [Hit],
+    frames: &'a [RetrievedFrame],
     goal: &Pose,
     left: Twist,
     seen: &BTreeSet<FrameId>,
 ) -> Progress<'a> {
-    let distance = |hit: &Hit| body_twist(&hit.pose, goal).norm();
-    let is_nearer =
-        |hit: &&Hit| distance(hit) < left.norm() && !seen.contains(&hit.neighbour.frame);
+    let distance = |frame: &RetrievedFrame| body_twist(&frame.pose, goal).norm();
+    let is_nearer = |frame: &&RetrievedFrame| {
+        distance(frame) < left.norm() && !seen.contains(&frame.neighbour.frame)
+    };
 
-    match hits.first().filter(is_nearer) {
-        Some(hit) => Progress::Nearest(hit),
+    match frames.first().filter(is_nearer) {
+        Some(frame) => Progress::Nearest(frame),
         None => Progress::Recovered(
-            hits.iter()
+            frames
+                .iter()
                 .filter(is_nearer)
                 .min_by(|a, b| distance(a).total_cmp(&distance(b))),
         ),

@@ -64,7 +64,7 @@ pub struct Query {
     /// What a refit is fitted on.
     pub fit_on: FitOn,
     /// Frames retrieved for each step.
-    pub hit_count: u32,
+    pub top_k: u32,
     /// Excludes the frame that a step starts from, and this many rows to each side of it, from
     /// retrieval; `None` excludes nothing.
     pub exclude_source: Option<u32>,
@@ -76,18 +76,18 @@ pub struct Limits {
     /// Steps of all motions together.
     pub steps: u32,
     /// Frames for each step.
-    pub hits: u32,
+    pub top_k: u32,
     /// Frames in the whole answer: this keeps it under the 4 MiB that gRPC clients accept by
     /// default.
-    pub hits_in_all: u64,
+    pub frames_in_answer: u64,
 }
 
 impl Default for Limits {
     fn default() -> Self {
         Self {
             steps: 1_000,
-            hits: 1_000,
-            hits_in_all: 10_000,
+            top_k: 1_000,
+            frames_in_answer: 10_000,
         }
     }
 }
@@ -98,7 +98,7 @@ impl Query {
     /// # Errors
     /// [`Error::NoTwist`] for an empty list of motions; [`Error::TwistNotFinite`] or
     /// [`Error::TwistBeyondPi`] for a motion that cannot be planned; [`Error::Steps`],
-    /// [`Error::HitCount`] or [`Error::HitsInAll`] for a count that is zero or over its limit.
+    /// [`Error::TopK`] or [`Error::FramesInAnswer`] for a count that is zero or over its limit.
     pub fn check(&self, limits: Limits) -> Result<(), Error> {
         let motions = match &self.displacement {
             Displacement::Twists(twists) => {
@@ -125,18 +125,18 @@ impl Query {
             });
         }
 
-        if self.hit_count == 0 || self.hit_count > limits.hits {
-            return Err(Error::HitCount {
-                actual: self.hit_count,
-                most: limits.hits,
+        if self.top_k == 0 || self.top_k > limits.top_k {
+            return Err(Error::TopK {
+                actual: self.top_k,
+                most: limits.top_k,
             });
         }
 
-        let in_all = actual.saturating_mul(u64::from(self.hit_count));
-        if in_all > limits.hits_in_all {
-            return Err(Error::HitsInAll {
+        let in_all = actual.saturating_mul(u64::from(self.top_k));
+        if in_all > limits.frames_in_answer {
+            return Err(Error::FramesInAnswer {
                 actual: in_all,
-                most: limits.hits_in_all,
+                most: limits.frames_in_answer,
             });
         }
 

@@ -40,7 +40,7 @@ pub struct RoomMatch {
 }
 
 /// Ranks rooms by one or more views of a camera that hardly moved between them, the newest last.
-/// `hit_count` frames are returned for the newest view.
+/// `top_k` frames are returned for the newest view.
 ///
 /// # Errors
 /// [`Error::NoMap`] without a map, [`Error::NoView`] without a view, [`Error::Adapters`] when the
@@ -48,7 +48,7 @@ pub struct RoomMatch {
 pub fn relocalize(
     maps: &[Arc<Map>],
     latents: &[Array1<f64>],
-    hit_count: usize,
+    top_k: usize,
     cancel: &Cancellation,
 ) -> Result<Relocalization, Error> {
     let adapter = maps.first().ok_or(Error::NoMap)?.navigator().adapter();
@@ -63,7 +63,7 @@ pub fn relocalize(
     let mut rooms = Vec::with_capacity(maps.len());
     for (place, map) in maps.iter().enumerate() {
         cancel.check().map_err(|_| Error::Cancelled)?;
-        let last = map.match_view(newest.view(), hit_count);
+        let last = map.match_view(newest.view(), top_k);
         let mut distance = last.nearest[0].distance;
         let mut out_of_distribution = last.out_of_distribution;
 

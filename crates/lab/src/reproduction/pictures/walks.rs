@@ -154,7 +154,7 @@ fn walked(navigator: &Navigator, pair: Pair) -> Result<Vec<u32>, Error> {
             split: Split::Time,
             stride: FAR,
         },
-        hit_count: 1,
+        top_k: 1,
         exclude_source: None,
     };
 
@@ -162,7 +162,7 @@ fn walked(navigator: &Navigator, pair: Pair) -> Result<Vec<u32>, Error> {
     let steps = answer
         .steps
         .iter()
-        .map(|step| step.hits[0].neighbour.frame.0);
+        .map(|step| step.frames[0].neighbour.frame.0);
     Ok([pair.source.0].into_iter().chain(steps).collect())
 }
 

@@ -1,13 +1,35 @@
-//! CatalogService: lists the rooms and adapters that the server has, page by page.
+//! CatalogService: lists the rooms and adapters that the server has, page by page, and changes them.
+//!
+//! | file | what |
+//! | --- | --- |
+//! | `changes` | what every change goes through: rights, one at a time, a look at the store afterwards |
+//! | `recent` | answers that are given again when a change is sent again |
+//! | `room_upload` | a room, frame by frame |
+//! | `adapter_upload` | an adapter |
+//! | `refits` | an adapter fitted to a room here |
+//! | `defaults` | defaults and removals |
+
+mod adapter_upload;
+mod changes;
+mod defaults;
+mod recent;
+mod refits;
+mod room_upload;
+
+pub use changes::Changes;
 
 use std::collections::BTreeMap;
 use std::ops::Bound;
 
-use tonic::{Request, Response, Status};
+use tonic::{Request, Response, Status, Streaming};
+
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
 
 use super::auth::RoomScope;
 use super::convert;
-use super::snapshot::ServedRoom;
+use super::memory::hold_answer;
+use super::snapshot::{ServedRoom, Snapshot};
 use super::{Error, Handlers, principal};
 use crate::store::StoredAdapter;
 use seese3_client::proto::v1 as pb;
@@ -30,12 +52,16 @@ impl CatalogService for Handlers {
             page_token,
         } = request.into_inner();
         let (page, next_page_token) = page(snapshot.rooms(), page_size, &page_token)?;
-        let rooms = page.into_iter().map(|served| room(served)).collect();
+        let rooms = page
+            .into_iter()
+            .map(|served| room(&snapshot, served))
+            .collect();
 
-        Ok(Response::new(pb::ListRoomsResponse {
+        let answer = pb::ListRoomsResponse {
             rooms,
             next_page_token,
-        }))
+        };
+        Ok(Response::new(hold_answer(answer)?))
     }
 
     async fn get_room(
@@ -43,7 +69,7 @@ impl CatalogService for Handlers {
         request: Request<pb::GetRoomRequest>,
     ) -> Result<Response<pb::GetRoomResponse>, Status> {
         let snapshot = self.snapshot(&request)?;
-        let room = room(snapshot.room(&request.into_inner().room)?);
+        let room = room(&snapshot, snapshot.room(&request.into_inner().room)?);
         Ok(Response::new(pb::GetRoomResponse { room: Some(room) }))
     }
 
@@ -63,10 +89,11 @@ impl CatalogService for Handlers {
             .map(|stored| adapter(stored, scope.as_ref()))
             .collect();
 
-        Ok(Response::new(pb::ListAdaptersResponse {
+        let answer = pb::ListAdaptersResponse {
             adapters,
             next_page_token,
-        }))
+        };
+        Ok(Response::new(hold_answer(answer)?))
     }
 
     async fn get_adapter(
@@ -81,6 +108,82 @@ impl CatalogService for Handlers {
         Ok(Response::new(pb::GetAdapterResponse {
             adapter: Some(adapter),
         }))
+    }
+
+    async fn create_room(
+        &self,
+        request: Request<Streaming<pb::CreateRoomRequest>>,
+    ) -> Result<Response<pb::CreateRoomResponse>, Status> {
+        let snapshot = self.snapshot(&request)?;
+        let caller = principal(&request).cloned();
+        let budget = self.workers.budget(request.metadata());
+
+        let received = self.receive_room(caller, snapshot, request.into_inner());
+        let answer = tokio::time::timeout(budget, received).await;
+        Ok(Response::new(answer.map_err(|_| Error::Deadline)??))
+    }
+
+    async fn publish_adapter(
+        &self,
+        request: Request<Streaming<pb::PublishAdapterRequest>>,
+    ) -> Result<Response<pb::PublishAdapterResponse>, Status> {
+        let caller = principal(&request).cloned();
+        let budget = self.workers.budget(request.metadata());
+
+        let received = self.receive_adapter(caller, request.into_inner());
+        let answer = tokio::time::timeout(budget, received).await;
+        Ok(Response::new(answer.map_err(|_| Error::Deadline)??))
+    }
+
+    type RefitRoomStream = ReceiverStream<Result<pb::RefitRoomResponse, Status>>;
+
+    async fn refit_room(
+        &self,
+        request: Request<pb::RefitRoomRequest>,
+    ) -> Result<Response<Self::RefitRoomStream>, Status> {
+        let caller = principal(&request).cloned();
+        let admitted = self.admit_refit(caller.as_ref(), request.into_inner())?;
+
+        let (events, heard) = mpsc::channel(16);
+        tokio::spawn(self.clone().run_refit(admitted, events));
+        Ok(Response::new(ReceiverStream::new(heard)))
+    }
+
+    async fn set_default(
+        &self,
+        request: Request<pb::SetDefaultRequest>,
+    ) -> Result<Response<pb::SetDefaultResponse>, Status> {
+        let caller = principal(&request).cloned();
+        Ok(Response::new(self.set(caller, request.into_inner()).await?))
+    }
+
+    async fn roll_back_default(
+        &self,
+        request: Request<pb::RollBackDefaultRequest>,
+    ) -> Result<Response<pb::RollBackDefaultResponse>, Status> {
+        let caller = principal(&request).cloned();
+        let answer = self.roll_back(caller, request.into_inner()).await?;
+        Ok(Response::new(answer))
+    }
+
+    async fn delete_room(
+        &self,
+        request: Request<pb::DeleteRoomRequest>,
+    ) -> Result<Response<pb::DeleteRoomResponse>, Status> {
+        let caller = principal(&request).cloned();
+        let answer = self.delete_room_named(caller, request.into_inner()).await?;
+        Ok(Response::new(answer))
+    }
+
+    async fn delete_adapter(
+        &self,
+        request: Request<pb::DeleteAdapterRequest>,
+    ) -> Result<Response<pb::DeleteAdapterResponse>, Status> {
+        let caller = principal(&request).cloned();
+        let answer = self
+            .delete_adapter_named(caller, request.into_inner())
+            .await?;
+        Ok(Response::new(answer))
     }
 }
 
@@ -126,7 +229,7 @@ fn page<'a, T>(
     Ok((page.into_iter().map(|(_, entry)| entry).collect(), next))
 }
 
-fn room(served: &ServedRoom) -> pb::Room {
+fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
     let provenance = served.room.provenance();
     pb::Room {
         revision: Some(pb::Revision {
@@ -134,16 +237,15 @@ fn room(served: &ServedRoom) -> pb::Room {
             revision: served.revision,
         }),
         frame_count: served.room.frame_count() as u32,
-        adapters: served
-            .navigators
-            .iter()
+        adapters: snapshot
+            .navigators(served)
             .map(|navigator| navigator.adapter.name.clone())
             .collect(),
         features: served.sources.iter().map(convert::source_to_wire).collect(),
         format: provenance.format.clone(),
         licence: provenance.licence.clone(),
         worst_rotation_deviation: provenance.worst_rotation_deviation,
-        created: served.created.clone(),
+        create_time: convert::time_to_wire(&served.created),
     }
 }
 
@@ -187,7 +289,7 @@ fn adapter(stored: &StoredAdapter, scope: Option<&RoomScope>) -> pb::Adapter {
             &scale.deviation,
         ))),
         singular_values: adapter.inverse().singular_values().to_vec(),
-        created: stored.created.clone(),
+        create_time: convert::time_to_wire(&stored.created),
         charts: adapter.network().chart_count() as u32,
         loss: record.config.loss.name().to_owned(),
         navigators: convert::navigator_names(adapter),

@@ -1,0 +1,214 @@
+//! `seese3 push`: uploads a room or an adapter to a server.
+
+use anyhow::bail;
+use clap::Args;
+use sha2::{Digest, Sha256};
+
+use super::ask::Server;
+use super::say;
+use crate::store::{Kind, ResourceName, Store, StoredRoom};
+use seese3_client::proto::v1 as pb;
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::Pose;
+
+/// The size of a message, bytes, as far as frames can be divided: well below what servers take.
+const MESSAGE_BYTES: usize = 1 << 20;
+
+#[derive(Debug, Args)]
+pub struct Push {
+    /// rooms/NAME or adapters/NAME, or one revision: rooms/NAME/revisions/NUMBER
+    name: ResourceName,
+    /// The store: a folder, or a bucket by its URL
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// Its name on the server, if it is another one
+    #[arg(long = "as", value_name = "NAME")]
+    renamed: Option<String>,
+    /// Only let the server check it
+    #[arg(long)]
+    validate_only: bool,
+    #[command(flatten)]
+    server: Server,
+}
+
+impl Push {
+    pub async fn run(self) -> anyhow::Result<()> {
+        let store = Store::open(&self.store)?;
+        let target = ResourceName {
+            kind: self.name.kind,
+            name: self.renamed.clone().unwrap_or(self.name.name.clone()),
+            revision: None,
+        };
+        let client = self.server.connect().await?;
+
+        let (revision, created, served) = match self.name.kind {
+            Kind::Room => {
+                let stored = store.load_room(&self.name.name, self.name.revision).await?;
+                let messages = room_messages(&stored, &target, self.validate_only)?;
+                let answer = client.create_room(tokio_stream::iter(messages)).await?;
+                (answer.revision, answer.created, answer.served)
+            }
+            Kind::Adapter => {
+                let files = store.adapter_files(&self.name.name, self.name.revision);
+                let (manifest, weights) = files.await?;
+                let messages = adapter_messages(manifest, &weights, &target, self.validate_only);
+                let answer = client.publish_adapter(tokio_stream::iter(messages)).await?;
+                (answer.revision, answer.created, answer.served)
+            }
+        };
+
+        let Some(revision) = revision else {
+            say(format_args!("{target} would be accepted"));
+            return Ok(());
+        };
+        let state = match (created, served) {
+            (true, true) => "published and served",
+            (false, true) => "already there, unchanged, and served",
+            (true, false) => "published; the server answers from another revision",
+            (false, false) => "already there, unchanged; the server answers from another revision",
+        };
+        say(format_args!("{}: {state}", target.at(revision.revision)));
+        Ok(())
+    }
+}
+
+/// The messages of an upload. What the protocol does not carry, the numbers and the held-out marks
+/// of a dataset and the paths of its images, stays behind.
+fn room_messages(
+    stored: &StoredRoom,
+    target: &ResourceName,
+    validate_only: bool,
+) -> anyhow::Result<Vec<pb::CreateRoomRequest>> {
+    use pb::create_room_request::Message;
+
+    if stored.features.is_empty() {
+        bail!("the room has no features; `seese3 encode` makes them");
+    }
+
+    let provenance = stored.room.provenance();
+    let upload = pb::RoomUpload {
+        name: target.to_string(),
+        features: stored
+            .features
+            .iter()
+            .map(|set| source_to_wire(set.source()))
+            .collect(),
+        format: provenance.format.clone(),
+        licence: provenance.licence.clone(),
+        camera: provenance.camera.map(|camera| pb::Pinhole {
+            width: 1.0,
+            height: camera.height(),
+            focal: camera.focal(),
+            centre_x: Some(camera.centre().x),
+            centre_y: Some(camera.centre().y),
+        }),
+        validate_only,
+        ..pb::RoomUpload::default()
+    };
+
+    let columns: usize = stored.features.iter().map(|set| set.rows().ncols()).sum();
+    let at_once = (MESSAGE_BYTES / (128 + 4 * columns)).max(1);
+    let frame_count = stored.room.frame_count();
+    let mut digest = Sha256::new();
+    let mut messages = vec![Message::Room(upload)];
+
+    for first in (0..frame_count).step_by(at_once) {
+        let batch = batch(stored, first..(first + at_once).min(frame_count));
+        digest.update(&batch.poses);
+        batch.features.iter().for_each(|rows| digest.update(rows));
+        messages.push(Message::Frames(batch));
+    }
+    messages.push(Message::End(pb::UploadEnd {
+        frame_count: frame_count as u32,
+        sha256: digest.finalize().to_vec(),
+    }));
+
+    Ok(messages
+        .into_iter()
+        .map(|message| pb::CreateRoomRequest {
+            message: Some(message),
+        })
+        .collect())
+}
+
+fn batch(stored: &StoredRoom, rows: std::ops::Range<usize>) -> pb::FrameBatch {
+    /// The part of a column; empty if the room has no such column.
+    fn part<T: Clone>(column: &[T], rows: &std::ops::Range<usize>) -> Vec<T> {
+        column.get(rows.clone()).unwrap_or_default().to_vec()
+    }
+
+    let pose_bytes = |pose: &Pose| {
+        // nalgebra stores a matrix by column; the transpose gives the rows that NumPy has.
+        let matrix = pose.to_homogeneous().transpose();
+        let numbers = matrix.iter().flat_map(|number| number.to_le_bytes());
+        numbers.collect::<Vec<u8>>()
+    };
+    let feature_bytes = |set: &Features| {
+        let part = set.rows().slice_move(ndarray::s![rows.clone(), ..]);
+        part.iter()
+            .flat_map(|number| number.to_le_bytes())
+            .collect()
+    };
+
+    let frames = stored.room.frames();
+    pb::FrameBatch {
+        poses: frames.poses[rows.clone()]
+            .iter()
+            .flat_map(pose_bytes)
+            .collect(),
+        features: stored.features.iter().map(feature_bytes).collect(),
+        images: Vec::new(),
+        timestamps_ns: part(&frames.timestamps_ns, &rows),
+        frame_names: part(&frames.names, &rows),
+        sequences: part(&frames.sequences, &rows),
+    }
+}
+
+fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
+    let FeatureSource {
+        name,
+        encoder,
+        layer,
+        base,
+        norm,
+        pooling,
+        preprocess,
+        dim,
+    } = source.clone();
+
+    pb::FeatureSource {
+        name,
+        encoder,
+        layer,
+        pooling,
+        preprocess,
+        dim: dim as u32,
+        base,
+        norm,
+    }
+}
+
+fn adapter_messages(
+    manifest: Vec<u8>,
+    weights: &[u8],
+    target: &ResourceName,
+    validate_only: bool,
+) -> Vec<pb::PublishAdapterRequest> {
+    use pb::publish_adapter_request::Message;
+
+    let upload = pb::AdapterUpload {
+        name: target.to_string(),
+        manifest,
+        request_id: String::new(),
+        validate_only,
+    };
+    let parts = weights.chunks(MESSAGE_BYTES);
+    let parts = parts.map(|part| Message::Weights(part.to_vec()));
+
+    std::iter::once(Message::Adapter(upload))
+        .chain(parts)
+        .map(|message| pb::PublishAdapterRequest {
+            message: Some(message),
+        })
+        .collect()
+}

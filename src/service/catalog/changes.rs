@@ -1,0 +1,281 @@
+//! What every change of the catalog goes through: the caller's rights, the memory of what was
+//! answered, one change at a time, and a look at the store afterwards.
+
+use std::future::Future;
+use std::sync::Arc;
+
+use prost::Message;
+use sha2::{Digest, Sha256};
+use tokio::sync::{Mutex, OwnedSemaphorePermit, Semaphore};
+
+use super::super::auth::Principal;
+use super::super::reload::Looks;
+use super::super::snapshot::Snapshot;
+use super::super::status::Full;
+use super::super::{Config, Error, Handlers, Phase};
+use super::recent::{Identity, Recent};
+use crate::refit;
+use crate::store::{self, Kind, Published, ResourceName, Store};
+use seese3_client::proto::v1 as pb;
+
+/// Uploads are counted in pieces of this many bytes.
+const PIECE: usize = 1_024;
+
+/// What changes of the catalog share.
+pub struct Changes {
+    pub store: Store,
+    looks: Looks,
+    recent: Arc<Mutex<Recent>>,
+    /// The pieces that uploads may hold in memory together.
+    uploads: Arc<Semaphore>,
+    fits: Arc<Semaphore>,
+}
+
+impl Changes {
+    pub fn new(store: Store, looks: Looks, config: &Config) -> Self {
+        Self {
+            store,
+            looks,
+            recent: Arc::default(),
+            uploads: Arc::new(Semaphore::new(config.upload_bytes / PIECE)),
+            // A fit takes all of the processor.
+            fits: Arc::new(Semaphore::new(1)),
+        }
+    }
+
+    /// Makes a change, unless the same one was made already; its answer is then given again. Changes
+    /// are made one after another. One that has begun is finished even if the caller goes away.
+    ///
+    /// # Errors
+    /// Those of the change; [`Error::Invalid`] if the request id belongs to another one.
+    pub async fn once<A: Message + Default + 'static>(
+        &self,
+        identity: Identity,
+        change: impl Future<Output = Result<A, Error>> + Send + 'static,
+    ) -> Result<A, Error> {
+        let recent = self.recent.clone();
+        let runtime = tokio::runtime::Handle::current();
+        let span = tracing::Span::current();
+
+        // Writing a store mixes files with hashing; both belong on a blocking thread.
+        let made = tokio::task::spawn_blocking(move || {
+            let _within = span.enter();
+            runtime.block_on(async move {
+                let mut recent = recent.lock_owned().await;
+                if let Some(answer) = recent.answer(&identity)? {
+                    return A::decode(answer).map_err(|_| Error::Internal);
+                }
+
+                let answer = change.await?;
+                recent.remember(identity, answer.encode_to_vec());
+                Ok(answer)
+            })
+        });
+
+        made.await.unwrap_or_else(|error| {
+            tracing::error!(%error, "a change panicked");
+            Err(Error::Internal)
+        })
+    }
+
+    /// The answer to the same change, if it was made already.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if the request id belongs to another change.
+    pub async fn answered<A: Message + Default>(
+        &self,
+        identity: &Identity,
+    ) -> Result<Option<A>, Error> {
+        let mut recent = self.recent.lock().await;
+        let answer = recent.answer(identity)?;
+        let decoded = answer.map(A::decode).transpose();
+        decoded.map_err(|_| Error::Internal)
+    }
+
+    /// Completes when the server has looked at the store again.
+    pub async fn look(&self) {
+        self.looks.look().await;
+    }
+
+    /// Room in memory for a part of an upload, to be held with it.
+    pub fn upload_room(&self, bytes: usize) -> Option<OwnedSemaphorePermit> {
+        let pieces = u32::try_from(bytes.div_ceil(PIECE)).ok()?;
+        self.uploads.clone().try_acquire_many_owned(pieces).ok()
+    }
+
+    /// The place of a fit.
+    pub fn fit_place(&self) -> Option<OwnedSemaphorePermit> {
+        self.fits.clone().try_acquire_owned().ok()
+    }
+}
+
+impl Handlers {
+    /// What changes go through.
+    ///
+    /// # Errors
+    /// [`Error::Precondition`] if this server takes no changes.
+    pub(super) fn changes(&self) -> Result<&Arc<Changes>, Error> {
+        self.changes.as_ref().ok_or_else(|| {
+            Error::Precondition(
+                "this server takes no changes; start it with --writable, or change its store"
+                    .to_owned(),
+            )
+        })
+    }
+
+    /// Room in memory for a part of an upload.
+    ///
+    /// # Errors
+    /// [`Error::Full`] if the uploads in progress hold as much as they may.
+    pub(super) fn upload_room(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Error> {
+        let room = self.changes()?.upload_room(bytes);
+        room.ok_or_else(|| self.workers.full(Full::Uploads))
+    }
+
+    /// Whether requests are answered from this revision now.
+    pub(super) fn serves(&self, kind: Kind, published: &pb::Revision) -> bool {
+        let is_served = |snapshot: &Snapshot| match kind {
+            Kind::Room => snapshot
+                .rooms()
+                .get(&published.name)
+                .is_some_and(|room| room.revision == published.revision),
+            Kind::Adapter => snapshot
+                .adapters()
+                .get(&published.name)
+                .is_some_and(|adapter| adapter.revision == published.revision),
+        };
+
+        match &*self.phase.borrow() {
+            Phase::Serving(snapshot) | Phase::Draining(snapshot) => is_served(snapshot),
+            Phase::Loading | Phase::Stopping => false,
+        }
+    }
+}
+
+/// The identity of a change. `method` tells it from others with the same content.
+pub fn identity(
+    caller: Option<&Arc<Principal>>,
+    request_id: &str,
+    method: &str,
+    content: &[u8],
+) -> Identity {
+    let mut digest = Sha256::new();
+    digest.update(method);
+    digest.update([0]);
+    digest.update(content);
+
+    Identity {
+        caller: caller.map_or_else(String::new, |caller| caller.name().to_owned()),
+        request_id: request_id.to_owned(),
+        content: digest.finalize().into(),
+    }
+}
+
+/// The room or adapter that a change names.
+///
+/// # Errors
+/// [`Error::Invalid`] if it is none of this kind.
+pub fn named(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error> {
+    let resource: ResourceName = text.parse().map_err(|error| Error::invalid(field, error))?;
+    if resource.kind != kind {
+        let problem = format!("names no {}; write {}/NAME", kind.name(), kind.collection());
+        return Err(Error::invalid(field, problem));
+    }
+
+    Ok(resource)
+}
+
+/// The same without a revision.
+///
+/// # Errors
+/// [`Error::Invalid`] if it is none of this kind, or a revision.
+pub fn named_whole(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error> {
+    let resource = named(field, text, kind)?;
+    if resource.revision.is_some() {
+        return Err(Error::invalid(
+            field,
+            "must not name a revision: the server numbers them",
+        ));
+    }
+
+    Ok(resource)
+}
+
+/// Refuses a caller who may not change this. Adapters answer in every room, so only those who may
+/// see every room change them.
+///
+/// # Errors
+/// [`Error::Forbidden`].
+pub fn check_right(caller: Option<&Arc<Principal>>, resource: &ResourceName) -> Result<(), Error> {
+    let Some(scope) = caller.map(|caller| caller.rooms()) else {
+        return Ok(());
+    };
+
+    match resource.kind {
+        Kind::Room if scope.contains(&resource.name) => Ok(()),
+        Kind::Room => Err(Error::Forbidden {
+            verb: "change this room",
+        }),
+        Kind::Adapter if scope.is_all() => Ok(()),
+        Kind::Adapter => Err(Error::Forbidden {
+            verb: "change adapters",
+        }),
+    }
+}
+
+/// A published revision on the wire.
+pub fn revision_to_wire(name: &str, published: &Published) -> pb::Revision {
+    pb::Revision {
+        name: name.to_owned(),
+        revision: published.revision,
+    }
+}
+
+impl From<store::Error> for Error {
+    fn from(error: store::Error) -> Self {
+        use store::Error as E;
+
+        match &error {
+            E::Unknown { kind, name, .. } => Self::NotFound {
+                field: (*kind).to_owned(),
+                name: name.clone(),
+                nearest: None,
+            },
+            E::UnknownRevision {
+                kind,
+                name,
+                revision,
+                ..
+            } => Self::NotFound {
+                field: (*kind).to_owned(),
+                name: format!("{name}/revisions/{revision}"),
+                nearest: None,
+            },
+            E::UnknownFeatures { .. } | E::WhichFeatures { .. } => Self::invalid("features", error),
+            E::InUse { .. } | E::NothingToTakeBack => Self::Precondition(error.to_string()),
+            E::Contended { name } => Self::Conflict {
+                name: name.clone(),
+                problem: "others changed it all the time; try again".to_owned(),
+            },
+            E::FeatureRows { .. } | E::DuplicateFeatures { .. } => Self::invalid("features", error),
+            E::Name { .. } => Self::invalid("name", error),
+            _ => {
+                tracing::error!(%error, "the store could not be changed");
+                Self::Internal
+            }
+        }
+    }
+}
+
+impl From<refit::Error> for Error {
+    fn from(error: refit::Error) -> Self {
+        use refit::Error as E;
+
+        match error {
+            E::Store(error) => error.into(),
+            E::Base { .. } => Self::invalid("base_adapter", error),
+            E::Name { .. } | E::Taken { .. } => Self::invalid("fitted_adapter", error),
+            E::Fitting(_) => Self::Precondition(error.to_string()),
+        }
+    }
+}

@@ -1,0 +1,127 @@
+//! The answers to recent changes, so that a change that is sent again is not made again.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use super::super::Error;
+
+/// How long an answer is remembered.
+const KEPT_FOR: Duration = Duration::from_secs(3_600);
+/// How many answers are remembered; the oldest goes first.
+const KEPT: usize = 1_000;
+/// The longest request id, characters.
+const LONGEST_ID: usize = 100;
+
+/// What tells a change from others.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Identity {
+    /// The caller; empty if the server does not know its callers.
+    pub caller: String,
+    /// What the caller calls this change; empty if it will not send it again.
+    pub request_id: String,
+    /// SHA-256 of the request.
+    pub content: [u8; 32],
+}
+
+struct Remembered {
+    identity: Identity,
+    answer: Vec<u8>,
+    at: Instant,
+}
+
+/// The answers, the oldest first.
+#[derive(Default)]
+pub struct Recent(VecDeque<Remembered>);
+
+impl Recent {
+    /// The answer to the same change, if it was made in the last hour.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if the request id is too long, or was given to another change.
+    pub fn answer(&mut self, identity: &Identity) -> Result<Option<&[u8]>, Error> {
+        if identity.request_id.chars().count() > LONGEST_ID {
+            let problem = format!("is longer than {LONGEST_ID} characters");
+            return Err(Error::invalid("request_id", problem));
+        }
+
+        while self
+            .0
+            .front()
+            .is_some_and(|oldest| oldest.at.elapsed() > KEPT_FOR)
+        {
+            self.0.pop_front();
+        }
+        if identity.request_id.is_empty() {
+            return Ok(None);
+        }
+
+        let is_same_id = |known: &&Remembered| {
+            (&known.identity.caller, &known.identity.request_id)
+                == (&identity.caller, &identity.request_id)
+        };
+        match self.0.iter().find(is_same_id) {
+            Some(known) if known.identity.content == identity.content => Ok(Some(&known.answer)),
+            Some(_) => Err(Error::invalid(
+                "request_id",
+                "was given to another change in the last hour; give each change its own",
+            )),
+            None => Ok(None),
+        }
+    }
+
+    /// Remembers the answer to a change.
+    pub fn remember(&mut self, identity: Identity, answer: Vec<u8>) {
+        if identity.request_id.is_empty() {
+            return;
+        }
+        if self.0.len() == KEPT {
+            self.0.pop_front();
+        }
+        self.0.push_back(Remembered {
+            identity,
+            answer,
+            at: Instant::now(),
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn identity(caller: &str, request_id: &str, content: u8) -> Identity {
+        Identity {
+            caller: caller.to_owned(),
+            request_id: request_id.to_owned(),
+            content: [content; 32],
+        }
+    }
+
+    /// Oracle: the contract itself: the same caller, id and content get the first answer; another
+    /// content is refused; other callers and changes without an id are new.
+    #[test]
+    fn a_change_that_is_sent_again_has_been_answered() {
+        let mut recent = Recent::default();
+        recent.remember(identity("a", "1", 7), vec![42]);
+        recent.remember(identity("a", "", 7), vec![43]);
+
+        assert_eq!(recent.answer(&identity("a", "1", 7)), Ok(Some(&[42][..])));
+        assert!(recent.answer(&identity("a", "1", 8)).is_err());
+        assert_eq!(recent.answer(&identity("b", "1", 8)), Ok(None));
+        assert_eq!(recent.answer(&identity("a", "", 7)), Ok(None));
+        assert!(recent.answer(&identity("a", &"x".repeat(101), 7)).is_err());
+    }
+
+    /// Oracle: the bound itself.
+    #[test]
+    fn memory_is_bounded() {
+        let mut recent = Recent::default();
+        for number in 0..=KEPT {
+            recent.remember(identity("a", &number.to_string(), 0), Vec::new());
+        }
+
+        assert_eq!(recent.0.len(), KEPT);
+        assert_eq!(recent.answer(&identity("a", "0", 0)), Ok(None));
+        assert!(recent.answer(&identity("a", "1", 0)).unwrap().is_some());
+    }
+}

@@ -1,0 +1,291 @@
+//! How large a message becomes when it is decoded, computed from its bytes and the descriptors of the
+//! protocol without decoding it. Two bytes on the wire can become hundreds: an empty message in a
+//! list is a tag and a zero, and a whole struct in memory.
+
+use std::collections::HashMap;
+use std::sync::LazyLock;
+
+use prost::Message;
+use prost_types::field_descriptor_proto::{Label, Type};
+use prost_types::{DescriptorProto, FieldDescriptorProto, FileDescriptorSet};
+use seese3_client::proto::FILE_DESCRIPTOR_SET;
+
+/// A list has up to twice the room that its elements take, and is moved when it grows.
+const GROWTH: usize = 3;
+/// A string, a list or bytes: address, length and room.
+const LIST: usize = 24;
+/// A number that may be absent.
+const NUMBER: usize = 16;
+/// What may be absent: the word that says so.
+const MARK: usize = 8;
+
+/// The messages of the protocol by their full names.
+static MESSAGES: LazyLock<HashMap<String, Shape>> = LazyLock::new(shapes);
+/// The messages that requests consist of, by the path of the RPC.
+static REQUESTS: LazyLock<HashMap<String, String>> = LazyLock::new(requests);
+
+/// What decoding needs to know of a message.
+#[derive(Debug, Default)]
+struct Shape {
+    /// The size of the struct, with the messages in it that are no lists, bytes.
+    size: usize,
+    fields: HashMap<u64, Field>,
+}
+
+#[derive(Debug, Clone)]
+struct Field {
+    is_list: bool,
+    /// What the field holds, where its length is on the wire.
+    content: Content,
+}
+
+#[derive(Debug, Clone)]
+enum Content {
+    /// Text or bytes.
+    Bytes,
+    /// Numbers that may be packed; how many bytes one byte on the wire becomes at most.
+    Numbers { growth: usize },
+    /// A message, by its full name.
+    Message(String),
+}
+
+/// An upper bound of the memory that the request of an RPC takes when it is decoded, bytes. For an
+/// RPC that is not ours it is the size of the message.
+pub fn decoded_size(path: &str, message: &[u8]) -> usize {
+    match REQUESTS.get(path) {
+        Some(name) => {
+            let own = MESSAGES.get(name).map_or(0, |shape| shape.size);
+            own.saturating_add(content_size(name, message))
+        }
+        None => message.len(),
+    }
+}
+
+/// The memory that lists, texts and the messages in lists take.
+fn content_size(name: &str, mut bytes: &[u8]) -> usize {
+    let Some(shape) = MESSAGES.get(name) else {
+        return bytes.len();
+    };
+    let mut size = 0_usize;
+
+    // What cannot be read here is refused by the decoder, at the same place.
+    while let Some((tag, value)) = next_field(&mut bytes) {
+        let Some(field) = shape.fields.get(&tag) else {
+            continue;
+        };
+        let Value::Bytes(value) = value else {
+            if field.is_list {
+                size = size.saturating_add(NUMBER * GROWTH);
+            }
+            continue;
+        };
+
+        size = size.saturating_add(match &field.content {
+            Content::Bytes if field.is_list => (value.len() + LIST) * GROWTH,
+            Content::Bytes => value.len(),
+            Content::Numbers { growth } => value.len().saturating_mul(growth * GROWTH),
+            Content::Message(name) => {
+                let inner = content_size(name, value);
+                let own = MESSAGES.get(name).map_or(0, |shape| shape.size);
+                match field.is_list {
+                    true => inner.saturating_add(own * GROWTH),
+                    false => inner,
+                }
+            }
+        });
+    }
+
+    size
+}
+
+enum Value<'a> {
+    Number,
+    Bytes(&'a [u8]),
+}
+
+/// The next field: its number and its value. None at the end, and where the bytes are no message.
+fn next_field<'a>(bytes: &mut &'a [u8]) -> Option<(u64, Value<'a>)> {
+    let key = varint(bytes)?;
+    let skip = |bytes: &mut &'a [u8], count: usize| -> Option<&'a [u8]> {
+        let (value, rest) = bytes.split_at_checked(count)?;
+        *bytes = rest;
+        Some(value)
+    };
+
+    let value = match key & 7 {
+        0 => {
+            varint(bytes)?;
+            Value::Number
+        }
+        1 => {
+            skip(bytes, 8)?;
+            Value::Number
+        }
+        2 => {
+            let length = usize::try_from(varint(bytes)?).ok()?;
+            Value::Bytes(skip(bytes, length)?)
+        }
+        5 => {
+            skip(bytes, 4)?;
+            Value::Number
+        }
+        _ => return None,
+    };
+    Some((key >> 3, value))
+}
+
+fn varint(bytes: &mut &[u8]) -> Option<u64> {
+    prost::encoding::decode_varint(bytes).ok()
+}
+
+fn descriptors() -> FileDescriptorSet {
+    // These are the bytes that the build wrote; were they wrong, nothing would be known of any
+    // message, and each would count as its bytes.
+    FileDescriptorSet::decode(FILE_DESCRIPTOR_SET).unwrap_or_default()
+}
+
+fn requests() -> HashMap<String, String> {
+    let mut requests = HashMap::new();
+    for file in descriptors().file {
+        for service in &file.service {
+            for method in &service.method {
+                let path = format!("/{}.{}/{}", file.package(), service.name(), method.name());
+                let input = method.input_type().trim_start_matches('.');
+                requests.insert(path, input.to_owned());
+            }
+        }
+    }
+
+    requests
+}
+
+fn shapes() -> HashMap<String, Shape> {
+    let mut messages: HashMap<String, DescriptorProto> = HashMap::new();
+    for file in descriptors().file {
+        for message in &file.message_type {
+            let name = format!("{}.{}", file.package(), message.name());
+            messages.insert(name, message.clone());
+        }
+    }
+
+    let shape = |(name, message): (&String, &DescriptorProto)| {
+        let fields = message.field.iter().map(|field| {
+            let number = u64::try_from(field.number()).unwrap_or_default();
+            (number, field_shape(field))
+        });
+        let shape = Shape {
+            size: struct_size(message, &messages, 0),
+            fields: fields.collect(),
+        };
+        (name.clone(), shape)
+    };
+    messages.iter().map(shape).collect()
+}
+
+fn field_shape(field: &FieldDescriptorProto) -> Field {
+    let content = match field.r#type() {
+        Type::Message | Type::Group => {
+            Content::Message(field.type_name().trim_start_matches('.').to_owned())
+        }
+        Type::String | Type::Bytes => Content::Bytes,
+        // A number of one byte on the wire, and of eight in memory.
+        Type::Int64 | Type::Uint64 | Type::Sint64 => Content::Numbers { growth: 8 },
+        Type::Int32 | Type::Uint32 | Type::Sint32 | Type::Enum => Content::Numbers { growth: 4 },
+        _ => Content::Numbers { growth: 1 },
+    };
+
+    Field {
+        is_list: field.label() == Label::Repeated,
+        content,
+    }
+}
+
+/// The size of a message's struct. Messages hold one another directly and never themselves.
+fn struct_size(
+    message: &DescriptorProto,
+    messages: &HashMap<String, DescriptorProto>,
+    depth: usize,
+) -> usize {
+    const DEEPEST: usize = 32;
+
+    let size = |field: &FieldDescriptorProto| match field.r#type() {
+        _ if field.label() == Label::Repeated => LIST,
+        Type::String | Type::Bytes => LIST,
+        Type::Message if depth < DEEPEST => {
+            let inner = messages.get(field.type_name().trim_start_matches('.'));
+            MARK + inner.map_or(LIST, |inner| struct_size(inner, messages, depth + 1))
+        }
+        _ => NUMBER,
+    };
+    message.field.iter().map(size).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use seese3_client::proto::v1 as pb;
+
+    const NAVIGATE: &str = "/seese3.v1.NavigationService/Navigate";
+    const BATCH: &str = "/seese3.v1.NavigationService/BatchNavigate";
+
+    /// Oracle: the sizes of the structs in this build. A struct is no larger than computed.
+    #[test]
+    fn structs_are_no_larger_than_computed() {
+        for (name, size) in [
+            ("NavigateRequest", size_of::<pb::NavigateRequest>()),
+            ("View", size_of::<pb::View>()),
+            ("Twist", size_of::<pb::Twist>()),
+            ("Prediction", size_of::<pb::Prediction>()),
+            ("EvaluateRequest", size_of::<pb::EvaluateRequest>()),
+            ("TrackRequest", size_of::<pb::TrackRequest>()),
+            ("CreateRoomRequest", size_of::<pb::CreateRoomRequest>()),
+        ] {
+            let computed = MESSAGES[&format!("seese3.v1.{name}")].size;
+            assert!(
+                (size..=4 * size).contains(&computed),
+                "{name}: {computed} for {size}"
+            );
+        }
+    }
+
+    /// Oracle: by hand: the list of an empty batch of N requests has N structs.
+    #[test]
+    fn what_grows_when_it_is_decoded_counts_as_grown() {
+        let batch = pb::BatchNavigateRequest {
+            requests: vec![pb::NavigateRequest::default(); 1_000],
+        };
+        let message = batch.encode_to_vec();
+        assert_eq!(message.len(), 2_000);
+        assert!(decoded_size(BATCH, &message) >= 1_000 * size_of::<pb::NavigateRequest>());
+
+        // Packed numbers of one byte become eight.
+        let feature = pb::Feature {
+            values: vec![1.0; 1_000],
+            source_name: String::new(),
+        };
+        let request = pb::NavigateRequest {
+            source: Some(pb::View {
+                view: Some(pb::view::View::Feature(feature)),
+            }),
+            ..pb::NavigateRequest::default()
+        };
+        let size = decoded_size(NAVIGATE, &request.encode_to_vec());
+        assert!((4_000..20_000).contains(&size), "{size}");
+    }
+
+    /// Oracle: nothing that a caller can send may stop the computation.
+    #[test]
+    fn bytes_that_are_no_message_are_passed_over() {
+        let twist = pb::Twist::default().encode_to_vec();
+        for bytes in [
+            &[0xff; 40][..],
+            &[0x0a, 0xff, 0xff, 0xff, 0xff, 0x0f],
+            &[0x0b, 0x0c],
+            &[],
+            &twist,
+        ] {
+            assert!(decoded_size(BATCH, bytes) < 100_000);
+        }
+        assert_eq!(decoded_size("/other/Service", &[1, 2, 3]), 3);
+    }
+}

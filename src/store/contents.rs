@@ -1,0 +1,173 @@
+//! What is in a store, revision by revision.
+
+use super::defaults::Defaults;
+use super::format::{AdapterBody, RoomBody};
+use super::{Error, Kind, ResourceName, Store, folder_of};
+
+/// A room or an adapter with all its revisions.
+#[derive(Debug, Clone)]
+pub struct Contents {
+    /// Its name, without a revision.
+    pub resource: ResourceName,
+    /// The revision that the name alone means.
+    pub current: u64,
+    /// Whether an operator chose that; otherwise it is the newest.
+    pub is_chosen: bool,
+    /// The adapter that an operator chose for this room.
+    pub default_adapter: Option<String>,
+    /// Every revision, in ascending order.
+    pub revisions: Vec<RevisionContents>,
+}
+
+/// One revision, read from its manifest alone.
+#[derive(Debug, Clone)]
+pub struct RevisionContents {
+    /// Counted from 1.
+    pub revision: u64,
+    /// What the manifest says; why it cannot be read, if it cannot.
+    pub manifest: Result<ManifestSummary, String>,
+}
+
+/// What a manifest says.
+#[derive(Debug, Clone)]
+pub struct ManifestSummary {
+    /// When it was published, RFC 3339.
+    pub created: String,
+    /// The size of its objects, bytes. Revisions may share objects.
+    pub bytes: u64,
+    /// A few words on the content.
+    pub about: String,
+}
+
+impl Store {
+    /// Everything in the store: rooms, then adapters, each sorted by name.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if the store cannot be read, otherwise as [`Store::defaults`]. A manifest that
+    /// is damaged is no error: its revision says so.
+    pub async fn contents(&self) -> Result<Vec<Contents>, Error> {
+        let defaults = self.defaults().await?;
+        let mut contents = Vec::new();
+
+        for kind in Kind::ALL {
+            for (name, numbers) in self.numbered(kind).await? {
+                let resource = ResourceName {
+                    kind,
+                    name,
+                    revision: None,
+                };
+                contents.push(
+                    self.contents_with(resource, numbers.present, &defaults)
+                        .await?,
+                );
+            }
+        }
+
+        Ok(contents)
+    }
+
+    /// One room or adapter.
+    ///
+    /// # Errors
+    /// As [`Store::contents`]; [`Error::Unknown`] or [`Error::UnknownRevision`] if it is not there.
+    pub async fn contents_of(&self, resource: &ResourceName) -> Result<Contents, Error> {
+        self.check_exists(resource).await?;
+        let folder = folder_of(resource.kind, &resource.name);
+        let present = self.revisions(&folder).await?.present;
+        let whole = ResourceName {
+            revision: None,
+            ..resource.clone()
+        };
+        let mut contents = self
+            .contents_with(whole, present, &self.defaults().await?)
+            .await?;
+
+        contents.revisions.retain(|held| {
+            resource
+                .revision
+                .is_none_or(|revision| held.revision == revision)
+        });
+        Ok(contents)
+    }
+
+    async fn contents_with(
+        &self,
+        resource: ResourceName,
+        present: Vec<u64>,
+        defaults: &Defaults,
+    ) -> Result<Contents, Error> {
+        let folder = folder_of(resource.kind, &resource.name);
+        let chosen = defaults.revision(resource.kind, &resource.name);
+        let newest = present.last().copied().unwrap_or_default();
+        let mut revisions = Vec::with_capacity(present.len());
+
+        for revision in present {
+            let summary = match resource.kind {
+                Kind::Room => {
+                    let body = self.room_body(&folder, revision).await;
+                    body.map(|body| room_summary(&body))
+                }
+                Kind::Adapter => {
+                    let body = self.adapter_body(&folder, revision).await;
+                    body.map(|body| adapter_summary(&body))
+                }
+            };
+            let manifest = match summary {
+                Ok(summary) => Ok(summary),
+                Err(error @ (Error::Damaged { .. } | Error::Schema { .. })) => {
+                    Err(error.to_string())
+                }
+                Err(error) => return Err(error),
+            };
+            revisions.push(RevisionContents { revision, manifest });
+        }
+
+        let default_adapter = match resource.kind {
+            Kind::Room => defaults.adapter(&resource.name).map(str::to_owned),
+            Kind::Adapter => None,
+        };
+
+        Ok(Contents {
+            resource,
+            current: chosen.unwrap_or(newest),
+            is_chosen: chosen.is_some(),
+            default_adapter,
+            revisions,
+        })
+    }
+}
+
+fn room_summary(body: &RoomBody) -> ManifestSummary {
+    let features: Vec<&str> = body
+        .features
+        .iter()
+        .map(|entry| entry.source.name())
+        .collect();
+    let features = match features.as_slice() {
+        [] => "no features".to_owned(),
+        names => names.join(", "),
+    };
+
+    ManifestSummary {
+        created: body.created.clone(),
+        bytes: body.objects().map(|object| object.bytes).sum(),
+        about: format!("{} frames, {features}", body.frame_count),
+    }
+}
+
+fn adapter_summary(body: &AdapterBody) -> ManifestSummary {
+    let features = body.source.name();
+    let about = match &body.fitted_to {
+        Some(fit) => format!(
+            "for {features}, fitted to rooms/{}/revisions/{}",
+            fit.room, fit.room_revision
+        ),
+        None => format!("for {features}"),
+    };
+
+    ManifestSummary {
+        created: body.created.clone(),
+        bytes: body.objects().map(|object| object.bytes).sum(),
+        about,
+    }
+}

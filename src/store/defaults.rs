@@ -1,0 +1,271 @@
+//! Which revision of a room or adapter is meant by its name alone, and which adapter answers in a
+//! room when a request names none.
+//!
+//! All choices of a store are one file, `defaults/000001.json`. A change writes the next number and
+//! keeps the files before it, so that the last change can be taken back.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use object_store::path::Path;
+use serde::{Deserialize, Serialize};
+
+use super::manifest::{self, SCHEMA};
+use super::{ATTEMPTS, Error, Kind, ResourceName, Store, manifest_name};
+
+const FOLDER: &str = "defaults";
+
+/// The choices of an operator. What is not chosen is the newest.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Defaults {
+    /// Revisions of rooms, by the room's name.
+    #[serde(default)]
+    room_revisions: BTreeMap<String, u64>,
+    /// Revisions of adapters, by the adapter's name.
+    #[serde(default)]
+    adapter_revisions: BTreeMap<String, u64>,
+    /// Adapters, by the name of the room in which they answer by default.
+    #[serde(default)]
+    adapters: BTreeMap<String, String>,
+}
+
+/// The file of all choices.
+#[derive(Debug, Serialize, Deserialize)]
+struct Body {
+    schema: u64,
+    /// The number in the file's name.
+    number: u64,
+    /// When it was written, RFC 3339.
+    created: String,
+    defaults: Defaults,
+}
+
+/// One choice.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Choice {
+    /// This revision is meant by the name alone. The name has a revision.
+    Revision(ResourceName),
+    /// This adapter answers in this room when a request names none.
+    Adapter {
+        /// The name of the room.
+        room: String,
+        /// The name of the adapter.
+        adapter: String,
+    },
+    /// Nothing is chosen for this room or adapter any more.
+    Nothing(ResourceName),
+}
+
+impl Defaults {
+    /// The revision that the name alone means, if one is chosen.
+    pub fn revision(&self, kind: Kind, name: &str) -> Option<u64> {
+        self.revisions(kind).get(name).copied()
+    }
+
+    /// The adapter that answers in a room when a request names none, if one is chosen.
+    pub fn adapter(&self, room: &str) -> Option<&str> {
+        self.adapters.get(room).map(String::as_str)
+    }
+
+    /// The rooms and adapters for which anything is chosen; rooms first, each sorted by name.
+    pub fn chosen(&self) -> Vec<ResourceName> {
+        let rooms: BTreeSet<&String> = self
+            .room_revisions
+            .keys()
+            .chain(self.adapters.keys())
+            .collect();
+        let rooms = rooms.into_iter().map(ResourceName::room);
+        let adapters = self.adapter_revisions.keys().map(ResourceName::adapter);
+        rooms.chain(adapters).collect()
+    }
+
+    /// The rooms in which an adapter answers by default.
+    pub fn rooms_of<'a>(&'a self, adapter: &'a str) -> impl Iterator<Item = &'a str> {
+        let is_chosen = move |entry: &(&'a String, &'a String)| entry.1 == adapter;
+        let rooms = self.adapters.iter().filter(is_chosen);
+        rooms.map(|(room, _)| room.as_str())
+    }
+
+    /// Everything that the choices name.
+    pub(super) fn named(&self) -> Vec<ResourceName> {
+        let mut named: Vec<ResourceName> = Vec::new();
+        for kind in Kind::ALL {
+            let resource = |(name, revision): (&String, &u64)| ResourceName {
+                kind,
+                name: name.clone(),
+                revision: Some(*revision),
+            };
+            named.extend(self.revisions(kind).iter().map(resource));
+        }
+        for (room, adapter) in &self.adapters {
+            named.push(ResourceName::room(room));
+            named.push(ResourceName::adapter(adapter));
+        }
+
+        named
+    }
+
+    fn revisions(&self, kind: Kind) -> &BTreeMap<String, u64> {
+        match kind {
+            Kind::Room => &self.room_revisions,
+            Kind::Adapter => &self.adapter_revisions,
+        }
+    }
+
+    fn with(&self, choice: &Choice) -> Self {
+        let mut changed = self.clone();
+        let revisions = |defaults: &mut Self, kind, name: &str, revision: Option<u64>| {
+            let revisions = match kind {
+                Kind::Room => &mut defaults.room_revisions,
+                Kind::Adapter => &mut defaults.adapter_revisions,
+            };
+            match revision {
+                Some(revision) => revisions.insert(name.to_owned(), revision),
+                None => revisions.remove(name),
+            };
+        };
+
+        match choice {
+            Choice::Revision(resource) => {
+                revisions(
+                    &mut changed,
+                    resource.kind,
+                    &resource.name,
+                    resource.revision,
+                );
+            }
+            Choice::Adapter { room, adapter } => {
+                changed.adapters.insert(room.clone(), adapter.clone());
+            }
+            Choice::Nothing(resource) => {
+                revisions(&mut changed, resource.kind, &resource.name, None);
+                if resource.kind == Kind::Room {
+                    changed.adapters.remove(&resource.name);
+                }
+            }
+        }
+
+        changed
+    }
+}
+
+impl Store {
+    /// The choices that hold now.
+    ///
+    /// # Errors
+    /// [`Error::Damaged`] if their file is truncated or altered, [`Error::Schema`] if a newer
+    /// program wrote it, [`Error::Io`] if the store cannot be read.
+    pub async fn defaults(&self) -> Result<Defaults, Error> {
+        Ok(self.numbered_defaults().await?.1)
+    }
+
+    /// Whether a choice can be made.
+    ///
+    /// # Errors
+    /// [`Error::Unknown`] or [`Error::UnknownRevision`] if what is chosen is not in the store,
+    /// [`Error::Io`] if it cannot be read.
+    pub async fn check_choice(&self, choice: &Choice) -> Result<(), Error> {
+        match choice {
+            Choice::Revision(resource) => self.check_exists(resource).await,
+            Choice::Adapter { room, adapter } => {
+                self.check_exists(&ResourceName::room(room)).await?;
+                self.check_exists(&ResourceName::adapter(adapter)).await
+            }
+            Choice::Nothing(_) => Ok(()),
+        }
+    }
+
+    /// Makes a choice. Choosing again what holds already changes nothing.
+    ///
+    /// # Errors
+    /// As [`Store::check_choice`] and [`Store::defaults`]; [`Error::Contended`] if others changed the
+    /// choices all the time.
+    pub async fn choose(&self, choice: &Choice) -> Result<Defaults, Error> {
+        self.check_choice(choice).await?;
+
+        for _ in 0..ATTEMPTS {
+            let (number, defaults) = self.numbered_defaults().await?;
+            let changed = defaults.with(choice);
+            if changed == defaults || self.write_defaults(number + 1, &changed).await? {
+                return Ok(changed);
+            }
+        }
+
+        Err(contended())
+    }
+
+    /// Takes the last change of the choices back: those before it hold again. Done twice, the change
+    /// holds again.
+    ///
+    /// # Errors
+    /// [`Error::NothingToTakeBack`] if nothing was ever chosen; [`Error::Unknown`] or
+    /// [`Error::UnknownRevision`] if what was chosen before is gone; otherwise as [`Store::choose`].
+    pub async fn take_back_choice(&self) -> Result<Defaults, Error> {
+        for _ in 0..ATTEMPTS {
+            let (number, _) = self.numbered_defaults().await?;
+            let before = match number {
+                0 => return Err(Error::NothingToTakeBack),
+                1 => Defaults::default(),
+                _ => self.read_defaults(number - 1).await?,
+            };
+
+            for resource in before.named() {
+                self.check_exists(&resource).await?;
+            }
+            if self.write_defaults(number + 1, &before).await? {
+                return Ok(before);
+            }
+        }
+
+        Err(contended())
+    }
+
+    /// The choices that hold now, with the number of their file; 0 if nothing was ever chosen.
+    async fn numbered_defaults(&self) -> Result<(u64, Defaults), Error> {
+        match self.numbered_files(&Path::from(FOLDER)).await?.highest {
+            0 => Ok((0, Defaults::default())),
+            number => Ok((number, self.read_defaults(number).await?)),
+        }
+    }
+
+    async fn read_defaults(&self, number: u64) -> Result<Defaults, Error> {
+        let path = Path::from(FOLDER).join(manifest_name(number));
+        let file = self.shown(&path);
+        let body: Body = manifest::decode(&file, &self.read(&path).await?)?;
+        if body.number != number {
+            let problem = format!("says it is number {}: it was moved or copied", body.number);
+            return Err(Error::Damaged { file, problem });
+        }
+
+        Ok(body.defaults)
+    }
+
+    /// Writes the choices unless the number is taken. Returns whether they were written.
+    async fn write_defaults(&self, number: u64, defaults: &Defaults) -> Result<bool, Error> {
+        let path = Path::from(FOLDER).join(manifest_name(number));
+        let body = Body {
+            schema: SCHEMA,
+            number,
+            created: chrono::Utc::now().to_rfc3339(),
+            defaults: defaults.clone(),
+        };
+
+        self.write_new(&path, manifest::encode(&self.shown(&path), &body)?)
+            .await
+    }
+
+    /// Refuses what is not in the store.
+    pub(super) async fn check_exists(&self, resource: &ResourceName) -> Result<(), Error> {
+        let ResourceName {
+            kind,
+            name,
+            revision,
+        } = resource;
+        self.published(*kind, name, *revision).await.map(drop)
+    }
+}
+
+fn contended() -> Error {
+    Error::Contended {
+        name: FOLDER.to_owned(),
+    }
+}

@@ -1,0 +1,152 @@
+//! What requests may hold in memory: bodies that never arrive, messages that grow when they are
+//! decoded, answers that are too large.
+
+use std::time::Duration;
+
+use seese3::service::{Config, Metrics};
+use seese3_client::proto::v1 as pb;
+use tokio::io::AsyncWriteExt;
+use tokio::net::TcpStream;
+use tonic::Code;
+
+use crate::harness::{question, start};
+
+/// The memory that is held, as the metrics say.
+fn held(metrics: &Metrics) -> u64 {
+    let text = metrics.text();
+    let line = text
+        .lines()
+        .find_map(|line| line.strip_prefix("seese3_memory_held_bytes "));
+    line.unwrap().parse().unwrap()
+}
+
+/// Waits until as much is held as wanted.
+async fn until_held(metrics: &Metrics, is_wanted: impl Fn(u64) -> bool) -> u64 {
+    for _ in 0..2_000 {
+        let now = held(metrics);
+        if is_wanted(now) {
+            return now;
+        }
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    panic!("{} bytes are held", held(metrics));
+}
+
+fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
+    let mut frame = (payload.len() as u32).to_be_bytes()[1..].to_vec();
+    frame.extend([kind, flags]);
+    frame.extend(stream.to_be_bytes());
+    frame.extend(payload);
+    frame
+}
+
+/// The headers of a call of Navigate in the literal form of HPACK (RFC 7541, section 6.2.2).
+fn headers() -> Vec<u8> {
+    let literal = |name: &[u8], value: &str| {
+        let mut field = name.to_vec();
+        field.push(value.len() as u8);
+        field.extend(value.as_bytes());
+        field
+    };
+
+    [
+        // POST and http stand in the static table.
+        vec![0x83, 0x86],
+        literal(&[0x04], "/seese3.v1.NavigationService/Navigate"),
+        literal(&[0x01], "test"),
+        literal(&[0x0f, 0x10], "application/grpc"),
+        literal(&[0x00, 2, b't', b'e'], "trailers"),
+    ]
+    .concat()
+}
+
+/// A connection with this many calls, each of which has sent these bytes of its body and says no
+/// more.
+async fn silent_calls(address: &str, count: u32, body: &[u8]) -> TcpStream {
+    let mut stream = TcpStream::connect(address).await.unwrap();
+    let mut bytes = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec();
+    bytes.extend(frame(4, 0, 0, &[]));
+    for call in 0..count {
+        let id = 2 * call + 1;
+        bytes.extend(frame(1, 4, id, &headers()));
+        if !body.is_empty() {
+            bytes.extend(frame(0, 0, id, body));
+        }
+    }
+
+    stream.write_all(&bytes).await.unwrap();
+    stream
+}
+
+/// Oracle: the bound and the time limit themselves.
+#[tokio::test]
+async fn bodies_that_never_arrive_hold_little_and_not_for_long() {
+    let metrics = Metrics::default();
+    let server = start(Config {
+        memory_bytes: 2 << 20,
+        receive_within: Duration::from_secs(2),
+        metrics: metrics.clone(),
+        ..Config::default()
+    })
+    .await;
+    assert_eq!(until_held(&metrics, |held| held == 0).await, 0);
+
+    // A call counts for 16 KiB and what it has sent.
+    let ten = silent_calls(&server.address, 10, &[0; 1_000]).await;
+    let expected = 10 * ((16 << 10) + 1_000);
+    until_held(&metrics, |held| held == expected).await;
+
+    // As many as fit: a further call is refused, and is answered when they have been given up.
+    let many = silent_calls(&server.address, 200, &[]).await;
+    until_held(&metrics, |held| held > (2 << 20) - (17 << 10)).await;
+    let refused = server.client.navigate(question()).await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::ResourceExhausted));
+
+    until_held(&metrics, |held| held == 0).await;
+    assert!(server.client.navigate(question()).await.is_ok());
+
+    drop((ten, many));
+    until_held(&metrics, |held| held == 0).await;
+}
+
+/// Oracle: by hand: two bytes for each request of a batch are hundreds when it is decoded.
+#[tokio::test]
+async fn a_message_that_grows_when_it_is_decoded_is_refused_before() {
+    let metrics = Metrics::default();
+    let server = start(Config {
+        metrics: metrics.clone(),
+        ..Config::default()
+    })
+    .await;
+
+    let empty = vec![pb::NavigateRequest::default(); 2_000_000];
+    let refused = server.client.batch_navigate(empty).await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::InvalidArgument), "{refused}");
+    assert_eq!(refused.field().as_deref(), Some("request"));
+
+    // A batch of the largest size is small beside that.
+    let batch = vec![question(); 256];
+    let answers = server.client.batch_navigate(batch).await.unwrap();
+    assert_eq!(answers.len(), 256);
+    until_held(&metrics, |held| held == 0).await;
+}
+
+/// Oracle: the bound itself.
+#[tokio::test]
+async fn an_answer_that_finds_no_memory_is_refused() {
+    let server = start(Config {
+        memory_bytes: 300_000,
+        ..Config::default()
+    })
+    .await;
+    assert!(server.client.navigate(question()).await.is_ok());
+
+    let large = pb::NavigateRequest {
+        steps: Some(100),
+        top_k: Some(100),
+        ..question()
+    };
+    let refused = server.client.navigate(large).await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::ResourceExhausted));
+    assert!(server.client.navigate(question()).await.is_ok());
+}
