@@ -50,6 +50,11 @@ def message_lines(message, path, said):
     if not fields:
         return
     oneofs = [oneof["name"] for oneof in message.get("oneofDecl", [])]
+    for index, oneof in enumerate(oneofs):
+        words = one_line(said.get((*path, 8, index), ""))
+        if words:
+            yield f"`{oneof}`: {words}"
+            yield ""
     yield "| field | type | meaning |"
     yield "| --- | --- | --- |"
     for index, field in enumerate(fields):

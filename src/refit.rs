@@ -130,7 +130,7 @@ impl Refit {
     /// Publishes what was fitted.
     ///
     /// # Errors
-    /// [`Error::Store`] if it cannot be written.
+    /// [`Error::Taken`] if somebody else has taken the name, [`Error::Store`] if it cannot be written.
     pub async fn publish(&self, store: &Store, fitted: &Fitted) -> Result<Published, Error> {
         let room_fit = RoomFit {
             room: self.stored.room.id().clone(),
@@ -141,6 +141,9 @@ impl Refit {
             }),
             rules: fitted.rules.clone(),
         };
+
+        // The fit took minutes, in which somebody else may have taken the name.
+        check_name(store, &self.name, self.stored.room.id()).await?;
 
         let features = self.features.rows();
         Ok(store

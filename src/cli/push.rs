@@ -21,7 +21,7 @@ pub struct Push {
     /// The store: a folder, or a bucket by its URL
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// Its name on the server, if it is another one
+    /// The name on the server; the same if omitted
     #[arg(long = "as", value_name = "NAME")]
     renamed: Option<String>,
     /// Only let the server check it

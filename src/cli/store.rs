@@ -204,7 +204,8 @@ impl Default {
         };
 
         Ok(Some(match (&self.adapter, name.kind, name.revision) {
-            (None, _, _) if self.unset => Choice::Nothing(name.clone()),
+            (None, _, None) if self.unset => Choice::Nothing(name.clone()),
+            (None, _, Some(_)) if self.unset => bail!("--unset takes a name without a revision"),
             (None, _, Some(_)) => Choice::Revision(name.clone()),
             (Some(adapter), Kind::Room, None)
                 if adapter.kind == Kind::Adapter && adapter.revision.is_none() =>
@@ -342,7 +343,7 @@ fn headline(held: &Contents) -> String {
     let count = held.revisions.len();
 
     format!(
-        "{}  revision {} of {count}{chosen}{adapter}",
+        "{}  revision {}{chosen}, {count} kept{adapter}",
         held.resource, held.current
     )
 }

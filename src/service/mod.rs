@@ -74,6 +74,8 @@ use seese3_core::navigation::{IndexKind, Limits};
 use snapshot::Loader;
 use workers::Workers;
 
+/// What requests of health may hold in memory, bytes.
+const PROBES: usize = 16 << 20;
 /// After the drain time, how long the server still waits for callers to receive the error of their
 /// abandoned requests.
 const LAST_WORDS: Duration = Duration::from_secs(1);
@@ -415,7 +417,7 @@ async fn operate(
 }
 
 fn memory_layer(config: &Config) -> MemoryLayer {
-    let memory = Memory::new(config.memory_bytes);
+    let memory = Memory::new(config.memory_bytes, config.metrics.clone());
     let counted = memory.clone();
     config.metrics.gauge_elsewhere(
         "memory_held_bytes",
@@ -427,7 +429,7 @@ fn memory_layer(config: &Config) -> MemoryLayer {
         memory,
         message_bytes: config.message_bytes,
         receive_within: config.receive_within,
-        metrics: config.metrics.clone(),
+        probes: Memory::new(PROBES, config.metrics.clone()),
     }
 }
 

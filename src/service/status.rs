@@ -36,11 +36,13 @@ pub enum Full {
     Fits,
     /// The memory of requests in progress.
     Memory,
+    /// The changes of the catalog that wait for their turn.
+    Changes,
 }
 
 impl Full {
     /// All of them.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::ShortRequests,
         Self::Images,
         Self::LongRequests,
@@ -51,6 +53,7 @@ impl Full {
         Self::Uploads,
         Self::Fits,
         Self::Memory,
+        Self::Changes,
     ];
 
     /// The words of messages and metrics.
@@ -66,6 +69,7 @@ impl Full {
             Self::Uploads => "bytes of uploads",
             Self::Fits => "fits",
             Self::Memory => "bytes of requests",
+            Self::Changes => "changes",
         }
     }
 }
@@ -99,10 +103,12 @@ pub enum Error {
     Unauthenticated { problem: &'static str },
     #[error("{name}: {problem}")]
     Conflict { name: String, problem: String },
-    #[error("the upload was broken off: {problem}")]
+    #[error("the request could not be received: {problem}")]
     Transport { code: Code, problem: String },
     #[error("the caller has no right to {verb}: the operator gives it in the server's --auth-file")]
     Forbidden { verb: &'static str },
+    #[error("the caller may not change {what}: its rooms stand in the server's --auth-file")]
+    OutOfScope { what: &'static str },
     #[error("the deadline passed before the answer was ready")]
     Deadline,
     #[error("the request was cancelled")]
@@ -200,7 +206,7 @@ impl Error {
             Self::Loading => Code::Unavailable,
             Self::Full { .. } => Code::ResourceExhausted,
             Self::Unauthenticated { .. } => Code::Unauthenticated,
-            Self::Forbidden { .. } => Code::PermissionDenied,
+            Self::Forbidden { .. } | Self::OutOfScope { .. } => Code::PermissionDenied,
             Self::Deadline => Code::DeadlineExceeded,
             Self::Cancelled => Code::Cancelled,
             Self::Internal => Code::Internal,
@@ -218,6 +224,7 @@ impl Error {
             Self::Full { .. } => "BUSY",
             Self::Unauthenticated { .. } => "UNAUTHENTICATED",
             Self::Forbidden { .. } => "FORBIDDEN",
+            Self::OutOfScope { .. } => "OUT_OF_SCOPE",
             Self::Deadline => "DEADLINE",
             Self::Cancelled => "CANCELLED",
             Self::Internal => "INTERNAL",

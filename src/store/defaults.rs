@@ -85,6 +85,28 @@ impl Defaults {
         rooms.map(|(room, _)| room.as_str())
     }
 
+    /// Drops the choices that name something that is gone.
+    fn forget(&mut self, gone: &ResourceName) {
+        let is_gone = |name: &String, revision: u64| {
+            *name == gone.name && gone.revision.is_none_or(|gone| gone == revision)
+        };
+        match gone.kind {
+            Kind::Room => {
+                self.room_revisions.retain(|name, now| !is_gone(name, *now));
+                if gone.revision.is_none() {
+                    self.adapters.remove(&gone.name);
+                }
+            }
+            Kind::Adapter => {
+                self.adapter_revisions
+                    .retain(|name, now| !is_gone(name, *now));
+                if gone.revision.is_none() {
+                    self.adapters.retain(|_, adapter| *adapter != gone.name);
+                }
+            }
+        }
+    }
+
     /// Everything that the choices name.
     pub(super) fn named(&self) -> Vec<ResourceName> {
         let mut named: Vec<ResourceName> = Vec::new();
@@ -193,23 +215,27 @@ impl Store {
         Err(contended())
     }
 
-    /// Takes the last change of the choices back: those before it hold again. Done twice, the change
-    /// holds again.
+    /// Takes the last change of the choices back: those before it hold again, as far as what they name
+    /// is still there. Done twice, the change holds again.
     ///
     /// # Errors
-    /// [`Error::NothingToTakeBack`] if nothing was ever chosen; [`Error::Unknown`] or
-    /// [`Error::UnknownRevision`] if what was chosen before is gone; otherwise as [`Store::choose`].
+    /// [`Error::NothingToTakeBack`] if nothing was ever chosen; otherwise as [`Store::choose`].
     pub async fn take_back_choice(&self) -> Result<Defaults, Error> {
         for _ in 0..ATTEMPTS {
             let (number, _) = self.numbered_defaults().await?;
-            let before = match number {
+            let mut before = match number {
                 0 => return Err(Error::NothingToTakeBack),
                 1 => Defaults::default(),
                 _ => self.read_defaults(number - 1).await?,
             };
 
             for resource in before.named() {
-                self.check_exists(&resource).await?;
+                match self.check_exists(&resource).await {
+                    Err(Error::Unknown { .. } | Error::UnknownRevision { .. }) => {
+                        before.forget(&resource);
+                    }
+                    exists => exists?,
+                }
             }
             if self.write_defaults(number + 1, &before).await? {
                 return Ok(before);

@@ -2,6 +2,7 @@
 //! files that a write left unfinished.
 
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use chrono::{DateTime, Utc};
@@ -11,6 +12,9 @@ use tokio_stream::StreamExt;
 
 use super::format::{AdapterBody, RoomBody};
 use super::{Error, Kind, Store, gone_name, manifest};
+
+/// The folders of a store; what else is beside them belongs to somebody else.
+const STORE_FOLDERS: [&str; 3] = ["rooms", "adapters", "defaults"];
 
 /// What nothing in the store needs.
 #[derive(Debug, Clone, Default)]
@@ -148,8 +152,12 @@ impl Store {
             let file = self.shown(&entry.location);
             let bytes = match self.read(&entry.location).await {
                 Ok(bytes) => bytes,
-                // It was removed since it was listed, and its objects are too young to be looked at.
-                Err(Error::Absent { .. }) => continue,
+                // It was removed since it was listed.
+                Err(Error::Absent { .. }) => match self.read(&gone_path(&entry.location)).await {
+                    Ok(bytes) => bytes,
+                    Err(Error::Absent { .. }) => continue,
+                    Err(error) => return Err(error),
+                },
                 Err(error) => return Err(error),
             };
             let objects: Vec<String> = match kind {
@@ -190,12 +198,22 @@ impl Store {
             cause: error.to_string(),
         };
 
-        let mut folders = vec![root.clone()];
+        // Files that have got their name, or are gone, since they were listed need no care.
+        let is_gone = |error: &std::io::Error| error.kind() == std::io::ErrorKind::NotFound;
+
+        let mut folders: Vec<PathBuf> = STORE_FOLDERS.iter().map(|name| root.join(name)).collect();
         while let Some(folder) = folders.pop() {
-            for entry in std::fs::read_dir(&folder).map_err(|error| io(&folder, error))? {
+            let entries = match std::fs::read_dir(&folder) {
+                Err(error) if is_gone(&error) => continue,
+                entries => entries.map_err(|error| io(&folder, error))?,
+            };
+            for entry in entries {
                 let entry = entry.map_err(|error| io(&folder, error))?;
                 let path = entry.path();
-                let found = entry.metadata().map_err(|error| io(&path, error))?;
+                let found = match entry.metadata() {
+                    Err(error) if is_gone(&error) => continue,
+                    found => found.map_err(|error| io(&path, error))?,
+                };
                 if found.is_dir() {
                     folders.push(path);
                     continue;
@@ -219,4 +237,13 @@ impl Store {
 
         Ok(())
     }
+}
+
+/// Where the manifest is once its revision was removed.
+fn gone_path(manifest: &Path) -> Path {
+    let name = manifest.as_ref();
+    Path::from(format!(
+        "{}.gone",
+        name.strip_suffix(".json").unwrap_or(name)
+    ))
 }

@@ -62,6 +62,11 @@ impl Store {
         let removed = self.check_removable(resource).await?;
         let folder = folder_of(resource.kind, &resource.name);
 
+        // A default that named what is gone would hide what is still there.
+        if resource.revision.is_none() {
+            self.choose(&Choice::Nothing(resource.clone())).await?;
+        }
+
         // The oldest first, so that no older revision is ever taken for the newest.
         for &revision in &removed.revisions {
             let manifest = revision_path(&folder, revision);
@@ -71,10 +76,6 @@ impl Store {
 
             let deleted = self.objects.delete(&manifest).await;
             deleted.map_err(|error| self.io(&manifest, &error))?;
-        }
-
-        if resource.revision.is_none() {
-            self.choose(&Choice::Nothing(resource.clone())).await?;
         }
 
         Ok(removed)

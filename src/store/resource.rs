@@ -88,8 +88,8 @@ impl fmt::Display for ResourceName {
 /// Text that names nothing in a store.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{text:?} is not a resource name; write rooms/NAME or adapters/NAME, where one revision is meant followed by \
-     /revisions/NUMBER"
+    "{text:?} is not a resource name; write rooms/NAME or adapters/NAME; add /revisions/NUMBER to \
+     name one revision"
 )]
 pub struct ResourceNameError {
     text: String,

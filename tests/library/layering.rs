@@ -61,7 +61,7 @@ const CRATES: [CrateRules; 4] = [
                 &["datasets", "encoder", "store", "service", "cli"],
             ),
             ("std::env", &["cli"]),
-            ("std::time", &["service", "cli", "main"]),
+            ("std::time", &["store", "service", "cli", "main"]),
             ("object_store", &["store"]),
             ("serde", &["datasets", "encoder", "store", "service", "cli"]),
             ("toml", &["encoder", "service", "cli"]),

@@ -310,6 +310,7 @@ async fn unfit_uploads_are_refused_and_leave_nothing() {
             vec![messages[0].clone(), pb::CreateRoomRequest { message: None }],
             "message",
         ),
+        ([&messages[..], &messages[1..2]].concat(), "message"),
     ] {
         let answer = server.client.create_room(tokio_stream::iter(sent)).await;
         assert_eq!(
@@ -428,6 +429,8 @@ async fn defaults_are_chosen_and_taken_back() {
     );
     assert_eq!(answering().await, "trial");
 
+    assert_eq!(choose(None).await.unwrap(), []);
+    choose(adapter("adapters/trial")).await.unwrap();
     choose(adapter("adapters/oracle")).await.unwrap();
     assert_eq!(answering().await, "oracle");
     let room = server.client.room("synthetic").await.unwrap().unwrap();
@@ -452,7 +455,8 @@ async fn defaults_are_chosen_and_taken_back() {
     assert_eq!(rolled_back[0].adapter, "adapters/trial");
     assert_eq!(answering().await, "trial");
 
-    // Nothing chosen: the newest.
+    // Nothing chosen: the newest, and not what was chosen last.
+    choose(adapter("adapters/oracle")).await.unwrap();
     assert!(choose(None).await.unwrap().is_empty());
     assert_eq!(answering().await, "trial");
     assert_eq!(delete("adapters/trial").await.unwrap(), [1]);
@@ -717,4 +721,65 @@ async fn only_those_who_may_change_what_they_may() {
         };
         assert_eq!(code, expected, "{caller}");
     }
+}
+
+/// Oracle: the bound on waiting changes: each is made or refused as one too many, and the server goes
+/// on. More than one blocking thread each would be more than there are.
+#[tokio::test]
+async fn many_changes_at_once_are_made_or_refused() {
+    let (server, store) = start_writable().await;
+    let mut changes = tokio::task::JoinSet::new();
+
+    for number in 0..600 {
+        let client = server.client.clone();
+        changes.spawn(async move {
+            let default = match number % 2 {
+                0 => None,
+                _ => Some(pb::set_default_request::Default::Revision(1)),
+            };
+            let request = pb::SetDefaultRequest {
+                name: "rooms/synthetic".to_owned(),
+                default,
+                ..pb::SetDefaultRequest::default()
+            };
+            match client.set_default(request).await {
+                Ok(_) => Code::Ok,
+                Err(error) => error.code().unwrap(),
+            }
+        });
+    }
+
+    let codes = changes.join_all().await;
+    let count = |code: Code| codes.iter().filter(|found| **found == code).count();
+    assert_eq!(count(Code::Ok) + count(Code::ResourceExhausted), 600);
+    assert!(count(Code::Ok) >= 64, "{} were made", count(Code::Ok));
+
+    assert!(server.client.navigate(question()).await.is_ok());
+    assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+}
+
+/// Oracle: the promise: a change that was admitted is made, whoever waits for it, and the same change
+/// that is sent again meanwhile is the same change.
+#[tokio::test]
+async fn a_caller_that_goes_away_leaves_its_change() {
+    let (server, store) = start_writable().await;
+    let upload = || {
+        let mut upload = Upload::synthetic("rooms/left");
+        upload.spec.request_id = "left".to_owned();
+        upload
+    };
+
+    let client = server.client.clone();
+    let leaving = tokio::spawn(async move { upload().send(&client).await });
+    let both = Upload::synthetic("rooms/left");
+    let sent_again = {
+        let mut again = both;
+        again.spec.request_id = "left".to_owned();
+        again.send(&server.client).await.unwrap()
+    };
+    leaving.abort();
+    let _ = leaving.await;
+
+    assert_eq!(sent_again.revision.unwrap().revision, 1);
+    assert_eq!(store.load_room("left", None).await.unwrap().revision, 1);
 }

@@ -40,6 +40,14 @@ fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
     frame
 }
 
+/// A message with its prefix, as gRPC has it in a body.
+fn prefixed(message: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![0];
+    bytes.extend((message.len() as u32).to_be_bytes());
+    bytes.extend(message);
+    bytes
+}
+
 /// The headers of a call of Navigate in the literal form of HPACK (RFC 7541, section 6.2.2).
 fn headers() -> Vec<u8> {
     let literal = |name: &[u8], value: &str| {
@@ -149,4 +157,28 @@ async fn an_answer_that_finds_no_memory_is_refused() {
     let refused = server.client.navigate(large).await.unwrap_err();
     assert_eq!(refused.code(), Some(Code::ResourceExhausted));
     assert!(server.client.navigate(question()).await.is_ok());
+}
+
+/// Oracle: gRPC: a request of one message has one message. What is behind it is not decoded.
+#[tokio::test]
+async fn a_second_message_is_not_decoded() {
+    let metrics = Metrics::default();
+    let server = start(Config {
+        metrics: metrics.clone(),
+        ..Config::default()
+    })
+    .await;
+
+    let two = [prefixed(&[]), prefixed(&[0; 50_000])].concat();
+    let mut stream = silent_calls(&server.address, 1, &[]).await;
+    for part in two.chunks(10_000) {
+        stream.write_all(&frame(0, 0, 1, part)).await.unwrap();
+    }
+    until_held(&metrics, |held| held > 50_000).await;
+    stream.write_all(&frame(0, 1, 1, &[])).await.unwrap();
+
+    // It is refused, and nothing of it is held any more.
+    until_held(&metrics, |held| held == 0).await;
+    let refused = r#"method="/seese3.v1.NavigationService/Navigate",code="INVALID_ARGUMENT"} 1"#;
+    assert!(metrics.text().contains(refused), "{}", metrics.text());
 }

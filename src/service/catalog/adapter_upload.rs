@@ -8,8 +8,8 @@ use tonic::Streaming;
 use super::super::auth::Principal;
 use super::super::{Error, Handlers};
 use super::changes::{check_right, identity, named_whole, revision_to_wire};
-use super::room_upload::next;
-use crate::store::{self, Kind};
+use super::room_upload::{expect_end, next};
+use crate::store::{self, Kind, Published};
 use seese3_client::proto::v1 as pb;
 
 impl Handlers {
@@ -37,26 +37,8 @@ impl Handlers {
         // The manifest says how much is coming, so that no more is ever held than that.
         let size = store::stated_weights_size(&upload.manifest).map_err(unfit)?;
         let size = usize::try_from(size).unwrap_or(usize::MAX);
-        let _memory = self.upload_room(size)?;
-        let mut weights = Vec::new();
-        while weights.len() < size {
-            match next(&mut messages, "weights").await?.message {
-                Some(Wire::Weights(part)) if part.len() <= size - weights.len() => {
-                    weights.extend(part);
-                }
-                Some(Wire::Weights(_)) => {
-                    let problem =
-                        format!("are longer than the {size} bytes that the manifest states");
-                    return Err(Error::invalid("weights", problem));
-                }
-                _ => {
-                    return Err(Error::invalid(
-                        "weights",
-                        "are required after the first message",
-                    ));
-                }
-            }
-        }
+        let memory = changes.upload_memory(size)?;
+        let weights = weights(&mut messages, size).await?;
 
         // Loading proves that the weights give their golden outputs on this machine.
         let manifest = upload.manifest.clone();
@@ -75,25 +57,57 @@ impl Handlers {
             "PublishAdapter",
             &content,
         );
-        let handlers = self.clone();
-        let made = async move {
-            let changes = handlers.changes()?;
-            let published = changes
-                .store
+        let store = changes.store.clone();
+        let published_as = name.name.clone();
+        let change = async move {
+            // What was uploaded counts until it is in the store.
+            let _memory = memory;
+            store
                 .publish_adapter_files(&name.name, &upload.manifest, weights)
                 .await
-                .map_err(unfit)?;
-            changes.look().await;
-
-            let revision = revision_to_wire(&name.name, &published);
-            Ok(pb::PublishAdapterResponse {
+                .map_err(unfit)
+        };
+        let handlers = self.clone();
+        let answer = move |published: Published| {
+            let revision = revision_to_wire(&published_as, &published);
+            pb::PublishAdapterResponse {
                 served: handlers.serves(Kind::Adapter, &revision),
                 created: published.is_new,
                 revision: Some(revision),
-            })
+            }
         };
-        changes.once(identity, made).await
+        changes.once(identity, change, answer).await
     }
+}
+
+/// The weights, of which the manifest states the size.
+async fn weights(
+    messages: &mut Streaming<pb::PublishAdapterRequest>,
+    size: usize,
+) -> Result<Vec<u8>, Error> {
+    use pb::publish_adapter_request::Message as Wire;
+
+    let mut weights = Vec::new();
+    while weights.len() < size {
+        match next(messages, "weights").await?.message {
+            Some(Wire::Weights(part)) if part.len() <= size - weights.len() => {
+                weights.extend(part);
+            }
+            Some(Wire::Weights(_)) => {
+                let problem = format!("are longer than the {size} bytes that the manifest states");
+                return Err(Error::invalid("weights", problem));
+            }
+            _ => {
+                return Err(Error::invalid(
+                    "weights",
+                    "are required after the first message",
+                ));
+            }
+        }
+    }
+
+    expect_end(messages).await?;
+    Ok(weights)
 }
 
 /// What is wrong with an uploaded adapter is the caller's to mend.

@@ -7,8 +7,10 @@ use std::sync::Arc;
 use prost::Message;
 use sha2::{Digest, Sha256};
 use tokio::sync::{Mutex, OwnedSemaphorePermit, Semaphore};
+use tracing::Instrument;
 
 use super::super::auth::Principal;
+use super::super::metrics::Metrics;
 use super::super::reload::Looks;
 use super::super::snapshot::Snapshot;
 use super::super::status::Full;
@@ -20,15 +22,21 @@ use seese3_client::proto::v1 as pb;
 
 /// Uploads are counted in pieces of this many bytes.
 const PIECE: usize = 1_024;
+/// The largest number of changes that wait for their turn.
+const MOST_WAITING: usize = 64;
 
 /// What changes of the catalog share.
 pub struct Changes {
     pub store: Store,
     looks: Looks,
     recent: Arc<Mutex<Recent>>,
+    /// Changes that may wait for their turn.
+    waiting: Arc<Semaphore>,
     /// The pieces that uploads may hold in memory together.
+    upload_pieces: usize,
     uploads: Arc<Semaphore>,
     fits: Arc<Semaphore>,
+    metrics: Metrics,
 }
 
 impl Changes {
@@ -37,40 +45,54 @@ impl Changes {
             store,
             looks,
             recent: Arc::default(),
+            waiting: Arc::new(Semaphore::new(MOST_WAITING)),
+            upload_pieces: config.upload_bytes / PIECE,
             uploads: Arc::new(Semaphore::new(config.upload_bytes / PIECE)),
             // A fit takes all of the processor.
             fits: Arc::new(Semaphore::new(1)),
+            metrics: config.metrics.clone(),
         }
     }
 
-    /// Makes a change, unless the same one was made already; its answer is then given again. Changes
-    /// are made one after another. One that has begun is finished even if the caller goes away.
+    /// Makes a change, lets the server look at its store, and then makes the answer; unless the same
+    /// change was made already, whose answer is given again. Changes are made one after another. One
+    /// that was admitted is finished even if the caller goes away.
     ///
     /// # Errors
-    /// Those of the change; [`Error::Invalid`] if the request id belongs to another one.
-    pub async fn once<A: Message + Default + 'static>(
-        &self,
+    /// Those of the change; [`Error::Invalid`] if the request id belongs to another one,
+    /// [`Error::Full`] if too many changes wait.
+    pub async fn once<T: Send + 'static, A: Message + Default + 'static>(
+        self: &Arc<Self>,
         identity: Identity,
-        change: impl Future<Output = Result<A, Error>> + Send + 'static,
+        change: impl Future<Output = Result<T, Error>> + Send + 'static,
+        answer: impl FnOnce(T) -> A + Send + 'static,
     ) -> Result<A, Error> {
-        let recent = self.recent.clone();
-        let runtime = tokio::runtime::Handle::current();
-        let span = tracing::Span::current();
+        let waiting = self.waiting.clone().try_acquire_owned();
+        let waiting = waiting.map_err(|_| {
+            self.metrics.shed(Full::Changes);
+            Error::Full {
+                what: Full::Changes,
+            }
+        })?;
 
-        // Writing a store mixes files with hashing; both belong on a blocking thread.
-        let made = tokio::task::spawn_blocking(move || {
-            let _within = span.enter();
-            runtime.block_on(async move {
-                let mut recent = recent.lock_owned().await;
+        let changes = self.clone();
+        let made = tokio::spawn(
+            async move {
+                let _waiting = waiting;
+
+                // A change waits here for its turn, and holds no thread while it does.
+                let mut recent = changes.recent.lock().await;
                 if let Some(answer) = recent.answer(&identity)? {
                     return A::decode(answer).map_err(|_| Error::Internal);
                 }
 
-                let answer = change.await?;
+                let answer = answer(on_blocking_thread(change).await??);
+                changes.looks.look().await;
                 recent.remember(identity, answer.encode_to_vec());
                 Ok(answer)
-            })
-        });
+            }
+            .in_current_span(),
+        );
 
         made.await.unwrap_or_else(|error| {
             tracing::error!(%error, "a change panicked");
@@ -92,21 +114,47 @@ impl Changes {
         decoded.map_err(|_| Error::Internal)
     }
 
-    /// Completes when the server has looked at the store again.
-    pub async fn look(&self) {
-        self.looks.look().await;
-    }
+    /// Memory for a part of an upload, to be held with it.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if it can never be held, [`Error::Full`] if the uploads in progress hold as
+    /// much as they may.
+    pub fn upload_memory(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Error> {
+        let pieces = bytes.div_ceil(PIECE);
+        if pieces > self.upload_pieces {
+            let problem =
+                "is larger than all uploads together may be; the operator sets --max-upload-bytes";
+            return Err(Error::invalid("message", problem));
+        }
 
-    /// Room in memory for a part of an upload, to be held with it.
-    pub fn upload_room(&self, bytes: usize) -> Option<OwnedSemaphorePermit> {
-        let pieces = u32::try_from(bytes.div_ceil(PIECE)).ok()?;
-        self.uploads.clone().try_acquire_many_owned(pieces).ok()
+        let pieces = u32::try_from(pieces).unwrap_or(u32::MAX);
+        let memory = self.uploads.clone().try_acquire_many_owned(pieces);
+        memory.map_err(|_| {
+            self.metrics.shed(Full::Uploads);
+            Error::Full {
+                what: Full::Uploads,
+            }
+        })
     }
 
     /// The place of a fit.
     pub fn fit_place(&self) -> Option<OwnedSemaphorePermit> {
         self.fits.clone().try_acquire_owned().ok()
     }
+}
+
+/// Runs work on a blocking thread: writing a store mixes files with hashing.
+async fn on_blocking_thread<T: Send + 'static>(
+    work: impl Future<Output = T> + Send + 'static,
+) -> Result<T, Error> {
+    let runtime = tokio::runtime::Handle::current();
+    let span = tracing::Span::current();
+    let done = tokio::task::spawn_blocking(move || span.in_scope(|| runtime.block_on(work)));
+
+    done.await.map_err(|error| {
+        tracing::error!(%error, "a change panicked");
+        Error::Internal
+    })
 }
 
 impl Handlers {
@@ -123,13 +171,20 @@ impl Handlers {
         })
     }
 
-    /// Room in memory for a part of an upload.
-    ///
-    /// # Errors
-    /// [`Error::Full`] if the uploads in progress hold as much as they may.
-    pub(super) fn upload_room(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Error> {
-        let room = self.changes()?.upload_room(bytes);
-        room.ok_or_else(|| self.workers.full(Full::Uploads))
+    /// Whether a room is answered with this revision of an adapter now.
+    pub(super) fn serves_in(&self, room: &str, adapter: &pb::Revision) -> bool {
+        match &*self.phase.borrow() {
+            Phase::Serving(snapshot) | Phase::Draining(snapshot) => {
+                let served = snapshot.rooms().get(room);
+                served.is_some_and(|room| {
+                    room.navigators.iter().any(|served| {
+                        let held = &served.adapter;
+                        (&held.name, held.revision) == (&adapter.name, adapter.revision)
+                    })
+                })
+            }
+            Phase::Loading | Phase::Stopping => false,
+        }
     }
 
     /// Whether requests are answered from this revision now.
@@ -192,10 +247,7 @@ pub fn named(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error>
 pub fn named_whole(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error> {
     let resource = named(field, text, kind)?;
     if resource.revision.is_some() {
-        return Err(Error::invalid(
-            field,
-            "must not name a revision: the server numbers them",
-        ));
+        return Err(Error::invalid(field, "must be without a revision"));
     }
 
     Ok(resource)
@@ -205,7 +257,7 @@ pub fn named_whole(field: &str, text: &str, kind: Kind) -> Result<ResourceName, 
 /// see every room change them.
 ///
 /// # Errors
-/// [`Error::Forbidden`].
+/// [`Error::OutOfScope`].
 pub fn check_right(caller: Option<&Arc<Principal>>, resource: &ResourceName) -> Result<(), Error> {
     let Some(scope) = caller.map(|caller| caller.rooms()) else {
         return Ok(());
@@ -213,13 +265,9 @@ pub fn check_right(caller: Option<&Arc<Principal>>, resource: &ResourceName) -> 
 
     match resource.kind {
         Kind::Room if scope.contains(&resource.name) => Ok(()),
-        Kind::Room => Err(Error::Forbidden {
-            verb: "change this room",
-        }),
+        Kind::Room => Err(Error::OutOfScope { what: "this room" }),
         Kind::Adapter if scope.is_all() => Ok(()),
-        Kind::Adapter => Err(Error::Forbidden {
-            verb: "change adapters",
-        }),
+        Kind::Adapter => Err(Error::OutOfScope { what: "adapters" }),
     }
 }
 

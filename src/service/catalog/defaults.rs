@@ -62,15 +62,12 @@ impl Handlers {
             return Ok(pb::SetDefaultResponse { defaults });
         }
 
-        let handlers = self.clone();
-        let made = async move {
-            let changes = handlers.changes()?;
-            let defaults = changes.store.choose(&choice).await?;
-            changes.look().await;
-            let defaults = defaults_to_wire(&defaults, scope(caller.as_ref()));
-            Ok(pb::SetDefaultResponse { defaults })
+        let store = changes.store.clone();
+        let change = async move { Ok(store.choose(&choice).await?) };
+        let answer = move |defaults: Defaults| pb::SetDefaultResponse {
+            defaults: defaults_to_wire(&defaults, scope(caller.as_ref())),
         };
-        changes.once(identity, made).await
+        changes.once(identity, change, answer).await
     }
 
     pub(super) async fn roll_back(
@@ -80,8 +77,8 @@ impl Handlers {
     ) -> Result<pb::RollBackDefaultResponse, Error> {
         // The last choice may be that of any room.
         if scope(caller.as_ref()).is_some_and(|scope| !scope.is_all()) {
-            return Err(Error::Forbidden {
-                verb: "roll back defaults: its rooms are not all of them",
+            return Err(Error::OutOfScope {
+                what: "the defaults of all rooms",
             });
         }
 
@@ -93,15 +90,12 @@ impl Handlers {
             &content,
         );
         let changes = self.changes()?.clone();
-        let handlers = self.clone();
-        let made = async move {
-            let changes = handlers.changes()?;
-            let defaults = changes.store.take_back_choice().await?;
-            changes.look().await;
-            let defaults = defaults_to_wire(&defaults, None);
-            Ok(pb::RollBackDefaultResponse { defaults })
+        let store = changes.store.clone();
+        let change = async move { Ok(store.take_back_choice().await?) };
+        let answer = |defaults: Defaults| pb::RollBackDefaultResponse {
+            defaults: defaults_to_wire(&defaults, None),
         };
-        changes.once(identity, made).await
+        changes.once(identity, change, answer).await
     }
 
     pub(super) async fn delete_room_named(
@@ -152,14 +146,9 @@ impl Handlers {
             return Ok(answer(removed.revisions));
         }
 
-        let handlers = self.clone();
-        let made = async move {
-            let changes = handlers.changes()?;
-            let removed = changes.store.remove(&resource).await?;
-            changes.look().await;
-            Ok(answer(removed.revisions))
-        };
-        changes.once(identity, made).await
+        let store = changes.store.clone();
+        let change = async move { Ok(store.remove(&resource).await?.revisions) };
+        changes.once(identity, change, answer).await
     }
 }
 

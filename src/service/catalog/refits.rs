@@ -14,7 +14,7 @@ use super::super::{Error, Handlers};
 use super::changes::{check_right, identity, named_whole, revision_to_wire};
 use super::recent::Identity;
 use crate::refit::{Refit, Request};
-use crate::store::Kind;
+use crate::store::{Kind, Published};
 use seese3_client::proto::v1 as pb;
 use seese3_core::fitting::FITTING_EPOCHS;
 
@@ -29,14 +29,14 @@ pub struct Admitted {
     request: Request,
     identity: Identity,
     validate_only: bool,
-    place: tokio::sync::OwnedSemaphorePermit,
 }
 
 impl Handlers {
     /// Checks a request, without reading the store.
     ///
     /// # Errors
-    /// [`Error::Invalid`], naming the field; [`Error::Full`] if another fit is in progress.
+    /// [`Error::Invalid`], naming the field; [`Error::OutOfScope`] if the caller may not change the
+    /// room.
     pub(super) fn admit_refit(
         &self,
         caller: Option<&Arc<Principal>>,
@@ -56,7 +56,7 @@ impl Handlers {
             validate_only,
         } = request;
 
-        let changes = self.changes()?;
+        self.changes()?;
         let room = named_whole("name", &name, Kind::Room)?;
         check_right(caller, &room)?;
         if seed > LARGEST_SEED {
@@ -78,12 +78,10 @@ impl Handlers {
             seed,
         };
 
-        let place = changes.fit_place();
         Ok(Admitted {
             request,
             identity,
             validate_only,
-            place: place.ok_or_else(|| self.workers.full(Full::Fits))?,
         })
     }
 
@@ -107,13 +105,18 @@ impl Handlers {
             request,
             identity,
             validate_only,
-            place,
         } = admitted;
         let changes = self.changes()?.clone();
         if let Some(answer) = changes.answered(&identity).await? {
             return Ok(answer);
         }
 
+        // Held until the adapter is published, so that a request that is sent again meanwhile is
+        // refused and not fitted again.
+        let place = changes.fit_place();
+        let place = place.ok_or_else(|| self.workers.full(Full::Fits))?;
+
+        let room = request.room.clone();
         let refit = Refit::prepare(&changes.store, request).await?;
         if validate_only {
             return Ok(pb::RefitResult::default());
@@ -134,21 +137,21 @@ impl Handlers {
             fitted.map(|fitted| (refit, fitted))
         };
         let (refit, fitted) = self.workers.run_admitted(Lane::Long, fit).await??;
-        drop(place);
-
+        let store = changes.store.clone();
+        let name = refit.name().to_owned();
+        let change = async move {
+            let _place = place;
+            Ok(refit.publish(&store, &fitted).await?)
+        };
         let handlers = self.clone();
-        let made = async move {
-            let changes = handlers.changes()?;
-            let published = refit.publish(&changes.store, &fitted).await?;
-            changes.look().await;
-
-            let revision = revision_to_wire(refit.name(), &published);
-            Ok(pb::RefitResult {
-                served: handlers.serves(Kind::Adapter, &revision),
+        let answer = move |published: Published| {
+            let revision = revision_to_wire(&name, &published);
+            pb::RefitResult {
+                served: handlers.serves_in(&room, &revision),
                 created: published.is_new,
                 revision: Some(revision),
-            })
+            }
         };
-        changes.once(identity, made).await
+        changes.once(identity, change, answer).await
     }
 }

@@ -16,7 +16,7 @@ use super::super::workers::Lane;
 use super::super::{Error, Handlers, convert};
 use super::changes::{check_right, identity, named_whole, revision_to_wire};
 use crate::datasets;
-use crate::store::{self, Kind, ResourceName};
+use crate::store::{self, Kind, Published, ResourceName};
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::{FeatureSource, Features, MAX_COLUMNS, UNSPECIFIED};
 use seese3_core::room::{Frames, Provenance, Room, RoomId, is_plain_name};
@@ -45,6 +45,19 @@ pub async fn next<M>(messages: &mut Streaming<M>, field: &str) -> Result<M, Erro
             code: status.code(),
             problem: status.message().to_owned(),
         }),
+    }
+}
+
+/// Refuses messages behind the last one.
+///
+/// # Errors
+/// [`Error::Invalid`] if there is one, otherwise as [`next`].
+pub async fn expect_end<M>(messages: &mut Streaming<M>) -> Result<(), Error> {
+    match next(messages, "message").await {
+        // Nothing more is what is wanted here.
+        Err(Error::Invalid { .. }) => Ok(()),
+        Ok(_) => Err(Error::invalid("message", "comes after the last one")),
+        Err(error) => Err(error),
     }
 }
 
@@ -84,10 +97,13 @@ impl Handlers {
         let end = loop {
             match next(&mut messages, "end").await?.message {
                 Some(Wire::Frames(batch)) => {
-                    received.memory.push(self.upload_room(batch.encoded_len())?);
+                    let arrived = changes.upload_memory(batch.encoded_len())?;
+                    let kept = changes.upload_memory(received.kept_bytes(&batch))?;
+                    received.memory.push(kept);
                     self.take_batch(&mut received, &snapshot, batch)
                         .await
                         .map_err(|error| error.within("frames"))?;
+                    drop(arrived);
                 }
                 Some(Wire::End(end)) => break end,
                 Some(Wire::Room(_)) => {
@@ -100,31 +116,36 @@ impl Handlers {
             }
         };
 
+        expect_end(&mut messages).await?;
+
         let mut content = upload.encode_to_vec();
         content.extend(received.other_columns.clone().finalize());
         content.extend(&end.sha256);
         let identity = identity(caller.as_ref(), &upload.request_id, "CreateRoom", &content);
 
         let name = received.name.name.clone();
+        let memory = std::mem::take(&mut received.memory);
         let (room, features) = finished(received, &upload, &end)?;
         if upload.validate_only {
             return Ok(pb::CreateRoomResponse::default());
         }
 
+        let store = changes.store.clone();
+        let change = async move {
+            // What was uploaded counts until it is in the store.
+            let _memory = memory;
+            Ok(store.publish_room(&room, &features).await?)
+        };
         let handlers = self.clone();
-        let made = async move {
-            let store = &changes_of(&handlers)?.store;
-            let published = store.publish_room(&room, &features).await?;
-            changes_of(&handlers)?.look().await;
-
+        let answer = move |published: Published| {
             let revision = revision_to_wire(&name, &published);
-            Ok(pb::CreateRoomResponse {
+            pb::CreateRoomResponse {
                 served: handlers.serves(Kind::Room, &revision),
                 created: published.is_new,
                 revision: Some(revision),
-            })
+            }
         };
-        changes.once(identity, made).await
+        changes.once(identity, change, answer).await
     }
 
     /// Adds a batch of frames.
@@ -211,10 +232,6 @@ impl Handlers {
 
         Ok(rows)
     }
-}
-
-fn changes_of(handlers: &Handlers) -> Result<&Arc<super::changes::Changes>, Error> {
-    handlers.changes()
 }
 
 /// Checks what is going to be uploaded.
@@ -316,6 +333,16 @@ fn source(given: &pb::FeatureSource) -> Result<FeatureSource, Error> {
 }
 
 impl Received {
+    /// What is kept of a batch, bytes: of images only their features.
+    fn kept_bytes(&self, batch: &pb::FrameBatch) -> usize {
+        let images: usize = batch.images.iter().map(Vec::len).sum();
+        let encoded = match self.encode_for {
+            Some(_) => batch.images.len() * 4 * self.sources[0].dim,
+            None => 0,
+        };
+        batch.encoded_len().saturating_sub(images) + encoded
+    }
+
     /// Adds the features of `n` frames.
     fn take_features(&mut self, features: &[Vec<u8>], n: usize) -> Result<(), Error> {
         if self.encode_for.is_some() {

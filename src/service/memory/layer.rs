@@ -14,8 +14,6 @@ use tonic::body::Body;
 use tower::{Layer, Service};
 
 use super::super::Error;
-use super::super::metrics::Metrics;
-use super::super::status::Full;
 use super::decoded::decoded_size;
 use super::{HELD, Held, Memory};
 
@@ -26,20 +24,22 @@ const STREAMS: [&str; 4] = [
     "/PublishAdapter",
     "/ServerReflectionInfo",
 ];
+/// The beginning of the paths of the health service.
+const HEALTH: &str = "/grpc.health.v1.Health/";
 /// What stands before a message: whether it is compressed, and its length.
 const PREFIX: usize = 5;
 
 /// Wraps a service so that its requests hold no more memory than they may.
 #[derive(Debug, Clone)]
 pub struct MemoryLayer {
-    /// The memory of all requests.
+    /// The memory of all requests but those of health.
     pub memory: Memory,
+    /// The memory of health's requests, which are answered when the other memory is full.
+    pub probes: Memory,
     /// The largest message, bytes.
     pub message_bytes: usize,
     /// How long a request with one message may take to arrive.
     pub receive_within: Duration,
-    /// Counts what is refused.
-    pub metrics: Metrics,
 }
 
 impl<S> Layer<S> for MemoryLayer {
@@ -94,8 +94,12 @@ where
 impl MemoryLayer {
     /// Receives a request as far as it has to be before a handler sees it.
     async fn received(&self, request: Request<Body>) -> Result<(Held, Request<Body>), Error> {
-        let held = self.memory.begin().ok_or_else(|| self.full())?;
         let path = request.uri().path().to_owned();
+        let memory = match path.starts_with(HEALTH) {
+            true => &self.probes,
+            false => &self.memory,
+        };
+        let held = memory.begin().ok_or_else(|| self.full())?;
 
         if STREAMS.iter().any(|end| path.ends_with(end)) {
             let layer = self.clone();
@@ -103,7 +107,7 @@ impl MemoryLayer {
             let request = request.map(|body| {
                 Body::new(CountedBody {
                     body,
-                    counted: 0,
+                    messages: Messages::default(),
                     held: counted,
                     layer,
                 })
@@ -114,7 +118,7 @@ impl MemoryLayer {
         let (head, body) = request.into_parts();
         let message = tokio::time::timeout(self.receive_within, self.whole(body, &held)).await;
         let message = message.map_err(|_| Error::Deadline)??;
-        let size = decoded_size(&path, message.get(PREFIX..).unwrap_or_default());
+        let size = decoded_size(&path, self.one_message(&message)?);
         if size > self.memory.largest_request() {
             let problem = format!(
                 "takes {size} bytes when it is decoded, over the limit of this server; send less at once"
@@ -127,6 +131,23 @@ impl MemoryLayer {
 
         let body = Body::new(WholeBody::new(message));
         Ok((held, Request::from_parts(head, body)))
+    }
+
+    /// The bytes of the one message that a body has to consist of, without its prefix. A message that
+    /// is too long is passed on: the decoder refuses it by its prefix.
+    fn one_message<'a>(&self, body: &'a [u8]) -> Result<&'a [u8], Error> {
+        let Some((prefix, message)) = body.split_first_chunk::<PREFIX>() else {
+            return Ok(&[]);
+        };
+        let [_, length @ ..] = *prefix;
+        let length = u32::from_be_bytes(length) as usize;
+
+        // The decoder would read every further message before it refuses them.
+        if length <= self.message_bytes && length != message.len() {
+            let problem = format!("has {} bytes where its prefix says {length}", message.len());
+            return Err(Error::invalid("request", problem));
+        }
+        Ok(message)
     }
 
     /// All bytes of a request.
@@ -155,18 +176,66 @@ impl MemoryLayer {
     }
 
     fn full(&self) -> Error {
-        self.metrics.shed(Full::Memory);
-        Error::Full { what: Full::Memory }
+        self.memory.full()
     }
 }
 
-/// The body of a request that is a stream: its bytes are counted up to the largest message, since the
-/// handler keeps no more of it.
+/// The body of a request that is a stream. What counts is the largest message so far: the handler
+/// keeps one at a time.
 struct CountedBody {
     body: Body,
-    counted: usize,
+    messages: Messages,
     held: Held,
     layer: MemoryLayer,
+}
+
+/// Finds the messages in the bytes of a stream.
+#[derive(Debug, Default)]
+struct Messages {
+    /// What has arrived of the prefix of the current message.
+    prefix: Vec<u8>,
+    /// How much of the current message is still to come, after its prefix.
+    missing: usize,
+    /// What has arrived of the current message.
+    current: usize,
+    /// The most that had arrived of any message.
+    largest: usize,
+}
+
+impl Messages {
+    /// Takes what arrived, and returns by how much the largest message grew.
+    fn take(&mut self, mut bytes: &[u8]) -> usize {
+        let before = self.largest;
+
+        while !bytes.is_empty() {
+            let wanted = match PREFIX - self.prefix.len() {
+                0 => self.missing,
+                wanted => wanted,
+            };
+            let (taken, rest) = bytes.split_at(wanted.min(bytes.len()));
+            bytes = rest;
+            self.current += taken.len();
+            self.largest = self.largest.max(self.current);
+
+            if self.prefix.len() < PREFIX {
+                self.prefix.extend(taken);
+                if let [_, length @ ..] = self.prefix.as_slice()
+                    && let Ok(length) = length.try_into()
+                {
+                    self.missing = u32::from_be_bytes(length) as usize;
+                }
+            } else {
+                self.missing -= taken.len();
+            }
+
+            if self.prefix.len() == PREFIX && self.missing == 0 {
+                self.prefix.clear();
+                self.current = 0;
+            }
+        }
+
+        self.largest - before
+    }
 }
 
 impl http_body::Body for CountedBody {
@@ -182,14 +251,13 @@ impl http_body::Body for CountedBody {
             return polled;
         };
 
-        let arrived = frame.data_ref().map_or(0, Bytes::len);
-        let uncounted = (self.layer.message_bytes + PREFIX).saturating_sub(self.counted);
-        let bytes = arrived.min(uncounted);
-        if !self.held.0.hold(bytes) {
-            return Poll::Ready(Some(Err(self.layer.full().into())));
+        // The decoder refuses a message that is too long as soon as its prefix has arrived.
+        if let Some(data) = frame.data_ref() {
+            let grown = self.messages.take(data);
+            if !self.held.0.hold(grown) {
+                return Poll::Ready(Some(Err(self.layer.full().into())));
+            }
         }
-
-        self.counted += bytes;
         polled
     }
 
@@ -225,5 +293,36 @@ impl http_body::Body for HoldingBody {
 
     fn size_hint(&self) -> SizeHint {
         self.body.size_hint()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn message(length: usize) -> Vec<u8> {
+        let mut bytes = vec![0];
+        bytes.extend((length as u32).to_be_bytes());
+        bytes.resize(PREFIX + length, 7);
+        bytes
+    }
+
+    /// Oracle: the lengths of the messages, however the stream is cut.
+    #[test]
+    fn a_stream_counts_for_its_largest_message() {
+        let stream: Vec<u8> = [30, 0, 100, 7, 100, 99]
+            .into_iter()
+            .flat_map(message)
+            .collect();
+
+        for step in [1, 2, 5, 6, 64, stream.len()] {
+            let mut messages = Messages::default();
+            let grown: usize = stream.chunks(step).map(|part| messages.take(part)).sum();
+            assert_eq!(grown, PREFIX + 100, "in parts of {step}");
+        }
+
+        // A length that is only announced counts for nothing.
+        let mut messages = Messages::default();
+        assert_eq!(messages.take(&[0, 0xff, 0xff, 0xff, 0xff, 1, 2]), 7);
     }
 }

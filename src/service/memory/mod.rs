@@ -3,8 +3,8 @@
 //!
 //! A request with one message is received as a whole, within a time limit, before a handler sees it:
 //! a caller that sends slowly costs no more than the bytes that it has sent. How large the message
-//! becomes is computed before it is decoded, see [`decoded`]. Of a stream of messages, only the
-//! largest message that can be on its way is counted.
+//! becomes is computed before it is decoded, see [`decoded`]. Of a stream of messages, the
+//! largest one so far is counted, since a handler keeps one at a time.
 
 mod decoded;
 mod layer;
@@ -17,6 +17,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use prost::Message;
 
 use super::Error;
+use super::metrics::Metrics;
 use super::status::Full;
 
 /// What every request is counted for at least: its headers, its task and its buffers.
@@ -35,15 +36,24 @@ pub struct Memory(Arc<Counter>);
 struct Counter {
     held: AtomicUsize,
     most: usize,
+    /// Counts what is refused.
+    metrics: Metrics,
 }
 
 impl Memory {
     /// Memory of which at most `most` bytes are held.
-    pub fn new(most: usize) -> Self {
+    pub fn new(most: usize, metrics: Metrics) -> Self {
         Self(Arc::new(Counter {
             held: AtomicUsize::new(0),
             most,
+            metrics,
         }))
+    }
+
+    /// The refusal of a request for which there is no memory, which is counted.
+    fn full(&self) -> Error {
+        self.0.metrics.shed(Full::Memory);
+        Error::Full { what: Full::Memory }
     }
 
     /// The bytes that are held now.
@@ -79,7 +89,7 @@ struct Share {
 impl Share {
     /// Holds more bytes. Returns whether there is memory for them; if not, nothing changes.
     fn hold(&self, bytes: usize) -> bool {
-        let Counter { held, most } = &*self.memory.0;
+        let Counter { held, most, .. } = &*self.memory.0;
         let grown = |now: usize| now.checked_add(bytes).filter(|sum| sum <= most);
         let is_held = held
             .try_update(Ordering::Relaxed, Ordering::Relaxed, grown)
@@ -104,13 +114,16 @@ impl Drop for Share {
 /// # Errors
 /// [`Error::Full`] if there is no memory for it.
 pub fn hold_answer<A: Message>(answer: A) -> Result<A, Error> {
+    // In memory an answer is at most about twice as large as encoded, and it is both at once.
     let bytes = 3 * answer.encoded_len();
 
+    let counted = HELD.try_with(|held| match held.0.hold(bytes) {
+        true => Ok(()),
+        false => Err(held.0.memory.full()),
+    });
     // Outside of a request, as in a unit test, nothing is counted.
-    match HELD.try_with(|held| held.0.hold(bytes)) {
-        Ok(false) => Err(Error::Full { what: Full::Memory }),
-        Ok(true) | Err(_) => Ok(answer),
-    }
+    counted.unwrap_or(Ok(()))?;
+    Ok(answer)
 }
 
 #[cfg(test)]
@@ -120,7 +133,7 @@ mod tests {
     /// Oracle: by hand.
     #[test]
     fn what_is_held_is_bounded_and_free_again() {
-        let memory = Memory::new(3 * LEAST);
+        let memory = Memory::new(3 * LEAST, Metrics::default());
         let first = memory.begin().unwrap();
         let second = memory.begin().unwrap();
         assert!(first.0.hold(LEAST));
