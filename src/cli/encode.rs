@@ -10,7 +10,7 @@ use super::encoder::{EncoderOptions, RuntimeOptions};
 use super::progress::bar;
 use super::say;
 use crate::encoder::{Encoded, Encoder, Journal, Kept, OnBadImage, Task, encode_room, read_image};
-use crate::store::{Store, StoredRoom};
+use crate::store::{Published, Store, StoredRoom};
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::Pose;
@@ -136,8 +136,7 @@ impl Encode {
             );
         }
 
-        let (room, features) = whole(newest, &sources, &encoded)?;
-        let published = store.publish_same_frames(&room, &features).await?;
+        let published = publish(&store, newest, &sources, &encoded).await?;
 
         // The rows are safe in the store, so the journal is no longer needed.
         journal.finish()?;
@@ -375,6 +374,23 @@ pub fn by_layer(
     }
 
     Ok(features)
+}
+
+/// Publishes the rows with the frames that they belong to. Frames that were left out on purpose leave
+/// the room with other frames.
+async fn publish(
+    store: &Store,
+    newest: StoredRoom,
+    sources: &[FeatureSource],
+    encoded: &Encoded,
+) -> anyhow::Result<Published> {
+    let is_whole = encoded.good.len() == newest.room.frame_count();
+    let (room, features) = whole(newest, sources, encoded)?;
+
+    Ok(match is_whole {
+        true => store.publish_same_frames(&room, &features).await?,
+        false => store.publish_room(&room, &features).await?,
+    })
 }
 
 /// The room and its new feature sets. If frames were dropped, the room and all its feature sets are

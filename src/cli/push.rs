@@ -34,11 +34,7 @@ pub struct Push {
 impl Push {
     pub async fn run(self) -> anyhow::Result<()> {
         let store = Store::open(&self.store)?;
-        let target = ResourceName {
-            kind: self.name.kind,
-            name: self.renamed.clone().unwrap_or(self.name.name.clone()),
-            revision: None,
-        };
+        let target = target(&self.name, self.renamed.as_deref())?;
         let client = self.server.connect().await?;
 
         let (revision, created, served) = match self.name.kind {
@@ -70,6 +66,20 @@ impl Push {
         say(format_args!("{}: {state}", target.at(revision.revision)));
         Ok(())
     }
+}
+
+/// The name on the server. It may be given as a plain name or as that of a room or adapter.
+fn target(source: &ResourceName, renamed: Option<&str>) -> anyhow::Result<ResourceName> {
+    let collection = source.kind.collection();
+    let name = match renamed {
+        None => source.name.clone(),
+        Some(given) => match given.split_once('/') {
+            Some((first, name)) if first == collection => name.to_owned(),
+            _ => given.to_owned(),
+        },
+    };
+
+    Ok(format!("{collection}/{name}").parse()?)
 }
 
 /// The messages of an upload. What the protocol does not carry, the numbers and the held-out marks

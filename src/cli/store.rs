@@ -263,10 +263,6 @@ impl CollectGarbage {
             false => store.collect_garbage(older_than).await?,
         };
 
-        for folder in &garbage.left_alone {
-            tracing::warn!("left alone: {folder}");
-        }
-
         if self.common.json {
             let files: Vec<Value> = garbage
                 .files
@@ -284,6 +280,9 @@ impl CollectGarbage {
 
         for file in &garbage.files {
             say(&file.path);
+        }
+        for folder in &garbage.left_alone {
+            say(format_args!("left alone: {folder}"));
         }
         let word = match self.dry_run {
             true => "would free",

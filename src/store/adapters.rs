@@ -156,8 +156,9 @@ impl Store {
         let folder = folder_of(Kind::Adapter, name);
 
         // The weights are written before the manifest that makes them visible.
+        let content = weights;
         let weights = self
-            .write_object(&folder, "weights", "safetensors", weights)
+            .write_object(&folder, "weights", "safetensors", content.clone())
             .await?;
 
         // As for rooms: try to create the next revision, and start again if another publisher was
@@ -200,6 +201,12 @@ impl Store {
                 .write_manifest(&folder, body.revision, manifest::encode(&manifest, &body)?)
                 .await?
             {
+                // The manifest keeps its object from now on. What was collected before is written
+                // again.
+                if self.lacks(&folder, body.objects()).await? {
+                    self.write_object(&folder, "weights", "safetensors", content)
+                        .await?;
+                }
                 return Ok(Published {
                     revision: body.revision,
                     is_new: true,

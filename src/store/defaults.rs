@@ -36,6 +36,10 @@ struct Body {
     number: u64,
     /// When it was written, RFC 3339.
     created: String,
+    /// The number of the file whose choices these are again, if they were taken back to it; 0 for no
+    /// choices at all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    back_to: Option<u64>,
     defaults: Defaults,
 }
 
@@ -207,7 +211,7 @@ impl Store {
         for _ in 0..ATTEMPTS {
             let (number, defaults) = self.numbered_defaults().await?;
             let changed = defaults.with(choice);
-            if changed == defaults || self.write_defaults(number + 1, &changed).await? {
+            if changed == defaults || self.write_defaults(number + 1, None, &changed).await? {
                 return Ok(changed);
             }
         }
@@ -216,17 +220,21 @@ impl Store {
     }
 
     /// Takes the last change of the choices back: those before it hold again, as far as what they name
-    /// is still there. Done twice, the change holds again.
+    /// is still there. Done again, the change before that one is taken back.
     ///
     /// # Errors
     /// [`Error::NothingToTakeBack`] if nothing was ever chosen; otherwise as [`Store::choose`].
     pub async fn take_back_choice(&self) -> Result<Defaults, Error> {
         for _ in 0..ATTEMPTS {
             let (number, _) = self.numbered_defaults().await?;
-            let mut before = match number {
+            let holds = match number {
+                0 => 0,
+                _ => self.read_defaults(number).await?.back_to.unwrap_or(number),
+            };
+            let mut before = match holds {
                 0 => return Err(Error::NothingToTakeBack),
                 1 => Defaults::default(),
-                _ => self.read_defaults(number - 1).await?,
+                _ => self.read_defaults(holds - 1).await?.defaults,
             };
 
             for resource in before.named() {
@@ -237,7 +245,10 @@ impl Store {
                     exists => exists?,
                 }
             }
-            if self.write_defaults(number + 1, &before).await? {
+            if self
+                .write_defaults(number + 1, Some(holds - 1), &before)
+                .await?
+            {
                 return Ok(before);
             }
         }
@@ -249,11 +260,11 @@ impl Store {
     async fn numbered_defaults(&self) -> Result<(u64, Defaults), Error> {
         match self.numbered_files(&Path::from(FOLDER)).await?.highest {
             0 => Ok((0, Defaults::default())),
-            number => Ok((number, self.read_defaults(number).await?)),
+            number => Ok((number, self.read_defaults(number).await?.defaults)),
         }
     }
 
-    async fn read_defaults(&self, number: u64) -> Result<Defaults, Error> {
+    async fn read_defaults(&self, number: u64) -> Result<Body, Error> {
         let path = Path::from(FOLDER).join(manifest_name(number));
         let file = self.shown(&path);
         let body: Body = manifest::decode(&file, &self.read(&path).await?)?;
@@ -262,16 +273,22 @@ impl Store {
             return Err(Error::Damaged { file, problem });
         }
 
-        Ok(body.defaults)
+        Ok(body)
     }
 
     /// Writes the choices unless the number is taken. Returns whether they were written.
-    async fn write_defaults(&self, number: u64, defaults: &Defaults) -> Result<bool, Error> {
+    async fn write_defaults(
+        &self,
+        number: u64,
+        back_to: Option<u64>,
+        defaults: &Defaults,
+    ) -> Result<bool, Error> {
         let path = Path::from(FOLDER).join(manifest_name(number));
         let body = Body {
             schema: SCHEMA,
             number,
             created: chrono::Utc::now().to_rfc3339(),
+            back_to,
             defaults: defaults.clone(),
         };
 

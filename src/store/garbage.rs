@@ -71,9 +71,17 @@ impl Store {
     /// As [`Store::find_garbage`]; [`Error::Io`] if a file cannot be removed.
     pub async fn collect_garbage(&self, older_than: Duration) -> Result<Garbage, Error> {
         let garbage = self.find_garbage(older_than).await?;
+        let before = Utc::now() - chrono::TimeDelta::from_std(older_than).unwrap_or_default();
 
         for file in &garbage.files {
             let path = Path::from(file.path.as_str());
+
+            // Somebody who publishes the same content again has written the object anew.
+            let now = self.objects.head(&path).await;
+            if now.is_ok_and(|now| now.last_modified > before) {
+                continue;
+            }
+
             match &self.folder {
                 // The names of unfinished files are none that the object store would accept.
                 Some(folder) => match std::fs::remove_file(folder.join(&file.path)) {

@@ -338,6 +338,25 @@ impl Store {
         })
     }
 
+    /// Whether an object that a revision needs is missing: somebody may have collected it as garbage
+    /// while the revision was being published.
+    async fn lacks<'a>(
+        &self,
+        folder: &Path,
+        objects: impl Iterator<Item = &'a manifest::ObjectRef>,
+    ) -> Result<bool, Error> {
+        for object in objects {
+            let path = folder.clone().join("objects").join(object.file.as_str());
+            match self.objects.head(&path).await {
+                Ok(_) => {}
+                Err(object_store::Error::NotFound { .. }) => return Ok(true),
+                Err(error) => return Err(self.io(&path, &error)),
+            }
+        }
+
+        Ok(false)
+    }
+
     /// Writes a manifest unless the revision already exists. Returns whether it was written.
     async fn write_manifest(
         &self,

@@ -1,5 +1,6 @@
 //! Publishing and loading rooms.
 
+use object_store::ObjectStoreExt;
 use object_store::path::Path;
 
 use super::format::{FeaturesEntry, RoomBody};
@@ -62,6 +63,23 @@ struct RoomObjects {
 enum Over {
     AnyFrames,
     SameFrames,
+}
+
+/// The newest revision, if publishing `body` would change nothing: content that differs only in the
+/// revision number and the date is not published again.
+fn unchanged(folder: &Path, body: &RoomBody, newest: Option<RoomBody>) -> Option<Published> {
+    let newest = newest?;
+    let same = RoomBody {
+        revision: newest.revision,
+        created: newest.created.clone(),
+        ..body.clone()
+    };
+
+    (same == newest).then(|| Published {
+        revision: newest.revision,
+        is_new: false,
+        manifest: revision_path(folder, newest.revision).to_string(),
+    })
 }
 
 /// The features of the newest revision that are not published anew.
@@ -173,22 +191,8 @@ impl Store {
             body.features
                 .sort_by(|a, b| a.source.name().cmp(b.source.name()));
 
-            // Content that differs only in the revision number and the date is not published again.
-            if let Some(newest) = newest {
-                let same = RoomBody {
-                    revision: newest.revision,
-                    created: newest.created.clone(),
-                    ..body.clone()
-                };
-
-                if same == newest {
-                    let manifest = revision_path(&folder, newest.revision).to_string();
-                    return Ok(Published {
-                        revision: newest.revision,
-                        is_new: false,
-                        manifest,
-                    });
-                }
+            if let Some(unchanged) = unchanged(&folder, &body, newest) {
+                return Ok(unchanged);
             }
 
             let manifest = revision_path(&folder, body.revision).to_string();
@@ -196,6 +200,12 @@ impl Store {
                 .write_manifest(&folder, body.revision, manifest::encode(&manifest, &body)?)
                 .await?
             {
+                if !self
+                    .confirm(&folder, &body, room, known.as_ref(), features)
+                    .await?
+                {
+                    continue;
+                }
                 return Ok(Published {
                     revision: body.revision,
                     is_new: true,
@@ -207,6 +217,32 @@ impl Store {
         Err(Error::Contended {
             name: room.id().to_string(),
         })
+    }
+
+    /// Makes sure that a revision has its objects once its manifest is there, which keeps them from
+    /// being collected. What was collected before is written again. Features that were carried over
+    /// cannot be: then the manifest is removed again, and the answer is false.
+    async fn confirm(
+        &self,
+        folder: &Path,
+        body: &RoomBody,
+        room: &Room,
+        known_frames: Option<&ObjectRef>,
+        features: &[Features],
+    ) -> Result<bool, Error> {
+        if !self.lacks(folder, body.objects()).await? {
+            return Ok(true);
+        }
+        self.write_objects(folder, room, known_frames, features)
+            .await?;
+        if !self.lacks(folder, body.objects()).await? {
+            return Ok(true);
+        }
+
+        let manifest = revision_path(folder, body.revision);
+        let removed = self.objects.delete(&manifest).await;
+        removed.map_err(|error| self.io(&manifest, &error))?;
+        Ok(false)
     }
 
     /// Writes the objects of a room. `known_frames` are those of the newest revision, if the room

@@ -649,6 +649,6 @@ fn an_adapter_is_fitted_and_its_views_are_located() {
     );
     refuses(
         &["fit", "--store", &store, "--room", "a", "--name", "a/b"],
-        &["--name 'a/b'"],
+        &["\"a/b\" cannot name an adapter"],
     );
 }

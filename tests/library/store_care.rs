@@ -77,6 +77,16 @@ async fn a_name_means_what_was_chosen() {
         .unwrap();
     assert_eq!(feature_names(&store, None).await, ["f", "g", "h", "i"]);
 
+    // Taken back step by step, as far back as anything was chosen.
+    for expected in [&["f", "g"][..], &["f", "g", "h", "i"]] {
+        store.take_back_choice().await.unwrap();
+        assert_eq!(feature_names(&store, None).await, expected);
+    }
+    assert!(matches!(
+        store.take_back_choice().await,
+        Err(Error::NothingToTakeBack)
+    ));
+
     // What is gone cannot be meant again.
     store
         .choose(&Choice::Revision(named("rooms/a/revisions/1")))
@@ -363,4 +373,38 @@ async fn publish_fitted(
         .publish_fitted("fitted", fitted, room_fit, features.rows())
         .await
         .unwrap();
+}
+
+/// Oracle: the promise: a revision that was published has its objects, whoever collects garbage
+/// meanwhile. The objects that are published again were left by a removal long ago.
+#[tokio::test]
+async fn garbage_that_is_published_again_is_not_collected() {
+    let (folder, store) = stored().await;
+    let (room, features) = (room("a"), [set("f", 1.0)]);
+    let long_ago = std::time::SystemTime::now() - Duration::from_secs(10 * 3_600);
+
+    for round in 0..10 {
+        let published = store.publish_room(&room, &features).await.unwrap();
+        assert!(published.is_new);
+        store.remove(&named("rooms/a")).await.unwrap();
+        for file in files(folder.path(), "rooms/a") {
+            let file = std::fs::File::options().write(true).open(file).unwrap();
+            file.set_modified(long_ago).unwrap();
+        }
+
+        let collecting = {
+            let store = store.clone();
+            let pause = Duration::from_micros(300 * round);
+            tokio::spawn(async move {
+                tokio::time::sleep(pause).await;
+                store.collect_garbage(Duration::from_secs(3_600)).await
+            })
+        };
+        store.publish_room(&room, &features).await.unwrap();
+        collecting.await.unwrap().unwrap();
+
+        let findings = store.verify(&|_| ()).await.unwrap();
+        assert!(findings.is_empty(), "round {round}: {findings:?}");
+        store.remove(&named("rooms/a")).await.unwrap();
+    }
 }

@@ -182,3 +182,27 @@ async fn a_second_message_is_not_decoded() {
     let refused = r#"method="/seese3.v1.NavigationService/Navigate",code="INVALID_ARGUMENT"} 1"#;
     assert!(metrics.text().contains(refused), "{}", metrics.text());
 }
+
+/// Oracle: by hand: two bytes for each name of a room are a string when they are decoded.
+#[tokio::test]
+async fn a_message_of_a_stream_that_grows_is_refused_too() {
+    let server = start(Config {
+        memory_bytes: 32 << 20,
+        ..Config::default()
+    })
+    .await;
+
+    let config = pb::TrackConfig {
+        rooms: vec![String::new(); 2_000_000],
+        ..pb::TrackConfig::default()
+    };
+    let request = pb::TrackRequest {
+        message: Some(pb::track_request::Message::Config(config)),
+    };
+    let opened = server.client.track(tokio_stream::iter([request])).await;
+    let refused = match opened {
+        Err(error) => error.code().unwrap(),
+        Ok(mut answers) => answers.message().await.unwrap_err().code(),
+    };
+    assert_eq!(refused, Code::ResourceExhausted);
+}

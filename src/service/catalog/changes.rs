@@ -86,8 +86,9 @@ impl Changes {
                     return A::decode(answer).map_err(|_| Error::Internal);
                 }
 
-                let answer = answer(on_blocking_thread(change).await??);
+                let made = on_blocking_thread(change).await??;
                 changes.looks.look().await;
+                let answer = answer(made);
                 recent.remember(identity, answer.encode_to_vec());
                 Ok(answer)
             }
@@ -161,8 +162,13 @@ impl Handlers {
     /// What changes go through.
     ///
     /// # Errors
-    /// [`Error::Precondition`] if this server takes no changes.
+    /// [`Error::Precondition`] if this server takes no changes, [`Error::Loading`] if it is not
+    /// serving: what is changed then would not be served.
     pub(super) fn changes(&self) -> Result<&Arc<Changes>, Error> {
+        if !matches!(&*self.phase.borrow(), Phase::Serving(_)) {
+            return Err(Error::Loading);
+        }
+
         self.changes.as_ref().ok_or_else(|| {
             Error::Precondition(
                 "this server takes no changes; start it with --writable, or change its store"
@@ -307,9 +313,16 @@ impl From<store::Error> for Error {
             },
             E::FeatureRows { .. } | E::DuplicateFeatures { .. } => Self::invalid("features", error),
             E::Name { .. } => Self::invalid("name", error),
+            E::Absent { .. } => Self::Conflict {
+                name: "the store".to_owned(),
+                problem: "was changed by somebody else meanwhile; try again".to_owned(),
+            },
             _ => {
                 tracing::error!(%error, "the store could not be changed");
-                Self::Internal
+                Self::Precondition(
+                    "the store cannot be read or written, or is damaged where this belongs; the server's log says why"
+                        .to_owned(),
+                )
             }
         }
     }

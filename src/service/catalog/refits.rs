@@ -70,9 +70,20 @@ impl Handlers {
                 given => Ok(Some(named_whole(field, given, Kind::Adapter)?.name)),
             }
         };
+        let fitted_adapter = adapter("fitted_adapter", &fitted_adapter)?;
+        let is_of_room = |name: &String| name.starts_with(&format!("{}.", room.name));
+        let sees_all = caller.is_none_or(|caller| caller.rooms().is_all());
+        if !sees_all && !fitted_adapter.as_ref().is_none_or(is_of_room) {
+            let problem = format!(
+                "must begin with '{}.': other names are not this caller's",
+                room.name
+            );
+            return Err(Error::invalid("fitted_adapter", problem));
+        }
+
         let request = Request {
             base: adapter("base_adapter", &base_adapter)?,
-            name: adapter("fitted_adapter", &fitted_adapter)?,
+            name: fitted_adapter,
             features: (!features.is_empty()).then_some(features),
             room: room.name,
             seed,

@@ -107,7 +107,7 @@ impl MemoryLayer {
             let request = request.map(|body| {
                 Body::new(CountedBody {
                     body,
-                    messages: Messages::default(),
+                    messages: Messages::of(&path),
                     held: counted,
                     layer,
                 })
@@ -192,17 +192,27 @@ struct CountedBody {
 /// Finds the messages in the bytes of a stream.
 #[derive(Debug, Default)]
 struct Messages {
+    /// The path of the RPC.
+    path: String,
     /// What has arrived of the prefix of the current message.
     prefix: Vec<u8>,
     /// How much of the current message is still to come, after its prefix.
     missing: usize,
-    /// What has arrived of the current message.
-    current: usize,
-    /// The most that had arrived of any message.
+    /// What has arrived of the current message, after its prefix.
+    current: Vec<u8>,
+    /// The most that any message took: what had arrived of it, here and in the decoder, and what it
+    /// becomes when it is decoded.
     largest: usize,
 }
 
 impl Messages {
+    fn of(path: &str) -> Self {
+        Self {
+            path: path.to_owned(),
+            ..Self::default()
+        }
+    }
+
     /// Takes what arrived, and returns by how much the largest message grew.
     fn take(&mut self, mut bytes: &[u8]) -> usize {
         let before = self.largest;
@@ -214,8 +224,6 @@ impl Messages {
             };
             let (taken, rest) = bytes.split_at(wanted.min(bytes.len()));
             bytes = rest;
-            self.current += taken.len();
-            self.largest = self.largest.max(self.current);
 
             if self.prefix.len() < PREFIX {
                 self.prefix.extend(taken);
@@ -226,11 +234,16 @@ impl Messages {
                 }
             } else {
                 self.missing -= taken.len();
+                self.current.extend(taken);
             }
 
+            let arrived = self.prefix.len() + self.current.len();
+            self.largest = self.largest.max(2 * arrived);
             if self.prefix.len() == PREFIX && self.missing == 0 {
+                let decoded = decoded_size(&self.path, &self.current);
+                self.largest = self.largest.max(decoded.saturating_add(2 * arrived));
                 self.prefix.clear();
-                self.current = 0;
+                self.current = Vec::new();
             }
         }
 
@@ -299,6 +312,8 @@ impl http_body::Body for HoldingBody {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use prost::Message;
+    use seese3_client::proto::v1 as pb;
 
     fn message(length: usize) -> Vec<u8> {
         let mut bytes = vec![0];
@@ -318,11 +333,27 @@ mod tests {
         for step in [1, 2, 5, 6, 64, stream.len()] {
             let mut messages = Messages::default();
             let grown: usize = stream.chunks(step).map(|part| messages.take(part)).sum();
-            assert_eq!(grown, PREFIX + 100, "in parts of {step}");
+            // Twice as it arrives, and once as it is decoded: an unknown RPC's as its bytes.
+            assert_eq!(grown, 2 * (PREFIX + 100) + 100, "in parts of {step}");
         }
 
         // A length that is only announced counts for nothing.
         let mut messages = Messages::default();
-        assert_eq!(messages.take(&[0, 0xff, 0xff, 0xff, 0xff, 1, 2]), 7);
+        assert_eq!(messages.take(&[0, 0xff, 0xff, 0xff, 0xff, 1, 2]), 14);
+
+        // What grows when it is decoded counts as grown, as soon as it is complete.
+        let config = pb::TrackConfig {
+            rooms: vec![String::new(); 1_000],
+            ..pb::TrackConfig::default()
+        };
+        let request = pb::TrackRequest {
+            message: Some(pb::track_request::Message::Config(config)),
+        };
+        let mut bytes = message(0);
+        let encoded = request.encode_to_vec();
+        bytes[1..].copy_from_slice(&(encoded.len() as u32).to_be_bytes());
+        bytes.extend(encoded);
+        let mut messages = Messages::of("/seese3.v1.OdometryService/Track");
+        assert!(messages.take(&bytes) > 1_000 * size_of::<String>());
     }
 }
