@@ -231,10 +231,13 @@ impl Store {
                 0 => 0,
                 _ => self.read_defaults(number).await?.back_to.unwrap_or(number),
             };
-            let mut before = match holds {
+            let (back_to, mut before) = match holds {
                 0 => return Err(Error::NothingToTakeBack),
-                1 => Defaults::default(),
-                _ => self.read_defaults(holds - 1).await?.defaults,
+                1 => (0, Defaults::default()),
+                _ => {
+                    let body = self.read_defaults(holds - 1).await?;
+                    (body.back_to.unwrap_or(holds - 1), body.defaults)
+                }
             };
 
             for resource in before.named() {
@@ -246,7 +249,7 @@ impl Store {
                 }
             }
             if self
-                .write_defaults(number + 1, Some(holds - 1), &before)
+                .write_defaults(number + 1, Some(back_to), &before)
                 .await?
             {
                 return Ok(before);
