@@ -19,8 +19,8 @@ pub enum Error {
     #[error(transparent)]
     Fitting(#[from] fitting::Error),
     #[error(
-        "adapter '{base}' has seen room '{room}' or was itself fitted to a room; begin from one that learned from \
-         other rooms alone, or from none"
+        "adapter '{base}' has seen room '{room}' or was itself fitted to a room; begin from one that \
+         learned from other rooms alone, or from none"
     )]
     Base { base: String, room: String },
     #[error("{name:?} cannot name an adapter: use 1 to 100 letters, digits, '.', '-' or '_'")]

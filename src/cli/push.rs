@@ -6,9 +6,10 @@ use sha2::{Digest, Sha256};
 
 use super::ask::Server;
 use super::say;
+use crate::service::source_to_wire;
 use crate::store::{Kind, ResourceName, Store, StoredRoom};
 use seese3_client::proto::v1 as pb;
-use seese3_core::features::{FeatureSource, Features};
+use seese3_core::features::Features;
 use seese3_core::geometry::Pose;
 
 /// The size of a message, bytes, as far as frames can be divided: well below what servers take.
@@ -171,30 +172,6 @@ fn batch(stored: &StoredRoom, rows: std::ops::Range<usize>) -> pb::FrameBatch {
         timestamps_ns: part(&frames.timestamps_ns, &rows),
         frame_names: part(&frames.names, &rows),
         sequences: part(&frames.sequences, &rows),
-    }
-}
-
-fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
-    let FeatureSource {
-        name,
-        encoder,
-        layer,
-        base,
-        norm,
-        pooling,
-        preprocess,
-        dim,
-    } = source.clone();
-
-    pb::FeatureSource {
-        name,
-        encoder,
-        layer,
-        pooling,
-        preprocess,
-        dim: dim as u32,
-        base,
-        norm,
     }
 }
 

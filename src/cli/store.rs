@@ -216,8 +216,8 @@ impl Default {
                 }
             }
             _ => bail!(
-                "name a revision ({name}/revisions/NUMBER), a room and an adapter (rooms/NAME adapters/NAME), or give \
-                 --unset"
+                "name a revision ({name}/revisions/NUMBER), a room and an adapter (rooms/NAME \
+                 adapters/NAME), or give --unset"
             ),
         }))
     }

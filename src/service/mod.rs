@@ -15,6 +15,7 @@ mod evaluation;
 mod image_encoder;
 mod navigate_to;
 mod health;
+mod holding_body;
 mod localization;
 mod measure;
 mod memory;
@@ -34,6 +35,7 @@ mod two_views;
 mod workers;
 
 pub use auth::{AuthError, Keyring};
+pub use convert::source_to_wire;
 pub use image_encoder::ImageEncoders;
 pub use metrics::Metrics;
 pub use reload::Reload;

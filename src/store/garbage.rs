@@ -50,9 +50,7 @@ impl Store {
     /// [`Error::Io`] if the store cannot be read.
     pub async fn find_garbage(&self, older_than: Duration) -> Result<Garbage, Error> {
         let mut garbage = Garbage::default();
-        let age = chrono::TimeDelta::from_std(older_than).unwrap_or(chrono::TimeDelta::MAX);
-        let before = Utc::now().checked_sub_signed(age);
-        let before = before.unwrap_or(DateTime::<Utc>::MIN_UTC);
+        let before = written_before(older_than);
 
         for kind in Kind::ALL {
             for (_, folder) in self.folders(kind).await? {
@@ -70,37 +68,45 @@ impl Store {
     /// # Errors
     /// As [`Store::find_garbage`]; [`Error::Io`] if a file cannot be removed.
     pub async fn collect_garbage(&self, older_than: Duration) -> Result<Garbage, Error> {
-        let garbage = self.find_garbage(older_than).await?;
-        let before = Utc::now() - chrono::TimeDelta::from_std(older_than).unwrap_or_default();
+        let before = written_before(older_than);
+        let mut garbage = self.find_garbage(older_than).await?;
+        let mut removed = Vec::with_capacity(garbage.files.len());
 
-        for file in &garbage.files {
-            let path = Path::from(file.path.as_str());
-
+        for file in garbage.files {
             // Somebody who publishes the same content again has written the object anew.
+            let path = Path::from(file.path.as_str());
             let now = self.objects.head(&path).await;
             if now.is_ok_and(|now| now.last_modified > before) {
                 continue;
             }
 
-            match &self.folder {
-                // The names of unfinished files are none that the object store would accept.
-                Some(folder) => match std::fs::remove_file(folder.join(&file.path)) {
-                    Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                        return Err(Error::Io {
-                            file: self.shown(&path),
-                            cause: error.to_string(),
-                        });
-                    }
-                    _ => {}
-                },
-                None => match self.objects.delete(&path).await {
-                    Ok(()) | Err(object_store::Error::NotFound { .. }) => {}
-                    Err(error) => return Err(self.io(&path, &error)),
-                },
-            }
+            self.remove_file(&file.path).await?;
+            removed.push(file);
         }
 
+        garbage.files = removed;
         Ok(garbage)
+    }
+
+    /// Removes a file, unless it is gone already.
+    async fn remove_file(&self, file: &str) -> Result<(), Error> {
+        let path = Path::from(file);
+
+        // The names of unfinished files are none that the object store would accept.
+        if let Some(folder) = &self.folder {
+            return match std::fs::remove_file(folder.join(file)) {
+                Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(Error::Io {
+                    file: self.shown(&path),
+                    cause: error.to_string(),
+                }),
+                _ => Ok(()),
+            };
+        }
+
+        match self.objects.delete(&path).await {
+            Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
+            Err(error) => Err(self.io(&path, &error)),
+        }
     }
 
     /// Finds the objects of one room or adapter that no manifest names.
@@ -245,6 +251,13 @@ impl Store {
 
         Ok(())
     }
+}
+
+/// The time before which a file that is older than this was written.
+fn written_before(older_than: Duration) -> DateTime<Utc> {
+    let age = chrono::TimeDelta::from_std(older_than).unwrap_or(chrono::TimeDelta::MAX);
+    let before = Utc::now().checked_sub_signed(age);
+    before.unwrap_or(DateTime::<Utc>::MIN_UTC)
 }
 
 /// Where the manifest is once its revision was removed.

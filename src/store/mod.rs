@@ -12,6 +12,7 @@
 //! Tensors are safetensors files; Python reads them with `safetensors.numpy.load_file(path)`.
 //! Published revisions never change.
 
+mod adapter_files;
 mod adapters;
 mod contents;
 mod defaults;
@@ -27,7 +28,8 @@ mod rooms;
 mod tensors;
 mod verification;
 
-pub use adapters::{BaseAdapter, RoomFit, StoredAdapter, check_adapter_files, stated_weights_size};
+pub use adapter_files::{check_adapter_files, stated_weights_size};
+pub use adapters::{BaseAdapter, RoomFit, StoredAdapter};
 pub use contents::{Contents, RevisionContents};
 pub use defaults::{Choice, Defaults};
 pub use garbage::{Garbage, GarbageFile};

@@ -29,7 +29,7 @@ impl Store {
 
         for kind in Kind::ALL {
             for (name, numbers) in self.numbered(kind).await? {
-                // Revisions share objects: each is read once.
+                // Revisions share objects: one that adds none to those before is not read again.
                 let mut intact = BTreeSet::new();
 
                 for revision in numbers.present {

@@ -128,6 +128,15 @@ async fn what_is_removed_is_gone_and_its_number_too() {
         Err(Error::UnknownRevision { newest: 2, .. })
     ));
 
+    // No age is too long to be asked for.
+    let for_ever = store.collect_garbage(Duration::MAX).await.unwrap();
+    assert!(for_ever.files.is_empty());
+    let ages = store
+        .collect_garbage(Duration::from_secs(1 << 42))
+        .await
+        .unwrap();
+    assert!(ages.files.is_empty());
+
     // A publisher may have begun from what was removed just now, so its objects stay for an hour.
     let hour = Duration::from_secs(3_600);
     assert!(store.find_garbage(hour).await.unwrap().files.is_empty());

@@ -6,7 +6,6 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use http::{HeaderMap, Request, Response, header};
-use http_body::{Frame, SizeHint};
 use tokio::sync::OwnedSemaphorePermit;
 use tonic::Status;
 use tonic::body::Body;
@@ -14,6 +13,7 @@ use tower::{Layer, Service};
 
 use super::super::Error;
 use super::super::connections::Peer;
+use super::super::holding_body::holding;
 use super::super::metrics::Metrics;
 use super::super::status::Full;
 use super::{Keyring, Principal, Verb};
@@ -97,12 +97,7 @@ where
             let response = answer.await?;
             Ok(match place {
                 None => response,
-                Some(place) => response.map(|body| {
-                    Body::new(HoldingBody {
-                        body,
-                        _place: place,
-                    })
-                }),
+                Some(place) => response.map(|body| holding(body, place)),
             })
         })
     }
@@ -183,30 +178,4 @@ fn bearer(headers: &HeaderMap) -> Result<Option<&[u8]>, Error> {
     }
 
     Ok(Some(token))
-}
-
-/// A body that holds its caller's place until it has ended.
-struct HoldingBody {
-    body: Body,
-    _place: OwnedSemaphorePermit,
-}
-
-impl http_body::Body for HoldingBody {
-    type Data = <Body as http_body::Body>::Data;
-    type Error = <Body as http_body::Body>::Error;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Self::Data>, Self::Error>>> {
-        Pin::new(&mut self.body).poll_frame(context)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
 }

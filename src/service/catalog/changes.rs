@@ -320,7 +320,8 @@ impl From<store::Error> for Error {
             _ => {
                 tracing::error!(%error, "the store could not be changed");
                 Self::Precondition(
-                    "the store cannot be read or written, or is damaged where this belongs; the server's log says why"
+                    "the store cannot be read or written, or is damaged where this belongs; the \
+                     server's log says why"
                         .to_owned(),
                 )
             }

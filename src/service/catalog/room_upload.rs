@@ -443,7 +443,8 @@ fn finished(
         return Err(Error::invalid("end.frame_count", problem));
     }
     if received.digest.finalize().as_slice() != end.sha256 {
-        let problem = "is not that of the bytes that arrived: poses, features and images of each batch, in this order";
+        let problem = "is not that of the bytes that arrived: poses, features and images of each \
+                       batch, in this order";
         return Err(Error::invalid("end.sha256", problem));
     }
 

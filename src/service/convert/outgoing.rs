@@ -167,6 +167,7 @@ pub fn time_to_wire(stated: &str) -> Option<prost_types::Timestamp> {
     })
 }
 
+/// The source of a set of features on the wire.
 pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
     let FeatureSource {
         name,

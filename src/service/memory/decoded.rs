@@ -21,8 +21,19 @@ const MARK: usize = 8;
 
 /// The messages of the protocol by their full names.
 static MESSAGES: LazyLock<HashMap<String, Shape>> = LazyLock::new(shapes);
-/// The messages that requests consist of, by the path of the RPC.
-static REQUESTS: LazyLock<HashMap<String, String>> = LazyLock::new(requests);
+/// What requests consist of, by the path of the RPC.
+static REQUESTS: LazyLock<HashMap<String, Request>> = LazyLock::new(requests);
+/// The end of the path of reflection, which has no descriptors here.
+const REFLECTION: &str = "/ServerReflectionInfo";
+
+/// What a request consists of.
+#[derive(Debug)]
+struct Request {
+    /// The full name of its messages.
+    message: String,
+    /// Whether it has several.
+    is_stream: bool,
+}
 
 /// What decoding needs to know of a message.
 #[derive(Debug, Default)]
@@ -53,11 +64,19 @@ enum Content {
 /// RPC that is not ours it is the size of the message.
 pub fn decoded_size(path: &str, message: &[u8]) -> usize {
     match REQUESTS.get(path) {
-        Some(name) => {
+        Some(Request { message: name, .. }) => {
             let own = MESSAGES.get(name).map_or(0, |shape| shape.size);
             own.saturating_add(content_size(name, message))
         }
         None => message.len(),
+    }
+}
+
+/// Whether the request of an RPC is a stream of messages.
+pub fn is_stream(path: &str) -> bool {
+    match REQUESTS.get(path) {
+        Some(request) => request.is_stream,
+        None => path.ends_with(REFLECTION),
     }
 }
 
@@ -152,14 +171,18 @@ fn descriptors() -> FileDescriptorSet {
     FileDescriptorSet::decode(FILE_DESCRIPTOR_SET).unwrap_or_default()
 }
 
-fn requests() -> HashMap<String, String> {
+fn requests() -> HashMap<String, Request> {
     let mut requests = HashMap::new();
     for file in descriptors().file {
         for service in &file.service {
             for method in &service.method {
                 let path = format!("/{}.{}/{}", file.package(), service.name(), method.name());
                 let input = method.input_type().trim_start_matches('.');
-                requests.insert(path, input.to_owned());
+                let request = Request {
+                    message: input.to_owned(),
+                    is_stream: method.client_streaming(),
+                };
+                requests.insert(path, request);
             }
         }
     }
@@ -279,6 +302,27 @@ mod tests {
         };
         let size = decoded_size(NAVIGATE, &request.encode_to_vec());
         assert!((4_000..20_000).contains(&size), "{size}");
+    }
+
+    /// Oracle: the protos, by hand.
+    #[test]
+    fn streams_are_known_by_their_paths() {
+        let service = |name: &str| format!("/seese3.v1.{name}");
+        for (path, expected) in [
+            (service("OdometryService/Track"), true),
+            (service("CatalogService/CreateRoom"), true),
+            (service("CatalogService/PublishAdapter"), true),
+            (service("OdometryService/EstimateMotion"), false),
+            (service("EvaluationService/Evaluate"), false),
+            (NAVIGATE.to_owned(), false),
+            (
+                "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo".to_owned(),
+                true,
+            ),
+            ("/grpc.health.v1.Health/Check".to_owned(), false),
+        ] {
+            assert_eq!(is_stream(&path), expected, "{path}");
+        }
     }
 
     /// Oracle: nothing that a caller can send may stop the computation.

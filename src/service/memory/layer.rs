@@ -14,16 +14,10 @@ use tonic::body::Body;
 use tower::{Layer, Service};
 
 use super::super::Error;
-use super::decoded::decoded_size;
+use super::super::holding_body::holding;
+use super::decoded::{decoded_size, is_stream};
 use super::{HELD, Held, Memory};
 
-/// The RPCs whose requests are streams of messages, by the end of their path.
-const STREAMS: [&str; 4] = [
-    "/Track",
-    "/CreateRoom",
-    "/PublishAdapter",
-    "/ServerReflectionInfo",
-];
 /// The beginning of the paths of the health service.
 const HEALTH: &str = "/grpc.health.v1.Health/";
 /// What stands before a message: whether it is compressed, and its length.
@@ -86,7 +80,7 @@ where
             };
 
             let response = HELD.scope(held.clone(), inner.call(request)).await?;
-            Ok(response.map(|body| Body::new(HoldingBody { body, _held: held })))
+            Ok(response.map(|body| holding(body, held)))
         })
     }
 }
@@ -99,17 +93,15 @@ impl MemoryLayer {
             true => &self.probes,
             false => &self.memory,
         };
-        let held = memory.begin().ok_or_else(|| self.full())?;
+        let held = memory.begin()?;
 
-        if STREAMS.iter().any(|end| path.ends_with(end)) {
-            let layer = self.clone();
+        if is_stream(&path) {
             let counted = held.clone();
             let request = request.map(|body| {
                 Body::new(CountedBody {
                     body,
                     messages: Messages::of(&path),
                     held: counted,
-                    layer,
                 })
             });
             return Ok((held, request));
@@ -118,16 +110,7 @@ impl MemoryLayer {
         let (head, body) = request.into_parts();
         let message = tokio::time::timeout(self.receive_within, self.whole(body, &held)).await;
         let message = message.map_err(|_| Error::Deadline)??;
-        let size = decoded_size(&path, self.one_message(&message)?);
-        if size > self.memory.largest_request() {
-            let problem = format!(
-                "takes {size} bytes when it is decoded, over the limit of this server; send less at once"
-            );
-            return Err(Error::invalid("request", problem));
-        }
-        if !held.0.hold(size) {
-            return Err(self.full());
-        }
+        held.hold_message(decoded_size(&path, self.one_message(&message)?))?;
 
         let body = Body::new(WholeBody::new(message));
         Ok((held, Request::from_parts(head, body)))
@@ -163,9 +146,7 @@ impl MemoryLayer {
             };
 
             // The decoder refuses a message that is too long by its prefix: no more is read of it.
-            if !held.0.hold(data.len()) {
-                return Err(self.full());
-            }
+            held.hold(data.len())?;
             whole.extend_from_slice(&data);
             if whole.len() > self.message_bytes + PREFIX {
                 break;
@@ -173,10 +154,6 @@ impl MemoryLayer {
         }
 
         Ok(whole.freeze())
-    }
-
-    fn full(&self) -> Error {
-        self.memory.full()
     }
 }
 
@@ -186,7 +163,6 @@ struct CountedBody {
     body: Body,
     messages: Messages,
     held: Held,
-    layer: MemoryLayer,
 }
 
 /// Finds the messages in the bytes of a stream.
@@ -267,37 +243,11 @@ impl http_body::Body for CountedBody {
         // The decoder refuses a message that is too long as soon as its prefix has arrived.
         if let Some(data) = frame.data_ref() {
             let grown = self.messages.take(data);
-            if !self.held.0.hold(grown) {
-                return Poll::Ready(Some(Err(self.layer.full().into())));
+            if let Err(error) = self.held.hold_message(grown) {
+                return Poll::Ready(Some(Err(error.into())));
             }
         }
         polled
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
-}
-
-/// The body of an answer, which holds the memory of its request until it has been sent.
-struct HoldingBody {
-    body: Body,
-    _held: Held,
-}
-
-impl http_body::Body for HoldingBody {
-    type Data = Bytes;
-    type Error = Status;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        Pin::new(&mut self.body).poll_frame(context)
     }
 
     fn is_end_stream(&self) -> bool {

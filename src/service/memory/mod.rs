@@ -66,13 +66,17 @@ impl Memory {
         self.0.most / 4
     }
 
-    /// What a new request holds; none if there is no memory for it.
-    fn begin(&self) -> Option<Held> {
-        let share = Share {
+    /// What a new request holds.
+    ///
+    /// # Errors
+    /// [`Error::Full`] if there is no memory for it.
+    fn begin(&self) -> Result<Held, Error> {
+        let held = Held(Arc::new(Share {
             memory: self.clone(),
             bytes: AtomicUsize::new(0),
-        };
-        share.hold(LEAST).then(|| Held(Arc::new(share)))
+        }));
+        held.hold(LEAST)?;
+        Ok(held)
     }
 }
 
@@ -86,19 +90,33 @@ struct Share {
     bytes: AtomicUsize,
 }
 
-impl Share {
-    /// Holds more bytes. Returns whether there is memory for them; if not, nothing changes.
-    fn hold(&self, bytes: usize) -> bool {
-        let Counter { held, most, .. } = &*self.memory.0;
+impl Held {
+    /// Holds more bytes.
+    ///
+    /// # Errors
+    /// [`Error::Full`] if there is no memory for them; then nothing changes.
+    fn hold(&self, bytes: usize) -> Result<(), Error> {
+        let Share { memory, bytes: own } = &*self.0;
+        let Counter { held, most, .. } = &*memory.0;
         let grown = |now: usize| now.checked_add(bytes).filter(|sum| sum <= most);
-        let is_held = held
-            .try_update(Ordering::Relaxed, Ordering::Relaxed, grown)
-            .is_ok();
 
-        if is_held {
-            self.bytes.fetch_add(bytes, Ordering::Relaxed);
+        held.try_update(Ordering::Relaxed, Ordering::Relaxed, grown)
+            .map_err(|_| memory.full())?;
+        own.fetch_add(bytes, Ordering::Relaxed);
+        Ok(())
+    }
+
+    /// Holds what a message takes when it is decoded, bytes.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if it takes more than one request may, [`Error::Full`] if there is no memory
+    /// for it now.
+    fn hold_message(&self, bytes: usize) -> Result<(), Error> {
+        if bytes > self.0.memory.largest_request() {
+            let problem = "takes more memory when it is decoded than one request may; send less";
+            return Err(Error::invalid("request", problem));
         }
-        is_held
+        self.hold(bytes)
     }
 }
 
@@ -117,12 +135,8 @@ pub fn hold_answer<A: Message>(answer: A) -> Result<A, Error> {
     // In memory an answer is at most about twice as large as encoded, and it is both at once.
     let bytes = 3 * answer.encoded_len();
 
-    let counted = HELD.try_with(|held| match held.0.hold(bytes) {
-        true => Ok(()),
-        false => Err(held.0.memory.full()),
-    });
     // Outside of a request, as in a unit test, nothing is counted.
-    counted.unwrap_or(Ok(()))?;
+    HELD.try_with(|held| held.hold(bytes)).unwrap_or(Ok(()))?;
     Ok(answer)
 }
 
@@ -136,15 +150,15 @@ mod tests {
         let memory = Memory::new(3 * LEAST, Metrics::default());
         let first = memory.begin().unwrap();
         let second = memory.begin().unwrap();
-        assert!(first.0.hold(LEAST));
-        assert!(!second.0.hold(1));
-        assert!(memory.begin().is_none());
+        assert!(first.hold(LEAST).is_ok());
+        assert!(second.hold(1).is_err());
+        assert!(memory.begin().is_err());
         assert_eq!(memory.held(), 3 * LEAST);
 
         drop(first);
         assert_eq!(memory.held(), LEAST);
-        assert!(!second.0.hold(usize::MAX));
-        assert!(second.0.hold(2 * LEAST));
+        assert!(second.hold(usize::MAX).is_err());
+        assert!(second.hold(2 * LEAST).is_ok());
 
         drop(second);
         assert_eq!(memory.held(), 0);

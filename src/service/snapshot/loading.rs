@@ -500,8 +500,9 @@ fn opened_for(
     })
 }
 
-/// The adapters that fit a room with features of these sources, in order of preference; the first is
-/// the room's default where an operator chose none: those fitted to this room first, then those trained in it, then the newest.
+/// The adapters that fit a room with features of these sources, in order of preference: those fitted
+/// to this room, then those trained in it, then the newest. The first is the room's default where an
+/// operator chose none.
 fn fitting(
     adapters: &BTreeMap<String, Arc<StoredAdapter>>,
     room: &RoomId,

@@ -322,8 +322,8 @@ impl Snapshot {
         match (self.default_adapters.get(id.as_str()), first) {
             (Some(chosen), first) if first.is_none_or(|first| first.adapter.name != *chosen) => {
                 Err(Error::Precondition(format!(
-                    "adapter '{chosen}' was chosen as the default of room '{id}' and does not serve it; name another, \
-                     or choose another"
+                    "adapter '{chosen}' was chosen as the default of room '{id}' and does not serve \
+                     it; name another, or choose another"
                 )))
             }
             (_, Some(first)) => Ok(first),

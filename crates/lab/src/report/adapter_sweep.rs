@@ -203,7 +203,10 @@ pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
             ),
             percent(&values, 0.0),
             percent(&values, 0.5),
-            format!("{:.3}", mean_of_known(&spreads)),
+            match spreads.is_empty() {
+                true => "–".to_owned(),
+                false => format!("{:.3}", mean_of_known(&spreads)),
+            },
             format!("{:.3}", mean(&values)),
         ]);
     }
