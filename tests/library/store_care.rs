@@ -9,7 +9,7 @@ use object_store::local::LocalFileSystem;
 use seese3::store::{Choice, Error, ResourceName, RoomFit, Store};
 use seese3_core::features::Features;
 use seese3_core::fitting::fit;
-use seese3_core::room::FrameId;
+use seese3_core::room::{FrameId, Room};
 use seese3_core::training::RoomData;
 
 use crate::dying::Dying;
@@ -416,4 +416,30 @@ async fn garbage_that_is_published_again_is_not_collected() {
         assert!(findings.is_empty(), "round {round}: {findings:?}");
         store.remove(&named("rooms/a")).await.unwrap();
     }
+}
+
+/// Oracle: the promise: of two recordings under one name one is published, unless the other is to
+/// replace it; the same frames with other features are no other recording.
+#[tokio::test]
+async fn other_frames_are_not_published_by_accident() {
+    let (_folder, store) = stored().await;
+    let first = room("a");
+    let mut frames = first.frames().clone();
+    frames.poses.reverse();
+    let other = Room::new(first.id().clone(), frames, first.provenance().clone()).unwrap();
+
+    let publish = async |room: &Room, scale: f32| {
+        let features = [set("f", scale)];
+        store.publish_same_frames(room, &features).await
+    };
+    assert_eq!(publish(&first, 1.0).await.unwrap().revision, 1);
+    assert_eq!(publish(&first, 2.0).await.unwrap().revision, 2);
+    let refused = publish(&other, 1.0).await;
+    assert!(
+        matches!(refused, Err(Error::OtherFrames { revision: 2, .. })),
+        "{refused:?}"
+    );
+
+    let replaced = store.publish_room(&other, &[set("f", 1.0)]).await.unwrap();
+    assert_eq!(replaced.revision, 3);
 }

@@ -384,7 +384,8 @@ async fn a_lame_duck_still_answers() {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
 
-    // A connection that begins now is a client that a load balancer still sends here.
+    // A connection that begins later is a client that a load balancer still sends here.
+    tokio::time::sleep(Duration::from_millis(500)).await;
     let late = Client::connect(&server.address, Duration::from_secs(5))
         .await
         .unwrap();
