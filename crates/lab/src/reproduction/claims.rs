@@ -73,6 +73,18 @@ impl Verdict {
     }
 }
 
+/// Whether a claim about several things holds for each: it does not if it fails for one, and where one
+/// cannot tell, all cannot.
+pub fn holds_for_each(cases: &[Option<bool>]) -> Option<bool> {
+    if cases.contains(&Some(false)) {
+        Some(false)
+    } else if cases.contains(&None) {
+        None
+    } else {
+        Some(true)
+    }
+}
+
 /// The fewest rooms whose resampled means say something: five of the same sign happen by chance in
 /// one of sixteen cases.
 const FEWEST_ROOMS: usize = 6;
@@ -165,6 +177,14 @@ mod tests {
         assert_eq!(is_most(&Rate::of(3, 3)), None);
         assert_eq!(is_most(&Rate::of(10, 10)), Some(true));
         assert_eq!(is_most(&Rate::of(0, 10)), Some(false));
+    }
+
+    /// Oracle: the meaning of "each": one failure is enough, and one unknown leaves it open.
+    #[test]
+    fn a_claim_about_each_fails_with_one() {
+        assert_eq!(holds_for_each(&[Some(true), Some(true)]), Some(true));
+        assert_eq!(holds_for_each(&[Some(true), None]), None);
+        assert_eq!(holds_for_each(&[None, Some(false)]), Some(false));
     }
 
     /// Oracle: the words of the verdicts.

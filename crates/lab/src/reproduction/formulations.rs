@@ -7,7 +7,7 @@ use seese3_core::motion_scores::MotionScores;
 use seese3_core::splits::Split;
 use seese3_core::statistics::{mean_of_known, paired_difference};
 
-use super::claims::{Claim, Verdict, count_words, is_above_zero};
+use super::claims::{Claim, Verdict, count_words, holds_for_each, is_above_zero};
 use super::render::spread;
 use super::{Error, FeatureSet, Found, Reproduction, paper};
 use seese3_core::training::RoomData;
@@ -97,13 +97,7 @@ fn is_best(compared: &Comparison) -> Option<bool> {
         .map(|other| is_above_zero(&paired_difference(adapter, other, 0)))
         .collect();
 
-    if is_above.contains(&Some(false)) {
-        Some(false)
-    } else if is_above.contains(&None) {
-        None
-    } else {
-        Some(true)
-    }
+    holds_for_each(&is_above)
 }
 
 /// One row per formulation, then the constant's and the paper's.
