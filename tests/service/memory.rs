@@ -204,5 +204,5 @@ async fn a_message_of_a_stream_that_grows_is_refused_too() {
         Err(error) => error.code().unwrap(),
         Ok(mut answers) => answers.message().await.unwrap_err().code(),
     };
-    assert_eq!(refused, Code::ResourceExhausted);
+    assert_eq!(refused, Code::InvalidArgument);
 }

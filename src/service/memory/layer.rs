@@ -110,7 +110,7 @@ impl MemoryLayer {
         let (head, body) = request.into_parts();
         let message = tokio::time::timeout(self.receive_within, self.whole(body, &held)).await;
         let message = message.map_err(|_| Error::Deadline)??;
-        held.hold_message(decoded_size(&path, self.one_message(&message)?))?;
+        held.hold_message(decoded_size(&path, self.one_message(&message)?), 0)?;
 
         let body = Body::new(WholeBody::new(message));
         Ok((held, Request::from_parts(head, body)))
@@ -189,10 +189,8 @@ impl Messages {
         }
     }
 
-    /// Takes what arrived, and returns by how much the largest message grew.
-    fn take(&mut self, mut bytes: &[u8]) -> usize {
-        let before = self.largest;
-
+    /// Takes what arrived.
+    fn take(&mut self, mut bytes: &[u8]) {
         while !bytes.is_empty() {
             let wanted = match PREFIX - self.prefix.len() {
                 0 => self.missing,
@@ -222,8 +220,6 @@ impl Messages {
                 self.current = Vec::new();
             }
         }
-
-        self.largest - before
     }
 }
 
@@ -242,8 +238,9 @@ impl http_body::Body for CountedBody {
 
         // The decoder refuses a message that is too long as soon as its prefix has arrived.
         if let Some(data) = frame.data_ref() {
-            let grown = self.messages.take(data);
-            if let Err(error) = self.held.hold_message(grown) {
+            let before = self.messages.largest;
+            self.messages.take(data);
+            if let Err(error) = self.held.hold_message(self.messages.largest, before) {
                 return Poll::Ready(Some(Err(error.into())));
             }
         }
@@ -282,14 +279,16 @@ mod tests {
 
         for step in [1, 2, 5, 6, 64, stream.len()] {
             let mut messages = Messages::default();
-            let grown: usize = stream.chunks(step).map(|part| messages.take(part)).sum();
+            stream.chunks(step).for_each(|part| messages.take(part));
             // Twice as it arrives, and once as it is decoded: an unknown RPC's as its bytes.
-            assert_eq!(grown, 2 * (PREFIX + 100) + 100, "in parts of {step}");
+            let expected = 2 * (PREFIX + 100) + 100;
+            assert_eq!(messages.largest, expected, "in parts of {step}");
         }
 
         // A length that is only announced counts for nothing.
         let mut messages = Messages::default();
-        assert_eq!(messages.take(&[0, 0xff, 0xff, 0xff, 0xff, 1, 2]), 14);
+        messages.take(&[0, 0xff, 0xff, 0xff, 0xff, 1, 2]);
+        assert_eq!(messages.largest, 14);
 
         // What grows when it is decoded counts as grown, as soon as it is complete.
         let config = pb::TrackConfig {
@@ -304,6 +303,7 @@ mod tests {
         bytes[1..].copy_from_slice(&(encoded.len() as u32).to_be_bytes());
         bytes.extend(encoded);
         let mut messages = Messages::of("/seese3.v1.OdometryService/Track");
-        assert!(messages.take(&bytes) > 1_000 * size_of::<String>());
+        messages.take(&bytes);
+        assert!(messages.largest > 1_000 * size_of::<String>());
     }
 }

@@ -106,17 +106,17 @@ impl Held {
         Ok(())
     }
 
-    /// Holds what a message takes when it is decoded, bytes.
+    /// Holds what a message takes when it is decoded, bytes, of which some are held already.
     ///
     /// # Errors
     /// [`Error::Invalid`] if it takes more than one request may, [`Error::Full`] if there is no memory
     /// for it now.
-    fn hold_message(&self, bytes: usize) -> Result<(), Error> {
+    fn hold_message(&self, bytes: usize, held_already: usize) -> Result<(), Error> {
         if bytes > self.0.memory.largest_request() {
             let problem = "takes more memory when it is decoded than one request may; send less";
             return Err(Error::invalid("request", problem));
         }
-        self.hold(bytes)
+        self.hold(bytes.saturating_sub(held_already))
     }
 }
 
@@ -143,6 +143,20 @@ pub fn hold_answer<A: Message>(answer: A) -> Result<A, Error> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Oracle: by hand: a message counts as a whole, in however many parts it arrives.
+    #[test]
+    fn a_message_is_no_larger_than_a_quarter_of_all() {
+        let memory = Memory::new(40 * LEAST, Metrics::default());
+        let held = memory.begin().unwrap();
+        assert!(held.hold_message(6 * LEAST, 0).is_ok());
+        assert!(held.hold_message(10 * LEAST, 6 * LEAST).is_ok());
+        assert_eq!(memory.held(), 11 * LEAST);
+
+        let refused = held.hold_message(10 * LEAST + 1, 10 * LEAST);
+        assert!(matches!(refused, Err(Error::Invalid { .. })));
+        assert_eq!(memory.held(), 11 * LEAST);
+    }
 
     /// Oracle: by hand.
     #[test]
