@@ -19,7 +19,7 @@ use seese3_core::cancel::Cancellation;
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
-use seese3_lab::studio::{Film, Suite};
+use seese3_lab::studio::{Film, Suite, Variation};
 
 /// The largest number of rooms on a contact sheet; below, its columns and the size of a tile,
 /// pixels.
@@ -41,6 +41,10 @@ pub struct Studio {
     /// How the rooms are filmed
     #[arg(long, default_value = "visits", value_parser = one_of::<Suite>())]
     suite: Suite,
+    /// What does not vary between the visits and rooms of the suite `visits`, separated by commas, to
+    /// see what a variation is good for; the poses stay the same
+    #[arg(long, value_delimiter = ',', value_name = "VARIATIONS", value_parser = one_of::<Variation>())]
+    without: Vec<Variation>,
     /// Number of rooms, 1 to 100000
     #[arg(long, default_value_t = 131, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     rooms: u32,
@@ -83,6 +87,9 @@ struct Spent {
 
 impl Studio {
     pub async fn run(self) -> anyhow::Result<()> {
+        if self.suite == Suite::Walks && !self.without.is_empty() {
+            bail!("--without belongs to the suite visits: walks are plain already");
+        }
         if let Some(file) = &self.sheet {
             return self.sheet(file);
         }
@@ -232,7 +239,10 @@ impl Studio {
     }
 
     fn film(&self, number: u32) -> Film {
-        self.suite.film(self.seed, number, self.frame_count())
+        let film = self.suite.film(self.seed, number, self.frame_count());
+        self.without
+            .iter()
+            .fold(film, |film, &variation| film.without(variation))
     }
 
     fn room_name(&self, number: u32) -> String {
@@ -247,8 +257,13 @@ impl Studio {
         film: &Film,
         (width, height): (usize, usize),
     ) -> anyhow::Result<Room> {
+        let without: String = Variation::ALL
+            .iter()
+            .filter(|variation| self.without.contains(variation))
+            .map(|variation| format!(" without {}", variation.name()))
+            .collect();
         let mut provenance = Provenance {
-            format: format!("studio {}", film.kind),
+            format: format!("studio {}{without}", film.kind),
             licence: "CC0-1.0".to_owned(),
             camera: Some(film.camera(width, height)?),
             ..Provenance::default()
@@ -374,6 +389,27 @@ impl Studio {
     }
 }
 
+impl ClosedSet for Variation {
+    fn all() -> Vec<Self> {
+        Self::ALL.to_vec()
+    }
+
+    fn name(self) -> &'static str {
+        self.name()
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            Self::Light => "Day, dusk or night, and the colour of lamps",
+            Self::Exposure => "Exposure and white balance",
+            Self::Lens => "Motion blur, noise and dark corners",
+            Self::FieldOfView => "The camera's field of view",
+            Self::Clutter => "Things that were moved, and passers-by",
+            Self::Detail => "Fine detail of all surfaces",
+        }
+    }
+}
+
 impl ClosedSet for Suite {
     fn all() -> Vec<Self> {
         Self::ALL.to_vec()
@@ -435,6 +471,11 @@ async fn stored(store: &Store, room: &Room) -> anyhow::Result<Option<StoredRoom>
             stored.room.frame_count(),
             room.frame_count()
         );
+    }
+
+    let [before, now] = [&stored.room, room].map(|room| &room.provenance().format);
+    if before != now {
+        bail!("room '{name}' is in the store as '{before}', not '{now}'; choose another store");
     }
 
     Ok(Some(stored))

@@ -5,7 +5,7 @@ use nalgebra::Isometry3;
 use super::photograph::{Shot, photograph};
 use super::render::{Camera, Sampling, radiance};
 use super::solid::Solid;
-use super::{FRAMES_PER_SECOND, Scene, SuiteRoom, render, visits};
+use super::{FRAMES_PER_SECOND, Light, Scene, SuiteRoom, render, visits};
 use seese3_core::geometry::{Pinhole, PinholeError, PixelCamera, Pose};
 use seese3_core::image::RgbImage;
 
@@ -49,6 +49,47 @@ impl Suite {
                     scenes: vec![room.scene],
                 }
             }
+        }
+    }
+}
+
+/// What makes drawn photographs as different from one another as real ones are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Variation {
+    /// Day, dusk or night, and lamps of different colours, another for each visit.
+    Light,
+    /// An exposure and a white balance for each visit.
+    Exposure,
+    /// Motion blur, noise, and corners that are darker than the middle.
+    Lens,
+    /// A field of view for each room.
+    FieldOfView,
+    /// Things that were moved between visits, and passers-by.
+    Clutter,
+    /// Fine detail of all surfaces.
+    Detail,
+}
+
+impl Variation {
+    /// All variations.
+    pub const ALL: [Self; 6] = [
+        Self::Light,
+        Self::Exposure,
+        Self::Lens,
+        Self::FieldOfView,
+        Self::Clutter,
+        Self::Detail,
+    ];
+
+    /// The name of the variation.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Light => "light",
+            Self::Exposure => "exposure",
+            Self::Lens => "lens",
+            Self::FieldOfView => "field-of-view",
+            Self::Clutter => "clutter",
+            Self::Detail => "detail",
         }
     }
 }
@@ -118,6 +159,52 @@ impl Film {
                 (seconds * 1e9).round() as i64
             })
             .collect()
+    }
+
+    /// The same recording, in which one thing no longer varies. The poses stay as they are. A plain
+    /// walk has no variations.
+    pub fn without(mut self, variation: Variation) -> Self {
+        if self.visits.is_empty() {
+            return self;
+        }
+
+        match variation {
+            Variation::Light => {
+                for scene in &mut self.scenes {
+                    scene.light = Light::PLAIN;
+                }
+            }
+            Variation::Exposure => {
+                for Visit { shot, .. } in &mut self.visits {
+                    shot.exposure = 1.0;
+                    shot.white = [1.0; 3];
+                }
+            }
+            Variation::Lens => {
+                for visit in &mut self.visits {
+                    visit.shutter = 0.0;
+                    visit.shot.vignette = 0.0;
+                    visit.shot.noise = [0.0; 2];
+                }
+            }
+            Variation::FieldOfView => self.field_of_view_rad = visits::FIELD_OF_VIEW_RAD,
+            Variation::Clutter => {
+                let (first, later) = self.scenes.split_at_mut(1);
+                for (scene, first) in later.iter_mut().zip(first.iter().cycle()) {
+                    scene.solids.clone_from(&first.solids);
+                    scene.shade_lamp();
+                }
+                for visit in &mut self.visits {
+                    visit.passer_by = None;
+                }
+            }
+            Variation::Detail => {
+                for scene in &mut self.scenes {
+                    scene.detail = 0.0;
+                }
+            }
+        }
+        self
     }
 
     /// The camera that takes images of this size.
@@ -202,5 +289,37 @@ impl PasserBy {
                 ..*solid
             })
             .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the definition of each variation: without it the image is another one and the poses
+    /// are the same, and leaving it out twice changes nothing more.
+    #[test]
+    fn a_variation_that_is_left_out_changes_the_images_alone() {
+        // A room that has a passer-by in its second visit.
+        let whole = (0..40)
+            .map(|number| Suite::Visits.film(5, number, 60))
+            .find(|film| film.visits[1].passer_by.is_some())
+            .unwrap();
+        let frame = whole.visits[1].passer_by.as_ref().unwrap().frames.start;
+        let images = |film: &Film| [frame, 59].map(|frame| film.image(frame, 64, 48).bytes);
+
+        for variation in Variation::ALL {
+            let without = whole.clone().without(variation);
+            assert_eq!(without.poses, whole.poses, "{variation:?}");
+            let name = variation.name();
+            assert_ne!(images(&without), images(&whole), "{name} changes nothing");
+
+            let twice = without.clone().without(variation);
+            assert_eq!(images(&twice), images(&without), "{name}");
+        }
+
+        let walk = Suite::Walks.film(5, 0, 10);
+        let without = walk.clone().without(Variation::Light);
+        assert_eq!(walk.image(3, 64, 48), without.image(3, 64, 48));
     }
 }

@@ -20,7 +20,7 @@ mod texture;
 mod visits;
 
 pub use camera_path::camera_path;
-pub use film::{Film, Suite};
+pub use film::{Film, Suite, Variation};
 pub use render::{Camera, Sampling, render};
 pub use suite::{SuiteRoom, Walk};
 

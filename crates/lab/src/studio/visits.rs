@@ -13,6 +13,9 @@ use super::texture::{Colour, Material};
 use super::{Light, PanelKind, Scene, Shell, Walk, furniture};
 use seese3_core::statistics::normal_deviates;
 
+/// The field of view of a camera where it does not vary: the middle of the others.
+pub(super) const FIELD_OF_VIEW_RAD: f64 = 67.5 * std::f64::consts::PI / 180.0;
+
 /// Visits of one room.
 const VISITS: usize = 2;
 
