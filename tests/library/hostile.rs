@@ -187,9 +187,31 @@ fn credentials_and_names() {
         "[[principal]]\nname = \"robot\"\ntoken_sha256 = \"{}\"\nverbs = [\"navigate\"]\nrooms = [\"lab-*\"]\nstreams = 4\n",
         "ab".repeat(32)
     );
-    feed("credentials", &[credentials.into_bytes()], |bytes| {
+    let issuer = "[[issuer]]\nissuer = \"https://login.example.org\"\naudience = \"seese3\"\npublic_keys = [\"rsa.pem\"]\n\
+                  verbs = [\"navigate\"]\nrooms = [\"*\"]\n";
+    let key = folder.path().join("rsa.pem");
+    let pem = std::fs::read(golden().join("jwt/rsa.pem")).unwrap();
+    std::fs::write(&key, &pem).unwrap();
+    let seeds = [credentials.into_bytes(), issuer.into()];
+    feed("credentials", &seeds, |bytes| {
         std::fs::write(&file, bytes).unwrap();
         drop(Keyring::open(file.clone()));
+    });
+
+    std::fs::write(&file, issuer).unwrap();
+    feed("public key", std::slice::from_ref(&pem), |bytes| {
+        std::fs::write(&key, bytes).unwrap();
+        drop(Keyring::open(file.clone()));
+    });
+
+    std::fs::write(&key, &pem).unwrap();
+    let keyring = Keyring::open(file).unwrap().current();
+    let tokens = std::fs::read(golden().join("jwt/tokens.json")).unwrap();
+    let tokens: serde_json::Value = serde_json::from_slice(&tokens).unwrap();
+    let token = tokens["good"]["RS256"].as_str().unwrap().as_bytes();
+    assert!(keyring.by_token(token).is_ok());
+    feed("token of an issuer", &[token.to_vec()], |bytes| {
+        assert!(bytes == token || keyring.by_token(bytes).is_err());
     });
 
     let names = [b"rooms/kitchen/revisions/3".to_vec()];

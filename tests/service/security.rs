@@ -149,6 +149,41 @@ async fn a_caller_may_what_its_verbs_say_and_nothing_else() {
     }
 }
 
+/// Oracle: PyJWT, which signed the tokens, and the meaning of `scope`.
+#[tokio::test]
+async fn tokens_that_an_issuer_signed_are_taken() {
+    let (folder, store) = filled_store().await;
+    let jwt = crate::support::golden().join("jwt");
+    let file = folder.path().join("auth.toml");
+    let all = VERBS.map(|verb| format!("\"{verb}\"")).join(", ");
+    std::fs::copy(jwt.join("p256.pem"), folder.path().join("login.pem")).unwrap();
+    let issuer = format!(
+        "[[issuer]]\nissuer = \"https://login.example.org\"\naudience = \"seese3\"\n\
+         public_keys = [\"login.pem\"]\nverbs = [{all}]\nrooms = [\"*\"]\n"
+    );
+    std::fs::write(&file, issuer).unwrap();
+    let config = Config {
+        keyring: Some(Arc::new(Keyring::open(file).unwrap())),
+        writable: true,
+        ..Config::default()
+    };
+    let server = start_on(folder, store, config).await;
+
+    let tokens = std::fs::read(jwt.join("tokens.json")).unwrap();
+    let tokens: serde_json::Value = serde_json::from_slice(&tokens).unwrap();
+    let codes =
+        async |token: &serde_json::Value| asked(&client_with(&server, token.as_str()).await).await;
+
+    assert_eq!(codes(&tokens["good"]["ES256"]).await, [Code::Ok; 6]);
+    let denied = Code::PermissionDenied;
+    let scoped = codes(&tokens["narrowed"]["scope"]).await;
+    assert_eq!(scoped, [Code::Ok, denied, denied, denied, denied, Code::Ok]);
+    for what in ["expired", "of another key", "of no algorithm"] {
+        let codes = codes(&tokens["bad"][what][0]).await;
+        assert_eq!(codes, [Code::Unauthenticated; 6], "{what}");
+    }
+}
+
 /// Oracle: the promise: a room that a caller may not see is answered exactly as one that does not
 /// exist.
 #[tokio::test]

@@ -11,19 +11,22 @@
 //! ```
 //!
 //! The file has no secret in it: of a token it has the SHA-256 (`printf %s "$TOKEN" | sha256sum`),
-//! of a client's certificate the fingerprint (`certificate_sha256`, that of its DER).
+//! of a client's certificate the fingerprint (`certificate_sha256`, that of its DER). Tokens that
+//! others signed are taken by `[[issuer]]`, see [`super::issuers`].
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 use subtle::ConstantTimeEq;
 use tokio::sync::watch;
 
-use super::{Principal, Rights, RoomScope, Verb};
+use super::super::Error;
+use super::issuers::{Issuer, IssuerForm};
+use super::{Principal, Rights, RoomScope, Signed, Verb};
 
 /// The time between two looks at the file.
 const LOOK: Duration = Duration::from_secs(5);
@@ -50,6 +53,12 @@ pub enum AuthError {
         name: String,
         problem: String,
     },
+    #[error("--auth-file: {}: issuer '{issuer}': {problem}", file.display())]
+    Issuer {
+        file: PathBuf,
+        issuer: String,
+        problem: String,
+    },
 }
 
 #[derive(Debug, Deserialize)]
@@ -57,6 +66,8 @@ pub enum AuthError {
 struct FileForm {
     #[serde(default)]
     principal: Vec<PrincipalForm>,
+    #[serde(default)]
+    issuer: Vec<IssuerForm>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -84,13 +95,16 @@ enum Proof {
 #[derive(Debug, Default)]
 pub struct Credentials {
     known: Vec<(Proof, Arc<Principal>)>,
+    issuers: Vec<Arc<Issuer>>,
+    /// SHA-256 of all files that were read.
+    digest: [u8; 32],
 }
 
 impl Credentials {
     /// Reads a file.
     ///
     /// # Errors
-    /// [`AuthError`], naming the principal and the key. A file without a principal is refused: it
+    /// [`AuthError`], naming the principal or issuer and the key. A file without any is refused: it
     /// would lock everybody out.
     pub fn read(file: &Path) -> Result<Self, AuthError> {
         let text = std::fs::read_to_string(file).map_err(|problem| AuthError::Unreadable {
@@ -108,8 +122,9 @@ impl Credentials {
         };
 
         let form: FileForm = toml::from_str(text).map_err(|error| syntax(error.to_string()))?;
-        if form.principal.is_empty() {
-            return Err(syntax("has no [[principal]]: nobody could call".to_owned()));
+        if form.principal.is_empty() && form.issuer.is_empty() {
+            let problem = "has no [[principal]] and no [[issuer]]: nobody could call";
+            return Err(syntax(problem.to_owned()));
         }
 
         let mut names = BTreeSet::new();
@@ -136,7 +151,26 @@ impl Credentials {
             known.push((proof, Arc::new(principal)));
         }
 
-        Ok(Self { known })
+        let mut digest = Sha256::new_with_prefix(text);
+        let mut issuers: Vec<Arc<Issuer>> = Vec::new();
+        for form in form.issuer {
+            let name = form.issuer.clone();
+            let unfit = |problem: String| AuthError::Issuer {
+                file: file.to_owned(),
+                issuer: name.clone(),
+                problem,
+            };
+
+            let issuer = issuer(form, file).map_err(unfit)?;
+            issuer.pems().iter().for_each(|pem| digest.update(pem));
+            issuers.push(Arc::new(issuer));
+        }
+
+        Ok(Self {
+            known,
+            issuers,
+            digest: digest.finalize().into(),
+        })
     }
 
     /// The same, with what did not change taken over from `before`: a caller's open streams go on,
@@ -151,20 +185,47 @@ impl Credentials {
                 *principal = old.clone();
             }
         }
+        for issuer in &mut self.issuers {
+            let same = before.issuers.iter().find(|old| old.is_like(issuer));
+            if let Some(old) = same {
+                *issuer = old.clone();
+            }
+        }
         self
     }
 
     fn holds(&self, principal: &Arc<Principal>) -> bool {
-        self.known
-            .iter()
-            .any(|(_, known)| Arc::ptr_eq(known, principal))
+        match &principal.signed {
+            Some(Signed { issuer, .. }) => {
+                self.issuers.iter().any(|known| Arc::ptr_eq(known, issuer))
+            }
+            None => self
+                .known
+                .iter()
+                .any(|(_, known)| Arc::ptr_eq(known, principal)),
+        }
     }
 
     /// The principal with this token.
-    pub fn by_token(&self, token: &[u8]) -> Option<Arc<Principal>> {
-        self.by_proof(&Sha256::digest(token).into(), |proof| match proof {
+    ///
+    /// # Errors
+    /// [`Error::Unauthenticated`] if nobody has it, or its issuer says that it is not good now.
+    pub fn by_token(&self, token: &[u8]) -> Result<Arc<Principal>, Error> {
+        let known = self.by_proof(&Sha256::digest(token).into(), |proof| match proof {
             Proof::Token(digest) => Some(digest),
             Proof::Certificate(_) => None,
+        });
+        if let Some(principal) = known {
+            return Ok(principal);
+        }
+
+        for issuer in &self.issuers {
+            if let Some(subject) = issuer.subject(token)? {
+                return Ok(Arc::new(subject));
+            }
+        }
+        Err(Error::Unauthenticated {
+            problem: "the token is not known",
         })
     }
 
@@ -216,6 +277,28 @@ fn principal(form: PrincipalForm) -> Result<(Proof, Principal), String> {
     if name.is_empty() || name.chars().any(char::is_control) {
         return Err("name must be one line of text".to_owned());
     }
+    let rights = rights(name, verbs, rooms, [streams, requests])?;
+    Ok((proof, Principal::new(rights)))
+}
+
+fn issuer(form: IssuerForm, file: &Path) -> Result<Issuer, String> {
+    let limits = [form.streams, form.requests];
+    let rights = rights(
+        form.issuer.clone(),
+        form.verbs.clone(),
+        form.rooms.clone(),
+        limits,
+    )?;
+    Issuer::new(form, rights, file.parent().unwrap_or(Path::new("")))
+}
+
+/// Rights as a file gives them; the limits are those of streams and of requests.
+fn rights(
+    name: String,
+    verbs: Vec<Verb>,
+    rooms: Vec<String>,
+    [streams, requests]: [Option<usize>; 2],
+) -> Result<Rights, String> {
     if verbs.is_empty() {
         return Err("verbs is empty: it could call nothing".to_owned());
     }
@@ -233,15 +316,13 @@ fn principal(form: PrincipalForm) -> Result<(Proof, Principal), String> {
         limit if (1..=LARGEST_LIMIT).contains(&limit) => Ok(limit),
         limit => Err(format!("{key} must be 1 to {LARGEST_LIMIT}, got {limit}")),
     };
-    let rights = Rights {
+    Ok(Rights {
         streams: limit("streams", streams, MOST_STREAMS)?,
         requests: limit("requests", requests, MOST_REQUESTS)?,
         name,
         verbs,
-        rooms: RoomScope(rooms),
-    };
-
-    Ok((proof, Principal::new(rights)))
+        rooms: RoomScope(vec![rooms]),
+    })
 }
 
 fn digest(key: &str, text: &str) -> Result<[u8; 32], String> {
@@ -278,15 +359,18 @@ impl Keyring {
         self.current.send_replace(Arc::new(credentials));
     }
 
-    /// Completes once the principal has other rights than when it was admitted, or none.
+    /// Completes once the principal has other rights than when it was admitted, or none, or its
+    /// token has expired.
     pub async fn revoked(&self, principal: &Arc<Principal>) {
         let mut changes = self.current.subscribe();
+        let changed = changes.wait_for(|credentials| !credentials.holds(principal));
+        let until = principal.signed.as_ref().and_then(|signed| signed.until);
 
-        // An error means that the server is gone.
-        let _ = changes
-            .wait_for(|credentials| !credentials.holds(principal))
-            .await
-            .map(drop);
+        tokio::select! {
+            // An error means that the server is gone.
+            _ = changed => {}
+            () = passed(until) => {}
+        }
     }
 
     /// Looks from time to time whether the file has changed; never completes. A file that cannot be
@@ -295,36 +379,42 @@ impl Keyring {
         // A file system that does not answer must hold up nothing but this.
         let read = || {
             let file = self.file.clone();
-            tokio::task::spawn_blocking(move || {
-                (std::fs::read(&file).ok(), Credentials::read(&file))
-            })
+            tokio::task::spawn_blocking(move || Credentials::read(&file))
         };
-        let mut seen = None;
+        let mut trouble = String::new();
 
         loop {
-            let Ok((now, credentials)) = read().await else {
+            let Ok(credentials) = read().await else {
                 return;
             };
-            if now == seen {
-                tokio::time::sleep(LOOK).await;
-                continue;
-            }
-            let is_first = seen.is_none();
-            seen = now;
-
             match credentials {
-                // What has the same rights is taken over, so that the first look changes nothing
-                // unless the file was replaced since it was opened.
-                Ok(credentials) if is_first => self.replace(credentials),
                 Ok(credentials) => {
-                    self.replace(credentials);
-                    tracing::info!("the credentials were replaced");
+                    trouble.clear();
+                    if credentials.digest != self.current().digest {
+                        self.replace(credentials);
+                        tracing::info!("the credentials were replaced");
+                    }
                 }
+                // Trouble that lasts is logged once.
+                Err(error) if error.to_string() == trouble => {}
                 Err(error) => {
                     tracing::error!(%error, "the new credentials cannot be used; those before stay");
+                    trouble = error.to_string();
                 }
             }
+            tokio::time::sleep(LOOK).await;
         }
+    }
+}
+
+/// Completes at a time of the system's clock; never if there is none.
+async fn passed(until: Option<SystemTime>) {
+    let Some(until) = until else {
+        return std::future::pending().await;
+    };
+    while let Ok(left) = until.duration_since(SystemTime::now()) {
+        // The clock may be set while this waits.
+        tokio::time::sleep(left.min(Duration::from_secs(60))).await;
     }
 }
 
@@ -356,8 +446,8 @@ mod tests {
         assert!(robot.rooms().contains("kitchen") && robot.rooms().contains("lab-2"));
         assert!(!robot.rooms().contains("kitchen2") && !robot.rooms().is_all());
 
-        assert!(credentials.by_token(b"Secret").is_none());
-        assert!(credentials.by_token(b"").is_none());
+        assert!(credentials.by_token(b"Secret").is_err());
+        assert!(credentials.by_token(b"").is_err());
 
         // A certificate with the digest of a token is no token.
         let digest = hex::decode(SECRET).unwrap().try_into().unwrap();
@@ -410,5 +500,17 @@ mod tests {
 
         keyring.replace(read(&principal("streams = 2")).unwrap());
         keyring.revoked(&other_one).await;
+    }
+
+    /// Oracle: the clock: what ends when a token ends does not end before.
+    #[tokio::test]
+    async fn a_token_holds_until_it_ends() {
+        let begun = SystemTime::now();
+        passed(Some(begun + Duration::from_millis(200))).await;
+        assert!(begun.elapsed().unwrap() >= Duration::from_millis(200));
+        passed(Some(SystemTime::UNIX_EPOCH)).await;
+
+        let never = tokio::time::timeout(Duration::from_millis(50), passed(None));
+        assert!(never.await.is_err());
     }
 }

@@ -7,16 +7,20 @@
 //! | file | what |
 //! | --- | --- |
 //! | `credentials` | the file that an operator writes |
+//! | `issuers` | tokens that others signed (JWT) |
 //! | `layer` | the check of every request |
 
 mod credentials;
+mod issuers;
 mod layer;
 
 pub use credentials::{AuthError, Keyring};
 pub use layer::AuthLayer;
 
 use std::sync::Arc;
+use std::time::SystemTime;
 
+use issuers::Issuer;
 use serde::Deserialize;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
@@ -52,26 +56,29 @@ impl Verb {
     }
 }
 
-/// The rooms that a caller may see: names, or beginnings of names with a `*` behind them.
+/// The rooms that a caller may see: those that are in each of these lists. A list has names, and
+/// beginnings of names with a `*` behind them.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RoomScope(Vec<String>);
+pub struct RoomScope(Vec<Vec<String>>);
 
 impl RoomScope {
     /// Whether the room may be seen.
     pub fn contains(&self, room: &str) -> bool {
-        self.0.iter().any(|given| match given.strip_suffix('*') {
+        let covers = |given: &String| match given.strip_suffix('*') {
             Some(beginning) => room.starts_with(beginning),
             None => room == given,
-        })
+        };
+        self.0.iter().all(|list| list.iter().any(covers))
     }
 
     /// Whether every room may be seen, whatever its name.
     pub fn is_all(&self) -> bool {
-        self.0.iter().any(|given| given == "*")
+        let is_all = |list: &Vec<String>| list.iter().any(|given| given == "*");
+        self.0.iter().all(is_all)
     }
 }
 
-/// What a caller may do, as an operator gave it.
+/// What a caller may do.
 #[derive(Debug, PartialEq, Eq)]
 struct Rights {
     name: String,
@@ -83,20 +90,45 @@ struct Rights {
     requests: usize,
 }
 
-/// A caller that is known, and what it has open.
+/// What a caller has open: the places that are left.
+#[derive(Debug)]
+struct Places {
+    streams: Arc<Semaphore>,
+    requests: Arc<Semaphore>,
+}
+
+impl Places {
+    fn new(rights: &Rights) -> Self {
+        Self {
+            streams: Arc::new(Semaphore::new(rights.streams)),
+            requests: Arc::new(Semaphore::new(rights.requests)),
+        }
+    }
+}
+
+/// Whose word it is that a caller is who it says.
+#[derive(Debug)]
+struct Signed {
+    issuer: Arc<Issuer>,
+    /// When that ends, if ever.
+    until: Option<SystemTime>,
+}
+
+/// A caller that is known.
 #[derive(Debug)]
 pub struct Principal {
     rights: Rights,
-    streams: Arc<Semaphore>,
-    requests: Arc<Semaphore>,
+    places: Arc<Places>,
+    /// None if the file of credentials itself knows the caller.
+    signed: Option<Signed>,
 }
 
 impl Principal {
     fn new(rights: Rights) -> Self {
         Self {
-            streams: Arc::new(Semaphore::new(rights.streams)),
-            requests: Arc::new(Semaphore::new(rights.requests)),
+            places: Arc::new(Places::new(&rights)),
             rights,
+            signed: None,
         }
     }
 
@@ -116,11 +148,11 @@ impl Principal {
 
     /// A place for one more Track stream; none if it has as many as it may.
     pub fn stream_place(&self) -> Option<OwnedSemaphorePermit> {
-        self.streams.clone().try_acquire_owned().ok()
+        self.places.streams.clone().try_acquire_owned().ok()
     }
 
     /// A place for one more request or stream of any kind; none if it has as many as it may.
     fn request_place(&self) -> Option<OwnedSemaphorePermit> {
-        self.requests.clone().try_acquire_owned().ok()
+        self.places.requests.clone().try_acquire_owned().ok()
     }
 }

@@ -125,7 +125,8 @@ impl Handlers {
                 () = handlers.answer_all(session, frames, &answers) => {}
                 () = revoked(handlers.config.keyring.as_ref(), caller.as_ref()) => {
                     let revoked = Error::Unauthenticated {
-                        problem: "the caller's rights have changed; open the stream again",
+                        problem: "the caller's rights have changed, or its token has expired; open \
+                                  the stream again",
                     };
                     let _ = answers.try_send(Err(revoked.into()));
                 }
