@@ -9,9 +9,12 @@ test:
 large:
     cargo test --workspace --features full -- --ignored
 
-# The long form of what the tests show in short: a thousand reloads under load.
+# The long forms of what the tests show in short: a thousand reloads under load, ten thousand streams that say nothing,
+# half an hour of a steady load.
 soak:
     SEESE3_RELOADS=1000 cargo test --release --test service swapped
+    SEESE3_IDLE_STREAMS=10000 cargo test --release --test service idle_streams
+    SEESE3_SOAK_SECONDS=1800 cargo test --release --test service steady_load -- --nocapture
 
 # The same for publishers and servers that are killed: two hundred each.
 kills:

@@ -4,6 +4,7 @@
 //! a place as soon as it is accepted, and has to finish its TLS handshake and send as many bytes as
 //! the preface of HTTP/2 has in time; only then does tonic see it, and check them.
 
+use std::future::Future;
 use std::io;
 use std::net::SocketAddr;
 use std::pin::Pin;
@@ -14,7 +15,8 @@ use std::time::Duration;
 use sha2::{Digest, Sha256};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::futures::OwnedNotified;
+use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
 use tokio_rustls::server::TlsStream;
 use tokio_stream::Stream;
@@ -40,6 +42,15 @@ pub struct Peer {
     pub address: SocketAddr,
     /// SHA-256 of the certificate that it proved to have, if it was asked for one.
     pub certificate: Option<[u8; 32]>,
+    /// Notified to close the connection.
+    closing: Arc<Notify>,
+}
+
+impl Peer {
+    /// Closes the connection, with everything that is open on it.
+    pub fn close(&self) {
+        self.closing.notify_one();
+    }
 }
 
 /// An open connection; its place is free again when it is dropped.
@@ -48,6 +59,8 @@ pub struct Connection {
     /// What was read while the connection was opened, and how much of it has been handed on.
     preface: io::Cursor<[u8; PREFACE]>,
     peer: Peer,
+    /// Completes when the connection is to be closed.
+    closed: Pin<Box<OwnedNotified>>,
     _place: OwnedSemaphorePermit,
 }
 
@@ -166,12 +179,15 @@ impl Opener {
             Transport::Tls(stream) => stream.read_exact(&mut preface).await?,
         };
 
+        let closing = Arc::new(Notify::new());
         Ok(Connection {
             transport,
             preface: io::Cursor::new(preface),
+            closed: Box::pin(closing.clone().notified_owned()),
             peer: Peer {
                 address,
                 certificate,
+                closing,
             },
             _place: place,
         })
@@ -192,6 +208,10 @@ impl AsyncRead for Connection {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
+        if self.closed.as_mut().poll(context).is_ready() {
+            return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
+        }
+
         let read = self.preface.position() as usize;
         let rest = &self.preface.get_ref()[read..];
 

@@ -99,6 +99,9 @@ pub struct Config {
     pub memory_bytes: usize,
     /// How long a request with one message may take to arrive.
     pub receive_within: Duration,
+    /// How long a caller may take to receive an answer of one message, before its connection is
+    /// closed.
+    pub take_within: Duration,
     /// Whether callers may change the catalog.
     pub writable: bool,
     /// What all uploads in progress may hold in memory together, bytes.
@@ -142,6 +145,7 @@ impl Default for Config {
             predictions: 100_000,
             memory_bytes: 1 << 30,
             receive_within: Duration::from_secs(30),
+            take_within: Duration::from_secs(60),
             writable: false,
             upload_bytes: 1 << 30,
             message_bytes: 4 << 20,
@@ -431,6 +435,7 @@ fn memory_layer(config: &Config) -> MemoryLayer {
         memory,
         message_bytes: config.message_bytes,
         receive_within: config.receive_within,
+        take_within: config.take_within,
         probes: Memory::new(PROBES, config.metrics.clone()),
     }
 }

@@ -3,13 +3,14 @@
 
 use std::time::Duration;
 
+use prost::Message;
 use seese3::service::{Config, Metrics};
 use seese3_client::proto::v1 as pb;
-use tokio::io::AsyncWriteExt;
-use tokio::net::TcpStream;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tonic::Code;
 
 use crate::harness::{question, start};
+use crate::http2::{NAVIGATE, frame, headers, opened, prefixed, silent_calls};
 
 /// The memory that is held, as the metrics say.
 fn held(metrics: &Metrics) -> u64 {
@@ -30,60 +31,6 @@ async fn until_held(metrics: &Metrics, is_wanted: impl Fn(u64) -> bool) -> u64 {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
     panic!("{} bytes are held", held(metrics));
-}
-
-fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
-    let mut frame = (payload.len() as u32).to_be_bytes()[1..].to_vec();
-    frame.extend([kind, flags]);
-    frame.extend(stream.to_be_bytes());
-    frame.extend(payload);
-    frame
-}
-
-/// A message with its prefix, as gRPC has it in a body.
-fn prefixed(message: &[u8]) -> Vec<u8> {
-    let mut bytes = vec![0];
-    bytes.extend((message.len() as u32).to_be_bytes());
-    bytes.extend(message);
-    bytes
-}
-
-/// The headers of a call of Navigate in the literal form of HPACK (RFC 7541, section 6.2.2).
-fn headers() -> Vec<u8> {
-    let literal = |name: &[u8], value: &str| {
-        let mut field = name.to_vec();
-        field.push(value.len() as u8);
-        field.extend(value.as_bytes());
-        field
-    };
-
-    [
-        // POST and http stand in the static table.
-        vec![0x83, 0x86],
-        literal(&[0x04], "/seese3.v1.NavigationService/Navigate"),
-        literal(&[0x01], "test"),
-        literal(&[0x0f, 0x10], "application/grpc"),
-        literal(&[0x00, 2, b't', b'e'], "trailers"),
-    ]
-    .concat()
-}
-
-/// A connection with this many calls, each of which has sent these bytes of its body and says no
-/// more.
-async fn silent_calls(address: &str, count: u32, body: &[u8]) -> TcpStream {
-    let mut stream = TcpStream::connect(address).await.unwrap();
-    let mut bytes = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".to_vec();
-    bytes.extend(frame(4, 0, 0, &[]));
-    for call in 0..count {
-        let id = 2 * call + 1;
-        bytes.extend(frame(1, 4, id, &headers()));
-        if !body.is_empty() {
-            bytes.extend(frame(0, 0, id, body));
-        }
-    }
-
-    stream.write_all(&bytes).await.unwrap();
-    stream
 }
 
 /// Oracle: the bound and the time limit themselves.
@@ -157,6 +104,40 @@ async fn an_answer_that_finds_no_memory_is_refused() {
     let refused = server.client.navigate(large).await.unwrap_err();
     assert_eq!(refused.code(), Some(Code::ResourceExhausted));
     assert!(server.client.navigate(question()).await.is_ok());
+}
+
+/// Oracle: the time limit itself. The caller's window is closed, so that nothing of the answer can be
+/// sent.
+#[tokio::test]
+async fn an_answer_that_is_not_received_is_not_kept() {
+    let metrics = Metrics::default();
+    let server = start(Config {
+        take_within: Duration::from_millis(500),
+        metrics: metrics.clone(),
+        ..Config::default()
+    })
+    .await;
+
+    // SETTINGS_INITIAL_WINDOW_SIZE is 0.
+    let mut stream = opened(&server.address, &[0, 4, 0, 0, 0, 0]).await;
+    let call = [
+        frame(1, 4, 1, &headers(NAVIGATE)),
+        frame(0, 1, 1, &prefixed(&question().encode_to_vec())),
+    ];
+    stream.write_all(&call.concat()).await.unwrap();
+    until_held(&metrics, |held| held > 0).await;
+
+    until_held(&metrics, |held| held == 0).await;
+    let mut rest = Vec::new();
+    let ended = stream.read_to_end(&mut rest);
+    let ended = tokio::time::timeout(Duration::from_secs(5), ended).await;
+    assert!(ended.is_ok(), "the connection is closed");
+
+    // An answer that is received at once costs nobody the connection.
+    for _ in 0..3 {
+        assert!(server.client.navigate(question()).await.is_ok());
+        tokio::time::sleep(Duration::from_millis(300)).await;
+    }
 }
 
 /// Oracle: gRPC: a request of one message has one message. What is behind it is not decoded.

@@ -82,37 +82,48 @@ fn code_of<T: std::fmt::Debug>(answer: Result<T, seese3_client::Error>) -> Code 
 
 /// Asks one RPC of each verb, in their order.
 async fn asked(client: &Client) -> [Code; 6] {
+    asked_in(client, "synthetic").await
+}
+
+/// Asks one RPC of each verb about a room.
+async fn asked_in(client: &Client, room: &str) -> [Code; 6] {
     let localized = client.localize(pb::LocalizeRequest {
-        rooms: vec!["synthetic".to_owned()],
+        rooms: vec![room.to_owned()],
         view: frame(3),
         ..pb::LocalizeRequest::default()
     });
     let estimated = client.estimate_motion(pb::EstimateMotionRequest {
-        room: "synthetic".to_owned(),
+        room: room.to_owned(),
         first: frame(3),
         second: frame(5),
         ..pb::EstimateMotionRequest::default()
     });
     let evaluated = client.evaluate(
         pb::EvaluateRequest {
-            room: "synthetic".to_owned(),
+            room: room.to_owned(),
             stride: Some(40),
             ..pb::EvaluateRequest::default()
         },
         |_| (),
     );
 
+    let navigated = pb::NavigateRequest {
+        room: room.to_owned(),
+        source: frame(3),
+        displacement: to_frame(5),
+        ..pb::NavigateRequest::default()
+    };
     let nothing_chosen = client.set_default(pb::SetDefaultRequest {
-        name: "rooms/synthetic".to_owned(),
+        name: format!("rooms/{room}"),
         ..pb::SetDefaultRequest::default()
     });
 
     [
-        code_of(client.navigate(question()).await),
+        code_of(client.navigate(navigated).await),
         code_of(localized.await),
         code_of(estimated.await),
         code_of(evaluated.await),
-        code_of(client.rooms().await),
+        code_of(client.room(room).await),
         code_of(nothing_chosen.await),
     ]
 }
@@ -146,6 +157,53 @@ async fn a_caller_may_what_its_verbs_say_and_nothing_else() {
             "{token:?}"
         );
         assert!(client.serves("").await.unwrap(), "health needs no token");
+    }
+}
+
+/// Oracle: the meaning of the file, for every verb with every kind of scope, and every room: what is
+/// not in both does not exist or is forbidden. Each caller has one verb.
+#[tokio::test]
+async fn every_verb_is_held_to_every_scope() {
+    let scopes = [
+        ("all", "\"*\"", [true, true]),
+        ("one", "\"synthetic\"", [true, false]),
+        ("other", "\"synthetic_b\"", [false, true]),
+        ("beginning", "\"synthetic_*\"", [false, true]),
+        ("none", "\"elsewhere\"", [false, false]),
+    ];
+    let mut file = String::new();
+    for verb in VERBS {
+        for (name, rooms, _) in scopes {
+            file += &principal(&format!("{verb}-{name}"), &format!("\"{verb}\""), rooms);
+        }
+    }
+    let (folder, store) = filled_store().await;
+    let auth = folder.path().join("auth.toml");
+    std::fs::write(&auth, file).unwrap();
+    let config = Config {
+        keyring: Some(Arc::new(Keyring::open(auth).unwrap())),
+        writable: true,
+        ..Config::default()
+    };
+    let server = start_on(folder, store, config).await;
+
+    for (granted, verb) in VERBS.iter().enumerate() {
+        for (name, _, seen) in scopes {
+            let client = client_with(&server, Some(&format!("{verb}-{name}"))).await;
+            for (room, is_seen) in ["synthetic", "synthetic_b"].into_iter().zip(seen) {
+                let codes = asked_in(&client, room).await;
+                for (needed, code) in codes.into_iter().enumerate() {
+                    let expected = match (needed == granted, is_seen, VERBS[needed]) {
+                        // Whether there is such a room is not told to who may not change it.
+                        (false, ..) | (true, false, "write") => Code::PermissionDenied,
+                        (true, false, _) => Code::NotFound,
+                        (true, true, _) => Code::Ok,
+                    };
+                    let asks = VERBS[needed];
+                    assert_eq!(code, expected, "{verb}-{name} asks {asks} of {room}");
+                }
+            }
+        }
     }
 }
 

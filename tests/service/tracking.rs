@@ -14,6 +14,15 @@ use crate::support::world::{calibrated, place, served};
 
 /// Two places, and an adapter that can be followed with; `key` seals tokens.
 async fn server(key: &[u8]) -> TestServer {
+    start_followed(Config {
+        token_key: TokenKey::new(key).unwrap(),
+        ..Config::default()
+    })
+    .await
+}
+
+/// Two places, and an adapter that can be followed with.
+pub async fn start_followed(config: Config) -> TestServer {
     let folder = tempfile::tempdir().unwrap();
     let store = Store::create(folder.path().to_str().unwrap()).unwrap();
     for name in ["hall", "attic"] {
@@ -27,35 +36,26 @@ async fn server(key: &[u8]) -> TestServer {
         .await
         .unwrap();
 
-    let token_key = TokenKey::new(key).unwrap();
-    start_on(
-        folder,
-        store,
-        Config {
-            token_key,
-            ..Config::default()
-        },
-    )
-    .await
+    start_on(folder, store, config).await
 }
 
 const KEY: &[u8] = b"a secret of the tests";
 
-fn config() -> pb::TrackConfig {
+pub fn config() -> pb::TrackConfig {
     pb::TrackConfig {
         room: "hall".to_owned(),
         ..pb::TrackConfig::default()
     }
 }
 
-fn begin(config: pb::TrackConfig) -> pb::TrackRequest {
+pub fn begin(config: pb::TrackConfig) -> pb::TrackRequest {
     pb::TrackRequest {
         message: Some(Message::Config(config)),
     }
 }
 
 /// Row `row` of the hall, as a camera's frame with that number and time.
-fn seen(row: usize) -> pb::TrackRequest {
+pub fn seen(row: usize) -> pb::TrackRequest {
     seen_of("hall", row)
 }
 

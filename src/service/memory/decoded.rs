@@ -33,6 +33,8 @@ struct Request {
     message: String,
     /// Whether it has several.
     is_stream: bool,
+    /// Whether its answer has several.
+    is_answered_by_stream: bool,
 }
 
 /// What decoding needs to know of a message.
@@ -78,6 +80,12 @@ pub fn is_stream(path: &str) -> bool {
         Some(request) => request.is_stream,
         None => path.ends_with(REFLECTION),
     }
+}
+
+/// Whether the answer is one message.
+pub fn has_one_answer(path: &str) -> bool {
+    let request = REQUESTS.get(path);
+    request.is_some_and(|request| !request.is_answered_by_stream)
 }
 
 /// The memory that lists, texts and the messages in lists take.
@@ -181,6 +189,7 @@ fn requests() -> HashMap<String, Request> {
                 let request = Request {
                     message: input.to_owned(),
                     is_stream: method.client_streaming(),
+                    is_answered_by_stream: method.server_streaming(),
                 };
                 requests.insert(path, request);
             }
@@ -323,6 +332,10 @@ mod tests {
         ] {
             assert_eq!(is_stream(&path), expected, "{path}");
         }
+
+        assert!(has_one_answer(NAVIGATE));
+        assert!(!has_one_answer(&service("EvaluationService/Evaluate")));
+        assert!(!has_one_answer("/grpc.health.v1.Health/Watch"));
     }
 
     /// Oracle: nothing that a caller can send may stop the computation.
