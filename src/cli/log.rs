@@ -11,7 +11,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use clap::ValueEnum;
 use tracing_appender::non_blocking::{ErrorCounter, NonBlockingBuilder, WorkerGuard};
 use tracing_subscriber::EnvFilter;
+use tracing_subscriber::Layer;
 use tracing_subscriber::fmt::format::FmtSpan;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 
 /// How many lines may wait to be written; further ones are dropped.
 const WAITING_LINES: usize = 8_192;
@@ -51,8 +54,15 @@ impl LogLosses {
     }
 }
 
-/// Starts the log of this process. RUST_LOG sets what is logged.
-pub fn start_log(format: LogFormat) -> Log {
+/// Where spans of requests go besides the log; in a build without the feature `otlp`, nowhere.
+#[cfg(feature = "otlp")]
+pub use crate::service::Traces;
+/// Where spans of requests go besides the log; in a build without the feature `otlp`, nowhere.
+#[cfg(not(feature = "otlp"))]
+pub enum Traces {}
+
+/// Starts the log of this process. RUST_LOG sets what is logged, but not what is exported.
+pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
     let failed = Arc::new(AtomicU64::new(0));
     let writer = Forgiving {
         inner: io::stderr(),
@@ -70,18 +80,26 @@ pub fn start_log(format: LogFormat) -> Log {
 
     let filter =
         EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,hnsw_rs=warn"));
-    let log = tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let log = tracing_subscriber::fmt::layer()
         // A request is logged once, when its span closes.
         .with_span_events(FmtSpan::CLOSE)
         .with_writer(writer)
         .with_ansi(io::stderr().is_terminal())
         // It would print to standard error, and panic where that cannot be written.
         .log_internal_errors(false);
+    let log = match format {
+        LogFormat::Text => log.with_filter(filter).boxed(),
+        LogFormat::Json => log.json().flatten_event(true).with_filter(filter).boxed(),
+    };
 
-    match format {
-        LogFormat::Text => log.init(),
-        LogFormat::Json => log.json().flatten_event(true).init(),
+    let subscriber = tracing_subscriber::registry().with(log);
+    #[cfg(feature = "otlp")]
+    subscriber.with(traces.map(Traces::layer)).init();
+    #[cfg(not(feature = "otlp"))]
+    {
+        // There is none in this build.
+        let _ = traces;
+        subscriber.init();
     }
 
     Log {

@@ -10,7 +10,7 @@ use tokio::net::TcpListener;
 use tokio::sync::Notify;
 
 use super::encoder::RuntimeName;
-use super::log::{LogFormat, start_log};
+use super::log::{LogFormat, Traces, start_log};
 use super::say;
 use crate::encoder::{Bounds, Runtime};
 use crate::service::{
@@ -150,6 +150,10 @@ pub struct Serve {
     /// Format of the log, which goes to standard error; RUST_LOG sets what is logged
     #[arg(long, env = "SEESE3_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
     log_format: LogFormat,
+    /// Send spans of requests to the OpenTelemetry collector at this address, such as
+    /// http://127.0.0.1:4317 (OTLP over gRPC, plain text). Needs a build with the feature `otlp`
+    #[arg(long, value_name = "URL", env = "OTEL_EXPORTER_OTLP_ENDPOINT")]
+    otlp_endpoint: Option<String>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -167,7 +171,8 @@ fn bounded(least: u64, most: u64) -> clap::builder::RangedU64ValueParser<usize> 
 
 impl Serve {
     pub async fn run(self) -> anyhow::Result<()> {
-        let log = start_log(self.log_format);
+        let traces = self.traces()?;
+        let log = start_log(self.log_format, traces.as_ref());
         let store = Store::open(&self.store)?;
         let config = self.server_config()?;
         let losses = log.losses();
@@ -359,6 +364,28 @@ impl Serve {
             },
             ..defaults
         })
+    }
+
+    #[cfg(feature = "otlp")]
+    fn traces(&self) -> anyhow::Result<Option<Traces>> {
+        let Some(endpoint) = &self.otlp_endpoint else {
+            return Ok(None);
+        };
+        let traces = Traces::open(endpoint);
+        traces
+            .map(Some)
+            .map_err(|problem| anyhow::anyhow!("--otlp-endpoint {endpoint}: {problem}"))
+    }
+
+    #[cfg(not(feature = "otlp"))]
+    fn traces(&self) -> anyhow::Result<Option<Traces>> {
+        match &self.otlp_endpoint {
+            None => Ok(None),
+            Some(_) => bail!(
+                "--otlp-endpoint: this program was built without the feature 'otlp'; build it with \
+                 `cargo install --path . --features full` (or `cargo build --release --features full`)"
+            ),
+        }
     }
 
     fn tls(&self) -> anyhow::Result<Option<Tls>> {

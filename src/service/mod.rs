@@ -30,6 +30,8 @@ mod snapshot;
 mod status;
 mod telemetry;
 mod tls;
+#[cfg(feature = "otlp")]
+mod traces;
 mod track;
 mod two_views;
 mod workers;
@@ -43,6 +45,8 @@ pub use shutdown::shutdown_signal;
 pub use snapshot::Snapshot;
 pub use status::{Error, Full};
 pub use tls::{Tls, TlsError, TlsFiles};
+#[cfg(feature = "otlp")]
+pub use traces::Traces;
 pub use track::TokenKey;
 
 use std::convert::Infallible;

@@ -48,14 +48,32 @@ impl MakeRequestId for RandomId {
 pub fn span<B>(request: &Request<B>) -> Span {
     let id = request.headers().get(REQUEST_ID);
     let peer = request.extensions().get::<Peer>();
-    tracing::info_span!(
+    let path = request.uri().path();
+    let span = tracing::info_span!(
         "request",
         id = id.and_then(|id| id.to_str().ok()).unwrap_or_default(),
-        method = request.uri().path(),
+        method = path,
+        trace = trace_id(request.headers()),
         peer = peer.map(|peer| field::display(peer.address)),
         principal = field::Empty,
         grpc_status = field::Empty,
-    )
+        // For the exporter of spans alone.
+        otel.name = field::Empty,
+        otel.kind = field::Empty,
+    );
+
+    #[cfg(feature = "otlp")]
+    super::traces::continue_trace(&span, path, request.headers());
+    span
+}
+
+/// The number of the trace that a request is part of, if its caller says so (W3C Trace Context,
+/// `traceparent`): lines of the log and spans of other services are found by it.
+fn trace_id(headers: &HeaderMap) -> Option<&str> {
+    let parts = headers.get("traceparent")?.to_str().ok()?;
+    let id = parts.split('-').nth(1)?;
+    let is_number = id.len() == 32 && id.bytes().all(|byte| byte.is_ascii_hexdigit());
+    is_number.then_some(id)
 }
 
 /// Records the status of a response that failed before its first message.
@@ -69,6 +87,8 @@ pub fn record_trailers(trailers: Option<&HeaderMap>, _: Duration, span: &Span) {
         Some(trailers) => record_status(trailers, span),
         None => {
             span.record("grpc_status", "0");
+            #[cfg(feature = "otlp")]
+            super::traces::record_status(span, "0");
         }
     }
 }
@@ -77,12 +97,32 @@ fn record_status(headers: &HeaderMap, span: &Span) {
     let status = headers.get("grpc-status");
     if let Some(status) = status.and_then(|status| status.to_str().ok()) {
         span.record("grpc_status", status);
+        #[cfg(feature = "otlp")]
+        super::traces::record_status(span, status);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Oracle: W3C Trace Context, section 3.2.
+    #[test]
+    fn the_trace_of_a_caller_is_known() {
+        let of = |text: &str| {
+            let mut headers = HeaderMap::new();
+            headers.insert("traceparent", text.parse().unwrap());
+            trace_id(&headers).map(str::to_owned)
+        };
+        let id = "4bf92f3577b34da6a3ce929d0e0e4736";
+        assert_eq!(
+            of(&format!("00-{id}-00f067aa0ba902b7-01")).as_deref(),
+            Some(id)
+        );
+        assert_eq!(of("00-4bf9-00f067aa0ba902b7-01"), None);
+        assert_eq!(of("nonsense"), None);
+        assert_eq!(trace_id(&HeaderMap::new()), None);
+    }
 
     /// Oracle: the promise: ids of up to 128 printable characters are kept, others are replaced by
     /// one of 16 digits that is new each time.

@@ -26,4 +26,6 @@ mod refusals;
 mod reload;
 mod security;
 mod soak;
+#[cfg(feature = "otlp")]
+mod traces;
 mod tracking;

@@ -1,0 +1,130 @@
+//! Spans of requests as a collector of OpenTelemetry gets them.
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use opentelemetry_proto::tonic::collector::trace::v1::trace_service_server::{
+    TraceService, TraceServiceServer,
+};
+use opentelemetry_proto::tonic::collector::trace::v1::{
+    ExportTraceServiceRequest, ExportTraceServiceResponse,
+};
+use opentelemetry_proto::tonic::trace::v1::Span;
+use opentelemetry_proto::tonic::trace::v1::span::SpanKind;
+use opentelemetry_proto::tonic::trace::v1::status::StatusCode;
+use seese3::service::{Config, Traces};
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::navigation_service_client::NavigationServiceClient;
+use tokio::net::TcpListener;
+use tokio_stream::wrappers::TcpListenerStream;
+use tonic::transport::Channel;
+use tonic::{Request, Response, Status};
+use tracing_subscriber::layer::SubscriberExt;
+
+use crate::harness::{question, start};
+
+/// A collector that keeps what it gets.
+#[derive(Clone, Default)]
+struct Collector(Arc<Mutex<Vec<Span>>>);
+
+#[tonic::async_trait]
+impl TraceService for Collector {
+    async fn export(
+        &self,
+        request: Request<ExportTraceServiceRequest>,
+    ) -> Result<Response<ExportTraceServiceResponse>, Status> {
+        let spans = request.into_inner().resource_spans.into_iter();
+        let spans = spans
+            .flat_map(|of_resource| of_resource.scope_spans)
+            .flat_map(|of_scope| of_scope.spans);
+        self.0.lock().unwrap().extend(spans);
+        Ok(Response::new(ExportTraceServiceResponse::default()))
+    }
+}
+
+impl Collector {
+    /// The span whose parent has this number, once it has arrived.
+    async fn child_of(&self, parent: [u8; 8]) -> Span {
+        for _ in 0..1_500 {
+            let found = |span: &&Span| span.parent_span_id == parent;
+            if let Some(span) = self.0.lock().unwrap().iter().find(found) {
+                return span.clone();
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        panic!("no span arrived: {:?}", self.0.lock().unwrap());
+    }
+}
+
+/// Oracle: W3C Trace Context and OpenTelemetry's own messages: a request that comes with a trace is a
+/// span of that trace, below the caller's, with its RPC and how it ended.
+#[tokio::test]
+async fn requests_are_spans_of_their_callers_traces() {
+    let collector = Collector::default();
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let endpoint = format!("http://{}", listener.local_addr().unwrap());
+    let service = TraceServiceServer::new(collector.clone());
+    let serving = tonic::transport::Server::builder()
+        .add_service(service)
+        .serve_with_incoming(TcpListenerStream::new(listener));
+    tokio::spawn(serving);
+
+    // This runtime has one thread, on which the server's requests run too.
+    let traces = Traces::open(&endpoint).unwrap();
+    let subscriber = tracing_subscriber::registry().with(traces.layer());
+    let guard = tracing::subscriber::set_default(subscriber);
+
+    let server = start(Config::default()).await;
+    let address = format!("http://{}", server.address);
+    let channel = Channel::from_shared(address)
+        .unwrap()
+        .connect()
+        .await
+        .unwrap();
+    let mut client = NavigationServiceClient::new(channel);
+    let mut ask = async |question: pb::NavigateRequest, parent: [u8; 8]| {
+        let mut request = Request::new(question);
+        let parent = parent.map(|byte| format!("{byte:02x}")).concat();
+        let context = format!("00-4bf92f3577b34da6a3ce929d0e0e4736-{parent}-01");
+        request
+            .metadata_mut()
+            .insert("traceparent", context.parse().unwrap());
+        client.navigate(request).await.is_ok()
+    };
+
+    assert!(ask(question(), [1; 8]).await);
+    let unknown = pb::NavigateRequest {
+        room: "nowhere".to_owned(),
+        ..question()
+    };
+    assert!(!ask(unknown, [2; 8]).await);
+
+    for (parent, status) in [([1; 8], "0"), ([2; 8], "5")] {
+        let span = collector.child_of(parent).await;
+        let trace: String = span
+            .trace_id
+            .iter()
+            .map(|byte| format!("{byte:02x}"))
+            .collect();
+        assert_eq!(trace, "4bf92f3577b34da6a3ce929d0e0e4736");
+        assert_eq!(span.name, "seese3.v1.NavigationService/Navigate");
+        assert_eq!(span.kind(), SpanKind::Server);
+        assert!(span.end_time_unix_nano > span.start_time_unix_nano);
+
+        let attributes = format!("{:?}", span.attributes);
+        assert!(attributes.contains("rpc.grpc.status_code"), "{attributes}");
+        assert!(
+            attributes.contains(&format!("IntValue({status})")),
+            "{attributes}"
+        );
+
+        // NOT_FOUND is the caller's mistake and no error of the server.
+        let code = span.status.unwrap_or_default().code();
+        assert_eq!(code, StatusCode::Unset);
+    }
+
+    drop(guard);
+    tokio::task::spawn_blocking(move || drop(traces))
+        .await
+        .unwrap();
+}
