@@ -116,10 +116,10 @@ mod tests {
         };
         let id = "4bf92f3577b34da6a3ce929d0e0e4736";
         assert_eq!(
-            of(&format!("00-{id}-00f067aa0ba902b7-01")).as_deref(),
+            of(&format!("00-{id}-00f067aa0b890217-01")).as_deref(),
             Some(id)
         );
-        assert_eq!(of("00-4bf9-00f067aa0ba902b7-01"), None);
+        assert_eq!(of("00-4bf9-00f067aa0b890217-01"), None);
         assert_eq!(of("nonsense"), None);
         assert_eq!(trace_id(&HeaderMap::new()), None);
     }

@@ -72,7 +72,12 @@ impl Store {
             let manifest = revision_path(&folder, revision);
             let gone = folder.clone().join("revisions").join(gone_name(revision));
             let bytes = self.read(&manifest).await?;
-            self.write_new(&gone, bytes).await?;
+            if let Err(error) = self.write_new(&gone, bytes).await {
+                // A full disk still takes a second name of the same file, and whoever removes wants
+                // to have room again.
+                let named = self.objects.copy_if_not_exists(&manifest, &gone).await;
+                named.map_err(|_| error)?;
+            }
 
             let deleted = self.objects.delete(&manifest).await;
             deleted.map_err(|error| self.io(&manifest, &error))?;

@@ -274,6 +274,24 @@ async fn a_removal_that_dies_leaves_the_newest() {
     }
 }
 
+/// Oracle: the promise: what is removed makes room on a full disk, and its numbers are not given
+/// again.
+#[tokio::test]
+async fn a_full_disk_can_be_emptied() {
+    let (folder, store) = three_revisions().await;
+    let files_of = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
+    let full = Store::with_objects(Arc::new(Dying::full(files_of)), "full");
+    assert!(full.publish_room(&room("b"), &[]).await.is_err());
+
+    full.remove(&named("rooms/a")).await.unwrap();
+    assert!(full.current_rooms().await.unwrap().is_empty());
+    full.collect_garbage(Duration::ZERO).await.unwrap();
+    assert!(files(folder.path(), "objects/").is_empty());
+
+    let again = store.publish_room(&room("a"), &[set("f", 1.0)]).await;
+    assert_eq!(again.unwrap().revision, 4);
+}
+
 /// Oracle: the damage that the test does. Each file is found by its name.
 #[tokio::test]
 async fn verification_finds_damage_and_broken_references() {

@@ -21,6 +21,8 @@ pub struct Dying<S> {
     inner: S,
     survives: usize,
     writes: Arc<AtomicUsize>,
+    /// Files can still be removed and get other names.
+    only_full: bool,
 }
 
 impl<S> Dying<S> {
@@ -29,6 +31,15 @@ impl<S> Dying<S> {
             inner,
             survives,
             writes: Arc::default(),
+            only_full: false,
+        }
+    }
+
+    /// A full disk: nothing can be written, but files can be removed and get second names.
+    pub fn full(inner: S) -> Self {
+        Self {
+            only_full: true,
+            ..Self::new(inner, 0)
         }
     }
 }
@@ -78,6 +89,10 @@ impl<S: ObjectStore> ObjectStore for Dying<S> {
     ) -> BoxStream<'static, Result<Path>> {
         use tokio_stream::StreamExt;
 
+        if self.only_full {
+            return self.inner.delete_stream(locations);
+        }
+
         let writes = self.writes.clone();
         let survives = self.survives;
         let counted = locations.map(move |location| {
@@ -97,7 +112,10 @@ impl<S: ObjectStore> ObjectStore for Dying<S> {
         self.inner.list_with_delimiter(prefix).await
     }
 
-    async fn copy_opts(&self, _: &Path, _: &Path, _: CopyOptions) -> Result<()> {
-        Err(killed())
+    async fn copy_opts(&self, from: &Path, to: &Path, options: CopyOptions) -> Result<()> {
+        match self.only_full {
+            true => self.inner.copy_opts(from, to, options).await,
+            false => Err(killed()),
+        }
     }
 }
