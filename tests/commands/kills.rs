@@ -19,7 +19,7 @@ fn kills() -> u32 {
 }
 
 /// A program that runs. It is killed at the end of the test, if not before.
-struct Running(Child);
+pub struct Running(Child);
 
 impl Running {
     fn kill(&mut self) {
@@ -48,7 +48,7 @@ fn started(arguments: &[&str]) -> Running {
 }
 
 /// Publishes room `a`; its features differ from those of every other `version`.
-fn import(folder: &Path, version: u32, store: &str) -> [String; 6] {
+pub fn import(folder: &Path, version: u32, store: &str) -> [String; 6] {
     let file = folder.join(format!("features-{version}.npy"));
     let rows = features(&golden(), "synthetic") * (1.0 + version as f32);
     ndarray_npy::write_npy(&file, &rows).unwrap();
@@ -64,7 +64,7 @@ fn import(folder: &Path, version: u32, store: &str) -> [String; 6] {
     ]
 }
 
-fn words(arguments: &[String]) -> Vec<&str> {
+pub fn words(arguments: &[String]) -> Vec<&str> {
     arguments.iter().map(String::as_str).collect()
 }
 
@@ -121,14 +121,13 @@ fn a_publisher_that_is_killed_leaves_an_old_or_a_new_revision() {
 
 /// A server that takes changes, and its address.
 fn serve(store: &str) -> (Running, String) {
-    let mut server = started(&[
-        "serve",
-        "--store",
-        store,
-        "--listen",
-        "127.0.0.1:0",
-        "--writable",
-    ]);
+    serve_with(store, &["--writable"])
+}
+
+/// A server with these options, and its address.
+pub fn serve_with(store: &str, options: &[&str]) -> (Running, String) {
+    let fixed = ["serve", "--store", store, "--listen", "127.0.0.1:0"];
+    let mut server = started(&[&fixed, options].concat());
     let mut line = String::new();
     BufReader::new(server.0.stdout.take().unwrap())
         .read_line(&mut line)

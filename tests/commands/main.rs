@@ -15,3 +15,5 @@ mod kills;
 mod program;
 mod research;
 mod rooms;
+#[cfg(feature = "otlp")]
+mod traces;

@@ -26,6 +26,4 @@ mod refusals;
 mod reload;
 mod security;
 mod soak;
-#[cfg(feature = "otlp")]
-mod traces;
 mod tracking;

@@ -9,19 +9,19 @@ use opentelemetry_proto::tonic::collector::trace::v1::trace_service_server::{
 use opentelemetry_proto::tonic::collector::trace::v1::{
     ExportTraceServiceRequest, ExportTraceServiceResponse,
 };
+use opentelemetry_proto::tonic::common::v1::any_value::Value;
 use opentelemetry_proto::tonic::trace::v1::Span;
 use opentelemetry_proto::tonic::trace::v1::span::SpanKind;
 use opentelemetry_proto::tonic::trace::v1::status::StatusCode;
-use seese3::service::{Config, Traces};
 use seese3_client::proto::v1 as pb;
-use seese3_client::proto::v1::navigation_service_client::NavigationServiceClient;
+use seese3_client::proto::v1::catalog_service_client::CatalogServiceClient;
 use tokio::net::TcpListener;
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::transport::Channel;
 use tonic::{Request, Response, Status};
-use tracing_subscriber::layer::SubscriberExt;
 
-use crate::harness::{question, start};
+use crate::kills::{import, serve_with, words};
+use crate::program::succeeds;
 
 /// A collector that keeps what it gets.
 #[derive(Clone, Default)]
@@ -58,7 +58,7 @@ impl Collector {
 
 /// Oracle: W3C Trace Context and OpenTelemetry's own messages: a request that comes with a trace is a
 /// span of that trace, below the caller's, with its RPC and how it ended.
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn requests_are_spans_of_their_callers_traces() {
     let collector = Collector::default();
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -69,62 +69,46 @@ async fn requests_are_spans_of_their_callers_traces() {
         .serve_with_incoming(TcpListenerStream::new(listener));
     tokio::spawn(serving);
 
-    // This runtime has one thread, on which the server's requests run too.
-    let traces = Traces::open(&endpoint).unwrap();
-    let subscriber = tracing_subscriber::registry().with(traces.layer());
-    let guard = tracing::subscriber::set_default(subscriber);
+    let folder = tempfile::tempdir().unwrap();
+    let store = folder.path().join("store").to_str().unwrap().to_owned();
+    succeeds(&words(&import(folder.path(), 1, &store)));
+    let options = ["--otlp-endpoint", &endpoint];
+    let (_server, address) = tokio::task::block_in_place(|| serve_with(&store, &options));
 
-    let server = start(Config::default()).await;
-    let address = format!("http://{}", server.address);
-    let channel = Channel::from_shared(address)
-        .unwrap()
-        .connect()
-        .await
-        .unwrap();
-    let mut client = NavigationServiceClient::new(channel);
-    let mut ask = async |question: pb::NavigateRequest, parent: [u8; 8]| {
-        let mut request = Request::new(question);
+    let address = format!("http://{address}");
+    let channel = Channel::from_shared(address).unwrap();
+    let mut client = CatalogServiceClient::new(channel.connect().await.unwrap());
+    let mut ask = async |room: &str, parent: [u8; 8]| {
+        let mut request = Request::new(pb::GetRoomRequest {
+            room: room.to_owned(),
+        });
         let parent = parent.map(|byte| format!("{byte:02x}")).concat();
         let context = format!("00-4bf92f3577b34da6a3ce929d0e0e4736-{parent}-01");
-        request
-            .metadata_mut()
-            .insert("traceparent", context.parse().unwrap());
-        client.navigate(request).await.is_ok()
+        let metadata = request.metadata_mut();
+        metadata.insert("traceparent", context.parse().unwrap());
+        client.get_room(request).await.is_ok()
     };
+    assert!(ask("a", [1; 8]).await);
+    assert!(!ask("nowhere", [2; 8]).await);
 
-    assert!(ask(question(), [1; 8]).await);
-    let unknown = pb::NavigateRequest {
-        room: "nowhere".to_owned(),
-        ..question()
-    };
-    assert!(!ask(unknown, [2; 8]).await);
-
-    for (parent, status) in [([1; 8], "0"), ([2; 8], "5")] {
+    for (parent, status) in [([1; 8], 0), ([2; 8], 5)] {
         let span = collector.child_of(parent).await;
-        let trace: String = span
-            .trace_id
-            .iter()
-            .map(|byte| format!("{byte:02x}"))
-            .collect();
-        assert_eq!(trace, "4bf92f3577b34da6a3ce929d0e0e4736");
-        assert_eq!(span.name, "seese3.v1.NavigationService/Navigate");
+        let trace = span.trace_id.iter().map(|byte| format!("{byte:02x}"));
+        assert_eq!(
+            trace.collect::<String>(),
+            "4bf92f3577b34da6a3ce929d0e0e4736"
+        );
+        assert_eq!(span.name, "seese3.v1.CatalogService/GetRoom");
         assert_eq!(span.kind(), SpanKind::Server);
         assert!(span.end_time_unix_nano > span.start_time_unix_nano);
 
-        let attributes = format!("{:?}", span.attributes);
-        assert!(attributes.contains("rpc.grpc.status_code"), "{attributes}");
-        assert!(
-            attributes.contains(&format!("IntValue({status})")),
-            "{attributes}"
-        );
+        let mut attributes = span.attributes.iter();
+        let code = attributes.find(|attribute| attribute.key == "rpc.grpc.status_code");
+        let code = code.and_then(|code| code.value.clone()?.value);
+        assert_eq!(code, Some(Value::IntValue(status)));
 
         // NOT_FOUND is the caller's mistake and no error of the server.
         let code = span.status.unwrap_or_default().code();
         assert_eq!(code, StatusCode::Unset);
     }
-
-    drop(guard);
-    tokio::task::spawn_blocking(move || drop(traces))
-        .await
-        .unwrap();
 }
