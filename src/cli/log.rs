@@ -78,8 +78,9 @@ pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
         failed,
     };
 
-    let filter =
-        EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,hnsw_rs=warn"));
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| {
+        EnvFilter::new("info,hnsw_rs=warn,opentelemetry=warn,opentelemetry_sdk=warn")
+    });
     let log = tracing_subscriber::fmt::layer()
         // A request is logged once, when its span closes.
         .with_span_events(FmtSpan::CLOSE)

@@ -152,7 +152,7 @@ pub struct Serve {
     log_format: LogFormat,
     /// Send spans of requests to the OpenTelemetry collector at this address, such as
     /// http://127.0.0.1:4317 (OTLP over gRPC, plain text). Needs a build with the feature `otlp`
-    #[arg(long, value_name = "URL", env = "OTEL_EXPORTER_OTLP_ENDPOINT")]
+    #[arg(long, value_name = "URL", env = "SEESE3_OTLP_ENDPOINT")]
     otlp_endpoint: Option<String>,
 }
 

@@ -9,6 +9,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
@@ -42,14 +43,23 @@ pub struct Peer {
     pub address: SocketAddr,
     /// SHA-256 of the certificate that it proved to have, if it was asked for one.
     pub certificate: Option<[u8; 32]>,
-    /// Notified to close the connection.
-    closing: Arc<Notify>,
+    closing: Arc<Closing>,
+}
+
+/// What closes a connection.
+#[derive(Debug, Default)]
+struct Closing {
+    asked: AtomicBool,
+    /// Notified once that is asked for.
+    now: Arc<Notify>,
 }
 
 impl Peer {
-    /// Closes the connection, with everything that is open on it.
-    pub fn close(&self) {
-        self.closing.notify_one();
+    /// Closes the connection, with everything that is open on it. Returns whether nobody asked for that
+    /// before.
+    pub fn close(&self) -> bool {
+        self.closing.now.notify_one();
+        !self.closing.asked.swap(true, Ordering::Relaxed)
     }
 }
 
@@ -179,11 +189,11 @@ impl Opener {
             Transport::Tls(stream) => stream.read_exact(&mut preface).await?,
         };
 
-        let closing = Arc::new(Notify::new());
+        let closing = Arc::new(Closing::default());
         Ok(Connection {
             transport,
             preface: io::Cursor::new(preface),
-            closed: Box::pin(closing.clone().notified_owned()),
+            closed: Box::pin(closing.now.clone().notified_owned()),
             peer: Peer {
                 address,
                 certificate,
@@ -202,15 +212,23 @@ impl Connected for Connection {
     }
 }
 
+impl Connection {
+    /// Fails once the connection is to be closed, whether its caller lets it read or write or neither.
+    fn check_open(&mut self, context: &mut Context<'_>) -> io::Result<()> {
+        match self.closed.as_mut().poll(context) {
+            Poll::Ready(()) => Err(io::ErrorKind::ConnectionAborted.into()),
+            Poll::Pending => Ok(()),
+        }
+    }
+}
+
 impl AsyncRead for Connection {
     fn poll_read(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        if self.closed.as_mut().poll(context).is_ready() {
-            return Poll::Ready(Err(io::ErrorKind::ConnectionAborted.into()));
-        }
+        self.check_open(context)?;
 
         let read = self.preface.position() as usize;
         let rest = &self.preface.get_ref()[read..];
@@ -235,6 +253,7 @@ impl AsyncWrite for Connection {
         context: &mut Context<'_>,
         bytes: &[u8],
     ) -> Poll<io::Result<usize>> {
+        self.check_open(context)?;
         match &mut self.transport {
             Transport::Plain(stream) => Pin::new(stream).poll_write(context, bytes),
             Transport::Tls(stream) => Pin::new(stream).poll_write(context, bytes),
@@ -246,6 +265,7 @@ impl AsyncWrite for Connection {
         context: &mut Context<'_>,
         slices: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
+        self.check_open(context)?;
         match &mut self.transport {
             Transport::Plain(stream) => Pin::new(stream).poll_write_vectored(context, slices),
             Transport::Tls(stream) => Pin::new(stream).poll_write_vectored(context, slices),
@@ -260,6 +280,7 @@ impl AsyncWrite for Connection {
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.check_open(context)?;
         match &mut self.transport {
             Transport::Plain(stream) => Pin::new(stream).poll_flush(context),
             Transport::Tls(stream) => Pin::new(stream).poll_flush(context),

@@ -103,9 +103,8 @@ pub struct Config {
     pub memory_bytes: usize,
     /// How long a request with one message may take to arrive.
     pub receive_within: Duration,
-    /// How long a caller may take to receive an answer of one message, before its connection is
-    /// closed.
-    pub take_within: Duration,
+    /// How long a caller may receive nothing of a unary response, before its connection is closed.
+    pub response_timeout: Duration,
     /// Whether callers may change the catalog.
     pub writable: bool,
     /// What all uploads in progress may hold in memory together, bytes.
@@ -149,7 +148,7 @@ impl Default for Config {
             predictions: 100_000,
             memory_bytes: 1 << 30,
             receive_within: Duration::from_secs(30),
-            take_within: Duration::from_secs(60),
+            response_timeout: Duration::from_secs(60),
             writable: false,
             upload_bytes: 1 << 30,
             message_bytes: 4 << 20,
@@ -439,7 +438,7 @@ fn memory_layer(config: &Config) -> MemoryLayer {
         memory,
         message_bytes: config.message_bytes,
         receive_within: config.receive_within,
-        take_within: config.take_within,
+        response_timeout: config.response_timeout,
         probes: Memory::new(PROBES, config.metrics.clone()),
     }
 }

@@ -57,7 +57,7 @@ pub fn span<B>(request: &Request<B>) -> Span {
         peer = peer.map(|peer| field::display(peer.address)),
         principal = field::Empty,
         grpc_status = field::Empty,
-        // For the exporter of spans alone.
+        // Recorded where spans are exported; then lines of the log have them too.
         otel.name = field::Empty,
         otel.kind = field::Empty,
     );

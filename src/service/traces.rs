@@ -18,7 +18,7 @@ use tonic::Code;
 use tracing::{Span, Subscriber};
 use tracing_opentelemetry::{OpenTelemetryLayer, OpenTelemetrySpanExt};
 use tracing_subscriber::Layer;
-use tracing_subscriber::filter::filter_fn;
+use tracing_subscriber::filter::{FilterExt, LevelFilter, filter_fn};
 use tracing_subscriber::registry::LookupSpan;
 
 /// How long the collector may take for one export, and the end of the server waits for the last.
@@ -33,8 +33,12 @@ impl Traces {
     /// yet. This is called on a thread of an async runtime with several.
     ///
     /// # Errors
-    /// In words, if the endpoint is no URL.
+    /// In words, if the endpoint is no URL of plain HTTP.
     pub fn open(endpoint: &str) -> Result<Self, String> {
+        if !endpoint.starts_with("http://") {
+            return Err("must begin with http://; spans are sent in plain text".to_owned());
+        }
+
         let exporter = SpanExporter::builder()
             .with_tonic()
             .with_endpoint(endpoint)
@@ -62,10 +66,13 @@ impl Traces {
         let layer: OpenTelemetryLayer<S, SdkTracer> =
             tracing_opentelemetry::layer().with_tracer(self.0.tracer("seese3"));
 
-        // Not what the exporter itself does.
-        layer.with_filter(filter_fn(|metadata| {
-            metadata.target().starts_with("seese3")
-        }))
+        // Not what the exporter itself does, and no lines of the log for developers.
+        let filter = filter_fn(|metadata| metadata.target().starts_with("seese3"));
+        layer.with_filter(
+            filter
+                .with_max_level_hint(LevelFilter::INFO)
+                .and(LevelFilter::INFO),
+        )
     }
 }
 

@@ -75,8 +75,10 @@ impl Store {
             if let Err(error) = self.write_new(&gone, bytes).await {
                 // A full disk still takes a second name of the same file, and whoever removes wants
                 // to have room again.
-                let named = self.objects.copy_if_not_exists(&manifest, &gone).await;
-                named.map_err(|_| error)?;
+                match self.objects.copy_if_not_exists(&manifest, &gone).await {
+                    Ok(()) | Err(object_store::Error::AlreadyExists { .. }) => {}
+                    Err(_) => return Err(error),
+                }
             }
 
             let deleted = self.objects.delete(&manifest).await;

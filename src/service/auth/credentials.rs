@@ -162,6 +162,9 @@ impl Credentials {
             };
 
             let issuer = issuer(form, file).map_err(unfit)?;
+            if issuers.iter().any(|other| other.has_tokens_of(&issuer)) {
+                return Err(unfit("is given twice for one audience".to_owned()));
+            }
             issuer.pems().iter().for_each(|pem| digest.update(pem));
             issuers.push(Arc::new(issuer));
         }
@@ -219,14 +222,18 @@ impl Credentials {
             return Ok(principal);
         }
 
+        let mut refusal = Error::Unauthenticated {
+            problem: "the token is not known",
+        };
         for issuer in &self.issuers {
-            if let Some(subject) = issuer.subject(token)? {
-                return Ok(Arc::new(subject));
+            match issuer.principal_of(token) {
+                Ok(Some(principal)) => return Ok(Arc::new(principal)),
+                Ok(None) => {}
+                // It may be for the audience of the next one.
+                Err(error) => refusal = error,
             }
         }
-        Err(Error::Unauthenticated {
-            problem: "the token is not known",
-        })
+        Err(refusal)
     }
 
     /// The principal with the certificate of this fingerprint.

@@ -4,7 +4,7 @@
 //! [[issuer]]
 //! issuer = "https://login.example.org"     # the token's `iss`
 //! audience = "seese3"                      # one of the token's `aud`
-//! public_keys = ["login.pem"]              # PEM files, beside the file of credentials; RSA, P-256, P-384 or Ed25519
+//! public_keys = ["login.pem"]              # PEM files, beside the file of credentials
 //! verbs = ["navigate", "localize", "track"]
 //! rooms = ["lab-*"]
 //! streams = 4                              # for each subject (`sub`)
@@ -12,8 +12,8 @@
 //! ```
 //!
 //! A token never allows more than its issuer's verbs and rooms. It allows less where it has `scope`
-//! (verbs, separated by spaces; words that are no verbs are somebody else's) or `seese3_rooms` (a list
-//! as `rooms`). It must have `sub` and `exp`.
+//! (verbs, separated by spaces; other words mean nothing here) or `seese3_rooms` (a list as `rooms`).
+//! It must have `sub` and `exp`. Keys are RSA of 2048 bits and more, P-256, P-384 or Ed25519.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -21,7 +21,7 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::{Duration, SystemTime};
 
 use jsonwebtoken::errors::ErrorKind;
-use jsonwebtoken::{DecodingKey, Validation};
+use jsonwebtoken::{AlgorithmFamily, DecodingKey, DecodingKeyKind, Validation};
 use serde::Deserialize;
 
 use super::super::Error;
@@ -118,6 +118,11 @@ impl Issuer {
         })
     }
 
+    /// Whether both are for the same tokens, so that it would be by chance which of them decides.
+    pub fn has_tokens_of(&self, other: &Self) -> bool {
+        (&self.form.issuer, &self.form.audience) == (&other.form.issuer, &other.form.audience)
+    }
+
     /// Whether both take the same tokens for the same rights.
     pub fn is_like(&self, other: &Self) -> bool {
         (&self.form, &self.pems) == (&other.form, &other.pems)
@@ -128,14 +133,16 @@ impl Issuer {
         &self.pems
     }
 
-    /// Whose token this is; none if it is not one of this issuer.
+    /// The principal of a token; none if it is not one of this issuer.
     ///
     /// # Errors
     /// [`Error::Unauthenticated`] if it is, and is not good any more, not yet, or not for us.
-    pub fn subject(self: &Arc<Self>, token: &[u8]) -> Result<Option<Principal>, Error> {
-        // What has no header of a kind that is taken is no such token at all.
-        if jsonwebtoken::decode_header(token).is_err() {
-            return Ok(None);
+    pub fn principal_of(self: &Arc<Self>, token: &[u8]) -> Result<Option<Principal>, Error> {
+        // What has no header of a kind that is taken is no such token at all. Extensions that have to be
+        // understood (`crit`, RFC 7515, section 4.1.11) are not.
+        match jsonwebtoken::decode_header(token) {
+            Ok(header) if header.crit.is_none() => {}
+            _ => return Ok(None),
         }
 
         for (key, validation) in &self.keys {
@@ -206,14 +213,18 @@ impl Issuer {
             return known;
         }
 
-        subjects.retain(|_, places| places.strong_count() > 0);
+        // Those that have nothing open are forgotten before the map would grow.
+        if subjects.len() == subjects.capacity() {
+            subjects.retain(|_, places| places.strong_count() > 0);
+        }
         let places = Arc::new(Places::new(&self.rights));
         subjects.insert(name.to_owned(), Arc::downgrade(&places));
         places
     }
 }
 
-/// When a token ends, which is at or after `exp`; none if that is further away than time is counted.
+/// When a token ends: at `exp`, and later by as much as clocks may differ. None if the system cannot
+/// represent that time.
 fn expiry(exp: f64) -> Option<SystemTime> {
     let since_1970 = Duration::try_from_secs_f64(exp + LEEWAY_S as f64).ok()?;
     SystemTime::UNIX_EPOCH.checked_add(since_1970)
@@ -221,10 +232,37 @@ fn expiry(exp: f64) -> Option<SystemTime> {
 
 /// A public key in PEM. Keys that both sides share (HMAC) are not taken: who checks could also sign.
 fn public_key(pem: &[u8]) -> Result<DecodingKey, String> {
-    DecodingKey::from_rsa_pem(pem)
+    const KINDS: &str = "RSA of 2048 bits or more, P-256, P-384 or Ed25519";
+
+    let text = String::from_utf8_lossy(pem);
+    if text.contains("PRIVATE KEY") {
+        return Err("has a private key; give the public one alone".to_owned());
+    }
+    if text.matches("-----BEGIN").count() > 1 {
+        return Err("has several keys; give a file to each".to_owned());
+    }
+
+    let key = DecodingKey::from_rsa_pem(pem)
         .or_else(|_| DecodingKey::from_ec_pem(pem))
         .or_else(|_| DecodingKey::from_ed_pem(pem))
-        .map_err(|_| "is no public key in PEM (RSA, P-256, P-384 or Ed25519)".to_owned())
+        .map_err(|_| format!("is no public key in PEM ({KINDS})"))?;
+
+    // A key that no token can be checked with is found now, by its length. An RSA key has its modulus,
+    // a point on a curve two coordinates and a byte before them.
+    let length = match key.kind() {
+        DecodingKeyKind::SecretOrDer(bytes) => bytes.len(),
+        DecodingKeyKind::RsaModulusExponent { n, .. } => n.len(),
+    };
+    let is_taken = match key.family() {
+        AlgorithmFamily::Rsa => length >= 2_048 / 8,
+        AlgorithmFamily::Ec => [1 + 2 * 32, 1 + 2 * 48].contains(&length),
+        AlgorithmFamily::Ed => length == 32,
+        AlgorithmFamily::Hmac => false,
+    };
+    match is_taken {
+        true => Ok(key),
+        false => Err(format!("is a key of another length or curve than {KINDS}")),
+    }
 }
 
 impl RoomScope {
@@ -360,5 +398,14 @@ mod tests {
         );
         assert!(taking(&["absent.pem"]).unwrap_err().contains("absent.pem"));
         assert!(taking(&[]).unwrap_err().contains("public_keys"));
+
+        let private = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(private.path(), "-----BEGIN PRIVATE KEY-----").unwrap();
+        let unfit = taking(&[private.path().to_str().unwrap()]).unwrap_err();
+        assert!(unfit.contains("private key"), "{unfit}");
+        for name in ["rsa1024.pem", "p521.pem", "two.pem"] {
+            let unfit = taking(&[&format!("unfit/{name}")]).unwrap_err();
+            assert!(unfit.contains(name), "{unfit}");
+        }
     }
 }

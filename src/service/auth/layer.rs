@@ -43,6 +43,14 @@ enum Need {
     Verb(Verb),
 }
 
+/// What is held until the answer to a request has ended.
+struct Admitted {
+    /// One of the places of its caller.
+    _place: OwnedSemaphorePermit,
+    /// What the caller of a signed token has open is counted as long as any of its principals lives.
+    _principal: Arc<Principal>,
+}
+
 /// Wraps a service so that only known callers reach it, if there are credentials.
 #[derive(Debug, Clone)]
 pub struct AuthLayer {
@@ -84,8 +92,8 @@ where
     }
 
     fn call(&mut self, mut request: Request<B>) -> Self::Future {
-        let place = match self.layer.admit(&mut request) {
-            Ok(place) => place,
+        let admitted = match self.layer.admit(&mut request) {
+            Ok(admitted) => admitted,
             Err(error) => {
                 let refused = Status::from(error).into_http();
                 return Box::pin(async move { Ok(refused) });
@@ -95,18 +103,17 @@ where
 
         Box::pin(async move {
             let response = answer.await?;
-            Ok(match place {
+            Ok(match admitted {
                 None => response,
-                Some(place) => response.map(|body| holding(body, place)),
+                Some(admitted) => response.map(|body| holding(body, admitted)),
             })
         })
     }
 }
 
 impl AuthLayer {
-    /// Checks a request and notes who it is from. Returns the caller's place, to be held until the
-    /// answer has ended.
-    fn admit<B>(&self, request: &mut Request<B>) -> Result<Option<OwnedSemaphorePermit>, Error> {
+    /// Checks a request and notes who it is from. None if nobody has to be known.
+    fn admit<B>(&self, request: &mut Request<B>) -> Result<Option<Admitted>, Error> {
         let Some(keyring) = &self.keyring else {
             return Ok(None);
         };
@@ -134,9 +141,12 @@ impl AuthLayer {
             self.metrics.shed(full);
             Error::Full { what: full }
         })?;
-        request.extensions_mut().insert(principal);
+        request.extensions_mut().insert(principal.clone());
 
-        Ok(Some(place))
+        Ok(Some(Admitted {
+            _place: place,
+            _principal: principal,
+        }))
     }
 }
 
@@ -176,4 +186,50 @@ fn bearer(headers: &HeaderMap) -> Result<Option<&[u8]>, Error> {
     }
 
     Ok(Some(token))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::convert::Infallible;
+
+    /// Oracle: the limit of the file. A token's calls count until they are answered, also when their
+    /// requests are gone before.
+    #[tokio::test]
+    async fn calls_of_one_subject_are_bounded() {
+        let golden = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/jwt");
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("auth.toml");
+        std::fs::copy(golden.join("p256.pem"), folder.path().join("login.pem")).unwrap();
+        let issuer = "[[issuer]]\nissuer = \"https://login.example.org\"\naudience = \"seese3\"\n\
+                      public_keys = [\"login.pem\"]\nverbs = [\"navigate\"]\nrooms = [\"*\"]\nrequests = 2\n";
+        std::fs::write(&file, issuer).unwrap();
+        let tokens = std::fs::read(golden.join("tokens.json")).unwrap();
+        let tokens: serde_json::Value = serde_json::from_slice(&tokens).unwrap();
+        let token = tokens["good"]["ES256"].as_str().unwrap();
+
+        let layer = AuthLayer {
+            keyring: Some(Arc::new(Keyring::open(file).unwrap())),
+            metrics: Metrics::default(),
+        };
+        let mut service = layer.layer(tower::service_fn(|request: Request<()>| {
+            drop(request);
+            std::future::pending::<Result<Response<Body>, Infallible>>()
+        }));
+        let mut call = || {
+            let request = Request::builder()
+                .uri("/seese3.v1.NavigationService/Navigate")
+                .header(header::AUTHORIZATION, format!("Bearer {token}"));
+            service.call(request.body(()).unwrap())
+        };
+
+        let open = [call(), call()];
+        let refused = call().await.unwrap();
+        assert_eq!(refused.headers()["grpc-status"], "8");
+
+        // Once they are given up, there are places again.
+        drop(open);
+        let answered = tokio::time::timeout(std::time::Duration::from_millis(50), call()).await;
+        assert!(answered.is_err(), "it is admitted, and never answered");
+    }
 }

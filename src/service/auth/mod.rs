@@ -106,11 +106,11 @@ impl Places {
     }
 }
 
-/// Whose word it is that a caller is who it says.
+/// By whose signature a caller is known.
 #[derive(Debug)]
 struct Signed {
     issuer: Arc<Issuer>,
-    /// When that ends, if ever.
+    /// When the token ends, if ever.
     until: Option<SystemTime>,
 }
 

@@ -26,6 +26,9 @@ static REQUESTS: LazyLock<HashMap<String, Request>> = LazyLock::new(requests);
 /// The end of the path of reflection, which has no descriptors here.
 const REFLECTION: &str = "/ServerReflectionInfo";
 
+/// The path of a check of health, which has no descriptors here.
+const HEALTH_CHECK: &str = "/grpc.health.v1.Health/Check";
+
 /// What a request consists of.
 #[derive(Debug)]
 struct Request {
@@ -82,10 +85,12 @@ pub fn is_stream(path: &str) -> bool {
     }
 }
 
-/// Whether the answer is one message.
-pub fn has_one_answer(path: &str) -> bool {
-    let request = REQUESTS.get(path);
-    request.is_some_and(|request| !request.is_answered_by_stream)
+/// Whether the response is one message.
+pub fn has_unary_response(path: &str) -> bool {
+    match REQUESTS.get(path) {
+        Some(request) => !request.is_answered_by_stream,
+        None => path == HEALTH_CHECK,
+    }
 }
 
 /// The memory that lists, texts and the messages in lists take.
@@ -333,9 +338,9 @@ mod tests {
             assert_eq!(is_stream(&path), expected, "{path}");
         }
 
-        assert!(has_one_answer(NAVIGATE));
-        assert!(!has_one_answer(&service("EvaluationService/Evaluate")));
-        assert!(!has_one_answer("/grpc.health.v1.Health/Watch"));
+        assert!(has_unary_response(NAVIGATE) && has_unary_response(HEALTH_CHECK));
+        assert!(!has_unary_response(&service("EvaluationService/Evaluate")));
+        assert!(!has_unary_response("/grpc.health.v1.Health/Watch"));
     }
 
     /// Oracle: nothing that a caller can send may stop the computation.

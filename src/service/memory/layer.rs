@@ -9,7 +9,6 @@ use bytes::{Bytes, BytesMut};
 use http::{Request, Response};
 use http_body::{Frame, SizeHint};
 use http_body_util::{BodyExt, Full as WholeBody};
-use tokio::task::JoinHandle;
 use tonic::Status;
 use tonic::body::Body;
 use tower::{Layer, Service};
@@ -17,7 +16,8 @@ use tower::{Layer, Service};
 use super::super::Error;
 use super::super::connections::Peer;
 use super::super::holding_body::holding;
-use super::decoded::{decoded_size, has_one_answer, is_stream};
+use super::decoded::{decoded_size, has_unary_response, is_stream};
+use super::response::{ResponseTimeout, in_pieces};
 use super::{HELD, Held, Memory};
 
 /// The beginning of the paths of the health service.
@@ -36,8 +36,8 @@ pub struct MemoryLayer {
     pub message_bytes: usize,
     /// How long a request with one message may take to arrive.
     pub receive_within: Duration,
-    /// How long a caller may take to receive an answer of one message.
-    pub take_within: Duration,
+    /// How long a caller may receive nothing of a unary response.
+    pub response_timeout: Duration,
 }
 
 impl<S> Layer<S> for MemoryLayer {
@@ -83,34 +83,14 @@ where
                 Err(error) => return Ok(Status::from(error).into_http()),
             };
 
-            let has_one_answer = has_one_answer(request.uri().path());
+            let is_unary = has_unary_response(request.uri().path());
             let peer = request.extensions().get::<Peer>().cloned();
             let response = HELD.scope(held.clone(), inner.call(request)).await?;
 
-            let peer = peer.filter(|_| has_one_answer);
-            let untaken = peer.map(|peer| Untaken::new(peer, layer.take_within));
-            Ok(response.map(|body| holding(body, (held, untaken))))
+            let peer = peer.filter(|_| is_unary);
+            let timeout = peer.map(|peer| ResponseTimeout::new(peer, layer.response_timeout));
+            Ok(response.map(|body| in_pieces(holding(body, held), timeout)))
         })
-    }
-}
-
-/// An answer that its caller has not received yet. A caller that does not receive it in time loses
-/// its connection: HTTP/2 would wait for ever, and what is on its way cannot be taken back otherwise.
-struct Untaken(JoinHandle<()>);
-
-impl Untaken {
-    fn new(peer: Peer, take_within: Duration) -> Self {
-        Self(tokio::spawn(async move {
-            tokio::time::sleep(take_within).await;
-            tracing::warn!(address = %peer.address, "an answer was not received in time; its connection is closed");
-            peer.close();
-        }))
-    }
-}
-
-impl Drop for Untaken {
-    fn drop(&mut self) {
-        self.0.abort();
     }
 }
 

@@ -8,6 +8,7 @@
 
 mod decoded;
 mod layer;
+mod response;
 
 pub use layer::MemoryLayer;
 

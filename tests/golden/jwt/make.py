@@ -43,6 +43,13 @@ def signed(content, key=keys["p256"], algorithm="ES256", headers=None):
 for name, key in keys.items():
     (HERE / f"{name}.pem").write_bytes(public_pem(key))
 
+# Keys that are not taken.
+unfit = HERE / "unfit"
+unfit.mkdir(exist_ok=True)
+(unfit / "rsa1024.pem").write_bytes(public_pem(rsa.generate_private_key(public_exponent=65537, key_size=1024)))
+(unfit / "p521.pem").write_bytes(public_pem(ec.generate_private_key(ec.SECP521R1())))
+(unfit / "two.pem").write_bytes(public_pem(keys["p256"]) + public_pem(keys["p384"]))
+
 good = {
     **{name: signed(claims(), keys["rsa"], name) for name in ["RS256", "RS384", "RS512", "PS256", "PS384", "PS512"]},
     "ES256": signed(claims()),
@@ -72,6 +79,10 @@ bad = {
     "subject of two lines": [signed(claims(sub="a\nb")), "sub"],
     "of another issuer": [signed(claims(iss="https://evil.example.org")), "not known"],
     "of another key": [signed(claims(), other), "not known"],
+    "of an extension that has to be understood": [
+        signed(claims(), headers={"crit": ["exp-by-moon"], "exp-by-moon": 1}),
+        "not known",
+    ],
     "of no algorithm": [jwt.encode(claims(), None, algorithm="none"), "not known"],
 }
 

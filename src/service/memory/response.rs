@@ -1,0 +1,132 @@
+//! Responses on their way to callers that may not receive them.
+//!
+//! HTTP/2 sends as much as the caller has room for, and waits for ever with the rest. What the
+//! transport has taken over is not counted any more, and it takes a frame of data as a whole as soon as
+//! there is room for one byte of it: so frames are short here.
+
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body::{Frame, SizeHint};
+use tokio::sync::Notify;
+use tokio::task::JoinHandle;
+use tonic::Status;
+use tonic::body::Body;
+
+use super::super::connections::Peer;
+
+/// The longest frame of data, bytes; as long as the longest frame of HTTP/2 is by default.
+const PIECE: usize = 16 << 10;
+
+/// The time limit of a response: a caller that receives nothing of it for so long loses its connection,
+/// since what is on its way cannot be taken back otherwise.
+pub struct ResponseTimeout {
+    /// Notified whenever the transport takes a piece.
+    taken: Arc<Notify>,
+    waiting: JoinHandle<()>,
+}
+
+impl ResponseTimeout {
+    /// A limit that begins now.
+    pub fn new(peer: Peer, limit: Duration) -> Self {
+        let taken = Arc::new(Notify::new());
+        let progress = taken.clone();
+        let waiting = tokio::spawn(async move {
+            while tokio::time::timeout(limit, progress.notified())
+                .await
+                .is_ok()
+            {}
+            if peer.close() {
+                let address = peer.address;
+                tracing::warn!(%address, "a response was not received: its connection is closed");
+            }
+        });
+
+        Self { taken, waiting }
+    }
+}
+
+impl Drop for ResponseTimeout {
+    fn drop(&mut self) {
+        self.waiting.abort();
+    }
+}
+
+/// The same body in short pieces.
+pub fn in_pieces(body: Body, timeout: Option<ResponseTimeout>) -> Body {
+    Body::new(Pieces {
+        body,
+        rest: Bytes::new(),
+        timeout,
+    })
+}
+
+struct Pieces {
+    body: Body,
+    /// What is left of the last frame of the body.
+    rest: Bytes,
+    timeout: Option<ResponseTimeout>,
+}
+
+impl http_body::Body for Pieces {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        if let Some(timeout) = &self.timeout {
+            timeout.taken.notify_one();
+        }
+
+        if self.rest.is_empty() {
+            let polled = Pin::new(&mut self.body).poll_frame(context);
+            let Poll::Ready(Some(Ok(frame))) = polled else {
+                return polled;
+            };
+            match frame.into_data() {
+                Ok(data) => self.rest = data,
+                Err(trailers) => return Poll::Ready(Some(Ok(trailers))),
+            }
+        }
+
+        let length = self.rest.len().min(PIECE);
+        let piece = self.rest.split_to(length);
+        Poll::Ready(Some(Ok(Frame::data(piece))))
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.rest.is_empty() && self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        SizeHint::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use http_body_util::{BodyExt, Full};
+
+    /// Oracle: the definition: the same bytes, in pieces of the length and one that is shorter.
+    #[tokio::test]
+    async fn a_body_is_the_same_in_pieces() {
+        let bytes: Vec<u8> = (0..PIECE * 2 + 5).map(|at| at as u8).collect();
+        let mut body = in_pieces(Body::new(Full::new(Bytes::from(bytes.clone()))), None);
+
+        let mut lengths = Vec::new();
+        let mut all = Vec::new();
+        while let Some(frame) = body.frame().await {
+            let data = frame.unwrap().into_data().unwrap();
+            lengths.push(data.len());
+            all.extend(data);
+        }
+        assert_eq!(lengths, [PIECE, PIECE, 5]);
+        assert_eq!(all, bytes);
+    }
+}
