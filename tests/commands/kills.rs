@@ -78,11 +78,23 @@ fn intact_revision(store: &str) -> u64 {
     shown["current"].as_u64().unwrap()
 }
 
-/// Kills after a moment that the seed decides, which lies within the time that the work takes.
-fn kill_within(running: &mut Running, longest: Duration, random: &mut ChaCha8Rng) {
-    let moment = longest.mul_f64(random.random_range(0.0..1.0));
-    std::thread::sleep(moment);
-    running.kill();
+/// The moments of kills: drawn from a time that grows when the work was cut short and shrinks when it
+/// was finished, so that both happen however busy the machine is.
+struct Moments {
+    longest: Duration,
+    random: ChaCha8Rng,
+}
+
+impl Moments {
+    fn kill(&mut self, running: &mut Running) {
+        let moment = self.longest.mul_f64(self.random.random_range(0.0..1.0));
+        std::thread::sleep(moment);
+        running.kill();
+    }
+
+    fn learn(&mut self, was_finished: bool) {
+        self.longest = self.longest.mul_f64(if was_finished { 0.7 } else { 1.4 });
+    }
 }
 
 /// Oracle: the promise of the store.
@@ -91,23 +103,26 @@ fn a_publisher_that_is_killed_leaves_an_old_or_a_new_revision() {
     let folder = tempfile::tempdir().unwrap();
     let store = folder.path().join("store");
     let store = text(&store);
-    let mut random = ChaCha8Rng::seed_from_u64(1);
 
     let first = import(folder.path(), 0, store);
     let began = std::time::Instant::now();
     succeeds(&words(&first));
-    let longest = began.elapsed() * 2;
+    let mut moments = Moments {
+        longest: began.elapsed() * 2,
+        random: ChaCha8Rng::seed_from_u64(1),
+    };
 
     let mut before = intact_revision(store);
     let mut finished = 0;
     for version in 1..=kills() {
         let next = import(folder.path(), version, store);
         let mut child = started(&words(&next));
-        kill_within(&mut child, longest, &mut random);
+        moments.kill(&mut child);
 
         let now = intact_revision(store);
         assert!(now == before || now == before + 1, "{before} became {now}");
         finished += now - before;
+        moments.learn(now > before);
         before = now;
 
         succeeds(&["store", "gc", "--older-than", "0", "--store", store]);
@@ -153,7 +168,6 @@ fn a_server_that_is_killed_during_an_upload_leaves_an_old_or_a_new_revision() {
     let folder = tempfile::tempdir().unwrap();
     let (store, source) = (folder.path().join("store"), folder.path().join("source"));
     let (store, source) = (text(&store), text(&source));
-    let mut random = ChaCha8Rng::seed_from_u64(2);
 
     for place in [store, source] {
         succeeds(&words(&import(folder.path(), 0, place)));
@@ -163,7 +177,10 @@ fn a_server_that_is_killed_during_an_upload_leaves_an_old_or_a_new_revision() {
     let (mut server, address) = serve(store);
     let began = std::time::Instant::now();
     succeeds(&["push", "rooms/a", "--store", source, "--server", &address]);
-    let longest = began.elapsed() * 2;
+    let mut moments = Moments {
+        longest: began.elapsed() * 2,
+        random: ChaCha8Rng::seed_from_u64(2),
+    };
     server.kill();
 
     let mut before = intact_revision(store);
@@ -173,12 +190,13 @@ fn a_server_that_is_killed_during_an_upload_leaves_an_old_or_a_new_revision() {
 
         let (mut server, address) = serve(store);
         let mut push = started(&["push", "rooms/a", "--store", source, "--server", &address]);
-        kill_within(&mut server, longest, &mut random);
+        moments.kill(&mut server);
         push.0.wait().unwrap();
 
         let now = intact_revision(store);
         assert!(now == before || now == before + 1, "{before} became {now}");
         finished += now - before;
+        moments.learn(now > before);
         before = now;
 
         succeeds(&["store", "gc", "--older-than", "0", "--store", store]);

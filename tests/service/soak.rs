@@ -14,14 +14,11 @@ const CALLERS: usize = 4;
 /// The share of what the server can answer that it is asked.
 const LOAD: f64 = 0.8;
 
-/// How long the load lasts: SEESE3_SOAK_SECONDS, 6 if it is not set; `just soak` asks for half an
-/// hour.
-fn time() -> Duration {
-    let given = std::env::var("SEESE3_SOAK_SECONDS").ok();
-    let seconds = given.map_or(6.0, |text| {
-        text.parse().expect("SEESE3_SOAK_SECONDS is a number")
-    });
-    Duration::from_secs_f64(seconds)
+/// How long the load lasts: SEESE3_SOAK_SECONDS; `just soak` asks for half an hour.
+fn given_time() -> Option<Duration> {
+    let given = std::env::var("SEESE3_SOAK_SECONDS").ok()?;
+    let seconds = given.parse().expect("SEESE3_SOAK_SECONDS is a number");
+    Some(Duration::from_secs_f64(seconds))
 }
 
 /// The memory of this process, the server's and the callers', bytes.
@@ -74,20 +71,22 @@ async fn asked(server: &Arc<TestServer>, during: Duration, pause: Duration) -> f
     count.load(Ordering::Relaxed) as f64 / begun.elapsed().as_secs_f64()
 }
 
-/// Oracle: the promise: no answer fails, and the memory that the process takes after a tenth of the
-/// time is what it takes at the end, within a tenth and 16 MiB.
+/// Oracle: the promise: no answer fails, and the memory that the process takes after a fifth of the
+/// time is what it takes at the end, within a tenth and 16 MiB. Without a time there are six seconds,
+/// and memory is not compared, because other tests share the process.
 #[cfg(target_os = "linux")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn memory_is_flat_under_a_steady_load() {
     let server = Arc::new(start(Config::default()).await);
-    let most = asked(&server, time() / 10, Duration::ZERO).await;
+    let time = given_time().unwrap_or(Duration::from_secs(6));
+    let most = asked(&server, time / 10, Duration::ZERO).await;
 
     // Of the time between two questions of one caller, the answer takes the share that is loaded.
     let pause = Duration::from_secs_f64(CALLERS as f64 / most * (1.0 / LOAD - 1.0));
-    let _ = asked(&server, time() / 10, pause).await;
+    let _ = asked(&server, time / 10, pause).await;
     let before = resident_bytes();
 
-    let rate = asked(&server, time() * 8 / 10, pause).await;
+    let rate = asked(&server, time * 8 / 10, pause).await;
     let after = resident_bytes();
     println!(
         "{rate:.0} of {most:.0} questions a second; {} MiB, then {} MiB",
@@ -95,7 +94,7 @@ async fn memory_is_flat_under_a_steady_load() {
         after >> 20
     );
     assert!(
-        after < before + before / 10 + (16 << 20),
+        given_time().is_none() || after < before + before / 10 + (16 << 20),
         "{before} bytes became {after}"
     );
 }
