@@ -55,8 +55,8 @@ struct Closing {
 }
 
 impl Peer {
-    /// Closes the connection, with everything that is open on it. Returns whether nobody asked for that
-    /// before.
+    /// Closes the connection, with everything that is open on it. Returns whether nobody asked for
+    /// that before.
     pub fn close(&self) -> bool {
         self.closing.now.notify_one();
         !self.closing.asked.swap(true, Ordering::Relaxed)
@@ -213,7 +213,8 @@ impl Connected for Connection {
 }
 
 impl Connection {
-    /// Fails once the connection is to be closed, whether its caller lets it read or write or neither.
+    /// Fails once the connection is to be closed, whether its caller lets it read or write or
+    /// neither.
     fn check_open(&mut self, context: &mut Context<'_>) -> io::Result<()> {
         match self.closed.as_mut().poll(context) {
             Poll::Ready(()) => Err(io::ErrorKind::ConnectionAborted.into()),

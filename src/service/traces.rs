@@ -1,8 +1,9 @@
 //! Spans of requests for a collector of OpenTelemetry (OTLP over gRPC).
 //!
-//! A request whose caller sends `traceparent` (W3C Trace Context) is part of the caller's trace, and
-//! is exported if the caller's trace is; any other begins a trace of its own. Spans wait in a queue of
-//! bounded length for a thread that sends them: a collector that is slow or gone holds nobody up.
+//! A request whose caller sends `traceparent` (W3C Trace Context) is part of the caller's trace,
+//! and is exported if the caller's trace is; any other begins a trace of its own. Spans wait in a
+//! queue of bounded length for a thread that sends them: a collector that is slow or gone holds
+//! nobody up.
 
 use std::time::Duration;
 
@@ -29,8 +30,8 @@ const EXPORT: Duration = Duration::from_secs(5);
 pub struct Traces(SdkTracerProvider);
 
 impl Traces {
-    /// Spans go to the collector at `endpoint`, such as `http://127.0.0.1:4317`. It need not be there
-    /// yet. This is called on a thread of an async runtime with several.
+    /// Spans go to the collector at `endpoint`, such as `http://127.0.0.1:4317`. It need not be
+    /// there yet. This is called on a thread of an async runtime with several.
     ///
     /// # Errors
     /// In words, if the endpoint is no URL of plain HTTP.

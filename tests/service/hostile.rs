@@ -106,8 +106,8 @@ async fn frames_against_the_rules_harm_nobody_else() {
     answers_others(&server, "bytes by chance").await;
 }
 
-/// Oracle: the attack's own definition (CVE-2023-44487): calls that are cancelled as soon as they are
-/// made cost the attacker nothing. The server gives the connection up.
+/// Oracle: the attack's own definition (CVE-2023-44487): calls that are cancelled as soon as they
+/// are made cost the attacker nothing. The server gives the connection up.
 #[tokio::test]
 async fn calls_that_are_cancelled_at_once_end_their_connection() {
     let metrics = Metrics::default();

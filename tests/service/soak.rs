@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use seese3::service::Config;
 use seese3_client::proto::v1 as pb;
+use tokio::time::MissedTickBehavior;
 
 use crate::harness::{TestServer, frame, question, start};
 
@@ -49,17 +50,27 @@ async fn ask(server: &TestServer, turn: u64) {
     }
 }
 
-/// Asks as often as the pause between a caller's questions lets it, and returns the rate, Hz.
-async fn asked(server: &Arc<TestServer>, during: Duration, pause: Duration) -> f64 {
+/// Asks at a rate, Hz, or as fast as answers come, and returns the rate that came about.
+async fn asked(server: &Arc<TestServer>, during: Duration, rate: Option<f64>) -> f64 {
     let count = Arc::new(AtomicU64::new(0));
     let begun = Instant::now();
     let callers: Vec<_> = (0..CALLERS)
         .map(|_| {
             let (server, count) = (server.clone(), count.clone());
+
+            // A caller that was late does not ask faster after that.
+            let mut ticks = rate.map(|rate| {
+                let period = Duration::from_secs_f64(CALLERS as f64 / rate);
+                let mut ticks = tokio::time::interval(period);
+                ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+                ticks
+            });
             tokio::spawn(async move {
                 while begun.elapsed() < during {
+                    if let Some(ticks) = &mut ticks {
+                        ticks.tick().await;
+                    }
                     ask(&server, count.fetch_add(1, Ordering::Relaxed)).await;
-                    tokio::time::sleep(pause).await;
                 }
             })
         })
@@ -72,21 +83,20 @@ async fn asked(server: &Arc<TestServer>, during: Duration, pause: Duration) -> f
 }
 
 /// Oracle: the promise: no answer fails, and the memory that the process takes after a fifth of the
-/// time is what it takes at the end, within a tenth and 16 MiB. Without a time there are six seconds,
-/// and memory is not compared, because other tests share the process.
+/// time is what it takes at the end, within a tenth and 16 MiB. Without a time there are six
+/// seconds, and memory is not compared, because other tests share the process.
 #[cfg(target_os = "linux")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn memory_is_flat_under_a_steady_load() {
     let server = Arc::new(start(Config::default()).await);
     let time = given_time().unwrap_or(Duration::from_secs(6));
-    let most = asked(&server, time / 10, Duration::ZERO).await;
+    let most = asked(&server, time / 10, None).await;
 
-    // Of the time between two questions of one caller, the answer takes the share that is loaded.
-    let pause = Duration::from_secs_f64(CALLERS as f64 / most * (1.0 / LOAD - 1.0));
-    let _ = asked(&server, time / 10, pause).await;
+    let load = Some(LOAD * most);
+    let _ = asked(&server, time / 10, load).await;
     let before = resident_bytes();
 
-    let rate = asked(&server, time * 8 / 10, pause).await;
+    let rate = asked(&server, time * 8 / 10, load).await;
     let after = resident_bytes();
     println!(
         "{rate:.0} of {most:.0} questions a second; {} MiB, then {} MiB",

@@ -484,8 +484,8 @@ mod tests {
         }
     }
 
-    /// Oracle: the promise: who keeps its rights keeps what it has open; who has others, or none, is
-    /// told so.
+    /// Oracle: the promise: who keeps its rights keeps what it has open; who has others, or none,
+    /// is told so.
     #[tokio::test]
     async fn only_changed_rights_are_revoked() {
         let folder = tempfile::tempdir().unwrap();

@@ -12,8 +12,9 @@
 //! ```
 //!
 //! A token never allows more than its issuer's verbs and rooms. It allows less where it has `scope`
-//! (verbs, separated by spaces; other words mean nothing here) or `seese3_rooms` (a list as `rooms`).
-//! It must have `sub` and `exp`. Keys are RSA of 2048 bits and more, P-256, P-384 or Ed25519.
+//! (verbs, separated by spaces; other words mean nothing here) or `seese3_rooms` (a list as
+//! `rooms`). It must have `sub` and `exp`. Keys are RSA of 2048 bits and more, P-256, P-384 or
+//! Ed25519.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -138,8 +139,8 @@ impl Issuer {
     /// # Errors
     /// [`Error::Unauthenticated`] if it is, and is not good any more, not yet, or not for us.
     pub fn principal_of(self: &Arc<Self>, token: &[u8]) -> Result<Option<Principal>, Error> {
-        // What has no header of a kind that is taken is no such token at all. Extensions that have to be
-        // understood (`crit`, RFC 7515, section 4.1.11) are not.
+        // What has no header of a kind that is taken is no such token at all. Extensions that have
+        // to be understood (`crit`, RFC 7515, section 4.1.11) are not.
         match jsonwebtoken::decode_header(token) {
             Ok(header) if header.crit.is_none() => {}
             _ => return Ok(None),
@@ -223,14 +224,15 @@ impl Issuer {
     }
 }
 
-/// When a token ends: at `exp`, and later by as much as clocks may differ. None if the system cannot
-/// represent that time.
+/// When a token ends: at `exp`, and later by as much as clocks may differ. None if the system
+/// cannot represent that time.
 fn expiry(exp: f64) -> Option<SystemTime> {
     let since_1970 = Duration::try_from_secs_f64(exp + LEEWAY_S as f64).ok()?;
     SystemTime::UNIX_EPOCH.checked_add(since_1970)
 }
 
-/// A public key in PEM. Keys that both sides share (HMAC) are not taken: who checks could also sign.
+/// A public key in PEM. Keys that both sides share (HMAC) are not taken: who checks could also
+/// sign.
 fn public_key(pem: &[u8]) -> Result<DecodingKey, String> {
     const KINDS: &str = "RSA of 2048 bits or more, P-256, P-384 or Ed25519";
 
@@ -247,8 +249,8 @@ fn public_key(pem: &[u8]) -> Result<DecodingKey, String> {
         .or_else(|_| DecodingKey::from_ed_pem(pem))
         .map_err(|_| format!("is no public key in PEM ({KINDS})"))?;
 
-    // A key that no token can be checked with is found now, by its length. An RSA key has its modulus,
-    // a point on a curve two coordinates and a byte before them.
+    // A key that no token can be checked with is found now, by its length. An RSA key has its
+    // modulus, a point on a curve two coordinates and a byte before them.
     let length = match key.kind() {
         DecodingKeyKind::SecretOrDer(bytes) => bytes.len(),
         DecodingKeyKind::RsaModulusExponent { n, .. } => n.len(),
@@ -291,6 +293,7 @@ mod tests {
 
     /// The credentials of a server that takes the tokens of these keys.
     fn taking(keys: &[&str]) -> Result<Credentials, String> {
+        // Paths in quotes, as a list of TOML.
         let keys: Vec<String> = keys
             .iter()
             .map(|key| format!("{:?}", golden().join(key)))

@@ -47,7 +47,8 @@ enum Need {
 struct Admitted {
     /// One of the places of its caller.
     _place: OwnedSemaphorePermit,
-    /// What the caller of a signed token has open is counted as long as any of its principals lives.
+    /// What the caller of a signed token has open is counted as long as any of its principals
+    /// lives.
     _principal: Arc<Principal>,
 }
 
@@ -193,8 +194,8 @@ mod tests {
     use super::*;
     use std::convert::Infallible;
 
-    /// Oracle: the limit of the file. A token's calls count until they are answered, also when their
-    /// requests are gone before.
+    /// Oracle: the limit of the file. A token's calls count until they are answered, also when
+    /// their requests are gone before.
     #[tokio::test]
     async fn calls_of_one_subject_are_bounded() {
         let golden = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/jwt");

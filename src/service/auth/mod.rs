@@ -1,8 +1,8 @@
 //! Who may call, and what for.
 //!
 //! A server without credentials answers everybody. Once there are any, a call without one is
-//! refused, and a caller sees only the rooms of its own: for everything else, a room outside of them
-//! does not exist.
+//! refused, and a caller sees only the rooms of its own: for everything else, a room outside of
+//! them does not exist.
 //!
 //! | file | what |
 //! | --- | --- |

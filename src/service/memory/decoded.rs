@@ -1,6 +1,6 @@
-//! How large a message becomes when it is decoded, computed from its bytes and the descriptors of the
-//! protocol without decoding it. Two bytes on the wire can become hundreds: an empty message in a
-//! list is a tag and a zero, and a whole struct in memory.
+//! How large a message becomes when it is decoded, computed from its bytes and the descriptors of
+//! the protocol without decoding it. Two bytes on the wire can become hundreds: an empty message in
+//! a list is a tag and a zero, and a whole struct in memory.
 
 use std::collections::HashMap;
 use std::sync::LazyLock;
@@ -358,7 +358,8 @@ mod tests {
         assert_eq!(decoded_size("/other/Service", &[1, 2, 3]), 3);
     }
 
-    /// Oracle: the decoder: it passes over a group of an unknown field, and reads what is behind it.
+    /// Oracle: the decoder: it passes over a group of an unknown field, and reads what is behind
+    /// it.
     #[test]
     fn nothing_hides_behind_a_group() {
         let batch = pb::BatchNavigateRequest {

@@ -125,8 +125,8 @@ impl MemoryLayer {
         Ok((held, Request::from_parts(head, body)))
     }
 
-    /// The bytes of the one message that a body has to consist of, without its prefix. A message that
-    /// is too long is passed on: the decoder refuses it by its prefix.
+    /// The bytes of the one message that a body has to consist of, without its prefix. A message
+    /// that is too long is passed on: the decoder refuses it by its prefix.
     fn one_message<'a>(&self, body: &'a [u8]) -> Result<&'a [u8], Error> {
         let Some((prefix, message)) = body.split_first_chunk::<PREFIX>() else {
             return Ok(&[]);

@@ -1,9 +1,9 @@
 //! A bound in bytes on what requests hold in memory: what has arrived of them, what it becomes when
 //! it is decoded, and answers that were not sent yet.
 //!
-//! A request with one message is received as a whole, within a time limit, before a handler sees it:
-//! a caller that sends slowly costs no more than the bytes that it has sent. How large the message
-//! becomes is computed before it is decoded, see [`decoded`]. Of a stream of messages, the
+//! A request with one message is received as a whole, within a time limit, before a handler sees
+//! it: a caller that sends slowly costs no more than the bytes that it has sent. How large the
+//! message becomes is computed before it is decoded, see [`decoded`]. Of a stream of messages, the
 //! largest one so far is counted, since a handler keeps one at a time.
 
 mod decoded;
@@ -62,7 +62,8 @@ impl Memory {
         self.0.held.load(Ordering::Relaxed)
     }
 
-    /// The largest size of one decoded request, bytes: a quarter of all, so that none is everything.
+    /// The largest size of one decoded request, bytes: a quarter of all, so that none is
+    /// everything.
     fn largest_request(&self) -> usize {
         self.0.most / 4
     }

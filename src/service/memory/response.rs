@@ -1,8 +1,8 @@
 //! Responses on their way to callers that may not receive them.
 //!
 //! HTTP/2 sends as much as the caller has room for, and waits for ever with the rest. What the
-//! transport has taken over is not counted any more, and it takes a frame of data as a whole as soon as
-//! there is room for one byte of it: so frames are short here.
+//! transport has taken over is not counted any more, and it takes a frame of data as a whole as
+//! soon as there is room for one byte of it: so frames are short here.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -21,8 +21,8 @@ use super::super::connections::Peer;
 /// The longest frame of data, bytes; as long as the longest frame of HTTP/2 is by default.
 const PIECE: usize = 16 << 10;
 
-/// The time limit of a response: a caller that receives nothing of it for so long loses its connection,
-/// since what is on its way cannot be taken back otherwise.
+/// The time limit of a response: a caller that receives nothing of it for so long loses its
+/// connection, since what is on its way cannot be taken back otherwise.
 pub struct ResponseTimeout {
     /// Notified whenever the transport takes a piece.
     taken: Arc<Notify>,
