@@ -225,12 +225,14 @@ mod tests {
         };
 
         let open = [call(), call()];
-        let refused = call().await.unwrap();
+        let soon = std::time::Duration::from_millis(500);
+        let refused = tokio::time::timeout(soon, call()).await;
+        let refused = refused.expect("it is refused at once").unwrap();
         assert_eq!(refused.headers()["grpc-status"], "8");
 
         // Once they are given up, there are places again.
         drop(open);
-        let answered = tokio::time::timeout(std::time::Duration::from_millis(50), call()).await;
+        let answered = tokio::time::timeout(soon, call()).await;
         assert!(answered.is_err(), "it is admitted, and never answered");
     }
 }
