@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use clap::{Args, ValueEnum};
+use clap::{ArgAction, Args, ValueEnum};
 use tokio::net::TcpListener;
 use tokio::sync::Notify;
 
@@ -14,7 +14,7 @@ use super::log::{LogFormat, Traces, start_log};
 use super::say;
 use crate::encoder::{Bounds, Runtime};
 use crate::service::{
-    Config, ImageEncoders, Keyring, Listeners, Reload, Tls, TlsFiles, TokenKey, run,
+    Config, ImageEncoders, Keyring, Listeners, Reload, RoomMemory, Tls, TlsFiles, TokenKey, run,
     shutdown_signal,
 };
 use crate::store::Store;
@@ -70,6 +70,15 @@ pub struct Serve {
     /// How the nearest frames are searched
     #[arg(long, env = "SEESE3_INDEX", value_enum, default_value_t = IndexName::Exact)]
     index: IndexName,
+    /// Load and verify every room before it is served; with `false`, when it is first asked for: the
+    /// start is short, and a damaged room is noticed late
+    #[arg(long, env = "SEESE3_PRELOAD", default_value_t = RoomMemory::default().preload, default_missing_value = "true", num_args = 0..=1, action = ArgAction::Set)]
+    preload: bool,
+    /// What the rooms in memory may hold together, about, 1048576 to 1099511627776 bytes; beyond it
+    /// the room that was asked for the longest time ago is dropped, and loaded again when it is asked
+    /// for; no bound if omitted. A room that is in use by a stream stays
+    #[arg(long, env = "SEESE3_MAX_ROOM_BYTES", value_parser = bounded(1 << 20, 1 << 40))]
+    max_room_bytes: Option<usize>,
     /// Also accept images instead of features, encoded by these models: `builtin`, `pixels`, or the
     /// ONNX files that the adapters' features were made with, separated by commas; none if omitted
     #[arg(
@@ -322,6 +331,10 @@ impl Serve {
             index: match self.index {
                 IndexName::Exact => IndexKind::Exact,
                 IndexName::Hnsw => IndexKind::Hnsw(HnswParameters::default()),
+            },
+            rooms: RoomMemory {
+                preload: self.preload,
+                bytes: self.max_room_bytes,
             },
             encoders: (!self.encoders.is_empty() || self.two_view.is_some()).then(|| {
                 ImageEncoders {

@@ -33,8 +33,14 @@ impl EvaluationService for Handlers {
     ) -> Result<Response<Self::EvaluateStream>, Status> {
         let snapshot = self.snapshot(&request)?;
         let budget = self.workers.budget(request.metadata());
-        let (served, protocol) =
-            protocol(&snapshot, request.into_inner(), self.config.limits.steps)?;
+        let most_steps = self.config.limits.steps;
+        let request = request.into_inner();
+        let (served, protocol) = self
+            .workers
+            .run(Lane::Short, budget, move |_| {
+                protocol(&snapshot, request, most_steps)
+            })
+            .await?;
 
         // The evaluation runs as its own task; the caller receives the stream of its events at
         // once.
@@ -138,7 +144,7 @@ fn protocol(
 
     // By default the adapter's own split and stride are used, so that the test pairs are those
     // that were held out when it was trained.
-    let served = snapshot.navigator(&room, &adapter)?.clone();
+    let served = snapshot.navigator(&room, &adapter)?;
     let record = &served.adapter.record;
     let split = convert::split(&split)?.unwrap_or(record.split);
     let stride = stride.unwrap_or(record.stride);
@@ -246,8 +252,8 @@ fn score(
     });
 
     Ok(pb::ScorePredictionsResponse {
-        room: Some(convert::room_revision(served)),
-        adapter: Some(convert::adapter_revision(served)),
+        room: Some(convert::room_revision(&served)),
+        adapter: Some(convert::adapter_revision(&served)),
         scores: Some(convert::row_to_wire(&row)),
         candidate_count: candidate_count as u32,
     })

@@ -63,12 +63,13 @@ fn status(phase: &Phase, rooms: RoomHealth, name: &str) -> Option<ServingStatus>
     let (Phase::Serving(snapshot) | Phase::Draining(snapshot)) = phase else {
         return None;
     };
-    let is_served = snapshot.rooms().contains_key(room);
-    let is_refused = snapshot.refused().rooms.contains_key(room);
+    let is_served = snapshot.answers_in(room);
+    let is_known =
+        snapshot.rooms().contains_key(room) || snapshot.refused().rooms.contains_key(room);
 
     match phase {
         Phase::Serving(_) if is_served => Some(ServingStatus::Serving),
-        _ if is_served || is_refused => Some(ServingStatus::NotServing),
+        _ if is_known => Some(ServingStatus::NotServing),
         _ => None,
     }
 }

@@ -205,26 +205,31 @@ pub(super) fn rooms_under(
         (name, _) => snapshot.adapter(name)?.name.clone(),
     };
 
-    if rooms.is_empty() {
-        let all = snapshot.rooms().values().flat_map(|room| &room.navigators);
-        let fitting: Vec<_> = all
-            .filter(|served| served.adapter.name == adapter)
-            .cloned()
+    if !rooms.is_empty() {
+        return rooms
+            .iter()
+            .map(|room| snapshot.navigator(room, &adapter))
             .collect();
-
-        return if fitting.is_empty() {
-            Err(Error::Precondition(format!(
-                "no room has the features of adapter '{adapter}'"
-            )))
-        } else {
-            Ok(fitting)
-        };
     }
 
-    rooms
+    // Where all rooms are searched, one that turns out to be damaged is left out, as one that was
+    // refused from the beginning is. The log and the health of the room say so.
+    let fitting = snapshot
+        .rooms()
         .iter()
-        .map(|room| Ok(snapshot.navigator(room, &adapter)?.clone()))
-        .collect()
+        .filter(|(_, room)| room.is_served_by(&adapter));
+    let answers = |answer: &Result<_, Error>| !matches!(answer, Err(Error::Precondition(_)));
+    let served: Vec<_> = fitting
+        .map(|(name, _)| snapshot.navigator(name, &adapter))
+        .filter(answers)
+        .collect::<Result<_, _>>()?;
+
+    if served.is_empty() {
+        return Err(Error::Precondition(format!(
+            "no room has the features of adapter '{adapter}'"
+        )));
+    }
+    Ok(served)
 }
 
 /// The only adapter that fits all the rooms, since distances under two adapters do not compare. It
@@ -235,7 +240,7 @@ fn only_adapter_of(snapshot: &Snapshot, rooms: &[String]) -> Result<String, Erro
     let answered = snapshot
         .rooms()
         .iter()
-        .filter(|(_, room)| !room.navigators.is_empty())
+        .filter(|(_, room)| !room.adapters().is_empty())
         .map(|(name, _)| name);
     let asked: Vec<&String> = if rooms.is_empty() {
         answered.collect()
@@ -247,12 +252,7 @@ fn only_adapter_of(snapshot: &Snapshot, rooms: &[String]) -> Result<String, Erro
     let mut fitting: Vec<&String> = snapshot.adapters().keys().collect();
     for room in asked {
         let served = snapshot.room(room)?;
-        fitting.retain(|name| {
-            served
-                .navigators
-                .iter()
-                .any(|navigator| navigator.adapter.name == **name)
-        });
+        fitting.retain(|name| served.is_served_by(name));
     }
 
     match fitting.as_slice() {

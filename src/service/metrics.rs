@@ -316,7 +316,7 @@ impl Metrics {
 
         let refused = snapshot.refused();
         for (kind, refused) in [
-            ("room", refused.rooms.len()),
+            ("room", snapshot.refused_rooms()),
             ("adapter", refused.adapters.len()),
             ("adapter of a room", snapshot.refused_in_rooms()),
         ] {

@@ -42,7 +42,7 @@ pub use image_encoder::ImageEncoders;
 pub use metrics::Metrics;
 pub use reload::Reload;
 pub use shutdown::shutdown_signal;
-pub use snapshot::Snapshot;
+pub use snapshot::{RoomMemory, Snapshot};
 pub use status::{Error, Full};
 pub use tls::{Tls, TlsError, TlsFiles};
 #[cfg(feature = "otlp")]
@@ -91,6 +91,8 @@ const LAST_WORDS: Duration = Duration::from_secs(1);
 pub struct Config {
     /// The index in which navigators search for the nearest frames.
     pub index: IndexKind,
+    /// Which rooms are in memory.
+    pub rooms: RoomMemory,
     /// The limits of one request: steps, hits, and frames in the whole answer.
     pub limits: Limits,
     /// The encoders for images that callers send; none if the server takes no images.
@@ -142,6 +144,7 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             index: IndexKind::Exact,
+            rooms: RoomMemory::default(),
             limits: Limits::default(),
             encoders: None,
             batch: 256,
@@ -304,7 +307,7 @@ pub async fn run(
 
     tokio::pin!(server, shutdown);
     let loading = async {
-        let loader = Loader::open(store, config.index, config.encoders, metrics.clone()).await?;
+        let loader = Loader::open(store, &config).await?;
         let first = loader.first(config.writable).await?;
         Ok::<_, RunError>((loader, first))
     };

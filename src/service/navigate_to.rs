@@ -148,7 +148,7 @@ fn ready(
         max_recoveries,
     } = request;
 
-    let served = snapshot.navigator(&room, &adapter)?.clone();
+    let served = snapshot.navigator(&room, &adapter)?;
     let navigator = &served.navigator;
     let source = convert::source("source", source, &served.adapter, snapshot)?;
     let pose = source_pose

@@ -153,8 +153,8 @@ fn navigate(
     let room = served.navigator.room();
 
     Ok(pb::NavigateResponse {
-        room: Some(convert::room_revision(served)),
-        adapter: Some(convert::adapter_revision(served)),
+        room: Some(convert::room_revision(&served)),
+        adapter: Some(convert::adapter_revision(&served)),
         steps: (1..)
             .zip(&answer.steps)
             .map(|(number, step)| convert::step_to_wire(number, step, room, &thresholds))

@@ -87,7 +87,7 @@ fn by_adapter(
         Some(snapshot.navigator(&room, &adapter)?)
     };
 
-    let stored = match served {
+    let stored = match &served {
         Some(served) => &served.adapter,
         None => adapter_without_room(snapshot, &adapter)?,
     };
@@ -108,7 +108,7 @@ fn by_adapter(
             Source::Feature(feature) => View::Feature(feature),
             Source::Latent(latent) => View::Latent(latent),
             Source::Frame(frame) => {
-                let served = served.ok_or_else(|| {
+                let served = served.as_ref().ok_or_else(|| {
                     Error::invalid("room", format!("is required: {field} is a frame"))
                 })?;
 
@@ -129,10 +129,13 @@ fn by_adapter(
     let twist = stored.adapter.motion(first.view(), second.view());
 
     // `latent` has found both frames in the room, so their poses exist.
-    let truth = served.zip(frames).and_then(|(served, (first, second))| {
-        let poses = served.navigator.room().poses();
-        Some((poses.get(first.row())?, poses.get(second.row())?))
-    });
+    let truth = served
+        .as_ref()
+        .zip(frames)
+        .and_then(|(served, (first, second))| {
+            let poses = served.navigator.room().poses();
+            Some((poses.get(first.row())?, poses.get(second.row())?))
+        });
 
     Ok(pb::EstimateMotionResponse {
         true_motion: truth
@@ -176,7 +179,7 @@ fn by_two_views(
     let of_room = if request.room.is_empty() {
         None
     } else {
-        snapshot.room(&request.room)?.room.provenance().camera
+        snapshot.room(&request.room)?.summary.provenance.camera
     };
     let Some(camera) = stated.or(of_room) else {
         if request.room.is_empty() && snapshot.adapters().is_empty() {

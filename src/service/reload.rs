@@ -84,13 +84,14 @@ pub(super) async fn keep_current(
         match now {
             Ok(now) => {
                 trouble.clear();
+                // Also where nothing changed: a room may have turned out to be damaged meanwhile.
+                metrics.serving(&now);
                 if now.is_like(&before) {
                     metrics.reloaded(ReloadOutcome::Unchanged);
                     continue;
                 }
 
                 log_changes(&before, &now);
-                metrics.serving(&now);
                 metrics.reloaded(ReloadOutcome::Changed);
                 phase.send_replace(Phase::Serving(Arc::new(now)));
             }
@@ -143,7 +144,7 @@ fn log_changes(before: &Snapshot, now: &Snapshot) {
     for (name, room) in now.rooms() {
         let known = before.rooms().get(name);
         if !known.is_some_and(|known| Arc::ptr_eq(known, room)) {
-            tracing::info!(room = name, revision = room.revision, "room loaded");
+            tracing::info!(room = name, revision = room.summary.revision, "room served");
         }
     }
     for (name, adapter) in now.adapters() {

@@ -9,6 +9,7 @@ use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
 use super::status::view_error;
 use super::workers::Lane;
 use super::{Error, Handlers};
+use crate::store::StoredAdapter;
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 use seese3_core::navigation::{RetrievedFrame, Source};
@@ -113,7 +114,7 @@ fn answer(
 
     let newest = newest.as_deref();
     let shown = found.rooms.iter().take(shown);
-    let rooms = shown.map(|room| room_to_wire(room, &served, snapshot, newest));
+    let rooms = shown.map(|room| room_to_wire(room, &served, newest));
 
     Ok(pb::RelocalizeResponse {
         adapter: Some(convert::adapter_revision(&served[0])),
@@ -162,18 +163,21 @@ pub fn rooms_to_track_in(
     }
 }
 
-/// The names of the adapters that can track in a room, its default first.
-fn adapters_that_track<'a>(snapshot: &'a Snapshot, room: &'a ServedRoom) -> Vec<&'a str> {
-    snapshot
-        .navigators(room)
-        .filter(|served| served.map.is_some())
-        .map(|served| served.adapter.name.as_str())
+/// The names of the adapters that can track in a room, if it is large enough; its default first.
+fn adapters_that_track(snapshot: &Snapshot, room: &ServedRoom) -> Vec<String> {
+    let adapters = snapshot.adapters_of(room);
+    let tracks = |adapter: &&Arc<StoredAdapter>| adapter.adapter.error_model().is_some();
+
+    adapters
+        .iter()
+        .filter(tracks)
+        .map(|adapter| adapter.name.clone())
         .collect()
 }
 
 /// Where no room is named, one room is enough: every adapter that can track in some room, by name.
-fn adapters_that_track_anywhere(snapshot: &Snapshot) -> Vec<&str> {
-    let mut names: Vec<&str> = snapshot
+fn adapters_that_track_anywhere(snapshot: &Snapshot) -> Vec<String> {
+    let mut names: Vec<String> = snapshot
         .rooms()
         .values()
         .flat_map(|room| adapters_that_track(snapshot, room))
@@ -184,7 +188,7 @@ fn adapters_that_track_anywhere(snapshot: &Snapshot) -> Vec<&str> {
 }
 
 /// In one room, its own default among the adapters that can track.
-fn default_that_tracks<'a>(snapshot: &'a Snapshot, room: &str) -> Vec<&'a str> {
+fn default_that_tracks(snapshot: &Snapshot, room: &str) -> Vec<String> {
     let mut names = snapshot
         .rooms()
         .get(room)
@@ -195,7 +199,7 @@ fn default_that_tracks<'a>(snapshot: &'a Snapshot, room: &str) -> Vec<&'a str> {
 
 /// Several named rooms need an adapter that can track in every one of them; they have no common
 /// order of preference, so the names are sorted.
-fn adapters_that_track_in_all<'a>(snapshot: &'a Snapshot, rooms: &[String]) -> Vec<&'a str> {
+fn adapters_that_track_in_all(snapshot: &Snapshot, rooms: &[String]) -> Vec<String> {
     let mut named = rooms.iter().filter_map(|room| snapshot.rooms().get(room));
     let mut names = named
         .next()
@@ -238,16 +242,13 @@ pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
 fn room_to_wire(
     found: &RoomMatch,
     served: &[Arc<ServedNavigator>],
-    snapshot: &Snapshot,
     newest: Option<&[f32]>,
 ) -> Result<pb::RoomMatch, Error> {
     let served = &served[found.map];
     let room = served.navigator.room();
 
     // An adapter that was fitted to the room reads it better than the one that tells rooms apart.
-    let source = served.adapter.adapter.source();
-    let reader = snapshot.room(room.id().as_str())?.reader(source);
-    let located = match (reader, newest) {
+    let located = match (served.room_reader(), newest) {
         (Some(reader), Some(feature)) => Some(located_by(reader, feature, room.id())?),
         _ => None,
     };

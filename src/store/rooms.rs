@@ -13,7 +13,7 @@ use seese3_core::adapter::TrainingRecord;
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::Pose;
-use seese3_core::room::{Frames, Room, RoomId, is_plain_name};
+use seese3_core::room::{Frames, Provenance, Room, RoomId, is_plain_name};
 
 /// A room that was loaded from the store, with its features.
 #[derive(Debug, Clone)]
@@ -42,12 +42,16 @@ impl StoredRoom {
 pub struct RoomSummary {
     /// Its name.
     pub room: String,
-    /// The revision that the name alone means.
+    /// The revision: that which the name alone means, unless another was asked for.
     pub revision: u64,
+    /// When it was published, RFC 3339.
+    pub created: String,
     /// The number of frames.
     pub frame_count: usize,
     /// The source of each set of features.
     pub features: Vec<FeatureSource>,
+    /// Where it came from.
+    pub provenance: Provenance,
 }
 
 /// The objects of a room that a manifest names.
@@ -427,23 +431,34 @@ impl Store {
     pub async fn rooms(&self) -> Result<Vec<RoomSummary>, Error> {
         let mut summaries = Vec::new();
         for room in self.names(Kind::Room).await? {
-            let (folder, revision) = self.resolve(Kind::Room, &room, None).await?;
-            let body = self.room_body(&folder, revision).await?;
-            let features = body
-                .features
-                .into_iter()
-                .map(|entry| entry.source.into())
-                .collect();
-
-            summaries.push(RoomSummary {
-                room,
-                revision,
-                frame_count: body.frame_count,
-                features,
-            });
+            summaries.push(self.room_summary(&room, None).await?);
         }
 
         Ok(summaries)
+    }
+
+    /// A summary of a room: of the given revision, or of the one that its name alone means.
+    ///
+    /// # Errors
+    /// As [`Store::load_room`]. Whether the files that the manifest names are there and intact is not
+    /// looked at.
+    pub async fn room_summary(
+        &self,
+        name: &str,
+        revision: Option<u64>,
+    ) -> Result<RoomSummary, Error> {
+        let (folder, revision) = self.resolve(Kind::Room, name, revision).await?;
+        let body = self.room_body(&folder, revision).await?;
+        let sources = body.features.into_iter().map(|entry| entry.source.into());
+
+        Ok(RoomSummary {
+            room: body.room,
+            revision,
+            created: body.created,
+            frame_count: body.frame_count,
+            features: sources.collect(),
+            provenance: body.provenance.into(),
+        })
     }
 
     /// Fills in what a room leaves empty from the newest revision, if that has the same poses. Also

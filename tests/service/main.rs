@@ -24,6 +24,7 @@ mod navigators;
 mod operations;
 mod refusals;
 mod reload;
+mod room_memory;
 mod security;
 mod soak;
 mod tracking;

@@ -297,6 +297,31 @@ impl Room {
         &self.id
     }
 
+    /// About how much memory it holds, bytes.
+    pub fn memory_bytes(&self) -> usize {
+        let Frames {
+            poses,
+            timestamps_ns,
+            names,
+            numbers,
+            images,
+            sequences,
+            held_out,
+        } = &self.frames;
+        let texts = names.iter().chain(images);
+        let texts: usize = texts
+            .map(|text| size_of::<String>() + text.capacity())
+            .sum();
+
+        // The timeline repeats the last two columns.
+        size_of_val(poses.as_slice())
+            + size_of_val(timestamps_ns.as_slice())
+            + size_of_val(numbers.as_slice())
+            + 2 * size_of_val(sequences.as_slice())
+            + 2 * size_of_val(held_out.as_slice())
+            + texts
+    }
+
     /// The number of frames, at least one.
     pub fn frame_count(&self) -> usize {
         self.frames.poses.len()

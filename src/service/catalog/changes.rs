@@ -183,8 +183,7 @@ impl Handlers {
             Phase::Serving(snapshot) | Phase::Draining(snapshot) => {
                 let served = snapshot.rooms().get(room);
                 served.is_some_and(|room| {
-                    room.navigators.iter().any(|served| {
-                        let held = &served.adapter;
+                    room.adapters().iter().any(|held| {
                         (&held.name, held.revision) == (&adapter.name, adapter.revision)
                     })
                 })
@@ -199,7 +198,7 @@ impl Handlers {
             Kind::Room => snapshot
                 .rooms()
                 .get(&published.name)
-                .is_some_and(|room| room.revision == published.revision),
+                .is_some_and(|room| room.summary.revision == published.revision),
             Kind::Adapter => snapshot
                 .adapters()
                 .get(&published.name)

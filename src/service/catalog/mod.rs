@@ -31,7 +31,7 @@ use super::convert;
 use super::memory::hold_answer;
 use super::snapshot::{ServedRoom, Snapshot};
 use super::{Error, Handlers, principal};
-use crate::store::StoredAdapter;
+use crate::store::{RoomSummary, StoredAdapter};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::catalog_service_server::CatalogService;
 use seese3_core::geometry::Twist;
@@ -230,22 +230,31 @@ fn page<'a, T>(
 }
 
 fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
-    let provenance = served.room.provenance();
+    let RoomSummary {
+        room,
+        revision,
+        created,
+        frame_count,
+        features,
+        provenance,
+    } = &served.summary;
+
     pb::Room {
         revision: Some(pb::Revision {
-            name: served.room.id().to_string(),
-            revision: served.revision,
+            name: room.clone(),
+            revision: *revision,
         }),
-        frame_count: served.room.frame_count() as u32,
+        frame_count: *frame_count as u32,
         adapters: snapshot
-            .navigators(served)
-            .map(|navigator| navigator.adapter.name.clone())
+            .adapters_of(served)
+            .iter()
+            .map(|adapter| adapter.name.clone())
             .collect(),
-        features: served.sources.iter().map(convert::source_to_wire).collect(),
+        features: features.iter().map(convert::source_to_wire).collect(),
         format: provenance.format.clone(),
         licence: provenance.licence.clone(),
         worst_rotation_deviation: provenance.worst_rotation_deviation,
-        create_time: convert::time_to_wire(&served.created),
+        create_time: convert::time_to_wire(created),
     }
 }
 

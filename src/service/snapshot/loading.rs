@@ -10,63 +10,18 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use super::super::RunError;
 use super::super::image_encoder::{self, ImageEncoder, ImageEncoders};
 use super::super::metrics::Metrics;
 use super::super::two_views::TwoViewReader;
-use super::content::content;
-use super::{Refusal, ServedNavigator, ServedRoom, Snapshot, reader_of};
+use super::super::{Config, RunError};
+use super::cache::RoomCache;
+use super::room_loading::{Problem, RoomLoader};
+use super::served::{Candidate, ServedRoom};
+use super::{Refusal, Snapshot};
 use crate::encoder;
-use crate::store::{self, RoomFit, Store, StoredAdapter, StoredRoom};
-use seese3_core::eval::TrainedOn;
+use crate::store::{self, RoomFit, Store, StoredAdapter};
 use seese3_core::features::FeatureSource;
-use seese3_core::fitting::{Localizer, RoomReader};
-use seese3_core::navigation::{IndexKind, Navigator};
-use seese3_core::room::{FrameId, RoomId};
-use seese3_core::tracking::Map;
-use seese3_core::training::RoomData;
-
-/// Why a room, or a room under an adapter, cannot be served.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum Problem {
-    #[error(transparent)]
-    Store(#[from] store::Error),
-    #[error("adapter '{adapter}' does not serve it: {problem}")]
-    Navigator {
-        adapter: String,
-        problem: seese3_core::navigation::Error,
-    },
-    #[error(
-        "adapter '{adapter}' was fitted from revision {revision} of adapter '{base}', which cannot be read: {problem}; \
-         publish that again, or fit anew"
-    )]
-    Base {
-        adapter: String,
-        base: String,
-        revision: u64,
-        problem: Box<store::Error>,
-    },
-    #[error("adapter '{adapter}' does not locate views in it: {problem}")]
-    Localizer {
-        adapter: String,
-        problem: Box<seese3_core::fitting::Error>,
-    },
-}
-
-impl Problem {
-    /// Whether it may be gone at the next look.
-    pub(super) fn may_pass(&self) -> bool {
-        match self {
-            Self::Store(error) => may_pass(error),
-            Self::Base { problem, .. } => may_pass(problem),
-            Self::Navigator { .. } | Self::Localizer { .. } => false,
-        }
-    }
-}
-
-fn may_pass(error: &store::Error) -> bool {
-    matches!(error, store::Error::Io { .. } | store::Error::Absent { .. })
-}
+use seese3_core::room::RoomId;
 
 /// Whether revisions that were refused before are tried again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -75,11 +30,31 @@ pub enum Refused {
     LeaveOut,
 }
 
+/// Which rooms are in memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RoomMemory {
+    /// Whether every room is loaded, and thereby verified, before it is served. Else a room is loaded
+    /// when it is first asked for.
+    pub preload: bool,
+    /// About how many bytes the rooms in memory may hold together; none for no bound.
+    pub bytes: Option<usize>,
+}
+
+impl Default for RoomMemory {
+    fn default() -> Self {
+        Self {
+            preload: true,
+            bytes: None,
+        }
+    }
+}
+
 /// Loads the snapshots of one server.
 #[derive(Clone)]
 pub struct Loader {
     store: Store,
-    index: IndexKind,
+    rooms: Arc<RoomCache>,
+    memory: RoomMemory,
     encoders: Option<ImageEncoders>,
     two_views: Option<Arc<TwoViewReader>>,
     metrics: Metrics,
@@ -90,20 +65,32 @@ impl Loader {
     ///
     /// # Errors
     /// [`RunError::Model`] or [`RunError::TwoView`] if a model cannot be used.
-    pub async fn open(
-        store: Store,
-        index: IndexKind,
-        encoders: Option<ImageEncoders>,
-        metrics: Metrics,
-    ) -> Result<Self, RunError> {
+    pub async fn open(store: Store, config: &Config) -> Result<Self, RunError> {
+        let Config {
+            index,
+            rooms: memory,
+            encoders,
+            metrics,
+            ..
+        } = config.clone();
+
         blocking(move || {
             if let Some(encoders) = &encoders {
                 image_encoder::check_models(&encoders.models)?;
             }
             let two_views = TwoViewReader::open(encoders.as_ref())?.map(Arc::new);
+
+            let loader = RoomLoader {
+                store: store.clone(),
+                index,
+            };
+            let rooms = Arc::new(RoomCache::new(loader, memory.bytes));
+            count_rooms(&rooms, &metrics);
+
             Ok(Self {
                 store,
-                index,
+                rooms,
+                memory,
                 encoders,
                 two_views,
                 metrics,
@@ -265,10 +252,9 @@ impl Loader {
         revision: u64,
     ) {
         let known = before.rooms.get(&name);
-        let same = known.filter(|known| known.revision == revision);
+        let same = known.filter(|known| known.summary.revision == revision);
         if let Some(same) = same
-            && same.was_tried_with(&fitting(&loaded.adapters, same.room.id(), &same.sources))
-            && (refused == Refused::LeaveOut || same.refused_adapters.is_empty())
+            && is_up_to_date(same, &loaded.adapters, refused)
         {
             loaded.rooms.insert(name, same.clone());
             return;
@@ -276,13 +262,12 @@ impl Loader {
 
         let refusal = match kept(&before.refused.rooms, &name, revision, refused) {
             Some(refusal) => refusal,
-            None => match self.room(&name, revision, &loaded.adapters, same).await {
+            None => match self.room(&name, revision, &loaded.adapters, known).await {
                 Ok(room) => {
                     loaded.rooms.insert(name, Arc::new(room));
                     return;
                 }
-                Err(problem) => {
-                    let refusal = Refusal::new(revision, &problem);
+                Err(refusal) => {
                     log_refusal("room", &name, before.refused.rooms.get(&name), &refusal);
                     refusal
                 }
@@ -295,161 +280,84 @@ impl Loader {
         loaded.refused.rooms.insert(name, refusal);
     }
 
-    /// A room under every adapter that fits it. `before` is the same revision as it was served with
-    /// other adapters.
+    /// A room that is to be served. `known` is the room as it was served before: what is in memory of
+    /// it is loaded anew now, so that no request has to wait for it.
     async fn room(
         &self,
         name: &str,
         revision: u64,
         adapters: &BTreeMap<String, Arc<StoredAdapter>>,
-        before: Option<&Arc<ServedRoom>>,
-    ) -> Result<ServedRoom, Problem> {
-        let stored = self.store.load_room(name, Some(revision)).await?;
-        let sources: Vec<FeatureSource> = stored
-            .features
-            .iter()
-            .map(|set| set.source().clone())
-            .collect();
+        known: Option<&Arc<ServedRoom>>,
+    ) -> Result<ServedRoom, Refusal> {
+        let refusal = |problem: store::Error| Refusal::new(revision, &Problem::Store(problem));
 
-        let mut served = ServedRoom {
-            room: Arc::new(stored.room.clone()),
-            revision,
-            created: stored.created.clone(),
-            navigators: Vec::new(),
-            refused_adapters: BTreeMap::new(),
-            tried: Vec::new(),
-            sources,
-        };
-
-        for adapter in fitting(adapters, served.room.id(), &served.sources) {
-            served.tried.push((adapter.name.clone(), adapter.revision));
-
-            // Fitted adapters come first, so that the reader that trackers are to use is known.
-            let source = adapter.adapter.source();
-            let tracking_reader = reader_of(&served.navigators, source).cloned();
-
-            let known = before.and_then(|before| before.under(&adapter, tracking_reader.as_ref()));
-            let navigator = match known {
-                Some(known) => Ok(known.clone()),
-                None => self
-                    .navigator(&stored, &served.room, &adapter, tracking_reader)
-                    .await
-                    .map(Arc::new),
-            };
-
-            match navigator {
-                Ok(navigator) => served.navigators.push(navigator),
-                Err(problem) => {
-                    let refusal = Refusal::new(adapter.revision, &problem);
-                    let known = before.and_then(|room| room.refused_adapters.get(&adapter.name));
-                    log_refusal("adapter", &adapter.name, known, &refusal);
-
-                    // The revision before goes on serving the room.
-                    let older = before.and_then(|room| room.under_any(&adapter.name));
-                    served.navigators.extend(older.cloned());
-                    served
-                        .refused_adapters
-                        .insert(adapter.name.clone(), refusal);
-                }
-            }
-        }
-
-        Ok(served)
-    }
-
-    /// A room under one adapter. `tracking_reader` gives the anchors of trackers, where an adapter
-    /// was fitted to the room.
-    async fn navigator(
-        &self,
-        stored: &StoredRoom,
-        room: &Arc<seese3_core::room::Room>,
-        adapter: &Arc<StoredAdapter>,
-        tracking_reader: Option<Arc<RoomReader>>,
-    ) -> Result<ServedNavigator, Problem> {
-        let source = adapter.adapter.source();
-        let features = stored
-            .features
-            .iter()
-            .find(|set| set.source().is_like(source));
-        let features = features.ok_or_else(|| store::Error::UnknownFeatures {
-            room: room.id().to_string(),
-            name: source.name.clone(),
-            known: Vec::new(),
+        let summary = self.store.room_summary(name, Some(revision)).await;
+        let summary = summary.map_err(refusal)?;
+        let id = RoomId::new(name).map_err(|error| {
+            refusal(store::Error::Damaged {
+                file: format!("rooms/{name}"),
+                problem: error.to_string(),
+            })
         })?;
 
-        let navigator = Navigator::new(room.clone(), features, adapter.adapter.clone(), self.index)
-            .map_err(|problem| Problem::Navigator {
-                adapter: adapter.name.clone(),
-                problem,
-            })?;
-        log_audit(&navigator, &adapter.name);
-
-        let navigator = Arc::new(navigator);
-        let trained_on = self
-            .store
-            .trained_on(&adapter.record, room.id(), stored.revision)
-            .await?;
-
-        // Rules that were measured on other frames say nothing of these.
-        let room_data = RoomData {
-            room,
-            revision: stored.revision,
-            features,
-        };
-        let reader = match &adapter.room_fit {
-            Some(fit) if trained_on == TrainedOn::TheseFrames => {
-                Some(Arc::new(self.room_reader(adapter, fit, &room_data).await?))
+        let serving = known.map_or_else(Vec::new, |known| known.adapters());
+        let candidate = |adapter: Arc<StoredAdapter>| {
+            let is_earlier = |served: &&Arc<StoredAdapter>| {
+                served.name == adapter.name && served.revision != adapter.revision
+            };
+            Candidate {
+                earlier: serving.iter().find(is_earlier).cloned(),
+                adapter,
             }
-            _ => None,
         };
+        let fitting = fitting(adapters, &id, &summary.features);
+        let candidates = fitting.into_iter().map(candidate).collect();
 
-        Ok(ServedNavigator {
-            map: map(&navigator, tracking_reader.as_ref()),
-            content: content(&navigator, tracking_reader.as_deref()),
-            trained_on,
-            reader,
-            tracking_reader,
-            room_revision: stored.revision,
-            adapter: adapter.clone(),
-            navigator,
-        })
+        let room = ServedRoom::new(id, summary, candidates, self.rooms.clone());
+        if self.memory.preload || known.is_some_and(|known| known.in_memory().is_some()) {
+            let same = known.filter(|known| known.summary.revision == revision);
+            self.rooms.preload(&room, same.map(AsRef::as_ref)).await?;
+        }
+        Ok(room)
+    }
+}
+
+/// Counts the rooms that are in memory.
+fn count_rooms(rooms: &Arc<RoomCache>, metrics: &Metrics) {
+    let counted = rooms.clone();
+    metrics.gauge_elsewhere(
+        "rooms_in_memory",
+        "Rooms whose frames, latents and indexes are in memory",
+        move || counted.size().0,
+    );
+
+    let counted = rooms.clone();
+    metrics.gauge_elsewhere(
+        "rooms_in_memory_bytes",
+        "About what the rooms in memory hold",
+        move || counted.size().1,
+    );
+}
+
+/// Whether a room is served as it would be if it were made anew.
+fn is_up_to_date(
+    room: &ServedRoom,
+    adapters: &BTreeMap<String, Arc<StoredAdapter>>,
+    refused: Refused,
+) -> bool {
+    let fitting = fitting(adapters, &room.id, &room.summary.features);
+    let tried = room.candidates.iter().map(|candidate| &candidate.adapter);
+    let is_same = |(tried, now): (&Arc<StoredAdapter>, &Arc<StoredAdapter>)| {
+        (&tried.name, tried.revision) == (&now.name, now.revision)
+    };
+    if tried.len() != fitting.len() || !tried.zip(&fitting).all(is_same) {
+        return false;
     }
 
-    /// The reader of a fitted adapter, with the adapter that it began from as a second one.
-    async fn room_reader(
-        &self,
-        adapter: &StoredAdapter,
-        fit: &RoomFit,
-        data: &RoomData<'_>,
-    ) -> Result<RoomReader, Problem> {
-        let base = match &fit.base {
-            Some(base) => {
-                let loaded = self
-                    .store
-                    .load_adapter(&base.name, Some(base.revision))
-                    .await;
-                let stored = loaded.map_err(|problem| Problem::Base {
-                    adapter: adapter.name.clone(),
-                    base: base.name.clone(),
-                    revision: base.revision,
-                    problem: Box::new(problem),
-                })?;
-                Some(stored.adapter)
-            }
-            None => None,
-        };
-
-        let mapped: Vec<FrameId> = (0..data.room.frame_count() as u32).map(FrameId).collect();
-        let localizer = Localizer::new(data, &mapped, base, Some(adapter.adapter.clone()))
-            .map_err(|problem| Problem::Localizer {
-                adapter: adapter.name.clone(),
-                problem: Box::new(problem),
-            })?;
-
-        Ok(RoomReader {
-            localizer,
-            rules: fit.rules.clone(),
-        })
+    let in_room = room.refused_adapters();
+    match refused {
+        Refused::TryAgain => in_room.is_empty() && room.refusal().is_none(),
+        Refused::LeaveOut => !in_room.values().any(|refusal| refusal.may_pass),
     }
 }
 
@@ -465,10 +373,7 @@ async fn blocking<T: Send + 'static>(
 /// Logs why a revision is refused, unless that has been logged.
 fn log_refusal(kind: &str, name: &str, known: Option<&Refusal>, refusal: &Refusal) {
     if known != Some(refusal) {
-        let Refusal {
-            revision, reason, ..
-        } = refusal;
-        tracing::error!(kind, name, revision, reason, "a revision cannot be served");
+        refusal.log(kind, name);
     }
 }
 
@@ -532,35 +437,4 @@ fn fitting(
     let mut ranked: Vec<Arc<StoredAdapter>> = adapters.values().filter(fits).cloned().collect();
     ranked.sort_by_key(|adapter| std::cmp::Reverse(rank(adapter)));
     ranked
-}
-
-fn log_audit(navigator: &Navigator, adapter: &str) {
-    if let Some(audit) = navigator.audit() {
-        tracing::info!(
-            room = %navigator.room().id(), adapter, frames = audit.frame_count, unreachable = audit.unreachable,
-            recall = audit.recall, k = audit.k, queries = audit.queries,
-            "approximate index audited against the exact scan"
-        );
-    }
-}
-
-/// The map of all frames of a room; none if the adapter is not calibrated. A room that is too small
-/// to track in also gives none, which is logged. Where an adapter was fitted to the room, its reader
-/// gives the anchors.
-fn map(navigator: &Arc<Navigator>, reader: Option<&Arc<RoomReader>>) -> Option<Arc<Map>> {
-    navigator.adapter().error_model()?;
-    let frames: Vec<FrameId> = (0..navigator.room().frame_count() as u32)
-        .map(FrameId)
-        .collect();
-
-    match Map::new(navigator.clone(), &frames) {
-        Ok(map) => Some(Arc::new(match reader {
-            Some(reader) => map.with_pose_reader(reader.clone()),
-            None => map,
-        })),
-        Err(error) => {
-            tracing::warn!(room = %navigator.room().id(), %error, "the room cannot be tracked in");
-            None
-        }
-    }
 }

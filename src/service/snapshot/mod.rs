@@ -2,11 +2,15 @@
 //! immutable. [`Loader`] makes a new snapshot when the store has changed; requests in flight keep
 //! the one that they began with.
 
+mod cache;
 mod content;
 mod loading;
+mod room_loading;
+mod served;
 
-use loading::Problem;
-pub use loading::{Loader, Refused};
+pub use loading::{Loader, Refused, RoomMemory};
+use room_loading::Problem;
+pub use served::{ServedNavigator, ServedRoom};
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -16,114 +20,6 @@ use super::auth::RoomScope;
 use super::image_encoder::ImageEncoder;
 use super::two_views::TwoViewReader;
 use crate::store::StoredAdapter;
-use seese3_core::eval::TrainedOn;
-use seese3_core::features::FeatureSource;
-use seese3_core::fitting::RoomReader;
-use seese3_core::navigation::Navigator;
-use seese3_core::room::Room;
-use seese3_core::tracking::Map;
-
-/// A room that is served.
-pub struct ServedRoom {
-    /// The room.
-    pub room: Arc<Room>,
-    /// The revision that is served.
-    pub revision: u64,
-    /// When this revision was published, RFC 3339.
-    pub created: String,
-    /// The sources of the room's features: encoder, layer, pooling and preprocessing.
-    pub sources: Vec<FeatureSource>,
-    /// One for each adapter that fits the room, in order of preference.
-    pub navigators: Vec<Arc<ServedNavigator>>,
-    /// Adapters that have the right features and still cannot serve the room, by name.
-    refused_adapters: BTreeMap<String, Refusal>,
-    /// The adapters that the room was loaded with, names and revisions, in order of preference.
-    tried: Vec<(String, u64)>,
-}
-
-/// A room under one adapter that fits it.
-pub struct ServedNavigator {
-    /// Retrieves frames and plans motions in the latents of this adapter.
-    pub navigator: Arc<Navigator>,
-    /// The map for tracking and relocalisation; none if the adapter is not calibrated or the room
-    /// is too small.
-    pub map: Option<Arc<Map>>,
-    /// The adapter as it is stored, with its training record.
-    pub adapter: Arc<StoredAdapter>,
-    /// SHA-256 of the numbers that answers depend on: poses, latents, and the adapter's parameters,
-    /// scale and calibration.
-    pub content: [u8; 32],
-    /// The room's revision.
-    pub room_revision: u64,
-    /// What the adapter has seen of this room.
-    pub trained_on: TrainedOn,
-    /// Locates single views, where the adapter was fitted to these very frames.
-    pub reader: Option<Arc<RoomReader>>,
-    /// The reader, of this or another adapter, that the map takes its anchors from.
-    tracking_reader: Option<Arc<RoomReader>>,
-}
-
-impl ServedRoom {
-    /// The reader of the adapter that was fitted to this room, if there is one for features of this
-    /// source; that of the newest of several.
-    pub fn reader(&self, source: &FeatureSource) -> Option<&RoomReader> {
-        reader_of(&self.navigators, source).map(Arc::as_ref)
-    }
-
-    /// Whether this room was loaded with exactly these adapters.
-    fn was_tried_with(&self, adapters: &[Arc<StoredAdapter>]) -> bool {
-        let given = adapters
-            .iter()
-            .map(|adapter| (&adapter.name, adapter.revision));
-        let tried = self.tried.iter().map(|(name, revision)| (name, *revision));
-        given.eq(tried)
-            && !self
-                .refused_adapters
-                .values()
-                .any(|refusal| refusal.may_pass)
-    }
-
-    /// This room under an earlier revision of an adapter, if there is one.
-    fn under_any(&self, adapter: &str) -> Option<&Arc<ServedNavigator>> {
-        self.navigators
-            .iter()
-            .find(|served| served.adapter.name == adapter)
-    }
-
-    /// This room under an adapter, if trackers there take their anchors from `tracking_reader`.
-    fn under(
-        &self,
-        adapter: &StoredAdapter,
-        tracking_reader: Option<&Arc<RoomReader>>,
-    ) -> Option<&Arc<ServedNavigator>> {
-        let is_same_reader =
-            |served: &ServedNavigator| match (&served.tracking_reader, tracking_reader) {
-                (Some(before), Some(now)) => Arc::ptr_eq(before, now),
-                (None, None) => true,
-                _ => false,
-            };
-
-        self.navigators
-            .iter()
-            .find(|served| served.is_of(adapter) && is_same_reader(served))
-    }
-}
-
-impl ServedNavigator {
-    fn is_of(&self, adapter: &StoredAdapter) -> bool {
-        self.adapter.name == adapter.name && self.adapter.revision == adapter.revision
-    }
-}
-
-fn reader_of<'a>(
-    navigators: &'a [Arc<ServedNavigator>],
-    source: &FeatureSource,
-) -> Option<&'a Arc<RoomReader>> {
-    navigators
-        .iter()
-        .filter(|served| served.adapter.adapter.source().is_like(source))
-        .find_map(|served| served.reader.as_ref())
-}
 
 /// A revision that is in the store and cannot be served.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -144,6 +40,13 @@ impl Refusal {
             reason: problem.to_string(),
             may_pass: problem.may_pass(),
         }
+    }
+
+    fn log(&self, kind: &str, name: &str) {
+        let Self {
+            revision, reason, ..
+        } = self;
+        tracing::error!(kind, name, revision, reason, "a revision cannot be served");
     }
 }
 
@@ -167,7 +70,8 @@ pub struct Snapshot {
 }
 
 impl Snapshot {
-    /// What is in the store and cannot be served. An older revision of it may be served instead.
+    /// What was found to be unfit to be served when this snapshot was made. An older revision of it
+    /// may be served instead.
     pub fn refused(&self) -> &Refusals {
         &self.refused
     }
@@ -200,7 +104,22 @@ impl Snapshot {
     /// How many adapters are refused in one of their rooms, over all rooms.
     pub fn refused_in_rooms(&self) -> usize {
         let rooms = self.rooms.values();
-        rooms.map(|room| room.refused_adapters.len()).sum()
+        rooms.map(|room| room.refused_adapters().len()).sum()
+    }
+
+    /// How many rooms are refused, those included that turned out to be damaged when they were first
+    /// asked for.
+    pub fn refused_rooms(&self) -> usize {
+        let later = |(name, room): &(&String, &Arc<ServedRoom>)| {
+            room.refusal().is_some() && !self.refused.rooms.contains_key(*name)
+        };
+        self.refused.rooms.len() + self.rooms.iter().filter(later).count()
+    }
+
+    /// Whether requests for a room are answered, as far as is known.
+    pub fn answers_in(&self, room: &str) -> bool {
+        let room = self.rooms.get(room);
+        room.is_some_and(|room| room.refusal().is_none())
     }
 
     /// Whether both snapshots answer alike: every room and adapter was taken over unchanged.
@@ -265,16 +184,17 @@ impl Snapshot {
     /// # Errors
     /// [`Error::Invalid`] if the name is empty, [`Error::NotFound`] if there is no such room,
     /// [`Error::Precondition`] if it is in the store and cannot be served.
-    pub fn room(&self, name: &str) -> Result<&ServedRoom, Error> {
+    pub fn room(&self, name: &str) -> Result<&Arc<ServedRoom>, Error> {
         if name.is_empty() {
             return Err(Error::invalid("room", "is required"));
         }
 
-        let room = self.rooms.get(name).map(Arc::as_ref);
-        room.ok_or_else(|| match self.refused.rooms.get(name) {
-            Some(refusal) => refused_error("room", name, refusal),
-            None => Error::not_found("room", name, self.rooms.keys()),
-        })
+        self.rooms
+            .get(name)
+            .ok_or_else(|| match self.refused.rooms.get(name) {
+                Some(refusal) => refused_error("room", name, refusal),
+                None => Error::not_found("room", name, self.rooms.keys()),
+            })
     }
 
     /// An adapter by name.
@@ -295,32 +215,24 @@ impl Snapshot {
             })
     }
 
-    /// A room under every adapter that fits it, the default first.
-    pub fn navigators<'a>(
-        &'a self,
-        room: &'a ServedRoom,
-    ) -> impl Iterator<Item = &'a Arc<ServedNavigator>> {
-        let chosen = self.default_adapters.get(room.room.id().as_str());
-        let is_chosen = move |served: &&Arc<ServedNavigator>| chosen == Some(&served.adapter.name);
-        let first = room.navigators.iter().filter(is_chosen);
-        let others = room
-            .navigators
-            .iter()
-            .filter(move |served| !is_chosen(served));
-        first.chain(others)
+    /// The adapters that serve a room, the default first.
+    pub fn adapters_of(&self, room: &ServedRoom) -> Vec<Arc<StoredAdapter>> {
+        let chosen = self.default_adapters.get(room.id.as_str());
+        let mut adapters = room.adapters();
+
+        // Stable, so that the others keep their order.
+        adapters.sort_by_key(|adapter| chosen != Some(&adapter.name));
+        adapters
     }
 
-    /// A room under its default adapter: the one that an operator chose, or the one that is preferred.
-    fn default_navigator<'a>(
-        &'a self,
-        room: &'a ServedRoom,
-    ) -> Result<&'a Arc<ServedNavigator>, Error> {
-        let id = room.room.id();
-        let first = self.navigators(room).next();
+    /// The default adapter of a room: the one that an operator chose, or the one that is preferred.
+    fn default_adapter(&self, room: &ServedRoom) -> Result<Arc<StoredAdapter>, Error> {
+        let id = &room.id;
+        let first = self.adapters_of(room).into_iter().next();
 
         // Another adapter in place of the one that was chosen would be a silent change of answers.
         match (self.default_adapters.get(id.as_str()), first) {
-            (Some(chosen), first) if first.is_none_or(|first| first.adapter.name != *chosen) => {
+            (Some(chosen), first) if first.as_ref().is_none_or(|first| first.name != *chosen) => {
                 Err(Error::Precondition(format!(
                     "adapter '{chosen}' was chosen as the default of room '{id}' and does not serve \
                      it; name another, or choose another"
@@ -334,42 +246,52 @@ impl Snapshot {
     }
 
     /// A room under the adapter of that name, or under the room's default adapter if the name is
-    /// empty.
+    /// empty. Loads the room if it is not in memory: only for threads that may block.
     ///
     /// # Errors
-    /// As [`Snapshot::room`] and [`Snapshot::adapter`]; [`Error::Precondition`] if the adapter does
-    /// not fit the room, or none does.
-    pub fn navigator(&self, room: &str, adapter: &str) -> Result<&Arc<ServedNavigator>, Error> {
+    /// As [`Snapshot::room`], [`ServedRoom::load`] and [`Snapshot::adapter`]; [`Error::Precondition`]
+    /// if the adapter does not fit the room, or none does.
+    pub fn navigator(&self, room: &str, adapter: &str) -> Result<Arc<ServedNavigator>, Error> {
         let served = self.room(room)?;
-        if adapter.is_empty() {
-            return self.default_navigator(served);
+
+        // What is wrong with a name costs no loading.
+        if !adapter.is_empty() {
+            self.adapter(adapter)?;
         }
+        let loaded = served.load()?;
+        let wanted = match adapter {
+            "" => self.default_adapter(served)?,
+            name => self.adapter(name)?.clone(),
+        };
 
-        let wanted = self.adapter(adapter)?;
-        served
-            .navigators
-            .iter()
-            .find(|navigator| navigator.adapter.name == wanted.name)
-            .ok_or_else(|| {
-                if let Some(fit) = &wanted.room_fit
-                    && fit.room != *served.room.id()
-                {
-                    return Error::Precondition(format!(
-                        "adapter '{adapter}' was fitted to room '{}' and serves no other",
-                        fit.room
-                    ));
-                }
-
-                if let Some(refusal) = served.refused_adapters.get(adapter) {
-                    return refused_error("adapter", adapter, refusal);
-                }
-
-                let source = &wanted.adapter.source().name;
-                Error::Precondition(format!(
-                    "room '{room}' has no features '{source}', which adapter '{adapter}' needs"
-                ))
-            })
+        let navigator = loaded.under_any(&wanted.name);
+        navigator
+            .cloned()
+            .ok_or_else(|| does_not_serve(served, &wanted))
     }
+}
+
+/// Why an adapter does not serve a room.
+fn does_not_serve(room: &ServedRoom, adapter: &StoredAdapter) -> Error {
+    let name = &adapter.name;
+    if let Some(fit) = &adapter.room_fit
+        && fit.room != room.id
+    {
+        return Error::Precondition(format!(
+            "adapter '{name}' was fitted to room '{}' and serves no other",
+            fit.room
+        ));
+    }
+
+    if let Some(refusal) = room.refused_adapters().get(name) {
+        return refused_error("adapter", name, refusal);
+    }
+
+    let source = &adapter.adapter.source().name;
+    Error::Precondition(format!(
+        "room '{}' has no features '{source}', which adapter '{name}' needs",
+        room.id
+    ))
 }
 
 fn owned<'a, T: Clone + 'a>(

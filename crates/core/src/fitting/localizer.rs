@@ -163,6 +163,14 @@ impl Localizer {
         })
     }
 
+    /// About how much memory it holds, bytes, besides the adapters.
+    pub fn memory_bytes(&self) -> usize {
+        let embedded = self.zero_shot.iter().chain(&self.fitted);
+        let latents: usize = embedded.map(|embedded| embedded.latents.len()).sum();
+
+        size_of_val(self.poses.as_slice()) + latents * size_of::<f64>() + self.index.memory_bytes()
+    }
+
     /// What the readers say of a view, given by its raw feature of shape (d,).
     ///
     /// # Errors

@@ -62,6 +62,10 @@ impl Index for ExactIndex {
         best
     }
 
+    fn memory_bytes(&self) -> usize {
+        size_of_val(self.values.as_slice()) + size_of_val(self.frames.as_slice())
+    }
+
     fn len(&self) -> usize {
         self.frames.len()
     }

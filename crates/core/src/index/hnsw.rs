@@ -15,6 +15,8 @@ use super::{ExactIndex, Exclusion, Index, Neighbour, by_distance_then_frame, dis
 use crate::room::FrameId;
 
 const MOST_LAYERS: usize = 16;
+/// About what one link of a point takes in the graph, bytes.
+const LINK_BYTES: usize = 48;
 
 /// How an [`HnswIndex`] is built and searched.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -202,6 +204,15 @@ impl Index for HnswIndex {
         }
 
         neighbours
+    }
+
+    fn memory_bytes(&self) -> usize {
+        // The graph keeps each row once more, in single precision, and up to twice `links` neighbours
+        // of each point in the lowest layer, every one with its distance behind a counted pointer.
+        let links = 2 * usize::from(self.parameters.links) * LINK_BYTES;
+        let row = self.latents.first().map_or(0, Vec::len) * (size_of::<f64>() + size_of::<f32>());
+
+        self.exact.memory_bytes() + self.latents.len() * (row + links)
     }
 
     fn len(&self) -> usize {

@@ -50,6 +50,9 @@ pub trait Index: Send + Sync {
     /// How many frames can be found.
     fn len(&self) -> usize;
 
+    /// About how much memory it holds, bytes: what grows with the number of frames.
+    fn memory_bytes(&self) -> usize;
+
     /// Whether no frame can be found.
     fn is_empty(&self) -> bool {
         self.len() == 0

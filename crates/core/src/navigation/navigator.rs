@@ -142,6 +142,12 @@ impl Navigator {
         self.latents.view()
     }
 
+    /// About how much memory it holds, bytes, besides the room and the adapter. What is built when it
+    /// is first asked for (searches under other metrics, refits) is not counted.
+    pub fn memory_bytes(&self) -> usize {
+        self.latents.len() * size_of::<f64>() + self.search.memory_bytes()
+    }
+
     /// How an approximate index compares with the exact scan; `None` if the index is exact.
     pub fn audit(&self) -> Option<Audit> {
         self.search.audit()

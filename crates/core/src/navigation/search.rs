@@ -269,6 +269,11 @@ impl Search {
             .nearest(&self.projection.one(latent), k, exclusion)
     }
 
+    /// About how much memory it holds, bytes.
+    pub fn memory_bytes(&self) -> usize {
+        self.index.memory_bytes()
+    }
+
     /// How an approximate index compares with the exact scan; `None` if the index is exact.
     pub fn audit(&self) -> Option<Audit> {
         self.audit

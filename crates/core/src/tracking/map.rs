@@ -115,6 +115,11 @@ impl Map {
         &self.navigator
     }
 
+    /// About how much memory it holds, bytes, besides the navigator.
+    pub fn memory_bytes(&self) -> usize {
+        self.index.memory_bytes()
+    }
+
     /// The errors of motions read in this room, scaled by what its mapped frames show.
     pub fn motion_errors(&self) -> &MotionErrors {
         &self.motion_errors
