@@ -88,6 +88,12 @@ pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
+/// √(mean of x²); NaN without values.
+pub fn root_mean_square(values: &[f64]) -> f64 {
+    let squares: f64 = values.iter().map(|value| value * value).sum();
+    (squares / values.len() as f64).sqrt()
+}
+
 /// The arithmetic mean of the values that are not NaN; NaN if none is left.
 pub fn mean_of_known(values: &[f64]) -> f64 {
     let known: Vec<f64> = values.iter().copied().filter(|x| !x.is_nan()).collect();

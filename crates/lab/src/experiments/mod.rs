@@ -24,6 +24,7 @@ pub mod odometry;
 pub mod path_comparison;
 pub mod probe;
 pub mod seeds;
+pub mod tracking_scores;
 
 use seese3_core::{
     adapter, calibration, eval, fitting, navigation, splits, tracking, training, trajectory,

@@ -22,6 +22,7 @@ use seese3_core::tracking::{
 use seese3_core::training::RoomData;
 use seese3_core::trajectory::{Relation, RpePairs, Statistics, Trajectory, ape, rpe};
 
+use super::tracking_scores::TrackingScores;
 use super::{Error, Within};
 
 /// Nanoseconds between the frames of a recording without times: a camera at 30 Hz.
@@ -67,6 +68,8 @@ pub struct RoomOdometry {
     pub odom: PathErrors,
     /// Errors of the fused path, over the frames where a place was known.
     pub fused: PathErrors,
+    /// The answers beside the simplest ones to the same frames.
+    pub scores: TrackingScores,
     /// Squared Mahalanobis lengths of the errors of map poses whose neighbours in time are mapped.
     pub map_poses_mapped: Vec<f64>,
     /// The same where the neighbours are not mapped.
@@ -280,6 +283,10 @@ fn room_odometry(
         tracked_frames: own.updates.len(),
         odom,
         fused,
+        scores: TrackingScores::of(own, |update| {
+            let (_, nearest) = update.best_match;
+            room.room.poses()[nearest.frame.row()]
+        }),
         map_poses_mapped: own.map_pose_surprises_where(has_mapped_neighbours),
         map_poses_unmapped: own.map_pose_surprises_where(|row| !has_mapped_neighbours(row)),
         motions: own.motion_surprises(),

@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use super::table::aligned;
 use crate::experiments::odometry::{LostFrames, PathErrors, Relocalisation, RoomOdometry};
+use crate::experiments::tracking_scores::{AnswerErrors, TrackingScores, VelocityErrors};
 use seese3_core::statistics::{Rate, coverage, mean, median};
 use seese3_core::tracking::MotionSurprise;
 
@@ -15,14 +16,18 @@ pub fn odometry_table(rooms: &[RoomOdometry]) -> String {
     let head = [
         "room",
         "n",
-        "odom m",
         "fused m",
-        "ratio",
-        "odom °",
+        "odom m",
+        "nearest frame m",
+        "standing still m",
         "fused °",
+        "nearest frame °",
         "TRACKING",
         "DEGRADED",
         "LOST",
+        "TRACKING wrong",
+        "velocity m/s off",
+        "0 m/s off",
         "unknown: LOST",
         "found after",
     ];
@@ -48,8 +53,10 @@ fn line(name: &str, count: String, rooms: &[RoomOdometry]) -> Vec<String> {
     // function.
     let of =
         |figure: &dyn Fn(&RoomOdometry) -> f64| mean(&rooms.iter().map(figure).collect::<Vec<_>>());
-    let odom = of(&|room| room.odom.ape_m);
-    let fused = of(&|room| room.fused.ape_m);
+    let scores = || rooms.iter().map(|room| &room.scores);
+    let ape = AnswerErrors::mean(scores().map(|scores| &scores.ape));
+    let turn = AnswerErrors::mean(scores().map(|scores| &scores.turn));
+    let velocity = VelocityErrors::mean(scores().map(|scores| &scores.velocity));
 
     let found: Vec<f64> = rooms
         .iter()
@@ -67,17 +74,29 @@ fn line(name: &str, count: String, rooms: &[RoomOdometry]) -> Vec<String> {
     vec![
         name.to_owned(),
         count,
-        format!("{odom:.3}"),
-        format!("{fused:.3}"),
-        format!("{:.3}", fused / odom),
-        format!("{:.2}", of(&|room| room.odom.ape_rad.to_degrees())),
-        format!("{:.2}", of(&|room| room.fused.ape_rad.to_degrees())),
+        format!("{:.3}", ape.fused),
+        format!("{:.3}", ape.odom),
+        format!("{:.3}", ape.nearest_frame),
+        format!("{:.3}", ape.standing_still),
+        format!("{:.2}", turn.fused.to_degrees()),
+        format!("{:.2}", turn.nearest_frame.to_degrees()),
         format!("{:.3}", of(&|room| room.statuses.tracking)),
         format!("{:.3}", of(&|room| room.statuses.degraded)),
         format!("{:.3}", of(&|room| room.statuses.lost)),
+        format!("{:.3}", wrong_share(rooms)),
+        format!("{:.3}", velocity.error_m_s),
+        format!("{:.3}", velocity.zero_m_s),
         format!("{:.3}", of(&|room| room.unknown_start.lost)),
         found,
     ]
+}
+
+/// The share of TRACKING frames that were more than half a metre or 15 degrees off, over all rooms.
+fn wrong_share(rooms: &[RoomOdometry]) -> f64 {
+    let sum = |of: fn(&TrackingScores) -> usize| -> usize {
+        rooms.iter().map(|room| of(&room.scores)).sum()
+    };
+    sum(|scores| scores.tracking_wrong) as f64 / sum(|scores| scores.tracking) as f64
 }
 
 /// Nominal against measured coverage: of map poses, of motions, and of motions by their length.
@@ -101,6 +120,11 @@ pub fn coverage_table(rooms: &[RoomOdometry]) -> String {
         "map poses, all",
         &[mapped, unmapped].concat(),
     ));
+
+    let tracking = concat(rooms, |room| &room.scores.tracking_surprises);
+    lines.push(coverage_line("map poses while TRACKING", &tracking));
+    let odom = concat(rooms, |room| &room.scores.odom_surprises);
+    lines.push(coverage_line("odom", &odom));
 
     let mut motions: Vec<MotionSurprise> =
         rooms.iter().flat_map(|room| room.motions.clone()).collect();
@@ -181,6 +205,9 @@ pub fn relocalisation_text(found: &Relocalisation) -> String {
 #[derive(Debug, Serialize)]
 pub struct OdometryJson {
     rooms: Vec<RoomJson>,
+    /// Means over rooms of errors, shares over the frames of all rooms.
+    #[serde(flatten)]
+    all: ScoresJson,
     /// Shares of map poses inside the 68 % and the 95 % ellipsoid, over all rooms.
     coverage_places: [f64; 2],
     coverage_motions: [f64; 2],
@@ -190,9 +217,46 @@ pub struct OdometryJson {
     alignment: &'static str,
 }
 
+/// A tracker's answers beside the simplest ones to the same frames.
+#[derive(Debug, Serialize)]
+struct ScoresJson {
+    ape_m: AnswersJson,
+    ape_rad: AnswersJson,
+    /// Shares of TRACKING map poses inside the 68 % and the 95 % ellipsoid; null without one.
+    coverage: CoverageJson,
+    coverage_odom: CoverageJson,
+    /// The share of TRACKING frames that were more than half a metre or 15 degrees off.
+    tracking_wrong: Option<f64>,
+    velocity: VelocityJson,
+}
+
+#[derive(Debug, Serialize)]
+struct AnswersJson {
+    fused: Option<f64>,
+    odom: Option<f64>,
+    nearest_frame: Option<f64>,
+    standing_still: Option<f64>,
+}
+
+#[derive(Debug, Serialize)]
+struct CoverageJson {
+    #[serde(rename = "68")]
+    within_68: Option<f64>,
+    #[serde(rename = "95")]
+    within_95: Option<f64>,
+}
+
+#[derive(Debug, Serialize)]
+struct VelocityJson {
+    error_m_s: Option<f64>,
+    zero_m_s: Option<f64>,
+}
+
 #[derive(Debug, Serialize)]
 struct RoomJson {
     room: String,
+    #[serde(flatten)]
+    scores: ScoresJson,
     format: String,
     mapped: usize,
     followed: usize,
@@ -246,6 +310,7 @@ pub fn odometry_json(
 
     OdometryJson {
         rooms: rooms.iter().map(room_json).collect(),
+        all: scores_json(rooms),
         coverage_places: shares(&map_poses),
         coverage_motions: shares(&squared_errors(&motions)),
         relocalisation: relocalisation.map(|found| RelocalisationJson {
@@ -273,6 +338,7 @@ fn room_json(room: &RoomOdometry) -> RoomJson {
 
     RoomJson {
         room: room.room.clone(),
+        scores: scores_json(std::slice::from_ref(room)),
         format: room.format.clone(),
         mapped: room.mapped_frames,
         followed: room.tracked_frames,
@@ -291,6 +357,38 @@ fn room_json(room: &RoomOdometry) -> RoomJson {
             lost_frames(room.other_rooms_from_start),
             lost_frames(room.other_rooms_after_own),
         ],
+    }
+}
+
+fn scores_json(rooms: &[RoomOdometry]) -> ScoresJson {
+    let scores = || rooms.iter().map(|room| &room.scores);
+    // JSON has no NaN: what is not known is null.
+    let known = |value: f64| value.is_finite().then_some(value);
+    let answers = |errors: AnswerErrors| AnswersJson {
+        fused: known(errors.fused),
+        odom: known(errors.odom),
+        nearest_frame: known(errors.nearest_frame),
+        standing_still: known(errors.standing_still),
+    };
+    let covered = |of: fn(&RoomOdometry) -> &Vec<f64>| {
+        let [within_68, within_95] = shares(&concat(rooms, of)).map(known);
+        CoverageJson {
+            within_68,
+            within_95,
+        }
+    };
+    let velocity = VelocityErrors::mean(scores().map(|scores| &scores.velocity));
+
+    ScoresJson {
+        ape_m: answers(AnswerErrors::mean(scores().map(|scores| &scores.ape))),
+        ape_rad: answers(AnswerErrors::mean(scores().map(|scores| &scores.turn))),
+        coverage: covered(|room| &room.scores.tracking_surprises),
+        coverage_odom: covered(|room| &room.scores.odom_surprises),
+        tracking_wrong: known(wrong_share(rooms)),
+        velocity: VelocityJson {
+            error_m_s: known(velocity.error_m_s),
+            zero_m_s: known(velocity.zero_m_s),
+        },
     }
 }
 

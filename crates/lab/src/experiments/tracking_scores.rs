@@ -1,0 +1,175 @@
+//! What a tracker's answers are worth: their errors beside those of the simplest answers to the same
+//! frames, and how honest their covariances and statuses are.
+
+use seese3_core::geometry::{Pose, PoseError, body_twist, log};
+use seese3_core::statistics::{mean, root_mean_square};
+use seese3_core::tracking::{Belief, Replay, Status, Update};
+
+/// An answer further than this from the truth is wrong, metres.
+const WRONG_BEYOND_M: f64 = 0.5;
+/// An answer turned by more than this from the truth is wrong, degrees.
+const WRONG_BEYOND_DEG: f64 = 15.0;
+
+/// The scores of one replay.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrackingScores {
+    /// Absolute errors of position over the frames with a map pose, metres.
+    pub ape: AnswerErrors,
+    /// The same errors of the nearest frame, standing still and so on as rotations, radians.
+    pub turn: AnswerErrors,
+    /// Squared Mahalanobis lengths of the errors of map poses that were TRACKING.
+    pub tracking_surprises: Vec<f64>,
+    /// The same of all `odom_from_camera`, laid on the true first pose.
+    pub odom_surprises: Vec<f64>,
+    /// How many frames were TRACKING.
+    pub tracking: usize,
+    /// How many of those were more than half a metre or 15 degrees off.
+    pub tracking_wrong: usize,
+    /// The velocity beside that of a camera that does not move.
+    pub velocity: VelocityErrors,
+}
+
+/// Root mean squares of the errors of several answers to the same frames.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AnswerErrors {
+    /// The map pose.
+    pub fused: f64,
+    /// Dead reckoning, laid on the true first pose.
+    pub odom: f64,
+    /// The pose of the mapped frame that looks most alike.
+    pub nearest_frame: f64,
+    /// The true pose of the first frame, throughout.
+    pub standing_still: f64,
+}
+
+/// Root mean squares over frames, metres per second.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VelocityErrors {
+    /// Of the reported velocity.
+    pub error_m_s: f64,
+    /// Of reporting zero: the true speed.
+    pub zero_m_s: f64,
+}
+
+impl TrackingScores {
+    /// The scores of a replay; `nearest_frame` gives the pose of an answer's best match.
+    pub fn of(replay: &Replay, nearest_frame: impl Fn(&Update) -> Pose) -> Self {
+        let odom = replay.odom_path().poses;
+        let first = replay.truth.poses.first().copied().unwrap_or_default();
+
+        let mut errors: [Vec<PoseError>; 4] = Default::default();
+        let mut tracking_surprises = Vec::new();
+        let mut odom_surprises = Vec::new();
+        let mut tracking = 0;
+        let mut tracking_wrong = 0;
+
+        let answers = replay.updates.iter().zip(&replay.truth.poses).zip(&odom);
+        for ((update, truth), odom) in answers {
+            let odom_belief = Belief {
+                pose: *odom,
+                covariance: update.odom.covariance,
+            };
+            odom_surprises.extend(surprise(&odom_belief, truth));
+
+            let Some(map_pose) = &update.map_pose else {
+                continue;
+            };
+            let given = [map_pose.pose, *odom, nearest_frame(update), first];
+            for (errors, pose) in errors.iter_mut().zip(given) {
+                errors.push(PoseError::between(&pose, truth));
+            }
+
+            if update.status == Status::Tracking {
+                tracking += 1;
+                tracking_wrong += usize::from(is_wrong(&map_pose.pose, truth));
+                tracking_surprises.extend(surprise(map_pose, truth));
+            }
+        }
+
+        let answers = |of: fn(&PoseError) -> f64| {
+            let [fused, odom, nearest_frame, standing_still] = errors
+                .each_ref()
+                .map(|errors| root_mean_square(&errors.iter().map(of).collect::<Vec<_>>()));
+            AnswerErrors {
+                fused,
+                odom,
+                nearest_frame,
+                standing_still,
+            }
+        };
+        Self {
+            ape: answers(|error| error.translation_m),
+            turn: answers(|error| error.rotation_rad),
+            tracking_surprises,
+            odom_surprises,
+            tracking,
+            tracking_wrong,
+            velocity: VelocityErrors::of(replay),
+        }
+    }
+}
+
+impl AnswerErrors {
+    /// Means over rooms. A room without a map pose counts for none.
+    pub fn mean<'a>(rooms: impl Iterator<Item = &'a Self>) -> Self {
+        let known: Vec<&Self> = rooms.filter(|errors| errors.fused.is_finite()).collect();
+        let of =
+            |of: fn(&Self) -> f64| mean(&known.iter().map(|errors| of(errors)).collect::<Vec<_>>());
+
+        Self {
+            fused: of(|errors| errors.fused),
+            odom: of(|errors| errors.odom),
+            nearest_frame: of(|errors| errors.nearest_frame),
+            standing_still: of(|errors| errors.standing_still),
+        }
+    }
+}
+
+impl VelocityErrors {
+    /// Of the linear velocities of a replay; NaN without one.
+    fn of(replay: &Replay) -> Self {
+        let mut error = Vec::new();
+        let mut speed = Vec::new();
+
+        let times = replay.truth.times_ns.windows(2);
+        let poses = replay.truth.poses.windows(2).zip(times);
+        for (update, (poses, times)) in replay.updates.iter().skip(1).zip(poses) {
+            let Some(reported) = update.velocity else {
+                continue;
+            };
+            let seconds = (times[1] - times[0]) as f64 * 1e-9;
+            let truth = body_twist(&poses[0], &poses[1]).linear / seconds;
+
+            error.push((reported.linear - truth).norm());
+            speed.push(truth.norm());
+        }
+
+        Self {
+            error_m_s: root_mean_square(&error),
+            zero_m_s: root_mean_square(&speed),
+        }
+    }
+
+    /// Means over rooms.
+    pub fn mean<'a>(rooms: impl Iterator<Item = &'a Self> + Clone) -> Self {
+        let error: Vec<f64> = rooms.clone().map(|errors| errors.error_m_s).collect();
+        let zero: Vec<f64> = rooms.map(|errors| errors.zero_m_s).collect();
+
+        Self {
+            error_m_s: mean(&error),
+            zero_m_s: mean(&zero),
+        }
+    }
+}
+
+fn is_wrong(pose: &Pose, truth: &Pose) -> bool {
+    let error = PoseError::between(pose, truth);
+    error.translation_m > WRONG_BEYOND_M || error.rotation_rad > WRONG_BEYOND_DEG.to_radians()
+}
+
+/// The squared Mahalanobis length of a belief's error; none if its covariance is not positive
+/// definite.
+fn surprise(belief: &Belief, truth: &Pose) -> Option<f64> {
+    let error = log(&belief.pose.inv_mul(truth)).to_vector();
+    Some(error.dot(&belief.covariance.cholesky()?.solve(&error)))
+}
