@@ -271,7 +271,7 @@ fn room_to_wire(
     let (pose, covariance) = match believed {
         Some(located) => (located.pose.clone(), located.covariance.clone()),
         None => {
-            let anchor = &found.last.anchor;
+            let anchor = &found.last.anchor.belief;
             let pose = convert::pose_to_wire(&anchor.pose, room.id().as_str());
             (
                 Some(pose),

@@ -3,12 +3,14 @@
 //! The messages are the tokens' own format and no part of the public API. A change of their layout
 //! or meaning needs a new `MAGIC` in `token`.
 
-use nalgebra::{Matrix6, Quaternion, Translation3, UnitQuaternion};
+use nalgebra::{Quaternion, SMatrix, Translation3, UnitQuaternion, Vector6};
 use prost::Message;
 
 use super::super::Error;
-use seese3_core::geometry::Pose;
-use seese3_core::tracking::{Belief, Candidate, Keyframe, LastFrame, State, TrackingHealth};
+use seese3_core::geometry::{Pose, Twist};
+use seese3_core::tracking::{
+    Belief, Candidate, Keyframe, LastFrame, MovingBelief, Place, State, TrackingHealth,
+};
 
 /// The content of a token: the configuration of the stream, a hash of what it was answered from,
 /// and its state.
@@ -48,8 +50,10 @@ pub struct SealedState {
     candidate: Option<SealedCandidate>,
     #[prost(uint32, tag = "10")]
     frames_off_map: u32,
-    #[prost(uint32, tag = "11")]
-    frames_since_anchor: u32,
+    #[prost(int64, optional, tag = "11")]
+    corrected_ns: Option<i64>,
+    #[prost(message, optional, tag = "12")]
+    place: Option<SealedPlace>,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -73,9 +77,21 @@ struct SealedKeyframe {
     #[prost(double, repeated, tag = "3")]
     odom: Vec<f64>,
     #[prost(double, repeated, tag = "4")]
-    map_pose: Vec<f64>,
-    #[prost(double, repeated, tag = "5")]
     reported_pose: Vec<f64>,
+    #[prost(int64, tag = "5")]
+    time_ns: i64,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct SealedPlace {
+    #[prost(int64, tag = "1")]
+    time_ns: i64,
+    #[prost(uint64, tag = "2")]
+    sequence: u64,
+    #[prost(double, repeated, tag = "3")]
+    latent: Vec<f64>,
+    #[prost(double, repeated, tag = "4")]
+    belief: Vec<f64>,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -116,19 +132,34 @@ impl SealedKeyframe {
             sequence,
             latent,
             odom,
-            map_pose,
             reported_pose,
+            time_ns,
         } = self;
 
-        let map_pose = belief_of_numbers(&map_pose)?;
-        let reported_pose = belief_of_numbers(&reported_pose)?;
-
         Ok(Keyframe {
+            time_ns,
             sequence,
             latent,
-            odom: required(&odom)?,
-            map_pose,
-            reported_pose,
+            odom: moving_of_numbers(&odom)?,
+            reported_pose: belief_of_numbers(&reported_pose)?,
+        })
+    }
+}
+
+impl SealedPlace {
+    fn opened(self) -> Result<Place, Error> {
+        let Self {
+            time_ns,
+            sequence,
+            latent,
+            belief,
+        } = self;
+
+        Ok(Place {
+            time_ns,
+            sequence,
+            latent,
+            belief: moving_of_numbers(&belief)?,
         })
     }
 }
@@ -157,17 +188,32 @@ fn index(room: u64) -> Result<usize, Error> {
     usize::try_from(room).map_err(|_| Error::Internal)
 }
 
-/// The 28 numbers of a belief: translation, quaternion (x, y, z, w), and the upper triangle of the
-/// symmetric covariance, row by row.
+/// The 28 numbers of a belief: those of its pose and of its covariance.
 fn belief_to_numbers(belief: &Belief) -> Vec<f64> {
-    let t = belief.pose.translation.vector;
-    let q = belief.pose.rotation.coords;
-    let upper = (0..6).flat_map(|row| (row..6).map(move |column| (row, column)));
+    let mut numbers = pose_to_numbers(&belief.pose);
+    numbers.extend(upper_triangle::<6>().map(|at| belief.covariance[at]));
+    numbers
+}
 
-    [t.x, t.y, t.z, q.x, q.y, q.z, q.w]
-        .into_iter()
-        .chain(upper.map(|at| belief.covariance[at]))
-        .collect()
+/// The 91 numbers of a moving belief: those of its pose, six of its velocity, and those of its
+/// covariance.
+fn moving_to_numbers(belief: &MovingBelief) -> Vec<f64> {
+    let mut numbers = pose_to_numbers(&belief.pose);
+    numbers.extend(&belief.velocity.to_vector());
+    numbers.extend(upper_triangle::<12>().map(|at| belief.covariance[at]));
+    numbers
+}
+
+/// Translation and quaternion (x, y, z, w).
+fn pose_to_numbers(pose: &Pose) -> Vec<f64> {
+    let t = pose.translation.vector;
+    let q = pose.rotation.coords;
+    vec![t.x, t.y, t.z, q.x, q.y, q.z, q.w]
+}
+
+/// The places of the upper triangle of a symmetric matrix, row by row.
+fn upper_triangle<const N: usize>() -> impl Iterator<Item = (usize, usize)> {
+    (0..N).flat_map(|row| (row..N).map(move |column| (row, column)))
 }
 
 /// The belief of such numbers; none if there are no numbers.
@@ -176,28 +222,49 @@ fn belief_of_numbers(numbers: &[f64]) -> Result<Option<Belief>, Error> {
         return Ok(None);
     }
 
-    // 7 numbers of the pose, then the 21 of the upper triangle of a 6×6 matrix.
-    let &[x, y, z, i, j, k, w, ref upper @ ..] = numbers else {
+    let (pose, upper) = pose_of_numbers(numbers)?;
+    Ok(Some(Belief {
+        pose,
+        covariance: symmetric(upper)?,
+    }))
+}
+
+/// The moving belief of such numbers.
+fn moving_of_numbers(numbers: &[f64]) -> Result<MovingBelief, Error> {
+    let (pose, rest) = pose_of_numbers(numbers)?;
+    let (velocity, upper) = rest.split_at_checked(6).ok_or(Error::Internal)?;
+    Ok(MovingBelief {
+        pose,
+        velocity: Twist::from_vector(&Vector6::from_column_slice(velocity)),
+        covariance: symmetric(upper)?,
+    })
+}
+
+/// The pose of seven numbers, and those after them.
+fn pose_of_numbers(numbers: &[f64]) -> Result<(Pose, &[f64]), Error> {
+    let &[x, y, z, i, j, k, w, ref rest @ ..] = numbers else {
         return Err(Error::Internal);
     };
-    if upper.len() != 21 {
-        return Err(Error::Internal);
-    }
 
     // The quaternion is not normalised again: that could change its last bit, and answers after a
     // resume must equal those without one.
     let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
-    let mut covariance = Matrix6::zeros();
-    let places = (0..6).flat_map(|row| (row..6).map(move |column| (row, column)));
-    for ((row, column), value) in places.zip(upper) {
-        covariance[(row, column)] = *value;
-        covariance[(column, row)] = *value;
+    let pose = Pose::from_parts(Translation3::new(x, y, z), rotation);
+    Ok((pose, rest))
+}
+
+/// The symmetric matrix with this upper triangle.
+fn symmetric<const N: usize>(upper: &[f64]) -> Result<SMatrix<f64, N, N>, Error> {
+    if upper.len() != N * (N + 1) / 2 {
+        return Err(Error::Internal);
     }
 
-    Ok(Some(Belief {
-        pose: Pose::from_parts(Translation3::new(x, y, z), rotation),
-        covariance,
-    }))
+    let mut matrix = SMatrix::zeros();
+    for ((row, column), value) in upper_triangle::<N>().zip(upper) {
+        matrix[(row, column)] = *value;
+        matrix[(column, row)] = *value;
+    }
+    Ok(matrix)
 }
 
 fn required(numbers: &[f64]) -> Result<Belief, Error> {
@@ -230,19 +297,37 @@ impl From<&LastFrame> for SealedLast {
 impl From<&Keyframe> for SealedKeyframe {
     fn from(keyframe: &Keyframe) -> Self {
         let Keyframe {
+            time_ns,
             sequence,
             latent,
             odom,
-            map_pose,
             reported_pose,
         } = keyframe;
 
         Self {
             sequence: *sequence,
             latent: latent.clone(),
-            odom: belief_to_numbers(odom),
-            map_pose: numbers(map_pose),
+            odom: moving_to_numbers(odom),
             reported_pose: numbers(reported_pose),
+            time_ns: *time_ns,
+        }
+    }
+}
+
+impl From<&Place> for SealedPlace {
+    fn from(place: &Place) -> Self {
+        let Place {
+            time_ns,
+            sequence,
+            latent,
+            belief,
+        } = place;
+
+        Self {
+            time_ns: *time_ns,
+            sequence: *sequence,
+            latent: latent.clone(),
+            belief: moving_to_numbers(belief),
         }
     }
 }
@@ -274,12 +359,13 @@ impl From<&State> for SealedState {
             room,
             last,
             keyframe,
+            place,
             initial_pose,
             recent,
             health,
             candidate,
             frames_off_map,
-            frames_since_anchor,
+            corrected_ns,
         } = state;
 
         // Tracking health is stored as a number for its state and the state's counter.
@@ -295,6 +381,7 @@ impl From<&State> for SealedState {
             room: room.map(|room| room as u64),
             last: last.as_ref().map(SealedLast::from),
             keyframe: keyframe.as_ref().map(SealedKeyframe::from),
+            place: place.as_ref().map(SealedPlace::from),
             initial_pose: numbers(initial_pose),
             recent: recent.iter().flatten().copied().collect(),
             recent_count: recent.len() as u32,
@@ -302,7 +389,7 @@ impl From<&State> for SealedState {
             health_count,
             candidate: candidate.as_ref().map(SealedCandidate::from),
             frames_off_map: *frames_off_map,
-            frames_since_anchor: *frames_since_anchor,
+            corrected_ns: *corrected_ns,
         }
     }
 }
@@ -311,13 +398,14 @@ impl SealedState {
     /// The tracker's state.
     ///
     /// # Errors
-    /// [`Error::Internal`] if a belief does not have 28 numbers, or a room's index is too large for
+    /// [`Error::Internal`] if a belief does not have its numbers, or a room's index is too large for
     /// this machine. No token that a server sealed has either.
     pub fn state(self) -> Result<State, Error> {
         let Self {
             room,
             last,
             keyframe,
+            place,
             initial_pose,
             recent,
             recent_count,
@@ -325,7 +413,7 @@ impl SealedState {
             health_count,
             candidate,
             frames_off_map,
-            frames_since_anchor,
+            corrected_ns,
         } = self;
 
         let health = match health {
@@ -350,12 +438,13 @@ impl SealedState {
             room: room.map(index).transpose()?,
             last,
             keyframe,
+            place: place.map(SealedPlace::opened).transpose()?,
             initial_pose: belief_of_numbers(&initial_pose)?,
             recent: recent.chunks(width.max(1)).map(<[f64]>::to_vec).collect(),
             health,
             candidate,
             frames_off_map,
-            frames_since_anchor,
+            corrected_ns,
         })
     }
 }
@@ -377,8 +466,15 @@ mod tests {
                 linear: nalgebra::Vector3::new(0.1, 0.2, 0.3),
                 angular: nalgebra::Vector3::y() * 0.4,
             },
-            &Matrix6::from_diagonal_element(1.0 / 7.0),
+            &nalgebra::Matrix6::from_diagonal_element(1.0 / 7.0),
         );
+        let mut moving = MovingBelief {
+            pose: odd,
+            velocity: Twist::from_vector(&Vector6::repeat(0.1)),
+            covariance: SMatrix::from_diagonal_element(1.0 / 3.0),
+        };
+        moving.covariance[(0, 11)] = 1.0 / 9.0;
+        moving.covariance[(11, 0)] = 1.0 / 9.0;
 
         let state = State {
             room: Some(3),
@@ -389,11 +485,17 @@ mod tests {
                 odom: belief,
             }),
             keyframe: Some(Keyframe {
+                time_ns: -6,
                 sequence: 9,
                 latent: vec![1.0 / 3.0; 20],
-                odom: belief,
-                map_pose: Some(belief),
+                odom: moving,
                 reported_pose: None,
+            }),
+            place: Some(Place {
+                time_ns: 3,
+                sequence: 8,
+                latent: vec![-0.0; 20],
+                belief: moving,
             }),
             initial_pose: None,
             recent: vec![vec![0.1; 20], vec![-0.0; 20]],
@@ -409,7 +511,7 @@ mod tests {
                 agreeing_anchors: 2,
             }),
             frames_off_map: 7,
-            frames_since_anchor: 2,
+            corrected_ns: Some(-7),
         };
 
         for state in [

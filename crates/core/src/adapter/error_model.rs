@@ -28,7 +28,7 @@ pub struct Stratum {
     /// The predicting number, above 0.
     pub at: f64,
     /// The share of a reading to be believed, from 0 to 1: the slope of the regression of truth on
-    /// reading. It is 1 for motions, which are believed as they are read.
+    /// reading.
     pub gain: f64,
     /// The covariance of errors on (v, ω), metres and radians; positive definite.
     pub covariance: Matrix6<f64>,
@@ -116,6 +116,11 @@ impl MotionErrors {
     pub fn at(&self, squared_length: f64, frames: u64) -> Matrix6<f64> {
         let shape = self.shapes.at(frames.max(1) as f64).covariance;
         shape * (squared_length + self.floor)
+    }
+
+    /// The share of a motion over `frames` frames to be believed as it was read.
+    pub fn gain(&self, frames: u64) -> f64 {
+        self.shapes.at(frames.max(1) as f64).gain
     }
 
     /// The covariance of a motion over as many frames as were measured at most.

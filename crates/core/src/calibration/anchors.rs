@@ -5,7 +5,8 @@ use ndarray::Array2;
 
 use super::Error;
 use super::model::EmbeddedRoom;
-use super::robust_covariance::robust_covariance;
+use super::motions::share_to_believe;
+use super::robust_covariance;
 use crate::adapter::{Adapter, ErrorTable, Stratum};
 use crate::geometry::{Twist, body_twist, exp};
 use crate::index::{ExactIndex, Exclusion, Index};
@@ -51,7 +52,7 @@ pub fn anchor_errors(
     for part in matches.chunks(matches.len().div_ceil(STRATA).max(1)) {
         let distances: Vec<f64> = part.iter().map(|found| found.distance).collect();
         let at = median(&distances);
-        let gain = gain(part, &scale);
+        let gain = share_to_believe(part.iter().map(|found| (&found.truth, &found.read)), &scale);
         let residuals: Vec<Vector6<f64>> = part.iter().map(|found| found.residual(gain)).collect();
 
         // Repeated images are at no distance at all: their stratum is left out, so that distances
@@ -97,26 +98,6 @@ fn add_matches(
                 truth: body_twist(&room.poses[at], &room.poses[row]).to_vector(),
             });
         }
-    }
-}
-
-/// The share of read motions to be believed: the slope of the regression of truth on reading
-/// through the origin, 0 to 1.
-fn gain(matches: &[Match], scale: &Vector6<f64>) -> f64 {
-    let mut truth_on_read = 0.0;
-    let mut read_on_read = 0.0;
-    for found in matches {
-        let read = found.read.component_div(scale);
-        let truth = found.truth.component_div(scale);
-        truth_on_read += truth.dot(&read);
-        read_on_read += read.dot(&read);
-    }
-
-    let slope = truth_on_read / read_on_read;
-    if slope.is_finite() {
-        slope.clamp(0.0, 1.0)
-    } else {
-        0.0
     }
 }
 

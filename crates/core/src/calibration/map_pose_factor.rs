@@ -7,7 +7,9 @@ use crate::adapter::Adapter;
 use crate::navigation::{IndexKind, Navigator};
 use crate::splits::HoldOut;
 use crate::statistics::coverage_deviation;
-use crate::tracking::{InitialPose, Map, Segment, Tracker, TrackerSettings, replay};
+use crate::tracking::{
+    InitialPose, Map, Segment, Status, Tracker, TrackerSettings, replay_streams,
+};
 use crate::training::RoomData;
 
 /// The smallest factor that is tried.
@@ -16,8 +18,6 @@ const SMALLEST_FACTOR: f64 = 0.1;
 const FACTOR_RATIO: f64 = 1.1;
 /// How many factors are tried.
 const FACTOR_COUNT: i32 = 40;
-/// Nanoseconds between frames: velocities play no role here.
-const PERIOD_NS: i64 = 1;
 
 /// Replays the rooms, with blocks left out of their maps, through trackers with each factor, and
 /// takes the one whose reported poses have the best coverage. `None` where no place was found.
@@ -68,7 +68,7 @@ fn tracker(adapter: &Arc<Adapter>, data: &RoomData<'_>) -> Result<Tracker, Error
     )?)
 }
 
-/// The squared Mahalanobis lengths of the errors of the map poses that a tracker reports in a room.
+/// The squared Mahalanobis lengths of the errors of the map poses that are TRACKING in a room.
 fn replayed_surprises(tracker: &Tracker, data: &RoomData<'_>) -> Vec<f64> {
     let segment = Segment {
         latents: tracker.maps()[0].navigator().latents(),
@@ -77,5 +77,7 @@ fn replayed_surprises(tracker: &Tracker, data: &RoomData<'_>) -> Vec<f64> {
         frames: &HoldOut::Blocks.tracked(data.room.frame_count()),
     };
 
-    replay(tracker, &[segment], PERIOD_NS, InitialPose::Given).map_pose_surprises()
+    let replayed = replay_streams(tracker, segment, data.room, InitialPose::Given);
+    let is_tracking = |row: usize| replayed.updates[row].status == Status::Tracking;
+    replayed.map_pose_surprises_where(is_tracking)
 }

@@ -20,11 +20,10 @@ mod limits;
 mod map_pose_factor;
 mod model;
 mod motions;
-mod robust_covariance;
 
 use std::sync::Arc;
 
-pub use robust_covariance::robust_covariance;
+use nalgebra::{Matrix6, Vector6};
 
 use error_covariance::error_covariance;
 use map_pose_factor::map_pose_factor;
@@ -32,7 +31,7 @@ use map_pose_factor::map_pose_factor;
 use crate::adapter::{self, Adapter, ErrorModel, ErrorStatistics, TrainingRecord};
 use crate::room::RoomId;
 use crate::training::{self, RoomData, check_rooms};
-use crate::{navigation, tracking};
+use crate::{navigation, statistics, tracking};
 
 /// The fewest rooms that a tracker's error model can be measured in: frames of one room have to be
 /// compared with those of another.
@@ -142,6 +141,16 @@ pub fn calibrate_retrieval(
         can_track: false,
     };
     Ok((adapter, report))
+}
+
+/// The covariance of errors, see [`statistics::robust_covariance`].
+///
+/// # Errors
+/// [`adapter::Error::ErrorModel`] when the errors do not span six dimensions.
+pub fn robust_covariance(residuals: &[Vector6<f64>]) -> Result<Matrix6<f64>, adapter::Error> {
+    statistics::robust_covariance(residuals).ok_or(adapter::Error::ErrorModel {
+        what: "the covariance of errors",
+    })
 }
 
 /// Refuses a room that an adapter learned from: its errors there are too small.

@@ -5,7 +5,7 @@ use ndarray::{Array2, Axis};
 
 use super::Error;
 use super::model::EmbeddedRoom;
-use super::robust_covariance::robust_covariance;
+use super::robust_covariance;
 use crate::adapter::{self, Adapter, ErrorTable, MotionErrors, PairPlan, Stratum, Whitener};
 use crate::geometry::body_twist;
 use crate::splits::Pair;
@@ -64,22 +64,31 @@ pub fn second_moment(rooms: &[EmbeddedRoom<'_>], pairs: &[RoomPair]) -> Result<A
     Ok((&moment + &moment.t()) * 0.5)
 }
 
-/// The covariances of motions by stride; `spread` is the whitener of the motion spread.
+/// The gains and covariances of motions by stride; `spread` is the whitener of the motion spread.
 pub fn motion_errors(
     adapter: &Adapter,
     rooms: &[EmbeddedRoom<'_>],
     pairs_by_stride: &[(u32, Vec<RoomPair>)],
     spread: &Whitener,
 ) -> Result<MotionErrors, Error> {
+    let scale = adapter.scale().deviation;
     let mut strata = Vec::with_capacity(pairs_by_stride.len());
     for (stride, pairs) in pairs_by_stride {
-        let residuals: Vec<Vector6<f64>> = pairs
+        let motions: Vec<ReadPair> = pairs
             .iter()
-            .map(|at| scaled_residual(adapter, &rooms[at.room], at.pair, spread))
+            .map(|at| ReadPair::of(adapter, &rooms[at.room], at.pair, spread))
+            .collect();
+        let read = motions.iter().map(|pair| (&pair.truth, &pair.read));
+        let gain = share_to_believe(read, &scale);
+
+        // Divided by √(u + u₀), what is left has the covariance S(n).
+        let residuals: Vec<Vector6<f64>> = motions
+            .iter()
+            .map(|pair| (pair.truth - pair.read * gain) / (pair.squared_length + FLOOR).sqrt())
             .collect();
         strata.push(Stratum {
             at: f64::from(*stride),
-            gain: 1.0,
+            gain,
             covariance: robust_covariance(&residuals)?,
         });
     }
@@ -90,23 +99,49 @@ pub fn motion_errors(
     })
 }
 
-/// The error of one read motion, divided by √(u + u₀): what is left has the covariance S(n).
-fn scaled_residual(
-    adapter: &Adapter,
-    room: &EmbeddedRoom<'_>,
-    pair: Pair,
-    spread: &Whitener,
-) -> Vector6<f64> {
-    let from = pair.source.row();
-    let to = pair.target.row();
-    let read = adapter
-        .motion_without_mean(room.latents.row(from), room.latents.row(to))
-        .to_vector();
-    let truth = body_twist(&room.poses[from], &room.poses[to]).to_vector();
+/// The share of read motions to be believed: the slope of the regression of truth on reading through
+/// the origin, 0 to 1. `scale` makes metres and radians comparable.
+pub fn share_to_believe<'a>(
+    pairs: impl Iterator<Item = (&'a Vector6<f64>, &'a Vector6<f64>)>,
+    scale: &Vector6<f64>,
+) -> f64 {
+    let mut truth_on_read = 0.0;
+    let mut read_on_read = 0.0;
+    for (truth, read) in pairs {
+        let read = read.component_div(scale);
+        truth_on_read += truth.component_div(scale).dot(&read);
+        read_on_read += read.dot(&read);
+    }
 
-    let difference = &room.coordinates.row(to) - &room.coordinates.row(from);
-    let squared_length = spread.squared_length(difference.view());
-    (truth - read) / (squared_length + FLOOR).sqrt()
+    let slope = truth_on_read / read_on_read;
+    if slope.is_finite() {
+        slope.clamp(0.0, 1.0)
+    } else {
+        0.0
+    }
+}
+
+/// A true motion and what was read of it.
+struct ReadPair {
+    truth: Vector6<f64>,
+    read: Vector6<f64>,
+    /// u, the squared length of the difference of the latents.
+    squared_length: f64,
+}
+
+impl ReadPair {
+    fn of(adapter: &Adapter, room: &EmbeddedRoom<'_>, pair: Pair, spread: &Whitener) -> Self {
+        let from = pair.source.row();
+        let to = pair.target.row();
+        let read = adapter.motion_without_mean(room.latents.row(from), room.latents.row(to));
+        let difference = &room.coordinates.row(to) - &room.coordinates.row(from);
+
+        Self {
+            truth: body_twist(&room.poses[from], &room.poses[to]).to_vector(),
+            read: read.to_vector(),
+            squared_length: spread.squared_length(difference.view()),
+        }
+    }
 }
 
 #[cfg(test)]

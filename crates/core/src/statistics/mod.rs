@@ -6,10 +6,12 @@
 //! ([`Rate`]).
 
 mod coverage;
+mod robust_covariance;
 
 pub use coverage::{
     CHI_SQUARED_68, CHI_SQUARED_95, Coverage, balancing_factor, coverage, coverage_deviation,
 };
+pub use robust_covariance::robust_covariance;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -1,20 +1,21 @@
 //! Correction: the mapped frame that looks like the view, taken as an anchor of the map pose.
 
-use super::Belief;
 use super::dead_reckoning::{EarlierView, Poses};
 use super::map::MapMatch;
 use super::state::{Candidate, Observation, State};
 use super::tracker::Tracker;
+use super::{Belief, MapAnchor, MovingBelief};
 
-/// 99 % of χ² with six degrees of freedom: an anchor whose surprise is larger is refused.
+/// 99 % of χ² with six degrees of freedom: an anchor whose surprise is larger counts for less.
 const GATE: f64 = 16.81;
-/// Successive anchors err alike: each one's covariance is multiplied by this.
-const ANCHOR_INFLATION: f64 = 2.0;
-/// Accepted frames from one anchor to the next: those in between err alike and tell nothing new.
-const ANCHOR_EVERY: u32 = 3;
+/// An anchor whose surprise is larger than this many times the gate is refused.
+const REFUSED_BEYOND: f64 = 4.0;
 /// Anchors in a row that must agree on a place before it replaces another one, or is believed where
 /// none was.
-pub const ANCHORS_TO_AGREE: u32 = 4;
+pub const ANCHORS_TO_AGREE: u32 = 10;
+/// Anchors are taken to be as far apart in time at most, seconds: after a pause the next one is as good
+/// as an independent one.
+const LONGEST_PAUSE_S: f64 = 10.0;
 
 /// The map that a view matches best.
 pub(super) struct BestMap {
@@ -25,18 +26,10 @@ pub(super) struct BestMap {
     pub matched: MapMatch,
 }
 
-/// A pose that a view was read to have, to correct the map pose by.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Anchor {
-    pub belief: Belief,
-    /// The covariance of a map pose that was corrected by it, over its own.
-    pub reported_factor: f64,
-}
-
 /// What an anchor did to the map pose.
 pub(super) struct Correction {
-    /// The anchor, if it was applied.
-    pub applied: Option<Anchor>,
+    /// Whether the anchor was applied.
+    pub is_applied: bool,
     /// The squared Mahalanobis distance of the anchor from the believed pose, if there was one.
     pub surprise: Option<f64>,
 }
@@ -44,52 +37,54 @@ pub(super) struct Correction {
 impl Correction {
     /// No anchor was tried.
     const NONE: Self = Self {
-        applied: None,
+        is_applied: false,
         surprise: None,
     };
 }
 
 impl Tracker {
-    /// Tries the best match as an anchor, if one is due and the view clearly matches one map.
-    pub(super) fn correct_when_due(
+    /// Tries the best match as an anchor, if the view looks like the room and clearly like one map.
+    pub(super) fn correct_by_match(
         &self,
         state: &mut State,
         poses: &mut Poses,
         frame: &Observation,
         view: &BestMap,
     ) -> Correction {
-        state.frames_since_anchor = state.frames_since_anchor.saturating_add(1);
-        let is_due = state.frames_since_anchor >= ANCHOR_EVERY || state.keyframe.is_none();
         let matches_room = view.matched.out_of_distribution <= 1.0;
-
-        if !(self.settings.fuse && matches_room && is_due) {
+        if !(self.settings.fuse && matches_room && view.is_clear) {
             return Correction::NONE;
         }
 
-        state.frames_since_anchor = 0;
-        if view.is_clear {
-            let anchor = self.anchor(frame, view);
-            self.correct(state, poses, frame, view.room, anchor)
-        } else {
-            Correction::NONE
-        }
+        let anchor = self.anchor(state, frame, view);
+        self.correct(state, poses, frame, view.room, anchor)
     }
 
     /// The pose of a view by the reader of its room if there is one and the view certainly shows the
-    /// room, else by the frame that it matches: beyond the mapped part a reader is surer than it
-    /// should be.
-    fn anchor(&self, frame: &Observation, view: &BestMap) -> Anchor {
+    /// room, else by the frames that it matches: beyond the mapped part a reader is surer than it
+    /// should be. Its covariance is that with which it counts beside the anchors before it.
+    fn anchor(&self, state: &State, frame: &Observation, view: &BestMap) -> Belief {
+        let MapAnchor { belief, memory_s } = view.matched.anchor;
         let feature = frame.feature.as_deref().filter(|_| view.matched.is_certain);
-        match self.maps[view.room].pose_by_reader(feature) {
-            // Its covariance was measured on the errors of single views of this room.
-            Some(belief) => Anchor {
-                belief,
-                reported_factor: 1.0,
-            },
-            None => Anchor {
-                belief: view.matched.anchor,
-                reported_factor: self.map_pose_factor,
-            },
+        let belief = self.maps[view.room]
+            .pose_by_reader(feature)
+            .unwrap_or(belief);
+
+        // Anchors whose errors are alike tell less than independent ones: a row of them with the
+        // correlation ρ from one to the next tells as much as independent ones of (1 + ρ)/(1 − ρ)
+        // times the covariance.
+        let pause = state.corrected_ns.map_or(LONGEST_PAUSE_S, |before| {
+            (frame.time_ns.abs_diff(before) as f64 * 1e-9).min(LONGEST_PAUSE_S)
+        });
+        let inflation = if memory_s > 0.0 {
+            let correlation = (-pause / memory_s).exp();
+            (1.0 + correlation) / (1.0 - correlation)
+        } else {
+            1.0
+        };
+        Belief {
+            covariance: belief.covariance * inflation,
+            ..belief
         }
     }
 
@@ -102,7 +97,7 @@ impl Tracker {
         poses: &mut Poses,
         frame: &Observation,
         room: usize,
-        given: Anchor,
+        anchor: Belief,
     ) -> Correction {
         // While a stream is lost no place is a candidate. Frames that miss the room or match
         // several rooms do not come here, so that anchors "in a row" may have such frames between
@@ -112,12 +107,6 @@ impl Tracker {
             return Correction::NONE;
         }
 
-        // The filter takes the inflated covariance; what is reported is measured with the plain
-        // one.
-        let anchor = Belief {
-            pose: given.belief.pose,
-            covariance: given.belief.covariance * ANCHOR_INFLATION,
-        };
         let surprise_at = |belief: &Belief| {
             belief
                 .innovation(&anchor)
@@ -125,13 +114,20 @@ impl Tracker {
         };
 
         let believed = poses.map_pose.filter(|_| state.room == Some(room));
-        let surprise = believed.as_ref().map(surprise_at);
+        let surprise = believed.map(|believed| surprise_at(&believed.place()));
         if let (Some(believed), Some(surprise)) = (believed, surprise)
-            && surprise <= GATE
+            && surprise <= REFUSED_BEYOND * GATE
         {
-            poses.map_pose = Some(believed.corrected(&anchor));
+            // Motions and errors have heavier tails than a Gaussian: a surprising anchor is believed
+            // less, but believed.
+            let doubted = Belief {
+                covariance: anchor.covariance * (surprise / GATE).max(1.0),
+                ..anchor
+            };
+            poses.map_pose = Some(believed.corrected(&doubted));
+            state.corrected_ns = Some(frame.time_ns);
             return Correction {
-                applied: Some(given),
+                is_applied: true,
                 surprise: Some(surprise),
             };
         }
@@ -150,7 +146,9 @@ impl Tracker {
         let is_applied = agreeing_anchors >= ANCHORS_TO_AGREE;
         if is_applied {
             state.room = Some(room);
-            poses.map_pose = Some(map_pose);
+            state.corrected_ns = Some(frame.time_ns);
+            let prior = self.maps[room].motion_prior();
+            poses.map_pose = Some(MovingBelief::at(map_pose, prior));
         } else {
             state.candidate = Some(Candidate {
                 room,
@@ -162,7 +160,7 @@ impl Tracker {
         }
 
         Correction {
-            applied: is_applied.then_some(given),
+            is_applied,
             surprise,
         }
     }
@@ -177,15 +175,5 @@ impl Tracker {
 
         let map_pose = candidate.map_pose.moved(motion, &covariance);
         (map_pose, candidate.agreeing_anchors)
-    }
-
-    /// A corrected map pose as it is reported: with the covariance of the anchor that corrected it,
-    /// times its factor. The filter would combine many anchors into one very sure pose, but anchors
-    /// on the same part of a path err alike.
-    pub(super) fn reported(map_pose: Belief, anchor: &Anchor) -> Belief {
-        Belief {
-            covariance: anchor.belief.covariance * anchor.reported_factor,
-            ..map_pose
-        }
     }
 }

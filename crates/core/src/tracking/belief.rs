@@ -111,7 +111,16 @@ impl Belief {
 
     /// The largest standard deviation of the position along any direction, metres.
     pub fn position_deviation_m(&self) -> f64 {
-        let block = self.covariance.fixed_view::<3, 3>(0, 0).into_owned();
+        self.largest_deviation(0)
+    }
+
+    /// The largest standard deviation of the rotation about any axis, radians.
+    pub fn rotation_deviation_rad(&self) -> f64 {
+        self.largest_deviation(3)
+    }
+
+    fn largest_deviation(&self, at: usize) -> f64 {
+        let block = self.covariance.fixed_view::<3, 3>(at, at).into_owned();
         block.symmetric_eigenvalues().max().max(0.0).sqrt()
     }
 }

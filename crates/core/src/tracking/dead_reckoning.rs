@@ -6,15 +6,22 @@
 use nalgebra::Matrix6;
 use ndarray::{ArrayView1, s};
 
-use super::Belief;
 use super::health::Continuity;
+use super::moving::ReadMotion;
 use super::state::{Observation, State};
 use super::tracker::Tracker;
+use super::{Belief, MotionPrior, MovingBelief};
+use crate::adapter::MotionErrors;
 use crate::geometry::{Pose, Twist, body_twist};
 
 /// The deviation of a stream's own origin, metres and radians: it is zero by definition, but a
 /// covariance has to be positive definite.
 const ORIGIN_DEVIATION: f64 = 1e-6;
+
+/// Motions are read only where calibration found that at least this share of a reading is to be
+/// believed: with less, how cameras move tells more, and a reading that shrinks every motion would
+/// stop the camera.
+const LEAST_GAIN: f64 = 0.5;
 
 /// How much of the motion before a frame was seen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -48,10 +55,10 @@ pub(super) struct EarlierView<'a> {
 /// The poses of a stream at one frame.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Poses {
-    /// `odom_from_camera`.
-    pub odom: Belief,
-    /// `map_from_camera` as the filter believes it.
-    pub map_pose: Option<Belief>,
+    /// `odom_from_camera` and the velocity as readings alone tell it.
+    pub odom: MovingBelief,
+    /// `map_from_camera` and the velocity as the filter believes them.
+    pub map_pose: Option<MovingBelief>,
     /// `map_from_camera` as it is reported.
     pub reported_pose: Option<Belief>,
 }
@@ -73,13 +80,14 @@ impl Tracker {
     ) -> Prediction {
         let Some(keyframe) = &state.keyframe else {
             // The first frame is the origin of `odom`.
-            let odom = Belief::known(Pose::identity(), ORIGIN_DEVIATION, ORIGIN_DEVIATION);
+            let origin = Belief::known(Pose::identity(), ORIGIN_DEVIATION, ORIGIN_DEVIATION);
+            let at = |pose: Belief| MovingBelief::at(pose, self.prior(state.room));
             return Prediction {
                 motion: Twist::default(),
-                covariance: odom.covariance,
+                covariance: origin.covariance,
                 poses: Poses {
-                    odom,
-                    map_pose: state.initial_pose,
+                    odom: at(origin),
+                    map_pose: state.initial_pose.map(at),
                     reported_pose: state.initial_pose,
                 },
             };
@@ -105,15 +113,81 @@ impl Tracker {
             motion = body_twist(&keyframe.odom.pose, &last_odom);
         }
 
-        let carried = |belief: &Belief| belief.moved(motion, &covariance);
+        let mut odom = self.carried(
+            &keyframe.odom,
+            from,
+            keyframe.time_ns,
+            (state.room, frame, reading),
+        );
+        if reading != MotionReading::Complete {
+            let mut of_pose = odom.covariance.fixed_view_mut::<6, 6>(0, 0);
+            of_pose += self.error_model.unread_errors();
+        }
+
+        let map_pose = state.place.as_ref().map(|place| {
+            let from = EarlierView {
+                latent: &place.latent,
+                sequence: place.sequence,
+            };
+            let to = (state.room, frame, reading);
+            self.carried(&place.belief, from, place.time_ns, to)
+        });
+
         Prediction {
             motion,
             covariance,
             poses: Poses {
-                odom: carried(&keyframe.odom),
-                map_pose: keyframe.map_pose.as_ref().map(carried),
-                reported_pose: keyframe.reported_pose.as_ref().map(carried),
+                odom,
+                reported_pose: match &map_pose {
+                    Some(believed) => Some(self.reported(believed)),
+                    None => keyframe
+                        .reported_pose
+                        .map(|belief| belief.moved(motion, &covariance)),
+                },
+                map_pose,
             },
+        }
+    }
+
+    /// A belief of an earlier view at this frame: by how cameras move, and by what is read between
+    /// the two views where that is better.
+    fn carried(
+        &self,
+        belief: &MovingBelief,
+        from: EarlierView<'_>,
+        from_ns: i64,
+        (room, frame, reading): (Option<usize>, &Observation, MotionReading),
+    ) -> MovingBelief {
+        let frames = frame.sequence.saturating_sub(from.sequence);
+        let is_worth_it = self.motion_errors(room).gain(frames) >= LEAST_GAIN;
+        let read = (reading == MotionReading::Complete && is_worth_it).then(|| {
+            let (motion, covariance) = self.motion_between(room, from, frame);
+            ReadMotion { motion, covariance }
+        });
+
+        let seconds = frame.time_ns.abs_diff(from_ns) as f64 * 1e-9;
+        belief.moved(self.prior(room), seconds, read.as_ref())
+    }
+
+    /// The errors of motions: in a known room those that its own frames showed.
+    fn motion_errors(&self, room: Option<usize>) -> &MotionErrors {
+        room.map_or(&self.error_model.statistics().motion_errors, |room| {
+            self.maps[room].motion_errors()
+        })
+    }
+
+    /// How the camera of a room moves; where no room is known, that of the first.
+    pub(super) fn prior(&self, room: Option<usize>) -> &MotionPrior {
+        self.maps[room.unwrap_or(0)].motion_prior()
+    }
+
+    /// A believed map pose as it is reported: with the covariance that such poses were measured to
+    /// have.
+    pub(super) fn reported(&self, believed: &MovingBelief) -> Belief {
+        let place = believed.place();
+        Belief {
+            covariance: place.covariance * self.map_pose_factor,
+            ..place
         }
     }
 
@@ -128,15 +202,13 @@ impl Tracker {
         let coordinates = s![..self.adapter().coordinate_count()];
         let difference = &to.latent.slice(coordinates) - &latent.slice(coordinates);
 
-        // In a known room the errors are those that its own frames showed.
-        let errors = room.map_or(&self.error_model.statistics().motion_errors, |room| {
-            self.maps[room].motion_errors()
-        });
+        let errors = self.motion_errors(room);
         let squared_length = self.error_model.spread_length(difference.view());
         let frames = to.sequence.saturating_sub(from.sequence);
         let covariance = errors.at(squared_length, frames);
 
-        let motion = self.adapter().motion_without_mean(latent, to.latent.view());
+        let read = self.adapter().motion_without_mean(latent, to.latent.view());
+        let motion = read.scaled(errors.gain(frames));
         if motion.is_unique_logarithm() {
             return (motion, covariance);
         }

@@ -4,9 +4,10 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView1, Axis, s};
 
+use super::anchor_model::{AnchorModel, Blend, LOOKED_AT, MapAnchor, calibrated_anchor};
+use super::motion_prior::MotionPrior;
 use super::{Belief, Error, room_errors};
 use crate::adapter::{ErrorModel, MotionErrors, TEMPORAL_NEIGHBOURS};
-use crate::geometry::exp;
 use crate::index::{ExactIndex, Exclusion, Index, Neighbour};
 use crate::navigation::Navigator;
 use crate::room::FrameId;
@@ -30,7 +31,9 @@ pub struct Map {
     typical_distance: f64,
     extent_m: f64,
     motion_errors: MotionErrors,
-    anchor_factor: f64,
+    /// None where too few frames are mapped: the calibrated errors are taken.
+    anchor_model: Option<AnchorModel>,
+    motion_prior: MotionPrior,
     pose_reader: Option<Arc<dyn PoseReader>>,
 }
 
@@ -44,8 +47,8 @@ pub struct MapMatch {
     pub out_of_distribution: f64,
     /// Whether the view is so near that hardly any frame of another room would be.
     pub is_certain: bool,
-    /// The pose read from the nearest frame, `world_from_camera`.
-    pub anchor: Belief,
+    /// The pose that the nearest frames tell.
+    pub anchor: MapAnchor,
 }
 
 impl Map {
@@ -81,16 +84,17 @@ impl Map {
         // poses are known.
         let motion_errors = room_errors::motion_errors(&navigator, &error_model, mapped)
             .map_err(Error::RoomErrors)?;
-        let anchor_factor = room_errors::anchor_factor(&navigator, &error_model, mapped, &whitened);
+        let anchor_model = AnchorModel::measured(&navigator, &whitened, mapped);
 
         Ok(Self {
             extent_m: extent(&navigator, mapped),
+            motion_prior: MotionPrior::of_path(navigator.room(), mapped),
             navigator,
             error_model,
             index,
             typical_distance,
             motion_errors,
-            anchor_factor,
+            anchor_model,
             pose_reader: None,
         })
     }
@@ -125,6 +129,11 @@ impl Map {
         &self.motion_errors
     }
 
+    /// How the camera that mapped the room moved.
+    pub fn motion_prior(&self) -> &MotionPrior {
+        &self.motion_prior
+    }
+
     /// The diagonal of the box around the mapped camera positions, metres.
     pub fn extent_m(&self) -> f64 {
         self.extent_m
@@ -139,23 +148,24 @@ impl Map {
             .frame_noise()
             .whitened(coordinates.insert_axis(Axis(0)));
 
-        let nearest = self
+        let mut nearest = self
             .index
-            .nearest(&whitened.row(0).to_vec(), count.max(1), None);
+            .nearest(&whitened.row(0).to_vec(), count.max(LOOKED_AT), None);
         // A map has frames, or it would not have a typical distance.
-        let best = nearest.first().copied().unwrap_or(Neighbour {
-            frame: FrameId(0),
-            distance: f64::INFINITY,
-        });
+        if nearest.is_empty() {
+            nearest.push(Neighbour {
+                frame: FrameId(0),
+                distance: f64::INFINITY,
+            });
+        }
 
-        // The stored frame is near the view, not at it: add the motion from it to the view, shrunk
-        // by the gain that calibration found for matches of this distance.
-        let errors = self.error_model.anchor_errors(best.distance);
-        let latents = self.navigator.latents();
-        let motion = adapter
-            .motion_without_mean(latents.row(best.frame.row()), latent)
-            .scaled(errors.gain);
-        let pose = self.navigator.room().poses()[best.frame.row()] * exp(&motion);
+        let best = nearest[0];
+        let blend = Blend::of(&self.navigator, &nearest, latent);
+        nearest.truncate(count.max(1));
+        let anchor = match &self.anchor_model {
+            Some(model) => model.anchor(&blend),
+            None => calibrated_anchor(&self.error_model, &blend),
+        };
 
         let limits = self.error_model.statistics();
         let relative_distance = best.distance / self.typical_distance;
@@ -163,10 +173,7 @@ impl Map {
             nearest,
             out_of_distribution: relative_distance / limits.out_of_distribution_ratio,
             is_certain: relative_distance <= limits.certain_match_ratio,
-            anchor: Belief {
-                pose,
-                covariance: errors.covariance * self.anchor_factor,
-            },
+            anchor,
         }
     }
 }

@@ -7,11 +7,14 @@
 //!
 //! A [`Belief`] is a pose with the covariance of its error in its own body frame, on (v, ω).
 
+mod anchor_model;
 mod anchoring;
 mod belief;
 mod dead_reckoning;
 mod health;
 mod map;
+mod motion_prior;
+mod moving;
 mod relocalize;
 mod replay;
 mod room_errors;
@@ -20,13 +23,16 @@ mod status;
 mod tracker;
 mod view;
 
+pub use anchor_model::MapAnchor;
 pub use anchoring::ANCHORS_TO_AGREE;
 pub use belief::{Belief, Innovation};
 pub use health::{Continuity, FrameEvidence, TrackingHealth};
 pub use map::{Map, MapMatch, PoseReader};
+pub use motion_prior::{ASSUMED_PERIOD_S, MotionPrior};
+pub use moving::MovingBelief;
 pub use relocalize::{ROOM_RATIO, Relocalization, RoomMatch, relocalize};
-pub use replay::{InitialPose, MapPath, MotionSurprise, Replay, Segment, replay};
-pub use state::{Candidate, Keyframe, LastFrame, Observation, Refusal, State, Update};
+pub use replay::{InitialPose, MapPath, MotionSurprise, Replay, Segment, replay, replay_streams};
+pub use state::{Candidate, Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
 pub use tracker::{Tracker, TrackerSettings};
 pub use view::{View, motion};
 

@@ -2,9 +2,10 @@
 
 use ndarray::ArrayView2;
 
+use super::motion_prior::{ASSUMED_PERIOD_S, seconds_between};
 use super::{Belief, Observation, State, Status, Tracker, Update};
 use crate::geometry::{Pose, PoseError, body_twist, log};
-use crate::room::FrameId;
+use crate::room::{FrameId, Room};
 use crate::trajectory::Trajectory;
 
 /// How surely a given initial pose is known: metres and radians, standard deviations by axis.
@@ -45,6 +46,8 @@ pub struct Replay {
     pub sequences: Vec<u64>,
     /// The tracker's answers, frame by frame.
     pub updates: Vec<Update>,
+    /// The rows in which a stream begins, in order; the first is 0.
+    pub beginnings: Vec<usize>,
 }
 
 /// Replays segments one after the other, as if no frame lay between them. Frames of successive rows
@@ -60,6 +63,7 @@ pub fn replay(
         truth: Trajectory::default(),
         sequences: Vec::new(),
         updates: Vec::new(),
+        beginnings: vec![0],
     };
 
     let mut sequence: u64 = 0;
@@ -91,6 +95,67 @@ pub fn replay(
     }
 
     found
+}
+
+/// Replays frames of a room, each of its sequences as a stream of its own. Times are those of the
+/// recording, or those of a camera with [`ASSUMED_PERIOD_S`] if it has none.
+pub fn replay_streams(
+    tracker: &Tracker,
+    segment: Segment<'_>,
+    room: &Room,
+    initial_pose: InitialPose,
+) -> Replay {
+    let mut joined = Replay {
+        truth: Trajectory::default(),
+        sequences: Vec::new(),
+        updates: Vec::new(),
+        beginnings: Vec::new(),
+    };
+
+    let same_sequence = |a: &FrameId, b: &FrameId| room.timeline().joins(*a, *b);
+    for frames in segment.frames.chunk_by(same_sequence) {
+        let stream = Segment { frames, ..segment };
+        let period_ns = period_ns(room, frames);
+        let replayed = replay(tracker, &[stream], period_ns, initial_pose);
+
+        // Numbers and times go on from stream to stream, so that each frame has its own.
+        let number = joined.sequences.last().map_or(0, |last| last + 1);
+        let time = joined
+            .truth
+            .times_ns
+            .last()
+            .map_or(0, |last| last + period_ns);
+        joined.beginnings.push(joined.updates.len());
+        joined.truth.poses.extend(replayed.truth.poses);
+        let times = replayed.truth.times_ns.into_iter();
+        joined.truth.times_ns.extend(times.map(|at| at + time));
+        let numbers = replayed.sequences.into_iter();
+        joined.sequences.extend(numbers.map(|at| at + number));
+        joined
+            .updates
+            .extend(replayed.updates.into_iter().map(|update| Update {
+                keyframe_sequence: update.keyframe_sequence + number,
+                ..update
+            }));
+    }
+
+    joined
+}
+
+/// The mean time from one row of a recording to the next, nanoseconds.
+fn period_ns(room: &Room, frames: &[FrameId]) -> i64 {
+    let assumed = (ASSUMED_PERIOD_S * 1e9).round() as i64;
+    let (Some(&first), Some(&last)) = (frames.first(), frames.last()) else {
+        return assumed;
+    };
+
+    let rows = f64::from(last.0 - first.0).max(1.0);
+    let period = seconds_between(room, first, last) / rows * 1e9;
+    if period >= 1.0 {
+        period.round() as i64
+    } else {
+        assumed
+    }
 }
 
 fn start(tracker: &Tracker, segments: &[Segment<'_>], initial_pose: InitialPose) -> State {
@@ -144,19 +209,24 @@ impl Replay {
         MapPath { path, rows }
     }
 
-    /// `odom_from_camera`, moved so that it begins at the true first pose.
+    /// `odom_from_camera`, moved so that each stream begins at its true first pose.
     pub fn odom_path(&self) -> Trajectory {
-        let first = self.truth.poses.first().copied().unwrap_or_default();
-        let poses = self
-            .updates
-            .iter()
-            .map(|update| first * update.odom.pose)
-            .collect();
+        let updates = self.updates.iter().enumerate();
+        let poses = updates.map(|(row, update)| self.first_pose(row) * update.odom.pose);
 
         Trajectory {
             times_ns: self.truth.times_ns.clone(),
-            poses,
+            poses: poses.collect(),
         }
+    }
+
+    /// The true first pose of the stream that a row belongs to.
+    pub fn first_pose(&self, row: usize) -> Pose {
+        let streams = self
+            .beginnings
+            .partition_point(|&beginning| beginning <= row);
+        let beginning = self.beginnings[streams.max(1) - 1];
+        self.truth.poses[beginning]
     }
 
     /// The squared Mahalanobis lengths of the errors of all map poses.

@@ -1,23 +1,16 @@
-//! How large an adapter's errors are in one room, compared with the rooms it was calibrated in.
-//!
-//! The poses of a map's frames are known, so its own frames tell: the errors of motions between
-//! them, and of poses read from one when it is left out of the map, against the calibrated
-//! covariances.
+//! How large the errors of an adapter's motions are in one room, compared with the rooms it was
+//! calibrated in: the poses of a map's frames are known, so its own frames tell.
 
-use ndarray::{Array2, s};
+use ndarray::s;
 
 use crate::adapter::{Error, ErrorModel, ErrorTable, MotionErrors, Stratum};
-use crate::geometry::{Pose, body_twist, exp, log};
-use crate::index::{ExactIndex, Exclusion, Index};
+use crate::geometry::body_twist;
 use crate::navigation::Navigator;
 use crate::room::FrameId;
 use crate::statistics::balancing_factor;
 
-/// At most so many pairs per stride, or frames per radius, are evaluated.
+/// At most so many pairs per stride are evaluated.
 const SAMPLES: usize = 200;
-/// Frames to each side that are left out of the map in turn, so that matches of many distances are
-/// seen.
-const LEFT_OUT_RADII: [u32; 5] = [2, 4, 8, 15, 30];
 /// With fewer errors than this no factor is estimated.
 const FEWEST_ERRORS: usize = 30;
 /// Factors of covariances are kept within these: deviations from half to ten times those of the
@@ -47,17 +40,6 @@ pub fn motion_errors(
         shapes: ErrorTable::new(strata)?,
         floor: calibrated.floor,
     })
-}
-
-/// How large the errors of retrieved poses are in a room, compared with the calibration: a factor
-/// of covariances. `whitened` are the room's whitened latents, row by frame.
-pub fn anchor_factor(
-    navigator: &Navigator,
-    error_model: &ErrorModel,
-    mapped: &[FrameId],
-    whitened: &Array2<f64>,
-) -> f64 {
-    factor_of(anchor_surprises(navigator, error_model, mapped, whitened))
 }
 
 /// The factor that makes covariances fit errors of these squared Mahalanobis lengths.
@@ -96,6 +78,10 @@ fn motion_surprises(
         .filter(|(from, to)| room.timeline().joins(*from, *to))
         .collect();
 
+    let gain = error_model
+        .statistics()
+        .motion_errors
+        .gain(u64::from(stride));
     let surprise = |(from, to): &(FrameId, FrameId)| {
         let latent_from = latents.row(from.row());
         let latent_to = latents.row(to.row());
@@ -105,6 +91,7 @@ fn motion_surprises(
         let truth = body_twist(&room.poses()[from.row()], &room.poses()[to.row()]).to_vector();
         let read = adapter
             .motion_without_mean(latent_from, latent_to)
+            .scaled(gain)
             .to_vector();
         let error = truth - read;
         Some(error.dot(&covariance.cholesky()?.solve(&error)))
@@ -112,43 +99,4 @@ fn motion_surprises(
 
     let every = pairs.len().div_ceil(SAMPLES).max(1);
     pairs.iter().step_by(every).filter_map(surprise).collect()
-}
-
-/// Squared Mahalanobis lengths of the errors of mapped frames' poses, each read from the frame that
-/// matches it best when it and its neighbours in time are left out of the map.
-fn anchor_surprises(
-    navigator: &Navigator,
-    error_model: &ErrorModel,
-    mapped: &[FrameId],
-    whitened: &Array2<f64>,
-) -> Vec<f64> {
-    let index = ExactIndex::new(whitened.view(), mapped);
-    let poses = navigator.room().poses();
-    let adapter = navigator.adapter();
-    let latents = navigator.latents();
-
-    let surprise = |centre: FrameId, radius: u32| {
-        let row = whitened.row(centre.row()).to_vec();
-        let best = *index
-            .nearest(&row, 1, Some(Exclusion { centre, radius }))
-            .first()?;
-
-        let errors = error_model.anchor_errors(best.distance);
-        let motion = adapter
-            .motion_without_mean(latents.row(best.frame.row()), latents.row(centre.row()))
-            .scaled(errors.gain);
-        let found: Pose = poses[best.frame.row()] * exp(&motion);
-
-        let error = log(&found.inv_mul(&poses[centre.row()])).to_vector();
-        Some(error.dot(&errors.covariance.cholesky()?.solve(&error)))
-    };
-
-    let every = mapped.len().div_ceil(SAMPLES).max(1);
-    let mut surprises = Vec::new();
-    for radius in LEFT_OUT_RADII {
-        let queries = mapped.iter().step_by(every);
-        surprises.extend(queries.filter_map(|&centre| surprise(centre, radius)));
-    }
-
-    surprises
 }

@@ -3,7 +3,7 @@
 use ndarray::Array1;
 
 use super::health::TrackingHealth;
-use super::{Belief, Status};
+use super::{Belief, MovingBelief, Status};
 use crate::geometry::Twist;
 use crate::index::Neighbour;
 
@@ -31,6 +31,8 @@ pub struct State {
     pub last: Option<LastFrame>,
     /// The frame that motions are read from.
     pub keyframe: Option<Keyframe>,
+    /// Where the camera was when its map pose was last corrected, if it is believed.
+    pub place: Option<Place>,
     /// The pose that was given from outside, until the first frame arrives: `world_from_camera`.
     pub initial_pose: Option<Belief>,
     /// Whitened latents of the last frames, the newest last: what a jump of the view is told by.
@@ -41,8 +43,8 @@ pub struct State {
     pub candidate: Option<Candidate>,
     /// Frames since the last one that matched the map.
     pub frames_off_map: u32,
-    /// Frames since a match was last considered as an anchor.
-    pub frames_since_anchor: u32,
+    /// When an anchor last corrected the map pose, nanoseconds on the sensor's clock.
+    pub corrected_ns: Option<i64>,
 }
 
 /// The last frame of a stream.
@@ -61,17 +63,31 @@ pub struct LastFrame {
 /// The frame that motions are read from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Keyframe {
+    /// When it was taken, nanoseconds on the sensor's clock.
+    pub time_ns: i64,
     /// The sender's number.
     pub sequence: u64,
     /// Its latent.
     pub latent: Vec<f64>,
-    /// `odom_from_camera` at this frame.
-    pub odom: Belief,
-    /// `map_from_camera` at this frame, if it is believed: what anchors are compared with.
-    pub map_pose: Option<Belief>,
-    /// `map_from_camera` as it is reported: with the covariance that its errors really have, and
-    /// also after the tracker stopped believing it.
+    /// `odom_from_camera` at this frame and the camera's velocity, of which nothing is known but what
+    /// motions were read.
+    pub odom: MovingBelief,
+    /// `map_from_camera` as it is reported: with the covariance that its errors were measured to have,
+    /// and also after the tracker stopped believing it.
     pub reported_pose: Option<Belief>,
+}
+
+/// Where the camera is believed to have been at a frame: what anchors are compared with.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Place {
+    /// When the frame was taken, nanoseconds on the sensor's clock.
+    pub time_ns: i64,
+    /// The sender's number.
+    pub sequence: u64,
+    /// Its latent.
+    pub latent: Vec<f64>,
+    /// `map_from_camera` and the camera's velocity.
+    pub belief: MovingBelief,
 }
 
 /// A map pose that recent anchors agree on.
@@ -107,8 +123,8 @@ pub struct Update {
     /// and where it is LOST because its position became too uncertain: look at `status` before
     /// using it.
     pub map_pose: Option<Belief>,
-    /// The mean velocity since the frame before, metres and radians per second, in the camera's
-    /// body frame; none for the first frame.
+    /// The camera's velocity in its body frame, metres and radians per second: that of the fused
+    /// pose where one is believed, else what readings alone tell; none for the first frame.
     pub velocity: Option<Twist>,
     /// Whether the place is known, and confirmed by recent frames.
     pub status: Status,

@@ -11,9 +11,7 @@
 //! - The map pose is kept twice. The *believed* pose is the filter's own, with the covariance that
 //!   the filter computes; anchors are compared with it. The *reported* pose is what clients are
 //!   told, with the covariance that its errors were measured to have. While both exist they are the
-//!   same pose and differ in covariance alone; where health is lost only the reported one remains. A filter
-//!   that treats anchors as independent grows far too sure of itself, because anchors on the same
-//!   part of a path err alike.
+//!   same pose and differ in covariance alone; where health is lost only the reported one remains.
 
 use std::sync::Arc;
 
@@ -22,10 +20,9 @@ use ndarray::{ArrayView1, Axis, s};
 use super::anchoring::BestMap;
 use super::dead_reckoning::{MotionReading, Poses, Prediction};
 use super::health::{Continuity, FrameEvidence, TrackingHealth};
-use super::state::{Keyframe, LastFrame, Observation, Refusal, State, Update};
-use super::{Belief, Error, Map, MapMatch, ROOM_RATIO};
+use super::state::{Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
+use super::{Belief, Error, Map, MapMatch, MovingBelief, ROOM_RATIO};
 use crate::adapter::{Adapter, ErrorModel, JUMP_WINDOW};
-use crate::geometry::{Twist, body_twist};
 
 /// Settings of a tracker.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -147,11 +144,17 @@ impl Tracker {
             // The pose is that of the last frame, which becomes the keyframe.
             Some(last) => {
                 state.keyframe = Some(Keyframe {
+                    time_ns: last.time_ns,
                     sequence: last.sequence,
                     latent: last.latent.clone(),
-                    odom: last.odom,
-                    map_pose: Some(pose),
+                    odom: MovingBelief::at(last.odom, self.prior(state.room)),
                     reported_pose: Some(pose),
+                });
+                state.place = Some(Place {
+                    time_ns: last.time_ns,
+                    sequence: last.sequence,
+                    latent: last.latent.clone(),
+                    belief: MovingBelief::at(pose, self.prior(state.room)),
                 });
             }
             None => state.initial_pose = Some(pose),
@@ -217,12 +220,10 @@ impl Tracker {
             self.stop_believing(state, &mut poses);
         }
 
-        // 4. Correction: every few frames the mapped frame that looks alike is tried as an anchor.
-        let correction = self.correct_when_due(state, &mut poses, frame, &best);
-        if let Some(anchor) = &correction.applied {
-            poses.reported_pose = poses
-                .map_pose
-                .map(|map_pose| Self::reported(map_pose, anchor));
+        // 4. Correction: the mapped frames that look alike are tried as an anchor.
+        let correction = self.correct_by_match(state, &mut poses, frame, &best);
+        if let Some(believed) = &poses.map_pose {
+            poses.reported_pose = Some(self.reported(believed));
         }
 
         // 5. What is remembered for the next frame.
@@ -230,13 +231,11 @@ impl Tracker {
             .keyframe
             .as_ref()
             .map_or(frame.sequence, |keyframe| keyframe.sequence);
-        let velocity = state
-            .last
-            .as_ref()
-            .map(|last| mean_velocity(last, frame, &poses.odom));
-        let is_keyframe = correction.applied.is_some()
-            || self.is_keyframe_due(state, frame.sequence, &prediction);
-        remember(state, frame, &poses, is_keyframe);
+        let believed = poses.map_pose.as_ref().unwrap_or(&poses.odom);
+        let velocity = state.last.as_ref().map(|_| believed.velocity);
+        let is_keyframe = self.is_keyframe_due(state, frame.sequence, &prediction);
+        let is_place = correction.is_applied || self.is_place_old(state, frame.sequence);
+        remember(state, frame, &poses, is_keyframe, is_place);
 
         // 6. The answer. The status judges the reported pose, but only while the filter still
         //    believes one.
@@ -248,7 +247,7 @@ impl Tracker {
             motion_covariance: prediction.covariance,
             keyframe_sequence,
             is_keyframe,
-            odom: poses.odom,
+            odom: poses.odom.place(),
             map_pose: poses.reported_pose,
             velocity,
             status,
@@ -256,7 +255,7 @@ impl Tracker {
             out_of_distribution: best.matched.out_of_distribution,
             room: state.room,
             best_match: (best.room, best.matched.nearest[0]),
-            match_used: correction.applied.is_some(),
+            match_used: correction.is_applied,
             surprise: correction.surprise,
             candidate: state.candidate.clone(),
         }
@@ -348,6 +347,15 @@ impl Tracker {
         }
     }
 
+    /// Whether the last place is so old that motions from it were not measured, or there is none.
+    fn is_place_old(&self, state: &State, sequence: u64) -> bool {
+        let keyframe_frames = u64::from(self.settings.keyframe_frames);
+        state
+            .place
+            .as_ref()
+            .is_none_or(|place| sequence.saturating_sub(place.sequence) >= keyframe_frames)
+    }
+
     fn is_keyframe_due(&self, state: &State, sequence: u64, prediction: &Prediction) -> bool {
         let keyframe_frames = u64::from(self.settings.keyframe_frames);
         let is_old = state
@@ -361,26 +369,46 @@ impl Tracker {
     }
 }
 
-/// Keeps the frame, and takes it as the keyframe if one is due.
-fn remember(state: &mut State, frame: &Observation, poses: &Poses, is_keyframe: bool) {
+/// Keeps the frame, takes it as the keyframe if one is due, and keeps where the camera is believed to
+/// be if that is new.
+fn remember(
+    state: &mut State,
+    frame: &Observation,
+    poses: &Poses,
+    is_keyframe: bool,
+    is_place: bool,
+) {
     let latent = frame.latent.to_vec();
 
     if is_keyframe {
         state.keyframe = Some(Keyframe {
+            time_ns: frame.time_ns,
             sequence: frame.sequence,
             latent: latent.clone(),
             odom: poses.odom,
-            map_pose: poses.map_pose,
             reported_pose: poses.reported_pose,
         });
         state.initial_pose = None;
+    }
+
+    match &poses.map_pose {
+        Some(belief) if is_place => {
+            state.place = Some(Place {
+                time_ns: frame.time_ns,
+                sequence: frame.sequence,
+                latent: latent.clone(),
+                belief: *belief,
+            });
+        }
+        Some(_) => {}
+        None => state.place = None,
     }
 
     state.last = Some(LastFrame {
         time_ns: frame.time_ns,
         sequence: frame.sequence,
         latent,
-        odom: poses.odom,
+        odom: poses.odom.place(),
     });
 }
 
@@ -391,12 +419,6 @@ fn frames_since_last(state: &State, frame: &Observation) -> u64 {
         .last
         .as_ref()
         .map_or(1, |last| frame.sequence - last.sequence)
-}
-
-/// Metres and radians per second since the last frame, in the last frame's body frame.
-fn mean_velocity(last: &LastFrame, frame: &Observation, odom: &Belief) -> Twist {
-    let seconds = frame.time_ns.abs_diff(last.time_ns) as f64 * 1e-9;
-    body_twist(&last.odom.pose, &odom.pose).scaled(seconds.recip())
 }
 
 fn distance(a: &[f64], b: &[f64]) -> f64 {

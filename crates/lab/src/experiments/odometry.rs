@@ -17,7 +17,7 @@ use seese3_core::room::Room;
 use seese3_core::splits::HoldOut;
 use seese3_core::tracking::{
     InitialPose, Map, MotionSurprise, Replay, Segment, Status, Tracker, TrackerSettings,
-    relocalize, replay,
+    relocalize, replay, replay_streams,
 };
 use seese3_core::training::RoomData;
 use seese3_core::trajectory::{Relation, RpePairs, Statistics, Trajectory, ape, rpe};
@@ -333,7 +333,7 @@ fn own_replay(room: &TrackedRoom<'_>, hold_out: HoldOut, initial_pose: InitialPo
         frames: &hold_out.tracked(room.room.frame_count()),
     };
 
-    replay(&room.tracker, &[segment], PERIOD_NS, initial_pose)
+    replay_streams(&room.tracker, segment, &room.room, initial_pose)
 }
 
 /// Frames of every other room, played to a room's tracker: as the beginning of a stream, or after

@@ -55,7 +55,6 @@ impl TrackingScores {
     /// The scores of a replay; `nearest_frame` gives the pose of an answer's best match.
     pub fn of(replay: &Replay, nearest_frame: impl Fn(&Update) -> Pose) -> Self {
         let odom = replay.odom_path().poses;
-        let first = replay.truth.poses.first().copied().unwrap_or_default();
 
         let mut errors: [Vec<PoseError>; 4] = Default::default();
         let mut tracking_surprises = Vec::new();
@@ -64,7 +63,7 @@ impl TrackingScores {
         let mut tracking_wrong = 0;
 
         let answers = replay.updates.iter().zip(&replay.truth.poses).zip(&odom);
-        for ((update, truth), odom) in answers {
+        for (row, ((update, truth), odom)) in answers.enumerate() {
             let odom_belief = Belief {
                 pose: *odom,
                 covariance: update.odom.covariance,
@@ -74,6 +73,7 @@ impl TrackingScores {
             let Some(map_pose) = &update.map_pose else {
                 continue;
             };
+            let first = replay.first_pose(row);
             let given = [map_pose.pose, *odom, nearest_frame(update), first];
             for (errors, pose) in errors.iter_mut().zip(given) {
                 errors.push(PoseError::between(&pose, truth));

@@ -2,8 +2,7 @@
 
 use nalgebra::{Matrix6, Vector6};
 
-use crate::adapter::Error;
-use crate::statistics::balancing_factor;
+use super::balancing_factor;
 
 /// Degrees of freedom of the Student's t that shapes are fitted with.
 const DEGREES_OF_FREEDOM: f64 = 4.0;
@@ -13,17 +12,9 @@ const DIMENSIONS: f64 = 6.0;
 const ITERATIONS: usize = 30;
 
 /// The covariance of errors: the shape of a Student's t, fitted by reweighting, times the factor
-/// that balances the shares of errors inside the 68 % and the 95 % ellipsoid.
-///
-/// # Errors
-/// [`Error::ErrorModel`] when the errors do not span six dimensions.
-pub fn robust_covariance(residuals: &[Vector6<f64>]) -> Result<Matrix6<f64>, Error> {
-    balanced(residuals).ok_or(Error::ErrorModel {
-        what: "the covariance of errors",
-    })
-}
-
-fn balanced(residuals: &[Vector6<f64>]) -> Option<Matrix6<f64>> {
+/// that balances the shares of errors inside the 68 % and the 95 % ellipsoid. None when the errors do
+/// not span six dimensions.
+pub fn robust_covariance(residuals: &[Vector6<f64>]) -> Option<Matrix6<f64>> {
     let mut shape = weighted_moment(residuals, |_| 1.0);
     for _ in 0..ITERATIONS {
         // An error far out in the tail gets a small weight; the t's own likelihood says how small.
@@ -60,8 +51,8 @@ fn weighted_moment(
 mod tests {
     use rand::SeedableRng;
 
+    use super::super::normal_deviates;
     use super::*;
-    use crate::statistics::normal_deviates;
 
     /// Oracle: the definition of a covariance: of normal errors it is their own, and both shares
     /// are near what is wanted.
@@ -74,7 +65,7 @@ mod tests {
             .map(|normal| normal.component_mul(&deviations))
             .collect();
 
-        let found = balanced(&drawn).unwrap();
+        let found = robust_covariance(&drawn).unwrap();
         for (axis, deviation) in deviations.iter().enumerate() {
             let ratio = found[(axis, axis)].sqrt() / deviation;
             assert!((0.95..1.05).contains(&ratio), "axis {axis}: {ratio}");
@@ -85,7 +76,7 @@ mod tests {
             .map(|r| Vector6::new(r[0], r[1], 0.0, r[3], r[4], r[5]))
             .collect();
         assert!(
-            balanced(&flat).is_none(),
+            robust_covariance(&flat).is_none(),
             "errors that never leave a plane have no covariance"
         );
     }

@@ -1,0 +1,154 @@
+//! A Gaussian on a camera's pose and velocity.
+
+use nalgebra::{Cholesky, Matrix6, SMatrix, SVector};
+
+use super::motion_prior::MotionPrior;
+use super::{Belief, Innovation};
+use crate::geometry::{Pose, Twist, adjoint, exp, log};
+
+pub(super) type Matrix12 = SMatrix<f64, 12, 12>;
+type Matrix18 = SMatrix<f64, 18, 18>;
+
+/// A pose and a velocity with the covariance of their errors: the pose's δ in its body frame, true =
+/// pose · exp(δ), and the velocity's, each ordered (v, ω); metres, radians and seconds.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MovingBelief {
+    /// `parent_from_camera`.
+    pub pose: Pose,
+    /// In the camera's body frame, metres and radians per second.
+    pub velocity: Twist,
+    /// Of (pose, velocity); symmetric and positive definite.
+    pub covariance: SMatrix<f64, 12, 12>,
+}
+
+/// A motion that was read between two views.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct ReadMotion {
+    pub motion: Twist,
+    pub covariance: Matrix6<f64>,
+}
+
+impl MovingBelief {
+    /// A camera whose place is known and whose velocity is not.
+    pub fn at(place: Belief, prior: &MotionPrior) -> Self {
+        let mut covariance = Matrix12::zeros();
+        covariance
+            .fixed_view_mut::<6, 6>(0, 0)
+            .copy_from(&place.covariance);
+        covariance
+            .fixed_view_mut::<6, 6>(6, 6)
+            .copy_from(&prior.velocity_covariance());
+
+        Self {
+            pose: place.pose,
+            velocity: Twist::default(),
+            covariance,
+        }
+    }
+
+    /// Where the camera is, without its velocity.
+    pub fn place(&self) -> Belief {
+        Belief {
+            pose: self.pose,
+            covariance: self.covariance.fixed_view::<6, 6>(0, 0).into_owned(),
+        }
+    }
+
+    /// The belief some seconds later. `read` is the motion that the views at both ends show, if
+    /// they show any: it is combined with what the prior expects, each by its covariance.
+    #[must_use]
+    pub(super) fn moved(
+        &self,
+        prior: &MotionPrior,
+        seconds: f64,
+        read: Option<&ReadMotion>,
+    ) -> Self {
+        let drift = prior.over(&self.velocity, seconds);
+
+        // The errors of three things, in this order: the pose before, the motion, the velocity
+        // after. The motion's is in the body frame after it.
+        let mut spread = SMatrix::<f64, 18, 12>::zeros();
+        for axis in 0..6 {
+            let part = axis / 3;
+            spread[(axis, axis)] = 1.0;
+            spread[(6 + axis, 6 + axis)] = drift.reach_s[part];
+            spread[(12 + axis, 6 + axis)] = drift.left[part];
+        }
+        let mut covariance: Matrix18 = spread * self.covariance * spread.transpose();
+        let mut of_drift = covariance.fixed_view_mut::<12, 12>(6, 6);
+        of_drift += drift.noise;
+
+        let mut change = SVector::<f64, 18>::zeros();
+        if let Some(read) = read {
+            let error = log(&exp(&drift.motion).inv_mul(&exp(&read.motion))).to_vector();
+            let of_motion = covariance.fixed_view::<18, 6>(0, 6).into_owned();
+            let sum = covariance.fixed_view::<6, 6>(6, 6) + read.covariance;
+            if let Some(sum) = Cholesky::new(sum) {
+                let gain = of_motion * sum.inverse();
+                change = gain * error;
+                covariance -= gain * of_motion.transpose();
+            }
+        }
+
+        let part = |at: usize| Twist::from_vector(&change.fixed_rows::<6>(at).into_owned());
+        let motion = exp(&drift.motion) * exp(&part(6));
+        let velocity = drift.velocity.to_vector() + change.fixed_rows::<6>(12);
+
+        // The error of the pose after: that of the pose before, carried along, and the motion's.
+        let mut merged = SMatrix::<f64, 12, 18>::zeros();
+        merged
+            .fixed_view_mut::<6, 6>(0, 0)
+            .copy_from(&adjoint(&motion.inverse()));
+        for axis in 0..6 {
+            merged[(axis, 6 + axis)] = 1.0;
+            merged[(6 + axis, 12 + axis)] = 1.0;
+        }
+
+        Self {
+            pose: self.pose * exp(&part(0)) * motion,
+            velocity: Twist::from_vector(&velocity),
+            covariance: symmetric(&(merged * covariance * merged.transpose())),
+        }
+    }
+
+    /// How far a measured pose is from this one; none when the sum of the covariances is not
+    /// positive definite.
+    pub fn innovation(&self, measured: &Belief) -> Option<Innovation> {
+        self.place().innovation(measured)
+    }
+
+    /// Fuses a measured pose by the Kalman gain, to first order in the innovation; the velocity
+    /// follows by its correlation with the pose. Where the sum of the covariances is not positive
+    /// definite, this belief is returned unchanged.
+    #[must_use]
+    pub fn corrected(&self, measured: &Belief) -> Self {
+        let place = self.place();
+        let Some(sum) = Cholesky::new(place.covariance + measured.covariance) else {
+            return *self;
+        };
+        let gain = self.covariance.fixed_view::<12, 6>(0, 0) * sum.inverse();
+
+        let twist = log(&self.pose.inv_mul(&measured.pose)).to_vector();
+        let change = gain * twist;
+        let step = Twist::from_vector(&change.fixed_rows::<6>(0).into_owned());
+        let velocity = self.velocity.to_vector() + change.fixed_rows::<6>(6);
+
+        // Joseph's form: (I − K H) P (I − K H)ᵀ + K R Kᵀ, with H = [I 0].
+        let mut rest = Matrix12::identity();
+        let mut of_pose = rest.fixed_view_mut::<12, 6>(0, 0);
+        of_pose -= gain;
+        let joseph = rest * self.covariance * rest.transpose()
+            + gain * measured.covariance * gain.transpose();
+
+        Self {
+            pose: self.pose * exp(&step),
+            velocity: Twist::from_vector(&velocity),
+            covariance: symmetric(&joseph),
+        }
+    }
+}
+
+/// The symmetric part of a matrix: rounding leaves products slightly asymmetric.
+fn symmetric(matrix: &Matrix12) -> Matrix12 {
+    (matrix + matrix.transpose()) * 0.5
+}
