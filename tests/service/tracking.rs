@@ -176,7 +176,7 @@ async fn a_camera_in_a_mapped_room_is_followed() {
     let candidate = searching.candidate.as_ref().unwrap();
     assert_eq!(
         (candidate.sequence, candidate.agreed, candidate.needed),
-        (1, 1, 4)
+        (1, 1, 10)
     );
 
     assert!(

@@ -54,6 +54,8 @@ pub struct SealedState {
     corrected_ns: Option<i64>,
     #[prost(message, optional, tag = "12")]
     place: Option<SealedPlace>,
+    #[prost(uint32, tag = "13")]
+    unchanged_frames: u32,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -365,6 +367,7 @@ impl From<&State> for SealedState {
             health,
             candidate,
             frames_off_map,
+            unchanged_frames,
             corrected_ns,
         } = state;
 
@@ -390,6 +393,7 @@ impl From<&State> for SealedState {
             candidate: candidate.as_ref().map(SealedCandidate::from),
             frames_off_map: *frames_off_map,
             corrected_ns: *corrected_ns,
+            unchanged_frames: *unchanged_frames,
         }
     }
 }
@@ -414,6 +418,7 @@ impl SealedState {
             candidate,
             frames_off_map,
             corrected_ns,
+            unchanged_frames,
         } = self;
 
         let health = match health {
@@ -444,6 +449,7 @@ impl SealedState {
             health,
             candidate,
             frames_off_map,
+            unchanged_frames,
             corrected_ns,
         })
     }
@@ -512,6 +518,7 @@ mod tests {
             }),
             frames_off_map: 7,
             corrected_ns: Some(-7),
+            unchanged_frames: 3,
         };
 
         for state in [

@@ -333,6 +333,33 @@ impl Session {
         ))
     }
 
+    /// What a frame's view shows, and whether its image is blank, which nobody can tell of a feature.
+    fn seen(&self, view: Option<pb::View>) -> Result<(View, bool), Error> {
+        const FIELD: &str = "frame.view";
+        let adapter = &self.served[0].adapter;
+
+        if let Some(pb::View {
+            view: Some(pb::view::View::Image(image)),
+        }) = &view
+        {
+            let field = format!("{FIELD}.image");
+            let encoder = self.snapshot.image_encoder(adapter)?;
+            let pixels = encoder.decoded(&field, image)?;
+            let is_blank = pixels.is_blank();
+            let feature = encoder.feature_of(&field, pixels)?;
+            return Ok((View::Feature(feature), is_blank));
+        }
+
+        match convert::source(FIELD, view, adapter, &self.snapshot)? {
+            Source::Feature(feature) => Ok((View::Feature(feature), false)),
+            Source::Latent(latent) => Ok((View::Latent(latent), false)),
+            Source::Frame(_) => Err(Error::invalid(
+                format!("{FIELD}.frame_id"),
+                "is a stored frame; give a feature, a latent or an image of the camera",
+            )),
+        }
+    }
+
     fn observe(
         &mut self,
         time_ns: i64,
@@ -351,20 +378,7 @@ impl Session {
         };
 
         let adapter = &self.served[0].adapter;
-        let view = match convert::source("frame.view", view, adapter, &self.snapshot)
-            .map_err(view_refused)?
-        {
-            Source::Feature(feature) => View::Feature(feature),
-            Source::Latent(latent) => View::Latent(latent),
-            Source::Frame(_) => {
-                let error = Error::invalid(
-                    "frame.view.frame_id",
-                    "is a stored frame; give a feature, a latent or an image of the camera",
-                );
-                return Err(view_refused(error));
-            }
-        };
-
+        let (view, is_blank) = self.seen(view).map_err(view_refused)?;
         let latent = view
             .latent(&adapter.adapter)
             .map_err(|error| view_refused(view_error(&error).within("frame.view")))?;
@@ -377,6 +391,7 @@ impl Session {
             sequence,
             latent,
             feature,
+            is_blank,
         };
 
         // Late and duplicate frames are refused too. A refused frame leaves the state as it was.

@@ -22,6 +22,9 @@ use crate::statistics::{median, robust_covariance};
 const BLENDED: usize = 3;
 /// Frames that a blend looks at: those, and one whose distance is compared with the nearest's.
 pub const LOOKED_AT: usize = BLENDED + 1;
+/// Frames further than this from the nearest are not blended with it, ‖(v, ω)‖, metres and radians
+/// mixed.
+const SAME_PLACE: f64 = 0.5;
 /// A frame's weight falls with this power of its distance.
 const POWER: i32 = 4;
 /// Added to distances, in deviations of frame noise, and to lengths of motions, metres and radians
@@ -45,12 +48,14 @@ const INDEPENDENT_STRATA: usize = 3;
 /// its neighbours: the variances of the lowest strata are this share of what the left-out frames
 /// show. Chosen on calibration rooms.
 const SHARE_OF_LOWEST: [f64; 2] = [0.5, 0.7];
+/// No map is known better than this, metres and radians: five millimetres and a third of a degree.
+const LEAST_DEVIATION: f64 = 0.005;
 /// Errors are remembered for this long where the room does not tell, seconds.
 const ASSUMED_MEMORY_S: f64 = 0.5;
 /// Beyond the highest stratum, standard deviations grow with the expected size up to this factor.
 const MOST_GROWTH: f64 = 3.0;
 /// Below the lowest one they fall to this factor at least.
-const LEAST_SHRINKAGE: f64 = 0.25;
+const LEAST_SHRINKAGE: f64 = 0.7;
 
 /// What the frames most like a view say of its pose.
 #[derive(Debug, Clone)]
@@ -129,8 +134,12 @@ impl Blend {
         let motions: Vec<Vector6<f64>> = motions.collect();
         let weighted = || motions.iter().zip(&weights);
 
-        let mean: Vector6<f64> = weighted()
-            .map(|(motion, weight)| motion * (weight / sum))
+        // Frames of another place than the nearest are no reason to place the view in between, but
+        // a reason to doubt.
+        let same_place = || weighted().filter(|(motion, _)| motion.norm() <= SAME_PLACE);
+        let sum_here: f64 = same_place().map(|(_, weight)| weight).sum();
+        let mean: Vector6<f64> = same_place()
+            .map(|(motion, weight)| motion * (weight / sum_here))
             .sum();
         let spread: f64 = weighted()
             .map(|(motion, weight)| (motion - mean).norm_squared() * weight / sum)
@@ -289,7 +298,8 @@ impl Stratum {
 
         let rest = |found: &LeftOut| found.error - found.blend.read * gain;
         let residuals: Vec<Vector6<f64>> = part.iter().map(|(_, found)| rest(found)).collect();
-        let covariance = robust_covariance(&residuals)?;
+        let covariance = robust_covariance(&residuals)?
+            + Matrix6::identity() * (LEAST_DEVIATION * LEAST_DEVIATION);
 
         Some(Self {
             size: median(&sizes),

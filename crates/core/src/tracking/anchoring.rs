@@ -36,14 +36,15 @@ pub(super) struct Correction {
 
 impl Correction {
     /// No anchor was tried.
-    const NONE: Self = Self {
+    pub(super) const NONE: Self = Self {
         is_applied: false,
         surprise: None,
     };
 }
 
 impl Tracker {
-    /// Tries the best match as an anchor, if the view looks like the room and clearly like one map.
+    /// Tries the best match of a view that looks like the room as an anchor, if it looks clearly like
+    /// one map.
     pub(super) fn correct_by_match(
         &self,
         state: &mut State,
@@ -51,8 +52,7 @@ impl Tracker {
         frame: &Observation,
         view: &BestMap,
     ) -> Correction {
-        let matches_room = view.matched.out_of_distribution <= 1.0;
-        if !(self.settings.fuse && matches_room && view.is_clear) {
+        if !(self.settings.fuse && view.is_clear) {
             return Correction::NONE;
         }
 
@@ -121,7 +121,7 @@ impl Tracker {
             // Motions and errors have heavier tails than a Gaussian: a surprising anchor is believed
             // less, but believed.
             let doubted = Belief {
-                covariance: anchor.covariance * (surprise / GATE).max(1.0),
+                covariance: anchor.covariance * (surprise / GATE).max(1.0).powi(2),
                 ..anchor
             };
             poses.map_pose = Some(believed.corrected(&doubted));

@@ -109,6 +109,13 @@ impl Belief {
         symmetric(&(turn * self.covariance * turn.transpose()))
     }
 
+    /// The squared Mahalanobis length of its error against the true pose; none if the covariance is
+    /// not positive definite.
+    pub fn squared_error(&self, truth: &Pose) -> Option<f64> {
+        let error = log(&self.pose.inv_mul(truth)).to_vector();
+        Some(error.dot(&self.covariance.cholesky()?.solve(&error)))
+    }
+
     /// The largest standard deviation of the position along any direction, metres.
     pub fn position_deviation_m(&self) -> f64 {
         self.largest_deviation(0)

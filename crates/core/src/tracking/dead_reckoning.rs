@@ -12,7 +12,7 @@ use super::state::{Observation, State};
 use super::tracker::Tracker;
 use super::{Belief, MotionPrior, MovingBelief};
 use crate::adapter::MotionErrors;
-use crate::geometry::{Pose, Twist, body_twist};
+use crate::geometry::{Pose, Twist, body_twist, exp};
 
 /// The deviation of a stream's own origin, metres and radians: it is zero by definition, but a
 /// covariance has to be positive definite.
@@ -50,6 +50,16 @@ impl MotionReading {
 pub(super) struct EarlierView<'a> {
     pub latent: &'a [f64],
     pub sequence: u64,
+}
+
+/// The frame that a belief is carried to.
+#[derive(Clone, Copy)]
+struct To<'a> {
+    /// The room that the stream is in, if that is known.
+    room: Option<usize>,
+    frame: &'a Observation,
+    /// Whether the motion from the earlier view is read.
+    is_read: bool,
 }
 
 /// The poses of a stream at one frame.
@@ -113,12 +123,27 @@ impl Tracker {
             motion = body_twist(&keyframe.odom.pose, &last_odom);
         }
 
-        let mut odom = self.carried(
-            &keyframe.odom,
-            from,
-            keyframe.time_ns,
-            (state.room, frame, reading),
-        );
+        // Where readings are worth it, `odom` is read at every frame and with one gain: with a gain
+        // that grows with the time since the keyframe it would lag behind and jump. Else it stays.
+        let errors = self.motion_errors(state.room);
+        let gain = errors.gain(self.error_model.longest_frames() as u64);
+        let is_read = reading == MotionReading::Complete && gain >= LEAST_GAIN;
+        let to_frame = To {
+            room: state.room,
+            frame,
+            is_read,
+        };
+        let mut odom = self.carried(&keyframe.odom, from, keyframe.time_ns, to_frame);
+        let read = self
+            .adapter()
+            .motion_without_mean(ArrayView1::from(from.latent), frame.latent.view());
+        odom.pose = match &state.last {
+            _ if is_read && read.is_unique_logarithm() => {
+                keyframe.odom.pose * exp(&read.scaled(gain))
+            }
+            Some(last) => last.odom.pose,
+            None => keyframe.odom.pose,
+        };
         if reading != MotionReading::Complete {
             let mut of_pose = odom.covariance.fixed_view_mut::<6, 6>(0, 0);
             of_pose += self.error_model.unread_errors();
@@ -129,8 +154,13 @@ impl Tracker {
                 latent: &place.latent,
                 sequence: place.sequence,
             };
-            let to = (state.room, frame, reading);
-            self.carried(&place.belief, from, place.time_ns, to)
+            let frames = frame.sequence.saturating_sub(place.sequence);
+            let is_worth_it = errors.gain(frames) >= LEAST_GAIN;
+            let to_frame = To {
+                is_read: is_worth_it && reading == MotionReading::Complete,
+                ..to_frame
+            };
+            self.carried(&place.belief, from, place.time_ns, to_frame)
         });
 
         Prediction {
@@ -150,17 +180,20 @@ impl Tracker {
     }
 
     /// A belief of an earlier view at this frame: by how cameras move, and by what is read between
-    /// the two views where that is better.
+    /// the two views where that counts.
     fn carried(
         &self,
         belief: &MovingBelief,
         from: EarlierView<'_>,
         from_ns: i64,
-        (room, frame, reading): (Option<usize>, &Observation, MotionReading),
+        to: To<'_>,
     ) -> MovingBelief {
-        let frames = frame.sequence.saturating_sub(from.sequence);
-        let is_worth_it = self.motion_errors(room).gain(frames) >= LEAST_GAIN;
-        let read = (reading == MotionReading::Complete && is_worth_it).then(|| {
+        let To {
+            room,
+            frame,
+            is_read,
+        } = to;
+        let read = is_read.then(|| {
             let (motion, covariance) = self.motion_between(room, from, frame);
             ReadMotion { motion, covariance }
         });

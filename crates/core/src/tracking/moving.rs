@@ -152,3 +152,81 @@ impl MovingBelief {
 fn symmetric(matrix: &Matrix12) -> Matrix12 {
     (matrix + matrix.transpose()) * 0.5
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+
+    fn prior() -> MotionPrior {
+        MotionPrior::assumed()
+    }
+
+    /// Oracle: the stationary Ornstein–Uhlenbeck process in closed form: after a time t the variance
+    /// of the way is 2σ²τ²(t/τ − 1 + e^(−t/τ)), its covariance with the velocity σ²τ(1 − e^(−t/τ));
+    /// and Kalman's gain by hand.
+    #[test]
+    fn a_measured_pose_tells_the_velocity() {
+        let (variance, duration, time) = (0.25, 0.5, 0.1_f64);
+        let left = (-time / duration).exp();
+        let way = 2.0 * variance * duration * duration * (time / duration - 1.0 + left);
+        let way_velocity = variance * duration * (1.0 - left);
+
+        let start = MovingBelief::at(Belief::known(Pose::identity(), 0.01, 0.01), &prior());
+        let later = start.moved(&prior(), time, None);
+        let found = later.covariance;
+        assert!((found[(0, 0)] - (1e-4 + way)).abs() < 1e-12);
+        assert!((found[(0, 6)] - way_velocity).abs() < 1e-12);
+        assert!((found[(6, 6)] - variance).abs() < 1e-12);
+
+        let measured = Belief::known(Pose::translation(0.03, 0.0, 0.0), 0.02, 0.02);
+        let corrected = later.corrected(&measured);
+        let gain = 0.03 / (1e-4 + way + 4e-4);
+        assert!((corrected.pose.translation.x - (1e-4 + way) * gain).abs() < 1e-12);
+        assert!((corrected.velocity.linear.x - way_velocity * gain).abs() < 1e-12);
+        assert!(corrected.velocity.linear.yz().norm() < 1e-12);
+    }
+
+    /// Oracle: the definition: a motion that is read exactly is the motion, and leaves the errors that
+    /// were there before, carried to the new body frame; one of which nothing is known changes nothing.
+    #[test]
+    fn a_reading_counts_as_much_as_it_is_sure() {
+        let start = MovingBelief::at(Belief::known(Pose::identity(), 0.1, 1e-6), &prior());
+        let motion = Twist {
+            linear: Vector3::new(0.2, -0.1, 0.05),
+            angular: Vector3::new(0.0, 0.4, 0.1),
+        };
+        let read = |variance: f64| ReadMotion {
+            motion,
+            covariance: Matrix6::from_diagonal_element(variance),
+        };
+
+        let sure = start.moved(&prior(), 0.5, Some(&read(1e-12)));
+        let error = log(&sure.pose.inv_mul(&exp(&motion))).to_vector();
+        assert!(error.norm() < 1e-6, "{error}");
+        let of_position = sure.covariance.fixed_view::<3, 3>(0, 0).into_owned();
+        assert!((of_position - nalgebra::Matrix3::identity() * 0.01).amax() < 1e-6);
+
+        let unsure = start.moved(&prior(), 0.5, Some(&read(1e12)));
+        let without = start.moved(&prior(), 0.5, None);
+        assert!((unsure.covariance - without.covariance).amax() < 1e-9);
+        assert!((unsure.pose.to_homogeneous() - without.pose.to_homogeneous()).amax() < 1e-9);
+    }
+
+    /// Oracle: the definition of positive definite, over a long stream with corrections.
+    #[test]
+    fn a_covariance_stays_positive_definite() {
+        let mut belief = MovingBelief::at(Belief::known(Pose::identity(), 1e-6, 1e-6), &prior());
+        for step in 0..5_000 {
+            belief = belief.moved(&prior(), 0.02, None);
+            if step % 3 == 0 {
+                belief = belief.corrected(&Belief::known(belief.pose, 1e-4, 1e-4));
+            }
+            assert!(
+                Cholesky::new(belief.covariance).is_some(),
+                "after {step} steps"
+            );
+        }
+    }
+}

@@ -82,6 +82,7 @@ pub fn replay(
                 feature: segment
                     .features
                     .map(|features| features.row(frame.row()).to_vec()),
+                is_blank: false,
             };
 
             // These are latents of the tracker's own adapter, in order: it refuses none.

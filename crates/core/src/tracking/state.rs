@@ -19,6 +19,8 @@ pub struct Observation {
     /// The raw feature of that latent, shape (d,), if it is known: the [`super::PoseReader`] of a map
     /// reads it.
     pub feature: Option<Vec<f32>>,
+    /// Whether the image is known to show nothing: it is blank, or all bright or dark.
+    pub is_blank: bool,
 }
 
 /// Everything that a tracker knows of a stream.
@@ -43,6 +45,8 @@ pub struct State {
     pub candidate: Option<Candidate>,
     /// Frames since the last one that matched the map.
     pub frames_off_map: u32,
+    /// Frames in a row that showed exactly what the one before did.
+    pub unchanged_frames: u32,
     /// When an anchor last corrected the map pose, nanoseconds on the sensor's clock.
     pub corrected_ns: Option<i64>,
 }

@@ -3,7 +3,7 @@
 use super::health::{FRAMES_TO_RECOVER, TrackingHealth};
 use super::map::MapMatch;
 use super::state::State;
-use super::tracker::Tracker;
+use super::tracker::{Sight, Tracker};
 use super::{ANCHORS_TO_AGREE, Belief, Status};
 
 /// Frames without a match after which a known place is in doubt.
@@ -20,6 +20,7 @@ impl Tracker {
         state: &State,
         reported_pose: Option<&Belief>,
         matched: &MapMatch,
+        sight: Sight,
     ) -> (Status, String) {
         if let TrackingHealth::Lost { certain_matches } = state.health {
             return (Status::Lost, reason_of_loss(certain_matches, matched));
@@ -47,6 +48,20 @@ impl Tracker {
                 "the position is known to {deviation:.1} m, the room is {extent:.1} m wide"
             );
             return (Status::Lost, reason);
+        }
+
+        let blind = match sight {
+            Sight::Clear => None,
+            Sight::Nothing => {
+                Some("the image shows nothing: it is blank, or all bright or dark".to_owned())
+            }
+            Sight::Unchanged => Some(format!(
+                "{} frames in a row are the same image: the camera is frozen, or a simulation without noise stands still",
+                state.unchanged_frames + 1
+            )),
+        };
+        if let Some(reason) = blind {
+            return (Status::Degraded, reason);
         }
 
         if agreeing > 0 {

@@ -17,12 +17,42 @@ use std::sync::Arc;
 
 use ndarray::{ArrayView1, Axis, s};
 
-use super::anchoring::BestMap;
+use super::anchoring::{BestMap, Correction};
 use super::dead_reckoning::{MotionReading, Poses, Prediction};
 use super::health::{Continuity, FrameEvidence, TrackingHealth};
 use super::state::{Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
 use super::{Belief, Error, Map, MapMatch, MovingBelief, ROOM_RATIO};
 use crate::adapter::{Adapter, ErrorModel, JUMP_WINDOW};
+
+/// Views this near to one another, in deviations of frame noise, are the same image: the noise of a
+/// camera that stands still is some tenths.
+const UNCHANGED_DISTANCE: f64 = 0.01;
+/// After so many frames that are the same image a camera is taken to be frozen. Recordings hold pairs
+/// of the same image where a frame was dropped.
+const FROZEN_FRAMES: u32 = 5;
+
+/// What a frame shows of the world.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Sight {
+    /// Something.
+    Clear,
+    /// Nothing: the image is blank.
+    Nothing,
+    /// Exactly what the frames before it showed: no camera sees that.
+    Unchanged,
+}
+
+impl Sight {
+    fn of(state: &State, frame: &Observation) -> Self {
+        if frame.is_blank {
+            Self::Nothing
+        } else if state.unchanged_frames >= FROZEN_FRAMES {
+            Self::Unchanged
+        } else {
+            Self::Clear
+        }
+    }
+}
 
 /// Settings of a tracker.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -197,13 +227,14 @@ impl Tracker {
         // 1. What the frame looks like: the best map, the mapped frame nearest to it, and whether
         //    the view follows from the views before.
         let best = self.match_maps(state.room, frame.latent.view());
-        let matches_room = best.matched.out_of_distribution <= 1.0;
         let continuity = self.record_view(state, frame);
+        let sight = Sight::of(state, frame);
+        let matches_room = sight == Sight::Clear && best.matched.out_of_distribution <= 1.0;
 
         // 2. What that says of the stream's health.
         state.health = state.health.after(FrameEvidence {
             matches_room,
-            matches_certainly: best.matched.is_certain,
+            matches_certainly: matches_room && best.matched.is_certain,
             continuity,
         });
         state.frames_off_map = if matches_room {
@@ -213,15 +244,23 @@ impl Tracker {
         };
 
         // 3. Dead reckoning: the motion since the keyframe carries every pose forward.
-        let reading = MotionReading::of(continuity, matches_room);
+        let reading = match sight {
+            Sight::Clear => MotionReading::of(continuity, matches_room),
+            Sight::Nothing | Sight::Unchanged => MotionReading::Unseen,
+        };
         let prediction = self.predict(state, frame, reading);
         let mut poses = prediction.poses;
         if state.health.is_lost() {
             self.stop_believing(state, &mut poses);
         }
 
-        // 4. Correction: the mapped frames that look alike are tried as an anchor.
-        let correction = self.correct_by_match(state, &mut poses, frame, &best);
+        // 4. Correction: the mapped frames that look alike are tried as an anchor. An image that is
+        //    repeated tells nothing new.
+        let correction = if matches_room && state.unchanged_frames == 0 {
+            self.correct_by_match(state, &mut poses, frame, &best)
+        } else {
+            Correction::NONE
+        };
         if let Some(believed) = &poses.map_pose {
             poses.reported_pose = Some(self.reported(believed));
         }
@@ -240,7 +279,7 @@ impl Tracker {
         // 6. The answer. The status judges the reported pose, but only while the filter still
         //    believes one.
         let judged_pose = poses.map_pose.and(poses.reported_pose);
-        let (status, reason) = self.status(state, judged_pose.as_ref(), &best.matched);
+        let (status, reason) = self.status(state, judged_pose.as_ref(), &best.matched, sight);
 
         Update {
             motion: prediction.motion,
@@ -293,8 +332,13 @@ impl Tracker {
         }
     }
 
-    /// Adds the frame's view to the recent ones, and says how it follows from them.
+    /// Adds the frame's view to the recent ones, and says how it follows from them. A blank view is
+    /// none: it neither follows nor jumps.
     fn record_view(&self, state: &mut State, frame: &Observation) -> Continuity {
+        if frame.is_blank {
+            return Continuity::Continuous;
+        }
+
         let coordinates = frame.latent.slice(s![..self.adapter().coordinate_count()]);
         let whitened = self
             .error_model
@@ -308,6 +352,16 @@ impl Tracker {
             .iter()
             .map(|other| distance(other, &whitened))
             .fold(f64::INFINITY, f64::min);
+
+        let is_unchanged = state
+            .recent
+            .last()
+            .is_some_and(|last| distance(last, &whitened) <= UNCHANGED_DISTANCE);
+        state.unchanged_frames = if is_unchanged {
+            state.unchanged_frames.saturating_add(1)
+        } else {
+            0
+        };
 
         // How far the views of a moving camera lie apart grows slowly with the frames from one to
         // the other, about as the cube root of their number.

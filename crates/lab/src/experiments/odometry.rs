@@ -12,11 +12,12 @@ use rayon::prelude::*;
 use seese3_core::adapter::Adapter;
 use seese3_core::cancel::Cancellation;
 use seese3_core::fitting::{RoomReader, fit};
+use seese3_core::geometry::PoseError;
 use seese3_core::navigation::{IndexKind, Navigator};
-use seese3_core::room::Room;
+use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
 use seese3_core::tracking::{
-    InitialPose, Map, MotionSurprise, Replay, Segment, Status, Tracker, TrackerSettings,
+    InitialPose, Map, MapMatch, MotionSurprise, Replay, Segment, Status, Tracker, TrackerSettings,
     relocalize, replay, replay_streams,
 };
 use seese3_core::training::RoomData;
@@ -138,7 +139,7 @@ pub struct LostFrames {
 }
 
 /// Which room single views were taken to be in.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Relocalisation {
     /// The right room was named.
     pub right: usize,
@@ -148,6 +149,12 @@ pub struct Relocalisation {
     pub ambiguous: usize,
     /// The number of rooms to choose from.
     pub rooms: usize,
+    /// Squared Mahalanobis lengths of the errors of the poses in the right room.
+    pub pose_surprises: Vec<f64>,
+    /// The errors of those poses, metres.
+    pub pose_errors_m: Vec<f64>,
+    /// Those of the nearest frames' poses, metres.
+    pub nearest_errors_m: Vec<f64>,
 }
 
 /// Trackers over each of several rooms, mapped as the protocol says.
@@ -231,6 +238,7 @@ pub fn relocalisation(
                 found.ambiguous += 1;
             } else if answer.rooms[0].map == place {
                 found.right += 1;
+                found.add_pose(&answer.rooms[0].last, room, frame);
             } else {
                 found.wrong += 1;
             }
@@ -245,13 +253,32 @@ pub fn relocalisation(
         .map(of_room)
         .collect::<Result<_, Error>>()?;
     let sum = |of: fn(&Relocalisation) -> usize| by_room.iter().map(of).sum();
+    let all = |of: fn(&Relocalisation) -> &Vec<f64>| by_room.iter().flat_map(of).copied().collect();
 
     Ok(Relocalisation {
         right: sum(|found| found.right),
         wrong: sum(|found| found.wrong),
         ambiguous: sum(|found| found.ambiguous),
         rooms: rooms.len(),
+        pose_surprises: all(|found| &found.pose_surprises),
+        pose_errors_m: all(|found| &found.pose_errors_m),
+        nearest_errors_m: all(|found| &found.nearest_errors_m),
     })
+}
+
+impl Relocalisation {
+    /// Counts how far the pose of a view in its right room is off.
+    fn add_pose(&mut self, matched: &MapMatch, room: &TrackedRoom<'_>, frame: FrameId) {
+        let poses = room.room.poses();
+        let truth = &poses[frame.row()];
+        let found = &matched.anchor.belief;
+        let nearest = &poses[matched.nearest[0].frame.row()];
+
+        self.pose_surprises.extend(found.squared_error(truth));
+        let error_m = |pose| PoseError::between(pose, truth).translation_m;
+        self.pose_errors_m.push(error_m(&found.pose));
+        self.nearest_errors_m.push(error_m(nearest));
+    }
 }
 
 fn room_odometry(

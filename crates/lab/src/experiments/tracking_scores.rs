@@ -1,7 +1,7 @@
 //! What a tracker's answers are worth: their errors beside those of the simplest answers to the same
 //! frames, and how honest their covariances and statuses are.
 
-use seese3_core::geometry::{Pose, PoseError, body_twist, log};
+use seese3_core::geometry::{Pose, PoseError, body_twist};
 use seese3_core::statistics::{mean, root_mean_square};
 use seese3_core::tracking::{Belief, Replay, Status, Update};
 
@@ -68,7 +68,7 @@ impl TrackingScores {
                 pose: *odom,
                 covariance: update.odom.covariance,
             };
-            odom_surprises.extend(surprise(&odom_belief, truth));
+            odom_surprises.extend(odom_belief.squared_error(truth));
 
             let Some(map_pose) = &update.map_pose else {
                 continue;
@@ -82,7 +82,7 @@ impl TrackingScores {
             if update.status == Status::Tracking {
                 tracking += 1;
                 tracking_wrong += usize::from(is_wrong(&map_pose.pose, truth));
-                tracking_surprises.extend(surprise(map_pose, truth));
+                tracking_surprises.extend(map_pose.squared_error(truth));
             }
         }
 
@@ -165,11 +165,4 @@ impl VelocityErrors {
 fn is_wrong(pose: &Pose, truth: &Pose) -> bool {
     let error = PoseError::between(pose, truth);
     error.translation_m > WRONG_BEYOND_M || error.rotation_rad > WRONG_BEYOND_DEG.to_radians()
-}
-
-/// The squared Mahalanobis length of a belief's error; none if its covariance is not positive
-/// definite.
-fn surprise(belief: &Belief, truth: &Pose) -> Option<f64> {
-    let error = log(&belief.pose.inv_mul(truth)).to_vector();
-    Some(error.dot(&belief.covariance.cholesky()?.solve(&error)))
 }

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::table::aligned;
 use crate::experiments::odometry::{LostFrames, PathErrors, Relocalisation, RoomOdometry};
 use crate::experiments::tracking_scores::{AnswerErrors, TrackingScores, VelocityErrors};
-use seese3_core::statistics::{Rate, coverage, mean, median};
+use seese3_core::statistics::{Rate, coverage, mean, median, root_mean_square};
 use seese3_core::tracking::MotionSurprise;
 
 /// Groups of about equal size into which the coverage table divides motions by their length.
@@ -192,12 +192,18 @@ pub fn relocalisation_text(found: &Relocalisation) -> String {
     let count = found.right + found.wrong + found.ambiguous;
     let share = |n: usize| n as f64 / count.max(1) as f64;
 
+    let covered = coverage(&found.pose_surprises);
     format!(
-        "single views among {} rooms: {:.4} right, {:.4} wrong, {:.4} ambiguous, of {count}",
+        "single views among {} rooms: {:.4} right, {:.4} wrong, {:.4} ambiguous, of {count}; right ones \
+         {:.3} m off (root mean square; nearest frame {:.3}), {:.3} and {:.3} within 68 and 95 %",
         found.rooms,
         share(found.right),
         share(found.wrong),
-        share(found.ambiguous)
+        share(found.ambiguous),
+        root_mean_square(&found.pose_errors_m),
+        root_mean_square(&found.nearest_errors_m),
+        covered.within_68,
+        covered.within_95,
     )
 }
 
@@ -293,6 +299,10 @@ struct RelocalisationJson {
     right: usize,
     wrong: usize,
     ambiguous: usize,
+    /// Root mean squares over the right ones, metres; null without one.
+    pose_m: Option<f64>,
+    nearest_frame_m: Option<f64>,
+    coverage: CoverageJson,
 }
 
 /// The record of tracking: the results of every room, the coverage over all rooms, relocalisation,
@@ -318,6 +328,9 @@ pub fn odometry_json(
             right: found.right,
             wrong: found.wrong,
             ambiguous: found.ambiguous,
+            pose_m: known(root_mean_square(&found.pose_errors_m)),
+            nearest_frame_m: known(root_mean_square(&found.nearest_errors_m)),
+            coverage: coverage_json(&found.pose_surprises),
         }),
         ape_formula: super::APE_FORMULA,
         rpe_formula: super::RPE_FORMULA,
@@ -362,21 +375,13 @@ fn room_json(room: &RoomOdometry) -> RoomJson {
 
 fn scores_json(rooms: &[RoomOdometry]) -> ScoresJson {
     let scores = || rooms.iter().map(|room| &room.scores);
-    // JSON has no NaN: what is not known is null.
-    let known = |value: f64| value.is_finite().then_some(value);
     let answers = |errors: AnswerErrors| AnswersJson {
         fused: known(errors.fused),
         odom: known(errors.odom),
         nearest_frame: known(errors.nearest_frame),
         standing_still: known(errors.standing_still),
     };
-    let covered = |of: fn(&RoomOdometry) -> &Vec<f64>| {
-        let [within_68, within_95] = shares(&concat(rooms, of)).map(known);
-        CoverageJson {
-            within_68,
-            within_95,
-        }
-    };
+    let covered = |of: fn(&RoomOdometry) -> &Vec<f64>| coverage_json(&concat(rooms, of));
     let velocity = VelocityErrors::mean(scores().map(|scores| &scores.velocity));
 
     ScoresJson {
@@ -389,6 +394,19 @@ fn scores_json(rooms: &[RoomOdometry]) -> ScoresJson {
             error_m_s: known(velocity.error_m_s),
             zero_m_s: known(velocity.zero_m_s),
         },
+    }
+}
+
+/// JSON has no NaN: what is not known is null.
+fn known(value: f64) -> Option<f64> {
+    value.is_finite().then_some(value)
+}
+
+fn coverage_json(squared_lengths: &[f64]) -> CoverageJson {
+    let [within_68, within_95] = shares(squared_lengths).map(known);
+    CoverageJson {
+        within_68,
+        within_95,
     }
 }
 
