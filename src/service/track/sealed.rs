@@ -94,6 +94,9 @@ struct SealedPlace {
     latent: Vec<f64>,
     #[prost(double, repeated, tag = "4")]
     belief: Vec<f64>,
+    /// The upper triangle of the covariance of its lasting error.
+    #[prost(double, repeated, tag = "5")]
+    lasting: Vec<f64>,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -155,6 +158,7 @@ impl SealedPlace {
             sequence,
             latent,
             belief,
+            lasting,
         } = self;
 
         Ok(Place {
@@ -162,6 +166,7 @@ impl SealedPlace {
             sequence,
             latent,
             belief: moving_of_numbers(&belief)?,
+            lasting: symmetric(&lasting)?,
         })
     }
 }
@@ -323,6 +328,7 @@ impl From<&Place> for SealedPlace {
             sequence,
             latent,
             belief,
+            lasting,
         } = place;
 
         Self {
@@ -330,6 +336,7 @@ impl From<&Place> for SealedPlace {
             sequence: *sequence,
             latent: latent.clone(),
             belief: moving_to_numbers(belief),
+            lasting: upper_triangle::<6>().map(|at| lasting[at]).collect(),
         }
     }
 }
@@ -502,6 +509,7 @@ mod tests {
                 sequence: 8,
                 latent: vec![-0.0; 20],
                 belief: moving,
+                lasting: SMatrix::from_diagonal_element(1.0 / 11.0),
             }),
             initial_pose: None,
             recent: vec![vec![0.1; 20], vec![-0.0; 20]],

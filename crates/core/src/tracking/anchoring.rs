@@ -1,5 +1,7 @@
 //! Correction: the mapped frame that looks like the view, taken as an anchor of the map pose.
 
+use nalgebra::Matrix6;
+
 use super::dead_reckoning::{EarlierView, Poses};
 use super::map::MapMatch;
 use super::state::{Candidate, Observation, State};
@@ -24,6 +26,15 @@ pub(super) struct BestMap {
     /// Whether no other map matches nearly as well.
     pub is_clear: bool,
     pub matched: MapMatch,
+}
+
+/// An anchor as it counts beside those before it.
+#[derive(Debug, Clone, Copy)]
+struct CountedAnchor {
+    /// The larger its covariance, the more its error is like those before it.
+    belief: Belief,
+    /// The covariance of its error, if that lasts; else zero.
+    lasting: Matrix6<f64>,
 }
 
 /// What an anchor did to the map pose.
@@ -63,7 +74,7 @@ impl Tracker {
     /// The pose of a view by the reader of its room if there is one and the view certainly shows the
     /// room, else by the frames that it matches: beyond the mapped part a reader is surer than it
     /// should be. Its covariance is that with which it counts beside the anchors before it.
-    fn anchor(&self, state: &State, frame: &Observation, view: &BestMap) -> Belief {
+    fn anchor(&self, state: &State, frame: &Observation, view: &BestMap) -> CountedAnchor {
         let MapAnchor { belief, memory_s } = view.matched.anchor;
         let feature = frame.feature.as_deref().filter(|_| view.matched.is_certain);
         let belief = self.maps[view.room]
@@ -82,9 +93,16 @@ impl Tracker {
         } else {
             1.0
         };
-        Belief {
-            covariance: belief.covariance * inflation,
-            ..belief
+        CountedAnchor {
+            belief: Belief {
+                covariance: belief.covariance * inflation,
+                ..belief
+            },
+            lasting: if memory_s > 0.0 {
+                belief.covariance
+            } else {
+                Matrix6::zeros()
+            },
         }
     }
 
@@ -97,8 +115,9 @@ impl Tracker {
         poses: &mut Poses,
         frame: &Observation,
         room: usize,
-        anchor: Belief,
+        counted: CountedAnchor,
     ) -> Correction {
+        let anchor = counted.belief;
         // While a stream is lost no place is a candidate. Frames that miss the room or match
         // several rooms do not come here, so that anchors "in a row" may have such frames between
         // them.
@@ -125,6 +144,7 @@ impl Tracker {
                 ..anchor
             };
             poses.map_pose = Some(believed.corrected(&doubted));
+            poses.lasting = counted.lasting;
             state.corrected_ns = Some(frame.time_ns);
             return Correction {
                 is_applied: true,
@@ -149,6 +169,7 @@ impl Tracker {
             state.corrected_ns = Some(frame.time_ns);
             let prior = self.maps[room].motion_prior();
             poses.map_pose = Some(MovingBelief::at(map_pose, prior));
+            poses.lasting = counted.lasting;
         } else {
             state.candidate = Some(Candidate {
                 room,

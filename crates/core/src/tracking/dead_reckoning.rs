@@ -69,6 +69,8 @@ pub(super) struct Poses {
     pub odom: MovingBelief,
     /// `map_from_camera` and the velocity as the filter believes them.
     pub map_pose: Option<MovingBelief>,
+    /// The covariance of the lasting error of the anchor that corrected the map pose last.
+    pub lasting: Matrix6<f64>,
     /// `map_from_camera` as it is reported.
     pub reported_pose: Option<Belief>,
 }
@@ -98,6 +100,7 @@ impl Tracker {
                 poses: Poses {
                     odom: at(origin),
                     map_pose: state.initial_pose.map(at),
+                    lasting: Matrix6::zeros(),
                     reported_pose: state.initial_pose,
                 },
             };
@@ -163,13 +166,17 @@ impl Tracker {
             self.carried(&place.belief, from, place.time_ns, to_frame)
         });
 
+        let lasting = state.place.as_ref().map(|place| place.lasting);
+        let lasting = lasting.unwrap_or_else(Matrix6::zeros);
+
         Prediction {
             motion,
             covariance,
             poses: Poses {
                 odom,
+                lasting,
                 reported_pose: match &map_pose {
-                    Some(believed) => Some(self.reported(believed)),
+                    Some(believed) => Some(self.reported(believed, &lasting)),
                     None => keyframe
                         .reported_pose
                         .map(|belief| belief.moved(motion, &covariance)),
@@ -216,10 +223,10 @@ impl Tracker {
 
     /// A believed map pose as it is reported: with the covariance that such poses were measured to
     /// have.
-    pub(super) fn reported(&self, believed: &MovingBelief) -> Belief {
+    pub(super) fn reported(&self, believed: &MovingBelief, lasting: &Matrix6<f64>) -> Belief {
         let place = believed.place();
         Belief {
-            covariance: place.covariance * self.map_pose_factor,
+            covariance: (place.covariance + lasting) * self.map_pose_factor,
             ..place
         }
     }

@@ -1,5 +1,6 @@
 //! What a tracker knows of a stream, what it is given for each frame, and what it answers.
 
+use nalgebra::Matrix6;
 use ndarray::Array1;
 
 use super::health::TrackingHealth;
@@ -92,6 +93,9 @@ pub struct Place {
     pub latent: Vec<f64>,
     /// `map_from_camera` and the camera's velocity.
     pub belief: MovingBelief,
+    /// The covariance of the lasting error of the anchor that corrected it last, which the filter cannot
+    /// average away; zero where its errors do not last.
+    pub lasting: Matrix6<f64>,
 }
 
 /// A map pose that recent anchors agree on.
@@ -115,7 +119,7 @@ pub struct Update {
     /// The motion from the keyframe to this frame, in the keyframe's body frame.
     pub motion: Twist,
     /// The covariance of that motion's error on (v, ω), metres and radians.
-    pub motion_covariance: nalgebra::Matrix6<f64>,
+    pub motion_covariance: Matrix6<f64>,
     /// The keyframe's number.
     pub keyframe_sequence: u64,
     /// Whether this frame is the keyframe from now on.

@@ -15,6 +15,7 @@
 
 use std::sync::Arc;
 
+use nalgebra::Matrix6;
 use ndarray::{ArrayView1, Axis, s};
 
 use super::anchoring::{BestMap, Correction};
@@ -185,6 +186,7 @@ impl Tracker {
                     sequence: last.sequence,
                     latent: last.latent.clone(),
                     belief: MovingBelief::at(pose, self.prior(state.room)),
+                    lasting: Matrix6::zeros(),
                 });
             }
             None => state.initial_pose = Some(pose),
@@ -262,7 +264,7 @@ impl Tracker {
             Correction::NONE
         };
         if let Some(believed) = &poses.map_pose {
-            poses.reported_pose = Some(self.reported(believed));
+            poses.reported_pose = Some(self.reported(believed, &poses.lasting));
         }
 
         // 5. What is remembered for the next frame.
@@ -452,6 +454,7 @@ fn remember(
                 sequence: frame.sequence,
                 latent: latent.clone(),
                 belief: *belief,
+                lasting: poses.lasting,
             });
         }
         Some(_) => {}
