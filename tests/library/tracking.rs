@@ -367,7 +367,12 @@ fn a_camera_that_sees_nothing_new_is_not_tracked() {
         .collect();
     assert!(deviations.windows(2).all(|pair| pair[0] < pair[1]));
     let error = PoseError::between(&frozen[59].map_pose.unwrap().pose, &room.poses()[121]);
-    assert!(error.translation_m < 3.0 * deviations[deviations.len() - 1]);
+    let deviation = deviations[deviations.len() - 1];
+    assert!(
+        error.translation_m < 4.0 * deviation,
+        "{} m off, known to {deviation}",
+        error.translation_m
+    );
 
     // It sees again, and is tracked where it is.
     let again: Vec<Update> = (121..201).step_by(2).map(|row| show(row, false)).collect();
