@@ -466,6 +466,17 @@ impl SealedState {
 mod tests {
     use super::*;
 
+    fn odd_moving(pose: Pose) -> MovingBelief {
+        let mut moving = MovingBelief {
+            pose,
+            velocity: Twist::from_vector(&Vector6::repeat(0.1)),
+            covariance: SMatrix::from_diagonal_element(1.0 / 3.0),
+        };
+        moving.covariance[(0, 11)] = 1.0 / 9.0;
+        moving.covariance[(11, 0)] = 1.0 / 9.0;
+        moving
+    }
+
     /// Oracle: the contract: a sealed state comes back bit by bit.
     #[test]
     fn a_state_comes_back_to_the_bit() {
@@ -481,13 +492,7 @@ mod tests {
             },
             &nalgebra::Matrix6::from_diagonal_element(1.0 / 7.0),
         );
-        let mut moving = MovingBelief {
-            pose: odd,
-            velocity: Twist::from_vector(&Vector6::repeat(0.1)),
-            covariance: SMatrix::from_diagonal_element(1.0 / 3.0),
-        };
-        moving.covariance[(0, 11)] = 1.0 / 9.0;
-        moving.covariance[(11, 0)] = 1.0 / 9.0;
+        let moving = odd_moving(odd);
 
         let state = State {
             room: Some(3),

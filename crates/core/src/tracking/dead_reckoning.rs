@@ -8,7 +8,7 @@ use ndarray::{ArrayView1, s};
 
 use super::health::Continuity;
 use super::moving::ReadMotion;
-use super::state::{Observation, State};
+use super::state::{Keyframe, Observation, State};
 use super::tracker::Tracker;
 use super::{Belief, MotionPrior, MovingBelief};
 use crate::adapter::MotionErrors;
@@ -91,19 +91,7 @@ impl Tracker {
         reading: MotionReading,
     ) -> Prediction {
         let Some(keyframe) = &state.keyframe else {
-            // The first frame is the origin of `odom`.
-            let origin = Belief::known(Pose::identity(), ORIGIN_DEVIATION, ORIGIN_DEVIATION);
-            let at = |pose: Belief| MovingBelief::at(pose, self.prior(state.room));
-            return Prediction {
-                motion: Twist::default(),
-                covariance: origin.covariance,
-                poses: Poses {
-                    odom: at(origin),
-                    map_pose: state.initial_pose.map(at),
-                    lasting: Matrix6::zeros(),
-                    reported_pose: state.initial_pose,
-                },
-            };
+            return self.origin(state);
         };
 
         let from = EarlierView {
@@ -126,32 +114,8 @@ impl Tracker {
             motion = body_twist(&keyframe.odom.pose, &last_odom);
         }
 
-        // Where readings are worth it, `odom` is read at every frame and with one gain: with a gain
-        // that grows with the time since the keyframe it would lag behind and jump. Else it stays.
+        let odom = self.carried_odom(state, keyframe, frame, reading);
         let errors = self.motion_errors(state.room);
-        let gain = errors.gain(self.error_model.longest_frames() as u64);
-        let is_read = reading == MotionReading::Complete && gain >= LEAST_GAIN;
-        let to_frame = To {
-            room: state.room,
-            frame,
-            is_read,
-        };
-        let mut odom = self.carried(&keyframe.odom, from, keyframe.time_ns, to_frame);
-        let read = self
-            .adapter()
-            .motion_without_mean(ArrayView1::from(from.latent), frame.latent.view());
-        odom.pose = match &state.last {
-            _ if is_read && read.is_unique_logarithm() => {
-                keyframe.odom.pose * exp(&read.scaled(gain))
-            }
-            Some(last) => last.odom.pose,
-            None => keyframe.odom.pose,
-        };
-        if reading != MotionReading::Complete {
-            let mut of_pose = odom.covariance.fixed_view_mut::<6, 6>(0, 0);
-            of_pose += self.error_model.unread_errors();
-        }
-
         let map_pose = state.place.as_ref().map(|place| {
             let from = EarlierView {
                 latent: &place.latent,
@@ -160,8 +124,9 @@ impl Tracker {
             let frames = frame.sequence.saturating_sub(place.sequence);
             let is_worth_it = errors.gain(frames) >= LEAST_GAIN;
             let to_frame = To {
+                room: state.room,
+                frame,
                 is_read: is_worth_it && reading == MotionReading::Complete,
-                ..to_frame
             };
             self.carried(&place.belief, from, place.time_ns, to_frame)
         });
@@ -182,6 +147,65 @@ impl Tracker {
                         .map(|belief| belief.moved(motion, &covariance)),
                 },
                 map_pose,
+            },
+        }
+    }
+
+    /// `odom` at this frame. Where readings are worth it, it is read at every frame and with one gain:
+    /// with a gain that grows with the time since the keyframe it would lag behind and jump. Else it
+    /// stays.
+    fn carried_odom(
+        &self,
+        state: &State,
+        keyframe: &Keyframe,
+        frame: &Observation,
+        reading: MotionReading,
+    ) -> MovingBelief {
+        let from = EarlierView {
+            latent: &keyframe.latent,
+            sequence: keyframe.sequence,
+        };
+        let errors = self.motion_errors(state.room);
+        let gain = errors.gain(self.error_model.longest_frames() as u64);
+        let is_read = reading == MotionReading::Complete && gain >= LEAST_GAIN;
+        let to_frame = To {
+            room: state.room,
+            frame,
+            is_read,
+        };
+
+        let mut odom = self.carried(&keyframe.odom, from, keyframe.time_ns, to_frame);
+        let read = self
+            .adapter()
+            .motion_without_mean(ArrayView1::from(from.latent), frame.latent.view());
+        odom.pose = match &state.last {
+            _ if is_read && read.is_unique_logarithm() => {
+                keyframe.odom.pose * exp(&read.scaled(gain))
+            }
+            Some(last) => last.odom.pose,
+            None => keyframe.odom.pose,
+        };
+
+        if reading != MotionReading::Complete {
+            let mut of_pose = odom.covariance.fixed_view_mut::<6, 6>(0, 0);
+            of_pose += self.error_model.unread_errors();
+        }
+        odom
+    }
+
+    /// The first frame, which is the origin of `odom`.
+    fn origin(&self, state: &State) -> Prediction {
+        let origin = Belief::known(Pose::identity(), ORIGIN_DEVIATION, ORIGIN_DEVIATION);
+        let at = |pose: Belief| MovingBelief::at(pose, self.prior(state.room));
+
+        Prediction {
+            motion: Twist::default(),
+            covariance: origin.covariance,
+            poses: Poses {
+                odom: at(origin),
+                map_pose: state.initial_pose.map(at),
+                lasting: Matrix6::zeros(),
+                reported_pose: state.initial_pose,
             },
         }
     }
