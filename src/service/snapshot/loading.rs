@@ -3,7 +3,7 @@
 //! - What did not change is taken over from the snapshot before, so that a reload costs what
 //!   changed and no more.
 //! - A room or an adapter that cannot be loaded is refused by itself. If an older revision of it is
-//!   being served, that goes on.
+//!   being served, that goes on; where rooms are not loaded ahead, as far as the manifest tells.
 //! - A revision that is damaged is not tried again, unless that is asked for. One that could not be
 //!   read is tried at every look.
 
@@ -355,9 +355,11 @@ fn is_up_to_date(
     }
 
     let in_room = room.refused_adapters();
+    let of_room = room.refusal();
+    let mut refusals = in_room.values().chain(&of_room);
     match refused {
-        Refused::TryAgain => in_room.is_empty() && room.refusal().is_none(),
-        Refused::LeaveOut => !in_room.values().any(|refusal| refusal.may_pass),
+        Refused::TryAgain => refusals.next().is_none(),
+        Refused::LeaveOut => !refusals.any(|refusal| refusal.may_pass),
     }
 }
 

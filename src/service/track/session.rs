@@ -118,14 +118,20 @@ impl Session {
             room,
             last,
             keyframe,
+            place,
             recent,
             candidate,
-            ..
+            initial_pose: _,
+            health: _,
+            frames_off_map: _,
+            unchanged_frames: _,
+            corrected_ns: _,
         } = &self.state;
 
         let latents = [
             last.as_ref().map(|last| &last.latent),
             keyframe.as_ref().map(|keyframe| &keyframe.latent),
+            place.as_ref().map(|place| &place.latent),
             candidate.as_ref().map(|candidate| &candidate.latent),
         ];
 

@@ -245,7 +245,10 @@ impl AnchorModel {
         };
 
         // A size that is not one is answered with the largest errors, the safe answer.
-        if size.is_nan() || size >= last.size {
+        if size.is_nan() {
+            return scaled(last, MOST_GROWTH);
+        }
+        if size >= last.size {
             return scaled(last, (size / last.size).clamp(1.0, MOST_GROWTH));
         }
         if size <= first.size {

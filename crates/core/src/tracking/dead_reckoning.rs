@@ -12,7 +12,7 @@ use super::state::{Keyframe, Observation, State};
 use super::tracker::Tracker;
 use super::{Belief, MotionPrior, MovingBelief};
 use crate::adapter::MotionErrors;
-use crate::geometry::{Pose, Twist, body_twist, exp};
+use crate::geometry::{Pose, Twist, adjoint, body_twist, exp};
 
 /// The deviation of a stream's own origin, metres and radians: it is zero by definition, but a
 /// covariance has to be positive definite.
@@ -22,6 +22,9 @@ const ORIGIN_DEVIATION: f64 = 1e-6;
 /// believed: with less, how cameras move tells more, and a reading that shrinks every motion would
 /// stop the camera.
 const LEAST_GAIN: f64 = 0.5;
+
+/// Longer pauses than this say no more of where a camera may be, seconds: a day.
+const LONGEST_PAUSE_S: f64 = 86_400.0;
 
 /// How much of the motion before a frame was seen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -131,8 +134,12 @@ impl Tracker {
             self.carried(&place.belief, from, place.time_ns, to_frame)
         });
 
-        let lasting = state.place.as_ref().map(|place| place.lasting);
-        let lasting = lasting.unwrap_or_else(Matrix6::zeros);
+        // An error is carried to the new body frame by the adjoint of the motion since then.
+        let lasting = state.place.as_ref().zip(map_pose.as_ref());
+        let lasting = lasting.map_or_else(Matrix6::zeros, |(place, now)| {
+            let back = adjoint(&now.pose.inv_mul(&place.belief.pose));
+            back * place.lasting * back.transpose()
+        });
 
         Prediction {
             motion,
@@ -229,7 +236,7 @@ impl Tracker {
             ReadMotion { motion, covariance }
         });
 
-        let seconds = frame.time_ns.abs_diff(from_ns) as f64 * 1e-9;
+        let seconds = (frame.time_ns.abs_diff(from_ns) as f64 * 1e-9).min(LONGEST_PAUSE_S);
         belief.moved(self.prior(room), seconds, read.as_ref())
     }
 

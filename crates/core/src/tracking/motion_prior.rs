@@ -232,6 +232,9 @@ fn duration(
     if correlation.is_nan() || correlation <= 0.0 {
         return least;
     }
+    if correlation >= 1.0 {
+        return most;
+    }
     (-seconds / correlation.ln()).clamp(least, most)
 }
 

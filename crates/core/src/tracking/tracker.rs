@@ -274,8 +274,10 @@ impl Tracker {
             .map_or(frame.sequence, |keyframe| keyframe.sequence);
         let believed = poses.map_pose.as_ref().unwrap_or(&poses.odom);
         let velocity = state.last.as_ref().map(|_| believed.velocity);
-        let is_keyframe = self.is_keyframe_due(state, frame.sequence, &prediction);
-        let is_place = correction.is_applied || self.is_place_old(state, frame.sequence);
+        // Motions cannot be read from a blank image.
+        let shows = sight != Sight::Nothing || state.keyframe.is_none();
+        let is_keyframe = shows && self.is_keyframe_due(state, frame.sequence, &prediction);
+        let is_place = shows && (correction.is_applied || self.is_place_old(state, frame.sequence));
         remember(state, frame, &poses, is_keyframe, is_place);
 
         // 6. The answer. The status judges the reported pose, but only while the filter still
