@@ -249,8 +249,8 @@ impl Snapshot {
     /// empty. Loads the room if it is not in memory: only for threads that may block.
     ///
     /// # Errors
-    /// As [`Snapshot::room`], [`ServedRoom::load`] and [`Snapshot::adapter`]; [`Error::Precondition`]
-    /// if the adapter does not fit the room, or none does.
+    /// As [`Snapshot::room`] and [`Snapshot::adapter`]; [`Error::Precondition`] if the room cannot be
+    /// loaded, the adapter does not fit it, or none does.
     pub fn navigator(&self, room: &str, adapter: &str) -> Result<Arc<ServedNavigator>, Error> {
         let served = self.room(room)?;
 
