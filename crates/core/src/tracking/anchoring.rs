@@ -93,6 +93,7 @@ impl Tracker {
         } else {
             1.0
         };
+
         CountedAnchor {
             belief: Belief {
                 covariance: belief.covariance * inflation,
@@ -118,6 +119,7 @@ impl Tracker {
         counted: CountedAnchor,
     ) -> Correction {
         let anchor = counted.belief;
+
         // While a stream is lost no place is a candidate. Frames that miss the room or match
         // several rooms do not come here, so that anchors "in a row" may have such frames between
         // them.

@@ -24,7 +24,7 @@ const ORIGIN_DEVIATION: f64 = 1e-6;
 const LEAST_GAIN: f64 = 0.5;
 
 /// Longer pauses than this say no more of where a camera may be, seconds: a day.
-const LONGEST_PAUSE_S: f64 = 86_400.0;
+const LONGEST_CARRY_S: f64 = 86_400.0;
 
 /// How much of the motion before a frame was seen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -236,7 +236,7 @@ impl Tracker {
             ReadMotion { motion, covariance }
         });
 
-        let seconds = (frame.time_ns.abs_diff(from_ns) as f64 * 1e-9).min(LONGEST_PAUSE_S);
+        let seconds = (frame.time_ns.abs_diff(from_ns) as f64 * 1e-9).min(LONGEST_CARRY_S);
         belief.moved(self.prior(room), seconds, read.as_ref())
     }
 

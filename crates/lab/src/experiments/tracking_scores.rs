@@ -15,7 +15,7 @@ const WRONG_BEYOND_DEG: f64 = 15.0;
 pub struct TrackingScores {
     /// Absolute errors of position over the frames with a map pose, metres.
     pub ape: AnswerErrors,
-    /// The same errors of the nearest frame, standing still and so on as rotations, radians.
+    /// Absolute errors of rotation over the same frames, radians.
     pub turn: AnswerErrors,
     /// Squared Mahalanobis lengths of the errors of map poses that were TRACKING.
     pub tracking_surprises: Vec<f64>,
