@@ -331,4 +331,15 @@ mod tests {
         let few = MotionPrior::of_path(&room, &mapped[..10]);
         assert_eq!(few, MotionPrior::assumed());
     }
+
+    /// Oracle: the definition: a velocity that never changes lasts as long as any may.
+    #[test]
+    fn a_constant_velocity_lasts() {
+        let twist = Twist {
+            linear: Vector3::x() * 0.25,
+            angular: Vector3::zeros(),
+        };
+        let steps = vec![Some((0.5, twist)); 40];
+        assert_eq!(duration(&steps, 4, 0.2, |twist| twist.linear), 5.0);
+    }
 }
