@@ -252,7 +252,7 @@ fn say_encoded(encoded: &Encoded, sources: &[FeatureSource], seconds: f64) {
 }
 
 /// The folder that the room's image paths start from: `given`, or where the images were at import.
-fn images_root(room: &Room, given: Option<&Path>) -> anyhow::Result<PathBuf> {
+pub(super) fn images_root(room: &Room, given: Option<&Path>) -> anyhow::Result<PathBuf> {
     if room.images().is_empty() {
         bail!(crate::encoder::Error::NoImages {
             room: room.id().to_string()

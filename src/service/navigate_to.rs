@@ -1,4 +1,7 @@
-//! NavigationService.NavigateTo: walks frame by frame to a goal and sends feedback after each step.
+//! NavigationService.NavigateTo: plans a way to a goal, frame by frame, and sends feedback after each
+//! step.
+//!
+//! The default is the shortest way over the room's poses; the paper's latent way is on request.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -23,7 +26,11 @@ use seese3_core::geometry::Pose;
 use seese3_core::navigation::{
     Error as E, Feedback, Navigator, Outcome, Pursuit, Source, Start, Stepper, pursue,
 };
+use seese3_core::planning::{
+    BelievedStart, Hops, KnownRoom, NoRoute, Planned, Route, RouteBounds, StartUnknown, plan,
+};
 use seese3_core::room::FrameId;
+use seese3_core::tracking::{Belief, PoseReader};
 
 /// The stream of feedback events and the final result.
 pub type Events = Pin<Box<dyn Stream<Item = Result<pb::NavigateToResponse, Status>> + Send>>;
@@ -31,9 +38,21 @@ pub type Events = Pin<Box<dyn Stream<Item = Result<pb::NavigateToResponse, Statu
 /// A checked request: everything that a pursuit needs.
 struct Ready {
     served: Arc<ServedNavigator>,
-    start: Start,
+    /// The view, with the pose that it is believed to have.
+    view: Start,
+    start: BelievedStart,
     goal: Pose,
     pursuit: Pursuit,
+    hops: Hops,
+    planner: pb::Planner,
+}
+
+/// How a planning ended.
+enum Ended {
+    /// A walk in latent space.
+    Walked(Outcome),
+    /// A way over poses; of its hops as many were sent as are allowed.
+    Planned(Planned),
 }
 
 impl Handlers {
@@ -81,17 +100,12 @@ impl Handlers {
         let begun = Instant::now();
 
         let work = move |cancel: &Cancellation| {
-            let Ready {
-                served,
-                start,
-                goal,
-                pursuit,
-            } = ready;
-
-            let stepper = Stepper::InversePoincare(Reading::Homogeneous);
-
+            let start = start_to_wire(&ready.start, &ready.served);
             let mut each = |feedback: Feedback| {
-                let feedback = feedback_to_wire(&feedback, &served, begun);
+                let mut feedback = feedback_to_wire(&feedback, &ready.served, begun);
+                if feedback.current_step == 0 {
+                    feedback.start = Some(start.clone());
+                }
 
                 // An error means that the caller has gone away; the `select!` below then cancels
                 // the work.
@@ -100,17 +114,8 @@ impl Handlers {
                 }));
             };
 
-            let outcome = pursue(
-                &served.navigator,
-                &stepper,
-                start,
-                &goal,
-                pursuit,
-                cancel,
-                &mut each,
-            )?;
-
-            Ok(result_to_wire(outcome, &served))
+            let ended = ready.plan(cancel, &mut each)?;
+            Ok(result_to_wire(&ended, &ready))
         };
 
         // If the caller closes the stream, `run` is dropped, which cancels the pursuit.
@@ -126,6 +131,49 @@ impl Handlers {
 
         // If this fails, the caller has gone away and nobody needs the result.
         let _ = heard.send(last).await;
+    }
+}
+
+impl Ready {
+    /// Plans the way; `each` hears of every step.
+    fn plan(&self, cancel: &Cancellation, each: &mut dyn FnMut(Feedback)) -> Result<Ended, Error> {
+        if self.planner == pb::Planner::Latent {
+            let stepper = Stepper::InversePoincare(Reading::Homogeneous);
+            let outcome = pursue(
+                &self.served.navigator,
+                &stepper,
+                self.view.clone(),
+                &self.goal,
+                self.pursuit,
+                cancel,
+                each,
+            )?;
+
+            return Ok(Ended::Walked(outcome));
+        }
+
+        let navigator = &self.served.navigator;
+        let bounds = RouteBounds {
+            hops: self.hops,
+            tolerance_m: self.pursuit.tolerance_m,
+            tolerance_rad: self.pursuit.tolerance_rad,
+        };
+        let planned = plan(navigator, &self.start, &self.goal, bounds, cancel).map_err(E::from)?;
+
+        // Where nothing is planned, it is still told where the camera is believed to be.
+        let nowhere = Route::default();
+        let route = match &planned {
+            Planned::Way { route, .. } => route,
+            Planned::StartUnknown(_) | Planned::NoRoute(_) => &nowhere,
+        };
+        let latent = self.view.latent.view();
+        route
+            .feedback(navigator, latent, &self.start.pose, &self.goal)
+            .into_iter()
+            .take(self.pursuit.steps as usize + 1)
+            .for_each(each);
+
+        Ok(Ended::Planned(planned))
     }
 }
 
@@ -146,7 +194,11 @@ fn ready(
         tolerance_rad,
         max_steps,
         max_recoveries,
+        planner,
     } = request;
+
+    let planner = pb::Planner::try_from(planner)
+        .map_err(|_| Error::invalid("planner", format!("has no value {planner}")))?;
 
     let served = snapshot.navigator(&room, &adapter)?;
     let navigator = &served.navigator;
@@ -164,23 +216,19 @@ fn ready(
         ));
     }
 
-    let mut start = navigator
+    let mut view = navigator
         .start(&source, pose)
         .map_err(|error| match error {
             E::Adapter(problem) => view_error(&problem).within("source"),
             other => Error::from(other),
         })?;
 
-    // The distance to the goal needs a start pose. A view that was sent without one is placed at
-    // its nearest stored frame.
-    start.pose = start.pose.or_else(|| {
-        navigator
-            .nearest(start.latent.view(), 1)
-            .first()
-            .map(|frame| frame.pose)
-    });
+    let start = believed_start(&served, &source, &view);
+    view.pose = Some(start.pose);
 
     let goal = goal_pose(goal, navigator, &room)?;
+    let own_step = Pursuit::of(navigator).step;
+    let hops = step.map_or(Hops::Preferably(own_step), Hops::AtMost);
     let pursuit = bounds(
         Pursuit::of(navigator),
         Asked {
@@ -195,10 +243,32 @@ fn ready(
 
     Ok(Ready {
         served,
+        view,
         start,
         goal,
         pursuit,
+        hops,
+        planner,
     })
+}
+
+/// Where the camera is believed to be: at its recorded or given pose, else where the view tells.
+fn believed_start(served: &ServedNavigator, source: &Source, view: &Start) -> BelievedStart {
+    let reader = served.room_reader().map(|reader| reader as &dyn PoseReader);
+    let room = KnownRoom {
+        navigator: &served.navigator,
+        map: served.map.as_deref(),
+        reader,
+    };
+
+    match (source, view.pose) {
+        (Source::Frame(_), Some(pose)) => BelievedStart::recorded(pose),
+        (_, Some(pose)) => BelievedStart::given(pose, room, view.latent.view()),
+        (Source::Feature(feature), None) => {
+            BelievedStart::seen(room, view.latent.view(), Some(feature))
+        }
+        (_, None) => BelievedStart::seen(room, view.latent.view(), None),
+    }
 }
 
 /// Both kinds of goal, as one pose in the room's world.
@@ -268,6 +338,7 @@ fn feedback_to_wire(
     let Feedback {
         step,
         frame,
+        motion,
         remaining,
         recoveries,
     } = feedback;
@@ -281,29 +352,106 @@ fn feedback_to_wire(
         rotation_remaining_rad: remaining.rotation_rad,
         number_of_recoveries: *recoveries,
         navigation_time_ns: u64::try_from(begun.elapsed().as_nanos()).unwrap_or(u64::MAX),
+        motion: Some(convert::twist_to_wire(motion)),
+        start: None,
     }
 }
 
-fn result_to_wire(outcome: Outcome, served: &ServedNavigator) -> pb::NavigateToResult {
-    let (outcome, message) = match outcome {
-        Outcome::Reached => (
-            pb::NavigateToOutcome::Reached,
-            "the last frame is within the tolerance",
-        ),
-        Outcome::Stuck => (
+fn start_to_wire(start: &BelievedStart, served: &ServedNavigator) -> pb::StartOfWay {
+    let room = served.navigator.room().id().as_str();
+    let covariance = start.covariance.map(|covariance| {
+        let belief = Belief {
+            pose: start.pose,
+            covariance,
+        };
+        convert::matrix_to_wire(&belief.ros_covariance())
+    });
+
+    pb::StartOfWay {
+        pose: Some(convert::pose_to_wire(&start.pose, room)),
+        pose_covariance: covariance.unwrap_or_default(),
+        out_of_distribution: start.out_of_distribution,
+    }
+}
+
+fn result_to_wire(ended: &Ended, ready: &Ready) -> pb::NavigateToResult {
+    let mut result = pb::NavigateToResult {
+        room: Some(convert::room_revision(&ready.served)),
+        adapter: Some(convert::adapter_revision(&ready.served)),
+        ..Default::default()
+    };
+
+    let most = ready.pursuit.steps as usize;
+    let (outcome, message) = match ended {
+        Ended::Walked(Outcome::Reached) => reached(),
+        Ended::Walked(Outcome::Spent) => steps_spent(),
+        Ended::Walked(Outcome::Stuck) => (
             pb::NavigateToOutcome::Stuck,
-            "no matching frame is nearer to the goal: the room may not be mapped in between",
+            "no matching frame is nearer to the goal; PLANNER_POSE_GRAPH may find a way".to_owned(),
         ),
-        Outcome::Spent => (
-            pb::NavigateToOutcome::StepsSpent,
-            "the limit of steps was reached; allow more with max_steps",
+        Ended::Planned(Planned::Way { route, .. }) if route.frames.len() > most => steps_spent(),
+        Ended::Planned(Planned::Way {
+            arrival_probability,
+            ..
+        }) => {
+            result.arrival_probability = *arrival_probability;
+            reached()
+        }
+        Ended::Planned(Planned::StartUnknown(why)) => {
+            (pb::NavigateToOutcome::StartUnknown, start_unknown(why))
+        }
+        Ended::Planned(Planned::NoRoute(NoRoute::HopTooLong { needed })) => {
+            result.needed_step = Some(*needed);
+            (
+                pb::NavigateToOutcome::Stuck,
+                format!(
+                    "every way has a hop longer than step, {:.3}; with {needed:.3} there is one",
+                    ready.pursuit.step
+                ),
+            )
+        }
+        Ended::Planned(Planned::NoRoute(NoRoute::GoalNotMapped { nearest, off })) => (
+            pb::NavigateToOutcome::GoalNotMapped,
+            format!(
+                "frame {nearest} is nearest to the goal, {:.2} m and {:.1} degrees off",
+                off.translation_m,
+                off.rotation_rad.to_degrees()
+            ),
         ),
     };
 
-    pb::NavigateToResult {
-        room: Some(convert::room_revision(served)),
-        adapter: Some(convert::adapter_revision(served)),
-        outcome: outcome as i32,
-        message: message.to_owned(),
+    result.set_outcome(outcome);
+    result.message = message;
+    result
+}
+
+fn reached() -> (pb::NavigateToOutcome, String) {
+    (
+        pb::NavigateToOutcome::Reached,
+        "the last frame is within the tolerance".to_owned(),
+    )
+}
+
+fn steps_spent() -> (pb::NavigateToOutcome, String) {
+    (
+        pb::NavigateToOutcome::StepsSpent,
+        "the limit of steps was reached; allow more with max_steps".to_owned(),
+    )
+}
+
+fn start_unknown(why: &StartUnknown) -> String {
+    match why {
+        StartUnknown::FarFromRoom {
+            out_of_distribution,
+        } => format!(
+            "the source is {out_of_distribution:.2} times as far from the room as its limit; \
+             send another view, or source_pose"
+        ),
+        StartUnknown::Unsure {
+            arrival_probability,
+        } => format!(
+            "the source does not tell well enough where the camera is: it would arrive with a \
+             probability of {arrival_probability:.2}; send another view, or source_pose"
+        ),
     }
 }

@@ -49,6 +49,7 @@ mod kitchen;
 mod layering;
 mod multi_step;
 mod navigation;
+mod planning;
 mod probes;
 mod scores;
 mod store;

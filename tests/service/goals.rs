@@ -4,10 +4,12 @@ use seese3::service::Config;
 use seese3_client::convert;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::navigate_to_request::Goal;
-use seese3_core::geometry::PoseError;
+use seese3_core::geometry::{PoseError, Twist, exp};
 use tonic::Code;
 
 use crate::harness::{feature, features_of, frame, room_of, start};
+use crate::support::world::served;
+use crate::tracking::start_followed;
 
 fn question(source: Option<pb::View>, goal: Goal) -> pb::NavigateToRequest {
     pb::NavigateToRequest {
@@ -61,7 +63,110 @@ async fn a_goal_is_reached_frame_by_frame() {
         }
     }
 
-    assert!(reached >= 3, "{reached} of 4 goals were reached");
+    assert_eq!(
+        reached, 4,
+        "a recording is a way from each of its frames to each other"
+    );
+}
+
+/// Oracle: composition: the start moved by the motions of all steps is the pose of the last frame, and
+/// no motion is longer than the step that was asked for. What cannot be reached in such steps can be
+/// in steps as long as the answer says.
+#[tokio::test]
+async fn a_way_is_driven_by_its_motions() {
+    let server = start(Config::default()).await;
+    let room = room_of("synthetic", "synthetic");
+    let goal = 300;
+    let ask = async |step: Option<f64>| {
+        let asked = pb::NavigateToRequest {
+            step,
+            ..question(frame(10), Goal::GoalFrameId(goal))
+        };
+        let mut steps = Vec::new();
+        let result = server
+            .client
+            .navigate_to(asked, |step| steps.push(step))
+            .await
+            .unwrap();
+        (result, steps)
+    };
+
+    let (stuck, steps) = ask(Some(1e-3)).await;
+    assert_eq!(
+        stuck.outcome(),
+        pb::NavigateToOutcome::Stuck,
+        "{}",
+        stuck.message
+    );
+    assert_eq!(steps.len(), 1, "the start alone");
+    let needed = stuck.needed_step.unwrap();
+
+    let (shorter, _) = ask(Some(needed * 0.999)).await;
+    assert_eq!(shorter.outcome(), pb::NavigateToOutcome::Stuck);
+
+    let (found, steps) = ask(Some(needed)).await;
+    assert_eq!(
+        found.outcome(),
+        pb::NavigateToOutcome::Reached,
+        "{}",
+        found.message
+    );
+    assert_eq!(found.needed_step, None);
+
+    let begun = steps[0].start.clone().unwrap();
+    let mut at = convert::pose(&begun.pose.unwrap()).unwrap();
+    let begins = PoseError::between(&at, &room.poses()[10]);
+    assert!(begins.translation_m < 1e-12 && begins.rotation_rad < 1e-7);
+    assert!(begun.pose_covariance.is_empty() && begun.out_of_distribution.is_none());
+    for step in &steps[1..] {
+        let motion = convert::twist(&step.motion.unwrap()).unwrap();
+        let motion = Twist {
+            linear: motion.linear,
+            angular: motion.angular,
+        };
+        assert!(motion.norm() <= needed && step.start.is_none());
+        at *= exp(&motion);
+    }
+    let last = steps.last().unwrap().current.clone().unwrap();
+    let error = PoseError::between(&at, &room.poses()[last.frame_id as usize]);
+    assert!(
+        error.translation_m < 1e-9 && error.rotation_rad < 1e-9,
+        "{error:?}"
+    );
+}
+
+/// Oracle: the definitions: a goal beside no frame, and a planner that does not exist.
+#[tokio::test]
+async fn a_goal_has_to_be_mapped() {
+    let server = start(Config::default()).await;
+    let room = room_of("synthetic", "synthetic");
+    let mut far = room.poses()[0];
+    far.translation.vector.x += 100.0;
+    let nowhere = convert::pose_to_wire(&far, "rooms/synthetic", "");
+
+    let result = server
+        .client
+        .navigate_to(question(frame(10), Goal::GoalPose(nowhere)), |_| ())
+        .await
+        .unwrap();
+    assert_eq!(result.outcome(), pb::NavigateToOutcome::GoalNotMapped);
+    assert!(
+        result.message.contains("nearest to the goal"),
+        "{}",
+        result.message
+    );
+
+    let unknown = pb::NavigateToRequest {
+        planner: 77,
+        ..question(frame(1), Goal::GoalFrameId(2))
+    };
+    let error = server
+        .client
+        .navigate_to(unknown, |_| ())
+        .await
+        .unwrap_err();
+    assert_eq!(error.code(), Some(Code::InvalidArgument));
+    assert!(error.to_string().contains("planner"), "{error}");
 }
 
 /// Oracle: the definition: the first recovery is the last step where none is allowed, and a pursuit
@@ -76,6 +181,7 @@ async fn a_pursuit_recovers_as_often_as_it_may() {
         for max_recoveries in [0, 50] {
             let asked = pb::NavigateToRequest {
                 max_recoveries: Some(max_recoveries),
+                planner: pb::Planner::Latent as i32,
                 ..question(frame(from), Goal::GoalFrameId(to))
             };
             let mut recoveries = Vec::new();
@@ -120,6 +226,7 @@ async fn a_pursuit_ends_at_its_bounds() {
 
     let asked = pb::NavigateToRequest {
         max_steps: Some(1),
+        step: Some(0.2),
         tolerance_m: Some(1e-6),
         tolerance_rad: Some(1e-6),
         ..question(frame(10), Goal::GoalFrameId(300))
@@ -216,4 +323,56 @@ async fn a_pursuit_ends_at_its_bounds() {
             "{error} does not say {word}"
         );
     }
+}
+
+/// Oracle: the worlds of the test: an attic is not the hall, and a frame of the hall stands where it was
+/// recorded.
+#[tokio::test]
+async fn a_view_that_tells_no_place_starts_no_way() {
+    let server = start_followed(Config::default()).await;
+    let ask = async |room_seen: &str, source_pose: Option<pb::Pose>| {
+        let asked = pb::NavigateToRequest {
+            room: "hall".to_owned(),
+            source: feature(served(room_seen).1.rows().row(40).to_vec()),
+            source_pose,
+            goal: Some(Goal::GoalFrameId(120)),
+            ..Default::default()
+        };
+        let mut steps = Vec::new();
+        let result = server
+            .client
+            .navigate_to(asked, |step| steps.push(step))
+            .await
+            .unwrap();
+        (result, steps)
+    };
+
+    let (own, steps) = ask("hall", None).await;
+    assert_eq!(
+        own.outcome(),
+        pb::NavigateToOutcome::Reached,
+        "{}",
+        own.message
+    );
+    let probability = own.arrival_probability.unwrap();
+    assert!((0.2..=1.0).contains(&probability), "{probability}");
+
+    let begun = steps[0].start.clone().unwrap();
+    assert_eq!(begun.pose_covariance.len(), 36);
+    assert!(begun.out_of_distribution.unwrap() <= 1.0);
+    let pose = convert::pose(&begun.pose.unwrap()).unwrap();
+    let off = PoseError::between(&pose, &served("hall").0.poses()[40]);
+    assert!(off.translation_m < 0.05, "{off:?}");
+
+    let (other, steps) = ask("attic", None).await;
+    assert_eq!(other.outcome(), pb::NavigateToOutcome::StartUnknown);
+    assert_eq!(steps.len(), 1, "nothing is planned");
+    assert!(other.message.contains("source"), "{}", other.message);
+
+    // The caller may know better.
+    let given = convert::pose_to_wire(&served("hall").0.poses()[40], "rooms/hall", "");
+    let (given, steps) = ask("attic", Some(given)).await;
+    assert_eq!(given.outcome(), pb::NavigateToOutcome::Reached);
+    assert_eq!(given.arrival_probability, None);
+    assert!(steps[0].start.clone().unwrap().out_of_distribution.unwrap() > 1.0);
 }

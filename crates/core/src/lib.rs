@@ -80,6 +80,7 @@
 //! | [`navigation`] | from a frame and a motion to the frames that follow |
 //! | [`localization`] | from a view to the frames that look like it |
 //! | [`tracking`] | a camera followed frame by frame, with covariances |
+//! | [`planning`] | a way from a view to a goal, over a room's frames |
 //! | [`calibration`] | how large an adapter's errors are in rooms that it did not learn from |
 //! | [`fitting`] | an adapter fitted to one mapped room, and single views located in it |
 //! | [`two_view`] | the motion between two views from where things are in both images |
@@ -105,6 +106,7 @@ pub mod training;
 pub mod navigation;
 pub mod localization;
 pub mod tracking;
+pub mod planning;
 pub mod calibration;
 pub mod fitting;
 pub mod two_view;

@@ -4,6 +4,8 @@
 mod localization;
 mod motion;
 mod odometry;
+mod planning;
+mod robustness;
 mod trajectory;
 
 use std::path::PathBuf;
@@ -51,6 +53,12 @@ enum What {
     Localization(localization::Localization),
     /// Read the motion between two views of a room, beside no motion and the mean motion
     Motion(motion::Motion),
+    /// Plan ways from unmapped views to mapped goals, beside greedy search, a pose graph and a
+    /// topological graph
+    Planning(planning::Planning),
+    /// Track held-out frames whose images are turned, blurred, darkened, hidden, frozen or thinned
+    /// out, beside the nearest frame and standing still
+    Robustness(robustness::Robustness),
     /// APE and RPE of an estimated trajectory against the true one, as evo defines them
     Trajectory(trajectory::EvaluateTrajectory),
 }
@@ -61,6 +69,8 @@ impl Evaluate {
             (Some(What::Odometry(odometry)), _) => odometry.run().await,
             (Some(What::Localization(localization)), _) => localization.run().await,
             (Some(What::Motion(motion)), _) => motion.run().await,
+            (Some(What::Planning(planning)), _) => planning.run().await,
+            (Some(What::Robustness(robustness)), _) => robustness.run().await,
             (Some(What::Trajectory(trajectory)), _) => trajectory.run(),
             (None, Some(navigation)) => navigation.run().await,
             (None, None) => {

@@ -39,6 +39,8 @@ pub struct Feedback {
     /// The frame chosen last, which is what the camera would see; `None` until a step has chosen
     /// one.
     pub frame: Option<RetrievedFrame>,
+    /// The motion of the step, in the body frame of the camera before it; zero if it found no frame.
+    pub motion: Twist,
     /// The error that remains between the camera's pose and the goal.
     pub remaining: PoseError,
     /// Steps so far whose nearest frame was no progress, so that another frame or a shorter motion
@@ -91,6 +93,7 @@ pub fn pursue(
     each(Feedback {
         step: 0,
         frame: None,
+        motion: Twist::default(),
         remaining: PoseError::between(&pose, goal),
         recoveries,
     });
@@ -108,13 +111,7 @@ pub fn pursue(
         }
 
         if step > pursuit.steps {
-            // If the last attempts were halved motions, there was no way on; otherwise the goal is
-            // only too far for this many steps.
-            return Ok(if halvings > 0 {
-                Outcome::Stuck
-            } else {
-                Outcome::Spent
-            });
+            return Ok(out_of_steps(halvings));
         }
 
         cancel.check()?;
@@ -137,6 +134,7 @@ pub fn pursue(
         // attempt asks for half the motion.
         match chosen {
             Some(frame) => {
+                let motion = body_twist(&pose, &frame.pose);
                 pose = frame.pose;
                 halvings = 0;
                 at = Some(*frame);
@@ -151,6 +149,7 @@ pub fn pursue(
                 each(Feedback {
                     step,
                     frame: at,
+                    motion,
                     remaining: PoseError::between(&pose, goal),
                     recoveries,
                 });
@@ -161,12 +160,23 @@ pub fn pursue(
                 each(Feedback {
                     step,
                     frame: at,
+                    motion: Twist::default(),
                     remaining,
                     recoveries,
                 });
             }
             None => return Ok(Outcome::Stuck),
         }
+    }
+}
+
+/// If the last attempts were halved motions, there was no way on; otherwise the goal is only too far
+/// for so many steps.
+fn out_of_steps(halvings: u32) -> Outcome {
+    if halvings > 0 {
+        Outcome::Stuck
+    } else {
+        Outcome::Spent
     }
 }
 
@@ -223,7 +233,7 @@ fn progress<'a>(
 
 impl Pursuit {
     /// Whether a camera this far from the goal has reached it.
-    fn is_reached(&self, remaining: &PoseError) -> bool {
+    pub fn is_reached(&self, remaining: &PoseError) -> bool {
         remaining.translation_m <= self.tolerance_m && remaining.rotation_rad <= self.tolerance_rad
     }
 

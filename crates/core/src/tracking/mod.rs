@@ -31,7 +31,10 @@ pub use map::{Map, MapMatch, PoseReader};
 pub use motion_prior::{ASSUMED_PERIOD_S, MotionPrior};
 pub use moving::MovingBelief;
 pub use relocalize::{ROOM_RATIO, Relocalization, RoomMatch, relocalize};
-pub use replay::{InitialPose, MapPath, MotionSurprise, Replay, Segment, replay, replay_streams};
+pub use replay::{
+    InitialPose, MapPath, MotionSurprise, Played, Replay, Segment, joined, period_ns, replay,
+    replay_frames, replay_streams,
+};
 pub use state::{Candidate, Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
 pub use tracker::{Tracker, TrackerSettings};
 pub use view::{View, motion};

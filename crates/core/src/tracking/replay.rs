@@ -16,7 +16,7 @@ const FOUND_WITHIN_M: f64 = 0.5;
 const FOUND_WITHIN_DEG: f64 = 15.0;
 
 /// Some frames of a recording.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Segment<'a> {
     /// Latents of the whole recording under the tracker's adapter, row by frame, shape (n, k).
     pub latents: ArrayView2<'a, f64>,
@@ -26,6 +26,15 @@ pub struct Segment<'a> {
     pub poses: &'a [Pose],
     /// The frames to replay, in order.
     pub frames: &'a [FrameId],
+}
+
+/// One frame of a stream to replay.
+#[derive(Debug, Clone)]
+pub struct Played {
+    /// What the tracker is given.
+    pub frame: Observation,
+    /// Where the camera truly is, `world_from_camera`.
+    pub truth: Pose,
 }
 
 /// What a tracker is told at the beginning of a stream.
@@ -58,13 +67,7 @@ pub fn replay(
     period_ns: i64,
     initial_pose: InitialPose,
 ) -> Replay {
-    let mut state = start(tracker, segments, initial_pose);
-    let mut found = Replay {
-        truth: Trajectory::default(),
-        sequences: Vec::new(),
-        updates: Vec::new(),
-        beginnings: vec![0],
-    };
+    let mut frames = Vec::new();
 
     let mut sequence: u64 = 0;
     for segment in segments {
@@ -75,23 +78,41 @@ pub fn replay(
             previous = Some(frame);
 
             let time_ns = sequence as i64 * period_ns;
-            let observation = Observation {
-                time_ns,
-                sequence,
-                latent: segment.latents.row(frame.row()).to_owned(),
-                feature: segment
-                    .features
-                    .map(|features| features.row(frame.row()).to_vec()),
-                is_blank: false,
-            };
+            frames.push(Played {
+                frame: Observation {
+                    time_ns,
+                    sequence,
+                    latent: segment.latents.row(frame.row()).to_owned(),
+                    feature: segment
+                        .features
+                        .map(|features| features.row(frame.row()).to_vec()),
+                    is_blank: false,
+                },
+                truth: segment.poses[frame.row()],
+            });
+        }
+    }
 
-            // These are latents of the tracker's own adapter, in order: it refuses none.
-            if let Ok(update) = tracker.observe(&mut state, &observation) {
-                found.truth.times_ns.push(time_ns);
-                found.truth.poses.push(segment.poses[frame.row()]);
-                found.sequences.push(sequence);
-                found.updates.push(update);
-            }
+    replay_frames(tracker, &frames, initial_pose)
+}
+
+/// Replays a stream frame by frame.
+pub fn replay_frames(tracker: &Tracker, frames: &[Played], initial_pose: InitialPose) -> Replay {
+    let mut state = start(tracker, frames, initial_pose);
+    let mut found = Replay {
+        truth: Trajectory::default(),
+        sequences: Vec::new(),
+        updates: Vec::new(),
+        beginnings: vec![0],
+    };
+
+    for Played { frame, truth } in frames {
+        // A frame of another adapter, or out of order, is refused and left out.
+        if let Ok(update) = tracker.observe(&mut state, frame) {
+            found.truth.times_ns.push(frame.time_ns);
+            found.truth.poses.push(*truth);
+            found.sequences.push(frame.sequence);
+            found.updates.push(update);
         }
     }
 
@@ -106,6 +127,25 @@ pub fn replay_streams(
     room: &Room,
     initial_pose: InitialPose,
 ) -> Replay {
+    let same_sequence = |a: &FrameId, b: &FrameId| room.timeline().joins(*a, *b);
+    let streams = segment.frames.chunk_by(same_sequence).map(|frames| {
+        let stream = Segment {
+            frames,
+            ..segment.clone()
+        };
+        let period_ns = period_ns(room, frames);
+        (
+            replay(tracker, &[stream], period_ns, initial_pose),
+            period_ns,
+        )
+    });
+
+    joined(streams)
+}
+
+/// Several streams as one replay, each with the mean time from one frame of its camera to the next,
+/// nanoseconds.
+pub fn joined(streams: impl Iterator<Item = (Replay, i64)>) -> Replay {
     let mut joined = Replay {
         truth: Trajectory::default(),
         sequences: Vec::new(),
@@ -113,12 +153,7 @@ pub fn replay_streams(
         beginnings: Vec::new(),
     };
 
-    let same_sequence = |a: &FrameId, b: &FrameId| room.timeline().joins(*a, *b);
-    for frames in segment.frames.chunk_by(same_sequence) {
-        let stream = Segment { frames, ..segment };
-        let period_ns = period_ns(room, frames);
-        let replayed = replay(tracker, &[stream], period_ns, initial_pose);
-
+    for (replayed, period_ns) in streams {
         // Numbers and times go on from stream to stream, so that each frame has its own.
         let number = joined.sequences.last().map_or(0, |last| last + 1);
         let time = joined
@@ -144,7 +179,7 @@ pub fn replay_streams(
 }
 
 /// The mean time from one row of a recording to the next, nanoseconds.
-fn period_ns(room: &Room, frames: &[FrameId]) -> i64 {
+pub fn period_ns(room: &Room, frames: &[FrameId]) -> i64 {
     let assumed = (ASSUMED_PERIOD_S * 1e9).round() as i64;
     let (Some(&first), Some(&last)) = (frames.first(), frames.last()) else {
         return assumed;
@@ -159,10 +194,8 @@ fn period_ns(room: &Room, frames: &[FrameId]) -> i64 {
     }
 }
 
-fn start(tracker: &Tracker, segments: &[Segment<'_>], initial_pose: InitialPose) -> State {
-    let first = segments
-        .first()
-        .and_then(|segment| Some(segment.poses[segment.frames.first()?.row()]));
+fn start(tracker: &Tracker, frames: &[Played], initial_pose: InitialPose) -> State {
+    let first = frames.first().map(|played| played.truth);
 
     match (initial_pose, first) {
         (InitialPose::Given, Some(pose)) => tracker.start(Some(Belief::known(

@@ -8,6 +8,8 @@
 //! - [`localization`]: single views in a partly mapped room.
 //! - [`motion`]: the motion between two views, beside the simplest answers.
 //! - [`odometry`]: a tracker along held-out frames.
+//! - [`planning`]: ways to a goal, beside simple planners.
+//! - [`robustness`]: a tracker under disturbances of its images.
 //! - [`path_comparison`]: an estimated path against a reference.
 //!
 //! An experiment takes rooms that are loaded ([`seese3_core::training::RoomData`]) and reads and
@@ -22,8 +24,11 @@ pub mod localization;
 pub mod motion;
 pub mod odometry;
 pub mod path_comparison;
+pub mod planning;
 pub mod probe;
+pub mod robustness;
 pub mod seeds;
+mod simple_planners;
 pub mod tracking_scores;
 
 use seese3_core::{

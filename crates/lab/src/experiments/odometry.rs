@@ -157,6 +157,23 @@ pub struct Relocalisation {
     pub nearest_errors_m: Vec<f64>,
 }
 
+impl TrackedRoom<'_> {
+    /// The room, with all its frames.
+    pub fn room(&self) -> &Room {
+        &self.room
+    }
+
+    /// A tracker over its mapped frames.
+    pub fn tracker(&self) -> &Tracker {
+        &self.tracker
+    }
+
+    /// Raw features, row by frame, shape (n, d).
+    pub fn features(&self) -> ArrayView2<'_, f32> {
+        self.features
+    }
+}
+
 /// Trackers over each of several rooms, mapped as the protocol says.
 ///
 /// # Errors

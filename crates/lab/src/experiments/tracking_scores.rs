@@ -54,6 +54,15 @@ pub struct VelocityErrors {
 impl TrackingScores {
     /// The scores of a replay; `nearest_frame` gives the pose of an answer's best match.
     pub fn of(replay: &Replay, nearest_frame: impl Fn(&Update) -> Pose) -> Self {
+        Self::of_rows(replay, |_| true, nearest_frame)
+    }
+
+    /// The scores of the rows of a replay that `keep` accepts.
+    pub fn of_rows(
+        replay: &Replay,
+        keep: impl Fn(usize) -> bool,
+        nearest_frame: impl Fn(&Update) -> Pose,
+    ) -> Self {
         let odom = replay.odom_path().poses;
 
         let mut errors: [Vec<PoseError>; 4] = Default::default();
@@ -64,6 +73,9 @@ impl TrackingScores {
 
         let answers = replay.updates.iter().zip(&replay.truth.poses).zip(&odom);
         for (row, ((update, truth), odom)) in answers.enumerate() {
+            if !keep(row) {
+                continue;
+            }
             let odom_belief = Belief {
                 pose: *odom,
                 covariance: update.odom.covariance,
@@ -104,7 +116,7 @@ impl TrackingScores {
             odom_surprises,
             tracking,
             tracking_wrong,
-            velocity: VelocityErrors::of(replay),
+            velocity: VelocityErrors::of(replay, &keep),
         }
     }
 }
@@ -127,14 +139,14 @@ impl AnswerErrors {
 
 impl VelocityErrors {
     /// Of the linear velocities of a replay; NaN without one.
-    fn of(replay: &Replay) -> Self {
+    fn of(replay: &Replay, keep: &dyn Fn(usize) -> bool) -> Self {
         let mut error = Vec::new();
         let mut speed = Vec::new();
 
         let times = replay.truth.times_ns.windows(2);
         let poses = replay.truth.poses.windows(2).zip(times);
-        for (update, (poses, times)) in replay.updates.iter().skip(1).zip(poses) {
-            let Some(reported) = update.velocity else {
+        for (row, (update, (poses, times))) in (1..).zip(replay.updates.iter().skip(1).zip(poses)) {
+            let Some(reported) = update.velocity.filter(|_| keep(row)) else {
                 continue;
             };
             let seconds = (times[1] - times[0]) as f64 * 1e-9;

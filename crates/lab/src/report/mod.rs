@@ -15,8 +15,10 @@ mod layers;
 mod localization;
 mod odometry;
 mod path_errors;
+mod planning;
 mod plot;
 mod probe;
+mod robustness;
 mod table;
 mod theory;
 mod training;
@@ -49,8 +51,10 @@ pub use odometry::{
 pub use path_errors::{
     APE_FORMULA, PathErrorsJson, RPE_FORMULA, path_errors_json, path_errors_table,
 };
+pub use planning::{PlanningJson, planning_json, planning_table};
 pub use plot::{PathPlot, path_svg};
 pub use probe::{ProbeContext, ProbeJson, probe_json, probe_table};
+pub use robustness::{RobustnessJson, robustness_json, robustness_table};
 pub use table::aligned;
 pub use theory::{TheoryJson, theory_json, theory_table, theory_table_rows};
 pub use training::{TrainingJson, training_json, training_table};

@@ -83,7 +83,7 @@ fn line(name: &str, count: String, rooms: &[RoomOdometry]) -> Vec<String> {
         format!("{:.3}", of(&|room| room.statuses.tracking)),
         format!("{:.3}", of(&|room| room.statuses.degraded)),
         format!("{:.3}", of(&|room| room.statuses.lost)),
-        format!("{:.3}", wrong_share(rooms)),
+        format!("{:.3}", wrong_share(&scores_of(rooms))),
         format!("{:.3}", velocity.error_m_s),
         format!("{:.3}", velocity.zero_m_s),
         format!("{:.3}", of(&|room| room.unknown_start.lost)),
@@ -91,11 +91,14 @@ fn line(name: &str, count: String, rooms: &[RoomOdometry]) -> Vec<String> {
     ]
 }
 
+fn scores_of(rooms: &[RoomOdometry]) -> Vec<&TrackingScores> {
+    rooms.iter().map(|room| &room.scores).collect()
+}
+
 /// The share of TRACKING frames that were more than half a metre or 15 degrees off, over all rooms.
-fn wrong_share(rooms: &[RoomOdometry]) -> f64 {
-    let sum = |of: fn(&TrackingScores) -> usize| -> usize {
-        rooms.iter().map(|room| of(&room.scores)).sum()
-    };
+pub(super) fn wrong_share(rooms: &[&TrackingScores]) -> f64 {
+    let sum =
+        |of: fn(&TrackingScores) -> usize| -> usize { rooms.iter().map(|scores| of(scores)).sum() };
     sum(|scores| scores.tracking_wrong) as f64 / sum(|scores| scores.tracking) as f64
 }
 
@@ -225,7 +228,7 @@ pub struct OdometryJson {
 
 /// A tracker's answers beside the simplest ones to the same frames.
 #[derive(Debug, Serialize)]
-struct ScoresJson {
+pub(super) struct ScoresJson {
     ape_m: AnswersJson,
     ape_rad: AnswersJson,
     /// Shares of TRACKING map poses inside the 68 % and the 95 % ellipsoid; null without one.
@@ -320,7 +323,7 @@ pub fn odometry_json(
 
     OdometryJson {
         rooms: rooms.iter().map(room_json).collect(),
-        all: scores_json(rooms),
+        all: scores_json(&scores_of(rooms)),
         coverage_places: shares(&map_poses),
         coverage_motions: shares(&squared_errors(&motions)),
         relocalisation: relocalisation.map(|found| RelocalisationJson {
@@ -351,7 +354,7 @@ fn room_json(room: &RoomOdometry) -> RoomJson {
 
     RoomJson {
         room: room.room.clone(),
-        scores: scores_json(std::slice::from_ref(room)),
+        scores: scores_json(&[&room.scores]),
         format: room.format.clone(),
         mapped: room.mapped_frames,
         followed: room.tracked_frames,
@@ -373,22 +376,26 @@ fn room_json(room: &RoomOdometry) -> RoomJson {
     }
 }
 
-fn scores_json(rooms: &[RoomOdometry]) -> ScoresJson {
-    let scores = || rooms.iter().map(|room| &room.scores);
+/// Means over rooms of errors, shares over the frames of all rooms.
+pub(super) fn scores_json(rooms: &[&TrackingScores]) -> ScoresJson {
+    let scores = || rooms.iter().copied();
     let answers = |errors: AnswerErrors| AnswersJson {
         fused: known(errors.fused),
         odom: known(errors.odom),
         nearest_frame: known(errors.nearest_frame),
         standing_still: known(errors.standing_still),
     };
-    let covered = |of: fn(&RoomOdometry) -> &Vec<f64>| coverage_json(&concat(rooms, of));
+    let covered = |of: fn(&TrackingScores) -> &Vec<f64>| {
+        let surprises: Vec<f64> = scores().flat_map(of).copied().collect();
+        coverage_json(&surprises)
+    };
     let velocity = VelocityErrors::mean(scores().map(|scores| &scores.velocity));
 
     ScoresJson {
         ape_m: answers(AnswerErrors::mean(scores().map(|scores| &scores.ape))),
         ape_rad: answers(AnswerErrors::mean(scores().map(|scores| &scores.turn))),
-        coverage: covered(|room| &room.scores.tracking_surprises),
-        coverage_odom: covered(|room| &room.scores.odom_surprises),
+        coverage: covered(|scores| &scores.tracking_surprises),
+        coverage_odom: covered(|scores| &scores.odom_surprises),
         tracking_wrong: known(wrong_share(rooms)),
         velocity: VelocityJson {
             error_m_s: known(velocity.error_m_s),

@@ -1,0 +1,427 @@
+//! Planners beside one another: from an unmapped view to a mapped goal, driven without looking again.
+//!
+//! Every second frame of a room (or what the hold-out says) is a room of its own, which is all that a
+//! planner knows. A question is the view of another frame, and a mapped frame as the goal. A planner
+//! answers with where it believes the camera to be and with poses to drive to. A simulated robot then
+//! drives these motions one after another from where the camera truly is. The planner is right if the
+//! robot ends within the tolerance of the goal.
+//!
+//! Views of other rooms are asked about too: there a planner should find no way.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use ndarray::Array1;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+
+use seese3_core::adapter::{Adapter, Reading};
+use seese3_core::cancel::Cancellation;
+use seese3_core::features::Features;
+use seese3_core::geometry::{Pose, PoseError, body_twist};
+use seese3_core::navigation::{
+    self, IndexKind, Navigator, Outcome, Pursuit, Start, Stepper, pursue,
+};
+use seese3_core::planning::{BelievedStart, Hops, KnownRoom, Planned, Route, RouteBounds, plan};
+use seese3_core::room::{FrameId, Room};
+use seese3_core::splits::HoldOut;
+use seese3_core::tracking::Map;
+use seese3_core::training::RoomData;
+
+use super::simple_planners::{greedy, pose_graph, topological};
+use super::{Error, Within};
+
+/// Views of each other room that a room's planners are asked about.
+const OTHER_ROOM_VIEWS: usize = 5;
+
+/// What decides an evaluation besides the rooms and the adapter.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlanningProtocol {
+    /// Which frames are mapped, and which views are asked about.
+    pub hold_out: HoldOut,
+    /// Questions in each room.
+    pub questions: usize,
+    /// The longest hop, ‖(v, ω)‖ with metres and radians mixed. None takes the adapter's own, which ours
+    /// and the pose graph exceed where there is no other way.
+    pub longest_hop: Option<f64>,
+    /// Of the questions.
+    pub seed: u64,
+}
+
+/// A planner that is evaluated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Planner {
+    /// What the server answers: the shortest way over the room's frames, from the pose that they tell.
+    Ours,
+    /// The latent way of the paper: a frame near the imagined latent, step by step.
+    Latent,
+    /// From frame to frame, each time the one nearest to the goal that one hop reaches.
+    Greedy,
+    /// The shortest way over the frames' poses from the pose of the nearest frame.
+    PoseGraph,
+    /// The shortest way over the frames that look alike.
+    Topological,
+    /// The robot stays where it is.
+    StandingStill,
+}
+
+impl Planner {
+    /// Every planner, in the order of tables.
+    pub const ALL: [Self; 6] = [
+        Self::Ours,
+        Self::Latent,
+        Self::Greedy,
+        Self::PoseGraph,
+        Self::Topological,
+        Self::StandingStill,
+    ];
+}
+
+/// What a planner answers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PlannedWay {
+    /// Where the planner believes the camera to be, `world_from_camera`.
+    pub start: Pose,
+    /// The poses to drive to, in order, `world_from_camera`.
+    pub poses: Vec<Pose>,
+    /// Whether the planner says that the goal is reached.
+    pub says_reached: bool,
+    /// How probable the planner thinks it that the robot ends within the tolerance, if it says that.
+    pub probability: Option<f64>,
+}
+
+/// How a planner did.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct PlannerScores {
+    /// Questions about views of the room.
+    pub questions: usize,
+    /// How often it said that the goal is reached.
+    pub says_reached: usize,
+    /// How often it said so and the robot was within the tolerance of the goal.
+    pub truly_there: usize,
+    /// How often the robot was there, whatever the planner said.
+    pub there_anyway: usize,
+    /// The sum of the hops where the goal was truly reached.
+    pub steps: usize,
+    /// The longest hop, ‖(v, ω)‖ with metres and radians mixed.
+    pub longest_hop: f64,
+    /// Questions about views of other rooms.
+    pub other_questions: usize,
+    /// How often it said that the goal is reached from there.
+    pub other_says_reached: usize,
+}
+
+/// The scores in one room, by planner.
+#[derive(Debug, Clone)]
+pub struct RoomPlanning {
+    /// The room.
+    pub room: String,
+    /// Mapped frames.
+    pub mapped_frames: usize,
+    /// The longest hop that was allowed.
+    pub longest_hop: f64,
+    /// The scores.
+    pub scores: BTreeMap<Planner, PlannerScores>,
+}
+
+/// What planners know of a room.
+pub struct MappedRoom {
+    /// The mapped frames as a room of their own.
+    pub navigator: Arc<Navigator>,
+    /// The same features, row by frame.
+    pub features: Features,
+    /// None if the adapter is not calibrated.
+    map: Option<Map>,
+    pursuit: Pursuit,
+    bounds: RouteBounds,
+}
+
+/// A question to the planners.
+pub struct PlanningQuestion {
+    /// What the camera sees, shape (d,).
+    pub feature: Vec<f32>,
+    /// The same under the adapter, shape (k,).
+    pub latent: Array1<f64>,
+    /// The goal, a frame of the mapped room.
+    pub goal: FrameId,
+}
+
+impl MappedRoom {
+    fn new(
+        data: &RoomData<'_>,
+        adapter: &Arc<Adapter>,
+        protocol: &PlanningProtocol,
+    ) -> Result<Self, Error> {
+        let what = || format!("room '{}'", data.room.id());
+        let rows = rows(&protocol.hold_out.mapped(data.room.frame_count()));
+        let frames = data.room.frames().select(&rows);
+        let room = Room::new(
+            data.room.id().clone(),
+            frames,
+            data.room.provenance().clone(),
+        );
+        let room = Arc::new(room.map_err(|problem| Error::Input(problem.to_string()))?);
+        let features = data.features.select(&rows);
+
+        let navigator = Navigator::new(room, &features, adapter.clone(), IndexKind::Exact);
+        let navigator = Arc::new(navigator.within(what)?);
+        let map = match adapter.error_model() {
+            Some(_) => Some(Map::new(navigator.clone(), &all_frames(&navigator)).within(what)?),
+            None => None,
+        };
+
+        let own = Pursuit::of(&navigator);
+        Ok(Self {
+            pursuit: Pursuit {
+                step: protocol.longest_hop.unwrap_or(own.step),
+                ..own
+            },
+            bounds: RouteBounds {
+                hops: protocol
+                    .longest_hop
+                    .map_or(Hops::Preferably(own.step), Hops::AtMost),
+                tolerance_m: own.tolerance_m,
+                tolerance_rad: own.tolerance_rad,
+            },
+            navigator,
+            features,
+            map,
+        })
+    }
+
+    /// The poses of the mapped frames, `world_from_camera`.
+    pub fn poses(&self) -> &[Pose] {
+        self.navigator.room().poses()
+    }
+
+    /// What is asked of a way.
+    pub fn pursuit(&self) -> &Pursuit {
+        &self.pursuit
+    }
+
+    /// What is asked of a route.
+    pub fn bounds(&self) -> RouteBounds {
+        self.bounds
+    }
+
+    fn answer(&self, planner: Planner, question: &PlanningQuestion) -> Result<PlannedWay, Error> {
+        match planner {
+            Planner::Ours => self.ours(question),
+            Planner::Latent => self.latent(question),
+            Planner::Greedy => Ok(greedy(self, question)),
+            Planner::PoseGraph => Ok(pose_graph(self, question)),
+            Planner::Topological => Ok(topological(self, question)),
+            Planner::StandingStill => Ok(PlannedWay {
+                start: Pose::identity(),
+                poses: Vec::new(),
+                says_reached: true,
+                probability: None,
+            }),
+        }
+    }
+
+    fn ours(&self, question: &PlanningQuestion) -> Result<PlannedWay, Error> {
+        let known = KnownRoom {
+            navigator: &self.navigator,
+            map: self.map.as_ref(),
+            reader: None,
+        };
+        let start = BelievedStart::seen(known, question.latent.view(), None);
+        let goal = self.poses()[question.goal.row()];
+        let planned = plan(
+            &self.navigator,
+            &start,
+            &goal,
+            self.bounds,
+            &Cancellation::default(),
+        );
+
+        let nothing = PlannedWay {
+            start: start.pose,
+            poses: Vec::new(),
+            says_reached: false,
+            probability: None,
+        };
+        Ok(match planned.map_err(navigation::Error::from)? {
+            Planned::Way {
+                route,
+                arrival_probability,
+            } => PlannedWay {
+                poses: self.poses_of(&route),
+                says_reached: true,
+                probability: arrival_probability,
+                ..nothing
+            },
+            Planned::StartUnknown(_) | Planned::NoRoute(_) => nothing,
+        })
+    }
+
+    /// The poses of a route's frames.
+    pub fn poses_of(&self, route: &Route) -> Vec<Pose> {
+        let pose = |frame: &FrameId| self.poses()[frame.row()];
+        route.frames.iter().map(pose).collect()
+    }
+
+    fn latent(&self, question: &PlanningQuestion) -> Result<PlannedWay, Error> {
+        let pose = self.navigator.nearest(question.latent.view(), 1)[0].pose;
+        let start = Start {
+            latent: question.latent.clone(),
+            frame: None,
+            pose: Some(pose),
+        };
+
+        let mut poses: Vec<Pose> = Vec::new();
+        let outcome = pursue(
+            &self.navigator,
+            &Stepper::InversePoincare(Reading::Homogeneous),
+            start,
+            &self.poses()[question.goal.row()],
+            self.pursuit,
+            &Cancellation::default(),
+            &mut |feedback| {
+                // An attempt that found no frame repeats the last one.
+                let at = feedback.frame.map(|frame| frame.pose);
+                if let Some(at) = at.filter(|at| poses.last() != Some(at)) {
+                    poses.push(at);
+                }
+            },
+        )?;
+
+        Ok(PlannedWay {
+            start: pose,
+            poses,
+            says_reached: outcome == Outcome::Reached,
+            probability: None,
+        })
+    }
+}
+
+/// Asks every planner in every room; `done` hears of each room.
+///
+/// # Errors
+/// [`Error`] when a room is too small, or its features are not those of the adapter.
+pub fn evaluate(
+    rooms: &[RoomData<'_>],
+    adapter: &Arc<Adapter>,
+    protocol: &PlanningProtocol,
+    done: &(dyn Fn() + Sync),
+) -> Result<Vec<RoomPlanning>, Error> {
+    let one = |(place, data): (usize, &RoomData<'_>)| {
+        let mapped = MappedRoom::new(data, adapter, protocol)?;
+        let mut random = ChaCha8Rng::seed_from_u64(protocol.seed);
+        random.set_stream(place as u64);
+        let mut scores: BTreeMap<Planner, PlannerScores> = BTreeMap::new();
+
+        let asked = protocol.hold_out.tracked(data.room.frame_count());
+        for _ in 0..protocol.questions {
+            let frame = asked[random.random_range(0..asked.len())];
+            let goal = mapped.any_frame(&mut random);
+            let question = question(data, adapter, frame, goal)?;
+            let truth = &data.room.poses()[frame.row()];
+            for planner in Planner::ALL {
+                let way = mapped.answer(planner, &question)?;
+                scores
+                    .entry(planner)
+                    .or_default()
+                    .add(&way, truth, &mapped, goal);
+            }
+        }
+
+        for other in rooms
+            .iter()
+            .filter(|other| other.room.id() != data.room.id())
+        {
+            for _ in 0..OTHER_ROOM_VIEWS {
+                let frame = FrameId(random.random_range(0..other.room.frame_count() as u32));
+                let goal = mapped.any_frame(&mut random);
+                let question = question(other, adapter, frame, goal)?;
+                for planner in Planner::ALL {
+                    let says_reached = mapped.answer(planner, &question)?.says_reached;
+                    let scores = scores.entry(planner).or_default();
+                    scores.other_questions += 1;
+                    scores.other_says_reached += usize::from(says_reached);
+                }
+            }
+        }
+
+        done();
+        Ok(RoomPlanning {
+            room: data.room.id().to_string(),
+            mapped_frames: mapped.poses().len(),
+            longest_hop: mapped.pursuit.step,
+            scores,
+        })
+    };
+
+    rooms.par_iter().enumerate().map(one).collect()
+}
+
+impl MappedRoom {
+    fn any_frame(&self, random: &mut ChaCha8Rng) -> FrameId {
+        FrameId(random.random_range(0..self.poses().len() as u32))
+    }
+}
+
+fn question(
+    data: &RoomData<'_>,
+    adapter: &Adapter,
+    frame: FrameId,
+    goal: FrameId,
+) -> Result<PlanningQuestion, Error> {
+    let feature = data.features.rows().row(frame.row()).to_vec();
+
+    Ok(PlanningQuestion {
+        latent: adapter.embed_one(&feature)?,
+        feature,
+        goal,
+    })
+}
+
+impl PlannerScores {
+    /// Counts one answer: drives its motions from the true pose of the camera.
+    fn add(&mut self, way: &PlannedWay, truth: &Pose, room: &MappedRoom, goal: FrameId) {
+        let end = way.poses.last().unwrap_or(&way.start);
+        let driven = truth * way.start.inv_mul(end);
+        let left = PoseError::between(&driven, &room.poses()[goal.row()]);
+        let is_there = room.pursuit.is_reached(&left);
+
+        self.questions += 1;
+        self.says_reached += usize::from(way.says_reached);
+        self.there_anyway += usize::from(is_there);
+        if way.says_reached && is_there {
+            self.truly_there += 1;
+            self.steps += way.poses.len();
+        }
+
+        let mut at = &way.start;
+        for pose in &way.poses {
+            self.longest_hop = self.longest_hop.max(body_twist(at, pose).norm());
+            at = pose;
+        }
+    }
+
+    /// The scores of several rooms together.
+    pub fn sum<'a>(rooms: impl Iterator<Item = &'a Self>) -> Self {
+        rooms.fold(Self::default(), |sum, room| Self {
+            questions: sum.questions + room.questions,
+            says_reached: sum.says_reached + room.says_reached,
+            truly_there: sum.truly_there + room.truly_there,
+            there_anyway: sum.there_anyway + room.there_anyway,
+            steps: sum.steps + room.steps,
+            longest_hop: sum.longest_hop.max(room.longest_hop),
+            other_questions: sum.other_questions + room.other_questions,
+            other_says_reached: sum.other_says_reached + room.other_says_reached,
+        })
+    }
+}
+
+fn all_frames(navigator: &Navigator) -> Vec<FrameId> {
+    (0..navigator.room().frame_count() as u32)
+        .map(FrameId)
+        .collect()
+}
+
+fn rows(frames: &[FrameId]) -> Vec<usize> {
+    frames.iter().map(|frame| frame.row()).collect()
+}

@@ -1,0 +1,245 @@
+//! A tracker under disturbances: the same stream with its images turned, blurred, darkened, hidden,
+//! frozen or thinned out, and the answers beside the simplest ones to the same frames.
+//!
+//! The map is made of the images as they are; each stream begins with its true pose. A disturbance
+//! that is there only for a while is scored while it is there.
+
+mod disturbance;
+
+use ndarray::ArrayView2;
+
+use seese3_core::room::FrameId;
+use seese3_core::splits::HoldOut;
+use seese3_core::tracking::{
+    InitialPose, Observation, Played, Replay, Status, joined, period_ns, replay_frames,
+};
+
+pub use disturbance::{Disturbance, Extent};
+
+use super::Error;
+use super::odometry::{StatusShares, TrackedRoom};
+use super::tracking_scores::TrackingScores;
+
+/// The most frames for which a camera is frozen or blank.
+const MOST_DISTURBED: usize = 60;
+
+/// The views of a disturbed camera, one for each tracked frame of a room.
+#[derive(Debug, Clone, Copy)]
+pub struct DisturbedViews<'a> {
+    /// Raw features, shape (tracked frames, d).
+    pub features: ArrayView2<'a, f32>,
+    /// Whether the disturbed images show nothing, one for each tracked frame.
+    pub is_blank: &'a [bool],
+}
+
+/// How a room was tracked in under one disturbance.
+#[derive(Debug, Clone)]
+pub struct DisturbedTracking {
+    /// The room.
+    pub room: String,
+    /// The disturbance.
+    pub disturbance: Disturbance,
+    /// The frames that are scored.
+    pub frames: usize,
+    /// The answers beside the simplest ones.
+    pub scores: TrackingScores,
+    /// Shares of the scored frames by status.
+    pub statuses: StatusShares,
+    /// After how many disturbed frames the status was no longer TRACKING, in the stream where that
+    /// took longest; none where it stayed TRACKING to the end. Only of disturbances of a part of the
+    /// stream.
+    pub noticed_after: Option<usize>,
+}
+
+/// The frames of one stream that are disturbed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Part {
+    begin: usize,
+    end: usize,
+}
+
+impl Part {
+    fn of(extent: Extent, count: usize) -> Self {
+        match extent {
+            Extent::Whole => Self {
+                begin: 0,
+                end: count,
+            },
+            Extent::Part => Self {
+                begin: count / 3,
+                end: count / 3 + (count / 3).min(MOST_DISTURBED),
+            },
+        }
+    }
+
+    fn holds(self, number: usize) -> bool {
+        (self.begin..self.end).contains(&number)
+    }
+}
+
+/// The tracked frames of a room under a hold-out, stream by stream.
+pub fn streams(room: &TrackedRoom<'_>, hold_out: HoldOut) -> Vec<Vec<FrameId>> {
+    let timeline = room.room().timeline();
+    hold_out
+        .tracked(timeline.frame_count)
+        .chunk_by(|a, b| timeline.joins(*a, *b))
+        .map(<[FrameId]>::to_vec)
+        .collect()
+}
+
+/// Tracks the disturbed streams of a room.
+///
+/// # Errors
+/// [`Error::Adapter`] when the features are not those of the tracker's adapter.
+pub fn evaluate(
+    room: &TrackedRoom<'_>,
+    hold_out: HoldOut,
+    disturbance: Disturbance,
+    views: DisturbedViews<'_>,
+) -> Result<DisturbedTracking, Error> {
+    let adapter = room.tracker().maps()[0].navigator().adapter().clone();
+    let latents = adapter.embed(views.features)?;
+
+    let mut replays = Vec::new();
+    let mut scored_rows = Vec::new();
+    let mut noticed = Vec::new();
+    let mut first_row = 0;
+
+    for frames in streams(room, hold_out) {
+        let part = Part::of(disturbance.extent(), frames.len());
+        let period = period_ns(room.room(), &frames);
+
+        let mut played = Vec::new();
+        let mut is_scored = Vec::new();
+        for (number, frame) in frames.iter().enumerate() {
+            let Some(taken) = taken(disturbance, part, number) else {
+                continue;
+            };
+            let time_ns = i64::from(frame.0 - frames[0].0) * period;
+
+            let row = first_row + taken.view;
+            played.push(Played {
+                frame: Observation {
+                    time_ns,
+                    sequence: taken
+                        .own_number
+                        .unwrap_or_else(|| u64::from(frame.0 - frames[0].0)),
+                    latent: latents.row(row).to_owned(),
+                    feature: Some(views.features.row(row).to_vec()),
+                    is_blank: taken.is_disturbed && views.is_blank[row],
+                },
+                truth: room.room().poses()[frame.row()],
+            });
+            is_scored.push(part.holds(number));
+        }
+
+        let replay = replay_frames(room.tracker(), &played, InitialPose::Given);
+        noticed.push(noticed_after(&replay, &is_scored));
+        scored_rows.extend(is_scored);
+        replays.push((replay, period));
+        first_row += frames.len();
+    }
+
+    let replay = joined(replays.into_iter());
+    let keep = |row: usize| scored_rows[row];
+    let poses = room.room().poses();
+    let share = |status| share_of(&replay, &scored_rows, status);
+
+    Ok(DisturbedTracking {
+        room: room.room().id().to_string(),
+        disturbance,
+        frames: scored_rows.iter().filter(|&&scored| scored).count(),
+        scores: TrackingScores::of_rows(&replay, keep, |update| {
+            poses[update.best_match.1.frame.row()]
+        }),
+        statuses: StatusShares {
+            tracking: share(Status::Tracking),
+            degraded: share(Status::Degraded),
+            lost: share(Status::Lost),
+            relocalizing: share(Status::Relocalizing),
+        },
+        // One stream in which nothing was noticed makes the answer none.
+        noticed_after: match disturbance.extent() {
+            Extent::Whole => None,
+            Extent::Part => noticed
+                .into_iter()
+                .try_fold(0, |most, frames| Some(most.max(frames?))),
+        },
+    })
+}
+
+/// What a camera takes as a frame of its stream.
+struct Taken {
+    /// The number of the tracked frame whose view it is.
+    view: usize,
+    is_disturbed: bool,
+    /// The number that the camera gives it, if it counts by itself.
+    own_number: Option<u64>,
+}
+
+/// None where the camera takes no frame. A view outside the disturbed part is undisturbed only for
+/// disturbances that keep the images.
+fn taken(disturbance: Disturbance, part: Part, number: usize) -> Option<Taken> {
+    let plain = Taken {
+        view: number,
+        is_disturbed: part.holds(number),
+        own_number: None,
+    };
+
+    match disturbance {
+        Disturbance::Rate { every } => number.is_multiple_of(every).then_some(Taken {
+            own_number: Some((number / every) as u64),
+            ..plain
+        }),
+        Disturbance::Frozen if part.holds(number) => Some(Taken {
+            view: part.begin,
+            ..plain
+        }),
+        _ => Some(plain),
+    }
+}
+
+/// After how many scored frames the status is no longer TRACKING.
+fn noticed_after(replay: &Replay, is_scored: &[bool]) -> Option<usize> {
+    let mut scored = replay
+        .updates
+        .iter()
+        .zip(is_scored)
+        .filter(|(_, scored)| **scored);
+    let noticed = scored.position(|(update, _)| update.status != Status::Tracking);
+    noticed.map(|frames| frames + 1)
+}
+
+fn share_of(replay: &Replay, is_scored: &[bool], status: Status) -> f64 {
+    let scored = || {
+        replay
+            .updates
+            .iter()
+            .zip(is_scored)
+            .filter(|(_, scored)| **scored)
+    };
+    let with_status = scored().filter(|(update, _)| update.status == status);
+    with_status.count() as f64 / scored().count() as f64
+}
+
+/// The tracked frames whose images a disturbance changes, by number among all tracked frames of the
+/// room, each with its number in its stream.
+pub fn changed_images(
+    room: &TrackedRoom<'_>,
+    hold_out: HoldOut,
+    disturbance: Disturbance,
+) -> Vec<(usize, usize)> {
+    if disturbance.keeps_images() {
+        return Vec::new();
+    }
+
+    let mut changed = Vec::new();
+    let mut first_row = 0;
+    for frames in streams(room, hold_out) {
+        let part = Part::of(disturbance.extent(), frames.len());
+        changed.extend((part.begin..part.end).map(|number| (first_row + number, number)));
+        first_row += frames.len();
+    }
+
+    changed
+}
