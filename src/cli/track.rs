@@ -155,9 +155,10 @@ impl Track {
                 }
             };
 
-            // Every answer carries a token of the tracker's state after it; only the newest is of
-            // use.
-            heard.token = answer.resume_token;
+            // A token holds the tracker's state after its answer; only the newest is of use.
+            if !answer.resume_token.is_empty() {
+                heard.token = answer.resume_token;
+            }
 
             match answer.answer {
                 Some(Answer::Started(started)) => heard.names = started.frames.unwrap_or_default(),
@@ -251,6 +252,8 @@ impl Track {
             room: self.room.clone().unwrap_or_default(),
             adapter: self.adapter.clone().unwrap_or_default(),
             fusion: fusion as i32,
+            // Tokens are most of an answer's bytes, and are kept only where they are asked for.
+            token_every: self.save_token.is_none().then_some(0),
             ..pb::TrackConfig::default()
         })
     }
@@ -352,6 +355,7 @@ fn frame(row: usize, view: pb::view::View, hz: f64) -> pb::TrackFrame {
         timestamp_ns: (row as f64 / hz * 1e9) as i64,
         sequence: row as u64 + 1,
         view,
+        with_token: false,
     }
 }
 

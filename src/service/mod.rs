@@ -11,6 +11,7 @@ mod auth;
 mod catalog;
 mod connections;
 mod convert;
+mod encoding;
 mod evaluation;
 mod image_encoder;
 mod navigate_to;

@@ -35,6 +35,10 @@ use seese3_core::tracking::{Belief, PoseReader};
 /// The stream of feedback events and the final result.
 pub type Events = Pin<Box<dyn Stream<Item = Result<pb::NavigateToResponse, Status>> + Send>>;
 
+/// In rooms of more frames than this, ways are planned beside batches and evaluations: a plan takes
+/// some ten milliseconds there.
+const MOST_SHORT_FRAMES: usize = 5_000;
+
 /// A checked request: everything that a pursuit needs.
 struct Ready {
     served: Arc<ServedNavigator>,
@@ -98,6 +102,7 @@ impl Handlers {
     ) {
         let heard = events.clone();
         let begun = Instant::now();
+        let frame_count = ready.served.navigator.room().frame_count();
 
         let work = move |cancel: &Cancellation| {
             let start = start_to_wire(&ready.start, &ready.served);
@@ -118,9 +123,16 @@ impl Handlers {
             Ok(result_to_wire(&ended, &ready))
         };
 
+        // The work of planning grows with the square of the number of frames.
+        let lane = if frame_count > MOST_SHORT_FRAMES {
+            Lane::Long
+        } else {
+            Lane::Short
+        };
+
         // If the caller closes the stream, `run` is dropped, which cancels the pursuit.
         let finished = tokio::select! {
-            finished = self.workers.run(Lane::Short, budget, work) => finished,
+            finished = self.workers.run(lane, budget, work) => finished,
             () = heard.closed() => return,
         };
         let last = finished

@@ -1,4 +1,5 @@
-//! OdometryService: EstimateMotion, the motion between two views. Track is in `track`.
+//! OdometryService: EstimateMotion, the motion between two views. Track is in `track`, Encode in
+//! `encoding`.
 
 use std::sync::Arc;
 
@@ -6,6 +7,8 @@ use ndarray::Array1;
 use tonic::{Request, Response, Status};
 
 use super::convert;
+use super::memory::hold_answer;
+use super::snapshot::ServedNavigator;
 use super::status::view_error;
 use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
@@ -46,6 +49,14 @@ impl OdometryService for Handlers {
 
         Ok(Response::new(answer))
     }
+
+    async fn encode(
+        &self,
+        request: Request<pb::EncodeRequest>,
+    ) -> Result<Response<pb::EncodeResponse>, Status> {
+        let answer = self.encoded_views(request).await?;
+        Ok(Response::new(hold_answer(answer)?))
+    }
 }
 
 fn answer(
@@ -79,18 +90,8 @@ fn by_adapter(
 
     let thresholds = convert::thresholds(thresholds)?;
 
-    // A room is only needed to look up views that are frames; features, latents and images need
-    // no more than the adapter.
-    let served = if room.is_empty() {
-        None
-    } else {
-        Some(snapshot.navigator(&room, &adapter)?)
-    };
-
-    let stored = match &served {
-        Some(served) => &served.adapter,
-        None => adapter_without_room(snapshot, &adapter)?,
-    };
+    let reader = ViewReader::of(snapshot, &room, &adapter)?;
+    let stored = reader.stored.clone();
 
     // If both views are frames of the room, the true motion between them is recorded and is
     // reported with the estimate.
@@ -103,25 +104,7 @@ fn by_adapter(
 
     let latent = |field: &str, given| -> Result<Array1<f64>, Error> {
         cancel.check()?;
-
-        let view = match convert::source(field, given, stored, snapshot)? {
-            Source::Feature(feature) => View::Feature(feature),
-            Source::Latent(latent) => View::Latent(latent),
-            Source::Frame(frame) => {
-                let served = served.as_ref().ok_or_else(|| {
-                    Error::invalid("room", format!("is required: {field} is a frame"))
-                })?;
-
-                let unknown = |_| Error::no_frame(&format!("{field}.frame_id"), frame);
-                served.navigator.room().pose(frame).map_err(unknown)?;
-
-                View::Latent(served.navigator.latents().row(frame.row()).to_vec())
-            }
-        };
-
-        // Each view is embedded by itself, so that an error names the view at fault.
-        view.latent(&stored.adapter)
-            .map_err(|error| view_error(&error).within(field))
+        Ok(reader.embedded(field, given)?.latent)
     };
 
     let first = latent("first", first)?;
@@ -129,7 +112,8 @@ fn by_adapter(
     let twist = stored.adapter.motion(first.view(), second.view());
 
     // `latent` has found both frames in the room, so their poses exist.
-    let truth = served
+    let truth = reader
+        .served
         .as_ref()
         .zip(frames)
         .and_then(|(served, (first, second))| {
@@ -213,6 +197,75 @@ fn image(view: Option<&pb::View>) -> Option<&[u8]> {
     match view?.view.as_ref()? {
         pb::view::View::Image(image) => Some(image),
         _ => None,
+    }
+}
+
+/// Embeds views under one adapter, and knows the room that stored frames are of.
+pub(super) struct ViewReader<'a> {
+    snapshot: &'a Snapshot,
+    served: Option<Arc<ServedNavigator>>,
+    pub stored: Arc<StoredAdapter>,
+}
+
+/// A view under an adapter.
+pub(super) struct EmbeddedView {
+    /// Shape (k,).
+    pub latent: Array1<f64>,
+    /// Shape (d,); of a view that was sent as a feature or an image.
+    pub feature: Option<Vec<f32>>,
+}
+
+impl<'a> ViewReader<'a> {
+    /// A room is only needed to look up views that are frames; features, latents and images need no
+    /// more than the adapter.
+    pub fn of(snapshot: &'a Snapshot, room: &str, adapter: &str) -> Result<Self, Error> {
+        if room.is_empty() {
+            return Ok(Self {
+                snapshot,
+                served: None,
+                stored: adapter_without_room(snapshot, adapter)?.clone(),
+            });
+        }
+
+        let served = snapshot.navigator(room, adapter)?;
+        Ok(Self {
+            snapshot,
+            stored: served.adapter.clone(),
+            served: Some(served),
+        })
+    }
+
+    /// One view, by itself, so that an error names the view at fault.
+    pub fn embedded(&self, field: &str, view: Option<pb::View>) -> Result<EmbeddedView, Error> {
+        let adapter = &self.stored.adapter;
+        let source = convert::source(field, view, &self.stored, self.snapshot)?;
+        let latent = |view: View| {
+            view.latent(adapter)
+                .map_err(|error| view_error(&error).within(field))
+        };
+
+        match source {
+            Source::Feature(feature) => Ok(EmbeddedView {
+                latent: latent(View::Feature(feature.clone()))?,
+                feature: Some(feature),
+            }),
+            Source::Latent(values) => Ok(EmbeddedView {
+                latent: latent(View::Latent(values))?,
+                feature: None,
+            }),
+            Source::Frame(frame) => {
+                let served = self.served.as_ref().ok_or_else(|| {
+                    Error::invalid("room", format!("is required: {field} is a frame"))
+                })?;
+
+                let unknown = |_| Error::no_frame(&format!("{field}.frame_id"), frame);
+                served.navigator.room().pose(frame).map_err(unknown)?;
+                Ok(EmbeddedView {
+                    latent: served.navigator.latents().row(frame.row()).to_owned(),
+                    feature: None,
+                })
+            }
+        }
     }
 }
 

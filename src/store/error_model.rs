@@ -6,6 +6,7 @@ use ndarray::Array2;
 use super::Error;
 use super::tensors::{TensorReader, TensorWriter};
 use seese3_core::adapter::{ErrorModel, ErrorStatistics, ErrorTable, MotionErrors, Stratum};
+use seese3_core::tracking::ASSUMED_PERIOD_S;
 
 const FRAME_NOISE: &str = "calibration.flicker";
 const MOTION_SPREAD: &str = "calibration.spread";
@@ -18,10 +19,13 @@ const ANCHORS: &str = "calibration.anchors";
 /// Five numbers, in this order: the floor u₀ of the motion errors, the out-of-distribution limit,
 /// the certain-match limit, the jump distance and the map-pose factor.
 const LIMITS: &str = "calibration.limits";
+/// One number, seconds. Files of earlier versions have none: their rooms were taken at 30 Hz.
+const FRAME_PERIOD: &str = "calibration.period";
 
 pub fn write(tensors: &mut TensorWriter, error_model: &ErrorModel) {
     // Destructured with no `..`, so that a new statistic breaks the build here.
     let ErrorStatistics {
+        frame_period_s,
         frame_noise,
         motion_spread,
         motion_errors,
@@ -54,6 +58,8 @@ pub fn write(tensors: &mut TensorWriter, error_model: &ErrorModel) {
         );
     }
 
+    tensors.f64(FRAME_PERIOD, &[1], [*frame_period_s].into_iter());
+
     // The order of the five numbers is part of the file format, and `read` relies on it.
     tensors.f64(
         LIMITS,
@@ -79,6 +85,12 @@ pub fn read(tensors: &TensorReader<'_>, file: &str) -> Result<Option<ErrorModel>
 
     let limits = sized(tensors, LIMITS, Some(1), 5, file)?;
 
+    let frame_period_s = if tensors.has(FRAME_PERIOD) {
+        sized(tensors, FRAME_PERIOD, Some(1), 1, file)?[(0, 0)]
+    } else {
+        ASSUMED_PERIOD_S
+    };
+
     let stratum = |row: ndarray::ArrayView1<'_, f64>| Stratum {
         at: row[0],
         gain: row[1],
@@ -95,6 +107,7 @@ pub fn read(tensors: &TensorReader<'_>, file: &str) -> Result<Option<ErrorModel>
     };
 
     let statistics = ErrorStatistics {
+        frame_period_s,
         frame_noise: tensors.f64(FRAME_NOISE)?,
         motion_spread: tensors.f64(MOTION_SPREAD)?,
         motion_errors: MotionErrors {

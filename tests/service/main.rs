@@ -13,6 +13,7 @@ mod support;
 mod answers;
 mod changes;
 mod fitted;
+mod frames;
 mod goals;
 mod harness;
 mod hostile;

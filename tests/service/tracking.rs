@@ -65,6 +65,7 @@ fn seen_of(room: &str, row: usize) -> pb::TrackRequest {
         timestamp_ns: row as i64 * 33_000_000,
         sequence: row as u64 + 1,
         view,
+        with_token: false,
     })
 }
 
@@ -252,6 +253,61 @@ async fn a_stream_goes_on_at_another_server_as_if_it_had_never_been_cut() {
     }
 }
 
+/// Oracle: the stream that brings a token with every answer: the others answer the same, with tokens
+/// where they were asked for, and go on from them.
+#[tokio::test]
+async fn tokens_come_when_they_are_asked_for() {
+    let server = server(KEY).await;
+    let frames = |asking: usize| -> Vec<pb::TrackRequest> {
+        (0..20)
+            .map(seen)
+            .enumerate()
+            .map(|(row, mut request)| {
+                if let Some(Message::Frame(frame)) = &mut request.message {
+                    frame.with_token = row == asking;
+                }
+                request
+            })
+            .collect()
+    };
+    let stream = async |token_every: Option<u32>| {
+        let config = pb::TrackConfig {
+            token_every,
+            ..config()
+        };
+        let requests = [vec![begin(config)], frames(12)].concat();
+        answers(&server, requests).await.unwrap()
+    };
+
+    let whole = stream(None).await;
+    for (every, expected) in [(Some(0), vec![12]), (Some(5), vec![4, 9, 12, 14, 19])] {
+        let thin = stream(every).await;
+        let rows = 0..20;
+        let with_token: Vec<usize> = rows
+            .filter(|row| !thin[row + 1].resume_token.is_empty())
+            .collect();
+        assert_eq!(with_token, expected, "{every:?}");
+        assert!(
+            !thin[0].resume_token.is_empty(),
+            "the first answer brings one"
+        );
+        for (thin, whole) in thin.iter().zip(&whole) {
+            assert_eq!(thin.answer, whole.answer);
+        }
+
+        let resume = pb::TrackConfig {
+            resume_token: thin[13].resume_token.clone(),
+            ..pb::TrackConfig::default()
+        };
+        let rest = [vec![begin(resume)], (13..20).map(seen).collect()].concat();
+        let rest = answers(&server, rest).await.unwrap();
+        assert_eq!(rest.len(), 8);
+        for (rest, whole) in rest[1..].iter().zip(&whole[14..]) {
+            assert_eq!(rest.answer, whole.answer);
+        }
+    }
+}
+
 /// Oracle: the promise: forged, altered, foreign and outdated tokens are refused by name.
 #[tokio::test]
 async fn tokens_that_are_not_genuine_are_refused() {
@@ -338,36 +394,42 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
     .unwrap();
 
     let late = pb::TrackFrame {
+        with_token: false,
         timestamp_ns: 0,
         sequence: 100,
         view: feature(vec![0.0; 48]),
     };
 
     let duplicate = pb::TrackFrame {
+        with_token: false,
         timestamp_ns: i64::MAX,
         sequence: 3,
         view: feature(vec![0.0; 48]),
     };
 
     let narrow = pb::TrackFrame {
+        with_token: false,
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: feature(vec![0.0; 47]),
     };
 
     let nan = pb::TrackFrame {
+        with_token: false,
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: feature(vec![f32::NAN; 48]),
     };
 
     let of_room = pb::TrackFrame {
+        with_token: false,
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: frame(3),
     };
 
     let empty = pb::TrackFrame {
+        with_token: false,
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: None,
@@ -424,6 +486,7 @@ async fn a_camera_in_another_place_is_lost_and_less_and_less_sure() {
         );
 
         message(pb::TrackFrame {
+            with_token: false,
             timestamp_ns: row as i64 * 33_000_000,
             sequence: row as u64 + 1,
             view,

@@ -309,6 +309,16 @@ impl Client {
             .into_inner())
     }
 
+    /// The latents of some views.
+    ///
+    /// # Errors
+    /// [`Error::Refused`].
+    pub async fn encode(&self, request: pb::EncodeRequest) -> Result<pb::EncodeResponse, Error> {
+        let mut service = OdometryServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        Ok(service.encode(self.request(request)).await?.into_inner())
+    }
+
     /// Opens a tracking stream: sends `requests` as they are made and returns the stream of
     /// answers. The deadline holds until the server accepts the configuration, the first of the
     /// requests; the stream itself has none, because it lasts as long as the robot moves.
@@ -324,6 +334,37 @@ impl Client {
             .max_decoding_message_size(MESSAGE_BYTES);
         let opened = tokio::time::timeout(self.deadline, service.track(requests)).await;
         Ok(opened.map_err(|_| Error::Deadline)??.into_inner())
+    }
+
+    /// All frames of a room, page by page; with `neighbours_within` also those that a motion of at most
+    /// this norm leads to, metres and radians mixed.
+    ///
+    /// # Errors
+    /// [`Error::Refused`]; also when the room changes between two pages.
+    pub async fn frames(
+        &self,
+        room: &str,
+        neighbours_within: Option<f64>,
+    ) -> Result<Vec<pb::RoomFrame>, Error> {
+        let mut service = CatalogServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MESSAGE_BYTES);
+        let mut frames = Vec::new();
+        let mut page_token = String::new();
+        loop {
+            let request = self.request(pb::ListFramesRequest {
+                room: room.to_owned(),
+                page_size: 0,
+                page_token,
+                neighbours_within,
+            });
+            let page = service.list_frames(request).await?.into_inner();
+            frames.extend(page.frames);
+
+            page_token = page.next_page_token;
+            if page_token.is_empty() {
+                return Ok(frames);
+            }
+        }
     }
 
     /// All rooms, page by page.

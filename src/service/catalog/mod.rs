@@ -6,12 +6,14 @@
 //! | `recent` | answers that are given again when a change is sent again |
 //! | `room_upload` | a room, frame by frame |
 //! | `adapter_upload` | an adapter |
+//! | `frames` | the frames of a room, for those who plan or draw themselves |
 //! | `refits` | an adapter fitted to a room here |
 //! | `defaults` | defaults and removals |
 
 mod adapter_upload;
 mod changes;
 mod defaults;
+mod frames;
 mod recent;
 mod refits;
 mod room_upload;
@@ -71,6 +73,14 @@ impl CatalogService for Handlers {
         let snapshot = self.snapshot(&request)?;
         let room = room(&snapshot, snapshot.room(&request.into_inner().room)?);
         Ok(Response::new(pb::GetRoomResponse { room: Some(room) }))
+    }
+
+    async fn list_frames(
+        &self,
+        request: Request<pb::ListFramesRequest>,
+    ) -> Result<Response<pb::ListFramesResponse>, Status> {
+        let answer = self.listed_frames(request).await?;
+        Ok(Response::new(hold_answer(answer)?))
     }
 
     async fn list_adapters(
@@ -187,6 +197,18 @@ impl CatalogService for Handlers {
     }
 }
 
+/// The entries of a page that a caller asks for; 0 is the server's choice.
+fn page_length(size: i32) -> Result<usize, Error> {
+    match usize::try_from(size) {
+        Ok(0) => Ok(PAGE),
+        Ok(size) => Ok(size.min(LARGEST_PAGE)),
+        Err(_) => Err(Error::invalid(
+            "page_size",
+            format!("must not be negative, got {size}"),
+        )),
+    }
+}
+
 /// One page of the entries in order of name, and the token of the next page: the last name of this
 /// page, or empty if this page is the last.
 fn page<'a, T>(
@@ -194,16 +216,7 @@ fn page<'a, T>(
     size: i32,
     token: &str,
 ) -> Result<(Vec<&'a T>, String), Error> {
-    let size = match usize::try_from(size) {
-        Ok(0) => PAGE,
-        Ok(size) => size.min(LARGEST_PAGE),
-        Err(_) => {
-            return Err(Error::invalid(
-                "page_size",
-                format!("must not be negative, got {size}"),
-            ));
-        }
-    };
+    let size = page_length(size)?;
 
     // The token is the last name that the caller has seen. It keeps its meaning when entries are
     // added or removed, and the server stores nothing between pages.

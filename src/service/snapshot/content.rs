@@ -77,6 +77,7 @@ impl ContentDigest {
     fn error_statistics(&mut self, statistics: &ErrorStatistics) {
         // Destructured with no `..`, so that a new statistic breaks the build here.
         let ErrorStatistics {
+            frame_period_s,
             frame_noise,
             motion_spread,
             motion_errors,
@@ -101,6 +102,7 @@ impl ContentDigest {
             certain_match_ratio,
             jump_distance,
             map_pose_factor,
+            frame_period_s,
         ]);
     }
 }

@@ -3,6 +3,7 @@
 //! Two tasks serve a stream. `read` receives messages and, if the newest frame wins, drops frames
 //! that waited too long; `answer_all` hands each message to the [`Session`] on a worker thread.
 
+mod configuration;
 mod sealed;
 mod session;
 mod token;

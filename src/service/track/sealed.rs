@@ -88,14 +88,12 @@ struct SealedKeyframe {
 struct SealedPlace {
     #[prost(int64, tag = "1")]
     time_ns: i64,
-    #[prost(uint64, tag = "2")]
-    sequence: u64,
-    #[prost(double, repeated, tag = "3")]
+    #[prost(double, repeated, tag = "2")]
     latent: Vec<f64>,
-    #[prost(double, repeated, tag = "4")]
+    #[prost(double, repeated, tag = "3")]
     belief: Vec<f64>,
     /// The upper triangle of the covariance of its lasting error.
-    #[prost(double, repeated, tag = "5")]
+    #[prost(double, repeated, tag = "4")]
     lasting: Vec<f64>,
 }
 
@@ -111,6 +109,8 @@ struct SealedCandidate {
     sequence: u64,
     #[prost(double, repeated, tag = "5")]
     latent: Vec<f64>,
+    #[prost(int64, tag = "6")]
+    time_ns: i64,
 }
 
 impl SealedLast {
@@ -155,7 +155,6 @@ impl SealedPlace {
     fn opened(self) -> Result<Place, Error> {
         let Self {
             time_ns,
-            sequence,
             latent,
             belief,
             lasting,
@@ -163,7 +162,6 @@ impl SealedPlace {
 
         Ok(Place {
             time_ns,
-            sequence,
             latent,
             belief: moving_of_numbers(&belief)?,
             lasting: symmetric(&lasting)?,
@@ -179,10 +177,12 @@ impl SealedCandidate {
             agreeing_anchors,
             sequence,
             latent,
+            time_ns,
         } = self;
 
         Ok(Candidate {
             room: index(room)?,
+            time_ns,
             sequence,
             latent,
             map_pose: required(&map_pose)?,
@@ -325,7 +325,6 @@ impl From<&Place> for SealedPlace {
     fn from(place: &Place) -> Self {
         let Place {
             time_ns,
-            sequence,
             latent,
             belief,
             lasting,
@@ -333,7 +332,6 @@ impl From<&Place> for SealedPlace {
 
         Self {
             time_ns: *time_ns,
-            sequence: *sequence,
             latent: latent.clone(),
             belief: moving_to_numbers(belief),
             lasting: upper_triangle::<6>().map(|at| lasting[at]).collect(),
@@ -345,6 +343,7 @@ impl From<&Candidate> for SealedCandidate {
     fn from(candidate: &Candidate) -> Self {
         let Candidate {
             room,
+            time_ns,
             sequence,
             latent,
             map_pose,
@@ -357,6 +356,7 @@ impl From<&Candidate> for SealedCandidate {
             agreeing_anchors: *agreeing_anchors,
             sequence: *sequence,
             latent: latent.clone(),
+            time_ns: *time_ns,
         }
     }
 }
@@ -511,7 +511,6 @@ mod tests {
             }),
             place: Some(Place {
                 time_ns: 3,
-                sequence: 8,
                 latent: vec![-0.0; 20],
                 belief: moving,
                 lasting: SMatrix::from_diagonal_element(1.0 / 11.0),
@@ -524,6 +523,7 @@ mod tests {
             },
             candidate: Some(Candidate {
                 room: 1,
+                time_ns: 12,
                 sequence: 8,
                 latent: vec![0.5; 20],
                 map_pose: belief,

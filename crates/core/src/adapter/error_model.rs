@@ -133,6 +133,9 @@ impl MotionErrors {
 /// from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ErrorStatistics {
+    /// The mean time from one frame to the next in the rooms that this was measured in, seconds. What is
+    /// said of a number of frames holds for this many times that time.
+    pub frame_period_s: f64,
     /// Frame noise: half the second moment of the differences of latents from one frame to the
     /// next, shape (c, c). It holds the camera's own motion over one frame as well as noise.
     pub frame_noise: Array2<f64>,
@@ -150,7 +153,8 @@ pub struct ErrorStatistics {
     /// shows this room: hardly any frame of another room comes so near.
     pub certain_match_ratio: f64,
     /// A view further than this, in `frame_noise`, from each of the last [`JUMP_WINDOW`] frames has
-    /// jumped; where frames are missing, than this times the cube root of the frames from the last one to it.
+    /// jumped; where more time has passed than `frame_period_s`, than this times the cube root of how
+    /// many times that is.
     pub jump_distance: f64,
     /// The reported covariance of a corrected map pose is that of its anchor times this factor.
     pub map_pose_factor: f64,
@@ -179,6 +183,7 @@ impl ErrorModel {
         }
 
         let positive = [
+            ("the time between frames", statistics.frame_period_s),
             ("the floor of motions", statistics.motion_errors.floor),
             ("the factor of map poses", statistics.map_pose_factor),
             (
@@ -225,6 +230,11 @@ impl ErrorModel {
     /// The squared length u of a difference of latents, shape (c,), in the motion spread.
     pub fn spread_length(&self, difference: ArrayView1<'_, f64>) -> f64 {
         self.motion_spread.squared_length(difference)
+    }
+
+    /// How many frames of the rooms that this was measured in a time takes, seconds; at least 1.
+    pub fn frames_in(&self, seconds: f64) -> u64 {
+        (seconds / self.statistics.frame_period_s).round().max(1.0) as u64
     }
 
     /// The most frames that the errors of motions were measured over.

@@ -9,6 +9,8 @@ use super::{Error, FEWEST_ROOMS_TO_TRACK};
 use crate::adapter::{Adapter, ErrorStatistics, TrainingRecord, Whitener};
 use crate::geometry::Pose;
 use crate::splits::Split;
+use crate::statistics::mean;
+use crate::tracking::frame_period_s;
 use crate::training::RoomData;
 
 /// A room as the adapter sees it.
@@ -66,7 +68,10 @@ pub fn measure(
     let anchor_errors = anchor_errors(adapter, &embedded, &whitened)?;
     let limits = match_limits(&whitened)?;
 
+    let periods: Vec<f64> = rooms.iter().map(|data| frame_period_s(data.room)).collect();
+
     Ok(ErrorStatistics {
+        frame_period_s: mean(&periods),
         frame_noise,
         motion_spread,
         motion_errors,

@@ -147,6 +147,33 @@ impl<'a> PoseGraph<'a> {
         })
     }
 
+    /// The frames that a motion of at most `longest_hop` leads to from a frame, ‖(v, ω)‖ with metres and
+    /// radians mixed, with that motion; at most `most`, the nearest first.
+    pub fn neighbours(
+        &self,
+        from: FrameId,
+        longest_hop: f64,
+        most: usize,
+    ) -> Vec<(FrameId, Twist)> {
+        let pose = &self.poses[from.row()];
+        let position = pose.translation.vector;
+        let near = |to: &&FrameId| {
+            let line = self.poses[to.row()].translation.vector - position;
+            **to != from && line.norm() <= longest_hop
+        };
+
+        let mut found: Vec<(FrameId, Twist)> = self
+            .frames
+            .iter()
+            .filter(near)
+            .map(|&to| (to, body_twist(pose, &self.poses[to.row()])))
+            .filter(|(_, motion)| motion.norm() <= longest_hop)
+            .collect();
+        found.sort_by(|a, b| a.1.norm().total_cmp(&b.1.norm()));
+        found.truncate(most);
+        found
+    }
+
     /// The frames within the tolerance of the goal, by place, with the motion that is left from there;
     /// the nearest first.
     fn targets(&self, goal: &Pose, bounds: RouteBounds) -> Vec<(usize, f64)> {

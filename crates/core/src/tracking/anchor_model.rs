@@ -10,7 +10,7 @@ use nalgebra::{Matrix4, Matrix6, Vector4, Vector6};
 use ndarray::{Array2, ArrayView1};
 
 use super::Belief;
-use super::motion_prior::seconds_between;
+use super::clock::seconds_between;
 use crate::adapter::ErrorModel;
 use crate::geometry::{Pose, Twist, body_twist, exp};
 use crate::index::Neighbour;

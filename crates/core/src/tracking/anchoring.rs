@@ -175,6 +175,7 @@ impl Tracker {
         } else {
             state.candidate = Some(Candidate {
                 room,
+                time_ns: frame.time_ns,
                 sequence: frame.sequence,
                 latent: frame.latent.to_vec(),
                 map_pose,
@@ -192,7 +193,7 @@ impl Tracker {
     fn carried_candidate(&self, candidate: Candidate, frame: &Observation) -> (Belief, u32) {
         let from = EarlierView {
             latent: &candidate.latent,
-            sequence: candidate.sequence,
+            time_ns: candidate.time_ns,
         };
         let (motion, covariance) = self.motion_between(Some(candidate.room), from, frame);
 

@@ -52,7 +52,7 @@ impl MotionReading {
 #[derive(Clone, Copy)]
 pub(super) struct EarlierView<'a> {
     pub latent: &'a [f64],
-    pub sequence: u64,
+    pub time_ns: i64,
 }
 
 /// The frame that a belief is carried to.
@@ -99,7 +99,7 @@ impl Tracker {
 
         let from = EarlierView {
             latent: &keyframe.latent,
-            sequence: keyframe.sequence,
+            time_ns: keyframe.time_ns,
         };
         let (mut motion, mut covariance) = self.motion_between(state.room, from, frame);
 
@@ -122,16 +122,16 @@ impl Tracker {
         let map_pose = state.place.as_ref().map(|place| {
             let from = EarlierView {
                 latent: &place.latent,
-                sequence: place.sequence,
+                time_ns: place.time_ns,
             };
-            let frames = frame.sequence.saturating_sub(place.sequence);
+            let frames = self.frames_between(place.time_ns, frame.time_ns);
             let is_worth_it = errors.gain(frames) >= LEAST_GAIN;
             let to_frame = To {
                 room: state.room,
                 frame,
                 is_read: is_worth_it && reading == MotionReading::Complete,
             };
-            self.carried(&place.belief, from, place.time_ns, to_frame)
+            self.carried(&place.belief, from, to_frame)
         });
 
         // An error is carried to the new body frame by the adjoint of the motion since then.
@@ -170,7 +170,7 @@ impl Tracker {
     ) -> MovingBelief {
         let from = EarlierView {
             latent: &keyframe.latent,
-            sequence: keyframe.sequence,
+            time_ns: keyframe.time_ns,
         };
         let errors = self.motion_errors(state.room);
         let gain = errors.gain(self.error_model.longest_frames() as u64);
@@ -181,7 +181,7 @@ impl Tracker {
             is_read,
         };
 
-        let mut odom = self.carried(&keyframe.odom, from, keyframe.time_ns, to_frame);
+        let mut odom = self.carried(&keyframe.odom, from, to_frame);
         let read = self
             .adapter()
             .motion_without_mean(ArrayView1::from(from.latent), frame.latent.view());
@@ -219,25 +219,25 @@ impl Tracker {
 
     /// A belief of an earlier view at this frame: by how cameras move, and by what is read between
     /// the two views where that counts.
-    fn carried(
-        &self,
-        belief: &MovingBelief,
-        from: EarlierView<'_>,
-        from_ns: i64,
-        to: To<'_>,
-    ) -> MovingBelief {
+    fn carried(&self, belief: &MovingBelief, from: EarlierView<'_>, to: To<'_>) -> MovingBelief {
         let To {
             room,
             frame,
             is_read,
         } = to;
+        let seconds = (frame.time_ns.abs_diff(from.time_ns) as f64 * 1e-9).min(LONGEST_CARRY_S);
         let read = is_read.then(|| {
             let (motion, covariance) = self.motion_between(room, from, frame);
             ReadMotion { motion, covariance }
         });
 
-        let seconds = (frame.time_ns.abs_diff(from_ns) as f64 * 1e-9).min(LONGEST_CARRY_S);
         belief.moved(self.prior(room), seconds, read.as_ref())
+    }
+
+    /// How many frames of the calibration rooms a time takes: errors were measured over these.
+    pub(super) fn frames_between(&self, from_ns: i64, to_ns: i64) -> u64 {
+        self.error_model
+            .frames_in(from_ns.abs_diff(to_ns) as f64 * 1e-9)
     }
 
     /// The errors of motions: in a known room those that its own frames showed.
@@ -275,7 +275,7 @@ impl Tracker {
 
         let errors = self.motion_errors(room);
         let squared_length = self.error_model.spread_length(difference.view());
-        let frames = to.sequence.saturating_sub(from.sequence);
+        let frames = self.frames_between(from.time_ns, to.time_ns);
         let covariance = errors.at(squared_length, frames);
 
         let read = self.adapter().motion_without_mean(latent, to.latent.view());

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use ndarray::{Array2, ArrayView1, Axis, s};
 
 use super::anchor_model::{AnchorModel, Blend, LOOKED_AT, MapAnchor, calibrated_anchor};
+use super::clock::frame_period_s;
 use super::motion_prior::MotionPrior;
 use super::{Belief, Error, room_errors};
 use crate::adapter::{ErrorModel, MotionErrors, TEMPORAL_NEIGHBOURS};
@@ -72,7 +73,13 @@ impl Map {
             .whitened(navigator.latents().slice(coordinates));
         let index = ExactIndex::new(whitened.view(), mapped);
 
-        let typical_distance = typical_distance(&index, &whitened, mapped);
+        // As many rows as the neighbours in time took in the rooms where limits were measured.
+        let rows_per_frame =
+            error_model.statistics().frame_period_s / frame_period_s(navigator.room());
+        let neighbours = (f64::from(TEMPORAL_NEIGHBOURS) * rows_per_frame)
+            .round()
+            .max(1.0);
+        let typical_distance = typical_distance(&index, &whitened, mapped, neighbours as u32);
         if !(typical_distance.is_finite() && typical_distance > 0.0) {
             return Err(Error::SmallMap {
                 room: navigator.room().id().clone(),
@@ -178,9 +185,14 @@ impl Map {
     }
 }
 
-/// The median distance from a mapped frame to the nearest other one that is not its neighbour in
-/// time: how far apart views of this room lie when a camera comes back.
-fn typical_distance(index: &ExactIndex, whitened: &Array2<f64>, mapped: &[FrameId]) -> f64 {
+/// The median distance from a mapped frame to the nearest other one that is not among its `neighbours`
+/// before and after it in time: how far apart views of this room lie when a camera comes back.
+fn typical_distance(
+    index: &ExactIndex,
+    whitened: &Array2<f64>,
+    mapped: &[FrameId],
+    neighbours: u32,
+) -> f64 {
     let every = mapped.len().div_ceil(SAMPLED_FRAMES).max(1);
     let distances: Vec<f64> = mapped
         .iter()
@@ -188,7 +200,7 @@ fn typical_distance(index: &ExactIndex, whitened: &Array2<f64>, mapped: &[FrameI
         .filter_map(|&centre| {
             let exclusion = Exclusion {
                 centre,
-                radius: TEMPORAL_NEIGHBOURS,
+                radius: neighbours,
             };
             let row = whitened.row(centre.row()).to_vec();
             Some(index.nearest(&row, 1, Some(exclusion)).first()?.distance)

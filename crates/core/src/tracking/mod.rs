@@ -10,6 +10,7 @@
 mod anchor_model;
 mod anchoring;
 mod belief;
+mod clock;
 mod dead_reckoning;
 mod health;
 mod map;
@@ -26,9 +27,10 @@ mod view;
 pub use anchor_model::MapAnchor;
 pub use anchoring::ANCHORS_TO_AGREE;
 pub use belief::{Belief, Innovation};
+pub use clock::{ASSUMED_PERIOD_S, frame_period_s, seconds_between};
 pub use health::{Continuity, FrameEvidence, TrackingHealth};
 pub use map::{Map, MapMatch, PoseReader};
-pub use motion_prior::{ASSUMED_PERIOD_S, MotionPrior};
+pub use motion_prior::MotionPrior;
 pub use moving::MovingBelief;
 pub use relocalize::{ROOM_RATIO, Relocalization, RoomMatch, relocalize};
 pub use replay::{

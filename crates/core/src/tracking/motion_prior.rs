@@ -6,12 +6,11 @@
 
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
+use super::clock::seconds_between;
 use super::moving::Matrix12;
 use crate::geometry::{Twist, body_twist};
 use crate::room::{FrameId, Room};
 
-/// Seconds between the rows of a recording without timestamps: a camera at 30 Hz.
-pub const ASSUMED_PERIOD_S: f64 = 1.0 / 30.0;
 /// Velocities are compared over about this time to see how long they last, seconds.
 const LAG_S: f64 = 0.2;
 /// Mapped frames further apart in time than this tell no velocity, seconds.
@@ -178,15 +177,6 @@ impl Decay {
             way_velocity: duration_s * (1.0 - left).powi(2),
             velocity: 1.0 - left * left,
         }
-    }
-}
-
-/// Seconds from one frame of a room to a later one: by their timestamps where the recording has them.
-pub fn seconds_between(room: &Room, from: FrameId, to: FrameId) -> f64 {
-    let times = room.timestamps_ns();
-    match (times.get(from.row()), times.get(to.row())) {
-        (Some(from), Some(to)) => to.saturating_sub(*from) as f64 * 1e-9,
-        _ => f64::from(to.0.saturating_sub(from.0)) * ASSUMED_PERIOD_S,
     }
 }
 

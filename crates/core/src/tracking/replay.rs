@@ -2,7 +2,7 @@
 
 use ndarray::ArrayView2;
 
-use super::motion_prior::{ASSUMED_PERIOD_S, seconds_between};
+use super::clock::{ASSUMED_PERIOD_S, seconds_between};
 use super::{Belief, Observation, State, Status, Tracker, Update};
 use crate::geometry::{Pose, PoseError, body_twist, log};
 use crate::room::{FrameId, Room};

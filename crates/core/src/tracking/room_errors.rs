@@ -3,6 +3,7 @@
 
 use ndarray::s;
 
+use super::clock::{frame_period_s, seconds_between};
 use crate::adapter::{Error, ErrorModel, ErrorTable, MotionErrors, Stratum};
 use crate::geometry::body_twist;
 use crate::navigation::Navigator;
@@ -26,9 +27,12 @@ pub fn motion_errors(
 ) -> Result<MotionErrors, Error> {
     let calibrated = &error_model.statistics().motion_errors;
 
+    // A stratum is of so many frames of the calibration rooms: here that may be more or fewer rows.
+    let rows_per_frame = error_model.statistics().frame_period_s / frame_period_s(navigator.room());
+
     let mut strata = Vec::with_capacity(calibrated.shapes.strata().len());
     for stratum in calibrated.shapes.strata() {
-        let stride = stratum.at as u32;
+        let stride = (stratum.at * rows_per_frame).round().max(1.0) as u32;
         let factor = factor_of(motion_surprises(navigator, error_model, mapped, stride));
         strata.push(Stratum {
             covariance: stratum.covariance * factor,
@@ -78,20 +82,23 @@ fn motion_surprises(
         .filter(|(from, to)| room.timeline().joins(*from, *to))
         .collect();
 
-    let gain = error_model
-        .statistics()
-        .motion_errors
-        .gain(u64::from(stride));
+    let frames =
+        |from: FrameId, to: FrameId| error_model.frames_in(seconds_between(room, from, to));
     let surprise = |(from, to): &(FrameId, FrameId)| {
         let latent_from = latents.row(from.row());
         let latent_to = latents.row(to.row());
         let difference = &latent_to.slice(coordinates) - &latent_from.slice(coordinates);
-        let covariance = error_model.motion_errors(difference.view(), u64::from(to.0 - from.0));
+        let covariance = error_model.motion_errors(difference.view(), frames(*from, *to));
 
         let truth = body_twist(&room.poses()[from.row()], &room.poses()[to.row()]).to_vector();
         let read = adapter
             .motion_without_mean(latent_from, latent_to)
-            .scaled(gain)
+            .scaled(
+                error_model
+                    .statistics()
+                    .motion_errors
+                    .gain(frames(*from, *to)),
+            )
             .to_vector();
         let error = truth - read;
         Some(error.dot(&covariance.cholesky()?.solve(&error)))

@@ -87,8 +87,6 @@ pub struct Keyframe {
 pub struct Place {
     /// When the frame was taken, nanoseconds on the sensor's clock.
     pub time_ns: i64,
-    /// The sender's number.
-    pub sequence: u64,
     /// Its latent.
     pub latent: Vec<f64>,
     /// `map_from_camera` and the camera's velocity.
@@ -103,7 +101,9 @@ pub struct Place {
 pub struct Candidate {
     /// The map, an index of [`super::Tracker::maps`].
     pub room: usize,
-    /// The number of the newest frame that spoke for it.
+    /// When the newest frame was taken that spoke for it, nanoseconds on the sensor's clock.
+    pub time_ns: i64,
+    /// That frame's number.
     pub sequence: u64,
     /// That frame's latent.
     pub latent: Vec<f64>,

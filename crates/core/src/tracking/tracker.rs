@@ -55,10 +55,15 @@ impl Sight {
     }
 }
 
+/// After a longer pause than this, in frames of the calibration rooms, a jump could not be noticed: half
+/// a second at 30 Hz.
+const LONGEST_GAP: u64 = 15;
+
 /// Settings of a tracker.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackerSettings {
-    /// A new keyframe is taken once a frame's number exceeds the keyframe's by this; at least 1.
+    /// A new keyframe is taken after the time that so many frames took in the rooms where the adapter's
+    /// errors were measured; at least 1.
     pub keyframe_frames: u32,
     /// A new keyframe is taken after a motion of this length, ‖(v, ω)‖, metres and radians mixed;
     /// above 0.
@@ -183,7 +188,6 @@ impl Tracker {
                 });
                 state.place = Some(Place {
                     time_ns: last.time_ns,
-                    sequence: last.sequence,
                     latent: last.latent.clone(),
                     belief: MovingBelief::at(pose, self.prior(state.room)),
                     lasting: Matrix6::zeros(),
@@ -276,8 +280,8 @@ impl Tracker {
         let velocity = state.last.as_ref().map(|_| believed.velocity);
         // Motions cannot be read from a blank image.
         let shows = sight != Sight::Nothing || state.keyframe.is_none();
-        let is_keyframe = shows && self.is_keyframe_due(state, frame.sequence, &prediction);
-        let is_place = shows && (correction.is_applied || self.is_place_old(state, frame.sequence));
+        let is_keyframe = shows && self.is_keyframe_due(state, frame.time_ns, &prediction);
+        let is_place = shows && (correction.is_applied || self.is_place_old(state, frame.time_ns));
         remember(state, frame, &poses, is_keyframe, is_place);
 
         // 6. The answer. The status judges the reported pose, but only while the filter still
@@ -367,12 +371,16 @@ impl Tracker {
             0
         };
 
-        // How far the views of a moving camera lie apart grows slowly with the frames from one to
-        // the other, about as the cube root of their number.
-        let frames = frames_since_last(state, frame);
-        let limit = self.error_model.statistics().jump_distance * (frames as f64).cbrt();
+        // How far the views of a moving camera lie apart grows slowly with the time from one to the
+        // other, about as its cube root.
+        let periods = state
+            .last
+            .as_ref()
+            .map_or(1, |last| self.frames_between(last.time_ns, frame.time_ns));
+        let limit = self.error_model.statistics().jump_distance * (periods as f64).cbrt();
 
-        let continuity = if frames > JUMP_WINDOW as u64 {
+        let missing = frames_since_last(state, frame) > JUMP_WINDOW as u64;
+        let continuity = if missing || periods > LONGEST_GAP {
             Continuity::Gap
         } else if !state.recent.is_empty() && nearest > limit {
             Continuity::Jump
@@ -406,24 +414,22 @@ impl Tracker {
     }
 
     /// Whether the last place is so old that motions from it were not measured, or there is none.
-    fn is_place_old(&self, state: &State, sequence: u64) -> bool {
-        let keyframe_frames = u64::from(self.settings.keyframe_frames);
-        state
-            .place
-            .as_ref()
-            .is_none_or(|place| sequence.saturating_sub(place.sequence) >= keyframe_frames)
+    fn is_place_old(&self, state: &State, time_ns: i64) -> bool {
+        let place = state.place.as_ref();
+        place.is_none_or(|place| self.is_old(place.time_ns, time_ns))
     }
 
-    fn is_keyframe_due(&self, state: &State, sequence: u64, prediction: &Prediction) -> bool {
-        let keyframe_frames = u64::from(self.settings.keyframe_frames);
-        let is_old = state
-            .keyframe
-            .as_ref()
-            .is_none_or(|keyframe| sequence.saturating_sub(keyframe.sequence) >= keyframe_frames);
+    fn is_keyframe_due(&self, state: &State, time_ns: i64, prediction: &Prediction) -> bool {
+        let keyframe = state.keyframe.as_ref();
+        let is_old = keyframe.is_none_or(|keyframe| self.is_old(keyframe.time_ns, time_ns));
 
         is_old
             || state.health.is_lost()
             || prediction.motion.norm() >= self.settings.keyframe_displacement
+    }
+
+    fn is_old(&self, from_ns: i64, to_ns: i64) -> bool {
+        self.frames_between(from_ns, to_ns) >= u64::from(self.settings.keyframe_frames)
     }
 }
 
@@ -453,7 +459,6 @@ fn remember(
         Some(belief) if is_place => {
             state.place = Some(Place {
                 time_ns: frame.time_ns,
-                sequence: frame.sequence,
                 latent: latent.clone(),
                 belief: *belief,
                 lasting: poses.lasting,

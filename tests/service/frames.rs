@@ -1,0 +1,121 @@
+//! The frames of a room over the wire, and views turned into latents.
+
+use seese3::service::Config;
+use seese3_client::convert;
+use seese3_client::proto::v1 as pb;
+use seese3_core::geometry::{Twist, body_twist, exp};
+use tonic::Code;
+
+use crate::harness::{feature, features_of, frame, room_of, start};
+
+/// Oracle: the recorded poses, and a search of all pairs by the definition.
+#[tokio::test]
+async fn a_room_lists_its_frames_and_their_neighbours() {
+    const HOP: f64 = 0.05;
+    let server = start(Config::default()).await;
+    let room = room_of("synthetic", "synthetic");
+    let poses = room.poses();
+
+    let frames = server.client.frames("synthetic", Some(HOP)).await.unwrap();
+    assert_eq!(frames.len(), poses.len());
+    assert!(frames.iter().any(|frame| frame.neighbours.len() > 2));
+
+    for (row, found) in frames.iter().enumerate() {
+        assert_eq!(found.frame_id as usize, row);
+        let pose = convert::pose(found.pose.as_ref().unwrap()).unwrap();
+        assert!((pose.to_homogeneous() - poses[row].to_homogeneous()).norm() < 1e-12);
+
+        let near =
+            |other: &usize| *other != row && body_twist(&poses[row], &poses[*other]).norm() <= HOP;
+        let expected = (0..poses.len()).filter(near).count();
+        assert_eq!(found.neighbours.len(), expected.min(64), "frame {row}");
+
+        let mut before = 0.0;
+        for neighbour in &found.neighbours {
+            let motion = convert::twist(neighbour.motion.as_ref().unwrap()).unwrap();
+            let motion = Twist {
+                linear: motion.linear,
+                angular: motion.angular,
+            };
+            let there = poses[row] * exp(&motion);
+            let stored = poses[neighbour.frame_id as usize];
+            assert!((there.to_homogeneous() - stored.to_homogeneous()).norm() < 1e-9);
+            assert!(motion.norm() >= before && motion.norm() <= HOP);
+            before = motion.norm();
+        }
+    }
+
+    let plain = server.client.frames("synthetic", None).await.unwrap();
+    assert!(plain.iter().all(|frame| frame.neighbours.is_empty()));
+
+    for (hop, room, code) in [
+        (Some(0.0), "synthetic", Code::InvalidArgument),
+        (Some(f64::NAN), "synthetic", Code::InvalidArgument),
+        (None, "nowhere", Code::NotFound),
+    ] {
+        let error = server.client.frames(room, hop).await.unwrap_err();
+        assert_eq!(error.code(), Some(code), "{error}");
+    }
+}
+
+/// Oracle: the promise: a latent says what the view says. The frames that are found by it are those
+/// that are found by the view, to the bit of their distances.
+#[tokio::test]
+async fn a_latent_stands_for_its_view() {
+    let server = start(Config::default()).await;
+    let row = features_of("synthetic").rows().row(77).to_vec();
+    let room = "synthetic".to_owned();
+    let served = server.client.room("synthetic").await.unwrap();
+    let adapter = served.unwrap().adapters[0].clone();
+
+    let encoded = server
+        .client
+        .encode(pb::EncodeRequest {
+            adapter: adapter.clone(),
+            room: room.clone(),
+            views: vec![feature(row.clone()).unwrap(), frame(77).unwrap()],
+            with_features: true,
+        })
+        .await
+        .unwrap();
+    assert_eq!(encoded.adapter.unwrap().name, adapter);
+    assert_eq!(encoded.views.len(), 2);
+    assert_eq!(encoded.views[0].feature.as_ref().unwrap().values, row);
+    assert!(encoded.views[1].feature.is_none(), "a frame is no feature");
+
+    let localize = async |view: Option<pb::View>| {
+        let asked = pb::LocalizeRequest {
+            rooms: vec![room.clone()],
+            adapter: adapter.clone(),
+            view,
+            top_k: Some(5),
+            ..Default::default()
+        };
+        server.client.localize(asked).await.unwrap().places
+    };
+    let latent = pb::View {
+        view: Some(pb::view::View::Latent(
+            encoded.views[0].latent.clone().unwrap(),
+        )),
+    };
+    assert_eq!(localize(feature(row)).await, localize(Some(latent)).await);
+
+    let bad = |views: Vec<pb::View>| pb::EncodeRequest {
+        adapter: adapter.clone(),
+        views,
+        ..Default::default()
+    };
+    for (request, word) in [
+        (bad(Vec::new()), "views"),
+        (bad(vec![frame(1).unwrap(); 257]), "views"),
+        (bad(vec![frame(1).unwrap()]), "room"),
+        (bad(vec![feature(vec![1.0; 3]).unwrap()]), "views[0]"),
+    ] {
+        let error = server.client.encode(request).await.unwrap_err();
+        assert_eq!(error.code(), Some(Code::InvalidArgument), "{error}");
+        assert!(
+            error.to_string().contains(word),
+            "{error} does not say {word}"
+        );
+    }
+}
