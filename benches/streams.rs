@@ -113,6 +113,13 @@ impl OdometryService for Echo {
         Err(tonic::Status::unimplemented("an echo"))
     }
 
+    async fn encode(
+        &self,
+        _: tonic::Request<pb::EncodeRequest>,
+    ) -> Result<tonic::Response<pb::EncodeResponse>, tonic::Status> {
+        Err(tonic::Status::unimplemented("an echo"))
+    }
+
     async fn track(
         &self,
         request: tonic::Request<tonic::Streaming<pb::TrackRequest>>,
@@ -222,6 +229,8 @@ async fn load(
                         timestamp_ns,
                         sequence,
                         view,
+                        with_token: false,
+                        odometry: None,
                     };
 
                     if sender

@@ -356,6 +356,7 @@ fn frame(row: usize, view: pb::view::View, hz: f64) -> pb::TrackFrame {
         sequence: row as u64 + 1,
         view,
         with_token: false,
+        odometry: None,
     }
 }
 

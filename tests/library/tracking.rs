@@ -5,12 +5,13 @@ use std::sync::Arc;
 use crate::support::world::{FRAMES, calibrated, place, served};
 use seese3_core::adapter::Adapter;
 use seese3_core::features::Features;
-use seese3_core::geometry::{Pose, PoseError, body_twist};
+use seese3_core::geometry::{Pose, PoseError, body_twist, exp};
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Frames, Room, RoomId};
 use seese3_core::statistics::root_mean_square;
 use seese3_core::tracking::{
-    Belief, Map, Observation, PoseReader, State, Status, Tracker, TrackerSettings, Update,
+    Belief, Drift, Map, MeasuredPose, Observation, PoseReader, State, Status, Tracker,
+    TrackerSettings, Update,
 };
 
 /// A tracker in a room of these poses, all of whose even frames are mapped.
@@ -53,6 +54,7 @@ fn observe(tracker: &Tracker, state: &mut State, features: &Features, row: usize
         latent,
         feature: None,
         is_blank: false,
+        measured: None,
     };
 
     tracker.observe(state, &observation).unwrap()
@@ -129,6 +131,7 @@ fn odom_never_jumps() {
                     latent,
                     feature: None,
                     is_blank: false,
+                    measured: None,
                 },
             )
             .unwrap();
@@ -182,6 +185,7 @@ fn what_a_gap_hid_is_not_taken_on_trust() {
             latent: adapter.embed_one(&view.to_vec()).unwrap(),
             feature: None,
             is_blank: false,
+            measured: None,
         };
         tracker.observe(state, &observation).unwrap()
     };
@@ -248,6 +252,7 @@ fn the_reader_of_a_room_gives_the_anchors() {
                 latent: latent.unwrap(),
                 feature: has_feature.then(|| vec![row as f32]),
                 is_blank: false,
+                measured: None,
             };
             let update = tracker.observe(&mut state, &observation).unwrap();
             if update.match_used {
@@ -328,6 +333,7 @@ fn a_camera_that_sees_nothing_new_is_not_tracked() {
             latent: latent.unwrap(),
             feature: None,
             is_blank,
+            measured: None,
         };
         tracker.observe(&mut state, &observation).unwrap()
     };
@@ -384,4 +390,81 @@ fn a_camera_that_sees_nothing_new_is_not_tracked() {
     let blank = show(201, true);
     assert_eq!(blank.status, Status::Degraded, "{}", blank.reason);
     assert!(!blank.match_used && blank.reason.contains("blank"));
+}
+
+/// Oracle: the true poses. The camera goes blind while it moves on. Wheels that drift by a twentieth
+/// of the way carry it, to within what they may have drifted, and the covariance holds the error;
+/// without them it is lost sight of.
+#[test]
+fn wheels_carry_a_blind_camera() {
+    let adapter = Arc::new(calibrated().0);
+    let (room, features) = served("hall");
+    let tracker = tracker(&adapter, room.poses().to_vec(), &features);
+
+    let ride = |has_wheels: bool| {
+        let mut state = tracker.start(Some(Belief::known(room.poses()[41], 0.01, 0.01)));
+        // The wheels' own frame is not the room's, and every motion that they report is 3 % too long.
+        let mut wheels = Pose::new(
+            nalgebra::Vector3::new(5.0, -2.0, 1.0),
+            nalgebra::Vector3::new(0.0, 1.0, 0.0),
+        );
+        let mut worst = 0.0_f64;
+        let mut surprises = Vec::new();
+        let mut statuses = Vec::new();
+
+        for row in 41..141 {
+            if row > 41 {
+                let motion = body_twist(&room.poses()[row - 1], &room.poses()[row]);
+                wheels *= exp(&motion.scaled(1.03));
+            }
+
+            let is_blind = row >= 71;
+            let observation = Observation {
+                time_ns: row as i64 * 33_000_000,
+                sequence: row as u64,
+                latent: adapter
+                    .embed_one(&features.rows().row(row).to_vec())
+                    .unwrap(),
+                feature: None,
+                is_blank: is_blind,
+                measured: has_wheels.then_some(MeasuredPose {
+                    pose: wheels,
+                    drift: Drift {
+                        translation_share: 0.05,
+                        rotation_share: 0.05,
+                    },
+                }),
+            };
+            let update = tracker.observe(&mut state, &observation).unwrap();
+            if is_blind {
+                let believed = update.map_pose.unwrap();
+                let truth = &room.poses()[row];
+                worst = worst.max(PoseError::between(&believed.pose, truth).translation_m);
+                surprises.extend(believed.squared_error(truth));
+                statuses.push(update.status);
+            }
+        }
+
+        (worst, surprises, statuses)
+    };
+
+    let (blind, ..) = ride(false);
+    let (carried, surprises, statuses) = ride(true);
+    assert!(blind > 0.5, "the camera hardly moved: {blind} m");
+    assert!(carried < 0.1, "{carried} m, {blind} without wheels");
+
+    // 95 % of chi-square with six degrees of freedom.
+    let held = surprises
+        .iter()
+        .filter(|surprise| **surprise <= 12.59)
+        .count();
+    assert!(
+        held * 10 >= surprises.len() * 9,
+        "{held} of {}",
+        surprises.len()
+    );
+    assert!(
+        statuses.iter().all(|status| *status == Status::Degraded),
+        "a blind camera is not TRACKING"
+    );
 }

@@ -6,7 +6,7 @@ use seese3_client::convert;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::track_request::Message;
 use seese3_client::proto::v1::track_response::Answer;
-use seese3_core::geometry::PoseError;
+use seese3_core::geometry::{Pose, PoseError};
 use tonic::Code;
 
 use crate::harness::{TestServer, feature, frame, start_on};
@@ -66,6 +66,7 @@ fn seen_of(room: &str, row: usize) -> pb::TrackRequest {
         sequence: row as u64 + 1,
         view,
         with_token: false,
+        odometry: None,
     })
 }
 
@@ -395,6 +396,7 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
 
     let late = pb::TrackFrame {
         with_token: false,
+        odometry: None,
         timestamp_ns: 0,
         sequence: 100,
         view: feature(vec![0.0; 48]),
@@ -402,6 +404,7 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
 
     let duplicate = pb::TrackFrame {
         with_token: false,
+        odometry: None,
         timestamp_ns: i64::MAX,
         sequence: 3,
         view: feature(vec![0.0; 48]),
@@ -409,6 +412,7 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
 
     let narrow = pb::TrackFrame {
         with_token: false,
+        odometry: None,
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: feature(vec![0.0; 47]),
@@ -416,6 +420,7 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
 
     let nan = pb::TrackFrame {
         with_token: false,
+        odometry: None,
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: feature(vec![f32::NAN; 48]),
@@ -423,6 +428,7 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
 
     let of_room = pb::TrackFrame {
         with_token: false,
+        odometry: None,
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: frame(3),
@@ -430,6 +436,7 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
 
     let empty = pb::TrackFrame {
         with_token: false,
+        odometry: None,
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: None,
@@ -487,6 +494,7 @@ async fn a_camera_in_another_place_is_lost_and_less_and_less_sure() {
 
         message(pb::TrackFrame {
             with_token: false,
+            odometry: None,
             timestamp_ns: row as i64 * 33_000_000,
             sequence: row as u64 + 1,
             view,
@@ -605,6 +613,7 @@ async fn a_stream_is_configured_once_and_first() {
                     map: "x".to_owned(),
                     odom: "x".to_owned(),
                     camera: String::new(),
+                    base: String::new(),
                 }),
                 ..config()
             })],
@@ -828,5 +837,143 @@ async fn a_view_is_found_among_rooms_or_called_ambiguous() {
     ] {
         let error = server.client.relocalize(request).await.unwrap_err();
         assert_eq!(error.field().as_deref(), Some(field), "{error}");
+    }
+}
+
+/// Oracle: composition, and the stream without a base. The base's poses are the camera's, moved by the
+/// mounting; odometry begins at the base; the camera's map poses and motions are what they were.
+#[tokio::test]
+async fn a_robot_gets_the_poses_of_its_base() {
+    let server = server(KEY).await;
+    let frames = || (0..40).map(seen);
+    let mounting = Pose::new(
+        nalgebra::Vector3::new(0.3, 0.1, 0.5),
+        nalgebra::Vector3::new(0.2, -1.4, 0.3),
+    );
+    let on_base = pb::TrackConfig {
+        base_from_camera: Some(convert::pose_to_wire(&mounting, "base_link", "camera")),
+        ..config()
+    };
+
+    let plain = answers(
+        &server,
+        [begin(config())].into_iter().chain(frames()).collect(),
+    );
+    let plain = plain.await.unwrap();
+    let based = answers(
+        &server,
+        [begin(on_base)].into_iter().chain(frames()).collect(),
+    );
+    let based = based.await.unwrap();
+
+    let pose = |given: &Option<pb::Pose>| convert::pose(given.as_ref().unwrap()).unwrap();
+    let near = |a: Pose, b: Pose| {
+        let apart = PoseError::between(&a, &b);
+        assert!(
+            apart.translation_m < 1e-9 && apart.rotation_rad < 1e-7,
+            "{apart:?}"
+        );
+    };
+
+    let first = update(&based[1]);
+    near(pose(&first.odom_from_base), Pose::identity());
+    assert!(update(&plain[1]).odom_from_base.is_none());
+
+    let (plain, based) = (update(&plain[40]), update(&based[40]));
+    assert_eq!(plain.motion, based.motion);
+    assert_eq!(plain.map_from_camera, based.map_from_camera);
+    assert_eq!(
+        plain.map_from_camera_covariance,
+        based.map_from_camera_covariance
+    );
+
+    near(
+        pose(&based.map_from_base) * mounting,
+        pose(&based.map_from_camera),
+    );
+    near(
+        pose(&based.map_from_odom) * pose(&based.odom_from_base),
+        pose(&based.map_from_base),
+    );
+    near(
+        pose(&based.odom_from_camera),
+        mounting * pose(&plain.odom_from_camera),
+    );
+    assert_eq!(
+        based.map_from_base.as_ref().unwrap().child_frame,
+        "base_link"
+    );
+    assert_eq!(based.map_from_base_covariance.len(), 36);
+
+    // A point that is fixed to the base moves with the base's velocity and with the camera's.
+    let moved = |velocity: &Option<pb::Twist>| convert::twist(velocity.as_ref().unwrap()).unwrap();
+    let of_camera = moved(&based.body_velocity);
+    let of_base = moved(&based.base_velocity);
+    let turn = mounting.rotation * of_camera.angular;
+    assert!((turn - of_base.angular).norm() < 1e-9);
+    let at_camera = of_base.linear + of_base.angular.cross(&mounting.translation.vector);
+    assert!((at_camera - mounting.rotation * of_camera.linear).norm() < 1e-9);
+}
+
+/// Oracle: the rules of TrackFrame.odometry: what is wrong with it refuses the frame by its name, and
+/// the next frame is answered as if it had not been sent.
+#[tokio::test]
+async fn odometry_that_is_none_is_refused() {
+    let server = server(KEY).await;
+    let with = |row: usize, odometry: pb::MeasuredOdometry| {
+        let mut request = seen(row);
+        if let Some(Message::Frame(frame)) = &mut request.message {
+            frame.odometry = Some(odometry);
+        }
+        request
+    };
+    let good = pb::MeasuredOdometry {
+        pose: Some(convert::pose_to_wire(&Pose::identity(), "wheels", "")),
+        ..Default::default()
+    };
+    let bad = [
+        (pb::MeasuredOdometry::default(), "odometry.pose"),
+        (
+            pb::MeasuredOdometry {
+                pose: Some(pb::Pose::default()),
+                ..good.clone()
+            },
+            "odometry.pose",
+        ),
+        (
+            pb::MeasuredOdometry {
+                translation_share: Some(f64::NAN),
+                ..good.clone()
+            },
+            "translation_share",
+        ),
+        (
+            pb::MeasuredOdometry {
+                rotation_share: Some(0.0),
+                ..good.clone()
+            },
+            "rotation_share",
+        ),
+    ];
+
+    for (odometry, word) in bad {
+        let sent = vec![
+            begin(config()),
+            with(0, good.clone()),
+            with(1, odometry),
+            seen(2),
+        ];
+        let heard = answers(&server, sent).await.unwrap();
+        match &heard[2].answer {
+            Some(Answer::Refusal(refusal)) => {
+                assert_eq!(refusal.reason(), pb::TrackRefusalReason::Odometry);
+                assert!(refusal.message.contains(word), "{}", refusal.message);
+            }
+            other => panic!("{other:?}"),
+        }
+
+        let plain = vec![begin(config()), with(0, good.clone()), seen(2)];
+        let plain = answers(&server, plain).await.unwrap();
+        assert_eq!(heard[3], plain[2]);
     }
 }

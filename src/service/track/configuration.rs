@@ -7,16 +7,21 @@ use super::super::convert;
 use super::super::relocalization::rooms_to_track_in;
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use seese3_client::proto::v1 as pb;
-use seese3_core::tracking::{Belief, TrackerSettings};
+use seese3_core::geometry::{Pose, adjoint};
+use seese3_core::tracking::{Belief, Drift, MeasuredPose, TrackerSettings};
 
 /// The standard deviation by axis of a pose whose sender states none: 0.1 m and 0.1 rad.
 const KNOWN: f64 = 0.1;
 /// The standard deviations that a sender may state, metres or radians.
 const DEVIATIONS: std::ops::RangeInclusive<f64> = 1e-6..=1e3;
-/// The names of the map, odometry and camera frames if the stream does not choose its own.
-const FRAME_NAMES: [&str; 3] = ["map", "odom", "camera"];
+/// The names of the map, odometry, camera and base frames if the stream does not choose its own.
+const FRAME_NAMES: [&str; 4] = ["map", "odom", "camera", "base_link"];
 /// The longest name of a frame.
 const LONGEST_NAME: usize = 100;
+/// How fast the odometry of another sensor drifts if its sender does not say, and what it may say:
+/// metres per metre, radians per radian.
+const DRIFT_SHARE: f64 = 0.05;
+const DRIFT_SHARES: std::ops::RangeInclusive<f64> = 1e-4..=10.0;
 
 /// The rooms of a configuration, all under one adapter; at least one.
 ///
@@ -98,16 +103,173 @@ pub fn back_pressure(given: i32) -> Result<(), Error> {
     }
 }
 
-pub fn frame_names(given: pb::FrameNames) -> Result<pb::FrameNames, Error> {
-    let pb::FrameNames { map, odom, camera } = given;
-    let mut names = [map, odom, camera];
+/// The coordinate frames of a stream.
+#[derive(Debug, Clone)]
+pub struct StreamFrames {
+    /// Their names, all different.
+    pub names: pb::FrameNames,
+    /// The camera's pose on the robot, if it is known.
+    pub base_from_camera: Option<Pose>,
+}
+
+/// What a pose that a client sends is of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Body {
+    Camera,
+    Base,
+}
+
+impl StreamFrames {
+    /// The frames that a configuration names. Names that are left empty take the defaults; the name of
+    /// a base only matters where the base is known.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] for a name that is too long or twice the same, and for a bad pose.
+    pub fn of(config: &pb::TrackConfig) -> Result<Self, Error> {
+        let given = config.base_from_camera.clone();
+        let names = frame_names(config.frames.clone().unwrap_or_default(), given.is_some())?;
+        let base_from_camera = given
+            .map(|mut pose| {
+                clear_name(&mut pose.parent_frame, &names.base);
+                clear_name(&mut pose.child_frame, &names.camera);
+                convert::pose(pose, "").map_err(|error| error.within("base_from_camera"))
+            })
+            .transpose()?;
+
+        Ok(Self {
+            names,
+            base_from_camera,
+        })
+    }
+
+    /// A pose on the map that is given from outside, of the camera or the base, as the camera's. Its
+    /// frames may have the stream's own names or those of the service, `rooms/NAME` and `camera`.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if the pose is missing or not valid, or a standard deviation is out of range.
+    pub fn known_pose(&self, given: pb::InitialPose, room: &str) -> Result<Belief, Error> {
+        let pb::InitialPose {
+            pose,
+            translation_deviation_m,
+            rotation_deviation_rad,
+        } = given;
+        let mut pose = pose.ok_or_else(|| Error::invalid("pose", "is required"))?;
+
+        // `convert::pose` takes an empty name for the room's world or the camera, so the stream's own
+        // names are cleared.
+        clear_name(&mut pose.parent_frame, &self.names.map);
+        let body = self.body(&mut pose, Body::Camera);
+        let pose = convert::pose(pose, room).map_err(|error| error.within("pose"))?;
+
+        let deviation =
+            |field: &str, given: Option<f64>| within(field, given.unwrap_or(KNOWN), DEVIATIONS);
+        let translation = deviation("translation_deviation_m", translation_deviation_m)?;
+        let rotation = deviation("rotation_deviation_rad", rotation_deviation_rad)?;
+
+        Ok(self.of_camera(Belief::known(pose, translation, rotation), body))
+    }
+
+    /// The odometry of another sensor, as the camera's.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if the pose is missing or not valid, or a share is out of range.
+    pub fn measured(&self, given: pb::MeasuredOdometry) -> Result<MeasuredPose, Error> {
+        let pb::MeasuredOdometry {
+            pose,
+            translation_share,
+            rotation_share,
+        } = given;
+        let mut pose = pose.ok_or_else(|| Error::invalid("pose", "is required"))?;
+
+        // The sensor's own frame may have any name.
+        pose.parent_frame.clear();
+        let body = self.body(&mut pose, Body::Base);
+        let pose = convert::pose(pose, "").map_err(|error| error.within("pose"))?;
+        let share = |field: &str, given: Option<f64>| {
+            within(field, given.unwrap_or(DRIFT_SHARE), DRIFT_SHARES)
+        };
+
+        Ok(MeasuredPose {
+            pose: match (body, self.base_from_camera) {
+                (Body::Base, Some(base_from_camera)) => pose * base_from_camera,
+                _ => pose,
+            },
+            drift: Drift {
+                translation_share: share("translation_share", translation_share)?,
+                rotation_share: share("rotation_share", rotation_share)?,
+            },
+        })
+    }
+
+    /// Whose pose a pose is, by the name of its child, which is cleared if it is one of the stream's.
+    fn body(&self, pose: &mut pb::Pose, unnamed: Body) -> Body {
+        if self.base_from_camera.is_none() {
+            clear_name(&mut pose.child_frame, &self.names.camera);
+            return Body::Camera;
+        }
+
+        if pose.child_frame.is_empty() {
+            return unnamed;
+        }
+        if pose.child_frame == self.names.base {
+            pose.child_frame.clear();
+            return Body::Base;
+        }
+
+        clear_name(&mut pose.child_frame, &self.names.camera);
+        Body::Camera
+    }
+
+    /// A belief of a body's pose as one of the camera's. The error is in the body's own frame, so that
+    /// it is carried over by the adjoint.
+    fn of_camera(&self, belief: Belief, body: Body) -> Belief {
+        match (body, self.base_from_camera) {
+            (Body::Base, Some(base_from_camera)) => on_another_body(&belief, &base_from_camera),
+            _ => belief,
+        }
+    }
+}
+
+/// A belief of a body's pose as one of another body that is fixed to it at `body_from_other`.
+pub fn on_another_body(belief: &Belief, body_from_other: &Pose) -> Belief {
+    let other = adjoint(&body_from_other.inverse());
+    Belief {
+        pose: belief.pose * body_from_other,
+        covariance: other * belief.covariance * other.transpose(),
+    }
+}
+
+fn clear_name(name: &mut String, own: &str) {
+    if name == own {
+        name.clear();
+    }
+}
+
+fn within(field: &str, value: f64, range: std::ops::RangeInclusive<f64>) -> Result<f64, Error> {
+    if range.contains(&value) {
+        return Ok(value);
+    }
+
+    let problem = format!("must be {:e} to {:e}", range.start(), range.end());
+    Err(Error::invalid(field, problem))
+}
+
+fn frame_names(given: pb::FrameNames, has_base: bool) -> Result<pb::FrameNames, Error> {
+    let pb::FrameNames {
+        map,
+        odom,
+        camera,
+        base,
+    } = given;
+    let mut names = [map, odom, camera, base];
 
     // Empty names take the defaults. The others are repeated in answers, so they must be short
     // and free of control characters.
-    for (name, (plain, field)) in names
-        .iter_mut()
-        .zip(FRAME_NAMES.into_iter().zip(["map", "odom", "camera"]))
-    {
+    for (name, (plain, field)) in names.iter_mut().zip(
+        FRAME_NAMES
+            .into_iter()
+            .zip(["map", "odom", "camera", "base"]),
+    ) {
         if name.is_empty() {
             *name = plain.to_owned();
         }
@@ -118,55 +280,22 @@ pub fn frame_names(given: pb::FrameNames) -> Result<pb::FrameNames, Error> {
     }
 
     // In a transform tree every frame needs a name of its own.
-    if names[0] == names[1] || names[1] == names[2] || names[0] == names[2] {
-        return Err(Error::invalid("frames", "must be three different names"));
+    let used = if has_base { &names[..] } else { &names[..3] };
+    let mut different: Vec<&String> = used.iter().collect();
+    different.sort();
+    different.dedup();
+    if different.len() != used.len() {
+        return Err(Error::invalid(
+            "frames",
+            format!("must be {} different names", used.len()),
+        ));
     }
 
-    let [map, odom, camera] = names;
-    Ok(pb::FrameNames { map, odom, camera })
-}
-
-/// A pose on the map that is given from outside, with its uncertainty. Its frames may have the
-/// stream's own names or those of the service, `rooms/NAME` and `camera`.
-///
-/// # Errors
-/// [`Error::Invalid`] if the pose is missing or not valid, or a standard deviation is out of range.
-pub fn known_pose(
-    given: pb::InitialPose,
-    room: &str,
-    names: &pb::FrameNames,
-) -> Result<Belief, Error> {
-    let pb::InitialPose {
-        pose,
-        translation_deviation_m,
-        rotation_deviation_rad,
-    } = given;
-    let mut pose = pose.ok_or_else(|| Error::invalid("pose", "is required"))?;
-
-    // `convert::pose` takes an empty name for the room's world or the camera, so the stream's own
-    // names are cleared.
-    for (frame, name) in [
-        (&mut pose.parent_frame, &names.map),
-        (&mut pose.child_frame, &names.camera),
-    ] {
-        if frame == name {
-            frame.clear();
-        }
-    }
-
-    let pose = convert::pose(pose, room).map_err(|error| error.within("pose"))?;
-
-    let deviation = |field: &str, given: Option<f64>| match given {
-        None => Ok(KNOWN),
-        Some(given) if DEVIATIONS.contains(&given) => Ok(given),
-        _ => Err(Error::invalid(
-            field,
-            format!("must be {:e} to {:e}", DEVIATIONS.start(), DEVIATIONS.end()),
-        )),
-    };
-
-    let translation = deviation("translation_deviation_m", translation_deviation_m)?;
-    let rotation = deviation("rotation_deviation_rad", rotation_deviation_rad)?;
-
-    Ok(Belief::known(pose, translation, rotation))
+    let [map, odom, camera, base] = names;
+    Ok(pb::FrameNames {
+        map,
+        odom,
+        camera,
+        base,
+    })
 }

@@ -9,7 +9,8 @@ use prost::Message;
 use super::super::Error;
 use seese3_core::geometry::{Pose, Twist};
 use seese3_core::tracking::{
-    Belief, Candidate, Keyframe, LastFrame, MovingBelief, Place, State, TrackingHealth,
+    Belief, Candidate, Keyframe, LastFrame, MeasuredSince, MovingBelief, Place, State,
+    TrackingHealth,
 };
 
 /// The content of a token: the configuration of the stream, a hash of what it was answered from,
@@ -56,6 +57,19 @@ pub struct SealedState {
     place: Option<SealedPlace>,
     #[prost(uint32, tag = "13")]
     unchanged_frames: u32,
+    #[prost(message, optional, tag = "14")]
+    measured: Option<SealedMeasured>,
+}
+
+/// What other sensors measured; absent if none ever did.
+#[derive(Clone, PartialEq, Message)]
+struct SealedMeasured {
+    #[prost(double, repeated, tag = "1")]
+    last: Vec<f64>,
+    #[prost(double, repeated, tag = "2")]
+    keyframe: Vec<f64>,
+    #[prost(double, repeated, tag = "3")]
+    place: Vec<f64>,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -376,6 +390,7 @@ impl From<&State> for SealedState {
             frames_off_map,
             unchanged_frames,
             corrected_ns,
+            measured,
         } = state;
 
         // Tracking health is stored as a number for its state and the state's counter.
@@ -401,7 +416,42 @@ impl From<&State> for SealedState {
             frames_off_map: *frames_off_map,
             corrected_ns: *corrected_ns,
             unchanged_frames: *unchanged_frames,
+            measured: SealedMeasured::of(measured),
         }
+    }
+}
+
+impl SealedMeasured {
+    fn of(measured: &MeasuredSince) -> Option<Self> {
+        let MeasuredSince {
+            last,
+            keyframe,
+            place,
+        } = measured;
+
+        (*measured != MeasuredSince::default()).then(|| Self {
+            last: last.as_ref().map_or_else(Vec::new, pose_to_numbers),
+            keyframe: numbers(keyframe),
+            place: numbers(place),
+        })
+    }
+
+    fn opened(self) -> Result<MeasuredSince, Error> {
+        let Self {
+            last,
+            keyframe,
+            place,
+        } = self;
+
+        Ok(MeasuredSince {
+            last: if last.is_empty() {
+                None
+            } else {
+                Some(pose_of_numbers(&last)?.0)
+            },
+            keyframe: belief_of_numbers(&keyframe)?,
+            place: belief_of_numbers(&place)?,
+        })
     }
 }
 
@@ -426,6 +476,7 @@ impl SealedState {
             frames_off_map,
             corrected_ns,
             unchanged_frames,
+            measured,
         } = self;
 
         let health = match health {
@@ -458,6 +509,10 @@ impl SealedState {
             frames_off_map,
             unchanged_frames,
             corrected_ns,
+            measured: match measured {
+                Some(measured) => measured.opened()?,
+                None => MeasuredSince::default(),
+            },
         })
     }
 }
@@ -532,6 +587,11 @@ mod tests {
             frames_off_map: 7,
             corrected_ns: Some(-7),
             unchanged_frames: 3,
+            measured: MeasuredSince {
+                last: Some(belief.pose),
+                keyframe: Some(belief),
+                place: None,
+            },
         };
 
         for state in [

@@ -13,7 +13,7 @@ use super::super::relocalization::maps;
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use super::super::status::view_error;
 use super::Overtaken;
-use super::configuration::{back_pressure, frame_names, known_pose, rooms, settings};
+use super::configuration::{StreamFrames, back_pressure, rooms, settings};
 use super::sealed::{Sealed, SealedState};
 use super::token::TokenKey;
 use super::wire;
@@ -30,7 +30,7 @@ pub struct Session {
     served: Vec<Arc<ServedNavigator>>,
     tracker: Tracker,
     config: pb::TrackConfig,
-    names: pb::FrameNames,
+    frames: StreamFrames,
     state: State,
     key: TokenKey,
     digest: Vec<u8>,
@@ -119,6 +119,7 @@ impl Session {
             frames_off_map: _,
             unchanged_frames: _,
             corrected_ns: _,
+            measured: _,
         } = &self.state;
 
         let latents = [
@@ -151,7 +152,7 @@ impl Session {
         let maps = maps(&served)?;
         let settings = settings(&config, &adapter.adapter)?;
 
-        let names = frame_names(config.frames.clone().unwrap_or_default())?;
+        let frames = StreamFrames::of(&config)?;
         back_pressure(config.back_pressure)?;
 
         // A pose only has a meaning in the world of a room, so the room must be known as well.
@@ -161,7 +162,8 @@ impl Session {
                 return Err(Error::invalid("initial_pose", "needs the room it is in"));
             }
             Some(given) => Some(
-                known_pose(given, &config.room, &names)
+                frames
+                    .known_pose(given, &config.room)
                     .map_err(|error| error.within("initial_pose"))?,
             ),
         };
@@ -186,7 +188,7 @@ impl Session {
             served,
             tracker,
             config,
-            names,
+            frames,
             state,
             key: key.clone(),
             digest,
@@ -210,7 +212,7 @@ impl Session {
                 .state
                 .room
                 .map(|room| convert::room_revision(&self.served[room])),
-            frames: Some(self.names.clone()),
+            frames: Some(self.frames.names.clone()),
             keyframes: Some(pb::KeyframePolicy {
                 displacement: Some(settings.keyframe_displacement),
                 frames: Some(settings.keyframe_frames),
@@ -238,11 +240,16 @@ impl Session {
             sequence,
             view,
             with_token,
+            odometry,
         } = frame;
 
-        let answer = match self.observe(timestamp_ns, sequence, view) {
+        let stamp = Stamp {
+            time_ns: timestamp_ns,
+            sequence,
+        };
+        let answer = match self.observe(stamp, view, odometry) {
             Ok(update) => {
-                let update = wire::update(&update, &self.names, &self.served);
+                let update = wire::update(&update, &self.frames, &self.served);
 
                 // Counted from the frame's arrival, so that the wait for a thread is included.
                 let elapsed_ns =
@@ -340,7 +347,9 @@ impl Session {
         })?;
         let name = self.served[room].navigator.room().id().to_string();
 
-        known_pose(given, &name, &self.names).map_err(|error| error.within(field))
+        self.frames
+            .known_pose(given, &name)
+            .map_err(|error| error.within(field))
     }
 
     /// Starts tracking anew with the same configuration. The configured initial pose is not used
@@ -381,9 +390,9 @@ impl Session {
 
     fn observe(
         &mut self,
-        time_ns: i64,
-        sequence: u64,
+        stamp: Stamp,
         view: Option<pb::View>,
+        odometry: Option<pb::MeasuredOdometry>,
     ) -> Result<seese3_core::tracking::Update, Refused> {
         use pb::TrackRefusalReason as Reason;
 
@@ -405,12 +414,20 @@ impl Session {
             View::Feature(feature) => Some(feature),
             View::Latent(_) => None,
         };
+        let measured = odometry
+            .map(|given| self.frames.measured(given))
+            .transpose()
+            .map_err(|error| {
+                let error = error.within("frame.odometry");
+                Refused::Frame(Reason::Odometry, error.to_string())
+            })?;
         let observation = Observation {
-            time_ns,
-            sequence,
+            time_ns: stamp.time_ns,
+            sequence: stamp.sequence,
             latent,
             feature,
             is_blank,
+            measured,
         };
 
         // Late and duplicate frames are refused too. A refused frame leaves the state as it was.
@@ -446,6 +463,12 @@ fn without_token(answer: pb::track_response::Answer) -> pb::TrackResponse {
         answer: Some(answer),
         resume_token: Vec::new(),
     }
+}
+
+/// When a frame was taken, and its number.
+struct Stamp {
+    time_ns: i64,
+    sequence: u64,
 }
 
 /// Why a frame gets no update.

@@ -4,21 +4,24 @@ use std::sync::Arc;
 
 use super::super::convert;
 use super::super::snapshot::ServedNavigator;
+use super::configuration::{StreamFrames, on_another_body};
 use seese3_client::proto::v1 as pb;
-use seese3_core::geometry::Pose;
+use seese3_core::geometry::{Pose, Twist, adjoint};
 use seese3_core::navigation::RetrievedFrame;
-use seese3_core::tracking::{ANCHORS_TO_AGREE, Status, Update};
+use seese3_core::tracking::{ANCHORS_TO_AGREE, Belief, Status, Update};
 
 /// An update as a wire message. Its `timestamp_ns`, `sequence` and `elapsed_ns` are left 0; the
 /// session fills them in.
 pub fn update(
     update: &Update,
-    names: &pb::FrameNames,
+    frames: &StreamFrames,
     served: &[Arc<ServedNavigator>],
 ) -> pb::TrackUpdate {
     // As in REP-105, map_from_odom = map_from_camera · camera_from_odom is the correction of the
     // drift: it jumps when the pose is corrected, while odom stays continuous.
-    let odom_from_camera = update.odom.pose;
+    let names = &frames.names;
+    let odom = odom_of_stream(&update.odom, frames);
+    let odom_from_camera = odom.pose;
     let map_from_odom = update
         .map_pose
         .map(|place| place.pose * odom_from_camera.inverse());
@@ -33,6 +36,15 @@ pub fn update(
     // The nearest frame of an unknown room would be misleading, so that it is reported only when
     // the room is known.
     let known = update.room.map(|room| &served[room]);
+
+    let camera_from_base = frames.base_from_camera.map(|pose| pose.inverse());
+    let base_in_map = update
+        .map_pose
+        .as_ref()
+        .zip(camera_from_base.as_ref())
+        .map(|(camera, camera_from_base)| on_another_body(camera, camera_from_base));
+    let base_velocity = update.velocity.zip(frames.base_from_camera);
+
     pb::TrackUpdate {
         timestamp_ns: 0,
         sequence: 0,
@@ -41,7 +53,7 @@ pub fn update(
         keyframe_sequence: update.keyframe_sequence,
         is_keyframe: update.is_keyframe,
         odom_from_camera: Some(pose(&odom_from_camera, &names.odom, &names.camera)),
-        odom_from_camera_covariance: convert::matrix_to_wire(&update.odom.ros_covariance()),
+        odom_from_camera_covariance: convert::matrix_to_wire(&odom.ros_covariance()),
         map_from_odom: map_from_odom.map(|found| pose(&found, &names.map, &names.odom)),
         map_from_camera: update
             .map_pose
@@ -68,6 +80,30 @@ pub fn update(
                 agreed: candidate.agreeing_anchors,
                 needed: ANCHORS_TO_AGREE,
             }),
+        odom_from_base: camera_from_base.map(|camera_from_base| {
+            let odom_from_base = odom_from_camera * camera_from_base;
+            pose(&odom_from_base, &names.odom, &names.base)
+        }),
+        map_from_base: base_in_map.map(|base| pose(&base.pose, &names.map, &names.base)),
+        map_from_base_covariance: base_in_map.map_or_else(Vec::new, |base| {
+            convert::matrix_to_wire(&base.ros_covariance())
+        }),
+        base_velocity: base_velocity.map(|(velocity, base_from_camera)| {
+            let velocity = adjoint(&base_from_camera) * velocity.to_vector();
+            convert::twist_to_wire(&Twist::from_vector(&velocity))
+        }),
+    }
+}
+
+/// The tracker's odometry begins at the camera; where the base is known, the stream's begins at the
+/// base.
+fn odom_of_stream(odom: &Belief, frames: &StreamFrames) -> Belief {
+    match frames.base_from_camera {
+        Some(base_from_camera) => Belief {
+            pose: base_from_camera * odom.pose,
+            ..*odom
+        },
+        None => *odom,
     }
 }
 

@@ -55,14 +55,14 @@ pub(super) struct EarlierView<'a> {
     pub time_ns: i64,
 }
 
-/// The frame that a belief is carried to.
-#[derive(Clone, Copy)]
-struct To<'a> {
+/// How a belief comes to a frame.
+struct Carried {
     /// The room that the stream is in, if that is known.
     room: Option<usize>,
-    frame: &'a Observation,
-    /// Whether the motion from the earlier view is read.
-    is_read: bool,
+    from_ns: i64,
+    to_ns: i64,
+    /// The motion in between, if it was measured or is read.
+    read: Option<ReadMotion>,
 }
 
 /// The poses of a stream at one frame.
@@ -117,6 +117,12 @@ impl Tracker {
             motion = body_twist(&keyframe.odom.pose, &last_odom);
         }
 
+        // What another sensor measured needs no view.
+        if let Some(measured) = state.measured.from_keyframe(frame.measured.as_ref()) {
+            motion = measured.motion;
+            covariance = measured.covariance;
+        }
+
         let odom = self.carried_odom(state, keyframe, frame, reading);
         let errors = self.motion_errors(state.room);
         let map_pose = state.place.as_ref().map(|place| {
@@ -126,12 +132,17 @@ impl Tracker {
             };
             let frames = self.frames_between(place.time_ns, frame.time_ns);
             let is_worth_it = errors.gain(frames) >= LEAST_GAIN;
-            let to_frame = To {
+            let is_read = is_worth_it && reading == MotionReading::Complete;
+            let measured = state.measured.from_place(frame.measured.as_ref());
+
+            let way = Carried {
                 room: state.room,
-                frame,
-                is_read: is_worth_it && reading == MotionReading::Complete,
+                from_ns: place.time_ns,
+                to_ns: frame.time_ns,
+                read: measured
+                    .or_else(|| is_read.then(|| self.read_motion(state.room, from, frame))),
             };
-            self.carried(&place.belief, from, to_frame)
+            self.carried(&place.belief, way)
         });
 
         // An error is carried to the new body frame by the adjoint of the motion since then.
@@ -158,7 +169,7 @@ impl Tracker {
         }
     }
 
-    /// `odom` at this frame. Where readings are worth it, it is read at every frame and with one gain:
+    /// `odom` at this frame: the sum of what was measured, if it was. Else, where readings are worth it, it is read at every frame and with one gain:
     /// with a gain that grows with the time since the keyframe it would lag behind and jump. Else it
     /// stays.
     fn carried_odom(
@@ -175,13 +186,21 @@ impl Tracker {
         let errors = self.motion_errors(state.room);
         let gain = errors.gain(self.error_model.longest_frames() as u64);
         let is_read = reading == MotionReading::Complete && gain >= LEAST_GAIN;
-        let to_frame = To {
+        let measured = state.measured.from_keyframe(frame.measured.as_ref());
+        let way = Carried {
             room: state.room,
-            frame,
-            is_read,
+            from_ns: keyframe.time_ns,
+            to_ns: frame.time_ns,
+            read: measured.or_else(|| is_read.then(|| self.read_motion(state.room, from, frame))),
         };
 
-        let mut odom = self.carried(&keyframe.odom, from, to_frame);
+        let mut odom = self.carried(&keyframe.odom, way);
+        let step = state.measured.from_last(frame.measured.as_ref());
+        if let (Some(_), Some(step), Some(last)) = (measured, step, &state.last) {
+            odom.pose = last.odom.pose * exp(&step);
+            return odom;
+        }
+
         let read = self
             .adapter()
             .motion_without_mean(ArrayView1::from(from.latent), frame.latent.view());
@@ -217,21 +236,29 @@ impl Tracker {
         }
     }
 
-    /// A belief of an earlier view at this frame: by how cameras move, and by what is read between
-    /// the two views where that counts.
-    fn carried(&self, belief: &MovingBelief, from: EarlierView<'_>, to: To<'_>) -> MovingBelief {
-        let To {
+    /// A belief of an earlier view at a frame: by how cameras move, and by the motion in between where
+    /// one is known.
+    fn carried(&self, belief: &MovingBelief, way: Carried) -> MovingBelief {
+        let Carried {
             room,
-            frame,
-            is_read,
-        } = to;
-        let seconds = (frame.time_ns.abs_diff(from.time_ns) as f64 * 1e-9).min(LONGEST_CARRY_S);
-        let read = is_read.then(|| {
-            let (motion, covariance) = self.motion_between(room, from, frame);
-            ReadMotion { motion, covariance }
-        });
+            from_ns,
+            to_ns,
+            read,
+        } = way;
 
+        let seconds = (to_ns.abs_diff(from_ns) as f64 * 1e-9).min(LONGEST_CARRY_S);
         belief.moved(self.prior(room), seconds, read.as_ref())
+    }
+
+    /// The motion from an earlier view to this frame, as the adapter reads it.
+    fn read_motion(
+        &self,
+        room: Option<usize>,
+        from: EarlierView<'_>,
+        frame: &Observation,
+    ) -> ReadMotion {
+        let (motion, covariance) = self.motion_between(room, from, frame);
+        ReadMotion { motion, covariance }
     }
 
     /// How many frames of the calibration rooms a time takes: errors were measured over these.

@@ -87,6 +87,7 @@ pub fn replay(
                         .features
                         .map(|features| features.row(frame.row()).to_vec()),
                     is_blank: false,
+                    measured: None,
                 },
                 truth: segment.poses[frame.row()],
             });

@@ -4,7 +4,7 @@ use nalgebra::Matrix6;
 use ndarray::Array1;
 
 use super::health::TrackingHealth;
-use super::{Belief, MovingBelief, Status};
+use super::{Belief, MeasuredPose, MeasuredSince, MovingBelief, Status};
 use crate::geometry::Twist;
 use crate::index::Neighbour;
 
@@ -22,6 +22,8 @@ pub struct Observation {
     pub feature: Option<Vec<f32>>,
     /// Whether the image is known to show nothing: it is blank, or all bright or dark.
     pub is_blank: bool,
+    /// Where another sensor says that the camera is, in an odometry frame of its own.
+    pub measured: Option<MeasuredPose>,
 }
 
 /// Everything that a tracker knows of a stream.
@@ -50,6 +52,8 @@ pub struct State {
     pub unchanged_frames: u32,
     /// When an anchor last corrected the map pose, nanoseconds on the sensor's clock.
     pub corrected_ns: Option<i64>,
+    /// What other sensors measured since the keyframe and the last place.
+    pub measured: MeasuredSince,
 }
 
 /// The last frame of a stream.

@@ -127,6 +127,7 @@ pub fn evaluate(
                     latent: latents.row(row).to_owned(),
                     feature: Some(views.features.row(row).to_vec()),
                     is_blank: taken.is_disturbed && views.is_blank[row],
+                    measured: None,
                 },
                 truth: room.room().poses()[frame.row()],
             });
