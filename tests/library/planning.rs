@@ -39,6 +39,7 @@ fn planners_say_what_they_know() {
         questions: 60,
         longest_hop: None,
         seed: 5,
+        is_fitted: false,
     };
 
     let found = planning::evaluate(&rooms, &adapter, &protocol, &|| ()).unwrap();

@@ -38,6 +38,10 @@ pub struct Planning {
     /// that the adapter was trained on
     #[arg(long, value_parser = positive)]
     step: Option<f64>,
+    /// Fit an adapter to each room's mapped frames, from the weights of --adapter, which tells where
+    /// a view is
+    #[arg(long)]
+    fit: bool,
     /// Seed of the questions
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -71,6 +75,7 @@ impl Planning {
             questions: self.questions as usize,
             longest_hop: self.step,
             seed: self.seed,
+            is_fitted: self.fit,
         };
 
         let progress = bar(room_data.len() as u64, "planning");

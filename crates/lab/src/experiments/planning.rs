@@ -19,6 +19,7 @@ use rayon::prelude::*;
 use seese3_core::adapter::{Adapter, Reading};
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::Features;
+use seese3_core::fitting::{RoomReader, fit};
 use seese3_core::geometry::{Pose, PoseError, body_twist};
 use seese3_core::navigation::{
     self, IndexKind, Navigator, Outcome, Pursuit, Start, Stepper, pursue,
@@ -26,7 +27,7 @@ use seese3_core::navigation::{
 use seese3_core::planning::{BelievedStart, Hops, KnownRoom, Planned, Route, RouteBounds, plan};
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
-use seese3_core::tracking::Map;
+use seese3_core::tracking::{Map, PoseReader};
 use seese3_core::training::RoomData;
 
 use super::simple_planners::{greedy, pose_graph, topological};
@@ -47,6 +48,9 @@ pub struct PlanningProtocol {
     pub longest_hop: Option<f64>,
     /// Of the questions.
     pub seed: u64,
+    /// Whether an adapter is fitted to the mapped frames, from the given one's weights, and tells ours
+    /// where a view is.
+    pub is_fitted: bool,
 }
 
 /// A planner that is evaluated.
@@ -133,6 +137,8 @@ pub struct MappedRoom {
     pub features: Features,
     /// None if the adapter is not calibrated.
     map: Option<Map>,
+    /// Of the adapter that was fitted to the mapped frames, if one was.
+    reader: Option<RoomReader>,
     pursuit: Pursuit,
     bounds: RouteBounds,
 }
@@ -171,6 +177,20 @@ impl MappedRoom {
             None => None,
         };
 
+        let reader = if protocol.is_fitted {
+            let data = RoomData {
+                room: navigator.room(),
+                revision: data.revision,
+                features: &features,
+            };
+            let mapped = all_frames(&navigator);
+            let fitted = fit(&data, &mapped, Some(adapter), 0, &|_| ()).within(what)?;
+            let reader = RoomReader::new(&data, &mapped, Some(adapter.clone()), &fitted);
+            Some(reader.within(what)?)
+        } else {
+            None
+        };
+
         let own = Pursuit::of(&navigator);
         Ok(Self {
             pursuit: Pursuit {
@@ -187,6 +207,7 @@ impl MappedRoom {
             navigator,
             features,
             map,
+            reader,
         })
     }
 
@@ -225,9 +246,10 @@ impl MappedRoom {
         let known = KnownRoom {
             navigator: &self.navigator,
             map: self.map.as_ref(),
-            reader: None,
+            reader: self.reader.as_ref().map(|reader| reader as &dyn PoseReader),
         };
-        let start = BelievedStart::seen(known, question.latent.view(), None);
+        let feature = Some(question.feature.as_slice());
+        let start = BelievedStart::seen(known, question.latent.view(), feature);
         let goal = self.poses()[question.goal.row()];
         let planned = plan(
             &self.navigator,
