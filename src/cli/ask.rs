@@ -147,7 +147,8 @@ pub struct Navigate {
     /// Name of the room to navigate in
     #[arg(long)]
     room: String,
-    /// Name of the adapter; if empty, the newest one that fits the room
+    /// Name of the adapter; if empty, the default of the room: one that was fitted to it, then one that
+    /// was trained in it, then the newest that fits
     #[arg(long, default_value = "")]
     adapter: String,
     /// Start at this frame of the room (its row, counted from 0)

@@ -50,7 +50,7 @@ fn answer(
     let reader = ViewReader::of(snapshot, &room, &adapter)?;
     let mut encoded = Vec::with_capacity(views.len());
     for (position, view) in views.into_iter().enumerate() {
-        cancel.check().map_err(|_| Error::Deadline)?;
+        cancel.check()?;
         let EmbeddedView { latent, feature } =
             reader.embedded(&format!("views[{position}]"), Some(view))?;
 

@@ -22,12 +22,13 @@ use seese3_client::proto::v1::navigate_to_request::Goal;
 use seese3_client::proto::v1::navigate_to_response::Event;
 use seese3_core::adapter::Reading;
 use seese3_core::cancel::Cancellation;
-use seese3_core::geometry::Pose;
+use seese3_core::geometry::{Pose, PoseError};
 use seese3_core::navigation::{
     Error as E, Feedback, Navigator, Outcome, Pursuit, Source, Start, Stepper, pursue,
 };
 use seese3_core::planning::{
-    BelievedStart, Hops, KnownRoom, NoRoute, Planned, Route, RouteBounds, StartUnknown, plan,
+    BelievedStart, Hops, KnownRoom, LEAST_ARRIVAL_PROBABILITY, NoRoute, Planned, Route,
+    RouteBounds, StartUnknown, plan,
 };
 use seese3_core::room::FrameId;
 use seese3_core::tracking::{Belief, PoseReader};
@@ -48,6 +49,7 @@ struct Ready {
     goal: Pose,
     pursuit: Pursuit,
     hops: Hops,
+    least_arrival_probability: f64,
     planner: pb::Planner,
 }
 
@@ -103,6 +105,7 @@ impl Handlers {
         let heard = events.clone();
         let begun = Instant::now();
         let frame_count = ready.served.navigator.room().frame_count();
+        let is_graph = ready.planner != pb::Planner::Latent;
 
         let work = move |cancel: &Cancellation| {
             let start = start_to_wire(&ready.start, &ready.served);
@@ -124,7 +127,7 @@ impl Handlers {
         };
 
         // The work of planning grows with the square of the number of frames.
-        let lane = if frame_count > MOST_SHORT_FRAMES {
+        let lane = if is_graph && frame_count > MOST_SHORT_FRAMES {
             Lane::Long
         } else {
             Lane::Short
@@ -147,6 +150,15 @@ impl Handlers {
 }
 
 impl Ready {
+    /// Whether the last of some frames is within the tolerance of the goal.
+    fn ends_within(&self, frames: &[FrameId]) -> bool {
+        let poses = self.served.navigator.room().poses();
+        frames.last().is_some_and(|frame| {
+            let left = PoseError::between(&poses[frame.row()], &self.goal);
+            self.pursuit.is_reached(&left)
+        })
+    }
+
     /// Plans the way; `each` hears of every step.
     fn plan(&self, cancel: &Cancellation, each: &mut dyn FnMut(Feedback)) -> Result<Ended, Error> {
         if self.planner == pb::Planner::Latent {
@@ -169,6 +181,7 @@ impl Ready {
             hops: self.hops,
             tolerance_m: self.pursuit.tolerance_m,
             tolerance_rad: self.pursuit.tolerance_rad,
+            least_arrival_probability: self.least_arrival_probability,
         };
         let planned = plan(navigator, &self.start, &self.goal, bounds, cancel).map_err(E::from)?;
 
@@ -207,7 +220,19 @@ fn ready(
         max_steps,
         max_recoveries,
         planner,
+        least_arrival_probability,
     } = request;
+
+    let least_arrival_probability = match least_arrival_probability {
+        None => LEAST_ARRIVAL_PROBABILITY,
+        Some(least) if (0.0..=1.0).contains(&least) => least,
+        Some(least) => {
+            return Err(Error::invalid(
+                "least_arrival_probability",
+                format!("must be 0 to 1, got {least}"),
+            ));
+        }
+    };
 
     let planner = pb::Planner::try_from(planner)
         .map_err(|_| Error::invalid("planner", format!("has no value {planner}")))?;
@@ -260,6 +285,7 @@ fn ready(
         goal,
         pursuit,
         hops,
+        least_arrival_probability,
         planner,
     })
 }
@@ -396,20 +422,42 @@ fn result_to_wire(ended: &Ended, ready: &Ready) -> pb::NavigateToResult {
     let most = ready.pursuit.steps as usize;
     let (outcome, message) = match ended {
         Ended::Walked(Outcome::Reached) => reached(),
-        Ended::Walked(Outcome::Spent) => steps_spent(),
+        Ended::Walked(Outcome::Spent) => (
+            pb::NavigateToOutcome::StepsSpent,
+            "the limit of steps was reached; allow more with max_steps".to_owned(),
+        ),
         Ended::Walked(Outcome::Stuck) => (
             pb::NavigateToOutcome::Stuck,
             "no matching frame is nearer to the goal; PLANNER_POSE_GRAPH may find a way".to_owned(),
         ),
-        Ended::Planned(Planned::Way { route, .. }) if route.frames.len() > most => steps_spent(),
+        Ended::Planned(Planned::Way { route, .. })
+            if route.frames.len() > most && !ready.ends_within(&route.frames[..most]) =>
+        {
+            (
+                pb::NavigateToOutcome::StepsSpent,
+                format!(
+                    "the way has {} hops, max_steps is {most}; allow more, or longer ones with step",
+                    route.frames.len()
+                ),
+            )
+        }
         Ended::Planned(Planned::Way {
+            route,
             arrival_probability,
-            ..
         }) => {
             result.arrival_probability = *arrival_probability;
+            let longest =
+                route.longest_hop(&ready.start.pose, ready.served.navigator.room().poses());
+            result.needed_step = Some(longest).filter(|longest| *longest > ready.pursuit.step);
             reached()
         }
         Ended::Planned(Planned::StartUnknown(why)) => {
+            if let StartUnknown::Unsure {
+                arrival_probability,
+            } = why
+            {
+                result.arrival_probability = Some(*arrival_probability);
+            }
             (pb::NavigateToOutcome::StartUnknown, start_unknown(why))
         }
         Ended::Planned(Planned::NoRoute(NoRoute::HopTooLong { needed })) => {
@@ -440,14 +488,7 @@ fn result_to_wire(ended: &Ended, ready: &Ready) -> pb::NavigateToResult {
 fn reached() -> (pb::NavigateToOutcome, String) {
     (
         pb::NavigateToOutcome::Reached,
-        "the last frame is within the tolerance".to_owned(),
-    )
-}
-
-fn steps_spent() -> (pb::NavigateToOutcome, String) {
-    (
-        pb::NavigateToOutcome::StepsSpent,
-        "the limit of steps was reached; allow more with max_steps".to_owned(),
+        "the way ends within the tolerance".to_owned(),
     )
 }
 
@@ -463,7 +504,8 @@ fn start_unknown(why: &StartUnknown) -> String {
             arrival_probability,
         } => format!(
             "the source does not tell well enough where the camera is: it would arrive with a \
-             probability of {arrival_probability:.2}; send another view, or source_pose"
+             probability of {arrival_probability:.2}; send another view or source_pose, or allow more with \
+             tolerance_m and tolerance_rad"
         ),
     }
 }

@@ -105,6 +105,52 @@ async fn a_view_is_located_in_the_room_of_its_adapter() {
     assert!(answer.located.is_none());
 }
 
+/// Oracle: the promise of NavigateTo: nothing is planned for a view that tells no place. An adapter that
+/// was fitted to a room and calibrated nowhere knows that too.
+#[tokio::test]
+async fn a_fitted_adapter_starts_no_way_from_elsewhere() {
+    use pb::navigate_to_request::Goal;
+
+    let server = server().await;
+    let ask = async |values: Vec<f32>| {
+        let asked = pb::NavigateToRequest {
+            room: "hall".to_owned(),
+            source: feature(values),
+            goal: Some(Goal::GoalFrameId(120)),
+            ..Default::default()
+        };
+        server.client.navigate_to(asked, |_| ()).await.unwrap()
+    };
+
+    let own = ask(served("hall").1.rows().row(40).to_vec()).await;
+    assert_eq!(own.adapter.unwrap().name, "hall.fitted");
+    assert_eq!(
+        own.outcome,
+        pb::NavigateToOutcome::Reached as i32,
+        "{}",
+        own.message
+    );
+    assert!(
+        own.arrival_probability
+            .is_some_and(|probability| probability > 0.5)
+    );
+
+    let width = served("hall").1.rows().ncols();
+    for elsewhere in [
+        served("attic").1.rows().row(40).to_vec(),
+        vec![0.0; width],
+        served("hall").1.rows().row(40).mapv(|x| 10.0 * x).to_vec(),
+    ] {
+        let answer = ask(elsewhere).await;
+        assert_eq!(
+            answer.outcome(),
+            pb::NavigateToOutcome::StartUnknown,
+            "{}",
+            answer.message
+        );
+    }
+}
+
 /// Oracle: the promise that a fitted adapter serves its own room alone, where it is the default.
 #[tokio::test]
 async fn a_fitted_adapter_serves_no_other_room() {

@@ -93,7 +93,7 @@ impl Planning {
         say(planning_table(&found).trim_end());
 
         if let Some(path) = &self.json {
-            write_json(path, &planning_json(&found, &protocol))?;
+            write_json(path, &planning_json(&found, &protocol, &stored.name))?;
             say(format_args!("wrote {}", path.display()));
         }
 

@@ -49,6 +49,9 @@ pub struct Robustness {
     /// Which frames are mapped and which are replayed
     #[arg(long, value_parser = one_of::<HoldOut>(), default_value = "interleaved")]
     hold_out: HoldOut,
+    /// Only disturbances whose name has this text in it, such as roll; may be repeated
+    #[arg(long = "only", value_name = "TEXT")]
+    only: Vec<String>,
     #[command(flatten)]
     runtime: RuntimeOptions,
     /// Write the results to this file as JSON
@@ -87,7 +90,8 @@ impl Robustness {
         };
         let trackers = trackers(&room_data, &stored.adapter, &protocol)?;
 
-        let steps = trackers.len() * Disturbance::ALL.len();
+        let disturbances = self.disturbances()?;
+        let steps = trackers.len() * disturbances.len();
         let progress = bar(steps as u64, "disturbing");
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(self.runtime.threads())
@@ -96,7 +100,7 @@ impl Robustness {
         let mut found: Vec<DisturbedTracking> = Vec::with_capacity(steps);
         for room in &trackers {
             let root = images_root(room.room(), self.images.as_deref())?;
-            for disturbance in Disturbance::ALL {
+            for &disturbance in &disturbances {
                 let camera = DisturbedCamera {
                     encoder: &encoder,
                     root: &root,
@@ -130,6 +134,27 @@ impl Robustness {
         }
 
         Ok(())
+    }
+
+    /// Those that are asked for.
+    fn disturbances(&self) -> anyhow::Result<Vec<Disturbance>> {
+        let is_asked = |disturbance: &Disturbance| {
+            let name = disturbance.name();
+            self.only.is_empty() || self.only.iter().any(|text| name.contains(text.as_str()))
+        };
+        let asked: Vec<Disturbance> = Disturbance::ALL.into_iter().filter(is_asked).collect();
+        if asked.is_empty() {
+            let names: Vec<String> = Disturbance::ALL
+                .into_iter()
+                .map(Disturbance::name)
+                .collect();
+            bail!(
+                "no disturbance has such a name; there are: {}",
+                names.join(", ")
+            );
+        }
+
+        Ok(asked)
     }
 
     fn encoder_of(&self, source: &FeatureSource) -> anyhow::Result<Encoder> {

@@ -11,7 +11,7 @@ use seese3_core::planning::PoseGraph;
 use seese3_core::room::{FrameId, Room};
 
 /// The most neighbours that a frame is given.
-const MOST_NEIGHBOURS: usize = 64;
+const MOST_NEIGHBOURS: usize = 32;
 
 impl Handlers {
     /// Answers a ListFrames request on a worker thread.
@@ -62,7 +62,7 @@ fn answer(
 
     let mut frames = Vec::new();
     for &frame in all.get(first..end).unwrap_or_default() {
-        cancel.check().map_err(|_| Error::Deadline)?;
+        cancel.check()?;
         let mut wire = frame_to_wire(room, frame);
         if let Some(hop) = neighbours_within {
             wire.neighbours = graph

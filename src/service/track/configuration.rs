@@ -132,7 +132,7 @@ impl StreamFrames {
             .map(|mut pose| {
                 clear_name(&mut pose.parent_frame, &names.base);
                 clear_name(&mut pose.child_frame, &names.camera);
-                convert::pose(pose, "").map_err(|error| error.within("base_from_camera"))
+                unnamed(pose).map_err(|error| error.within("base_from_camera"))
             })
             .transpose()?;
 
@@ -184,7 +184,7 @@ impl StreamFrames {
         // The sensor's own frame may have any name.
         pose.parent_frame.clear();
         let body = self.body(&mut pose, Body::Base);
-        let pose = convert::pose(pose, "").map_err(|error| error.within("pose"))?;
+        let pose = unnamed(pose).map_err(|error| error.within("pose"))?;
         let share = |field: &str, given: Option<f64>| {
             within(field, given.unwrap_or(DRIFT_SHARE), DRIFT_SHARES)
         };
@@ -233,10 +233,30 @@ impl StreamFrames {
 /// A belief of a body's pose as one of another body that is fixed to it at `body_from_other`.
 pub fn on_another_body(belief: &Belief, body_from_other: &Pose) -> Belief {
     let other = adjoint(&body_from_other.inverse());
+    let covariance = other * belief.covariance * other.transpose();
+
+    // Rounding leaves it a little asymmetric, and a token keeps one half of it.
     Belief {
         pose: belief.pose * body_from_other,
-        covariance: other * belief.covariance * other.transpose(),
+        covariance: (covariance + covariance.transpose()) * 0.5,
     }
+}
+
+/// A pose between two of the stream's frames, whose names were cleared: what is left is none of them.
+fn unnamed(pose: pb::Pose) -> Result<Pose, Error> {
+    for (field, name) in [
+        ("parent_frame", &pose.parent_frame),
+        ("child_frame", &pose.child_frame),
+    ] {
+        if !name.is_empty() {
+            return Err(Error::invalid(
+                field,
+                format!("'{name}' is not the name of that frame in this stream"),
+            ));
+        }
+    }
+
+    convert::pose(pose, "")
 }
 
 fn clear_name(name: &mut String, own: &str) {

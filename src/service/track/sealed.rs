@@ -9,7 +9,7 @@ use prost::Message;
 use super::super::Error;
 use seese3_core::geometry::{Pose, Twist};
 use seese3_core::tracking::{
-    Belief, Candidate, Keyframe, LastFrame, MeasuredSince, MovingBelief, Place, State,
+    Belief, Candidate, Driven, Keyframe, LastFrame, MeasuredSince, MovingBelief, Place, State,
     TrackingHealth,
 };
 
@@ -232,6 +232,32 @@ fn pose_to_numbers(pose: &Pose) -> Vec<f64> {
     vec![t.x, t.y, t.z, q.x, q.y, q.z, q.w]
 }
 
+/// The nine numbers of what was driven; none of nothing.
+fn driven_to_numbers(driven: Option<&Driven>) -> Vec<f64> {
+    driven.map_or_else(Vec::new, |driven| {
+        let mut numbers = pose_to_numbers(&driven.pose);
+        numbers.extend([driven.way_m, driven.turns_rad]);
+        numbers
+    })
+}
+
+/// What was driven by such numbers; nothing if there are none.
+fn driven_of_numbers(numbers: &[f64]) -> Result<Option<Driven>, Error> {
+    if numbers.is_empty() {
+        return Ok(None);
+    }
+
+    let (pose, rest) = pose_of_numbers(numbers)?;
+    let &[way_m, turns_rad] = rest else {
+        return Err(Error::Internal);
+    };
+    Ok(Some(Driven {
+        pose,
+        way_m,
+        turns_rad,
+    }))
+}
+
 /// The places of the upper triangle of a symmetric matrix, row by row.
 fn upper_triangle<const N: usize>() -> impl Iterator<Item = (usize, usize)> {
     (0..N).flat_map(|row| (row..N).map(move |column| (row, column)))
@@ -431,8 +457,8 @@ impl SealedMeasured {
 
         (*measured != MeasuredSince::default()).then(|| Self {
             last: last.as_ref().map_or_else(Vec::new, pose_to_numbers),
-            keyframe: numbers(keyframe),
-            place: numbers(place),
+            keyframe: driven_to_numbers(keyframe.as_ref()),
+            place: driven_to_numbers(place.as_ref()),
         })
     }
 
@@ -449,8 +475,8 @@ impl SealedMeasured {
             } else {
                 Some(pose_of_numbers(&last)?.0)
             },
-            keyframe: belief_of_numbers(&keyframe)?,
-            place: belief_of_numbers(&place)?,
+            keyframe: driven_of_numbers(&keyframe)?,
+            place: driven_of_numbers(&place)?,
         })
     }
 }
@@ -589,7 +615,11 @@ mod tests {
             unchanged_frames: 3,
             measured: MeasuredSince {
                 last: Some(belief.pose),
-                keyframe: Some(belief),
+                keyframe: Some(Driven {
+                    pose: belief.pose,
+                    way_m: 1.0 / 7.0,
+                    turns_rad: 0.3,
+                }),
                 place: None,
             },
         };

@@ -133,7 +133,8 @@ impl MotionErrors {
 /// from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ErrorStatistics {
-    /// The mean time from one frame to the next in the rooms that this was measured in, seconds. What is
+    /// The time from one frame to the next in the rooms that this was measured in, seconds: the mean of
+    /// their medians. What is
     /// said of a number of frames holds for this many times that time.
     pub frame_period_s: f64,
     /// Frame noise: half the second moment of the differences of latents from one frame to the

@@ -51,4 +51,9 @@ impl PoseReader for RoomReader {
         let furthest = self.rules.rules().last()?.up_to;
         (view.nearest.distance <= furthest).then_some(view.pose)
     }
+
+    fn distance_over_range(&self, feature: &[f32]) -> Option<f64> {
+        let view = self.locate(feature).ok()?;
+        Some(view.nearest.distance / self.rules.rules().last()?.up_to)
+    }
 }

@@ -19,7 +19,8 @@ use crate::navigation::Navigator;
 use crate::room::FrameId;
 use crate::tracking::Belief;
 
-/// Nothing is planned where the camera would arrive with a smaller probability. Chosen on calibration
+/// Unless another one is asked for, nothing is planned where the camera would arrive with a smaller
+/// probability. Chosen on calibration
 /// rooms, where it left the most ways that ended at the goal, and none from the views of other rooms.
 pub const LEAST_ARRIVAL_PROBABILITY: f64 = 0.2;
 
@@ -48,9 +49,9 @@ pub enum StartUnknown {
         /// Its distance over the room's limit, above 1.
         out_of_distribution: f64,
     },
-    /// It looks like several places, or not much like any.
+    /// It looks like several places, or not much like any: not enough for this way and this tolerance.
     Unsure {
-        /// With which probability a camera would arrive; below [`LEAST_ARRIVAL_PROBABILITY`].
+        /// With which probability a camera would arrive; below what was asked for.
         arrival_probability: f64,
     },
 }
@@ -99,7 +100,7 @@ pub fn plan(
     });
 
     Ok(match arrival_probability {
-        Some(arrival_probability) if arrival_probability < LEAST_ARRIVAL_PROBABILITY => {
+        Some(arrival_probability) if arrival_probability < bounds.least_arrival_probability => {
             Planned::StartUnknown(StartUnknown::Unsure {
                 arrival_probability,
             })

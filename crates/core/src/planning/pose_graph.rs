@@ -13,7 +13,10 @@ use crate::index::Neighbour;
 use crate::navigation::{Feedback, Navigator, RetrievedFrame};
 use crate::room::FrameId;
 
-/// The frames that a route may lead over.
+/// A straight line may come out longer than the hop by this part of it.
+const ROUNDING: f64 = 1e-9;
+
+/// The frames that a route may lead over; at least one.
 #[derive(Debug, Clone, Copy)]
 pub struct PoseGraph<'a> {
     poses: &'a [Pose],
@@ -29,6 +32,15 @@ pub struct RouteBounds {
     pub tolerance_m: f64,
     /// Angle from the goal, radians, within which it counts as reached.
     pub tolerance_rad: f64,
+    /// Nothing is planned where the camera would arrive with a smaller probability, 0 to 1.
+    pub least_arrival_probability: f64,
+}
+
+impl RouteBounds {
+    /// Whether a camera this far from the goal has reached it.
+    fn are_met(&self, left: &PoseError) -> bool {
+        left.translation_m <= self.tolerance_m && left.rotation_rad <= self.tolerance_rad
+    }
 }
 
 /// How long hops may be, ‖(v, ω)‖ with metres and radians mixed; above 0.
@@ -44,7 +56,7 @@ pub enum Hops {
 /// A way to the goal.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Route {
-    /// The frames in order, without the start; empty if no frame is nearer to the goal than the start.
+    /// The frames in order, without the start; empty if the start is within the tolerance of the goal.
     pub frames: Vec<FrameId>,
     /// The sum of all hops, ‖(v, ω)‖ with metres and radians mixed.
     pub length: f64,
@@ -102,18 +114,13 @@ impl<'a> PoseGraph<'a> {
         bounds: RouteBounds,
         cancel: &Cancellation,
     ) -> Result<Result<Route, NoRoute>, Cancelled> {
-        let targets = self.targets(goal, bounds);
-        let Some(best) = targets.first() else {
-            return Ok(Err(self.goal_not_mapped(goal)));
-        };
+        if bounds.are_met(&PoseError::between(start, goal)) {
+            return Ok(Ok(Route::default()));
+        }
 
-        // A camera that is already nearer to the goal than any frame has nothing to drive to.
-        let start_left = body_twist(start, goal).norm();
-        if start_left <= best.1 {
-            return Ok(Ok(Route {
-                frames: Vec::new(),
-                length: 0.0,
-            }));
+        let targets = self.targets(goal, bounds);
+        if targets.is_empty() {
+            return Ok(Err(self.goal_not_mapped(goal)));
         }
 
         let (Hops::AtMost(longest_hop) | Hops::Preferably(longest_hop)) = bounds.hops;
@@ -178,11 +185,7 @@ impl<'a> PoseGraph<'a> {
     /// the nearest first.
     fn targets(&self, goal: &Pose, bounds: RouteBounds) -> Vec<(usize, f64)> {
         let mut targets: Vec<(usize, f64)> = (0..self.frames.len())
-            .filter(|&place| {
-                let left = PoseError::between(self.pose(place), goal);
-                left.translation_m <= bounds.tolerance_m
-                    && left.rotation_rad <= bounds.tolerance_rad
-            })
+            .filter(|&place| bounds.are_met(&PoseError::between(self.pose(place), goal)))
             .map(|place| (place, body_twist(self.pose(place), goal).norm()))
             .collect();
 
@@ -223,8 +226,10 @@ impl<'a> PoseGraph<'a> {
             for &place in &open {
                 let to = self.pose(place);
 
-                // A hop is never shorter than its straight line: most frames are ruled out by that.
+                // A hop is never shorter than its straight line, but for rounding: most frames are
+                // ruled out by that.
                 let line = (to.translation.vector - pose.translation.vector).norm();
+                let line = line * (1.0 - ROUNDING);
                 if line > longest_hop || measure.with(cost, line) >= found.cost[place] {
                     continue;
                 }
@@ -275,6 +280,17 @@ impl Measure {
 }
 
 impl Route {
+    /// The longest hop, from the start on; `poses` are those of all frames, row by frame.
+    pub fn longest_hop(&self, start: &Pose, poses: &[Pose]) -> f64 {
+        let stops: Vec<&Pose> = std::iter::once(start)
+            .chain(self.frames.iter().map(|frame| &poses[frame.row()]))
+            .collect();
+        let hops = stops
+            .windows(2)
+            .map(|pair| body_twist(pair[0], pair[1]).norm());
+        hops.fold(0.0, f64::max)
+    }
+
     /// What is reported of a route before its first hop and after each: for a camera with this latent,
     /// of shape (k,), and this pose. A frame's distance is that of its latent from the one before.
     pub fn feedback(
@@ -330,6 +346,7 @@ mod tests {
             hops: Hops::AtMost(longest_hop),
             tolerance_m: 0.05,
             tolerance_rad: 0.05,
+            least_arrival_probability: 0.0,
         }
     }
 
@@ -404,6 +421,34 @@ mod tests {
 
         let there = routed(&poses, &at(5.0, 0.0), &at(5.0, 0.0), 2.0).unwrap();
         assert!(there.frames.is_empty());
+
+        // Nearer to an unmapped goal than any frame is not there yet; within the tolerance of it is.
+        assert!(routed(&poses, &at(2.1, 0.0), &at(2.0, 0.0), 9.0).is_err());
+        let within = routed(&poses, &at(2.04, 0.0), &at(2.0, 0.0), 9.0).unwrap();
+        assert!(within.frames.is_empty());
+        let no_hop = routed(&poses, &at(4.96, 0.0), &at(5.0, 0.0), 1e-3).unwrap();
+        assert!(no_hop.frames.is_empty());
+    }
+
+    /// Oracle: the metric of tolerances, by hand. The frame is within 0.25 m and 0.25 rad of the goal, and
+    /// further off than the start by metres and radians mixed, which is 0.27 m off and not there.
+    #[test]
+    fn a_start_outside_the_tolerance_is_not_there() {
+        let frame = Pose::new(Vector3::new(0.2, 0.0, 0.0), Vector3::new(0.0, 0.2, 0.0));
+        let bounds = RouteBounds {
+            tolerance_m: 0.25,
+            tolerance_rad: 0.25,
+            ..bounds(1.0)
+        };
+        let route = PoseGraph::new(&[frame], &[FrameId(0)])
+            .route(
+                &at(0.27, 0.0),
+                &at(0.0, 0.0),
+                bounds,
+                &Cancellation::default(),
+            )
+            .unwrap();
+        assert_eq!(route.unwrap().frames, [FrameId(0)]);
     }
 
     proptest! {

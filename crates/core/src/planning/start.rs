@@ -29,6 +29,8 @@ pub struct BelievedStart {
     /// The view's distance over the room's limit, where that is known: above 1 it looks like another
     /// place.
     pub out_of_distribution: Option<f64>,
+    /// Whether the view told the pose. Else it was recorded or given.
+    is_seen: bool,
 }
 
 impl BelievedStart {
@@ -38,6 +40,7 @@ impl BelievedStart {
             pose,
             covariance: None,
             out_of_distribution: None,
+            is_seen: false,
         }
     }
 
@@ -56,22 +59,25 @@ impl BelievedStart {
     /// nearest frame.
     pub fn seen(room: KnownRoom<'_>, latent: ArrayView1<'_, f64>, feature: Option<&[f32]>) -> Self {
         let matched = room.map.map(|map| map.match_view(latent, 1));
-        let out_of_distribution = matched.as_ref().map(|found| found.out_of_distribution);
+        let reader = room.reader.zip(feature);
+        let read = reader.and_then(|(reader, feature)| reader.read_pose(feature));
 
-        let read = room
-            .reader
-            .zip(feature)
-            .and_then(|(reader, feature)| reader.read_pose(feature));
+        // Without a calibrated adapter the range of the reader tells what is not of this room.
+        let out_of_distribution = match &matched {
+            Some(found) => Some(found.out_of_distribution),
+            None => reader.and_then(|(reader, feature)| reader.distance_over_range(feature)),
+        };
+
         let belief: Option<Belief> = read.or(matched.map(|found| found.anchor.belief));
-
-        match belief {
-            Some(belief) => Self {
-                pose: belief.pose,
-                covariance: Some(belief.covariance),
-                out_of_distribution,
-            },
+        Self {
             // A room has frames, so that one is nearest.
-            None => Self::recorded(room.navigator.nearest(latent, 1)[0].pose),
+            pose: match &belief {
+                Some(belief) => belief.pose,
+                None => room.navigator.nearest(latent, 1)[0].pose,
+            },
+            covariance: belief.map(|belief| belief.covariance),
+            out_of_distribution,
+            is_seen: true,
         }
     }
 
@@ -79,6 +85,6 @@ impl BelievedStart {
     /// the view: that pose means nothing.
     pub fn beyond_limit(&self) -> Option<f64> {
         self.out_of_distribution
-            .filter(|far| *far > 1.0 && self.covariance.is_some())
+            .filter(|far| *far > 1.0 && self.is_seen)
     }
 }

@@ -61,7 +61,7 @@ struct Carried {
     room: Option<usize>,
     from_ns: i64,
     to_ns: i64,
-    /// The motion in between, if it was measured or is read.
+    /// The motion in between, if it is read.
     read: Option<ReadMotion>,
 }
 
@@ -133,14 +133,15 @@ impl Tracker {
             let frames = self.frames_between(place.time_ns, frame.time_ns);
             let is_worth_it = errors.gain(frames) >= LEAST_GAIN;
             let is_read = is_worth_it && reading == MotionReading::Complete;
-            let measured = state.measured.from_place(frame.measured.as_ref());
 
+            if let Some(measured) = state.measured.from_place(frame.measured.as_ref()) {
+                return self.driven(&place.belief, &measured, state, frame);
+            }
             let way = Carried {
                 room: state.room,
                 from_ns: place.time_ns,
                 to_ns: frame.time_ns,
-                read: measured
-                    .or_else(|| is_read.then(|| self.read_motion(state.room, from, frame))),
+                read: is_read.then(|| self.read_motion(state.room, from, frame)),
             };
             self.carried(&place.belief, way)
         });
@@ -169,9 +170,9 @@ impl Tracker {
         }
     }
 
-    /// `odom` at this frame: the sum of what was measured, if it was. Else, where readings are worth it, it is read at every frame and with one gain:
-    /// with a gain that grows with the time since the keyframe it would lag behind and jump. Else it
-    /// stays.
+    /// `odom` at this frame: the sum of what was measured, if it was. Else, where readings are worth it,
+    /// it is read at every frame and with one gain: with a gain that grows with the time since the
+    /// keyframe it would lag behind and jump. Else it stays.
     fn carried_odom(
         &self,
         state: &State,
@@ -186,26 +187,33 @@ impl Tracker {
         let errors = self.motion_errors(state.room);
         let gain = errors.gain(self.error_model.longest_frames() as u64);
         let is_read = reading == MotionReading::Complete && gain >= LEAST_GAIN;
-        let measured = state.measured.from_keyframe(frame.measured.as_ref());
+        if let Some(measured) = state.measured.from_keyframe(frame.measured.as_ref()) {
+            let odom = self.driven(&keyframe.odom, &measured, state, frame);
+            // A frame before that brought no pose has left odom where the views took it.
+            let step = state.measured.step(frame.measured.as_ref());
+            let last = state
+                .last
+                .as_ref()
+                .map_or(keyframe.odom.pose, |last| last.odom.pose);
+            return MovingBelief {
+                pose: last * exp(&step.unwrap_or_default()),
+                ..odom
+            };
+        }
+
         let way = Carried {
             room: state.room,
             from_ns: keyframe.time_ns,
             to_ns: frame.time_ns,
-            read: measured.or_else(|| is_read.then(|| self.read_motion(state.room, from, frame))),
+            read: is_read.then(|| self.read_motion(state.room, from, frame)),
         };
-
         let mut odom = self.carried(&keyframe.odom, way);
-        let step = state.measured.from_last(frame.measured.as_ref());
-        if let (Some(_), Some(step), Some(last)) = (measured, step, &state.last) {
-            odom.pose = last.odom.pose * exp(&step);
-            return odom;
-        }
-
         let read = self
             .adapter()
             .motion_without_mean(ArrayView1::from(from.latent), frame.latent.view());
         odom.pose = match &state.last {
-            _ if is_read && read.is_unique_logarithm() => {
+            // Beside measured motions, read ones would be counted from another frame.
+            _ if is_read && read.is_unique_logarithm() && state.measured.last.is_none() => {
                 keyframe.odom.pose * exp(&read.scaled(gain))
             }
             Some(last) => last.odom.pose,
@@ -248,6 +256,33 @@ impl Tracker {
 
         let seconds = (to_ns.abs_diff(from_ns) as f64 * 1e-9).min(LONGEST_CARRY_S);
         belief.moved(self.prior(room), seconds, read.as_ref())
+    }
+
+    /// A belief of an earlier frame at this one, by a measured motion alone: how cameras move on average
+    /// says nothing beside it. The velocity is that of the last step.
+    fn driven(
+        &self,
+        belief: &MovingBelief,
+        measured: &ReadMotion,
+        state: &State,
+        frame: &Observation,
+    ) -> MovingBelief {
+        let place = belief.place().moved(measured.motion, &measured.covariance);
+        let moving = MovingBelief::at(place, self.prior(state.room));
+
+        let step = state.measured.step(frame.measured.as_ref());
+        let last_ns = state
+            .last
+            .as_ref()
+            .map_or(frame.time_ns, |last| last.time_ns);
+        let seconds = frame.time_ns.abs_diff(last_ns) as f64 * 1e-9;
+        match step {
+            Some(step) if seconds > 0.0 => MovingBelief {
+                velocity: step.scaled(seconds.recip()),
+                ..moving
+            },
+            _ => moving,
+        }
     }
 
     /// The motion from an earlier view to this frame, as the adapter reads it.

@@ -22,6 +22,12 @@ pub trait PoseReader: Send + Sync {
     /// The pose of a view, `world_from_camera`, from its raw feature of shape (d,); none if the
     /// feature cannot be read.
     fn read_pose(&self, feature: &[f32]) -> Option<Belief>;
+
+    /// How far a view is from the map, over the furthest that the reader was tried at: above 1 it reads
+    /// nothing. None if it does not know such a distance.
+    fn distance_over_range(&self, _feature: &[f32]) -> Option<f64> {
+        None
+    }
 }
 
 /// The mapped frames of a room under an adapter with an error model.

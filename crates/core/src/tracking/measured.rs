@@ -2,13 +2,13 @@
 //!
 //! The sensor reports the camera's pose in an odometry frame of its own, which drifts and never jumps.
 //! The motion between two such poses counts in place of what the adapter reads, also where a view
-//! shows nothing. A frame that brings no pose ends that until the next keyframe or place.
+//! shows nothing. A frame that brings no pose is told by its view alone; the next one that brings a
+//! pose covers both. A keyframe or place at a frame without a pose waits for the next one with it.
 
 use nalgebra::{Matrix6, Vector6};
 
-use super::Belief;
 use super::moving::ReadMotion;
-use crate::geometry::{Pose, Twist, body_twist, log};
+use crate::geometry::{Pose, Twist, body_twist, exp, log};
 
 /// Standard deviations that a motion has besides its shares: a millimetre, and half a milliradian.
 const LEAST_DEVIATION_M: f64 = 1e-3;
@@ -23,7 +23,8 @@ pub struct MeasuredPose {
     pub drift: Drift,
 }
 
-/// How fast a sensor's odometry drifts, as standard deviations by axis.
+/// How fast a sensor's odometry drifts, as standard deviations by axis. Errors are taken to last, as
+/// those of a wheel of the wrong size do: they grow with the way, however many frames it takes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Drift {
     /// Metres per metre of translation, above 0.
@@ -32,31 +33,33 @@ pub struct Drift {
     pub rotation_share: f64,
 }
 
-/// A motion between two frames, with the covariance of r in true motion = motion + r, on (v, ω),
-/// metres and radians.
+/// What was driven from an earlier frame to the last one that brought a pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct MeasuredMotion {
-    motion: Twist,
-    covariance: Matrix6<f64>,
+pub struct Driven {
+    /// The later camera's pose in the earlier one.
+    pub pose: Pose,
+    /// The length of the way, metres.
+    pub way_m: f64,
+    /// The sum of all turns, radians.
+    pub turns_rad: f64,
 }
 
-/// What was measured from earlier frames to the last one: its pose in theirs. None where a frame
-/// between them brought no pose.
+/// What was measured up to the last frame that brought a pose.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct MeasuredSince {
-    /// The last frame's pose in the sensor's odometry frame.
+    /// That frame's pose in the sensor's odometry frame.
     pub last: Option<Pose>,
-    /// Since the keyframe.
-    pub keyframe: Option<Belief>,
-    /// Since the frame of the last place.
-    pub place: Option<Belief>,
+    /// Driven since the keyframe; none if that brought no pose.
+    pub keyframe: Option<Driven>,
+    /// Driven since the frame of the last place; none if that brought no pose.
+    pub place: Option<Driven>,
 }
 
 impl MeasuredSince {
     /// As it is before the next frame of a stream whose last frame has become keyframe and place.
     #[must_use]
     pub(super) fn begun(self) -> Self {
-        let begun = self.last.map(|_| no_motion());
+        let begun = self.last.map(|_| Driven::not_at_all());
         Self {
             last: self.last,
             keyframe: begun,
@@ -73,77 +76,154 @@ impl MeasuredSince {
         is_place: bool,
     ) -> Self {
         let step = self.step(measured);
-        let or_begin = |begins: bool, since: Option<Belief>| {
-            if begins {
-                measured.map(|_| no_motion())
-            } else {
-                moved(since, step)
-            }
+        let or_begin = |begins: bool, since: Option<Driven>| match (begins, measured) {
+            (true, measured) => measured.map(|_| Driven::not_at_all()),
+            (false, None) => since,
+            (false, Some(_)) => Some(since?.and(step?)),
         };
 
         Self {
-            last: measured.map(|measured| measured.pose),
+            last: measured.map(|measured| measured.pose).or(self.last),
             keyframe: or_begin(is_keyframe, self.keyframe),
             place: or_begin(is_place, self.place),
         }
     }
 
-    /// The motion from the keyframe to this frame, if it was measured all along.
+    /// The motion from the keyframe to this frame, if both brought a pose.
     pub(super) fn from_keyframe(&self, measured: Option<&MeasuredPose>) -> Option<ReadMotion> {
-        read(moved(self.keyframe, self.step(measured)))
+        self.known(self.keyframe, measured)
     }
 
-    /// The motion from the last place to this frame, if it was measured all along.
+    /// The motion from the last place to this frame, if both brought a pose.
     pub(super) fn from_place(&self, measured: Option<&MeasuredPose>) -> Option<ReadMotion> {
-        read(moved(self.place, self.step(measured)))
+        self.known(self.place, measured)
     }
 
-    /// The motion from the last frame to this one, if both brought a pose.
-    pub(super) fn from_last(&self, measured: Option<&MeasuredPose>) -> Option<Twist> {
-        Some(self.step(measured)?.motion)
-    }
-
-    fn step(&self, measured: Option<&MeasuredPose>) -> Option<MeasuredMotion> {
+    /// The motion from the last frame that brought a pose to this one, if it does too.
+    pub(super) fn step(&self, measured: Option<&MeasuredPose>) -> Option<Twist> {
         let (last, measured) = self.last.zip(measured)?;
         let motion = body_twist(&last, &measured.pose);
+        motion.is_unique_logarithm().then_some(motion)
+    }
 
-        motion.is_unique_logarithm().then(|| MeasuredMotion {
+    fn known(&self, since: Option<Driven>, measured: Option<&MeasuredPose>) -> Option<ReadMotion> {
+        let driven = since?.and(self.step(measured)?);
+        let motion = log(&driven.pose);
+
+        motion.is_unique_logarithm().then_some(ReadMotion {
             motion,
-            covariance: measured.drift.over(motion),
+            covariance: measured?.drift.over(driven),
         })
     }
 }
 
+impl Driven {
+    /// From a frame to itself.
+    fn not_at_all() -> Self {
+        Self {
+            pose: Pose::identity(),
+            way_m: 0.0,
+            turns_rad: 0.0,
+        }
+    }
+
+    fn and(self, motion: Twist) -> Self {
+        Self {
+            pose: self.pose * exp(&motion),
+            way_m: self.way_m + motion.linear.norm(),
+            turns_rad: self.turns_rad + motion.angular.norm(),
+        }
+    }
+}
+
 impl Drift {
-    fn over(self, motion: Twist) -> Matrix6<f64> {
-        let metres = motion.linear.norm();
-        let translation = LEAST_DEVIATION_M + self.translation_share * metres;
-        let rotation = LEAST_DEVIATION_RAD + self.rotation_share * (motion.angular.norm() + metres);
+    /// The covariance of the error of what was driven, on (v, ω) in the later camera's body frame. A
+    /// heading that is wrong more and more leads aside by half of what it is wrong at the end.
+    fn over(self, driven: Driven) -> Matrix6<f64> {
+        let Driven {
+            way_m, turns_rad, ..
+        } = driven;
+        let rotation = LEAST_DEVIATION_RAD + self.rotation_share * (turns_rad + way_m);
+        let translation =
+            LEAST_DEVIATION_M + self.translation_share * way_m + 0.5 * rotation * way_m;
 
         let (v, w) = (translation.powi(2), rotation.powi(2));
         Matrix6::from_diagonal(&Vector6::new(v, v, v, w, w, w))
     }
 }
 
-/// No motion, without any error.
-fn no_motion() -> Belief {
-    Belief {
-        pose: Pose::identity(),
-        covariance: Matrix6::zeros(),
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::geometry::PoseError;
+
+    const DRIFT: Drift = Drift {
+        translation_share: 0.05,
+        rotation_share: 0.02,
+    };
+
+    /// A way of three metres along x that turns by 0.3 rad about y, in so many frames; without a pose
+    /// in the frames that `is_silent` says.
+    fn ridden(frames: u32, is_silent: impl Fn(u32) -> bool) -> Option<ReadMotion> {
+        let whole = Twist {
+            linear: Vector3::new(3.0, 0.0, 0.0),
+            angular: Vector3::new(0.0, 0.3, 0.0),
+        };
+        let measured = |frame: u32| {
+            let share = f64::from(frame) / f64::from(frames);
+            let place = Pose::new(Vector3::new(7.0, 1.0, -2.0), Vector3::new(0.4, 0.0, 1.0));
+            (!is_silent(frame)).then(|| MeasuredPose {
+                pose: place * exp(&whole.scaled(share)),
+                drift: DRIFT,
+            })
+        };
+
+        let mut since = MeasuredSince::default().after(measured(0).as_ref(), true, true);
+        for frame in 1..frames {
+            since = since.after(measured(frame).as_ref(), false, false);
+        }
+        since.from_place(measured(frames).as_ref())
     }
-}
 
-fn moved(since: Option<Belief>, step: Option<MeasuredMotion>) -> Option<Belief> {
-    let (since, step) = since.zip(step)?;
-    Some(since.moved(step.motion, &step.covariance))
-}
+    /// Oracle: the definition, by hand: shares of the way, whatever the rate and whatever is missing in
+    /// between.
+    #[test]
+    fn errors_grow_with_the_way_and_not_with_the_frames() {
+        let rotation = 5e-4 + 0.02 * (0.3 + 3.0);
+        let translation = 1e-3 + 0.05 * 3.0 + 0.5 * rotation * 3.0;
 
-fn read(whole: Option<Belief>) -> Option<ReadMotion> {
-    let whole = whole?;
-    let motion = log(&whole.pose);
+        let silences: [fn(u32) -> bool; 2] = [|_| false, |frame| frame % 10 == 5];
+        for frames in [1, 30, 300] {
+            for is_silent in silences {
+                let found = ridden(frames, is_silent).unwrap();
+                assert!((found.motion.linear - Vector3::new(3.0, 0.0, 0.0)).norm() < 1e-9);
+                assert!((found.covariance[(0, 0)].sqrt() - translation).abs() < 1e-9);
+                assert!((found.covariance[(4, 4)].sqrt() - rotation).abs() < 1e-9);
+            }
+        }
+    }
 
-    motion.is_unique_logarithm().then_some(ReadMotion {
-        motion,
-        covariance: whole.covariance,
-    })
+    /// Oracle: the rules: what began without a pose is not known, and a frame without one has no
+    /// measured motion.
+    #[test]
+    fn nothing_is_measured_from_or_to_a_silent_frame() {
+        assert!(ridden(30, |frame| frame == 0).is_none());
+        assert!(ridden(30, |frame| frame == 30).is_none());
+        assert!(ridden(30, |frame| frame == 29).is_some());
+    }
+
+    /// Oracle: composition.
+    #[test]
+    fn what_is_driven_adds_up() {
+        let step = Twist {
+            linear: Vector3::new(0.1, 0.0, 0.0),
+            angular: Vector3::new(0.0, 0.0, 0.1),
+        };
+        let twice = Driven::not_at_all().and(step).and(step);
+        let error = PoseError::between(&twice.pose, &exp(&step.times(2)));
+        assert!(error.translation_m < 1e-12 && error.rotation_rad < 1e-7);
+        assert!((twice.way_m - 0.2).abs() < 1e-12 && (twice.turns_rad - 0.2).abs() < 1e-12);
+    }
 }

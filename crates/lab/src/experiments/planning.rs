@@ -24,7 +24,9 @@ use seese3_core::geometry::{Pose, PoseError, body_twist};
 use seese3_core::navigation::{
     self, IndexKind, Navigator, Outcome, Pursuit, Start, Stepper, pursue,
 };
-use seese3_core::planning::{BelievedStart, Hops, KnownRoom, Planned, Route, RouteBounds, plan};
+use seese3_core::planning::{
+    BelievedStart, Hops, KnownRoom, LEAST_ARRIVAL_PROBABILITY, Planned, Route, RouteBounds, plan,
+};
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
 use seese3_core::tracking::{Map, PoseReader};
@@ -106,6 +108,8 @@ pub struct PlannerScores {
     pub truly_there: usize,
     /// How often the robot was there, whatever the planner said.
     pub there_anyway: usize,
+    /// The sum of the stated probabilities to arrive; of planners that state none, 0.
+    pub expected_there: f64,
     /// The sum of the hops where the goal was truly reached.
     pub steps: usize,
     /// The longest hop, ‖(v, ω)‖ with metres and radians mixed.
@@ -203,6 +207,7 @@ impl MappedRoom {
                     .map_or(Hops::Preferably(own.step), Hops::AtMost),
                 tolerance_m: own.tolerance_m,
                 tolerance_rad: own.tolerance_rad,
+                least_arrival_probability: LEAST_ARRIVAL_PROBABILITY,
             },
             navigator,
             features,
@@ -411,6 +416,7 @@ impl PlannerScores {
         self.questions += 1;
         self.says_reached += usize::from(way.says_reached);
         self.there_anyway += usize::from(is_there);
+        self.expected_there += way.probability.unwrap_or(0.0);
         if way.says_reached && is_there {
             self.truly_there += 1;
             self.steps += way.poses.len();
@@ -430,6 +436,7 @@ impl PlannerScores {
             says_reached: sum.says_reached + room.says_reached,
             truly_there: sum.truly_there + room.truly_there,
             there_anyway: sum.there_anyway + room.there_anyway,
+            expected_there: sum.expected_there + room.expected_there,
             steps: sum.steps + room.steps,
             longest_hop: sum.longest_hop.max(room.longest_hop),
             other_questions: sum.other_questions + room.other_questions,

@@ -1,5 +1,5 @@
-//! Planners of ten lines each, beside which ours has to stand. All begin at the pose of a stored frame
-//! and never say that they do not know.
+//! Planners of a few lines, beside which ours has to stand. All begin at the pose of a stored frame, and
+//! none judges whether the camera is there.
 
 use std::collections::BTreeSet;
 
@@ -75,8 +75,8 @@ pub(super) fn pose_graph(room: &MappedRoom, question: &PlanningQuestion) -> Plan
     }
 }
 
-/// The shortest way over frames that look alike, by the angle between their raw features: each is
-/// joined with the ten that look most like it, and with the next one of its recording. Poses serve only
+/// The shortest way over frames that look alike, by the cosine of their raw features: from each, edges
+/// lead to the ten that look most like it and to the rows before and after it. Poses serve only
 /// to drive from frame to frame.
 pub(super) fn topological(room: &MappedRoom, question: &PlanningQuestion) -> PlannedWay {
     let directions = Directions::of(room);

@@ -111,6 +111,9 @@ struct PlannerJson {
     truly_there: f64,
     /// The share of questions after which the robot was there, whatever the planner said.
     there_anyway: f64,
+    /// The mean over all questions of the stated probability to arrive, 0 where nothing was planned; null
+    /// for planners that state none.
+    expected_there: Option<f64>,
     /// The mean number of hops where the goal was truly reached; null without any.
     steps: Option<f64>,
     longest_hop: f64,
@@ -130,10 +133,19 @@ struct ProtocolJson {
     hold_out: &'static str,
     questions_per_room: usize,
     seed: u64,
+    adapter: String,
+    /// Whether an adapter was fitted to the mapped frames.
+    fit: bool,
+    /// The longest hop that was asked for; null for the adapter's own.
+    step: Option<f64>,
 }
 
-/// The record of an evaluation.
-pub fn planning_json(rooms: &[RoomPlanning], protocol: &PlanningProtocol) -> PlanningJson {
+/// The record of an evaluation with an adapter of this name.
+pub fn planning_json(
+    rooms: &[RoomPlanning],
+    protocol: &PlanningProtocol,
+    adapter: &str,
+) -> PlanningJson {
     let by_planner = |scores: &dyn Fn(Planner) -> PlannerScores| {
         Planner::ALL
             .into_iter()
@@ -155,6 +167,9 @@ pub fn planning_json(rooms: &[RoomPlanning], protocol: &PlanningProtocol) -> Pla
             hold_out: protocol.hold_out.name(),
             questions_per_room: protocol.questions,
             seed: protocol.seed,
+            adapter: adapter.to_owned(),
+            fit: protocol.is_fitted,
+            step: protocol.longest_hop,
         },
     }
 }
@@ -167,6 +182,8 @@ impl PlannerJson {
             says_reached: share(scores.says_reached, scores.questions),
             truly_there: share(scores.truly_there, scores.questions),
             there_anyway: share(scores.there_anyway, scores.questions),
+            expected_there: (scores.expected_there > 0.0)
+                .then(|| scores.expected_there / scores.questions as f64),
             steps: known(scores.steps, scores.truly_there),
             longest_hop: scores.longest_hop,
             other_rooms: OtherRoomsJson {

@@ -1,10 +1,11 @@
 //! What is done to a camera's images on the way to a tracker.
 
 use image::imageops;
-use nalgebra::Vector2;
+use nalgebra::{Vector2, Vector3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
+use seese3_core::geometry::Pose;
 use seese3_core::image::RgbImage;
 use seese3_core::statistics::normal_deviates;
 
@@ -126,6 +127,18 @@ impl Disturbance {
         matches!(self, Self::None | Self::Frozen | Self::Rate { .. })
     }
 
+    /// Where the disturbed camera is, if the undisturbed one is at `pose`; both `world_from_camera`. A
+    /// camera that is turned clockwise about its axis is turned about +z, from x, right, to y, down.
+    pub fn truth(self, pose: &Pose) -> Pose {
+        match self {
+            Self::Roll { degrees } => {
+                let turn = Vector3::new(0.0, 0.0, degrees.to_radians());
+                pose * Pose::new(Vector3::zeros(), turn)
+            }
+            _ => *pose,
+        }
+    }
+
     /// The image that the camera takes as frame `number` of its stream.
     pub fn disturbed(self, picture: &RgbImage, number: usize) -> RgbImage {
         match self {
@@ -242,6 +255,8 @@ fn rounded(value: f64) -> u8 {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Point3;
+
     use super::*;
 
     /// A white point at a place of a black image of 41 × 31 pixels.
@@ -265,8 +280,13 @@ mod tests {
     /// is then above it.
     #[test]
     fn a_camera_that_rolls_clockwise_sees_the_world_turn_the_other_way() {
-        let turned = Disturbance::Roll { degrees: 90.0 }.disturbed(&point(30, 15), 0);
+        let quarter = Disturbance::Roll { degrees: 90.0 };
+        let turned = quarter.disturbed(&point(30, 15), 0);
         assert_eq!(brightest(&turned), (20, 5));
+
+        // What is to the right of the level camera, in its frame, is above the turned one: y is down.
+        let right = quarter.truth(&Pose::identity()).inverse() * Point3::new(1.0, 0.0, 5.0);
+        assert!((right - Point3::new(0.0, -1.0, 5.0)).norm() < 1e-12);
     }
 
     /// Oracle: by hand. A camera that sees half as much shows things twice as far from the centre.

@@ -129,13 +129,16 @@ pub fn evaluate(
                     is_blank: taken.is_disturbed && views.is_blank[row],
                     measured: None,
                 },
-                truth: room.room().poses()[frame.row()],
+                truth: disturbance.truth(&room.room().poses()[frame.row()]),
             });
             is_scored.push(part.holds(number));
         }
 
         let replay = replay_frames(room.tracker(), &played, InitialPose::Given);
-        noticed.push(noticed_after(&replay, &is_scored));
+        // A stream of two frames has none that is disturbed.
+        if part.begin < part.end {
+            noticed.push(noticed_after(&replay, &is_scored));
+        }
         scored_rows.extend(is_scored);
         replays.push((replay, period));
         first_row += frames.len();
@@ -178,8 +181,7 @@ struct Taken {
     own_number: Option<u64>,
 }
 
-/// None where the camera takes no frame. A view outside the disturbed part is undisturbed only for
-/// disturbances that keep the images.
+/// None where the camera takes no frame.
 fn taken(disturbance: Disturbance, part: Part, number: usize) -> Option<Taken> {
     let plain = Taken {
         view: number,
