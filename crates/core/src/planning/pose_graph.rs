@@ -56,7 +56,8 @@ pub enum Hops {
 /// A way to the goal.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Route {
-    /// The frames in order, without the start; empty if the start is within the tolerance of the goal.
+    /// The frames in order, without the start. A start within the tolerance of the goal has one hop at
+    /// most, to a frame that is nearer.
     pub frames: Vec<FrameId>,
     /// The sum of all hops, ‖(v, ω)‖ with metres and radians mixed.
     pub length: f64,
@@ -114,11 +115,11 @@ impl<'a> PoseGraph<'a> {
         bounds: RouteBounds,
         cancel: &Cancellation,
     ) -> Result<Result<Route, NoRoute>, Cancelled> {
+        let targets = self.targets(goal, bounds);
         if bounds.are_met(&PoseError::between(start, goal)) {
-            return Ok(Ok(Route::default()));
+            return Ok(Ok(self.last_hop(start, goal, bounds, &targets)));
         }
 
-        let targets = self.targets(goal, bounds);
         if targets.is_empty() {
             return Ok(Err(self.goal_not_mapped(goal)));
         }
@@ -141,6 +142,29 @@ impl<'a> PoseGraph<'a> {
         let found = self.search(start, needed, Measure::Sum, cancel)?;
         let route = self.route_of(&found, &targets);
         Ok(route.ok_or(NoRoute::HopTooLong { needed }))
+    }
+
+    /// The way of a camera that is within the tolerance already: one hop to the frame nearest to the goal,
+    /// if that is nearer and one hop away.
+    fn last_hop(
+        &self,
+        start: &Pose,
+        goal: &Pose,
+        bounds: RouteBounds,
+        targets: &[(usize, f64)],
+    ) -> Route {
+        let left = body_twist(start, goal).norm();
+        let best = targets.first().filter(|(_, theirs)| *theirs < left);
+        let hop = best.map(|&(place, _)| (place, body_twist(start, self.pose(place)).norm()));
+
+        let (Hops::AtMost(longest_hop) | Hops::Preferably(longest_hop)) = bounds.hops;
+        match hop {
+            Some((place, length)) if length <= longest_hop => Route {
+                frames: vec![self.frames[place]],
+                length,
+            },
+            _ => Route::default(),
+        }
     }
 
     /// The way to the first of these places that is reached.
@@ -426,6 +450,8 @@ mod tests {
         assert!(routed(&poses, &at(2.1, 0.0), &at(2.0, 0.0), 9.0).is_err());
         let within = routed(&poses, &at(2.04, 0.0), &at(2.0, 0.0), 9.0).unwrap();
         assert!(within.frames.is_empty());
+        let one_hop = routed(&poses, &at(4.96, 0.0), &at(5.0, 0.0), 1.0).unwrap();
+        assert_eq!(one_hop.frames, [FrameId(2)]);
         let no_hop = routed(&poses, &at(4.96, 0.0), &at(5.0, 0.0), 1e-3).unwrap();
         assert!(no_hop.frames.is_empty());
     }
