@@ -223,16 +223,7 @@ fn ready(
         least_arrival_probability,
     } = request;
 
-    let least_arrival_probability = match least_arrival_probability {
-        None => LEAST_ARRIVAL_PROBABILITY,
-        Some(least) if (0.0..=1.0).contains(&least) => least,
-        Some(least) => {
-            return Err(Error::invalid(
-                "least_arrival_probability",
-                format!("must be 0 to 1, got {least}"),
-            ));
-        }
-    };
+    let least_arrival_probability = least_probability(least_arrival_probability)?;
 
     let planner = pb::Planner::try_from(planner)
         .map_err(|_| Error::invalid("planner", format!("has no value {planner}")))?;
@@ -307,6 +298,16 @@ fn believed_start(served: &ServedNavigator, source: &Source, view: &Start) -> Be
         }
         (_, None) => BelievedStart::seen(room, view.latent.view(), None),
     }
+}
+
+fn least_probability(given: Option<f64>) -> Result<f64, Error> {
+    let least = given.unwrap_or(LEAST_ARRIVAL_PROBABILITY);
+    if (0.0..=1.0).contains(&least) {
+        return Ok(least);
+    }
+
+    let problem = format!("must be 0 to 1, got {least}");
+    Err(Error::invalid("least_arrival_probability", problem))
 }
 
 /// Both kinds of goal, as one pose in the room's world.

@@ -558,6 +558,18 @@ mod tests {
         moving
     }
 
+    fn odd_measured(pose: Pose) -> MeasuredSince {
+        MeasuredSince {
+            last: Some(pose),
+            keyframe: Some(Driven {
+                pose,
+                way_m: 1.0 / 7.0,
+                turns_rad: 0.3,
+            }),
+            place: None,
+        }
+    }
+
     /// Oracle: the contract: a sealed state comes back bit by bit.
     #[test]
     fn a_state_comes_back_to_the_bit() {
@@ -613,15 +625,7 @@ mod tests {
             frames_off_map: 7,
             corrected_ns: Some(-7),
             unchanged_frames: 3,
-            measured: MeasuredSince {
-                last: Some(belief.pose),
-                keyframe: Some(Driven {
-                    pose: belief.pose,
-                    way_m: 1.0 / 7.0,
-                    turns_rad: 0.3,
-                }),
-                place: None,
-            },
+            measured: odd_measured(belief.pose),
         };
 
         for state in [

@@ -118,7 +118,10 @@ impl Tracker {
         }
 
         // What another sensor measured needs no view.
-        if let Some(measured) = state.measured.from_keyframe(frame.measured.as_ref()) {
+        if let Some(measured) = state
+            .measured
+            .motion_since_keyframe(frame.measured.as_ref())
+        {
             motion = measured.motion;
             covariance = measured.covariance;
         }
@@ -134,7 +137,7 @@ impl Tracker {
             let is_worth_it = errors.gain(frames) >= LEAST_GAIN;
             let is_read = is_worth_it && reading == MotionReading::Complete;
 
-            if let Some(measured) = state.measured.from_place(frame.measured.as_ref()) {
+            if let Some(measured) = state.measured.motion_since_place(frame.measured.as_ref()) {
                 return self.driven(&place.belief, &measured, state, frame);
             }
             let way = Carried {
@@ -187,7 +190,10 @@ impl Tracker {
         let errors = self.motion_errors(state.room);
         let gain = errors.gain(self.error_model.longest_frames() as u64);
         let is_read = reading == MotionReading::Complete && gain >= LEAST_GAIN;
-        if let Some(measured) = state.measured.from_keyframe(frame.measured.as_ref()) {
+        if let Some(measured) = state
+            .measured
+            .motion_since_keyframe(frame.measured.as_ref())
+        {
             let odom = self.driven(&keyframe.odom, &measured, state, frame);
             // A frame before that brought no pose has left odom where the views took it.
             let step = state.measured.step(frame.measured.as_ref());

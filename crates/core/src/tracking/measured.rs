@@ -90,12 +90,15 @@ impl MeasuredSince {
     }
 
     /// The motion from the keyframe to this frame, if both brought a pose.
-    pub(super) fn from_keyframe(&self, measured: Option<&MeasuredPose>) -> Option<ReadMotion> {
+    pub(super) fn motion_since_keyframe(
+        &self,
+        measured: Option<&MeasuredPose>,
+    ) -> Option<ReadMotion> {
         self.known(self.keyframe, measured)
     }
 
     /// The motion from the last place to this frame, if both brought a pose.
-    pub(super) fn from_place(&self, measured: Option<&MeasuredPose>) -> Option<ReadMotion> {
+    pub(super) fn motion_since_place(&self, measured: Option<&MeasuredPose>) -> Option<ReadMotion> {
         self.known(self.place, measured)
     }
 
@@ -184,7 +187,7 @@ mod tests {
         for frame in 1..frames {
             since = since.after(measured(frame).as_ref(), false, false);
         }
-        since.from_place(measured(frames).as_ref())
+        since.motion_since_place(measured(frames).as_ref())
     }
 
     /// Oracle: the definition, by hand: shares of the way, whatever the rate and whatever is missing in
