@@ -9,8 +9,8 @@ use prost::Message;
 use super::super::Error;
 use seese3_core::geometry::{Pose, Twist};
 use seese3_core::tracking::{
-    Belief, Candidate, Driven, Keyframe, LastFrame, MeasuredSince, MovingBelief, Place, State,
-    TrackingHealth,
+    Belief, Candidate, Driven, Keyframe, LastFrame, LastMeasured, MeasuredSince, MovingBelief,
+    Place, State, TrackingHealth,
 };
 
 /// The content of a token: the configuration of the stream, a hash of what it was answered from,
@@ -64,6 +64,9 @@ pub struct SealedState {
 /// What other sensors measured; absent if none ever did.
 #[derive(Clone, PartialEq, Message)]
 struct SealedMeasured {
+    /// Of the last frame that brought a pose.
+    #[prost(int64, tag = "4")]
+    time_ns: i64,
     #[prost(double, repeated, tag = "1")]
     last: Vec<f64>,
     #[prost(double, repeated, tag = "2")]
@@ -456,7 +459,8 @@ impl SealedMeasured {
         } = measured;
 
         (*measured != MeasuredSince::default()).then(|| Self {
-            last: last.as_ref().map_or_else(Vec::new, pose_to_numbers),
+            time_ns: last.map_or(0, |last| last.time_ns),
+            last: last.map_or_else(Vec::new, |last| pose_to_numbers(&last.pose)),
             keyframe: driven_to_numbers(keyframe.as_ref()),
             place: driven_to_numbers(place.as_ref()),
         })
@@ -464,6 +468,7 @@ impl SealedMeasured {
 
     fn opened(self) -> Result<MeasuredSince, Error> {
         let Self {
+            time_ns,
             last,
             keyframe,
             place,
@@ -473,7 +478,10 @@ impl SealedMeasured {
             last: if last.is_empty() {
                 None
             } else {
-                Some(pose_of_numbers(&last)?.0)
+                Some(LastMeasured {
+                    time_ns,
+                    pose: pose_of_numbers(&last)?.0,
+                })
             },
             keyframe: driven_of_numbers(&keyframe)?,
             place: driven_of_numbers(&place)?,
@@ -560,7 +568,7 @@ mod tests {
 
     fn odd_measured(pose: Pose) -> MeasuredSince {
         MeasuredSince {
-            last: Some(pose),
+            last: Some(LastMeasured { time_ns: -9, pose }),
             keyframe: Some(Driven {
                 pose,
                 way_m: 1.0 / 7.0,

@@ -134,8 +134,7 @@ impl MotionErrors {
 #[derive(Debug, Clone, PartialEq)]
 pub struct ErrorStatistics {
     /// The time from one frame to the next in the rooms that this was measured in, seconds: the mean of
-    /// their medians. What is
-    /// said of a number of frames holds for this many times that time.
+    /// their medians. What is said of a number of frames holds for so many times this time.
     pub frame_period_s: f64,
     /// Frame noise: half the second moment of the differences of latents from one frame to the
     /// next, shape (c, c). It holds the camera's own motion over one frame as well as noise.

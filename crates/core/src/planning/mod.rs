@@ -20,8 +20,8 @@ use crate::room::FrameId;
 use crate::tracking::Belief;
 
 /// Unless another one is asked for, nothing is planned where the camera would arrive with a smaller
-/// probability. Chosen on calibration
-/// rooms, where it left the most ways that ended at the goal, and none from the views of other rooms.
+/// probability. Chosen on six calibration rooms: of 0, 0.2, 0.3, 0.5 and 0.7 the smallest with which no
+/// view of another room started a way.
 pub const LEAST_ARRIVAL_PROBABILITY: f64 = 0.2;
 
 /// What comes of planning.

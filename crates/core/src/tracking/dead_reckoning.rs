@@ -276,10 +276,11 @@ impl Tracker {
         let place = belief.place().moved(measured.motion, &measured.covariance);
         let moving = MovingBelief::at(place, self.prior(state.room));
 
+        // The step is from the last frame that brought a pose, which may not be the last one.
         let step = state.measured.step(frame.measured.as_ref());
         let last_ns = state
+            .measured
             .last
-            .as_ref()
             .map_or(frame.time_ns, |last| last.time_ns);
         let seconds = frame.time_ns.abs_diff(last_ns) as f64 * 1e-9;
         match step {

@@ -8,6 +8,7 @@
 use nalgebra::{Matrix6, Vector6};
 
 use super::moving::ReadMotion;
+use super::state::Observation;
 use crate::geometry::{Pose, Twist, body_twist, exp, log};
 
 /// Standard deviations that a motion has besides its shares: a millimetre, and half a milliradian.
@@ -44,11 +45,20 @@ pub struct Driven {
     pub turns_rad: f64,
 }
 
+/// The last frame that brought a pose.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LastMeasured {
+    /// When it was taken, nanoseconds on the camera's clock.
+    pub time_ns: i64,
+    /// Its pose in the sensor's odometry frame.
+    pub pose: Pose,
+}
+
 /// What was measured up to the last frame that brought a pose.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct MeasuredSince {
-    /// That frame's pose in the sensor's odometry frame.
-    pub last: Option<Pose>,
+    /// That frame.
+    pub last: Option<LastMeasured>,
     /// Driven since the keyframe; none if that brought no pose.
     pub keyframe: Option<Driven>,
     /// Driven since the frame of the last place; none if that brought no pose.
@@ -56,10 +66,11 @@ pub struct MeasuredSince {
 }
 
 impl MeasuredSince {
-    /// As it is before the next frame of a stream whose last frame has become keyframe and place.
+    /// As it is when the frame of this time, the last of its stream, has become keyframe and place.
     #[must_use]
-    pub(super) fn begun(self) -> Self {
-        let begun = self.last.map(|_| Driven::not_at_all());
+    pub(super) fn begun(self, time_ns: i64) -> Self {
+        let brought_pose = self.last.filter(|last| last.time_ns == time_ns);
+        let begun = brought_pose.map(|_| Driven::not_at_all());
         Self {
             last: self.last,
             keyframe: begun,
@@ -69,12 +80,8 @@ impl MeasuredSince {
 
     /// As it is after a frame, which may have become keyframe or place.
     #[must_use]
-    pub(super) fn after(
-        self,
-        measured: Option<&MeasuredPose>,
-        is_keyframe: bool,
-        is_place: bool,
-    ) -> Self {
+    pub(super) fn after(self, frame: &Observation, is_keyframe: bool, is_place: bool) -> Self {
+        let measured = frame.measured.as_ref();
         let step = self.step(measured);
         let or_begin = |begins: bool, since: Option<Driven>| match (begins, measured) {
             (true, measured) => measured.map(|_| Driven::not_at_all()),
@@ -83,7 +90,12 @@ impl MeasuredSince {
         };
 
         Self {
-            last: measured.map(|measured| measured.pose).or(self.last),
+            last: measured.map_or(self.last, |measured| {
+                Some(LastMeasured {
+                    time_ns: frame.time_ns,
+                    pose: measured.pose,
+                })
+            }),
             keyframe: or_begin(is_keyframe, self.keyframe),
             place: or_begin(is_place, self.place),
         }
@@ -105,7 +117,7 @@ impl MeasuredSince {
     /// The motion from the last frame that brought a pose to this one, if it does too.
     pub(super) fn step(&self, measured: Option<&MeasuredPose>) -> Option<Twist> {
         let (last, measured) = self.last.zip(measured)?;
-        let motion = body_twist(&last, &measured.pose);
+        let motion = body_twist(&last.pose, &measured.pose);
         motion.is_unique_logarithm().then_some(motion)
     }
 
@@ -183,9 +195,18 @@ mod tests {
             })
         };
 
-        let mut since = MeasuredSince::default().after(measured(0).as_ref(), true, true);
+        let observed = |frame: u32| Observation {
+            time_ns: i64::from(frame),
+            sequence: u64::from(frame),
+            latent: ndarray::Array1::zeros(1),
+            feature: None,
+            is_blank: false,
+            measured: measured(frame),
+        };
+
+        let mut since = MeasuredSince::default().after(&observed(0), true, true);
         for frame in 1..frames {
-            since = since.after(measured(frame).as_ref(), false, false);
+            since = since.after(&observed(frame), false, false);
         }
         since.motion_since_place(measured(frames).as_ref())
     }
@@ -215,6 +236,20 @@ mod tests {
         assert!(ridden(30, |frame| frame == 0).is_none());
         assert!(ridden(30, |frame| frame == 30).is_none());
         assert!(ridden(30, |frame| frame == 29).is_some());
+    }
+
+    /// Oracle: the rule, by hand: a place that is set at a frame without a pose is not measured from.
+    #[test]
+    fn a_place_at_a_silent_frame_begins_nothing() {
+        let since = MeasuredSince {
+            last: Some(LastMeasured {
+                time_ns: 5,
+                pose: Pose::identity(),
+            }),
+            ..MeasuredSince::default()
+        };
+        assert!(since.begun(5).place.is_some() && since.begun(5).keyframe.is_some());
+        assert!(since.begun(6).place.is_none() && since.begun(6).keyframe.is_none());
     }
 
     /// Oracle: composition.

@@ -31,7 +31,7 @@ pub use belief::{Belief, Innovation};
 pub use clock::{ASSUMED_PERIOD_S, frame_period_s, seconds_between};
 pub use health::{Continuity, FrameEvidence, TrackingHealth};
 pub use map::{Map, MapMatch, PoseReader};
-pub use measured::{Drift, Driven, MeasuredPose, MeasuredSince};
+pub use measured::{Drift, Driven, LastMeasured, MeasuredPose, MeasuredSince};
 pub use motion_prior::MotionPrior;
 pub use moving::MovingBelief;
 pub use relocalize::{ROOM_RATIO, Relocalization, RoomMatch, relocalize};

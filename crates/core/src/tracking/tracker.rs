@@ -192,7 +192,7 @@ impl Tracker {
                     belief: MovingBelief::at(pose, self.prior(state.room)),
                     lasting: Matrix6::zeros(),
                 });
-                state.measured = state.measured.begun();
+                state.measured = state.measured.begun(last.time_ns);
             }
             None => state.initial_pose = Some(pose),
         }
@@ -284,9 +284,7 @@ impl Tracker {
         let is_keyframe = shows && self.is_keyframe_due(state, frame.time_ns, &prediction);
         let is_place = shows && (correction.is_applied || self.is_place_old(state, frame.time_ns));
         remember(state, frame, &poses, is_keyframe, is_place);
-        state.measured = state
-            .measured
-            .after(frame.measured.as_ref(), is_keyframe, is_place);
+        state.measured = state.measured.after(frame, is_keyframe, is_place);
 
         // 6. The answer. The status judges the reported pose, but only while the filter still
         //    believes one.
