@@ -17,11 +17,11 @@ use clap::{Args, Subcommand};
 use super::named::one_of;
 use super::progress::bar;
 use super::{check_writable, say, write_json};
-use crate::store::{Store, StoredAdapter};
+use crate::store::{Store, StoredAdapter, StoredRoom};
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{
-    Baselines, Leak, Protocol, TestPairs, TrainedOn, evaluate, is_calibrated_in,
+    Baselines, Leak, Protocol, TestPairs, TrainedOn, evaluate, has_seen, is_calibrated_in,
 };
 use seese3_core::features::Features;
 use seese3_core::motion_scores::MotionScores;
@@ -61,6 +61,16 @@ enum What {
     Robustness(robustness::Robustness),
     /// APE and RPE of an estimated trajectory against the true one, as evo defines them
     Trajectory(trajectory::EvaluateTrajectory),
+}
+
+/// Says which rooms an adapter has learned from or was calibrated on.
+fn say_leaks(rooms: &[(StoredRoom, Features)], record: &TrainingRecord) {
+    for (room, _) in rooms {
+        let room = room.room.id();
+        if has_seen(record, room) {
+            say(format_args!("LEAK: the adapter has seen room '{room}'"));
+        }
+    }
 }
 
 impl Evaluate {

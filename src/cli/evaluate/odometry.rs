@@ -7,7 +7,6 @@ use std::sync::{Mutex, PoisonError};
 use anyhow::Context;
 use clap::Args;
 
-use seese3_core::eval::has_seen;
 use seese3_core::splits::HoldOut;
 use seese3_core::tracking::{Replay, TrackerSettings};
 use seese3_core::training::RoomData;
@@ -23,6 +22,7 @@ use super::super::named::{ClosedSet, one_of};
 use super::super::progress::bar;
 use super::super::rooms::{data, load_rooms};
 use super::super::{check_writable, say, write_file, write_json};
+use super::say_leaks;
 use crate::export::{kitti_trajectory, tum_trajectory};
 use crate::store::Store;
 
@@ -76,14 +76,7 @@ impl Odometry {
         let stored = store.load_adapter(&self.adapter, None).await?;
         let source = stored.adapter.source().name.clone();
         let rooms = load_rooms(&store, &self.rooms, Some(&source)).await?;
-        for (room, _) in &rooms {
-            if has_seen(&stored.record, room.room.id()) {
-                say(format_args!(
-                    "LEAK: the adapter has seen room '{}'",
-                    room.room.id()
-                ));
-            }
-        }
+        say_leaks(&rooms, &stored.record);
 
         let adapter = stored.adapter;
         let hold_out = self.hold_out;

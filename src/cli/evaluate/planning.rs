@@ -5,7 +5,6 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use seese3_core::eval::has_seen;
 use seese3_core::splits::HoldOut;
 use seese3_core::training::RoomData;
 use seese3_lab::experiments::planning::{PlanningProtocol, evaluate};
@@ -15,6 +14,7 @@ use super::super::named::one_of;
 use super::super::progress::bar;
 use super::super::rooms::{data, load_rooms};
 use super::super::{check_writable, say, write_json};
+use super::say_leaks;
 use crate::store::Store;
 
 #[derive(Debug, Args)]
@@ -60,14 +60,7 @@ impl Planning {
         let stored = store.load_adapter(&self.adapter, None).await?;
         let source = stored.adapter.source().name.clone();
         let rooms = load_rooms(&store, &self.rooms, Some(&source)).await?;
-        for (room, _) in &rooms {
-            if has_seen(&stored.record, room.room.id()) {
-                say(format_args!(
-                    "LEAK: the adapter has seen room '{}'",
-                    room.room.id()
-                ));
-            }
-        }
+        say_leaks(&rooms, &stored.record);
 
         let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
         let protocol = PlanningProtocol {

@@ -7,7 +7,6 @@ use clap::Args;
 use ndarray::Array2;
 use rayon::prelude::*;
 
-use seese3_core::eval::has_seen;
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
 use seese3_core::room::FrameId;
@@ -26,6 +25,7 @@ use super::super::named::one_of;
 use super::super::progress::bar;
 use super::super::rooms::{data, load_rooms};
 use super::super::{check_writable, say, write_json};
+use super::say_leaks;
 use crate::encoder::{Encoder, read_image};
 use crate::store::Store;
 
@@ -72,14 +72,7 @@ impl Robustness {
         let stored = store.load_adapter(&self.adapter, None).await?;
         let source = stored.adapter.source().clone();
         let rooms = load_rooms(&store, &self.rooms, Some(&source.name)).await?;
-        for (room, _) in &rooms {
-            if has_seen(&stored.record, room.room.id()) {
-                say(format_args!(
-                    "LEAK: the adapter has seen room '{}'",
-                    room.room.id()
-                ));
-            }
-        }
+        say_leaks(&rooms, &stored.record);
 
         let encoder = self.encoder_of(&source)?;
         let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
