@@ -25,6 +25,17 @@ pub struct Push {
     /// The name on the server; the same if omitted
     #[arg(long = "as", value_name = "NAME")]
     renamed: Option<String>,
+    /// Add the frames behind those of the room of this name on the server, whose world frame their
+    /// poses are in
+    #[arg(long)]
+    extend: bool,
+    /// With --extend: the room's features that these frames do not have may be missing in its new
+    /// revision
+    #[arg(long, requires = "extend")]
+    drop_other_features: bool,
+    /// Of a room: afterwards let the server fit an adapter to all of its frames
+    #[arg(long, conflicts_with = "validate_only")]
+    refit: bool,
     /// Only let the server check it
     #[arg(long)]
     validate_only: bool,
@@ -36,12 +47,15 @@ impl Push {
     pub async fn run(self) -> anyhow::Result<()> {
         let store = Store::open(&self.store)?;
         let target = target(&self.name, self.renamed.as_deref())?;
+        if (self.extend || self.refit) && self.name.kind == Kind::Adapter {
+            bail!("--extend and --refit are for rooms; an adapter is published as a whole");
+        }
         let client = self.server.connect().await?;
 
         let (revision, created, served) = match self.name.kind {
             Kind::Room => {
                 let stored = store.load_room(&self.name.name, self.name.revision).await?;
-                let messages = room_messages(&stored, &target, self.validate_only)?;
+                let messages = room_messages(&stored, self.upload(&stored, &target))?;
                 let answer = client.create_room(tokio_stream::iter(messages)).await?;
                 (answer.revision, answer.created, answer.served)
             }
@@ -60,12 +74,65 @@ impl Push {
         };
         let state = match (created, served) {
             (true, true) => "published and served",
+            (false, true) if self.extend => "these frames are its last ones already",
             (false, true) => "already there, unchanged, and served",
             (true, false) => "published; the server answers from another revision",
             (false, false) => "already there, unchanged; the server answers from another revision",
         };
-        say(format_args!("{}: {state}", target.at(revision.revision)));
+        say(format_args!(
+            "{}: {state}",
+            target.clone().at(revision.revision)
+        ));
+
+        if self.refit {
+            let request = pb::RefitRoomRequest {
+                name: target.to_string(),
+                ..pb::RefitRoomRequest::default()
+            };
+            let fitted = client.refit_room(request, |_| ()).await?.revision;
+            let fitted = fitted.unwrap_or_default();
+            say(format_args!(
+                "adapters/{}/revisions/{}: fitted to it",
+                fitted.name, fitted.revision
+            ));
+        }
         Ok(())
+    }
+
+    /// The description of a room's upload.
+    fn upload(&self, stored: &StoredRoom, target: &ResourceName) -> pb::RoomUpload {
+        let provenance = stored.room.provenance();
+        // A room that is extended keeps its own.
+        let own = |words: &String| {
+            if self.extend {
+                String::new()
+            } else {
+                words.clone()
+            }
+        };
+
+        pb::RoomUpload {
+            name: target.to_string(),
+            features: stored
+                .features
+                .iter()
+                .map(|set| source_to_wire(set.source()))
+                .collect(),
+            encode_for: String::new(),
+            format: own(&provenance.format),
+            licence: own(&provenance.licence),
+            camera: provenance.camera.map(|camera| pb::Pinhole {
+                width: 1.0,
+                height: camera.height(),
+                focal: camera.focal(),
+                centre_x: Some(camera.centre().x),
+                centre_y: Some(camera.centre().y),
+            }),
+            request_id: String::new(),
+            validate_only: self.validate_only,
+            extend: self.extend,
+            drop_other_features: self.drop_other_features,
+        }
     }
 }
 
@@ -87,35 +154,13 @@ fn target(source: &ResourceName, renamed: Option<&str>) -> anyhow::Result<Resour
 /// of a dataset and the paths of its images, stays behind.
 fn room_messages(
     stored: &StoredRoom,
-    target: &ResourceName,
-    validate_only: bool,
+    upload: pb::RoomUpload,
 ) -> anyhow::Result<Vec<pb::CreateRoomRequest>> {
     use pb::create_room_request::Message;
 
     if stored.features.is_empty() {
         bail!("the room has no features; `seese3 encode` makes them");
     }
-
-    let provenance = stored.room.provenance();
-    let upload = pb::RoomUpload {
-        name: target.to_string(),
-        features: stored
-            .features
-            .iter()
-            .map(|set| source_to_wire(set.source()))
-            .collect(),
-        format: provenance.format.clone(),
-        licence: provenance.licence.clone(),
-        camera: provenance.camera.map(|camera| pb::Pinhole {
-            width: 1.0,
-            height: camera.height(),
-            focal: camera.focal(),
-            centre_x: Some(camera.centre().x),
-            centre_y: Some(camera.centre().y),
-        }),
-        validate_only,
-        ..pb::RoomUpload::default()
-    };
 
     let columns: usize = stored.features.iter().map(|set| set.rows().ncols()).sum();
     let at_once = (MESSAGE_BYTES / (128 + 4 * columns)).max(1);

@@ -17,6 +17,7 @@ mod adapters;
 mod contents;
 mod defaults;
 mod error_model;
+mod extension;
 mod format;
 mod garbage;
 mod manifest;
@@ -32,6 +33,7 @@ pub use adapter_files::{check_adapter_files, stated_weights_size};
 pub use adapters::{BaseAdapter, RoomFit, StoredAdapter};
 pub use contents::{Contents, RevisionContents};
 pub use defaults::{Choice, Defaults};
+pub use extension::{ExtendedRoom, OtherFeatures};
 pub use garbage::{Garbage, GarbageFile};
 pub use removal::Removed;
 pub use resource::{Kind, ResourceName, ResourceNameError};
@@ -109,6 +111,8 @@ pub enum Error {
         "room '{room}' has other frames since revision {revision}; give another name, or replace it on purpose"
     )]
     OtherFrames { room: String, revision: u64 },
+    #[error("frames cannot be added to room '{room}': {problem}")]
+    CannotAdd { room: String, problem: String },
     #[error("{resource} cannot be removed: {reason}")]
     InUse { resource: String, reason: String },
     #[error("no default was ever chosen, so there is nothing to take back")]

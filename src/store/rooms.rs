@@ -62,11 +62,13 @@ struct RoomObjects {
     features: Vec<FeaturesEntry>,
 }
 
-/// Which frames of a newest revision may be published over.
+/// Which newest revision may be published over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Over {
+pub(super) enum Over {
     AnyFrames,
     SameFrames,
+    /// The newest one has this number.
+    Revision(u64),
 }
 
 /// The newest revision, if publishing `body` would change nothing: content that differs only in the
@@ -136,7 +138,12 @@ impl Store {
         self.publish_over(room, features, Over::SameFrames).await
     }
 
-    async fn publish_over(
+    /// Publishes a room as [`Store::publish_room`] does.
+    ///
+    /// # Errors
+    /// [`Error::OtherFrames`] if the newest revision is not one that `over` allows, otherwise as
+    /// [`Store::publish_room`].
+    pub(super) async fn publish_over(
         &self,
         room: &Room,
         features: &[Features],
@@ -180,6 +187,14 @@ impl Store {
             // Row i of the features belongs to frame i. Features published earlier therefore stay
             // valid as long as the poses are the same.
             if let Some(newest) = &newest {
+                let is_another = matches!(over, Over::Revision(base) if base != newest.revision);
+                if is_another {
+                    return Err(Error::OtherFrames {
+                        room: room.id().to_string(),
+                        revision: newest.revision,
+                    });
+                }
+
                 if newest.frames == body.frames || self.has_poses(&folder, newest, room).await? {
                     let kept = features_to_keep(newest, &objects.features);
                     body.features.extend(kept);

@@ -40,6 +40,7 @@ mod dying;
 mod correctors;
 mod datasets;
 mod encoders;
+mod extension;
 mod fitting;
 mod formulations;
 mod geometry;

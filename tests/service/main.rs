@@ -12,6 +12,7 @@ mod support;
 
 mod answers;
 mod changes;
+mod extension;
 mod fitted;
 mod frames;
 mod goals;

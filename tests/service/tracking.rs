@@ -77,7 +77,7 @@ fn message(frame: pb::TrackFrame) -> pb::TrackRequest {
 }
 
 /// All answers of a stream; an error ends it.
-async fn answers(
+pub async fn answers(
     server: &TestServer,
     requests: Vec<pb::TrackRequest>,
 ) -> Result<Vec<pb::TrackResponse>, tonic::Status> {
@@ -544,9 +544,27 @@ async fn a_camera_in_another_place_is_lost_and_less_and_less_sure() {
 #[tokio::test]
 async fn a_stream_is_configured_once_and_first() {
     let server = server(KEY).await;
+    let with_camera = |focal: f64| {
+        begin(pb::TrackConfig {
+            camera: Some(pb::Pinhole {
+                width: 1280.0,
+                height: 960.0,
+                focal,
+                ..pb::Pinhole::default()
+            }),
+            ..config()
+        })
+    };
+
+    // The hall was mapped with 585 pixels in images 640 wide, which see 57 degrees across. 1,100 in images
+    // 1,280 wide see 60; 1,000 see 65.
+    answers(&server, vec![with_camera(1_100.0)]).await.unwrap();
+
     for (requests, word) in [
         (vec![seen(0)], "config"),
         (vec![], "config"),
+        (vec![with_camera(1_000.0)], "config.camera"),
+        (vec![with_camera(-5.0)], "config.camera"),
         (vec![begin(config()), begin(config())], "config"),
         (
             vec![begin(config()), pb::TrackRequest { message: None }],

@@ -4,7 +4,7 @@
 use seese3_core::adapter::{Adapter, Preset, TrainingRecord};
 use seese3_core::calibration::calibrate;
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::Pose;
+use seese3_core::geometry::{Pinhole, PixelCamera, Pose};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
@@ -51,7 +51,17 @@ pub fn place(name: &str, seed: u64) -> (Room, Features) {
         poses,
         ..Frames::default()
     };
-    let room = Room::new(RoomId::new(name).unwrap(), frames, Provenance::default()).unwrap();
+    let camera = PixelCamera {
+        width: 640.0,
+        height: 480.0,
+        focal: 585.0,
+        centre: None,
+    };
+    let provenance = Provenance {
+        camera: Some(Pinhole::new(camera).unwrap()),
+        ..Provenance::default()
+    };
+    let room = Room::new(RoomId::new(name).unwrap(), frames, provenance).unwrap();
 
     (
         room,

@@ -312,6 +312,7 @@ impl From<store::Error> for Error {
             },
             E::FeatureRows { .. } | E::DuplicateFeatures { .. } => Self::invalid("features", error),
             E::Name { .. } => Self::invalid("name", error),
+            E::CannotAdd { .. } => Self::invalid("frames", error),
             E::Absent { .. } => Self::Conflict {
                 name: "the store".to_owned(),
                 problem: "was changed by somebody else meanwhile; try again".to_owned(),

@@ -16,7 +16,7 @@ use super::super::workers::Lane;
 use super::super::{Error, Handlers, convert};
 use super::changes::{check_right, identity, named_whole, revision_to_wire};
 use crate::datasets;
-use crate::store::{self, Kind, Published, ResourceName};
+use crate::store::{self, Kind, OtherFeatures, Published, ResourceName};
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::{FeatureSource, Features, MAX_COLUMNS, UNSPECIFIED};
 use seese3_core::room::{Frames, Provenance, Room, RoomId, is_plain_name};
@@ -93,6 +93,16 @@ impl Handlers {
             return Err(Error::invalid("room", "is required in the first message"));
         };
         let mut received = begun(&upload, caller.as_ref(), &snapshot)?;
+        if upload.extend {
+            // The room is joined to the added frames in memory.
+            let known = changes
+                .store
+                .room_summary(&received.name.name, None)
+                .await?;
+            let columns: usize = known.features.iter().map(|source| source.dim).sum();
+            let bytes = known.frame_count * (POSE_BYTES + 4 * columns);
+            received.memory.push(changes.upload_memory(2 * bytes)?);
+        }
 
         let end = loop {
             match next(&mut messages, "end").await?.message {
@@ -126,15 +136,30 @@ impl Handlers {
         let name = received.name.name.clone();
         let memory = std::mem::take(&mut received.memory);
         let (room, features) = finished(received, &upload, &end)?;
+        let others = if upload.drop_other_features {
+            OtherFeatures::LeftBehind
+        } else {
+            OtherFeatures::Required
+        };
+
+        let store = changes.store.clone();
         if upload.validate_only {
+            if upload.extend {
+                store.extended_room(&room, &features, others).await?;
+            }
             return Ok(pb::CreateRoomResponse::default());
         }
 
-        let store = changes.store.clone();
+        let extend = upload.extend;
         let change = async move {
             // What was uploaded counts until it is in the store.
             let _memory = memory;
-            Ok(store.publish_room(&room, &features).await?)
+            let published = if extend {
+                store.extend_room(&room, &features, others).await
+            } else {
+                store.publish_room(&room, &features).await
+            };
+            Ok(published?)
         };
         let handlers = self.clone();
         let answer = move |published: Published| {
@@ -251,6 +276,8 @@ fn begun(
         }
     }
 
+    check_extension(upload).map_err(within)?;
+
     let (sources, encode_for) = match (upload.features.as_slice(), upload.encode_for.as_str()) {
         ([], "") => {
             let problem = "is required, or encode_for with images";
@@ -283,6 +310,24 @@ fn begun(
         other_columns: Sha256::new(),
         memory: Vec::new(),
     })
+}
+
+/// Checks what only an extension of a room may or may not state.
+fn check_extension(upload: &pb::RoomUpload) -> Result<(), Error> {
+    if !upload.extend {
+        return match upload.drop_other_features {
+            true => Err(Error::invalid("drop_other_features", "needs extend")),
+            false => Ok(()),
+        };
+    }
+
+    for (field, words) in [("format", &upload.format), ("licence", &upload.licence)] {
+        if !words.is_empty() {
+            let problem = "must be left out: a room that is extended keeps its own";
+            return Err(Error::invalid(field, problem));
+        }
+    }
+    Ok(())
 }
 
 fn source(given: &pb::FeatureSource) -> Result<FeatureSource, Error> {

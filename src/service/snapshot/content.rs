@@ -1,36 +1,54 @@
-//! The identity of what answers are computed from.
+//! The identity of what the states of tracked streams are made of.
 
+use ndarray::s;
 use sha2::{Digest, Sha256};
 
 use seese3_core::adapter::{Adapter, ErrorStatistics, Network};
-use seese3_core::fitting::{PartRule, ReadingRule, RoomReader};
 use seese3_core::navigation::Navigator;
 
-/// SHA-256 of the numbers that answers are computed from. Name and revision do not identify a room
-/// or adapter across stores: two stores may use the same ones for different content.
-pub fn content(navigator: &Navigator, reader: Option<&RoomReader>) -> [u8; 32] {
+/// The identity of a room under an adapter, as hashes. Name and revision are none: two stores may use
+/// the same ones for different content.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Content {
+    /// SHA-256 of the adapter and its calibration.
+    pub adapter: [u8; 32],
+    /// That of all frames, as [`frames_content`].
+    pub frames: [u8; 32],
+}
+
+impl Content {
+    /// Of a room under an adapter.
+    pub fn of(navigator: &Navigator) -> Self {
+        Self {
+            adapter: adapter_content(navigator.adapter()),
+            frames: frames_content(navigator, navigator.room().frame_count()),
+        }
+    }
+}
+
+/// SHA-256 of the poses and latents of a room's first frames. At least that many frames must exist.
+///
+/// Rotations enter to a millionth: a revision that others are added to is published again, and its
+/// rotations are then projected to SO(3) once more, which may change their last digits.
+pub fn frames_content(navigator: &Navigator, frame_count: usize) -> [u8; 32] {
     let mut digest = ContentDigest(Sha256::new());
 
-    // Every number enters with all its bits, so that states resume only where the tracker would
-    // compute exactly the same.
-    for pose in navigator.room().poses() {
+    for pose in &navigator.room().poses()[..frame_count] {
         digest.numbers(&pose.translation.vector);
-        digest.numbers(&pose.rotation.coords);
+        let rotation = pose.rotation.to_rotation_matrix();
+        for entry in rotation.matrix() {
+            let millionths = (entry * 1e6).round() as i64;
+            digest.0.update(millionths.to_le_bytes());
+        }
     }
-    digest.numbers(navigator.latents());
+    digest.numbers(navigator.latents().slice(s![..frame_count, ..]));
 
-    let adapter = navigator.adapter();
+    digest.0.finalize().into()
+}
+
+fn adapter_content(adapter: &Adapter) -> [u8; 32] {
+    let mut digest = ContentDigest(Sha256::new());
     digest.adapter(adapter);
-
-    if let Some(reader) = reader {
-        for adapter in reader.localizer.adapters() {
-            digest.adapter(adapter);
-        }
-        for rule in reader.rules.rules() {
-            digest.reading_rule(rule);
-        }
-    }
-
     if let Some(error_model) = adapter.error_model() {
         digest.error_statistics(error_model.statistics());
     }
@@ -54,24 +72,6 @@ impl ContentDigest {
         }
         self.numbers(&adapter.scale().mean);
         self.numbers(&adapter.scale().deviation);
-    }
-
-    fn reading_rule(&mut self, rule: &ReadingRule) {
-        // Destructured with no `..`, so that a new field breaks the build here.
-        let ReadingRule {
-            up_to,
-            translation,
-            rotation,
-            covariance,
-            least_disagreement,
-        } = rule;
-
-        self.numbers([up_to, least_disagreement]);
-        self.numbers(covariance);
-        for PartRule { reader, gain } in [translation, rotation] {
-            self.0.update(reader.name());
-            self.numbers([gain]);
-        }
     }
 
     fn error_statistics(&mut self, statistics: &ErrorStatistics) {

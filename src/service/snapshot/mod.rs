@@ -8,6 +8,7 @@ mod loading;
 mod room_loading;
 mod served;
 
+pub use content::frames_content;
 pub use loading::{Loader, Refused, RoomMemory};
 use room_loading::Problem;
 pub use served::{ServedNavigator, ServedRoom};

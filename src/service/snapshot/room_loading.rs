@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::Refusal;
-use super::content::content;
+use super::content::Content;
 use super::served::{LoadedRoom, ServedNavigator, ServedRoom, reader_of};
 use crate::store::{self, RoomFit, Store, StoredAdapter, StoredRoom};
 use seese3_core::eval::TrainedOn;
@@ -195,7 +195,7 @@ impl RoomLoader {
 
         Ok(ServedNavigator {
             map: map(&navigator, tracking_reader.as_ref()),
-            content: content(&navigator, tracking_reader.as_deref()),
+            content: Content::of(&navigator),
             trained_on,
             reader,
             tracking_reader,

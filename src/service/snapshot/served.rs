@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use super::super::Error;
 use super::cache::{Key, RoomCache};
+use super::content::Content;
 use super::{Refusal, refused_error};
 use crate::store::{RoomSummary, StoredAdapter};
 use seese3_core::eval::TrainedOn;
@@ -64,9 +65,8 @@ pub struct ServedNavigator {
     pub map: Option<Arc<Map>>,
     /// The adapter as it is stored, with its training record.
     pub adapter: Arc<StoredAdapter>,
-    /// SHA-256 of the numbers that answers depend on: poses, latents, and the adapter's parameters,
-    /// scale and calibration.
-    pub content: [u8; 32],
+    /// The identity of the adapter and the room's frames.
+    pub content: Content,
     /// The room's revision.
     pub room_revision: u64,
     /// What the adapter has seen of this room.

@@ -18,6 +18,8 @@ const DEVIATIONS: std::ops::RangeInclusive<f64> = 1e-6..=1e3;
 const FRAME_NAMES: [&str; 4] = ["map", "odom", "camera", "base_link"];
 /// The longest name of a frame.
 const LONGEST_NAME: usize = 100;
+/// By what share the field of view of a camera may differ from that of the one that mapped a room.
+const OTHER_VIEW: f64 = 0.1;
 /// How fast the odometry of another sensor drifts if its sender does not say, and what it may say:
 /// metres per metre, radians per radian.
 const DRIFT_SHARE: f64 = 0.05;
@@ -91,6 +93,43 @@ pub fn settings(
         keyframe_displacement: displacement.unwrap_or(plain.keyframe_displacement),
         fuse,
     })
+}
+
+/// Refuses a camera that sees much more or less than the one that mapped a room.
+///
+/// # Errors
+/// [`Error::Invalid`] if the camera is not valid, or sees otherwise than a room's.
+pub fn check_camera(
+    camera: Option<&pb::Pinhole>,
+    served: &[Arc<ServedNavigator>],
+) -> Result<(), Error> {
+    let Some(camera) = camera else {
+        return Ok(());
+    };
+    let camera = convert::pinhole(camera)?;
+
+    for served in served {
+        let room = served.navigator.room();
+        let Some(of_room) = &room.provenance().camera else {
+            continue;
+        };
+
+        for (side, ours, theirs) in [
+            ("across", camera.degrees_across(), of_room.degrees_across()),
+            ("down", camera.degrees_down(), of_room.degrees_down()),
+        ] {
+            if (ours / theirs - 1.0).abs() > OTHER_VIEW {
+                let problem = format!(
+                    "sees {ours:.1} degrees {side}, and the one that mapped room '{}' {theirs:.1}: crop or pad \
+                     the images to that, or map with this camera",
+                    room.id()
+                );
+                return Err(Error::invalid("camera", problem));
+            }
+        }
+    }
+
+    Ok(())
 }
 
 pub fn back_pressure(given: i32) -> Result<(), Error> {

@@ -5,7 +5,6 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use prost::Message;
-use sha2::{Digest, Sha256};
 
 use super::super::Error;
 use super::super::convert;
@@ -13,8 +12,8 @@ use super::super::relocalization::maps;
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use super::super::status::view_error;
 use super::Overtaken;
-use super::configuration::{StreamFrames, back_pressure, rooms, settings};
-use super::sealed::{Sealed, SealedState};
+use super::configuration::{StreamFrames, back_pressure, check_camera, rooms, settings};
+use super::sealed::{Sealed, SealedRoom, SealedState};
 use super::token::TokenKey;
 use super::wire;
 use seese3_client::proto::v1 as pb;
@@ -33,7 +32,6 @@ pub struct Session {
     frames: StreamFrames,
     state: State,
     key: TokenKey,
-    digest: Vec<u8>,
 }
 
 impl Session {
@@ -72,7 +70,7 @@ impl Session {
         // server.
         let sealed =
             Sealed::decode(key.open(&field, &config.resume_token)?).map_err(|_| Error::Internal)?;
-        let (config, state) = sealed.config.zip(sealed.state).ok_or(Error::Internal)?;
+        let config = sealed.config.clone().ok_or(Error::Internal)?;
 
         let mut session = Self::configured(snapshot, config, key).map_err(|error| match error {
             Error::NotFound { name, .. } => {
@@ -81,15 +79,12 @@ impl Session {
             other => other,
         })?;
 
-        // The state is made of latents and poses, which mean nothing under another adapter or
-        // map.
-        if session.digest != sealed.served {
-            let problem =
-                "this server has other rooms or another adapter than the token; start anew";
-            return Err(Error::Precondition(format!("{field}: {problem}")));
-        }
-
-        session.state = state.state()?;
+        // The state is made of latents and poses, which mean nothing under another adapter or in
+        // another room.
+        session.state = sealed.opened_in(&session.served)?.ok_or_else(|| {
+            let problem = "this server has another room or adapter than the token; start anew";
+            Error::Precondition(format!("{field}: {problem}"))
+        })?;
 
         if !session.fits() {
             return Err(Error::Precondition(format!(
@@ -101,7 +96,7 @@ impl Session {
     }
 
     /// Whether the state's latents have the width of this adapter and its room indices exist here.
-    /// The digest should guarantee it; without this check a state that does not fit would be a
+    /// The rooms' content should guarantee it; without this check a state that does not fit would be a
     /// panic in the tracker.
     fn fits(&self) -> bool {
         let adapter = &self.served[0].adapter.adapter;
@@ -154,6 +149,7 @@ impl Session {
 
         let frames = StreamFrames::of(&config)?;
         back_pressure(config.back_pressure)?;
+        check_camera(config.camera.as_ref(), &served)?;
 
         // A pose only has a meaning in the world of a room, so the room must be known as well.
         let begins = match config.initial_pose.clone() {
@@ -180,8 +176,6 @@ impl Session {
         let tracker =
             Tracker::new(maps, settings).map_err(|error| Error::Precondition(error.to_string()))?;
         let state = tracker.start(begins);
-        let digest = digest(&served);
-
         let snapshot = snapshot.clone();
         Ok(Self {
             snapshot,
@@ -191,7 +185,6 @@ impl Session {
             frames,
             state,
             key: key.clone(),
-            digest,
         })
     }
 
@@ -448,7 +441,8 @@ impl Session {
         // on another server.
         let sealed = Sealed {
             config: Some(self.config.clone()),
-            served: self.digest.clone(),
+            adapter: self.served[0].content.adapter.to_vec(),
+            rooms: SealedRoom::named_by(&self.state, &self.served),
             state: Some(SealedState::from(&self.state)),
         };
         pb::TrackResponse {
@@ -477,22 +471,4 @@ enum Refused {
     Frame(pb::TrackRefusalReason, String),
     /// The server is at fault; the stream ends.
     Server(Error),
-}
-
-/// Hash of everything that answers depend on: the rooms and their adapter, by name, revision and
-/// content.
-fn digest(served: &[Arc<ServedNavigator>]) -> Vec<u8> {
-    let mut digest = Sha256::new();
-    for served in served {
-        let room = served.navigator.room().id();
-        let adapter = &served.adapter;
-        digest.update(format!(
-            "{room}@{} {}@{}\n",
-            served.room_revision, adapter.name, adapter.revision
-        ));
-
-        digest.update(served.content);
-    }
-
-    digest.finalize().to_vec()
 }

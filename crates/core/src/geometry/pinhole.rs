@@ -99,6 +99,24 @@ impl Pinhole {
         self.centre
     }
 
+    /// How far it sees from left to right, degrees.
+    pub fn degrees_across(&self) -> f64 {
+        self.degrees(self.centre.x, 1.0)
+    }
+
+    /// How far it sees from top to bottom, degrees.
+    pub fn degrees_down(&self) -> f64 {
+        self.degrees(self.centre.y, self.height)
+    }
+
+    /// The angle between the two edges of an image whose length is given, with the principal point
+    /// somewhere between them.
+    fn degrees(&self, centre: f64, length: f64) -> f64 {
+        let to_one = (centre / self.focal).atan();
+        let to_other = ((length - centre) / self.focal).atan();
+        (to_one + to_other).to_degrees()
+    }
+
     /// Where a point of the image, image widths from its top left corner, lies on the plane at
     /// distance 1 before the camera.
     pub fn to_image_plane(&self, point: Vector2<f64>) -> Vector2<f64> {
@@ -130,6 +148,28 @@ mod tests {
             camera.to_image_plane(Vector2::new(1.0, 0.375)),
             Vector2::new(1.0, 0.0)
         );
+    }
+
+    /// Oracle: by hand. 320 pixels before the middle of 640 are 45° to each side; an edge that lies at the
+    /// principal point itself adds nothing.
+    #[test]
+    fn the_field_of_view_is_the_angle_between_the_edges() {
+        let half = PixelCamera {
+            focal: 320.0,
+            ..KITCHEN
+        };
+        let camera = Pinhole::new(half).unwrap();
+        assert!((camera.degrees_across() - 90.0).abs() < 1e-12);
+        let down = 2.0 * (240.0_f64 / 320.0).atan().to_degrees();
+        assert!((camera.degrees_down() - down).abs() < 1e-12);
+
+        let from_the_corner = PixelCamera {
+            centre: Some(Vector2::new(0.0, 240.0)),
+            focal: 640.0,
+            ..KITCHEN
+        };
+        let camera = Pinhole::new(from_the_corner).unwrap();
+        assert!((camera.degrees_across() - 45.0).abs() < 1e-12);
     }
 
     /// Oracle: a focal length in image widths, none, or a principal point of other images is a

@@ -7,7 +7,7 @@ use seese3_core::fitting::{Fitted, Localizer, MotionReader, ReadingRules, Readin
 use seese3_core::geometry::{Pose, PoseError, exp, log};
 use seese3_core::room::FrameId;
 use seese3_core::splits::is_in_left_out_block;
-use seese3_core::statistics::{Coverage, coverage, median, quantile};
+use seese3_core::statistics::{Coverage, RecordedMedian, coverage, median_of_recording, quantile};
 use seese3_core::training::RoomData;
 
 use super::Error;
@@ -51,20 +51,20 @@ impl LocalizationProtocol {
     }
 }
 
-/// Median and 90 % quantile of errors.
+/// Median, with its interval, and 90 % quantile of errors.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ErrorQuantiles {
-    /// Half of the errors are at most this.
-    pub median: f64,
+    /// Half of the errors are at most this; its interval is that of twenty parts of the recording.
+    pub median: RecordedMedian,
     /// Nine tenths of the errors are at most this.
     pub p90: f64,
 }
 
 impl ErrorQuantiles {
-    /// The quantiles of these errors; NaN without any.
+    /// The quantiles of these errors, in the order of the recording; NaN without any.
     pub fn of(errors: &[f64]) -> Self {
         Self {
-            median: median(errors),
+            median: median_of_recording(errors, 0),
             p90: quantile(errors, 0.9).unwrap_or(f64::NAN),
         }
     }

@@ -215,7 +215,7 @@ mod tests {
         };
         let found = errors(&[truth], &[Twist::default()]);
 
-        assert!((found.translation_m.median - 5.0).abs() < 1e-12);
-        assert!(found.rotation_deg.median.abs() < 1e-12);
+        assert!((found.translation_m.median.median - 5.0).abs() < 1e-12);
+        assert!(found.rotation_deg.median.median.abs() < 1e-12);
     }
 }

@@ -3,11 +3,14 @@
 
 use serde::Serialize;
 
+use seese3_core::statistics::RecordedMedian;
+
 use super::table::aligned;
 use crate::experiments::localization::{ErrorQuantiles, Localization, LocalizationErrors};
 use crate::experiments::motion::{AdapterErrors, MotionErrors, MotionEvaluation, TwoViewErrors};
 
-/// One line per way to locate a view: medians and 90 % quantiles of the errors.
+/// One line per way to locate a view: medians, with their intervals, and 90 % quantiles of the
+/// errors.
 pub fn localization_table(found: &Localization) -> String {
     let mut lines = vec![head("located by")];
     let mut add = |name: &str, errors: &LocalizationErrors| {
@@ -27,7 +30,8 @@ pub fn localization_table(found: &Localization) -> String {
     aligned(&lines)
 }
 
-/// One line per way to read a motion: medians and 90 % quantiles of the errors.
+/// One line per way to read a motion: medians, with their intervals, and 90 % quantiles of the
+/// errors.
 pub fn motion_table(found: &MotionEvaluation) -> String {
     let mut lines = vec![head("motion by")];
     let mut add = |name: &str, errors: &MotionErrors| {
@@ -74,11 +78,19 @@ fn head(first: &str) -> Vec<String> {
 fn line(name: &str, metres: &ErrorQuantiles, degrees: &ErrorQuantiles) -> Vec<String> {
     vec![
         name.to_owned(),
-        format!("{:.4}", metres.median),
+        interval(&metres.median, 4),
         format!("{:.3}", metres.p90),
-        format!("{:.2}", degrees.median),
+        interval(&degrees.median, 2),
         format!("{:.1}", degrees.p90),
     ]
+}
+
+/// A median with its interval, to so many decimals.
+fn interval(median: &RecordedMedian, decimals: usize) -> String {
+    format!(
+        "{:.decimals$} [{:.decimals$}, {:.decimals$}]",
+        median.median, median.low, median.high
+    )
 }
 
 /// What was evaluated.
@@ -148,6 +160,9 @@ struct ErrorsJson {
 #[derive(Debug, Serialize)]
 struct QuantilesJson {
     median: f64,
+    /// The median's 95 % interval.
+    low: f64,
+    high: f64,
     p90: f64,
 }
 
@@ -182,7 +197,9 @@ impl From<&MotionErrors> for ErrorsJson {
 impl From<&ErrorQuantiles> for QuantilesJson {
     fn from(quantiles: &ErrorQuantiles) -> Self {
         Self {
-            median: quantiles.median,
+            median: quantiles.median.median,
+            low: quantiles.median.low,
+            high: quantiles.median.high,
             p90: quantiles.p90,
         }
     }
