@@ -104,28 +104,9 @@ impl Handlers {
             received.memory.push(changes.upload_memory(2 * bytes)?);
         }
 
-        let end = loop {
-            match next(&mut messages, "end").await?.message {
-                Some(Wire::Frames(batch)) => {
-                    let arrived = changes.upload_memory(batch.encoded_len())?;
-                    let kept = changes.upload_memory(received.kept_bytes(&batch))?;
-                    received.memory.push(kept);
-                    self.take_batch(&mut received, &snapshot, batch)
-                        .await
-                        .map_err(|error| error.within("frames"))?;
-                    drop(arrived);
-                }
-                Some(Wire::End(end)) => break end,
-                Some(Wire::Room(_)) => {
-                    return Err(Error::invalid("room", "may only be sent once"));
-                }
-                None => {
-                    let problem = "one of room, frames and end is required in every message";
-                    return Err(Error::invalid("message", problem));
-                }
-            }
-        };
-
+        let end = self
+            .receive_frames(&mut received, &snapshot, &mut messages)
+            .await?;
         expect_end(&mut messages).await?;
 
         let mut content = upload.encode_to_vec();
@@ -171,6 +152,39 @@ impl Handlers {
             }
         };
         changes.once(identity, change, answer).await
+    }
+
+    /// Receives the frames of an upload up to the message that ends it.
+    async fn receive_frames(
+        &self,
+        received: &mut Received,
+        snapshot: &Arc<Snapshot>,
+        messages: &mut Streaming<pb::CreateRoomRequest>,
+    ) -> Result<pb::UploadEnd, Error> {
+        use pb::create_room_request::Message as Wire;
+
+        let changes = self.changes()?;
+        loop {
+            match next(messages, "end").await?.message {
+                Some(Wire::Frames(batch)) => {
+                    let arrived = changes.upload_memory(batch.encoded_len())?;
+                    let kept = changes.upload_memory(received.kept_bytes(&batch))?;
+                    received.memory.push(kept);
+                    self.take_batch(received, snapshot, batch)
+                        .await
+                        .map_err(|error| error.within("frames"))?;
+                    drop(arrived);
+                }
+                Some(Wire::End(end)) => return Ok(end),
+                Some(Wire::Room(_)) => {
+                    return Err(Error::invalid("room", "may only be sent once"));
+                }
+                None => {
+                    let problem = "one of room, frames and end is required in every message";
+                    return Err(Error::invalid("message", problem));
+                }
+            }
+        }
     }
 
     /// Adds a batch of frames.
