@@ -13,7 +13,7 @@ use crate::store::StoredAdapter;
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 use seese3_core::navigation::{RetrievedFrame, Source};
-use seese3_core::tracking::{self, Map, RoomMatch, View, relocalize};
+use seese3_core::tracking::{self, Map, MapQuery, RoomMatch, View, relocalize};
 
 /// Rooms in an answer if the request does not say how many.
 const ROOMS: u32 = 3;
@@ -77,7 +77,7 @@ fn answer(
     let maps = maps(&served)?;
     let stored = &served[0].adapter;
     let mut latents = Vec::with_capacity(views.len());
-    let mut newest = None;
+    let mut features = Vec::with_capacity(views.len());
 
     // Views are embedded one by one, with a check for cancellation before each, since an image
     // may have to be encoded.
@@ -96,10 +96,10 @@ fn answer(
             }
         };
 
-        newest = match &view {
+        features.push(match &view {
             View::Feature(feature) => Some(feature.clone()),
             View::Latent(_) => None,
-        };
+        });
 
         latents.push(
             view.latent(&stored.adapter)
@@ -107,12 +107,20 @@ fn answer(
         );
     }
 
-    let found = relocalize(&maps, &latents, top_k, cancel).map_err(|error| match error {
+    let queries: Vec<MapQuery<'_>> = latents
+        .iter()
+        .zip(&features)
+        .map(|(latent, feature)| MapQuery {
+            latent: latent.view(),
+            feature: feature.as_deref(),
+        })
+        .collect();
+    let found = relocalize(&maps, &queries, top_k, cancel).map_err(|error| match error {
         tracking::Error::Cancelled => Error::Cancelled,
         _ => Error::Internal,
     })?;
 
-    let newest = newest.as_deref();
+    let newest = features.last().and_then(Option::as_deref);
     let shown = found.rooms.iter().take(shown);
     let rooms = shown.map(|room| room_to_wire(room, &served, newest));
 

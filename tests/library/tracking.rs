@@ -10,7 +10,7 @@ use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Frames, Room, RoomId};
 use seese3_core::statistics::root_mean_square;
 use seese3_core::tracking::{
-    Belief, Drift, Map, MeasuredPose, Observation, PoseReader, State, Status, Tracker,
+    Belief, Drift, Map, MapQuery, MeasuredPose, Observation, PoseReader, State, Status, Tracker,
     TrackerSettings, Update,
 };
 
@@ -288,7 +288,7 @@ fn a_view_is_placed_between_mapped_frames() {
         let latent = adapter
             .embed_one(&features.rows().row(row).to_vec())
             .unwrap();
-        let matched = map.match_view(latent.view(), 1);
+        let matched = map.match_view(MapQuery::of_latent(latent.view()), 1);
         let anchor = matched.anchor.belief;
         let truth = &room.poses()[row];
         let found = &room.poses()[matched.nearest[0].frame.row()];

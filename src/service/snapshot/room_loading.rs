@@ -8,6 +8,7 @@ use super::content::Content;
 use super::served::{LoadedRoom, ServedNavigator, ServedRoom, reader_of};
 use crate::store::{self, RoomFit, Store, StoredAdapter, StoredRoom};
 use seese3_core::eval::TrainedOn;
+use seese3_core::features::Features;
 use seese3_core::fitting::{Localizer, RoomReader};
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Room};
@@ -194,7 +195,7 @@ impl RoomLoader {
         };
 
         Ok(ServedNavigator {
-            map: map(&navigator, tracking_reader.as_ref()),
+            map: map(&navigator, features, tracking_reader.as_ref()),
             content: Content::of(&navigator),
             trained_on,
             reader,
@@ -256,17 +257,24 @@ fn log_audit(navigator: &Navigator, adapter: &str) {
 /// The map of all frames of a room; none if the adapter is not calibrated. A room that is too small
 /// to track in also gives none, which is logged. Where an adapter was fitted to the room, its reader
 /// gives the anchors.
-fn map(navigator: &Arc<Navigator>, reader: Option<&Arc<RoomReader>>) -> Option<Arc<Map>> {
+fn map(
+    navigator: &Arc<Navigator>,
+    features: &Features,
+    reader: Option<&Arc<RoomReader>>,
+) -> Option<Arc<Map>> {
     navigator.adapter().error_model()?;
     let frames: Vec<FrameId> = (0..navigator.room().frame_count() as u32)
         .map(FrameId)
         .collect();
 
     match Map::new(navigator.clone(), &frames) {
-        Ok(map) => Some(Arc::new(match reader {
-            Some(reader) => map.with_pose_reader(reader.clone()),
-            None => map,
-        })),
+        Ok(map) => {
+            let map = map.with_features(features.rows(), &frames);
+            Some(Arc::new(match reader {
+                Some(reader) => map.with_pose_reader(reader.clone()),
+                None => map,
+            }))
+        }
         Err(error) => {
             tracing::warn!(room = %navigator.room().id(), %error, "the room cannot be tracked in");
             None

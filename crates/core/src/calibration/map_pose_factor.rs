@@ -61,6 +61,7 @@ fn tracker(adapter: &Arc<Adapter>, data: &RoomData<'_>) -> Result<Tracker, Error
     let mapped = HoldOut::Blocks.mapped(data.room.frame_count());
     let navigator = Navigator::new(room, data.features, adapter.clone(), IndexKind::Exact)?;
     let map = Map::new(Arc::new(navigator), &mapped)?;
+    let map = map.with_features(data.features.rows(), &mapped);
 
     Ok(Tracker::new(
         vec![Arc::new(map)],
@@ -72,7 +73,7 @@ fn tracker(adapter: &Arc<Adapter>, data: &RoomData<'_>) -> Result<Tracker, Error
 fn replayed_surprises(tracker: &Tracker, data: &RoomData<'_>) -> Vec<f64> {
     let segment = Segment {
         latents: tracker.maps()[0].navigator().latents(),
-        features: None,
+        features: Some(data.features.rows()),
         poses: data.room.poses(),
         frames: &HoldOut::Blocks.tracked(data.room.frame_count()),
     };

@@ -5,7 +5,7 @@ use ndarray::ArrayView1;
 
 use crate::geometry::Pose;
 use crate::navigation::Navigator;
-use crate::tracking::{Belief, Map, PoseReader};
+use crate::tracking::{Belief, Map, MapQuery, PoseReader};
 
 /// What tells where the view of a camera is in a room.
 #[derive(Clone, Copy)]
@@ -46,7 +46,9 @@ impl BelievedStart {
 
     /// A pose that the caller gives for a view with this latent, of shape (k,).
     pub fn given(pose: Pose, room: KnownRoom<'_>, latent: ArrayView1<'_, f64>) -> Self {
-        let matched = room.map.map(|map| map.match_view(latent, 1));
+        let matched = room
+            .map
+            .map(|map| map.match_view(MapQuery::of_latent(latent), 1));
         Self {
             out_of_distribution: matched.map(|found| found.out_of_distribution),
             ..Self::recorded(pose)
@@ -58,7 +60,8 @@ impl BelievedStart {
     /// else between the frames that look most like it; else, without a calibrated adapter, that of the
     /// nearest frame.
     pub fn seen(room: KnownRoom<'_>, latent: ArrayView1<'_, f64>, feature: Option<&[f32]>) -> Self {
-        let matched = room.map.map(|map| map.match_view(latent, 1));
+        let query = MapQuery { latent, feature };
+        let matched = room.map.map(|map| map.match_view(query, 1));
         let reader = room.reader.zip(feature);
         let read = reader.and_then(|(reader, feature)| reader.read_pose(feature));
 

@@ -6,10 +6,11 @@
 //! that means in this room its own frames tell: each is looked for when it and its neighbours are
 //! left out, and its true pose is known.
 
-use nalgebra::{Matrix4, Matrix6, Vector4, Vector6};
+use nalgebra::{Matrix5, Matrix6, Vector5, Vector6};
 use ndarray::{Array2, ArrayView1};
 
 use super::Belief;
+use super::appearance::part_of;
 use super::clock::seconds_between;
 use crate::adapter::ErrorModel;
 use crate::geometry::{Pose, Twist, body_twist, exp};
@@ -36,6 +37,8 @@ const SAMPLES: usize = 150;
 /// Rows to each side that are left out with a frame, one round each; in a last round its whole
 /// sequence is.
 const LEFT_OUT_ROWS: [u32; 9] = [0, 1, 2, 4, 8, 15, 30, 60, 120];
+/// A frame with so many rows to each side left out stands for a view of a place that was not mapped.
+const UNSEEN_ROWS: u32 = 8;
 /// Strata of about as many blends each, by the size that their errors are expected to have.
 const STRATA: usize = 8;
 /// A room whose frames give fewer blends than this tells nothing of its errors.
@@ -67,7 +70,7 @@ pub struct Blend {
     /// The distance of the nearest frame, in deviations of frame noise.
     distance: f64,
     /// What the size of the error is expected from.
-    predictors: Vector4<f64>,
+    predictors: Vector5<f64>,
 }
 
 /// A pose that was told by mapped frames.
@@ -83,7 +86,7 @@ pub struct MapAnchor {
 #[derive(Debug, Clone)]
 pub struct AnchorModel {
     /// Of the predictors, for the logarithm of the size of the error.
-    coefficients: Vector4<f64>,
+    coefficients: Vector5<f64>,
     strata: Vec<Stratum>,
 }
 
@@ -112,7 +115,14 @@ struct LeftOut {
 impl Blend {
     /// The blend of the frames nearest to a view, in order of their distance, which is in deviations
     /// of frame noise; there is at least one.
-    pub fn of(navigator: &Navigator, nearest: &[Neighbour], latent: ArrayView1<'_, f64>) -> Self {
+    /// `second_opinion` is the pose that the same view has by another measure of likeness, if there
+    /// is one.
+    pub fn of(
+        navigator: &Navigator,
+        nearest: &[Neighbour],
+        latent: ArrayView1<'_, f64>,
+        second_opinion: Option<&Pose>,
+    ) -> Self {
         let poses = navigator.room().poses();
         let first = poses[nearest[0].frame.row()];
 
@@ -152,20 +162,29 @@ impl Blend {
             motion.to_vector() * (weight / sum)
         });
 
+        let pose = first * exp(&Twist::from_vector(&mean));
+        let disagreement = second_opinion.map_or(0.0, |other| body_twist(&pose, other).norm());
+
         let distance = nearest[0].distance;
         let last = nearest.get(BLENDED).unwrap_or(&nearest[nearest.len() - 1]);
         let log = |value: f64| (value + LEAST).ln();
         Self {
-            pose: first * exp(&Twist::from_vector(&mean)),
+            pose,
             read: read.sum(),
             distance,
-            predictors: Vector4::new(
+            predictors: Vector5::new(
                 1.0,
                 log(distance),
                 log(spread.sqrt()),
                 log(distance) - log(last.distance),
+                log(disagreement),
             ),
         }
+    }
+
+    /// `world_from_camera`, without the read motion.
+    pub fn pose(&self) -> &Pose {
+        &self.pose
     }
 
     /// The pose when a share of the read motion is believed.
@@ -175,14 +194,13 @@ impl Blend {
 }
 
 impl AnchorModel {
-    /// Measures the errors in a room; `whitened` are its latents in deviations of frame noise, row by
-    /// frame. None if too few of its frames are mapped.
+    /// Measures the errors in a room. None if too few of its frames are mapped.
     pub fn measured(
         navigator: &Navigator,
-        whitened: &Array2<f64>,
+        likeness: Likeness<'_>,
         mapped: &[FrameId],
     ) -> Option<Self> {
-        let left_out = left_out_blends(navigator, whitened, mapped);
+        let left_out = left_out_blends(navigator, likeness, mapped);
         if left_out.len() < FEWEST_BLENDS {
             return None;
         }
@@ -338,10 +356,10 @@ fn memory(part: &[(f64, &LeftOut)], covariance: &Matrix6<f64>) -> Option<f64> {
 }
 
 /// The coefficients that predict the logarithm of the size of errors best, by least squares.
-fn size_coefficients(left_out: &[LeftOut]) -> Option<Vector4<f64>> {
+fn size_coefficients(left_out: &[LeftOut]) -> Option<Vector5<f64>> {
     // A little of the identity keeps predictors that do not vary from having any weight.
-    let mut moment = Matrix4::identity() * 1e-6;
-    let mut product = Vector4::zeros();
+    let mut moment = Matrix5::identity() * 1e-6;
+    let mut product = Vector5::zeros();
     for found in left_out {
         let x = found.blend.predictors;
         moment += x * x.transpose();
@@ -355,7 +373,7 @@ fn size_coefficients(left_out: &[LeftOut]) -> Option<Vector4<f64>> {
 /// left out.
 fn left_out_blends(
     navigator: &Navigator,
-    whitened: &Array2<f64>,
+    likeness: Likeness<'_>,
     mapped: &[FrameId],
 ) -> Vec<LeftOut> {
     let room = navigator.room();
@@ -368,7 +386,7 @@ fn left_out_blends(
     let mut left_out = Vec::new();
     let every = pairs.len().div_ceil(SAMPLES).max(1);
     for pair in pairs.iter().step_by(every) {
-        let rounds = pair.map(|frame| blends_without(navigator, whitened, mapped, frame));
+        let rounds = pair.map(|frame| blends_without(navigator, likeness, mapped, frame));
         let [first, second] = rounds;
         let seconds = seconds_between(room, pair[0], pair[1]);
 
@@ -387,17 +405,24 @@ fn left_out_blends(
     left_out
 }
 
-/// The blends of a mapped frame with their errors, one for each round of what is left out; none where
-/// too few frames are left.
-fn blends_without(
-    navigator: &Navigator,
-    whitened: &Array2<f64>,
-    mapped: &[FrameId],
-    frame: FrameId,
-) -> Vec<Option<(Blend, Vector6<f64>)>> {
-    let row = whitened.row(frame.row());
+/// By what mapped frames are alike: coordinates, row by frame; frames are alike that lie near to one
+/// another.
+#[derive(Clone, Copy)]
+pub struct Likeness<'a> {
+    /// Those by which frames are found.
+    pub coordinates: &'a Array2<f64>,
+    /// For each part of the mapped frames, those that know nothing of the part, if the first were made
+    /// from these very frames.
+    pub without_part: Option<&'a [Array2<f64>]>,
+    /// Others, by which frames are found a second time.
+    pub second_opinion: Option<&'a Array2<f64>>,
+}
+
+/// The mapped frames by their distance from one of them, the nearest first.
+fn by_distance(coordinates: &Array2<f64>, mapped: &[FrameId], frame: FrameId) -> Vec<Neighbour> {
+    let row = coordinates.row(frame.row());
     let distance_to = |other: FrameId| {
-        let difference = &whitened.row(other.row()) - &row;
+        let difference = &coordinates.row(other.row()) - &row;
         difference.dot(&difference).sqrt()
     };
     let mut nearest: Vec<Neighbour> = mapped
@@ -413,6 +438,26 @@ fn blends_without(
             .then(a.frame.cmp(&b.frame))
     });
 
+    nearest
+}
+
+/// The blends of a mapped frame with their errors, one for each round of what is left out; none where
+/// too few frames are left.
+fn blends_without(
+    navigator: &Navigator,
+    likeness: Likeness<'_>,
+    mapped: &[FrameId],
+    frame: FrameId,
+) -> Vec<Option<(Blend, Vector6<f64>)>> {
+    let nearest = by_distance(likeness.coordinates, mapped, frame);
+    let nearest_unseen = likeness.without_part.map(|coordinates| {
+        let place = mapped.partition_point(|other| other < &frame);
+        by_distance(&coordinates[part_of(place, mapped.len())], mapped, frame)
+    });
+    let second = likeness
+        .second_opinion
+        .map(|coordinates| by_distance(coordinates, mapped, frame));
+
     let timeline = navigator.room().timeline();
     let rounds = LEFT_OUT_ROWS.map(Some).into_iter().chain([None]);
     let found = |rows: Option<u32>| {
@@ -420,17 +465,30 @@ fn blends_without(
             Some(rows) => other.frame.0.abs_diff(frame.0) > rows,
             None => !timeline.joins(other.frame, frame),
         };
-        let left: Vec<Neighbour> = nearest
-            .iter()
-            .filter(is_left)
-            .take(LOOKED_AT)
-            .copied()
-            .collect();
-        if left.len() < LOOKED_AT {
-            return None;
-        }
+        let left = |nearest: &[Neighbour]| -> Option<Vec<Neighbour>> {
+            let left: Vec<Neighbour> = nearest
+                .iter()
+                .filter(is_left)
+                .take(LOOKED_AT)
+                .copied()
+                .collect();
+            (left.len() == LOOKED_AT).then_some(left)
+        };
 
-        let blend = Blend::of(navigator, &left, navigator.latents().row(frame.row()));
+        // A frame with neighbours is told from them by coordinates that were made for its place.
+        let is_unseen = rows.is_none_or(|rows| rows >= UNSEEN_ROWS);
+        let nearest = match &nearest_unseen {
+            Some(nearest_unseen) if is_unseen => nearest_unseen,
+            _ => &nearest,
+        };
+
+        let latents = navigator.latents();
+        let latent = latents.row(frame.row());
+        let second = second
+            .as_deref()
+            .and_then(left)
+            .map(|left| Blend::of(navigator, &left, latent, None).pose);
+        let blend = Blend::of(navigator, &left(nearest)?, latent, second.as_ref());
         let error = body_twist(&blend.pose, &navigator.room().poses()[frame.row()]);
         let is_known = error.is_unique_logarithm();
         is_known.then(|| (blend, error.to_vector()))

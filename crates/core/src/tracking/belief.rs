@@ -4,6 +4,10 @@ use nalgebra::{Cholesky, Matrix6, Vector6};
 
 use crate::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
 
+/// A pose of larger deviations than these is of little use: 2.5 of them are half a metre, or 15 degrees.
+const PLACE_DEVIATION_M: f64 = 0.2;
+const PLACE_DEVIATION_RAD: f64 = 0.105;
+
 /// A pose with the covariance of its error δ in its own body frame: true = pose · exp(δ), δ ordered
 /// (v, ω), metres and radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -114,6 +118,12 @@ impl Belief {
     pub fn squared_error(&self, truth: &Pose) -> Option<f64> {
         let error = log(&self.pose.inv_mul(truth)).to_vector();
         Some(error.dot(&self.covariance.cholesky()?.solve(&error)))
+    }
+
+    /// Whether it may be relied on to half a metre and 15 degrees.
+    pub fn tells_a_place(&self) -> bool {
+        self.position_deviation_m() <= PLACE_DEVIATION_M
+            && self.rotation_deviation_rad() <= PLACE_DEVIATION_RAD
     }
 
     /// The largest standard deviation of the position along any direction, metres.

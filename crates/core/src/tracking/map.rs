@@ -2,9 +2,10 @@
 
 use std::sync::Arc;
 
-use ndarray::{Array2, ArrayView1, Axis, s};
+use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
 
-use super::anchor_model::{AnchorModel, Blend, LOOKED_AT, MapAnchor, calibrated_anchor};
+use super::anchor_model::{AnchorModel, Blend, LOOKED_AT, Likeness, MapAnchor, calibrated_anchor};
+use super::appearance::{Appearance, RoomAppearance};
 use super::clock::frame_period_s;
 use super::motion_prior::MotionPrior;
 use super::{Belief, Error, room_errors};
@@ -30,6 +31,41 @@ pub trait PoseReader: Send + Sync {
     }
 }
 
+/// A view as a map looks for it.
+#[derive(Debug, Clone, Copy)]
+pub struct MapQuery<'a> {
+    /// Its latent, shape (k,).
+    pub latent: ArrayView1<'a, f64>,
+    /// Its raw feature, shape (d,), if it is known. It finds the mapped frames that are nearest better
+    /// than the latent does.
+    pub feature: Option<&'a [f32]>,
+}
+
+impl<'a> MapQuery<'a> {
+    /// A view of which the latent alone is known.
+    pub fn of_latent(latent: ArrayView1<'a, f64>) -> Self {
+        Self {
+            latent,
+            feature: None,
+        }
+    }
+}
+
+/// The mapped frames by what the views of the room differ in.
+struct AppearanceMap {
+    appearance: Appearance,
+    index: ExactIndex,
+    anchor_model: AnchorModel,
+}
+
+impl AppearanceMap {
+    /// The mapped frames whose features are most like one of shape (d,).
+    fn nearest(&self, feature: &[f32], count: usize) -> Vec<Neighbour> {
+        let coordinates = self.appearance.coordinates(feature).to_vec();
+        self.index.nearest(&coordinates, count, None)
+    }
+}
+
 /// The mapped frames of a room under an adapter with an error model.
 pub struct Map {
     navigator: Arc<Navigator>,
@@ -42,15 +78,19 @@ pub struct Map {
     anchor_model: Option<AnchorModel>,
     motion_prior: MotionPrior,
     pose_reader: Option<Arc<dyn PoseReader>>,
+    by_appearance: Option<AppearanceMap>,
 }
 
 /// How a view matches a map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MapMatch {
-    /// The nearest mapped frames, by distance in standard deviations of frame noise; at least one.
+    /// The mapped frames that look most alike, the most alike first, each with the distance of its
+    /// latent in standard deviations of frame noise; at least one.
     pub nearest: Vec<Neighbour>,
-    /// The distance of the nearest frame over the room's limit: above 1 the view looks like another
-    /// place.
+    /// The distance of the nearest latent, in standard deviations of frame noise: it compares between
+    /// rooms.
+    pub distance: f64,
+    /// That distance over the room's limit: above 1 the view looks like another place.
     pub out_of_distribution: f64,
     /// Whether the view is so near that hardly any frame of another room would be.
     pub is_certain: bool,
@@ -97,7 +137,12 @@ impl Map {
         // poses are known.
         let motion_errors = room_errors::motion_errors(&navigator, &error_model, mapped)
             .map_err(Error::RoomErrors)?;
-        let anchor_model = AnchorModel::measured(&navigator, &whitened, mapped);
+        let by_latent = Likeness {
+            coordinates: &whitened,
+            without_part: None,
+            second_opinion: None,
+        };
+        let anchor_model = AnchorModel::measured(&navigator, by_latent, mapped);
 
         Ok(Self {
             extent_m: extent(&navigator, mapped),
@@ -109,7 +154,45 @@ impl Map {
             motion_errors,
             anchor_model,
             pose_reader: None,
+            by_appearance: None,
         })
+    }
+
+    /// The same map with the raw features of its room, shape (n, d), of which the frames `mapped` are
+    /// mapped: a view whose feature is known is looked for by it. A room with few frames, or of which
+    /// they tell too little, stays as it is.
+    #[must_use]
+    pub fn with_features(self, features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Self {
+        let measured = || {
+            let RoomAppearance {
+                appearance,
+                coordinates,
+                without_part,
+            } = RoomAppearance::of(features, mapped)?;
+
+            let of_motion = s![.., ..self.navigator.adapter().coordinate_count()];
+            let whitened = self
+                .error_model
+                .frame_noise()
+                .whitened(self.navigator.latents().slice(of_motion));
+            let likeness = Likeness {
+                coordinates: &coordinates,
+                without_part: Some(&without_part),
+                second_opinion: Some(&whitened),
+            };
+
+            Some(AppearanceMap {
+                anchor_model: AnchorModel::measured(&self.navigator, likeness, mapped)?,
+                index: ExactIndex::new(coordinates.view(), mapped),
+                appearance,
+            })
+        };
+
+        let by_appearance = measured();
+        Self {
+            by_appearance,
+            ..self
+        }
     }
 
     /// The same map with a reader of its own room, which gives anchors wherever a frame brings its
@@ -134,7 +217,10 @@ impl Map {
 
     /// About how much memory it holds, bytes, besides the navigator.
     pub fn memory_bytes(&self) -> usize {
-        self.index.memory_bytes()
+        let by_appearance = self.by_appearance.as_ref().map_or(0, |map| {
+            map.appearance.memory_bytes() + map.index.memory_bytes()
+        });
+        self.index.memory_bytes() + by_appearance
     }
 
     /// The errors of motions read in this room, scaled by what its mapped frames show.
@@ -152,42 +238,71 @@ impl Map {
         self.extent_m
     }
 
-    /// Matches a view, given by its latent of shape (k,), with the `count` nearest mapped frames.
-    pub fn match_view(&self, latent: ArrayView1<'_, f64>, count: usize) -> MapMatch {
-        let adapter = self.navigator.adapter();
-        let coordinates = latent.slice(s![..adapter.coordinate_count()]);
-        let whitened = self
-            .error_model
-            .frame_noise()
-            .whitened(coordinates.insert_axis(Axis(0)));
-
-        let mut nearest = self
-            .index
-            .nearest(&whitened.row(0).to_vec(), count.max(LOOKED_AT), None);
+    /// Matches a view with the `count` mapped frames that look most alike.
+    pub fn match_view(&self, query: MapQuery<'_>, count: usize) -> MapMatch {
+        let whitened = self.whitened(query.latent);
+        let mut by_latent = self.index.nearest(&whitened, count.max(LOOKED_AT), None);
         // A map has frames, or it would not have a typical distance.
-        if nearest.is_empty() {
-            nearest.push(Neighbour {
+        if by_latent.is_empty() {
+            by_latent.push(Neighbour {
                 frame: FrameId(0),
                 distance: f64::INFINITY,
             });
         }
 
-        let best = nearest[0];
-        let blend = Blend::of(&self.navigator, &nearest, latent);
-        nearest.truncate(count.max(1));
-        let anchor = match &self.anchor_model {
-            Some(model) => model.anchor(&blend),
-            None => calibrated_anchor(&self.error_model, &blend),
+        let distance = by_latent[0].distance;
+        let blend = Blend::of(&self.navigator, &by_latent, query.latent, None);
+        let (mut nearest, anchor) = match self.by_appearance.as_ref().zip(query.feature) {
+            Some((map, feature)) => {
+                let alike = map.nearest(feature, count.max(LOOKED_AT));
+                let second = Some(blend.pose());
+                let blend = Blend::of(&self.navigator, &alike, query.latent, second);
+                let nearest = self.with_latent_distances(&alike, &whitened);
+                (nearest, map.anchor_model.anchor(&blend))
+            }
+            None => {
+                let anchor = match &self.anchor_model {
+                    Some(model) => model.anchor(&blend),
+                    None => calibrated_anchor(&self.error_model, &blend),
+                };
+                (by_latent, anchor)
+            }
         };
+        nearest.truncate(count.max(1));
 
         let limits = self.error_model.statistics();
-        let relative_distance = best.distance / self.typical_distance;
+        let relative_distance = distance / self.typical_distance;
         MapMatch {
             nearest,
+            distance,
             out_of_distribution: relative_distance / limits.out_of_distribution_ratio,
             is_certain: relative_distance <= limits.certain_match_ratio,
             anchor,
         }
+    }
+
+    /// The same frames, with the distances of their latents from a whitened one.
+    fn with_latent_distances(&self, frames: &[Neighbour], whitened: &[f64]) -> Vec<Neighbour> {
+        let latents = self.navigator.latents();
+        let of_latent = |found: &Neighbour| {
+            let other = self.whitened(latents.row(found.frame.row()));
+            let squares = whitened.iter().zip(other).map(|(a, b)| (a - b).powi(2));
+            Neighbour {
+                frame: found.frame,
+                distance: squares.sum::<f64>().sqrt(),
+            }
+        };
+        frames.iter().map(of_latent).collect()
+    }
+
+    /// A latent of shape (k,) in standard deviations of frame noise.
+    fn whitened(&self, latent: ArrayView1<'_, f64>) -> Vec<f64> {
+        let coordinates = latent.slice(s![..self.navigator.adapter().coordinate_count()]);
+        self.error_model
+            .frame_noise()
+            .whitened(coordinates.insert_axis(Axis(0)))
+            .row(0)
+            .to_vec()
     }
 }
 

@@ -9,6 +9,7 @@
 
 mod anchor_model;
 mod anchoring;
+mod appearance;
 mod belief;
 mod clock;
 mod dead_reckoning;
@@ -30,7 +31,7 @@ pub use anchoring::ANCHORS_TO_AGREE;
 pub use belief::{Belief, Innovation};
 pub use clock::{ASSUMED_PERIOD_S, frame_period_s, seconds_between};
 pub use health::{Continuity, FrameEvidence, TrackingHealth};
-pub use map::{Map, MapMatch, PoseReader};
+pub use map::{Map, MapMatch, MapQuery, PoseReader};
 pub use measured::{Drift, Driven, LastMeasured, MeasuredPose, MeasuredSince};
 pub use motion_prior::MotionPrior;
 pub use moving::MovingBelief;

@@ -2,9 +2,7 @@
 
 use std::sync::Arc;
 
-use ndarray::Array1;
-
-use super::{Error, Map, MapMatch};
+use super::{Error, Map, MapMatch, MapQuery};
 use crate::cancel::Cancellation;
 
 /// A room is only named if its nearest frame is this much nearer than that of any other room.
@@ -18,7 +16,7 @@ pub struct Relocalization {
     /// The second room's distance over the best one's; infinite with one room.
     pub margin: f64,
     /// Whether the best room should not be relied on: another one matches nearly as well, or none
-    /// matches.
+    /// matches, or the view does not tell where in the room it is.
     pub ambiguous: bool,
     /// Why it is ambiguous, in words; empty if it is not.
     pub reason: String,
@@ -47,12 +45,12 @@ pub struct RoomMatch {
 /// maps have several adapters, [`Error::Cancelled`] when nobody waits any more.
 pub fn relocalize(
     maps: &[Arc<Map>],
-    latents: &[Array1<f64>],
+    views: &[MapQuery<'_>],
     top_k: usize,
     cancel: &Cancellation,
 ) -> Result<Relocalization, Error> {
     let adapter = maps.first().ok_or(Error::NoMap)?.navigator().adapter();
-    let (newest, earlier) = latents.split_last().ok_or(Error::NoView)?;
+    let (newest, earlier) = views.split_last().ok_or(Error::NoView)?;
     if maps
         .iter()
         .any(|map| !Arc::ptr_eq(map.navigator().adapter(), adapter))
@@ -63,18 +61,18 @@ pub fn relocalize(
     let mut rooms = Vec::with_capacity(maps.len());
     for (place, map) in maps.iter().enumerate() {
         cancel.check().map_err(|_| Error::Cancelled)?;
-        let last = map.match_view(newest.view(), top_k);
-        let mut distance = last.nearest[0].distance;
+        let last = map.match_view(*newest, top_k);
+        let mut distance = last.distance;
         let mut out_of_distribution = last.out_of_distribution;
 
-        for latent in earlier {
+        for view in earlier {
             cancel.check().map_err(|_| Error::Cancelled)?;
-            let matched = map.match_view(latent.view(), 1);
-            distance += matched.nearest[0].distance;
+            let matched = map.match_view(*view, 1);
+            distance += matched.distance;
             out_of_distribution += matched.out_of_distribution;
         }
 
-        let count = latents.len() as f64;
+        let count = views.len() as f64;
         rooms.push(RoomMatch {
             map: place,
             distance: distance / count,
@@ -98,6 +96,7 @@ fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
     // The margin is NaN when both distances are zero.
     let has_rival = margin.recip() > ROOM_RATIO || margin.is_nan();
     let is_far = best.out_of_distribution > 1.0;
+    let is_vague = !best.last.anchor.belief.tells_a_place();
     let reason = if is_far {
         format!(
             "the best room is {:.2} times as far as its limit",
@@ -105,6 +104,13 @@ fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
         )
     } else if has_rival {
         format!("the second room is only {margin:.2} times as far as the best")
+    } else if is_vague {
+        let belief = &best.last.anchor.belief;
+        format!(
+            "the view is known to {:.2} m and {:.0}° only in the best room",
+            belief.position_deviation_m(),
+            belief.rotation_deviation_rad().to_degrees()
+        )
     } else {
         String::new()
     };
@@ -112,7 +118,7 @@ fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
     Relocalization {
         rooms,
         margin,
-        ambiguous: has_rival || is_far,
+        ambiguous: has_rival || is_far || is_vague,
         reason,
     }
 }

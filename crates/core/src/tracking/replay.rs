@@ -20,7 +20,7 @@ const FOUND_WITHIN_DEG: f64 = 15.0;
 pub struct Segment<'a> {
     /// Latents of the whole recording under the tracker's adapter, row by frame, shape (n, k).
     pub latents: ArrayView2<'a, f64>,
-    /// Raw features of the same frames, shape (n, d), for maps with a [`super::PoseReader`].
+    /// Raw features of the same frames, shape (n, d), if the streams are to bring them.
     pub features: Option<ArrayView2<'a, f32>>,
     /// Poses of the whole recording, `world_from_camera`, row by frame.
     pub poses: &'a [Pose],

@@ -17,8 +17,8 @@ pub struct Observation {
     pub sequence: u64,
     /// Its latent under the tracker's adapter, shape (k,).
     pub latent: Array1<f64>,
-    /// The raw feature of that latent, shape (d,), if it is known: the [`super::PoseReader`] of a map
-    /// reads it.
+    /// The raw feature of that latent, shape (d,), if it is known: mapped frames are found by it, and the
+    /// [`super::PoseReader`] of a map reads it.
     pub feature: Option<Vec<f32>>,
     /// Whether the image is known to show nothing: it is blank, or all bright or dark.
     pub is_blank: bool,

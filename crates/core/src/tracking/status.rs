@@ -8,9 +8,6 @@ use super::{ANCHORS_TO_AGREE, Belief, Status};
 
 /// Frames without a match after which a known place is in doubt.
 const FRAMES_UNTIL_DOUBT: u32 = 10;
-/// A pose of larger deviations than these is not TRACKING: 2.5 of them are half a metre, or 15 degrees.
-const TRACKING_DEVIATION_M: f64 = 0.2;
-const TRACKING_DEVIATION_RAD: f64 = 0.105;
 
 impl Tracker {
     /// The status after a frame, and the reason in words. `reported_pose` is where the frame was
@@ -72,9 +69,8 @@ impl Tracker {
         }
 
         // What is called TRACKING may be relied on to half a metre and 15 degrees.
-        let turn = reported_pose.rotation_deviation_rad();
-        if deviation > TRACKING_DEVIATION_M || turn > TRACKING_DEVIATION_RAD {
-            let turn = turn.to_degrees();
+        if !reported_pose.tells_a_place() {
+            let turn = reported_pose.rotation_deviation_rad().to_degrees();
             let reason = format!("the pose is known to {deviation:.2} m and {turn:.0}° only");
             return (Status::Degraded, reason);
         }

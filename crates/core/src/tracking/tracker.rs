@@ -16,13 +16,13 @@
 use std::sync::Arc;
 
 use nalgebra::Matrix6;
-use ndarray::{ArrayView1, Axis, s};
+use ndarray::{Axis, s};
 
 use super::anchoring::{BestMap, Correction};
 use super::dead_reckoning::{MotionReading, Poses, Prediction};
 use super::health::{Continuity, FrameEvidence, TrackingHealth};
 use super::state::{Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
-use super::{Belief, Error, Map, MapMatch, MovingBelief, ROOM_RATIO};
+use super::{Belief, Error, Map, MapMatch, MapQuery, MovingBelief, ROOM_RATIO};
 use crate::adapter::{Adapter, ErrorModel, JUMP_WINDOW};
 
 /// Views this near to one another, in deviations of frame noise, are the same image: the noise of a
@@ -233,7 +233,7 @@ impl Tracker {
     fn step(&self, state: &mut State, frame: &Observation) -> Update {
         // 1. What the frame looks like: the best map, the mapped frame nearest to it, and whether
         //    the view follows from the views before.
-        let best = self.match_maps(state.room, frame.latent.view());
+        let best = self.match_maps(state.room, frame);
         let continuity = self.record_view(state, frame);
         let sight = Sight::of(state, frame);
         let matches_room = sight == Sight::Clear && best.matched.out_of_distribution <= 1.0;
@@ -312,12 +312,16 @@ impl Tracker {
 
     /// How the view matches the believed room or, if no room is believed yet, the one of all maps
     /// that it matches best.
-    fn match_maps(&self, room: Option<usize>, latent: ArrayView1<'_, f64>) -> BestMap {
+    fn match_maps(&self, room: Option<usize>, frame: &Observation) -> BestMap {
+        let query = MapQuery {
+            latent: frame.latent.view(),
+            feature: frame.feature.as_deref(),
+        };
         if let Some(room) = room {
             return BestMap {
                 room,
                 is_clear: true,
-                matched: self.maps[room].match_view(latent, 1),
+                matched: self.maps[room].match_view(query, 1),
             };
         }
 
@@ -325,9 +329,9 @@ impl Tracker {
             .maps
             .iter()
             .enumerate()
-            .map(|(room, map)| (room, map.match_view(latent, 1)))
+            .map(|(room, map)| (room, map.match_view(query, 1)))
             .collect();
-        let distance = |found: &(usize, MapMatch)| found.1.nearest[0].distance;
+        let distance = |found: &(usize, MapMatch)| found.1.distance;
         matches.sort_by(|a, b| distance(a).total_cmp(&distance(b)).then(a.0.cmp(&b.0)));
 
         let is_clear = matches

@@ -17,8 +17,8 @@ use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
 use seese3_core::tracking::{
-    InitialPose, Map, MapMatch, MotionSurprise, Replay, Segment, Status, Tracker, TrackerSettings,
-    relocalize, replay, replay_streams,
+    InitialPose, Map, MapMatch, MapQuery, MotionSurprise, Replay, Segment, Status, Tracker,
+    TrackerSettings, relocalize, replay, replay_streams,
 };
 use seese3_core::training::RoomData;
 use seese3_core::trajectory::{Relation, RpePairs, Statistics, Trajectory, ape, rpe};
@@ -147,6 +147,8 @@ pub struct Relocalisation {
     pub wrong: usize,
     /// No room was named.
     pub ambiguous: usize,
+    /// Some room was named when the right one was not among those that were looked in.
+    pub named_without_own: usize,
     /// The number of rooms to choose from.
     pub rooms: usize,
     /// Squared Mahalanobis lengths of the errors of the poses in the right room.
@@ -194,7 +196,8 @@ pub fn trackers<'a>(
         )?;
 
         let what = || format!("room '{}'", room.id());
-        let mut map = Map::new(Arc::new(navigator), &mapped).within(what)?;
+        let map = Map::new(Arc::new(navigator), &mapped).within(what)?;
+        let mut map = map.with_features(data.features.rows(), &mapped);
         if protocol.is_fitted {
             let fitted = fit(data, &mapped, Some(adapter), 0, &|_| ()).within(what)?;
             let reader = RoomReader::new(data, &mapped, Some(adapter.clone()), &fitted);
@@ -244,12 +247,24 @@ pub fn relocalisation(
     let maps: Vec<Arc<Map>> = rooms.iter().map(|room| room.map.clone()).collect();
 
     let of_room = |(place, room): (usize, &TrackedRoom<'_>)| {
+        let mut others = maps.clone();
+        others.remove(place);
         let mut found = Relocalisation::default();
         let tracked = hold_out.tracked(room.room.frame_count());
 
         for frame in tracked.into_iter().step_by(RELOCALISED_STEP) {
-            let latent = room.map.navigator().latents().row(frame.row()).to_owned();
-            let answer = relocalize(&maps, &[latent], 1, &Cancellation::default())?;
+            let feature = room.features.row(frame.row()).to_vec();
+            let latents = room.map.navigator().latents();
+            let view = MapQuery {
+                latent: latents.row(frame.row()),
+                feature: Some(&feature),
+            };
+            let answer = relocalize(&maps, &[view], 1, &Cancellation::default())?;
+
+            if !others.is_empty() {
+                let answer = relocalize(&others, &[view], 1, &Cancellation::default())?;
+                found.named_without_own += usize::from(!answer.ambiguous);
+            }
 
             if answer.ambiguous {
                 found.ambiguous += 1;
@@ -276,6 +291,7 @@ pub fn relocalisation(
         right: sum(|found| found.right),
         wrong: sum(|found| found.wrong),
         ambiguous: sum(|found| found.ambiguous),
+        named_without_own: sum(|found| found.named_without_own),
         rooms: rooms.len(),
         pose_surprises: all(|found| &found.pose_surprises),
         pose_errors_m: all(|found| &found.pose_errors_m),

@@ -177,7 +177,11 @@ impl MappedRoom {
         let navigator = Navigator::new(room, &features, adapter.clone(), IndexKind::Exact);
         let navigator = Arc::new(navigator.within(what)?);
         let map = match adapter.error_model() {
-            Some(_) => Some(Map::new(navigator.clone(), &all_frames(&navigator)).within(what)?),
+            Some(_) => {
+                let mapped = all_frames(&navigator);
+                let map = Map::new(navigator.clone(), &mapped).within(what)?;
+                Some(map.with_features(features.rows(), &mapped))
+            }
             None => None,
         };
 

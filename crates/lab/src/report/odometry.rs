@@ -197,12 +197,13 @@ pub fn relocalisation_text(found: &Relocalisation) -> String {
 
     let covered = coverage(&found.pose_surprises);
     format!(
-        "single views among {} rooms: {:.4} right, {:.4} wrong, {:.4} ambiguous, of {count}; right ones \
-         {:.3} m off (root mean square; nearest frame {:.3}), {:.3} and {:.3} within 68 and 95 %",
+        "single views among {} rooms: {:.4} right, {:.4} wrong, {:.4} ambiguous, of {count}; without their own \
+         room {:.4} are called clear; right ones {:.3} m off (root mean square; nearest frame {:.3}), {:.3} and {:.3} within 68 and 95 %",
         found.rooms,
         share(found.right),
         share(found.wrong),
         share(found.ambiguous),
+        share(found.named_without_own),
         root_mean_square(&found.pose_errors_m),
         root_mean_square(&found.nearest_errors_m),
         covered.within_68,
@@ -302,6 +303,8 @@ struct RelocalisationJson {
     right: usize,
     wrong: usize,
     ambiguous: usize,
+    /// Views that were not ambiguous among the rooms without their own.
+    named_without_own: usize,
     /// Root mean squares over the right ones, metres; null without one.
     pose_m: Option<f64>,
     nearest_frame_m: Option<f64>,
@@ -331,6 +334,7 @@ pub fn odometry_json(
             right: found.right,
             wrong: found.wrong,
             ambiguous: found.ambiguous,
+            named_without_own: found.named_without_own,
             pose_m: known(root_mean_square(&found.pose_errors_m)),
             nearest_frame_m: known(root_mean_square(&found.nearest_errors_m)),
             coverage: coverage_json(&found.pose_surprises),
