@@ -14,6 +14,9 @@ poses and TF are those of base_link, which may have no other parent than odom. W
 the optical ones (x right, y down, z forward), and TF is only published if publish_tf is set: a camera frame that a robot
 description holds has a parent already. TF map -> odom and ~/pose are published while the camera is TRACKING or DEGRADED.
 
+With camera (width, height and focal length in pixels: width, height and K[0] of CameraInfo) a room that was mapped with another field
+of view is refused.
+
 The wheels' frame is base_link, and base_from_camera is needed for them. When a stream cannot be resumed, odometry begins
 anew; that is logged as an error, and /diagnostics counts it.
 """
@@ -65,6 +68,16 @@ def mounting(numbers):
     x, y, z, qx, qy, qz, qw = numbers
     return geometry_pb2.Pose(position=geometry_pb2.Vector3(x=x, y=y, z=z),
                              orientation=geometry_pb2.Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
+def pinhole(numbers):
+    """A camera of its width, height and focal length in pixels, as CameraInfo has them, or None of none."""
+    if not numbers:
+        return None
+    if len(numbers) != 3:
+        raise ValueError("camera must be width, height and focal length in pixels")
+    width, height, focal = numbers
+    return geometry_pb2.Pinhole(width=width, height=height, focal=focal)
 
 
 def status_name(update):
@@ -184,7 +197,8 @@ def main():
     config = odometry_pb2.TrackConfig(
         room=given["room"], adapter=given["adapter"], back_pressure=odometry_pb2.BACK_PRESSURE_NEWEST,
         frames=odometry_pb2.FrameNames(camera=given["camera_frame"], base=given["base_frame"]),
-        base_from_camera=base_from_camera)
+        base_from_camera=base_from_camera,
+        camera=pinhole(node.declare_parameter("camera", Parameter.Type.DOUBLE_ARRAY).value))
     channel = grpc.insecure_channel(given["server"])
     stream = Stream(channel, config)
     odom = node.create_publisher(Odometry, "~/odom", 10)

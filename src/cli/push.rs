@@ -6,7 +6,7 @@ use sha2::{Digest, Sha256};
 
 use super::ask::Server;
 use super::say;
-use crate::service::source_to_wire;
+use crate::service::{pinhole_to_wire, source_to_wire};
 use crate::store::{Kind, ResourceName, Store, StoredRoom};
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::Features;
@@ -121,13 +121,7 @@ impl Push {
             encode_for: String::new(),
             format: own(&provenance.format),
             licence: own(&provenance.licence),
-            camera: provenance.camera.map(|camera| pb::Pinhole {
-                width: 1.0,
-                height: camera.height(),
-                focal: camera.focal(),
-                centre_x: Some(camera.centre().x),
-                centre_y: Some(camera.centre().y),
-            }),
+            camera: provenance.camera.as_ref().map(pinhole_to_wire),
             request_id: String::new(),
             validate_only: self.validate_only,
             extend: self.extend,

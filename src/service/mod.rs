@@ -38,7 +38,7 @@ mod two_views;
 mod workers;
 
 pub use auth::{AuthError, Keyring};
-pub use convert::source_to_wire;
+pub use convert::{pinhole_to_wire, source_to_wire};
 pub use image_encoder::ImageEncoders;
 pub use metrics::Metrics;
 pub use reload::Reload;

@@ -3,6 +3,8 @@
 
 use std::sync::Arc;
 
+use ndarray::Array1;
+
 use super::convert;
 use super::localization::{located_by, rooms_under};
 use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
@@ -76,11 +78,49 @@ fn answer(
     let served = rooms_to_track_in(snapshot, &rooms, &adapter)?;
     let maps = maps(&served)?;
     let stored = &served[0].adapter;
-    let mut latents = Vec::with_capacity(views.len());
-    let mut features = Vec::with_capacity(views.len());
+    let views = embedded(views, stored, snapshot, cancel)?;
+    let queries: Vec<MapQuery<'_>> = views
+        .iter()
+        .map(|view| MapQuery {
+            latent: view.latent.view(),
+            feature: view.feature.as_deref(),
+        })
+        .collect();
+    let found = relocalize(&maps, &queries, top_k, cancel).map_err(|error| match error {
+        tracking::Error::Cancelled => Error::Cancelled,
+        _ => Error::Internal,
+    })?;
 
-    // Views are embedded one by one, with a check for cancellation before each, since an image
-    // may have to be encoded.
+    let newest = views.last().and_then(|view| view.feature.as_deref());
+    let shown = found.rooms.iter().take(shown);
+    let rooms = shown.map(|room| room_to_wire(room, &served, newest));
+
+    Ok(pb::RelocalizeResponse {
+        adapter: Some(convert::adapter_revision(&served[0])),
+        rooms: rooms.collect::<Result<_, _>>()?,
+        room_count: served.len() as u32,
+        margin: found.margin.is_finite().then_some(found.margin),
+        ambiguous: found.ambiguous,
+        reason: found.reason,
+    })
+}
+
+/// A view under the adapter.
+struct EmbeddedView {
+    latent: Array1<f64>,
+    /// Its raw feature, unless it came as a latent.
+    feature: Option<Vec<f32>>,
+}
+
+/// Embeds the views of a request one by one, with a check for cancellation before each, since an image
+/// may have to be encoded.
+fn embedded(
+    views: Vec<pb::View>,
+    stored: &StoredAdapter,
+    snapshot: &Snapshot,
+    cancel: &Cancellation,
+) -> Result<Vec<EmbeddedView>, Error> {
+    let mut embedded = Vec::with_capacity(views.len());
     for (position, view) in views.into_iter().enumerate() {
         cancel.check()?;
         let field = format!("views[{position}]");
@@ -96,51 +136,39 @@ fn answer(
             }
         };
 
-        features.push(match &view {
-            View::Feature(feature) => Some(feature.clone()),
+        let latent = view
+            .latent(&stored.adapter)
+            .map_err(|error| view_error(&error).within(&field))?;
+        let feature = match view {
+            View::Feature(feature) => Some(feature),
             View::Latent(_) => None,
-        });
-
-        latents.push(
-            view.latent(&stored.adapter)
-                .map_err(|error| view_error(&error).within(&field))?,
-        );
+        };
+        embedded.push(EmbeddedView { latent, feature });
     }
 
-    let queries: Vec<MapQuery<'_>> = latents
-        .iter()
-        .zip(&features)
-        .map(|(latent, feature)| MapQuery {
-            latent: latent.view(),
-            feature: feature.as_deref(),
-        })
-        .collect();
-    let found = relocalize(&maps, &queries, top_k, cancel).map_err(|error| match error {
-        tracking::Error::Cancelled => Error::Cancelled,
-        _ => Error::Internal,
-    })?;
-
-    let newest = features.last().and_then(Option::as_deref);
-    let shown = found.rooms.iter().take(shown);
-    let rooms = shown.map(|room| room_to_wire(room, &served, newest));
-
-    Ok(pb::RelocalizeResponse {
-        adapter: Some(convert::adapter_revision(&served[0])),
-        rooms: rooms.collect::<Result<_, _>>()?,
-        room_count: served.len() as u32,
-        margin: found.margin.is_finite().then_some(found.margin),
-        ambiguous: found.ambiguous,
-        reason: found.reason,
-    })
+    Ok(embedded)
 }
 
 /// The rooms to track or relocalise in, all under one adapter; at least one. If no adapter is
 /// named, only those that can track in these rooms are considered: the first of a single room, else
-/// the only one.
+/// the only one. Where all rooms are searched, those that are too small to track in are left out.
 ///
 /// # Errors
 /// [`Error::Invalid`] on `adapter` if several can track; else as [`rooms_under`].
 pub fn rooms_to_track_in(
+    snapshot: &Snapshot,
+    rooms: &[String],
+    adapter: &str,
+) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+    let mut served = rooms_by_adapter(snapshot, rooms, adapter)?;
+    if rooms.is_empty() && served.iter().any(|served| served.map.is_some()) {
+        served.retain(|served| served.map.is_some());
+    }
+
+    Ok(served)
+}
+
+fn rooms_by_adapter(
     snapshot: &Snapshot,
     rooms: &[String],
     adapter: &str,

@@ -1,9 +1,11 @@
 //! Adding frames to a room: a robot's own, for instance, of places that the map does not show yet.
 
-use ndarray::{Axis, concatenate};
+use ndarray::{Axis, concatenate, s};
 
 use super::rooms::Over;
-use super::{ATTEMPTS, Error, Kind, Published, Store, StoredRoom, check_features, revision_path};
+use super::{
+    ATTEMPTS, Error, Kind, Published, RoomSummary, Store, StoredRoom, check_features, revision_path,
+};
 use crate::store::folder_of;
 use seese3_core::features::Features;
 use seese3_core::geometry::Pose;
@@ -25,11 +27,28 @@ pub struct ExtendedRoom {
     features: Vec<Features>,
     /// The revision that the frames were added to.
     base: u64,
-    /// Whether the frames were the room's last ones already.
+    /// Whether the room had the frames already.
     is_there: bool,
 }
 
+impl ExtendedRoom {
+    /// Whether the room had the frames already.
+    pub fn is_there(&self) -> bool {
+        self.is_there
+    }
+}
+
 impl Store {
+    /// A summary of the newest revision of a room, whichever its name alone means.
+    ///
+    /// # Errors
+    /// As [`Store::room_summary`].
+    pub async fn newest_room_summary(&self, name: &str) -> Result<RoomSummary, Error> {
+        let revisions = self.revisions(&folder_of(Kind::Room, name)).await?;
+        self.room_summary(name, revisions.present.last().copied())
+            .await
+    }
+
     /// The newest revision of a room with frames behind its own: the room `addition`, which has the
     /// same name, with `features`. Nothing is published.
     ///
@@ -55,7 +74,7 @@ impl Store {
     }
 
     /// Adds frames to the newest revision of a room, as [`Store::extended_room`] says, and publishes
-    /// the result. Frames that are the room's last ones already are not added again.
+    /// the result. Frames that the room has already, one after the other, are not added again.
     ///
     /// # Errors
     /// As [`Store::extended_room`] and [`Store::publish_room`].
@@ -111,7 +130,7 @@ fn extended(
     };
 
     let features = joined_features(base, features, others).map_err(refused)?;
-    if ends_with(base, addition, &features) {
+    if has_frames(base, addition, &features) {
         return Ok(ExtendedRoom {
             room: base.room.clone(),
             features: base.features.clone(),
@@ -123,16 +142,17 @@ fn extended(
 
     let known = base.room.provenance();
     let added = addition.provenance();
-    if added.camera.is_some() && known.camera.is_some() && added.camera != known.camera {
-        return Err(refused(
-            "they were taken by another camera than the room's; leave the camera out, or make a \
-             room of their own"
-                .to_owned(),
-        ));
+    let problem = match (&added.camera, &known.camera) {
+        (Some(added), Some(known)) => known.difference(added),
+        (Some(_), None) => Some("that of the room's frames is not known: leave it out".to_owned()),
+        (None, _) => None,
+    };
+    if let Some(problem) = problem {
+        return Err(refused(format!("their camera {problem}")));
     }
+
     let provenance = Provenance {
         images_root: String::new(),
-        camera: known.camera.or(added.camera),
         worst_rotation_deviation: known
             .worst_rotation_deviation
             .max(added.worst_rotation_deviation),
@@ -155,29 +175,21 @@ fn joined_features(
     added: &[Features],
     others: OtherFeatures,
 ) -> Result<Vec<Features>, String> {
-    let known = || -> String {
-        let names = base.features.iter().map(|set| set.source().name.as_str());
-        names.collect::<Vec<&str>>().join(", ")
-    };
-
+    let mut rows_of: Vec<Option<&Features>> = vec![None; base.features.len()];
     for set in added {
-        let is_known = |known: &Features| known.source().is_like(set.source());
-        if !base.features.iter().any(is_known) {
+        let place = place_among(&base.features, set)?;
+        if rows_of[place].replace(set).is_some() {
+            let name = &base.features[place].source().name;
             return Err(format!(
-                "features '{}' are made otherwise than the room's: {}",
-                set.source().name,
-                known()
+                "rows of the room's features '{name}' were sent twice"
             ));
         }
     }
 
     let mut joined = Vec::with_capacity(base.features.len());
-    for known in &base.features {
+    for (known, rows) in base.features.iter().zip(rows_of) {
         let name = &known.source().name;
-        let Some(rows) = added
-            .iter()
-            .find(|set| known.source().is_like(set.source()))
-        else {
+        let Some(rows) = rows else {
             if others == OtherFeatures::LeftBehind {
                 continue;
             }
@@ -196,27 +208,67 @@ fn joined_features(
     Ok(joined)
 }
 
-/// Whether the added frames are the last ones of the base already: the same poses and features.
+/// Which of the room's sets is made as an added one: that of the same name or, if none is, the only
+/// one that is made so.
+fn place_among(known: &[Features], added: &Features) -> Result<usize, String> {
+    let alike: Vec<usize> = (0..known.len())
+        .filter(|&place| known[place].source().is_like(added.source()))
+        .collect();
+    let name = &added.source().name;
+    let of_same_name = alike
+        .iter()
+        .find(|&&place| known[place].source().name == *name);
+
+    match (of_same_name, alike.as_slice()) {
+        (Some(&place), _) => Ok(place),
+        (None, [only]) => Ok(*only),
+        (None, found) => {
+            let names = |places: &mut dyn Iterator<Item = usize>| {
+                let names = places.map(|place| known[place].source().name.as_str());
+                names.collect::<Vec<&str>>().join(", ")
+            };
+            Err(if found.is_empty() {
+                format!(
+                    "features '{name}' differ in how they were made from the room's: {}",
+                    names(&mut (0..known.len()))
+                )
+            } else {
+                format!(
+                    "features '{name}' may be several of the room's, send them by name: {}",
+                    names(&mut found.iter().copied())
+                )
+            })
+        }
+    }
+}
+
+/// Whether the base already has the added frames, one after the other: the same poses, times and features.
 /// `joined` are the features of both.
-fn ends_with(base: &StoredRoom, addition: &Room, joined: &[Features]) -> bool {
+fn has_frames(base: &StoredRoom, addition: &Room, joined: &[Features]) -> bool {
+    let known = base.room.frame_count();
     let added = addition.frame_count();
-    let Some(before) = base.room.frame_count().checked_sub(added) else {
+    if joined.len() != base.features.len() || added > known {
         return false;
-    };
+    }
 
     // Stored rotations are projected when they are read, so that equal ones agree up to rounding.
-    let same = |(a, b): (&Pose, &Pose)| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-12;
-    let same_poses = base.room.poses()[before..]
-        .iter()
-        .zip(addition.poses())
-        .all(same);
+    let same = |a: &Pose, b: &Pose| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-12;
+    let begins_at = |first: usize| {
+        let times = base.room.timestamps_ns().get(first..first + added);
+        if times.unwrap_or_default() != addition.timestamps_ns() {
+            return false;
+        }
 
-    let same_rows = |set: &Features| {
-        let rows = set.rows();
-        let end = rows.nrows() - added;
-        rows.slice(ndarray::s![before..end, ..]) == rows.slice(ndarray::s![end.., ..])
+        let poses = &base.room.poses()[first..first + added];
+        let same_rows = |set: &Features| {
+            let rows = set.rows();
+            rows.slice(s![first..first + added, ..]) == rows.slice(s![known.., ..])
+        };
+        let mut pairs = poses.iter().zip(addition.poses());
+        pairs.all(|(a, b)| same(a, b)) && joined.iter().all(same_rows)
     };
-    same_poses && joined.len() == base.features.len() && joined.iter().all(same_rows)
+
+    (0..=known - added).any(begins_at)
 }
 
 /// Every column of the known frames with that of the added ones behind it.
@@ -233,16 +285,6 @@ fn joined_frames(known: &Frames, added: &Frames) -> Result<Frames, String> {
         };
         return Err(problem.to_owned());
     }
-    if let (Some(last), Some(first)) = (
-        known.timestamps_ns.iter().max(),
-        added.timestamps_ns.first(),
-    ) && first <= last
-    {
-        return Err(format!(
-            "the first was taken at {first} ns, before the room's last at {last} ns: use the same clock"
-        ));
-    }
-
     // A frame without a name has an empty one.
     let names = if known.names.is_empty() && added.names.is_empty() {
         Vec::new()

@@ -544,6 +544,8 @@ impl Store {
             provenance.licence.clone_from(&known.provenance().licence);
         }
 
+        provenance.camera = provenance.camera.or(known.provenance().camera);
+
         // Image paths are relative to the images root, so both come from the same revision.
         if given.images.is_empty() {
             provenance

@@ -1,7 +1,7 @@
 //! Frames that are added to a room.
 
 use seese3::store::{Error, OtherFeatures, Store};
-use seese3_core::features::Features;
+use seese3_core::features::{FeatureSource, Features};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 
 use crate::store::{room, set, stored};
@@ -83,9 +83,15 @@ async fn added_frames_follow_the_rooms_own() {
         "the room's camera stays"
     );
 
-    // Sent again, they are there already.
+    // Sent again, they are there already; so are others that the room has had all along.
     let again = extend().await.unwrap();
     assert_eq!((again.revision, again.is_new), (2, false));
+    let features = [rows("f", 1.0, 100..140), rows("g", 2.0, 100..140)];
+    let others = OtherFeatures::Required;
+    let addition = part(100..140);
+    let old = store.extend_room(&addition, &features, others).await;
+    let old = old.unwrap();
+    assert_eq!((old.revision, old.is_new), (2, false));
     assert!(store.verify(&|_| ()).await.unwrap().is_empty());
 }
 
@@ -108,13 +114,11 @@ async fn frames_that_do_not_fit_are_refused() {
         Room::new(RoomId::new("b").unwrap(), frames, Provenance::default()).unwrap()
     };
 
-    let early = [rows("f", 1.0, 100..140), rows("g", 2.0, 100..140)];
     let stranger = vec![rows("f", 1.0, 260..300), rows("h", 2.0, 260..300)];
     for (addition, features, word) in [
         (part(260..300), one(), "drop_other_features"),
         (part(260..300), stranger, "'h'"),
         (without_times, both(), "timestamps"),
-        (part(100..140), early.to_vec(), "clock"),
         (elsewhere, both(), "'b'"),
     ] {
         let refused = store
@@ -130,6 +134,23 @@ async fn frames_that_do_not_fit_are_refused() {
     let newest = store.load_room("a", None).await.unwrap();
     assert_eq!((newest.revision, newest.features.len()), (1, 2));
 
+    // The same frames at another time are others.
+    let later = {
+        let known = part(100..140).frames().clone();
+        let frames = Frames {
+            timestamps_ns: known
+                .timestamps_ns
+                .iter()
+                .map(|t| t + 1_000_000_000_000)
+                .collect(),
+            ..known
+        };
+        Room::new(RoomId::new("a").unwrap(), frames, Provenance::default()).unwrap()
+    };
+    let features = [rows("f", 1.0, 100..140), rows("g", 2.0, 100..140)];
+    let extended = store.extended_room(&later, &features, OtherFeatures::Required);
+    assert!(!extended.await.unwrap().is_there());
+
     // On purpose, a set may be left behind.
     let published = store
         .extend_room(&part(260..300), &one(), OtherFeatures::LeftBehind)
@@ -137,6 +158,46 @@ async fn frames_that_do_not_fit_are_refused() {
         .unwrap();
     let newest = store.load_room("a", None).await.unwrap();
     assert_eq!((published.revision, newest.features.len()), (2, 1));
+}
+
+/// Oracle: the names: two sets that are made alike get each its own rows, and an unnamed third one is
+/// refused.
+#[tokio::test]
+async fn features_that_are_made_alike_are_told_by_their_names() {
+    let (_folder, store) = stored().await;
+    let of = |name: &str, scale: f32, rows: std::ops::Range<usize>| {
+        let set = set(name, scale).select(&rows.collect::<Vec<usize>>());
+        let source = FeatureSource {
+            encoder: "one@1".to_owned(),
+            ..set.source().clone()
+        };
+        Features::new(source, set.rows().to_owned()).unwrap()
+    };
+    let known = [of("f", 1.0, 0..260), of("g", 2.0, 0..260)];
+    store.publish_room(&part(0..260), &known).await.unwrap();
+
+    let both = [of("g", 2.0, 260..300), of("f", 1.0, 260..300)];
+    let extend = |features: Vec<Features>| {
+        let store = store.clone();
+        async move {
+            let others = OtherFeatures::Required;
+            store.extend_room(&part(260..300), &features, others).await
+        }
+    };
+    for (features, word) in [
+        (vec![of("f", 1.0, 260..300)], "drop_other_features"),
+        (vec![of("h", 1.0, 260..300), both[0].clone()], "by name"),
+    ] {
+        let refused = extend(features).await.unwrap_err().to_string();
+        assert!(refused.contains(word), "{refused}");
+    }
+
+    extend(both.to_vec()).await.unwrap();
+    let back = store.load_room("a", None).await.unwrap();
+    for (name, scale) in [("f", 1.0), ("g", 2.0)] {
+        let expected = set(name, scale);
+        assert_eq!(back.features(name).unwrap().rows(), expected.rows());
+    }
 }
 
 /// Oracle: the promise: nobody's frames are lost when several add theirs at once.

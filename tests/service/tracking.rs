@@ -6,11 +6,12 @@ use seese3_client::convert;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::track_request::Message;
 use seese3_client::proto::v1::track_response::Answer;
-use seese3_core::geometry::{Pose, PoseError};
+use seese3_core::geometry::{Pinhole, PixelCamera, Pose, PoseError};
+use seese3_core::room::{Provenance, Room};
 use tonic::Code;
 
 use crate::harness::{TestServer, feature, frame, start_on};
-use crate::support::world::{calibrated, place, served};
+use crate::support::world::{FRAMES, calibrated, place, served};
 
 /// Two places, and an adapter that can be followed with; `key` seals tokens.
 async fn server(key: &[u8]) -> TestServer {
@@ -648,6 +649,70 @@ async fn a_stream_is_configured_once_and_first() {
             error.message().contains(word),
             "{error:?} does not say {word}"
         );
+    }
+}
+
+/// Oracle: the contract: where no room is named, those that are too small to track in, or that another
+/// camera has mapped, are left out; and they are refused by name.
+#[tokio::test]
+async fn rooms_that_cannot_be_tracked_in_do_not_stop_a_search() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+    let (adapter, record) = calibrated();
+    for name in ["hall", "attic", "small"] {
+        let (room, features) = served(name);
+        let rows: Vec<usize> = (0..if name == "small" { 2 } else { FRAMES }).collect();
+        let wide = PixelCamera {
+            width: 640.0,
+            height: 480.0,
+            focal: 320.0,
+            centre: None,
+        };
+        let provenance = match name {
+            "attic" => Provenance {
+                camera: Some(Pinhole::new(wide).unwrap()),
+                ..Provenance::default()
+            },
+            _ => room.provenance().clone(),
+        };
+        let room = Room::new(room.id().clone(), room.frames().select(&rows), provenance);
+        store
+            .publish_room(&room.unwrap(), &[features.select(&rows)])
+            .await
+            .unwrap();
+    }
+    store
+        .publish_adapter("followed", &adapter, &record, served("hall").1.rows())
+        .await
+        .unwrap();
+    let server = start_on(folder, store, Config::default()).await;
+
+    let anywhere = pb::TrackConfig {
+        camera: Some(pb::Pinhole {
+            width: 640.0,
+            height: 480.0,
+            focal: 585.0,
+            ..pb::Pinhole::default()
+        }),
+        ..pb::TrackConfig::default()
+    };
+    let requests = [begin(anywhere.clone())]
+        .into_iter()
+        .chain((0..30).map(seen));
+    let found = answers(&server, requests.collect()).await.unwrap();
+    assert_eq!(update(&found[30]).room.as_ref().unwrap().name, "hall");
+
+    for (room, code, word) in [
+        ("small", Code::FailedPrecondition, "too few"),
+        ("attic", Code::InvalidArgument, "config.camera"),
+    ] {
+        let named = pb::TrackConfig {
+            room: room.to_owned(),
+            ..anywhere.clone()
+        };
+        let error = answers(&server, vec![begin(named)]).await.unwrap_err();
+        assert_eq!(error.code(), code, "{error:?}");
+        assert!(error.message().contains(word), "{error:?}");
     }
 }
 

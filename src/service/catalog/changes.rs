@@ -145,7 +145,7 @@ impl Changes {
 }
 
 /// Runs work on a blocking thread: writing a store mixes files with hashing.
-async fn on_blocking_thread<T: Send + 'static>(
+pub async fn on_blocking_thread<T: Send + 'static>(
     work: impl Future<Output = T> + Send + 'static,
 ) -> Result<T, Error> {
     let runtime = tokio::runtime::Handle::current();

@@ -268,6 +268,7 @@ fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
         licence: provenance.licence.clone(),
         worst_rotation_deviation: provenance.worst_rotation_deviation,
         create_time: convert::time_to_wire(created),
+        camera: provenance.camera.as_ref().map(convert::pinhole_to_wire),
     }
 }
 

@@ -14,7 +14,7 @@ use super::super::auth::Principal;
 use super::super::snapshot::Snapshot;
 use super::super::workers::Lane;
 use super::super::{Error, Handlers, convert};
-use super::changes::{check_right, identity, named_whole, revision_to_wire};
+use super::changes::{check_right, identity, named_whole, on_blocking_thread, revision_to_wire};
 use crate::datasets;
 use crate::store::{self, Kind, OtherFeatures, Published, ResourceName};
 use seese3_client::proto::v1 as pb;
@@ -97,7 +97,7 @@ impl Handlers {
             // The room is joined to the added frames in memory.
             let known = changes
                 .store
-                .room_summary(&received.name.name, None)
+                .newest_room_summary(&received.name.name)
                 .await?;
             let columns: usize = known.features.iter().map(|source| source.dim).sum();
             let bytes = known.frame_count * (POSE_BYTES + 4 * columns);
@@ -126,7 +126,8 @@ impl Handlers {
         let store = changes.store.clone();
         if upload.validate_only {
             if upload.extend {
-                store.extended_room(&room, &features, others).await?;
+                let check = async move { store.extended_room(&room, &features, others).await };
+                on_blocking_thread(check).await??;
             }
             return Ok(pb::CreateRoomResponse::default());
         }

@@ -8,7 +8,7 @@ use seese3_client::proto::v1 as pb;
 use seese3_core::adapter::Adapter;
 use seese3_core::eval::{RetrievalScores, Row};
 use seese3_core::features::FeatureSource;
-use seese3_core::geometry::{Pose, Twist};
+use seese3_core::geometry::{Pinhole, Pose, Twist};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{
@@ -165,6 +165,17 @@ pub fn time_to_wire(stated: &str) -> Option<prost_types::Timestamp> {
         seconds: time.timestamp(),
         nanos: i32::try_from(time.timestamp_subsec_nanos()).ok()?,
     })
+}
+
+/// A camera on the wire, in image widths.
+pub fn pinhole_to_wire(camera: &Pinhole) -> pb::Pinhole {
+    pb::Pinhole {
+        width: 1.0,
+        height: camera.height(),
+        focal: camera.focal(),
+        centre_x: Some(camera.centre().x),
+        centre_y: Some(camera.centre().y),
+    }
 }
 
 /// The source of a set of features on the wire.

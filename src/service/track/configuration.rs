@@ -18,18 +18,29 @@ const DEVIATIONS: std::ops::RangeInclusive<f64> = 1e-6..=1e3;
 const FRAME_NAMES: [&str; 4] = ["map", "odom", "camera", "base_link"];
 /// The longest name of a frame.
 const LONGEST_NAME: usize = 100;
-/// By what share the field of view of a camera may differ from that of the one that mapped a room.
-const OTHER_VIEW: f64 = 0.1;
 /// How fast the odometry of another sensor drifts if its sender does not say, and what it may say:
 /// metres per metre, radians per radian.
 const DRIFT_SHARE: f64 = 0.05;
 const DRIFT_SHARES: std::ops::RangeInclusive<f64> = 1e-4..=10.0;
 
-/// The rooms of a configuration, all under one adapter; at least one.
+/// The rooms of a configuration, all under one adapter; at least one. With a camera, those that were
+/// mapped with one like it, or with one that is not known.
 ///
 /// # Errors
-/// [`Error::Invalid`] if both `room` and `rooms` are given, or as [`rooms_to_track_in`].
+/// [`Error::Invalid`] if both `room` and `rooms` are given, or the camera is not valid or unlike that of
+/// every room; otherwise as [`rooms_to_track_in`].
 pub fn rooms(
+    snapshot: &Snapshot,
+    config: &pb::TrackConfig,
+) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+    let served = named_rooms(snapshot, config)?;
+    match &config.camera {
+        Some(camera) => seen_alike(camera, served),
+        None => Ok(served),
+    }
+}
+
+fn named_rooms(
     snapshot: &Snapshot,
     config: &pb::TrackConfig,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
@@ -95,41 +106,36 @@ pub fn settings(
     })
 }
 
-/// Refuses a camera that sees much more or less than the one that mapped a room.
+/// The rooms that were mapped with a camera like this one, as far as theirs are known.
 ///
 /// # Errors
-/// [`Error::Invalid`] if the camera is not valid, or sees otherwise than a room's.
-pub fn check_camera(
-    camera: Option<&pb::Pinhole>,
-    served: &[Arc<ServedNavigator>],
-) -> Result<(), Error> {
-    let Some(camera) = camera else {
-        return Ok(());
-    };
+/// [`Error::Invalid`] if the camera is not valid, or no room is left.
+fn seen_alike(
+    camera: &pb::Pinhole,
+    served: Vec<Arc<ServedNavigator>>,
+) -> Result<Vec<Arc<ServedNavigator>>, Error> {
     let camera = convert::pinhole(camera)?;
+    let mut other = None;
+    let mut alike = Vec::new();
 
     for served in served {
         let room = served.navigator.room();
-        let Some(of_room) = &room.provenance().camera else {
-            continue;
-        };
-
-        for (side, ours, theirs) in [
-            ("across", camera.degrees_across(), of_room.degrees_across()),
-            ("down", camera.degrees_down(), of_room.degrees_down()),
-        ] {
-            if (ours / theirs - 1.0).abs() > OTHER_VIEW {
-                let problem = format!(
-                    "sees {ours:.1} degrees {side}, and the one that mapped room '{}' {theirs:.1}: crop or pad \
-                     the images to that, or map with this camera",
-                    room.id()
-                );
-                return Err(Error::invalid("camera", problem));
-            }
+        let of_room = room.provenance().camera.as_ref();
+        match of_room.and_then(|of_room| of_room.difference(&camera)) {
+            None => alike.push(served),
+            Some(difference) => other = Some((room.id().to_string(), difference)),
         }
     }
 
-    Ok(())
+    match other {
+        Some((room, difference)) if alike.is_empty() => Err(Error::invalid(
+            "camera",
+            format!(
+                "{difference} ('{room}'): crop or pad the images to that, or map with this camera"
+            ),
+        )),
+        _ => Ok(alike),
+    }
 }
 
 pub fn back_pressure(given: i32) -> Result<(), Error> {

@@ -12,7 +12,7 @@ use super::super::relocalization::maps;
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use super::super::status::view_error;
 use super::Overtaken;
-use super::configuration::{StreamFrames, back_pressure, check_camera, rooms, settings};
+use super::configuration::{StreamFrames, back_pressure, rooms, settings};
 use super::sealed::{Sealed, SealedRoom, SealedState};
 use super::token::TokenKey;
 use super::wire;
@@ -149,7 +149,6 @@ impl Session {
 
         let frames = StreamFrames::of(&config)?;
         back_pressure(config.back_pressure)?;
-        check_camera(config.camera.as_ref(), &served)?;
 
         // A pose only has a meaning in the world of a room, so the room must be known as well.
         let begins = match config.initial_pose.clone() {

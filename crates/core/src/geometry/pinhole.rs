@@ -23,6 +23,9 @@ pub enum PinholeError {
     },
 }
 
+/// By what share the fields of view of two cameras may differ that count as alike.
+const OTHER_VIEW: f64 = 0.1;
+
 /// A pinhole camera as its calibration states it, in pixels of its images.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PixelCamera {
@@ -97,6 +100,20 @@ impl Pinhole {
     /// The principal point from the top left corner, image widths.
     pub fn centre(&self) -> Vector2<f64> {
         self.centre
+    }
+
+    /// In what another camera sees so much more or less that places look different through it, in words;
+    /// none if it does not.
+    pub fn difference(&self, other: &Self) -> Option<String> {
+        [
+            ("across", self.degrees_across(), other.degrees_across()),
+            ("down", self.degrees_down(), other.degrees_down()),
+        ]
+        .into_iter()
+        .find(|(_, ours, theirs)| (theirs / ours - 1.0).abs() > OTHER_VIEW)
+        .map(|(side, ours, theirs)| {
+            format!("sees {theirs:.1} degrees {side}, and the one that mapped the room {ours:.1}")
+        })
     }
 
     /// How far it sees from left to right, degrees.

@@ -107,9 +107,9 @@ fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
     } else if is_vague {
         let belief = &best.last.anchor.belief;
         format!(
-            "the view is known to {:.2} m and {:.0}° only in the best room",
-            belief.position_deviation_m(),
-            belief.rotation_deviation_rad().to_degrees()
+            "the view is known to {:.2} m and {:.0}° only in the best room, 2.5 standard deviations",
+            2.5 * belief.position_deviation_m(),
+            2.5 * belief.rotation_deviation_rad().to_degrees()
         )
     } else {
         String::new()

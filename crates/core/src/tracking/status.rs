@@ -1,5 +1,6 @@
 //! The status of a stream: whether its pose should be trusted, and why.
 
+use super::belief::PLACE_DEVIATION_M;
 use super::health::{FRAMES_TO_RECOVER, TrackingHealth};
 use super::map::MapMatch;
 use super::state::State;
@@ -37,10 +38,11 @@ impl Tracker {
             return (Status::Relocalizing, reason);
         };
 
-        // A position that is known to no better than the size of the room says nothing.
+        // A position that is known to no better than the size of the room says nothing, unless the
+        // room was mapped on the spot.
         let deviation = reported_pose.position_deviation_m();
         let extent = state.room.map_or(0.0, |room| self.maps[room].extent_m());
-        if deviation > extent {
+        if deviation > extent.max(PLACE_DEVIATION_M) {
             let reason = format!(
                 "the position is known to {deviation:.1} m, the room is {extent:.1} m wide"
             );
@@ -71,7 +73,11 @@ impl Tracker {
         // What is called TRACKING may be relied on to half a metre and 15 degrees.
         if !reported_pose.tells_a_place() {
             let turn = reported_pose.rotation_deviation_rad().to_degrees();
-            let reason = format!("the pose is known to {deviation:.2} m and {turn:.0}° only");
+            let reason = format!(
+                "the pose is known to {:.2} m and {:.0}° only, 2.5 standard deviations",
+                2.5 * deviation,
+                2.5 * turn
+            );
             return (Status::Degraded, reason);
         }
 

@@ -6,13 +6,13 @@
 
 use std::sync::Arc;
 
-use ndarray::ArrayView2;
+use ndarray::{ArrayView1, ArrayView2};
 use rayon::prelude::*;
 
 use seese3_core::adapter::Adapter;
 use seese3_core::cancel::Cancellation;
 use seese3_core::fitting::{RoomReader, fit};
-use seese3_core::geometry::PoseError;
+use seese3_core::geometry::{Pose, PoseError};
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
@@ -50,6 +50,7 @@ pub struct TrackedRoom<'a> {
     room: Arc<Room>,
     /// Raw features, row by frame, shape (n, d).
     features: ArrayView2<'a, f32>,
+    mapped: Vec<FrameId>,
     map: Arc<Map>,
     tracker: Tracker,
 }
@@ -170,6 +171,23 @@ impl TrackedRoom<'_> {
         &self.tracker
     }
 
+    /// The pose of the mapped frame whose raw feature is most like one of shape (d,), by the cosine: the
+    /// simplest answer.
+    pub fn most_alike(&self, feature: ArrayView1<'_, f32>) -> &Pose {
+        let cosine = |frame: &&FrameId| {
+            let row = self.features.row(frame.row());
+            row.dot(&feature) / row.dot(&row).sqrt()
+        };
+        let best = self
+            .mapped
+            .iter()
+            .max_by(|a, b| cosine(a).total_cmp(&cosine(b)));
+
+        // A map has frames.
+        let row = best.map_or(0, |frame| frame.row());
+        &self.room.poses()[row]
+    }
+
     /// Raw features, row by frame, shape (n, d).
     pub fn features(&self) -> ArrayView2<'_, f32> {
         self.features
@@ -209,6 +227,7 @@ pub fn trackers<'a>(
         Ok(TrackedRoom {
             room,
             features: data.features.rows(),
+            mapped,
             map,
             tracker,
         })
@@ -343,9 +362,8 @@ fn room_odometry(
         tracked_frames: own.updates.len(),
         odom,
         fused,
-        scores: TrackingScores::of(own, |update| {
-            let (_, nearest) = update.best_match;
-            room.room.poses()[nearest.frame.row()]
+        scores: TrackingScores::of(own, |row| {
+            *room.most_alike(room.features.row(tracked[row].row()))
         }),
         map_poses_mapped: own.map_pose_surprises_where(has_mapped_neighbours),
         map_poses_unmapped: own.map_pose_surprises_where(|row| !has_mapped_neighbours(row)),

@@ -3,7 +3,7 @@
 
 use seese3_core::geometry::{Pose, PoseError, body_twist};
 use seese3_core::statistics::{mean, root_mean_square};
-use seese3_core::tracking::{Belief, Replay, Status, Update};
+use seese3_core::tracking::{Belief, Replay, Status};
 
 /// An answer further than this from the truth is wrong, metres.
 const WRONG_BEYOND_M: f64 = 0.5;
@@ -36,7 +36,7 @@ pub struct AnswerErrors {
     pub fused: f64,
     /// Dead reckoning, laid on the true first pose.
     pub odom: f64,
-    /// The pose of the mapped frame that looks most alike.
+    /// The pose of the mapped frame whose raw feature is most alike, by the cosine.
     pub nearest_frame: f64,
     /// The true pose of the first frame, throughout.
     pub standing_still: f64,
@@ -52,8 +52,9 @@ pub struct VelocityErrors {
 }
 
 impl TrackingScores {
-    /// The scores of a replay; `nearest_frame` gives the pose of an answer's best match.
-    pub fn of(replay: &Replay, nearest_frame: impl Fn(&Update) -> Pose) -> Self {
+    /// The scores of a replay; `nearest_frame` gives the pose of the mapped frame whose raw feature is
+    /// most like that of a row.
+    pub fn of(replay: &Replay, nearest_frame: impl Fn(usize) -> Pose) -> Self {
         Self::of_rows(replay, |_| true, nearest_frame)
     }
 
@@ -61,7 +62,7 @@ impl TrackingScores {
     pub fn of_rows(
         replay: &Replay,
         keep: impl Fn(usize) -> bool,
-        nearest_frame: impl Fn(&Update) -> Pose,
+        nearest_frame: impl Fn(usize) -> Pose,
     ) -> Self {
         let odom = replay.odom_path().poses;
 
@@ -86,7 +87,7 @@ impl TrackingScores {
                 continue;
             };
             let first = replay.first_pose(row);
-            let given = [map_pose.pose, *odom, nearest_frame(update), first];
+            let given = [map_pose.pose, *odom, nearest_frame(row), first];
             for (errors, pose) in errors.iter_mut().zip(given) {
                 errors.push(PoseError::between(&pose, truth));
             }

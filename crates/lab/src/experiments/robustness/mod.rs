@@ -102,6 +102,7 @@ pub fn evaluate(
 
     let mut replays = Vec::new();
     let mut scored_rows = Vec::new();
+    let mut view_rows = Vec::new();
     let mut noticed = Vec::new();
     let mut first_row = 0;
 
@@ -132,6 +133,7 @@ pub fn evaluate(
                 truth: disturbance.truth(&room.room().poses()[frame.row()]),
             });
             is_scored.push(part.holds(number));
+            view_rows.push(row);
         }
 
         let replay = replay_frames(room.tracker(), &played, InitialPose::Given);
@@ -146,15 +148,14 @@ pub fn evaluate(
 
     let replay = joined(replays.into_iter());
     let keep = |row: usize| scored_rows[row];
-    let poses = room.room().poses();
     let share = |status| share_of(&replay, &scored_rows, status);
 
     Ok(DisturbedTracking {
         room: room.room().id().to_string(),
         disturbance,
         frames: scored_rows.iter().filter(|&&scored| scored).count(),
-        scores: TrackingScores::of_rows(&replay, keep, |update| {
-            poses[update.best_match.1.frame.row()]
+        scores: TrackingScores::of_rows(&replay, keep, |row| {
+            *room.most_alike(views.features.row(view_rows[row]))
         }),
         statuses: StatusShares {
             tracking: share(Status::Tracking),
