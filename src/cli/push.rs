@@ -74,7 +74,7 @@ impl Push {
         };
         let state = match (created, served) {
             (true, true) => "published and served",
-            (false, true) if self.extend => "these frames are its last ones already",
+            (false, true) if self.extend => "it has these frames already",
             (false, true) => "already there, unchanged, and served",
             (true, false) => "published; the server answers from another revision",
             (false, false) => "already there, unchanged; the server answers from another revision",

@@ -31,13 +31,6 @@ pub struct ExtendedRoom {
     is_there: bool,
 }
 
-impl ExtendedRoom {
-    /// Whether the room had the frames already.
-    pub fn is_there(&self) -> bool {
-        self.is_there
-    }
-}
-
 impl Store {
     /// A summary of the newest revision of a room, whichever its name alone means.
     ///
@@ -144,11 +137,12 @@ fn extended(
     let added = addition.provenance();
     let problem = match (&added.camera, &known.camera) {
         (Some(added), Some(known)) => known.difference(added),
-        (Some(_), None) => Some("that of the room's frames is not known: leave it out".to_owned()),
-        (None, _) => None,
+        _ => None,
     };
     if let Some(problem) = problem {
-        return Err(refused(format!("their camera {problem}")));
+        return Err(refused(format!(
+            "their camera {problem}; make a room of their own"
+        )));
     }
 
     let provenance = Provenance {

@@ -186,15 +186,15 @@ impl Store {
 
             // Row i of the features belongs to frame i. Features published earlier therefore stay
             // valid as long as the poses are the same.
-            if let Some(newest) = &newest {
-                let is_another = matches!(over, Over::Revision(base) if base != newest.revision);
-                if is_another {
-                    return Err(Error::OtherFrames {
-                        room: room.id().to_string(),
-                        revision: newest.revision,
-                    });
-                }
+            let newest_revision = newest.as_ref().map(|newest| newest.revision);
+            if matches!(over, Over::Revision(base) if Some(base) != newest_revision) {
+                return Err(Error::OtherFrames {
+                    room: room.id().to_string(),
+                    revision: numbers.highest,
+                });
+            }
 
+            if let Some(newest) = &newest {
                 if newest.frames == body.frames || self.has_poses(&folder, newest, room).await? {
                     let kept = features_to_keep(newest, &objects.features);
                     body.features.extend(kept);

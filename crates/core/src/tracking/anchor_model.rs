@@ -28,7 +28,7 @@ pub const LOOKED_AT: usize = BLENDED + 1;
 const SAME_PLACE: f64 = 0.5;
 /// A frame's weight falls with this power of its distance.
 const POWER: i32 = 4;
-/// Added to distances, in deviations of frame noise, and to lengths of motions, metres and radians
+/// Added to distances, in the unit of the coordinates, and to lengths of motions, metres and radians
 /// mixed, before their logarithms are taken.
 const LEAST: f64 = 1e-3;
 
@@ -67,7 +67,7 @@ pub struct Blend {
     pose: Pose,
     /// The motion from there to the view, as the adapter reads it.
     read: Vector6<f64>,
-    /// The distance of the nearest frame, in deviations of frame noise.
+    /// The distance of the nearest frame, in the unit of the coordinates.
     distance: f64,
     /// What the size of the error is expected from.
     predictors: Vector5<f64>,
@@ -113,8 +113,7 @@ struct LeftOut {
 }
 
 impl Blend {
-    /// The blend of the frames nearest to a view, in order of their distance, which is in deviations
-    /// of frame noise; there is at least one.
+    /// The blend of the frames nearest to a view, in order of their distance; there is at least one.
     /// `second_opinion` is the pose that the same view has by another measure of likeness, if there
     /// is one.
     pub fn of(
