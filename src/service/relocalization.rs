@@ -112,7 +112,8 @@ struct EmbeddedView {
     feature: Option<Vec<f32>>,
 }
 
-/// Embeds the views of a request one by one, with a check for cancellation before each, since an image
+/// Embeds the views of a request one by one, with a check for cancellation before each, since an
+/// image
 /// may have to be encoded.
 fn embedded(
     views: Vec<pb::View>,
@@ -299,7 +300,8 @@ fn room_to_wire(
         convert::retrieved_to_wire(&retrieved, room)
     };
 
-    // It is believed where the views look like the room. Else the pose and covariance are those of the
+    // It is believed where the views look like the room. Else the pose and covariance are those of
+    // the
     // newest view, read from its nearest frame.
     let believed = located
         .as_ref()

@@ -49,7 +49,8 @@ impl Store {
     /// the first frames had any.
     ///
     /// # Errors
-    /// [`Error::Unknown`] if there is no such room, [`Error::CannotAdd`] if the frames do not fit to
+    /// [`Error::Unknown`] if there is no such room, [`Error::CannotAdd`] if the frames do not fit
+    /// to
     /// its own, otherwise as [`Store::load_room`].
     pub async fn extended_room(
         &self,
@@ -66,7 +67,8 @@ impl Store {
         extended(&base, addition, features, others)
     }
 
-    /// Adds frames to the newest revision of a room, as [`Store::extended_room`] says, and publishes
+    /// Adds frames to the newest revision of a room, as [`Store::extended_room`] says, and
+    /// publishes
     /// the result. Frames that the room has already, one after the other, are not added again.
     ///
     /// # Errors
@@ -236,7 +238,8 @@ fn place_among(known: &[Features], added: &Features) -> Result<usize, String> {
     }
 }
 
-/// Whether the base already has the added frames, one after the other: the same poses, times and features.
+/// Whether the base already has the added frames, one after the other: the same poses, times and
+/// features.
 /// `joined` are the features of both.
 fn has_frames(base: &StoredRoom, addition: &Room, joined: &[Features]) -> bool {
     let known = base.room.frame_count();
@@ -279,6 +282,7 @@ fn joined_frames(known: &Frames, added: &Frames) -> Result<Frames, String> {
         };
         return Err(problem.to_owned());
     }
+
     // A frame without a name has an empty one.
     let names = if known.names.is_empty() && added.names.is_empty() {
         Vec::new()

@@ -344,7 +344,8 @@ impl Store {
         })
     }
 
-    /// Whether an object that a revision needs is missing: somebody may have collected it as garbage
+    /// Whether an object that a revision needs is missing: somebody may have collected it as
+    /// garbage
     /// while the revision was being published.
     async fn lacks<'a>(
         &self,
@@ -478,7 +479,8 @@ impl Store {
         Ok(numbers)
     }
 
-    /// The folder of a room or an adapter, and the requested revision, or else the one that the name
+    /// The folder of a room or an adapter, and the requested revision, or else the one that the
+    /// name
     /// alone means: that which an operator chose, or the newest.
     async fn resolve(
         &self,

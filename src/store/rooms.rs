@@ -324,7 +324,8 @@ impl Store {
         Ok(Some(object))
     }
 
-    /// Loads a room with all its features: the given revision, or the one that the name alone means.
+    /// Loads a room with all its features: the given revision, or the one that the name alone
+    /// means.
     ///
     /// # Errors
     /// [`Error::Unknown`] if there is no such room, [`Error::UnknownRevision`] if it has no such
@@ -334,8 +335,10 @@ impl Store {
         self.load(name, revision, None).await
     }
 
-    /// Loads the revision that a room's name alone means, with one set of features: the named one, or
-    /// the only one if no name is given. The features are returned beside the room, whose own list is empty.
+    /// Loads the revision that a room's name alone means, with one set of features: the named one,
+    /// or
+    /// the only one if no name is given. The features are returned beside the room, whose own list
+    /// is empty.
     ///
     /// # Errors
     /// As [`Store::load_room`]; also [`Error::UnknownFeatures`] if the room has no features of this
@@ -429,7 +432,8 @@ impl Store {
         Ok(one.frames == other.frames)
     }
 
-    /// The names of all rooms, sorted, each with the revision that its name alone means. No manifest
+    /// The names of all rooms, sorted, each with the revision that its name alone means. No
+    /// manifest
     /// is read.
     ///
     /// # Errors
@@ -455,7 +459,8 @@ impl Store {
     /// A summary of a room: of the given revision, or of the one that its name alone means.
     ///
     /// # Errors
-    /// As [`Store::load_room`]. Whether the files that the manifest names are there and intact is not
+    /// As [`Store::load_room`]. Whether the files that the manifest names are there and intact is
+    /// not
     /// looked at.
     pub async fn room_summary(
         &self,

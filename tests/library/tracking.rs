@@ -225,7 +225,8 @@ impl PoseReader for Knowing {
     }
 }
 
-/// Oracle: the reader's own poses and covariance: frames that bring their feature are corrected by it
+/// Oracle: the reader's own poses and covariance: frames that bring their feature are corrected by
+/// it
 /// and reported about as surely as it is sure, frames without one by the frames that they match.
 #[test]
 fn the_reader_of_a_room_gives_the_anchors() {
@@ -273,8 +274,10 @@ fn the_reader_of_a_room_gives_the_anchors() {
     assert!(error.translation_m > 0.8, "{error:?}");
 }
 
-/// Oracle: the true poses of frames that are not mapped: the blend of the frames most like a view is
-/// nearer to it than the nearest frame is, and its covariance holds about as many errors as it says.
+/// Oracle: the true poses of frames that are not mapped: the blend of the frames most like a view
+/// is
+/// nearer to it than the nearest frame is, and its covariance holds about as many errors as it
+/// says.
 #[test]
 fn a_view_is_placed_between_mapped_frames() {
     let adapter = Arc::new(calibrated().0);
@@ -313,7 +316,8 @@ fn a_view_is_placed_between_mapped_frames() {
     assert!(shares.0 > 0.6 && shares.1 > 0.88, "{shares:?}");
 }
 
-/// Oracle: the promise: a camera whose images stop changing is noticed within ten frames, and what is
+/// Oracle: the promise: a camera whose images stop changing is noticed within ten frames, and what
+/// is
 /// said of its pose becomes less and less sure; pairs of the same image are none, and a camera that
 /// sees again is followed again. A blank image is noticed at once.
 #[test]
@@ -392,7 +396,8 @@ fn a_camera_that_sees_nothing_new_is_not_tracked() {
     assert!(!blank.match_used && blank.reason.contains("blank"));
 }
 
-/// Oracle: the true poses. The camera goes blind while it moves on. Wheels that drift by a twentieth
+/// Oracle: the true poses. The camera goes blind while it moves on. Wheels that drift by a
+/// twentieth
 /// of the way carry it, to within what they may have drifted, and the covariance holds the error;
 /// without them it is lost sight of.
 #[test]
@@ -403,7 +408,8 @@ fn wheels_carry_a_blind_camera() {
 
     let ride = |has_wheels: bool| {
         let mut state = tracker.start(Some(Belief::known(room.poses()[41], 0.01, 0.01)));
-        // The wheels' own frame is not the room's, and every motion that they report is 3 % too long.
+        // The wheels' own frame is not the room's, and every motion that they report is 3 % too
+        // long.
         let mut wheels = Pose::new(
             nalgebra::Vector3::new(5.0, -2.0, 1.0),
             nalgebra::Vector3::new(0.0, 1.0, 0.0),

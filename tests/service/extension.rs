@@ -80,7 +80,8 @@ async fn send(
         .await
 }
 
-/// Oracle: the recorded poses. A stream that began before the room grew goes on at its token, in the
+/// Oracle: the recorded poses. A stream that began before the room grew goes on at its token, in
+/// the
 /// grown room; the frames that were added are found; and an adapter is fitted to all of them.
 #[tokio::test]
 async fn streams_and_tokens_survive_the_growth_of_a_room() {
@@ -105,7 +106,8 @@ async fn streams_and_tokens_survive_the_growth_of_a_room() {
     let room = server.client.room("hall").await.unwrap().unwrap();
     assert_eq!(room.frame_count, 380);
 
-    // Rules that were measured in the smaller room tell nothing of the larger one, until the next fit.
+    // Rules that were measured in the smaller room tell nothing of the larger one, until the next
+    // fit.
     let located = || async {
         let request = pb::LocalizeRequest {
             rooms: vec!["hall".to_owned()],

@@ -255,7 +255,8 @@ async fn a_stream_goes_on_at_another_server_as_if_it_had_never_been_cut() {
     }
 }
 
-/// Oracle: the stream that brings a token with every answer: the others answer the same, with tokens
+/// Oracle: the stream that brings a token with every answer: the others answer the same, with
+/// tokens
 /// where they were asked for, and go on from them.
 #[tokio::test]
 async fn tokens_come_when_they_are_asked_for() {
@@ -557,7 +558,8 @@ async fn a_stream_is_configured_once_and_first() {
         })
     };
 
-    // The hall was mapped with 585 pixels in images 640 wide, which see 57 degrees across. 1,100 in images
+    // The hall was mapped with 585 pixels in images 640 wide, which see 57 degrees across. 1,100
+    // in images
     // 1,280 wide see 60; 1,000 see 65.
     answers(&server, vec![with_camera(1_100.0)]).await.unwrap();
 
@@ -652,7 +654,8 @@ async fn a_stream_is_configured_once_and_first() {
     }
 }
 
-/// Oracle: the contract: where no room is named, those that are too small to track in, or that another
+/// Oracle: the contract: where no room is named, those that are too small to track in, or that
+/// another
 /// camera has mapped, are left out; and they are refused by name.
 #[tokio::test]
 async fn rooms_that_cannot_be_tracked_in_do_not_stop_a_search() {
@@ -923,7 +926,8 @@ async fn a_view_is_found_among_rooms_or_called_ambiguous() {
     }
 }
 
-/// Oracle: composition, and the stream without a base. The base's poses are the camera's, moved by the
+/// Oracle: composition, and the stream without a base. The base's poses are the camera's, moved by
+/// the
 /// mounting; odometry begins at the base; the camera's map poses and motions are what they were.
 #[tokio::test]
 async fn a_robot_gets_the_poses_of_its_base() {
@@ -998,7 +1002,8 @@ async fn a_robot_gets_the_poses_of_its_base() {
     assert!((at_camera - mounting.rotation * of_camera.linear).norm() < 1e-9);
 }
 
-/// Oracle: the rules of TrackFrame.odometry: what is wrong with it refuses the frame by its name, and
+/// Oracle: the rules of TrackFrame.odometry: what is wrong with it refuses the frame by its name,
+/// and
 /// the next frame is answered as if it had not been sent.
 #[tokio::test]
 async fn odometry_that_is_none_is_refused() {

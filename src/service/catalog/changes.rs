@@ -54,8 +54,10 @@ impl Changes {
         }
     }
 
-    /// Makes a change, lets the server look at its store, and then makes the answer; unless the same
-    /// change was made already, whose answer is given again. Changes are made one after another. One
+    /// Makes a change, lets the server look at its store, and then makes the answer; unless the
+    /// same
+    /// change was made already, whose answer is given again. Changes are made one after another.
+    /// One
     /// that was admitted is finished even if the caller goes away.
     ///
     /// # Errors
@@ -118,7 +120,8 @@ impl Changes {
     /// Memory for a part of an upload, to be held with it.
     ///
     /// # Errors
-    /// [`Error::Invalid`] if it can never be held, [`Error::Full`] if the uploads in progress hold as
+    /// [`Error::Invalid`] if it can never be held, [`Error::Full`] if the uploads in progress hold
+    /// as
     /// much as they may.
     pub fn upload_memory(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Error> {
         let pieces = bytes.div_ceil(PIECE);

@@ -1,4 +1,5 @@
-//! CatalogService: lists the rooms and adapters that the server has, page by page, and changes them.
+//! CatalogService: lists the rooms and adapters that the server has, page by page, and changes
+//! them.
 //!
 //! | file | what |
 //! | --- | --- |

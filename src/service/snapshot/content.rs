@@ -6,7 +6,8 @@ use sha2::{Digest, Sha256};
 use seese3_core::adapter::{Adapter, ErrorStatistics, Network};
 use seese3_core::navigation::Navigator;
 
-/// The identity of a room under an adapter, as hashes. Name and revision are none: two stores may use
+/// The identity of a room under an adapter, as hashes. Name and revision are none: two stores may
+/// use
 /// the same ones for different content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Content {

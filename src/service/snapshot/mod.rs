@@ -108,7 +108,8 @@ impl Snapshot {
         rooms.map(|room| room.refused_adapters().len()).sum()
     }
 
-    /// How many rooms are refused, those included that turned out to be damaged when they were first
+    /// How many rooms are refused, those included that turned out to be damaged when they were
+    /// first
     /// asked for.
     pub fn refused_rooms(&self) -> usize {
         let later = |(name, room): &(&String, &Arc<ServedRoom>)| {
@@ -250,7 +251,8 @@ impl Snapshot {
     /// empty. Loads the room if it is not in memory: only for threads that may block.
     ///
     /// # Errors
-    /// As [`Snapshot::room`] and [`Snapshot::adapter`]; [`Error::Precondition`] if the room cannot be
+    /// As [`Snapshot::room`] and [`Snapshot::adapter`]; [`Error::Precondition`] if the room cannot
+    /// be
     /// loaded, the adapter does not fit it, or none does.
     pub fn navigator(&self, room: &str, adapter: &str) -> Result<Arc<ServedNavigator>, Error> {
         let served = self.room(room)?;
@@ -303,7 +305,8 @@ fn owned<'a, T: Clone + 'a>(
         .collect()
 }
 
-/// The caller learns that it is the operator's turn. The reason stays in the log: it may name files.
+/// The caller learns that it is the operator's turn. The reason stays in the log: it may name
+/// files.
 fn refused_error(kind: &str, name: &str, refusal: &Refusal) -> Error {
     Error::Precondition(format!(
         "{kind} '{name}' cannot be served: its revision {} was refused, and the server's log says why",

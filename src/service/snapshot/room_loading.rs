@@ -73,7 +73,8 @@ impl RoomLoader {
     /// A room under its adapters. What did not change since `before` is taken over from it.
     ///
     /// # Errors
-    /// [`Problem`] if the room itself cannot be loaded. An adapter that cannot serve it is refused by
+    /// [`Problem`] if the room itself cannot be loaded. An adapter that cannot serve it is refused
+    /// by
     /// itself, and its revision before serves on.
     pub async fn load(
         &self,
@@ -255,7 +256,8 @@ fn log_audit(navigator: &Navigator, adapter: &str) {
 }
 
 /// The map of all frames of a room; none if the adapter is not calibrated. A room that is too small
-/// to track in also gives none, which is logged. Where an adapter was fitted to the room, its reader
+/// to track in also gives none, which is logged. Where an adapter was fitted to the room, its
+/// reader
 /// gives the anchors.
 fn map(
     navigator: &Arc<Navigator>,

@@ -128,7 +128,8 @@ impl ServedRoom {
         }
     }
 
-    /// Everything that answers are computed from. Reads the store if the room is not in memory: only
+    /// Everything that answers are computed from. Reads the store if the room is not in memory:
+    /// only
     /// for threads that may block.
     ///
     /// # Errors

@@ -23,11 +23,13 @@ const LONGEST_NAME: usize = 100;
 const DRIFT_SHARE: f64 = 0.05;
 const DRIFT_SHARES: std::ops::RangeInclusive<f64> = 1e-4..=10.0;
 
-/// The rooms of a configuration, all under one adapter; at least one. With a camera, those that were
+/// The rooms of a configuration, all under one adapter; at least one. With a camera, those that
+/// were
 /// mapped with one like it, or with one that is not known.
 ///
 /// # Errors
-/// [`Error::Invalid`] if both `room` and `rooms` are given, or the camera is not valid or unlike that of
+/// [`Error::Invalid`] if both `room` and `rooms` are given, or the camera is not valid or unlike
+/// that of
 /// every room; otherwise as [`rooms_to_track_in`].
 pub fn rooms(
     snapshot: &Snapshot,
@@ -165,7 +167,8 @@ enum Body {
 }
 
 impl StreamFrames {
-    /// The frames that a configuration names. Names that are left empty take the defaults; the name of
+    /// The frames that a configuration names. Names that are left empty take the defaults; the
+    /// name of
     /// a base only matters where the base is known.
     ///
     /// # Errors
@@ -187,11 +190,13 @@ impl StreamFrames {
         })
     }
 
-    /// A pose on the map that is given from outside, of the camera or the base, as the camera's. Its
+    /// A pose on the map that is given from outside, of the camera or the base, as the camera's.
+    /// Its
     /// frames may have the stream's own names or those of the service, `rooms/NAME` and `camera`.
     ///
     /// # Errors
-    /// [`Error::Invalid`] if the pose is missing or not valid, or a standard deviation is out of range.
+    /// [`Error::Invalid`] if the pose is missing or not valid, or a standard deviation is out of
+    /// range.
     pub fn known_pose(&self, given: pb::InitialPose, room: &str) -> Result<Belief, Error> {
         let pb::InitialPose {
             pose,
@@ -200,7 +205,8 @@ impl StreamFrames {
         } = given;
         let mut pose = pose.ok_or_else(|| Error::invalid("pose", "is required"))?;
 
-        // `convert::pose` takes an empty name for the room's world or the camera, so the stream's own
+        // `convert::pose` takes an empty name for the room's world or the camera, so the stream's
+        // own
         // names are cleared.
         clear_name(&mut pose.parent_frame, &self.names.map);
         let body = self.body(&mut pose, Body::Camera);
@@ -246,7 +252,8 @@ impl StreamFrames {
         })
     }
 
-    /// Whose pose a pose is, by the name of its child, which is cleared if it is one of the stream's.
+    /// Whose pose a pose is, by the name of its child, which is cleared if it is one of the
+    /// stream's.
     fn body(&self, pose: &mut pb::Pose, unnamed: Body) -> Body {
         if self.base_from_camera.is_none() {
             clear_name(&mut pose.child_frame, &self.names.camera);
@@ -265,7 +272,8 @@ impl StreamFrames {
         Body::Camera
     }
 
-    /// A belief of a body's pose as one of the camera's. The error is in the body's own frame, so that
+    /// A belief of a body's pose as one of the camera's. The error is in the body's own frame, so
+    /// that
     /// it is carried over by the adjoint.
     fn of_camera(&self, belief: Belief, body: Body) -> Belief {
         match (body, self.base_from_camera) {
@@ -287,7 +295,8 @@ pub fn on_another_body(belief: &Belief, body_from_other: &Pose) -> Belief {
     }
 }
 
-/// A pose between two of the stream's frames, whose names were cleared: what is left is none of them.
+/// A pose between two of the stream's frames, whose names were cleared: what is left is none of
+/// them.
 fn unnamed(pose: pb::Pose) -> Result<Pose, Error> {
     for (field, name) in [
         ("parent_frame", &pose.parent_frame),

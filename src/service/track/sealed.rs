@@ -16,7 +16,8 @@ use seese3_core::tracking::{
     Place, State, TrackingHealth,
 };
 
-/// The content of a token: the configuration of the stream, what its state is made of, and the state.
+/// The content of a token: the configuration of the stream, what its state is made of, and the
+/// state.
 #[derive(Clone, PartialEq, Message)]
 pub struct Sealed {
     /// The configuration as it was sent.
@@ -66,7 +67,8 @@ impl SealedRoom {
         places.into_iter().map(sealed).collect()
     }
 
-    /// Where this room is among those that are served: one that has the same frames, maybe with others
+    /// Where this room is among those that are served: one that has the same frames, maybe with
+    /// others
     /// behind them. Poses and latents of a state mean the same there.
     fn place_in(&self, served: &[Arc<ServedNavigator>]) -> Option<usize> {
         let is_this = |served: &Arc<ServedNavigator>| {
@@ -90,7 +92,8 @@ impl SealedRoom {
 }
 
 impl Sealed {
-    /// The state, with its rooms by their numbers among those that are served here under the stream's
+    /// The state, with its rooms by their numbers among those that are served here under the
+    /// stream's
     /// adapter; none if the state means nothing here.
     ///
     /// # Errors
@@ -591,7 +594,8 @@ impl SealedState {
     /// The tracker's state.
     ///
     /// # Errors
-    /// [`Error::Internal`] if a belief does not have its numbers, or a room's index is too large for
+    /// [`Error::Internal`] if a belief does not have its numbers, or a room's index is too large
+    /// for
     /// this machine. No token that a server sealed has either.
     pub fn state(self) -> Result<State, Error> {
         let Self {

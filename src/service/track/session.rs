@@ -96,7 +96,8 @@ impl Session {
     }
 
     /// Whether the state's latents have the width of this adapter and its room indices exist here.
-    /// The rooms' content should guarantee it; without this check a state that does not fit would be a
+    /// The rooms' content should guarantee it; without this check a state that does not fit would
+    /// be a
     /// panic in the tracker.
     fn fits(&self) -> bool {
         let adapter = &self.served[0].adapter.adapter;
@@ -353,7 +354,8 @@ impl Session {
         ))
     }
 
-    /// What a frame's view shows, and whether its image is blank, which nobody can tell of a feature.
+    /// What a frame's view shows, and whether its image is blank, which nobody can tell of a
+    /// feature.
     fn seen(&self, view: Option<pb::View>) -> Result<(View, bool), Error> {
         const FIELD: &str = "frame.view";
         let adapter = &self.served[0].adapter;
@@ -436,7 +438,8 @@ impl Session {
     }
 
     fn answer(&self, answer: pb::track_response::Answer) -> pb::TrackResponse {
-        // The token carries the whole state, so that the stream can go on from it after a restart or
+        // The token carries the whole state, so that the stream can go on from it after a restart
+        // or
         // on another server.
         let sealed = Sealed {
             config: Some(self.config.clone()),

@@ -102,7 +102,8 @@ impl Pinhole {
         self.centre
     }
 
-    /// In what another camera sees so much more or less that places look different through it, in words;
+    /// In what another camera sees so much more or less that places look different through it, in
+    /// words;
     /// none if it does not.
     pub fn difference(&self, other: &Self) -> Option<String> {
         [
@@ -167,7 +168,8 @@ mod tests {
         );
     }
 
-    /// Oracle: by hand. 320 pixels before the middle of 640 are 45° to each side; an edge that lies at the
+    /// Oracle: by hand. 320 pixels before the middle of 640 are 45° to each side; an edge that
+    /// lies at the
     /// principal point itself adds nothing.
     #[test]
     fn the_field_of_view_is_the_angle_between_the_edges() {

@@ -1,7 +1,9 @@
-//! The pose of a view by the mapped frames that look most like it, and how wrong that is in this very
+//! The pose of a view by the mapped frames that look most like it, and how wrong that is in this
+//! very
 //! room.
 //!
-//! The three nearest frames are blended: a view between two mapped frames lies between them. How far
+//! The three nearest frames are blended: a view between two mapped frames lies between them. How
+//! far
 //! off the blend is shows in the distances of the frames, and above all in whether they agree. What
 //! that means in this room its own frames tell: each is looked for when it and its neighbours are
 //! left out, and its true pose is known.
@@ -28,7 +30,8 @@ pub const LOOKED_AT: usize = BLENDED + 1;
 const SAME_PLACE: f64 = 0.5;
 /// A frame's weight falls with this power of its distance.
 const POWER: i32 = 4;
-/// Added to distances, in the unit of the coordinates, and to lengths of motions, metres and radians
+/// Added to distances, in the unit of the coordinates, and to lengths of motions, metres and
+/// radians
 /// mixed, before their logarithms are taken.
 const LEAST: f64 = 1e-3;
 
@@ -37,7 +40,8 @@ const SAMPLES: usize = 150;
 /// Rows to each side that are left out with a frame, one round each; in a last round its whole
 /// sequence is.
 const LEFT_OUT_ROWS: [u32; 9] = [0, 1, 2, 4, 8, 15, 30, 60, 120];
-/// A frame with so many rows to each side left out stands for a view of a place that was not mapped.
+/// A frame with so many rows to each side left out stands for a view of a place that was not
+/// mapped.
 const UNSEEN_ROWS: u32 = 8;
 /// Strata of about as many blends each, by the size that their errors are expected to have.
 const STRATA: usize = 8;
@@ -113,7 +117,8 @@ struct LeftOut {
 }
 
 impl Blend {
-    /// The blend of the frames nearest to a view, in order of their distance; there is at least one.
+    /// The blend of the frames nearest to a view, in order of their distance; there is at least
+    /// one.
     /// `second_opinion` is the pose that the same view has by another measure of likeness, if there
     /// is one.
     pub fn of(
@@ -404,13 +409,15 @@ fn left_out_blends(
     left_out
 }
 
-/// By what mapped frames are alike: coordinates, row by frame; frames are alike that lie near to one
+/// By what mapped frames are alike: coordinates, row by frame; frames are alike that lie near to
+/// one
 /// another.
 #[derive(Clone, Copy)]
 pub struct Likeness<'a> {
     /// Those by which frames are found.
     pub coordinates: &'a Array2<f64>,
-    /// For each part of the mapped frames, those that know nothing of the part, if the first were made
+    /// For each part of the mapped frames, those that know nothing of the part, if the first were
+    /// made
     /// from these very frames.
     pub without_part: Option<&'a [Array2<f64>]>,
     /// Others, by which frames are found a second time.
@@ -440,7 +447,8 @@ fn by_distance(coordinates: &Array2<f64>, mapped: &[FrameId], frame: FrameId) ->
     nearest
 }
 
-/// The blends of a mapped frame with their errors, one for each round of what is left out; none where
+/// The blends of a mapped frame with their errors, one for each round of what is left out; none
+/// where
 /// too few frames are left.
 fn blends_without(
     navigator: &Navigator,

@@ -1,7 +1,9 @@
 //! What the views of one room differ in: the principal components of its own features.
 //!
-//! A latent holds what tells motion in any room, and little of what tells two places of this room apart.
-//! In six calibration rooms of which every second frame was mapped the frame that was nearest by its
+//! A latent holds what tells motion in any room, and little of what tells two places of this room
+//! apart.
+//! In six calibration rooms of which every second frame was mapped the frame that was nearest by
+//! its
 //! latent was .035 m off, by its feature .015 m, and by 32 components of the feature .017 m.
 
 use nalgebra::SymmetricEigen;
@@ -16,7 +18,8 @@ const COMPONENTS: usize = 32;
 const SAMPLED: usize = 128;
 /// Of fewer frames nothing is told.
 const FEWEST: usize = 48;
-/// A component is divided by the root of its standard deviation, to which this share of the largest one
+/// A component is divided by the root of its standard deviation, to which this share of the
+/// largest one
 /// is added: those that vary little count for more than they would by themselves, and for less than
 /// if all varied alike. Chosen on calibration rooms, where it makes little difference.
 const LEAST_SHARE: f64 = 0.05;
@@ -35,8 +38,10 @@ pub struct RoomAppearance {
     pub appearance: Appearance,
     /// By those components, shape (n, c).
     pub coordinates: Array2<f64>,
-    /// By the components without one part of the mapped frames, a part each. A view of a place that was
-    /// not mapped is nearer to mapped frames than one whose neighbours the components were made for.
+    /// By the components without one part of the mapped frames, a part each. A view of a place
+    /// that was
+    /// not mapped is nearer to mapped frames than one whose neighbours the components were made
+    /// for.
     pub without_part: Vec<Array2<f64>>,
 }
 
@@ -77,7 +82,8 @@ pub struct Appearance {
 }
 
 impl Appearance {
-    /// The components of the mapped frames of a room, whose features have shape (n, d). None if they are
+    /// The components of the mapped frames of a room, whose features have shape (n, d). None if
+    /// they are
     /// few or all alike.
     pub fn of(features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Option<Self> {
         let every = mapped.len().div_ceil(SAMPLED).max(1);
@@ -129,7 +135,8 @@ impl Appearance {
         Some(Self { mean, components })
     }
 
-    /// The coordinates of the mapped frames, row by frame, shape (n, c); those of other frames are zeros.
+    /// The coordinates of the mapped frames, row by frame, shape (n, c); those of other frames are
+    /// zeros.
     pub fn coordinates_of(&self, features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Array2<f64> {
         let mut centred = Array2::zeros((mapped.len(), features.ncols()));
         for (mut row, frame) in centred.outer_iter_mut().zip(mapped) {
@@ -172,7 +179,8 @@ mod tests {
         (0..count as u32).map(FrameId).collect()
     }
 
-    /// Oracle: by hand. Features turn a little in a plane, besides a length that says nothing: nearly all
+    /// Oracle: by hand. Features turn a little in a plane, besides a length that says nothing:
+    /// nearly all
     /// that varies is the sine of the angle, scaled to a root mean square of 10, and lengths do not
     /// matter.
     #[test]

@@ -4,7 +4,8 @@ use nalgebra::{Cholesky, Matrix6, Vector6};
 
 use crate::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
 
-/// A pose of larger deviations than these is of little use: 2.5 of them are half a metre, or 15 degrees.
+/// A pose of larger deviations than these is of little use: 2.5 of them are half a metre, or 15
+/// degrees.
 pub(super) const PLACE_DEVIATION_M: f64 = 0.2;
 const PLACE_DEVIATION_RAD: f64 = 0.105;
 

@@ -9,12 +9,15 @@ use crate::geometry::{Pose, Twist, adjoint, exp, log};
 pub(super) type Matrix12 = SMatrix<f64, 12, 12>;
 type Matrix18 = SMatrix<f64, 18, 18>;
 
-/// A person turns and stops more abruptly than a Gaussian velocity of the same variance and duration:
-/// the variance that is added on the way is multiplied by this. Chosen on calibration rooms, from 1 to
+/// A person turns and stops more abruptly than a Gaussian velocity of the same variance and
+/// duration:
+/// the variance that is added on the way is multiplied by this. Chosen on calibration rooms, from
+/// 1 to
 /// 16: 1 follows late, from 8 on velocities are worse.
 const ABRUPTNESS: f64 = 4.0;
 
-/// A pose and a velocity with the covariance of their errors: the pose's δ in its body frame, true =
+/// A pose and a velocity with the covariance of their errors: the pose's δ in its body frame, true
+/// =
 /// pose · exp(δ), and the velocity's, each ordered (v, ω); metres, radians and seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MovingBelief {
@@ -168,9 +171,11 @@ mod tests {
         MotionPrior::assumed()
     }
 
-    /// Oracle: the stationary Ornstein–Uhlenbeck process in closed form: after a time t the variance
+    /// Oracle: the stationary Ornstein–Uhlenbeck process in closed form: after a time t the
+    /// variance
     /// of the way is 2σ²τ²(t/τ − 1 + e^(−t/τ)), its covariance with the velocity σ²τ(1 − e^(−t/τ)).
-    /// What of that comes from the velocity at the beginning is taken once, the rest as abruptly as a
+    /// What of that comes from the velocity at the beginning is taken once, the rest as abruptly
+    /// as a
     /// person moves. And Kalman's gain by hand.
     #[test]
     fn a_measured_pose_tells_the_velocity() {
@@ -200,8 +205,10 @@ mod tests {
         assert!(corrected.velocity.linear.yz().norm() < 1e-12);
     }
 
-    /// Oracle: the definition: a motion that is read exactly is the motion, and leaves the errors that
-    /// were there before, carried to the new body frame; one of which nothing is known changes nothing.
+    /// Oracle: the definition: a motion that is read exactly is the motion, and leaves the errors
+    /// that
+    /// were there before, carried to the new body frame; one of which nothing is known changes
+    /// nothing.
     #[test]
     fn a_reading_counts_as_much_as_it_is_sure() {
         let start = MovingBelief::at(Belief::known(Pose::identity(), 0.1, 1e-6), &prior());

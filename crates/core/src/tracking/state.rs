@@ -17,7 +17,8 @@ pub struct Observation {
     pub sequence: u64,
     /// Its latent under the tracker's adapter, shape (k,).
     pub latent: Array1<f64>,
-    /// The raw feature of that latent, shape (d,), if it is known: mapped frames are found by it, and the
+    /// The raw feature of that latent, shape (d,), if it is known: mapped frames are found by it,
+    /// and the
     /// [`super::PoseReader`] of a map reads it.
     pub feature: Option<Vec<f32>>,
     /// Whether the image is known to show nothing: it is blank, or all bright or dark.
@@ -78,10 +79,12 @@ pub struct Keyframe {
     pub sequence: u64,
     /// Its latent.
     pub latent: Vec<f64>,
-    /// `odom_from_camera` at this frame and the camera's velocity, of which nothing is known but what
+    /// `odom_from_camera` at this frame and the camera's velocity, of which nothing is known but
+    /// what
     /// motions were read.
     pub odom: MovingBelief,
-    /// `map_from_camera` as it is reported: with the covariance that its errors were measured to have,
+    /// `map_from_camera` as it is reported: with the covariance that its errors were measured to
+    /// have,
     /// and also after the tracker stopped believing it.
     pub reported_pose: Option<Belief>,
 }
@@ -95,7 +98,8 @@ pub struct Place {
     pub latent: Vec<f64>,
     /// `map_from_camera` and the camera's velocity.
     pub belief: MovingBelief,
-    /// The covariance of the lasting error of the anchor that corrected it last, which the filter cannot
+    /// The covariance of the lasting error of the anchor that corrected it last, which the filter
+    /// cannot
     /// average away; zero where its errors do not last.
     pub lasting: Matrix6<f64>,
 }

@@ -28,7 +28,8 @@ use crate::adapter::{Adapter, ErrorModel, JUMP_WINDOW};
 /// Views this near to one another, in deviations of frame noise, are the same image: the noise of a
 /// camera that stands still is some tenths.
 const UNCHANGED_DISTANCE: f64 = 0.01;
-/// After so many frames that are the same image a camera is taken to be frozen. Recordings hold pairs
+/// After so many frames that are the same image a camera is taken to be frozen. Recordings hold
+/// pairs
 /// of the same image where a frame was dropped.
 const FROZEN_FRAMES: u32 = 5;
 
@@ -55,14 +56,16 @@ impl Sight {
     }
 }
 
-/// After a longer pause than this, in frames of the calibration rooms, a jump could not be noticed: half
+/// After a longer pause than this, in frames of the calibration rooms, a jump could not be
+/// noticed: half
 /// a second at 30 Hz.
 const LONGEST_GAP: u64 = 15;
 
 /// Settings of a tracker.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackerSettings {
-    /// A new keyframe is taken after the time that so many frames took in the rooms where the adapter's
+    /// A new keyframe is taken after the time that so many frames took in the rooms where the
+    /// adapter's
     /// errors were measured; at least 1.
     pub keyframe_frames: u32,
     /// A new keyframe is taken after a motion of this length, ‖(v, ω)‖, metres and radians mixed;
@@ -439,7 +442,8 @@ impl Tracker {
     }
 }
 
-/// Keeps the frame, takes it as the keyframe if one is due, and keeps where the camera is believed to
+/// Keeps the frame, takes it as the keyframe if one is due, and keeps where the camera is believed
+/// to
 /// be if that is new.
 fn remember(
     state: &mut State,

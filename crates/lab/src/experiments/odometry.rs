@@ -171,7 +171,8 @@ impl TrackedRoom<'_> {
         &self.tracker
     }
 
-    /// The pose of the mapped frame whose raw feature is most like one of shape (d,), by the cosine: the
+    /// The pose of the mapped frame whose raw feature is most like one of shape (d,), by the
+    /// cosine: the
     /// simplest answer.
     pub fn most_alike(&self, feature: ArrayView1<'_, f32>) -> &Pose {
         let cosine = |frame: &&FrameId| {

@@ -1,9 +1,14 @@
-//! Planners beside one another: from an unmapped view to a mapped goal, driven without looking again.
+//! Planners beside one another: from an unmapped view to a mapped goal, driven without looking
+//! again.
 //!
-//! Every second frame of a room (or what the hold-out says) is a room of its own, which is all that a
-//! planner knows. A question is the view of another frame, and a mapped frame as the goal. A planner
-//! answers with where it believes the camera to be and with poses to drive to. A simulated robot then
-//! drives these motions one after another from where the camera truly is. The planner is right if the
+//! Every second frame of a room (or what the hold-out says) is a room of its own, which is all
+//! that a
+//! planner knows. A question is the view of another frame, and a mapped frame as the goal. A
+//! planner
+//! answers with where it believes the camera to be and with poses to drive to. A simulated robot
+//! then
+//! drives these motions one after another from where the camera truly is. The planner is right if
+//! the
 //! robot ends within the tolerance of the goal.
 //!
 //! Views of other rooms are asked about too: there a planner should find no way.
@@ -45,12 +50,14 @@ pub struct PlanningProtocol {
     pub hold_out: HoldOut,
     /// Questions in each room.
     pub questions: usize,
-    /// The longest hop, ‖(v, ω)‖ with metres and radians mixed. None takes the adapter's own, which ours
+    /// The longest hop, ‖(v, ω)‖ with metres and radians mixed. None takes the adapter's own,
+    /// which ours
     /// and the pose graph exceed where there is no other way.
     pub longest_hop: Option<f64>,
     /// Of the questions.
     pub seed: u64,
-    /// Whether an adapter is fitted to the mapped frames, from the given one's weights, and tells ours
+    /// Whether an adapter is fitted to the mapped frames, from the given one's weights, and tells
+    /// ours
     /// where a view is.
     pub is_fitted: bool,
 }
@@ -58,7 +65,8 @@ pub struct PlanningProtocol {
 /// A planner that is evaluated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Planner {
-    /// What the server answers: the shortest way over the room's frames, from the pose that they tell.
+    /// What the server answers: the shortest way over the room's frames, from the pose that they
+    /// tell.
     Ours,
     /// The latent way of the paper: a frame near the imagined latent, step by step.
     Latent,
@@ -93,7 +101,8 @@ pub struct PlannedWay {
     pub poses: Vec<Pose>,
     /// Whether the planner says that the goal is reached.
     pub says_reached: bool,
-    /// How probable the planner thinks it that the robot ends within the tolerance, if it says that.
+    /// How probable the planner thinks it that the robot ends within the tolerance, if it says
+    /// that.
     pub probability: Option<f64>,
 }
 

@@ -46,7 +46,8 @@ pub struct DisturbedTracking {
     /// Shares of the scored frames by status.
     pub statuses: StatusShares,
     /// After how many disturbed frames the status was no longer TRACKING, in the stream where that
-    /// took longest; none where it stayed TRACKING to the end. Only of disturbances of a part of the
+    /// took longest; none where it stayed TRACKING to the end. Only of disturbances of a part of
+    /// the
     /// stream.
     pub noticed_after: Option<usize>,
 }
