@@ -123,6 +123,77 @@ async fn evaluate_streams_progress_and_the_oracles_table() {
     }
 }
 
+/// Oracle: two ways to one number: the frames that Navigate retrieves in the last of three steps, handed
+/// in with the frame that this step started from, get the scores that Evaluate gives the same walks.
+/// Without that frame, some of them are refused, since a walk may come back to its source.
+#[tokio::test]
+async fn walks_that_snap_can_be_handed_in() {
+    let server = start(Config::default()).await;
+    let (steps, stride, radius) = (3, 40, 30);
+    let evaluate = pb::EvaluateRequest {
+        room: "synthetic".to_owned(),
+        split: "whole".to_owned(),
+        navigators: vec!["inverse-poincare-affine".to_owned()],
+        stride: Some(stride),
+        exclude_source: true,
+        exclude_radius: radius,
+        steps: Some(steps),
+        mode: pb::Mode::Snap.into(),
+        ..pb::EvaluateRequest::default()
+    };
+    let report = server.client.evaluate(evaluate, drop).await.unwrap();
+
+    let mut predictions = Vec::new();
+    for source in 0..600 - stride {
+        let walk = pb::NavigateRequest {
+            source: frame(source),
+            displacement: to_frame(source + stride),
+            navigator: "inverse-poincare-affine".to_owned(),
+            steps: Some(steps),
+            mode: pb::Mode::Snap.into(),
+            exclude_source: true,
+            exclude_radius: radius,
+            ..question()
+        };
+        let walked = server.client.navigate(walk).await.unwrap().steps;
+        let retrieved = |step: usize| walked[step].frames[0].frame_id;
+
+        predictions.push(pb::Prediction {
+            source_frame_id: source,
+            target_frame_id: source + stride,
+            prediction: Some(pb::prediction::Prediction::RetrievedFrameId(retrieved(2))),
+            last_step_frame_id: Some(retrieved(1)),
+        });
+    }
+
+    let request = |predictions| pb::ScorePredictionsRequest {
+        room: "synthetic".to_owned(),
+        split: "whole".to_owned(),
+        exclude_source: true,
+        exclude_radius: radius,
+        predictions,
+        ..pb::ScorePredictionsRequest::default()
+    };
+    let scored = server
+        .client
+        .score_predictions(request(predictions.clone()))
+        .await
+        .unwrap()
+        .scores
+        .unwrap();
+
+    let expected = &report.navigators[0];
+    assert_eq!((scored.n, expected.n), (560, 560));
+    assert_eq!(scored.hit_rates, expected.hit_rates);
+    assert_eq!(scored.top1, expected.top1);
+
+    for prediction in &mut predictions {
+        prediction.last_step_frame_id = None;
+    }
+    let refused = server.client.score_predictions(request(predictions)).await;
+    assert!(refused.unwrap_err().to_string().contains("is excluded"));
+}
+
 /// Oracle: as above; the client brings the oracle's own latents, and then its retrieved frames.
 #[tokio::test]
 async fn a_clients_predictions_get_the_oracles_scores() {
@@ -135,6 +206,7 @@ async fn a_clients_predictions_get_the_oracles_scores() {
         source_frame_id,
         target_frame_id,
         prediction: Some(prediction),
+        ..pb::Prediction::default()
     };
 
     let by_latent = latents

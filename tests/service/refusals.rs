@@ -644,6 +644,7 @@ async fn the_other_calls_name_the_field() {
         source_frame_id: 500,
         target_frame_id: frame,
         prediction,
+        ..Default::default()
     };
 
     let retrieved = |frame| Some(pb::prediction::Prediction::RetrievedFrameId(frame));
@@ -811,6 +812,7 @@ async fn the_other_calls_name_the_field() {
         source_frame_id: 1,
         target_frame_id: 41,
         prediction: retrieved(541),
+        ..Default::default()
     };
 
     refused(

@@ -8,7 +8,7 @@ use super::super::snapshot::Snapshot;
 use super::{CAMERA, world_frame};
 use crate::store::StoredAdapter;
 use seese3_client::proto::v1 as pb;
-use seese3_core::eval::{Prediction, check_thresholds, default_thresholds};
+use seese3_core::eval::{PredictedPair, Prediction, check_thresholds, default_thresholds};
 use seese3_core::geometry::{Pinhole, PixelCamera, Pose, Twist};
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{
@@ -374,27 +374,35 @@ pub fn navigators(names: &[String]) -> Result<Vec<NavigatorKind>, Error> {
         .collect()
 }
 
-pub fn prediction(position: usize, given: pb::Prediction) -> Result<(Pair, Prediction), Error> {
+pub fn prediction(position: usize, given: pb::Prediction) -> Result<PredictedPair, Error> {
     let pb::Prediction {
         source_frame_id,
         target_frame_id,
         prediction,
+        last_step_frame_id,
     } = given;
-    let pair = Pair {
-        source: FrameId(source_frame_id),
-        target: FrameId(target_frame_id),
-    };
 
-    match prediction {
+    let prediction = match prediction {
         Some(pb::prediction::Prediction::Latent(pb::Latent { values })) => {
-            Ok((pair, Prediction::Latent(values)))
+            Prediction::Latent(values)
         }
         Some(pb::prediction::Prediction::RetrievedFrameId(frame)) => {
-            Ok((pair, Prediction::Frame(FrameId(frame))))
+            Prediction::Frame(FrameId(frame))
         }
-        None => Err(Error::invalid(
-            format!("predictions[{position}]"),
-            "needs a latent or a retrieved_frame_id",
-        )),
-    }
+        None => {
+            return Err(Error::invalid(
+                format!("predictions[{position}]"),
+                "needs a latent or a retrieved_frame_id",
+            ));
+        }
+    };
+
+    Ok(PredictedPair {
+        pair: Pair {
+            source: FrameId(source_frame_id),
+            target: FrameId(target_frame_id),
+        },
+        prediction,
+        last_step_from: last_step_frame_id.map(FrameId),
+    })
 }

@@ -9,7 +9,7 @@ mod retrieval;
 pub use baselines::{Baselines, LEAST_CONSTANT_R2, TestPairs};
 pub use leak::{Leak, TrainedOn, has_seen, is_calibrated_in};
 pub use navigators::{Protocol, Report, Row, evaluate};
-pub use predictions::{Prediction, PredictionScope, score_predictions};
+pub use predictions::{PredictedPair, Prediction, PredictionScope, score_predictions};
 pub use retrieval::{LatentScores, PoseRecall, RetrievalScores};
 
 use crate::{adapter, cancel, navigation, room, splits};

@@ -18,13 +18,26 @@ pub enum Prediction {
     Frame(FrameId),
 }
 
+/// A client's prediction, and the pair that it is for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PredictedPair {
+    /// The source and the target.
+    pub pair: Pair,
+    /// What is expected at the target.
+    pub prediction: Prediction,
+    /// The frame that the last step started from, where the motion was divided into steps that each
+    /// went on from a frame: the exclusion is around it, as it is in `evaluate`. None for the source.
+    pub last_step_from: Option<FrameId>,
+}
+
 /// Which pairs and frames are allowed, and the thresholds by which they are scored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PredictionScope {
     /// Pairs must be test pairs of this split, and candidates are as in [`Split::candidates`]. If
     /// none is given, any pair is scored and all frames are candidates.
     pub split: Option<Split>,
-    /// If given, the source frame and this many rows to each side of it may not be retrieved.
+    /// If given, the source frame and this many rows to each side of it may not be retrieved; see
+    /// [`PredictedPair::last_step_from`].
     pub exclude_source: Option<u32>,
     /// ε of Hit@ε.
     pub thresholds: Vec<f64>,
@@ -39,7 +52,7 @@ pub struct PredictionScope {
 /// fit the room, the scope or the adapter.
 pub fn score_predictions(
     navigator: &Navigator,
-    predictions: &[(Pair, Prediction)],
+    predictions: &[PredictedPair],
     scope: &PredictionScope,
     cancel: &Cancellation,
 ) -> Result<Row, Error> {
@@ -71,12 +84,12 @@ pub fn score_predictions(
     let mut pairs = Vec::with_capacity(predictions.len());
     let mut retrieved = Vec::with_capacity(predictions.len());
     let mut latents: Vec<f64> = Vec::new();
-    for (position, (pair, prediction)) in predictions.iter().enumerate() {
+    for (position, predicted) in predictions.iter().enumerate() {
         cancel.check()?;
 
         // Errors name the prediction by its position, since the client sees only its own list.
         let frame = scoring
-            .retrieved_frame(*pair, prediction)
+            .retrieved_frame(predicted)
             .map_err(|problem| Error::Prediction {
                 position,
                 problem: Box::new(problem),
@@ -84,10 +97,10 @@ pub fn score_predictions(
 
         // Predicted latents are collected in one row; whether every pair has one is checked at the
         // end.
-        if let Prediction::Latent(latent) = prediction {
+        if let Prediction::Latent(latent) = &predicted.prediction {
             latents.extend(latent);
         }
-        pairs.push(*pair);
+        pairs.push(predicted.pair);
         retrieved.push(frame);
     }
 
@@ -114,9 +127,16 @@ struct Scoring<'a> {
 impl Scoring<'_> {
     /// The frame that a prediction retrieves: a frame as it is, if it may be retrieved, and for a
     /// latent its nearest candidate.
-    fn retrieved_frame(&self, pair: Pair, prediction: &Prediction) -> Result<FrameId, Error> {
+    fn retrieved_frame(&self, predicted: &PredictedPair) -> Result<FrameId, Error> {
+        let PredictedPair {
+            pair,
+            ref prediction,
+            last_step_from,
+        } = *predicted;
+
         let room = self.navigator.room();
-        for frame in [pair.source, pair.target] {
+        let started_from = last_step_from.unwrap_or(pair.source);
+        for frame in [pair.source, pair.target, started_from] {
             room.pose(frame)?;
         }
 
@@ -131,9 +151,8 @@ impl Scoring<'_> {
             });
         }
 
-        // The frames that may not be retrieved depend on the pair's source.
         let exclusion = self.scope.exclude_source.map(|radius| Exclusion {
-            centre: pair.source,
+            centre: started_from,
             radius,
         });
 
