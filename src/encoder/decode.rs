@@ -30,6 +30,8 @@ const LONGEST_SIDE: usize = 16_384;
 
 /// The end-of-image marker of a JPEG. Other bytes may follow it in the file.
 const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];
+/// The code of the marker that begins the compressed pixels of a JPEG.
+const START_OF_SCAN: u8 = 0xda;
 /// The most bytes that may be allocated to read the header of a PNG: a colour profile in it is
 /// compressed, and may be a decompression bomb.
 const HEADER_ALLOC: u64 = 16 << 20;
@@ -124,7 +126,8 @@ fn check_size(width: usize, height: usize, bounds: Bounds) -> Result<(), String>
 
 /// Decodes a JPEG strictly: a truncated image is an error and is not filled up with grey.
 fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
-    if !bytes.windows(2).rev().any(|marker| marker == END_OF_IMAGE) {
+    let pixels = compressed_pixels(bytes).unwrap_or_default();
+    if !pixels.windows(2).rev().any(|marker| marker == END_OF_IMAGE) {
         return Err("has no end-of-image marker: the file is truncated".to_owned());
     }
 
@@ -152,6 +155,31 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
         height,
         bytes,
     })
+}
+
+/// What follows the header of a JPEG: an end-of-image marker before it belongs to a thumbnail. None if
+/// the header does not end.
+fn compressed_pixels(bytes: &[u8]) -> Option<&[u8]> {
+    // A header is a list of segments: 0xff, a code, the length in two bytes, which it includes, and as
+    // much content. Only the start of the image, at the beginning, has no length.
+    let mut rest = bytes.get(2..)?;
+    loop {
+        let &[0xff, code, ..] = rest else {
+            return None;
+        };
+        // A marker may be preceded by any number of bytes 0xff.
+        if code == 0xff {
+            rest = &rest[1..];
+            continue;
+        }
+
+        let length = rest.get(2..4)?;
+        let length = usize::from(u16::from_be_bytes([length[0], length[1]]));
+        rest = rest.get(2 + length..)?;
+        if code == START_OF_SCAN {
+            return Some(rest);
+        }
+    }
 }
 
 /// Reads and decodes a room's image: a file below `root`, or the part `FILE@OFFSET+LENGTH` of one.
@@ -264,23 +292,30 @@ mod tests {
         assert!(read_image(folder.path(), "p.bin@4+99999").is_err());
     }
 
-    /// Oracle: the photographs of a tiny recording, whole and under every cut: a JPEG that ends
-    /// early is no image, whatever a lenient decoder would make of it.
+    /// Oracle: the photograph of a tiny recording, whole and under every cut, as it is and with a
+    /// thumbnail, which is a whole JPEG within the header: a JPEG that ends early is no image,
+    /// whatever a lenient decoder would make of it.
     #[test]
     fn a_jpeg_that_ends_early_is_refused() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR"))
             .join("tests/golden/datasets/scannet/scene0000_00/color");
-        let whole = std::fs::read(folder.join("9.jpg")).unwrap();
-        let image = decode("9.jpg", &whole, Bounds::LOCAL).unwrap();
+        let plain = std::fs::read(folder.join("9.jpg")).unwrap();
 
-        assert_eq!((image.width, image.height), (8, 6));
+        let length = (plain.len() as u16 + 2).to_be_bytes();
+        let thumbnail = [&[0xff, 0xe1], &length[..], &plain].concat();
+        let with_thumbnail = [&plain[..2], &thumbnail, &plain[2..]].concat();
 
-        for cut in 0..whole.len() - 1 {
-            assert!(
-                decode("9.jpg", &whole[..cut], Bounds::LOCAL).is_err(),
-                "cut at {cut} of {}",
-                whole.len()
-            );
+        for whole in [plain, with_thumbnail] {
+            let image = decode("9.jpg", &whole, Bounds::LOCAL).unwrap();
+            assert_eq!((image.width, image.height), (8, 6));
+
+            for cut in 0..whole.len() - 1 {
+                assert!(
+                    decode("9.jpg", &whole[..cut], Bounds::LOCAL).is_err(),
+                    "cut at {cut} of {}",
+                    whole.len()
+                );
+            }
         }
     }
 
