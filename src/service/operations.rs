@@ -1,14 +1,22 @@
 //! The second listener, for those who operate a server: metrics and probes over plain HTTP.
 //!
-//! It has connections of its own, so that it answers while the gRPC port is full.
+//! It has connections of its own, so that it answers while the gRPC port is full; few of them, and
+//! none for long, because it asks for no credentials.
+
+use std::convert::Infallible;
+use std::time::Duration;
 
 use axum::Router;
 use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
 use axum::routing::get;
-use tokio::net::TcpListener;
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
+use tokio::task::JoinSet;
 
 use super::Phase;
 use super::metrics::Metrics;
@@ -22,19 +30,55 @@ struct Operated {
     phase: watch::Receiver<Phase>,
 }
 
+/// So many connections may be open; a further one waits to be accepted.
+const CONNECTIONS: usize = 32;
+/// A connection that asks nothing for so long is closed.
+const SILENCE: Duration = Duration::from_secs(5);
+/// No connection lives longer; whoever scrapes opens the next one.
+const LIFETIME: Duration = Duration::from_secs(60);
+/// The pause after the system refused to accept a connection.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
+
 /// Answers `/metrics`, `/livez` and `/readyz` until it is dropped.
 pub(super) async fn serve(
     listener: TcpListener,
     metrics: Metrics,
     phase: watch::Receiver<Phase>,
-) -> std::io::Result<()> {
+) -> Infallible {
     let router = Router::new()
         .route("/metrics", get(scrape))
         .route("/livez", get(|| async { "alive\n" }))
         .route("/readyz", get(ready))
         .with_state(Operated { metrics, phase });
 
-    axum::serve(listener, router).await
+    let mut connections = JoinSet::new();
+    loop {
+        while connections.try_join_next().is_some() {}
+        if connections.len() >= CONNECTIONS {
+            connections.join_next().await;
+        }
+
+        match listener.accept().await {
+            Ok((stream, _)) => {
+                connections.spawn(answer(stream, router.clone()));
+            }
+            Err(error) => {
+                tracing::debug!(%error, "no connection for metrics can be accepted");
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+            }
+        }
+    }
+}
+
+/// Answers the requests of one connection.
+async fn answer(stream: TcpStream, router: Router) {
+    let connection = http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(SILENCE)
+        .serve_connection(TokioIo::new(stream), TowerToHyperService::new(router));
+
+    // However it ends, there is nobody left to tell.
+    let _ = tokio::time::timeout(LIFETIME, connection).await;
 }
 
 async fn scrape(State(operated): State<Operated>) -> impl IntoResponse {

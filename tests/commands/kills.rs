@@ -19,7 +19,7 @@ fn kills() -> u32 {
 }
 
 /// A program that runs. It is killed at the end of the test, if not before.
-pub struct Running(Child);
+pub struct Running(pub Child);
 
 impl Running {
     fn kill(&mut self) {
@@ -143,6 +143,12 @@ fn serve(store: &str) -> (Running, String) {
 pub fn serve_with(store: &str, options: &[&str]) -> (Running, String) {
     let fixed = ["serve", "--store", store, "--listen", "127.0.0.1:0"];
     let mut server = started(&[&fixed, options].concat());
+    let address = address_of(&mut server);
+    (server, address)
+}
+
+/// The address of a server that has just been started, once it serves.
+pub fn address_of(server: &mut Running) -> String {
     let mut line = String::new();
     BufReader::new(server.0.stdout.take().unwrap())
         .read_line(&mut line)
@@ -155,7 +161,7 @@ pub fn serve_with(store: &str, options: &[&str]) -> (Running, String) {
 
     for _ in 0..600 {
         if seese3(&["health", "--server", &address]).status.success() {
-            return (server, address);
+            return address;
         }
         std::thread::sleep(Duration::from_millis(20));
     }

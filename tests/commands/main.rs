@@ -11,6 +11,8 @@
 mod support;
 
 mod basics;
+#[cfg(target_os = "linux")]
+mod disks;
 mod kills;
 mod program;
 mod research;

@@ -85,3 +85,30 @@ async fn metrics_count_what_was_asked_and_probes_tell_the_stage() {
     stop.send(()).unwrap();
     ended.await.unwrap().unwrap();
 }
+
+/// Oracle: the bounds: connections that say nothing are closed after five seconds, and the scrape that
+/// waited for a place among 32 is answered then.
+#[tokio::test]
+async fn silent_connections_do_not_stop_scrapes() {
+    let (_folder, store) = filled_store().await;
+    let operations = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let operated = operations.local_addr().unwrap().to_string();
+    let listeners = Listeners {
+        grpc: TcpListener::bind("127.0.0.1:0").await.unwrap(),
+        operations: Some(operations),
+    };
+    tokio::spawn(run(
+        listeners,
+        store,
+        Config::default(),
+        std::future::pending(),
+    ));
+
+    let mut silent = Vec::new();
+    for _ in 0..40 {
+        silent.push(TcpStream::connect(&operated).await.unwrap());
+    }
+
+    let scrape = tokio::time::timeout(Duration::from_secs(60), get(&operated, "/livez")).await;
+    assert_eq!(scrape.expect("never answered").1, "alive\n");
+}
