@@ -73,8 +73,8 @@ pub fn encode_builtin(image: &RgbImage) -> Vec<f32> {
                 }
             }
 
-            // A central difference needs a neighbour on every side,
-            // so pixels at the border give their colour only.
+            // A central difference needs a neighbour on every side, so pixels at the border give
+            // their colour only.
             if x == 0 || y == 0 || x + 1 == width || y + 1 == height {
                 continue;
             }

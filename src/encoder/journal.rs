@@ -73,8 +73,8 @@ impl Journal {
         let mut found = vec![0; HEADER_BYTES];
         let is_ours = journal.file.read_exact(&mut found).is_ok() && found == header;
 
-        // The file is new, belongs to another task, or
-        // was truncated within its header: start empty.
+        // The file is new, belongs to another task, or was truncated within its header: start
+        // empty.
         if !is_ours {
             journal.file.set_len(0).map_err(io)?;
             journal.file.rewind().map_err(io)?;

@@ -200,8 +200,8 @@ impl Encoder {
             size,
         };
 
-        // The trial run gives the rank and width of each output.
-        // Where no size is fixed, a small image is tried.
+        // The trial run gives the rank and width of each output. Where no size is fixed, a small
+        // image is tried.
         let (width, height) = size.unwrap_or((64, 64));
         let grey = RgbImage {
             width,
@@ -254,8 +254,8 @@ impl Encoder {
                 _ => None,
             };
 
-            // The two encoders without a model have no
-            // options, so their whole sources are compared.
+            // The two encoders without a model have no options, so their whole sources are
+            // compared.
             if let Some(encoder) = plain {
                 if encoder.sources("")[0].is_like(source) {
                     return Ok(Some(encoder));
@@ -268,8 +268,8 @@ impl Encoder {
                 continue;
             }
 
-            // The file is the right one; everything else
-            // about the encoder is read back from the source.
+            // The file is the right one; everything else about the encoder is read back from the
+            // source.
             let (preparation, window) = Preparation::parse(&source.preprocess)?;
 
             let layer = Layer {
@@ -457,8 +457,8 @@ impl Encoder {
             }
         }
 
-        // Axes: clip, image of the clip, channel, row,
-        // column. Models with another order get it below.
+        // Axes: clip, image of the clip, channel, row, column. Models with another order get it
+        // below.
         let shape = IxDyn(&[clips.len(), self.window, 3, height, width]);
         let frames = ArrayD::from_shape_vec(shape, numbers).map_err(|error| Error::Runtime {
             runtime: self.runtime(),
@@ -467,8 +467,8 @@ impl Encoder {
 
         let outputs = match &self.backbone {
             Backbone::Builtin => Vec::new(),
-            // Clips of raw pixels have one image, whose
-            // axis is dropped to give maps (clip, 3, H, W).
+            // Clips of raw pixels have one image, whose axis is dropped to give maps (clip, 3, H,
+            // W).
             Backbone::Pixels => vec![frames.index_axis_move(Axis(1), 0)],
             Backbone::Model {
                 runner, clip_axis, ..
@@ -508,8 +508,8 @@ fn feature_name(prefix: &str, layer: &Layer, backbone: &Backbone) -> String {
         Backbone::Model { .. } => format!("{prefix}-{}-{}", layer.name, layer.pooling.short()),
     };
 
-    // A name must begin with a letter or digit; the `a`
-    // in front leaves only the character to be tested.
+    // A name must begin with a letter or digit; the `a` in front leaves only the character to be
+    // tested.
     let plain: String = name
         .chars()
         .map(|c| {

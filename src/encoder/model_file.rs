@@ -119,8 +119,8 @@ impl ModelFile {
             )));
         }
 
-        // A file may list its weights among the inputs;
-        // only the other inputs are given by the caller.
+        // A file may list its weights among the inputs; only the other inputs are given by the
+        // caller.
         let weights: HashSet<&str> = graph
             .initializer
             .iter()
@@ -148,8 +148,8 @@ impl ModelFile {
             ));
         }
 
-        // An axis of open size has a name in place of a number, which
-        // `DimProto` leaves out: it is read as 0 and becomes `None`.
+        // An axis of open size has a name in place of a number, which `DimProto` leaves out: it is
+        // read as 0 and becomes `None`.
         let shape = tensor.and_then(|tensor| tensor.shape.as_ref());
         let input = shape.map_or_else(Vec::new, |shape| {
             shape

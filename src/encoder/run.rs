@@ -78,8 +78,8 @@ pub fn encode_room(
         .map(|kept| std::mem::take(&mut kept.before))
         .unwrap_or_default();
 
-    // Rows are kept by frame number, so that those of the
-    // journal and the new ones end up in the order of the room.
+    // Rows are kept by frame number, so that those of the journal and the new ones end up in the
+    // order of the room.
     let mut rows: BTreeMap<usize, Vec<f32>> = before
         .into_iter()
         .filter(|(row, _)| *row < frame_count)
@@ -110,8 +110,8 @@ pub fn encode_room(
         );
         let encoded = encoded?;
 
-        // These rows are written before an error of the next batch
-        // is returned, so that they are not computed a second time.
+        // These rows are written before an error of the next batch is returned, so that they are
+        // not computed a second time.
         if let Some(kept) = &mut kept {
             kept.journal.append(
                 clips

@@ -204,7 +204,7 @@ impl Inner {
         );
         registry.register(
             "refused",
-            "Newest revisions in the store that cannot be served: rooms, adapters, and adapters in one of their rooms",
+            "Newest revisions in the store that cannot be served: rooms, adapters, adapters in one of their rooms, and choices of defaults",
             self.refused.clone(),
         );
         registry.register(
@@ -319,6 +319,7 @@ impl Metrics {
             ("room", snapshot.refused_rooms()),
             ("adapter", refused.adapters.len()),
             ("adapter of a room", snapshot.refused_in_rooms()),
+            ("defaults", usize::from(refused.defaults.is_some())),
         ] {
             let gauge = self.0.refused.get_or_create(&KindLabels { kind });
             gauge.set(count(refused));

@@ -81,7 +81,7 @@ use seese3_core::navigation::{IndexKind, Limits};
 use snapshot::Loader;
 use workers::Workers;
 
-/// What requests of health may hold in memory, bytes.
+/// What questions for health may hold in memory, bytes.
 const PROBES: usize = 16 << 20;
 /// After the drain time, how long the server still waits for callers to receive the error of their
 /// abandoned requests.
@@ -194,8 +194,6 @@ pub enum RunError {
     },
     #[error("the server failed: {0}")]
     Transport(#[from] tonic::transport::Error),
-    #[error("the listener of metrics failed: {0}")]
-    Operations(std::io::Error),
     #[error("the reflection service cannot be made: {0}")]
     Reflection(String),
     #[error("loading the store failed: {0}")]
@@ -301,7 +299,7 @@ pub async fn run(
     let server = async {
         tokio::select! {
             ended = answering => ended,
-            failed = operating => Err(failed),
+            never = operating => match never {},
             never = following => match never {},
         }
     };
@@ -413,19 +411,15 @@ async fn follow_files(tls: Option<Arc<Tls>>, keyring: Option<Arc<Keyring>>) -> I
     std::future::pending().await
 }
 
-/// Answers those who operate the server, if there is a listener for them. Completes only if that
-/// fails.
+/// Answers those who operate the server, if there is a listener for them; never completes.
 async fn operate(
     listener: Option<TcpListener>,
     metrics: Metrics,
     phase: watch::Receiver<Phase>,
-) -> RunError {
+) -> Infallible {
     match listener {
         None => std::future::pending().await,
-        Some(listener) => match operations::serve(listener, metrics, phase).await {
-            Ok(()) => std::future::pending().await,
-            Err(problem) => RunError::Operations(problem),
-        },
+        Some(listener) => operations::serve(listener, metrics, phase).await,
     }
 }
 

@@ -113,8 +113,7 @@ struct EmbeddedView {
 }
 
 /// Embeds the views of a request one by one, with a check for cancellation before each, since an
-/// image
-/// may have to be encoded.
+/// image may have to be encoded.
 fn embedded(
     views: Vec<pb::View>,
     stored: &StoredAdapter,
@@ -301,8 +300,7 @@ fn room_to_wire(
     };
 
     // It is believed where the views look like the room. Else the pose and covariance are those of
-    // the
-    // newest view, read from its nearest frame.
+    // the newest view, read from its nearest frame.
     let believed = located
         .as_ref()
         .filter(|_| found.out_of_distribution <= 1.0);

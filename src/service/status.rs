@@ -93,6 +93,8 @@ pub enum Error {
         /// The served name that is most like it, if one nearly is.
         nearest: Option<String>,
     },
+    #[error("{field}: '{name}' is not in the store")]
+    NotStored { field: String, name: String },
     #[error("{0}")]
     Precondition(String),
     #[error("the server is not ready: it is loading its store or stopping; try again")]
@@ -199,7 +201,7 @@ impl Error {
     pub fn code(&self) -> Code {
         match self {
             Self::Invalid { .. } => Code::InvalidArgument,
-            Self::NotFound { .. } => Code::NotFound,
+            Self::NotFound { .. } | Self::NotStored { .. } => Code::NotFound,
             Self::Precondition(_) => Code::FailedPrecondition,
             Self::Conflict { .. } => Code::Aborted,
             Self::Transport { code, .. } => *code,
@@ -217,6 +219,7 @@ impl Error {
         match self {
             Self::Invalid { .. } => "INVALID_FIELD",
             Self::NotFound { .. } => "NOT_SERVED",
+            Self::NotStored { .. } => "NOT_STORED",
             Self::Precondition(_) => "PRECONDITION",
             Self::Conflict { .. } => "CONFLICT",
             Self::Transport { .. } => "TRANSPORT",
@@ -255,6 +258,9 @@ impl From<Error> for Status {
             }
             Error::NotFound { field, name, .. } => {
                 details.set_resource_info(brief(field), brief(name), "", "is not served");
+            }
+            Error::NotStored { field, name } => {
+                details.set_resource_info(brief(field), brief(name), "", "is not in the store");
             }
             Error::Full { .. } => {
                 details.set_retry_info(Some(std::time::Duration::from_millis(500)));
@@ -396,6 +402,51 @@ impl From<eval::Error> for Error {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Oracle: the page of errors, which is written by hand: it has a row for each error, with its reason
+    /// and its code.
+    #[test]
+    fn every_reason_is_documented() {
+        let page = std::fs::read_to_string("docs/errors.md").unwrap();
+        let name = || "a".to_owned();
+        let errors = [
+            (Error::invalid("a", "b"), "INVALID_ARGUMENT"),
+            (Error::no_frame("a", FrameId(0)), "NOT_FOUND"),
+            (
+                Error::NotStored {
+                    field: name(),
+                    name: name(),
+                },
+                "NOT_FOUND",
+            ),
+            (Error::Precondition(name()), "FAILED_PRECONDITION"),
+            (Error::Loading, "UNAVAILABLE"),
+            (
+                Error::Full {
+                    what: Full::Streams,
+                },
+                "RESOURCE_EXHAUSTED",
+            ),
+            (Error::Unauthenticated { problem: "a" }, "UNAUTHENTICATED"),
+            (
+                Error::Conflict {
+                    name: name(),
+                    problem: name(),
+                },
+                "ABORTED",
+            ),
+            (Error::Forbidden { verb: "a" }, "PERMISSION_DENIED"),
+            (Error::OutOfScope { what: "a" }, "PERMISSION_DENIED"),
+            (Error::Deadline, "DEADLINE_EXCEEDED"),
+            (Error::Cancelled, "CANCELLED"),
+            (Error::Internal, "INTERNAL"),
+        ];
+
+        for (error, code) in errors {
+            let row = format!("| `{}` | `{code}` |", error.reason());
+            assert!(page.contains(&row), "{row}");
+        }
+    }
 
     /// Oracle: by hand: a letter left out is one edit of seven, 0.86; another name shares hardly
     /// a letter.

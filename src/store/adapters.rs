@@ -10,7 +10,7 @@ use super::adapter_files::{
 };
 use super::format::{AdapterBody, FittedEntry, TrainingEntry};
 use super::manifest::{self, ObjectRef, SCHEMA};
-use super::{ATTEMPTS, Error, Kind, Published, Store, folder_of, revision_path};
+use super::{ATTEMPTS, Defaults, Error, Kind, Published, Store, folder_of, revision_path};
 use seese3_core::adapter::{Adapter, TrainingRecord};
 use seese3_core::fitting::{Fitted, ReadingRules};
 use seese3_core::room::{RoomId, is_plain_name};
@@ -273,13 +273,13 @@ impl Store {
         self.names(Kind::Adapter).await
     }
 
-    /// The names of all adapters, sorted, each with the revision that its name alone means. No
-    /// manifest is read.
+    /// The names of all adapters, sorted, each with the revision that its name alone means by these
+    /// choices. No manifest is read.
     ///
     /// # Errors
-    /// [`Error::Io`] if the store cannot be listed, otherwise as [`Store::defaults`].
-    pub async fn current_adapters(&self) -> Result<Vec<(String, u64)>, Error> {
-        self.current(Kind::Adapter).await
+    /// [`Error::Io`] if the store cannot be listed.
+    pub async fn current_adapters(&self, defaults: &Defaults) -> Result<Vec<(String, u64)>, Error> {
+        self.current(Kind::Adapter, defaults).await
     }
 
     pub(super) async fn adapter_body(

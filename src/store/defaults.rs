@@ -43,6 +43,15 @@ struct Body {
     defaults: Defaults,
 }
 
+/// The choices that hold as far as their files can be read.
+#[derive(Debug)]
+pub struct StandingDefaults {
+    /// Those of the newest file that can be read; none were made if there is no such file.
+    pub defaults: Defaults,
+    /// Why newer ones do not hold, if there are any.
+    pub refused: Option<Error>,
+}
+
 /// One choice.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Choice {
@@ -184,6 +193,27 @@ impl Store {
         Ok(self.numbered_defaults().await?.1)
     }
 
+    /// The choices by which to serve: those before, where the file of the newest ones is damaged.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if the store cannot be read.
+    pub async fn standing_defaults(&self) -> Result<StandingDefaults, Error> {
+        let mut refused = None;
+
+        for number in self.numbers_of_defaults().await?.into_iter().rev() {
+            match self.read_defaults(number).await {
+                Ok(Body { defaults, .. }) => return Ok(StandingDefaults { defaults, refused }),
+                Err(error @ (Error::Damaged { .. } | Error::Schema { .. })) => {
+                    refused.get_or_insert(error);
+                }
+                Err(error) => return Err(error),
+            }
+        }
+
+        let defaults = Defaults::default();
+        Ok(StandingDefaults { defaults, refused })
+    }
+
     /// Whether a choice can be made.
     ///
     /// # Errors
@@ -220,16 +250,22 @@ impl Store {
     }
 
     /// Takes the last change of the choices back: those before it hold again, as far as what they name
-    /// is still there. Done again, the change before that one is taken back.
+    /// is still there. Done again, the change before that one is taken back. A change whose file is
+    /// damaged is taken back as well.
     ///
     /// # Errors
     /// [`Error::NothingToTakeBack`] if nothing was ever chosen; otherwise as [`Store::choose`].
     pub async fn take_back_choice(&self) -> Result<Defaults, Error> {
         for _ in 0..ATTEMPTS {
-            let (number, _) = self.numbered_defaults().await?;
+            let number = self.numbers_of_defaults().await?.last().copied();
+            let number = number.unwrap_or_default();
             let holds = match number {
                 0 => 0,
-                _ => self.read_defaults(number).await?.back_to.unwrap_or(number),
+                _ => match self.read_defaults(number).await {
+                    Ok(body) => body.back_to.unwrap_or(number),
+                    Err(Error::Damaged { .. }) => number,
+                    Err(error) => return Err(error),
+                },
             };
             let (back_to, mut before) = match holds {
                 0 => return Err(Error::NothingToTakeBack),
@@ -261,10 +297,16 @@ impl Store {
 
     /// The choices that hold now, with the number of their file; 0 if nothing was ever chosen.
     async fn numbered_defaults(&self) -> Result<(u64, Defaults), Error> {
-        match self.numbered_files(&Path::from(FOLDER)).await?.highest {
-            0 => Ok((0, Defaults::default())),
-            number => Ok((number, self.read_defaults(number).await?.defaults)),
+        match self.numbers_of_defaults().await?.last() {
+            None => Ok((0, Defaults::default())),
+            Some(&number) => Ok((number, self.read_defaults(number).await?.defaults)),
         }
+    }
+
+    /// The numbers of the files of choices, in ascending order.
+    async fn numbers_of_defaults(&self) -> Result<Vec<u64>, Error> {
+        let numbers = self.numbered_files(&Path::from(FOLDER)).await?;
+        Ok(numbers.present)
     }
 
     async fn read_defaults(&self, number: u64) -> Result<Body, Error> {

@@ -50,8 +50,7 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Unknown`] if there is no such room, [`Error::CannotAdd`] if the frames do not fit
-    /// to
-    /// its own, otherwise as [`Store::load_room`].
+    /// to its own, otherwise as [`Store::load_room`].
     pub async fn extended_room(
         &self,
         addition: &Room,
@@ -68,8 +67,8 @@ impl Store {
     }
 
     /// Adds frames to the newest revision of a room, as [`Store::extended_room`] says, and
-    /// publishes
-    /// the result. Frames that the room has already, one after the other, are not added again.
+    /// publishes the result. Frames that the room has already, one after the other, are not added
+    /// again.
     ///
     /// # Errors
     /// As [`Store::extended_room`] and [`Store::publish_room`].
@@ -239,8 +238,7 @@ fn place_among(known: &[Features], added: &Features) -> Result<usize, String> {
 }
 
 /// Whether the base already has the added frames, one after the other: the same poses, times and
-/// features.
-/// `joined` are the features of both.
+/// features. `joined` are the features of both.
 fn has_frames(base: &StoredRoom, addition: &Room, joined: &[Features]) -> bool {
     let known = base.room.frame_count();
     let added = addition.frame_count();

@@ -32,7 +32,7 @@ mod verification;
 pub use adapter_files::{check_adapter_files, stated_weights_size};
 pub use adapters::{BaseAdapter, RoomFit, StoredAdapter};
 pub use contents::{Contents, RevisionContents};
-pub use defaults::{Choice, Defaults};
+pub use defaults::{Choice, Defaults, StandingDefaults};
 pub use extension::{ExtendedRoom, OtherFeatures};
 pub use garbage::{Garbage, GarbageFile};
 pub use removal::Removed;
@@ -345,8 +345,7 @@ impl Store {
     }
 
     /// Whether an object that a revision needs is missing: somebody may have collected it as
-    /// garbage
-    /// while the revision was being published.
+    /// garbage while the revision was being published.
     async fn lacks<'a>(
         &self,
         folder: &Path,
@@ -397,9 +396,8 @@ impl Store {
         Ok(numbered.into_iter().map(|(name, _)| name).collect())
     }
 
-    /// The same, each with the revision that its name alone means.
-    async fn current(&self, kind: Kind) -> Result<Vec<(String, u64)>, Error> {
-        let defaults = self.defaults().await?;
+    /// The same, each with the revision that its name alone means by these choices.
+    async fn current(&self, kind: Kind, defaults: &Defaults) -> Result<Vec<(String, u64)>, Error> {
         let current = |(name, numbers): (String, Numbers)| {
             let chosen = defaults.revision(kind, &name);
             let newest = numbers.present.last().copied();
@@ -480,8 +478,7 @@ impl Store {
     }
 
     /// The folder of a room or an adapter, and the requested revision, or else the one that the
-    /// name
-    /// alone means: that which an operator chose, or the newest.
+    /// name alone means: that which an operator chose, or the newest.
     async fn resolve(
         &self,
         kind: Kind,

@@ -8,7 +8,7 @@ use super::manifest::{self, ObjectRef, SCHEMA};
 use super::room_files::{
     features_file, frames_file, names_file, read_features, read_frames, read_names,
 };
-use super::{ATTEMPTS, Error, Kind, Published, Store, folder_of, revision_path};
+use super::{ATTEMPTS, Defaults, Error, Kind, Published, Store, folder_of, revision_path};
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::{FeatureSource, Features};
@@ -336,9 +336,8 @@ impl Store {
     }
 
     /// Loads the revision that a room's name alone means, with one set of features: the named one,
-    /// or
-    /// the only one if no name is given. The features are returned beside the room, whose own list
-    /// is empty.
+    /// or the only one if no name is given. The features are returned beside the room, whose own
+    /// list is empty.
     ///
     /// # Errors
     /// As [`Store::load_room`]; also [`Error::UnknownFeatures`] if the room has no features of this
@@ -432,14 +431,13 @@ impl Store {
         Ok(one.frames == other.frames)
     }
 
-    /// The names of all rooms, sorted, each with the revision that its name alone means. No
-    /// manifest
-    /// is read.
+    /// The names of all rooms, sorted, each with the revision that its name alone means by these
+    /// choices. No manifest is read.
     ///
     /// # Errors
-    /// [`Error::Io`] if the store cannot be listed, otherwise as [`Store::defaults`].
-    pub async fn current_rooms(&self) -> Result<Vec<(String, u64)>, Error> {
-        self.current(Kind::Room).await
+    /// [`Error::Io`] if the store cannot be listed.
+    pub async fn current_rooms(&self, defaults: &Defaults) -> Result<Vec<(String, u64)>, Error> {
+        self.current(Kind::Room, defaults).await
     }
 
     /// A summary of every room, of the revision that its name alone means; sorted by name.
@@ -460,8 +458,7 @@ impl Store {
     ///
     /// # Errors
     /// As [`Store::load_room`]. Whether the files that the manifest names are there and intact is
-    /// not
-    /// looked at.
+    /// not looked at.
     pub async fn room_summary(
         &self,
         name: &str,

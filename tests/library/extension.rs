@@ -69,9 +69,8 @@ async fn added_frames_follow_the_rooms_own() {
         );
     }
 
-    // The first frames have the sequences 0 to 5, ten of them in the last one; what is added
-    // begins the
-    // sequence 6. Numbers go on from 3 · 259.
+    // The first frames have the sequences 0 to 5, ten of them in the last one; what is added begins
+    // the sequence 6. Numbers go on from 3 · 259.
     let frames = back.room.frames();
     assert_eq!(frames.sequences[259..261], [5, 6]);
     assert_eq!(frames.numbers[259..262], [777, 778, 779]);
@@ -108,8 +107,7 @@ async fn added_frames_follow_the_rooms_own() {
 }
 
 /// Oracle: the promise that nothing is lost: what does not fit is refused with what to change, and
-/// the
-/// room stays as it was.
+/// the room stays as it was.
 #[tokio::test]
 async fn frames_that_do_not_fit_are_refused() {
     let (_folder, store) = begun().await;
@@ -157,8 +155,7 @@ async fn frames_that_do_not_fit_are_refused() {
 }
 
 /// Oracle: the names: two sets that are made alike get each its own rows, and an unnamed third one
-/// is
-/// refused.
+/// is refused.
 #[tokio::test]
 async fn features_that_are_made_alike_are_told_by_their_names() {
     let (_folder, store) = stored().await;

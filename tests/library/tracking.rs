@@ -226,8 +226,7 @@ impl PoseReader for Knowing {
 }
 
 /// Oracle: the reader's own poses and covariance: frames that bring their feature are corrected by
-/// it
-/// and reported about as surely as it is sure, frames without one by the frames that they match.
+/// it and reported about as surely as it is sure, frames without one by the frames that they match.
 #[test]
 fn the_reader_of_a_room_gives_the_anchors() {
     let adapter = Arc::new(calibrated().0);
@@ -275,8 +274,7 @@ fn the_reader_of_a_room_gives_the_anchors() {
 }
 
 /// Oracle: the true poses of frames that are not mapped: the blend of the frames most like a view
-/// is
-/// nearer to it than the nearest frame is, and its covariance holds about as many errors as it
+/// is nearer to it than the nearest frame is, and its covariance holds about as many errors as it
 /// says.
 #[test]
 fn a_view_is_placed_between_mapped_frames() {
@@ -317,9 +315,8 @@ fn a_view_is_placed_between_mapped_frames() {
 }
 
 /// Oracle: the promise: a camera whose images stop changing is noticed within ten frames, and what
-/// is
-/// said of its pose becomes less and less sure; pairs of the same image are none, and a camera that
-/// sees again is followed again. A blank image is noticed at once.
+/// is said of its pose becomes less and less sure; pairs of the same image are none, and a camera
+/// that sees again is followed again. A blank image is noticed at once.
 #[test]
 fn a_camera_that_sees_nothing_new_is_not_tracked() {
     let adapter = Arc::new(calibrated().0);
@@ -397,9 +394,8 @@ fn a_camera_that_sees_nothing_new_is_not_tracked() {
 }
 
 /// Oracle: the true poses. The camera goes blind while it moves on. Wheels that drift by a
-/// twentieth
-/// of the way carry it, to within what they may have drifted, and the covariance holds the error;
-/// without them it is lost sight of.
+/// twentieth of the way carry it, to within what they may have drifted, and the covariance holds
+/// the error; without them it is lost sight of.
 #[test]
 fn wheels_carry_a_blind_camera() {
     let adapter = Arc::new(calibrated().0);

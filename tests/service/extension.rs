@@ -81,8 +81,7 @@ async fn send(
 }
 
 /// Oracle: the recorded poses. A stream that began before the room grew goes on at its token, in
-/// the
-/// grown room; the frames that were added are found; and an adapter is fitted to all of them.
+/// the grown room; the frames that were added are found; and an adapter is fitted to all of them.
 #[tokio::test]
 async fn streams_and_tokens_survive_the_growth_of_a_room() {
     let server = server().await;

@@ -102,6 +102,36 @@ async fn health_answers_for_the_server_its_services_and_its_rooms() {
         .unwrap();
 }
 
+/// Oracle: the bounds by hand: a request holds 16 KiB at least, so that 60 watchers are more than
+/// 800 kB have room for. Those who only check are answered beside them.
+#[tokio::test]
+async fn watchers_leave_room_for_those_who_check() {
+    let config = Config {
+        memory_bytes: 800_000,
+        ..Config::default()
+    };
+    let server = start(config).await;
+
+    let mut client = HealthClient::new(channel(&server.address).await);
+    let mut watchers = Vec::new();
+    let mut refused = 0;
+    for _ in 0..60 {
+        match client.watch(named("")).await {
+            Ok(watcher) => watchers.push(watcher),
+            Err(status) => {
+                assert_eq!(status.code(), Code::ResourceExhausted);
+                refused += 1;
+            }
+        }
+    }
+    assert!(refused > 0 && !watchers.is_empty());
+
+    for _ in 0..100 {
+        let checked = check(&server.address, "").await;
+        assert_eq!(checked, Ok(ServingStatus::Serving));
+    }
+}
+
 /// Oracle: the promise of the deployment's page: a store of which nothing can be served ends the
 /// server, and the error names the file.
 #[tokio::test]

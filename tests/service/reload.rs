@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use seese3::service::{Config, Reload};
-use seese3::store::Store;
+use seese3::store::{Choice, Store};
 use seese3_client::Client;
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::Features;
@@ -238,6 +238,43 @@ async fn a_server_starts_beside_damage_and_outlives_its_store() {
     std::fs::remove_dir_all(server.folder.path().join("adapters")).unwrap();
     tokio::time::sleep(Duration::from_millis(200)).await;
     assert!(server.client.navigate(question()).await.is_ok());
+}
+
+/// Oracle: the promise: where the newest choices of defaults are damaged, the ones before them hold, at
+/// a reload and at the start, and everything else goes on.
+#[tokio::test]
+async fn damaged_choices_leave_those_before_them() {
+    let (server, store, asked) = start_watched().await;
+    let (adapter, rows) = (oracle_adapter(), features_of("synthetic"));
+    store
+        .publish_adapter("trial", &adapter, &record(), rows.rows())
+        .await
+        .unwrap();
+    for adapter in ["oracle", "trial"] {
+        let choice = Choice::Adapter {
+            room: "synthetic".to_owned(),
+            adapter: adapter.to_owned(),
+        };
+        store.choose(&choice).await.unwrap();
+    }
+    let choices = server.folder.path().join("defaults/000002.json");
+    std::fs::write(choices, b"short").unwrap();
+
+    let (new, new_rows) = (room_of("new", "synthetic_b"), features_of("synthetic_b"));
+    store.publish_room(&new, &[new_rows]).await.unwrap();
+    asked.notify_one();
+    let revision = async || revision_of(&server.client, "new").await;
+    until("the new room", revision, |found| *found == Some(1)).await;
+
+    let answering = async |server: &TestServer| {
+        let answer = server.client.navigate(question()).await.unwrap();
+        answer.adapter.unwrap().name
+    };
+    assert_eq!(answering(&server).await, "oracle");
+
+    let TestServer { folder, .. } = server;
+    let server = start_on(folder, store, Config::default()).await;
+    assert_eq!(answering(&server).await, "oracle");
 }
 
 /// Publishes revisions that differ in their features, while `askers` ask without a pause.

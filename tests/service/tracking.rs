@@ -256,8 +256,7 @@ async fn a_stream_goes_on_at_another_server_as_if_it_had_never_been_cut() {
 }
 
 /// Oracle: the stream that brings a token with every answer: the others answer the same, with
-/// tokens
-/// where they were asked for, and go on from them.
+/// tokens where they were asked for, and go on from them.
 #[tokio::test]
 async fn tokens_come_when_they_are_asked_for() {
     let server = server(KEY).await;
@@ -558,9 +557,8 @@ async fn a_stream_is_configured_once_and_first() {
         })
     };
 
-    // The hall was mapped with 585 pixels in images 640 wide, which see 57 degrees across. 1,100
-    // in images
-    // 1,280 wide see 60; 1,000 see 65.
+    // The hall was mapped with 585 pixels in images 640 wide, which see 57 degrees across. 1,100 in
+    // images 1,280 wide see 60; 1,000 see 65.
     answers(&server, vec![with_camera(1_100.0)]).await.unwrap();
 
     for (requests, word) in [
@@ -655,8 +653,7 @@ async fn a_stream_is_configured_once_and_first() {
 }
 
 /// Oracle: the contract: where no room is named, those that are too small to track in, or that
-/// another
-/// camera has mapped, are left out; and they are refused by name.
+/// another camera has mapped, are left out; and they are refused by name.
 #[tokio::test]
 async fn rooms_that_cannot_be_tracked_in_do_not_stop_a_search() {
     let folder = tempfile::tempdir().unwrap();
@@ -927,8 +924,8 @@ async fn a_view_is_found_among_rooms_or_called_ambiguous() {
 }
 
 /// Oracle: composition, and the stream without a base. The base's poses are the camera's, moved by
-/// the
-/// mounting; odometry begins at the base; the camera's map poses and motions are what they were.
+/// the mounting; odometry begins at the base; the camera's map poses and motions are what they
+/// were.
 #[tokio::test]
 async fn a_robot_gets_the_poses_of_its_base() {
     let server = server(KEY).await;
@@ -1003,8 +1000,7 @@ async fn a_robot_gets_the_poses_of_its_base() {
 }
 
 /// Oracle: the rules of TrackFrame.odometry: what is wrong with it refuses the frame by its name,
-/// and
-/// the next frame is answered as if it had not been sent.
+/// and the next frame is answered as if it had not been sent.
 #[tokio::test]
 async fn odometry_that_is_none_is_refused() {
     let server = server(KEY).await;

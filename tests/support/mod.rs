@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Ix2};
 use safetensors::{Dtype, SafeTensors};
+use seese3::store::Store;
 use seese3_core::geometry::{Pose, nearest_rotation};
 
 /// The folder of large inputs outside the repository: `SEESE3_SHARED`, else `../shared`.
@@ -22,6 +23,12 @@ pub fn shared() -> PathBuf {
         folder.display()
     );
     folder
+}
+
+/// The rooms of a store, each with the revision that its name means.
+pub async fn current_rooms(store: &Store) -> Vec<(String, u64)> {
+    let defaults = store.defaults().await.unwrap();
+    store.current_rooms(&defaults).await.unwrap()
 }
 
 /// The committed oracles.

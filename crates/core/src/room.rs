@@ -274,8 +274,8 @@ impl Room {
             });
         }
 
-        // The timeline repeats two of the columns, so that splits
-        // can be made without the poses and the paths of images.
+        // The timeline repeats two of the columns, so that splits can be made without the poses and
+        // the paths of images.
         let sequences = frames.sequences.clone();
         let held_out = frames.held_out.clone();
         let timeline = Timeline {

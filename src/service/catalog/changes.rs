@@ -55,10 +55,8 @@ impl Changes {
     }
 
     /// Makes a change, lets the server look at its store, and then makes the answer; unless the
-    /// same
-    /// change was made already, whose answer is given again. Changes are made one after another.
-    /// One
-    /// that was admitted is finished even if the caller goes away.
+    /// same change was made already, whose answer is given again. Changes are made one after
+    /// another. One that was admitted is finished even if the caller goes away.
     ///
     /// # Errors
     /// Those of the change; [`Error::Invalid`] if the request id belongs to another one,
@@ -121,8 +119,7 @@ impl Changes {
     ///
     /// # Errors
     /// [`Error::Invalid`] if it can never be held, [`Error::Full`] if the uploads in progress hold
-    /// as
-    /// much as they may.
+    /// as much as they may.
     pub fn upload_memory(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Error> {
         let pieces = bytes.div_ceil(PIECE);
         if pieces > self.upload_pieces {
@@ -292,20 +289,18 @@ impl From<store::Error> for Error {
         use store::Error as E;
 
         match &error {
-            E::Unknown { kind, name, .. } => Self::NotFound {
+            E::Unknown { kind, name, .. } => Self::NotStored {
                 field: (*kind).to_owned(),
                 name: name.clone(),
-                nearest: None,
             },
             E::UnknownRevision {
                 kind,
                 name,
                 revision,
                 ..
-            } => Self::NotFound {
+            } => Self::NotStored {
                 field: (*kind).to_owned(),
                 name: format!("{name}/revisions/{revision}"),
-                nearest: None,
             },
             E::UnknownFeatures { .. } | E::WhichFeatures { .. } => Self::invalid("features", error),
             E::InUse { .. } | E::NothingToTakeBack => Self::Precondition(error.to_string()),

@@ -20,8 +20,9 @@ use super::decoded::{decoded_size, has_unary_response, is_stream};
 use super::response::{ResponseTimeout, in_pieces};
 use super::{HELD, Held, Memory};
 
-/// The beginning of the paths of the health service.
-const HEALTH: &str = "/grpc.health.v1.Health/";
+/// The path of a question for health. Watch is not among them: it stays open, and many would hold
+/// all of the memory of probes.
+const PROBE: &str = "/grpc.health.v1.Health/Check";
 /// What stands before a message: whether it is compressed, and its length.
 const PREFIX: usize = 5;
 
@@ -98,7 +99,7 @@ impl MemoryLayer {
     /// Receives a request as far as it has to be before a handler sees it.
     async fn received(&self, request: Request<Body>) -> Result<(Held, Request<Body>), Error> {
         let path = request.uri().path().to_owned();
-        let memory = match path.starts_with(HEALTH) {
+        let memory = match path == PROBE {
             true => &self.probes,
             false => &self.memory,
         };

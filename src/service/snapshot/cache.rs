@@ -8,7 +8,7 @@ use moka::sync::Cache;
 use tokio::runtime::Handle;
 
 use super::Refusal;
-use super::room_loading::RoomLoader;
+use super::room_loading::{RoomLoader, contained};
 use super::served::{LoadedRoom, ServedRoom};
 
 /// Which [`ServedRoom`] an entry belongs to.
@@ -105,7 +105,7 @@ impl RoomCache {
         room: &ServedRoom,
         before: Option<&ServedRoom>,
     ) -> Result<Arc<LoadedRoom>, Refusal> {
-        let loaded = self.loader.load(room, before).await;
+        let loaded = contained(self.loader.load(room, before)).await;
         let loaded = loaded.map_err(|problem| Refusal::new(room.summary.revision, &problem));
 
         room.remember(loaded.as_ref());

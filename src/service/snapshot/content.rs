@@ -7,8 +7,7 @@ use seese3_core::adapter::{Adapter, ErrorStatistics, Network};
 use seese3_core::navigation::Navigator;
 
 /// The identity of a room under an adapter, as hashes. Name and revision are none: two stores may
-/// use
-/// the same ones for different content.
+/// use the same ones for different content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Content {
     /// SHA-256 of the adapter and its calibration.

@@ -15,11 +15,11 @@ use super::super::metrics::Metrics;
 use super::super::two_views::TwoViewReader;
 use super::super::{Config, RunError};
 use super::cache::RoomCache;
-use super::room_loading::{Problem, RoomLoader};
+use super::room_loading::{Problem, RoomLoader, contained};
 use super::served::{Candidate, ServedRoom};
 use super::{Refusal, Snapshot};
 use crate::encoder;
-use crate::store::{self, RoomFit, Store, StoredAdapter};
+use crate::store::{self, Defaults, RoomFit, StandingDefaults, Store, StoredAdapter};
 use seese3_core::features::FeatureSource;
 use seese3_core::room::RoomId;
 
@@ -149,14 +149,14 @@ impl Loader {
             ..Snapshot::default()
         };
 
-        let defaults = self.store.defaults().await?;
-        for (name, revision) in self.store.current_adapters().await? {
+        let defaults = self.defaults(&mut loaded, before).await?;
+        for (name, revision) in self.store.current_adapters(&defaults).await? {
             self.add_adapter(&mut loaded, before, refused, name, revision)
                 .await;
         }
-        self.add_image_encoders(&mut loaded, before);
+        self.add_image_encoders(&mut loaded, before, refused);
 
-        for (name, revision) in self.store.current_rooms().await? {
+        for (name, revision) in self.store.current_rooms(&defaults).await? {
             if let Some(adapter) = defaults.adapter(&name) {
                 loaded
                     .default_adapters
@@ -167,6 +167,29 @@ impl Loader {
         }
 
         Ok(loaded)
+    }
+
+    /// The choices of an operator. If the file of the newest ones is damaged, those before it hold.
+    async fn defaults(
+        &self,
+        loaded: &mut Snapshot,
+        before: &Snapshot,
+    ) -> Result<Defaults, RunError> {
+        let StandingDefaults { defaults, refused } = self.store.standing_defaults().await?;
+
+        let reason = refused.map(|problem| problem.to_string());
+        if let Some(reason) = &reason
+            && before.refused.defaults.as_ref() != Some(reason)
+        {
+            tracing::error!(
+                reason,
+                "the choices of defaults cannot be read; those before them hold; take the last change back with \
+                 `seese3 store default --back`"
+            );
+        }
+
+        loaded.refused.defaults = reason;
+        Ok(defaults)
     }
 
     /// Adds the current revision of an adapter; if it is refused, the one that was served before.
@@ -186,13 +209,13 @@ impl Loader {
 
         let refusal = match kept(&before.refused.adapters, &name, revision, refused) {
             Some(refusal) => refusal,
-            None => match self.store.load_adapter(&name, Some(revision)).await {
+            None => match self.adapter(&name, revision).await {
                 Ok(stored) => {
                     loaded.adapters.insert(name, Arc::new(stored));
                     return;
                 }
                 Err(problem) => {
-                    let refusal = Refusal::new(revision, &problem.into());
+                    let refusal = Refusal::new(revision, &problem);
                     log_refusal(
                         "adapter",
                         &name,
@@ -210,9 +233,15 @@ impl Loader {
         loaded.refused.adapters.insert(name, refusal);
     }
 
+    async fn adapter(&self, name: &str, revision: u64) -> Result<StoredAdapter, Problem> {
+        let load = async { Ok(self.store.load_adapter(name, Some(revision)).await?) };
+        contained(load).await
+    }
+
     /// Adds the image encoders of all adapters. An adapter whose encoder cannot be used is served
-    /// without one: callers may still send features.
-    fn add_image_encoders(&self, loaded: &mut Snapshot, before: &Snapshot) {
+    /// without one: callers may still send features. One that failed before is tried again when that
+    /// is asked for.
+    fn add_image_encoders(&self, loaded: &mut Snapshot, before: &Snapshot, refused: Refused) {
         let Some(encoders) = &self.encoders else {
             return;
         };
@@ -222,7 +251,9 @@ impl Loader {
         let mut opened: Vec<(FeatureSource, Option<Arc<ImageEncoder>>)> = Vec::new();
         for (name, adapter) in &before.adapters {
             let encoder = before.image_encoders.get(name).cloned();
-            opened.push((adapter.adapter.source().clone(), encoder));
+            if encoder.is_some() || refused == Refused::LeaveOut {
+                opened.push((adapter.adapter.source().clone(), encoder));
+            }
         }
 
         for (name, adapter) in &loaded.adapters {

@@ -54,6 +54,8 @@ impl Refusal {
 /// What is refused, by name.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Refusals {
+    /// Why the newest choices of defaults do not hold, and older ones do.
+    pub defaults: Option<String>,
     pub rooms: BTreeMap<String, Refusal>,
     pub adapters: BTreeMap<String, Refusal>,
 }
@@ -98,6 +100,7 @@ impl Snapshot {
                 rooms: owned(refused_rooms.filter(|(name, _)| scope.contains(name))),
                 // An adapter may be named after its room.
                 adapters: BTreeMap::new(),
+                defaults: None,
             },
         }
     }
@@ -109,8 +112,7 @@ impl Snapshot {
     }
 
     /// How many rooms are refused, those included that turned out to be damaged when they were
-    /// first
-    /// asked for.
+    /// first asked for.
     pub fn refused_rooms(&self) -> usize {
         let later = |(name, room): &(&String, &Arc<ServedRoom>)| {
             room.refusal().is_some() && !self.refused.rooms.contains_key(*name)
@@ -252,8 +254,7 @@ impl Snapshot {
     ///
     /// # Errors
     /// As [`Snapshot::room`] and [`Snapshot::adapter`]; [`Error::Precondition`] if the room cannot
-    /// be
-    /// loaded, the adapter does not fit it, or none does.
+    /// be loaded, the adapter does not fit it, or none does.
     pub fn navigator(&self, room: &str, adapter: &str) -> Result<Arc<ServedNavigator>, Error> {
         let served = self.room(room)?;
 

@@ -1,7 +1,10 @@
 //! Loading one room under every adapter that fits it.
 
 use std::collections::BTreeMap;
+use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
+
+use futures_util::FutureExt;
 
 use super::Refusal;
 use super::content::Content;
@@ -40,6 +43,10 @@ pub(super) enum Problem {
         adapter: String,
         problem: Box<seese3_core::fitting::Error>,
     },
+    #[error(
+        "loading it panicked, which is a defect of this program: the lines before this one say where"
+    )]
+    Panicked,
 }
 
 impl Problem {
@@ -48,7 +55,7 @@ impl Problem {
         match self {
             Self::Store(error) => may_pass(error),
             Self::Base { problem, .. } => may_pass(problem),
-            Self::Navigator { .. } | Self::Localizer { .. } => false,
+            Self::Navigator { .. } | Self::Localizer { .. } | Self::Panicked => false,
         }
     }
 }
@@ -60,6 +67,15 @@ fn may_pass(error: &store::Error) -> bool {
         error,
         E::Io { .. } | E::Absent { .. } | E::Unknown { .. } | E::UnknownRevision { .. }
     )
+}
+
+/// Loads one thing such that a panic refuses it alone.
+pub(super) async fn contained<T>(
+    loading: impl Future<Output = Result<T, Problem>>,
+) -> Result<T, Problem> {
+    // What the loading had begun is dropped with it.
+    let loaded = AssertUnwindSafe(loading).catch_unwind().await;
+    loaded.unwrap_or(Err(Problem::Panicked))
 }
 
 /// Loads the rooms of a store.
@@ -74,8 +90,7 @@ impl RoomLoader {
     ///
     /// # Errors
     /// [`Problem`] if the room itself cannot be loaded. An adapter that cannot serve it is refused
-    /// by
-    /// itself, and its revision before serves on.
+    /// by itself, and its revision before serves on.
     pub async fn load(
         &self,
         room: &ServedRoom,
@@ -257,8 +272,7 @@ fn log_audit(navigator: &Navigator, adapter: &str) {
 
 /// The map of all frames of a room; none if the adapter is not calibrated. A room that is too small
 /// to track in also gives none, which is logged. Where an adapter was fitted to the room, its
-/// reader
-/// gives the anchors.
+/// reader gives the anchors.
 fn map(
     navigator: &Arc<Navigator>,
     features: &Features,
@@ -281,5 +295,20 @@ fn map(
             tracing::warn!(room = %navigator.room().id(), %error, "the room cannot be tracked in");
             None
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the promise itself: what panics is refused, and tried again only when that is asked for.
+    #[tokio::test]
+    async fn a_panic_refuses_one_thing() {
+        let panicked = contained(async { panic!("on purpose") }).await;
+        let problem: Problem = panicked.map(|()| ()).unwrap_err();
+        assert!(matches!(problem, Problem::Panicked) && !problem.may_pass());
+
+        assert_eq!(contained(async { Ok(7) }).await.unwrap(), 7);
     }
 }

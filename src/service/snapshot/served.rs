@@ -129,8 +129,7 @@ impl ServedRoom {
     }
 
     /// Everything that answers are computed from. Reads the store if the room is not in memory:
-    /// only
-    /// for threads that may block.
+    /// only for threads that may block.
     ///
     /// # Errors
     /// [`Error::Precondition`] if the room cannot be loaded. The log says why.

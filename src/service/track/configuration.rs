@@ -24,13 +24,11 @@ const DRIFT_SHARE: f64 = 0.05;
 const DRIFT_SHARES: std::ops::RangeInclusive<f64> = 1e-4..=10.0;
 
 /// The rooms of a configuration, all under one adapter; at least one. With a camera, those that
-/// were
-/// mapped with one like it, or with one that is not known.
+/// were mapped with one like it, or with one that is not known.
 ///
 /// # Errors
 /// [`Error::Invalid`] if both `room` and `rooms` are given, or the camera is not valid or unlike
-/// that of
-/// every room; otherwise as [`rooms_to_track_in`].
+/// that of every room; otherwise as [`rooms_to_track_in`].
 pub fn rooms(
     snapshot: &Snapshot,
     config: &pb::TrackConfig,
@@ -167,9 +165,8 @@ enum Body {
 }
 
 impl StreamFrames {
-    /// The frames that a configuration names. Names that are left empty take the defaults; the
-    /// name of
-    /// a base only matters where the base is known.
+    /// The frames that a configuration names. Names that are left empty take the defaults; the name
+    /// of a base only matters where the base is known.
     ///
     /// # Errors
     /// [`Error::Invalid`] for a name that is too long or twice the same, and for a bad pose.
@@ -191,8 +188,8 @@ impl StreamFrames {
     }
 
     /// A pose on the map that is given from outside, of the camera or the base, as the camera's.
-    /// Its
-    /// frames may have the stream's own names or those of the service, `rooms/NAME` and `camera`.
+    /// Its frames may have the stream's own names or those of the service, `rooms/NAME` and
+    /// `camera`.
     ///
     /// # Errors
     /// [`Error::Invalid`] if the pose is missing or not valid, or a standard deviation is out of
@@ -206,8 +203,7 @@ impl StreamFrames {
         let mut pose = pose.ok_or_else(|| Error::invalid("pose", "is required"))?;
 
         // `convert::pose` takes an empty name for the room's world or the camera, so the stream's
-        // own
-        // names are cleared.
+        // own names are cleared.
         clear_name(&mut pose.parent_frame, &self.names.map);
         let body = self.body(&mut pose, Body::Camera);
         let pose = convert::pose(pose, room).map_err(|error| error.within("pose"))?;
@@ -273,8 +269,7 @@ impl StreamFrames {
     }
 
     /// A belief of a body's pose as one of the camera's. The error is in the body's own frame, so
-    /// that
-    /// it is carried over by the adjoint.
+    /// that it is carried over by the adjoint.
     fn of_camera(&self, belief: Belief, body: Body) -> Belief {
         match (body, self.base_from_camera) {
             (Body::Base, Some(base_from_camera)) => on_another_body(&belief, &base_from_camera),

@@ -68,8 +68,7 @@ impl SealedRoom {
     }
 
     /// Where this room is among those that are served: one that has the same frames, maybe with
-    /// others
-    /// behind them. Poses and latents of a state mean the same there.
+    /// others behind them. Poses and latents of a state mean the same there.
     fn place_in(&self, served: &[Arc<ServedNavigator>]) -> Option<usize> {
         let is_this = |served: &Arc<ServedNavigator>| {
             let room = served.navigator.room();
@@ -93,8 +92,7 @@ impl SealedRoom {
 
 impl Sealed {
     /// The state, with its rooms by their numbers among those that are served here under the
-    /// stream's
-    /// adapter; none if the state means nothing here.
+    /// stream's adapter; none if the state means nothing here.
     ///
     /// # Errors
     /// [`Error::Internal`] if the numbers do not make a state.
@@ -595,8 +593,7 @@ impl SealedState {
     ///
     /// # Errors
     /// [`Error::Internal`] if a belief does not have its numbers, or a room's index is too large
-    /// for
-    /// this machine. No token that a server sealed has either.
+    /// for this machine. No token that a server sealed has either.
     pub fn state(self) -> Result<State, Error> {
         let Self {
             room,

@@ -97,8 +97,7 @@ impl Session {
 
     /// Whether the state's latents have the width of this adapter and its room indices exist here.
     /// The rooms' content should guarantee it; without this check a state that does not fit would
-    /// be a
-    /// panic in the tracker.
+    /// be a panic in the tracker.
     fn fits(&self) -> bool {
         let adapter = &self.served[0].adapter.adapter;
         let rooms = self.served.len();
@@ -439,8 +438,7 @@ impl Session {
 
     fn answer(&self, answer: pb::track_response::Answer) -> pb::TrackResponse {
         // The token carries the whole state, so that the stream can go on from it after a restart
-        // or
-        // on another server.
+        // or on another server.
         let sealed = Sealed {
             config: Some(self.config.clone()),
             adapter: self.served[0].content.adapter.to_vec(),

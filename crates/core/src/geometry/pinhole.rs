@@ -103,8 +103,7 @@ impl Pinhole {
     }
 
     /// In what another camera sees so much more or less that places look different through it, in
-    /// words;
-    /// none if it does not.
+    /// words; none if it does not.
     pub fn difference(&self, other: &Self) -> Option<String> {
         [
             ("across", self.degrees_across(), other.degrees_across()),
@@ -168,9 +167,8 @@ mod tests {
         );
     }
 
-    /// Oracle: by hand. 320 pixels before the middle of 640 are 45° to each side; an edge that
-    /// lies at the
-    /// principal point itself adds nothing.
+    /// Oracle: by hand. 320 pixels before the middle of 640 are 45° to each side; an edge that lies
+    /// at the principal point itself adds nothing.
     #[test]
     fn the_field_of_view_is_the_angle_between_the_edges() {
         let half = PixelCamera {

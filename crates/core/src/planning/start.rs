@@ -24,12 +24,10 @@ pub struct BelievedStart {
     /// `world_from_camera`.
     pub pose: Pose,
     /// The covariance of its error in its own body frame, where it is known: of a pose that the
-    /// view
-    /// tells, by a calibrated adapter.
+    /// view tells, by a calibrated adapter.
     pub covariance: Option<Matrix6<f64>>,
     /// The view's distance over the room's limit, where that is known: above 1 it looks like
-    /// another
-    /// place.
+    /// another place.
     pub out_of_distribution: Option<f64>,
     /// Whether the view told the pose. Else it was recorded or given.
     is_seen: bool,
@@ -57,13 +55,10 @@ impl BelievedStart {
         }
     }
 
-    /// The pose that a view tells, by its latent of shape (k,) and, if it is known, its raw
-    /// feature of
-    /// shape (d,): as the adapter reads it that was fitted to the room, as far as that was
-    /// measured;
-    /// else between the frames that look most like it; else, without a calibrated adapter, that of
-    /// the
-    /// nearest frame.
+    /// The pose that a view tells, by its latent of shape (k,) and, if it is known, its raw feature
+    /// of shape (d,): as the adapter reads it that was fitted to the room, as far as that was
+    /// measured; else between the frames that look most like it; else, without a calibrated
+    /// adapter, that of the nearest frame.
     pub fn seen(room: KnownRoom<'_>, latent: ArrayView1<'_, f64>, feature: Option<&[f32]>) -> Self {
         let query = MapQuery { latent, feature };
         let matched = room.map.map(|map| map.match_view(query, 1));
@@ -89,9 +84,8 @@ impl BelievedStart {
         }
     }
 
-    /// How many times as far from the room as its limit the view is, if it is and its pose was
-    /// told by
-    /// the view: that pose means nothing.
+    /// How many times as far from the room as its limit the view is, if it is and its pose was told
+    /// by the view: that pose means nothing.
     pub fn beyond_limit(&self) -> Option<f64> {
         self.out_of_distribution
             .filter(|far| *far > 1.0 && self.is_seen)

@@ -178,9 +178,8 @@ pub struct RecordedMedian {
 }
 
 /// The median of values in the order of a recording, with a percentile bootstrap over at most
-/// twenty
-/// contiguous blocks, equally long but for the last, since values of neighbouring frames are alike;
-/// NaN without values.
+/// twenty contiguous blocks, equally long but for the last, since values of neighbouring frames are
+/// alike; NaN without values.
 pub fn median_of_recording(values: &[f64], seed: u64) -> RecordedMedian {
     const BLOCKS: usize = 20;
     const MEDIANS: usize = 2_000;

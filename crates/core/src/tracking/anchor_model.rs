@@ -1,12 +1,10 @@
 //! The pose of a view by the mapped frames that look most like it, and how wrong that is in this
-//! very
-//! room.
+//! very room.
 //!
 //! The three nearest frames are blended: a view between two mapped frames lies between them. How
-//! far
-//! off the blend is shows in the distances of the frames, and above all in whether they agree. What
-//! that means in this room its own frames tell: each is looked for when it and its neighbours are
-//! left out, and its true pose is known.
+//! far off the blend is shows in the distances of the frames, and above all in whether they agree.
+//! What that means in this room its own frames tell: each is looked for when it and its neighbours
+//! are left out, and its true pose is known.
 
 use nalgebra::{Matrix5, Matrix6, Vector5, Vector6};
 use ndarray::{Array2, ArrayView1};
@@ -31,8 +29,7 @@ const SAME_PLACE: f64 = 0.5;
 /// A frame's weight falls with this power of its distance.
 const POWER: i32 = 4;
 /// Added to distances, in the unit of the coordinates, and to lengths of motions, metres and
-/// radians
-/// mixed, before their logarithms are taken.
+/// radians mixed, before their logarithms are taken.
 const LEAST: f64 = 1e-3;
 
 /// At most so many mapped frames are left out.
@@ -118,9 +115,8 @@ struct LeftOut {
 
 impl Blend {
     /// The blend of the frames nearest to a view, in order of their distance; there is at least
-    /// one.
-    /// `second_opinion` is the pose that the same view has by another measure of likeness, if there
-    /// is one.
+    /// one. `second_opinion` is the pose that the same view has by another measure of likeness, if
+    /// there is one.
     pub fn of(
         navigator: &Navigator,
         nearest: &[Neighbour],
@@ -410,15 +406,13 @@ fn left_out_blends(
 }
 
 /// By what mapped frames are alike: coordinates, row by frame; frames are alike that lie near to
-/// one
-/// another.
+/// one another.
 #[derive(Clone, Copy)]
 pub struct Likeness<'a> {
     /// Those by which frames are found.
     pub coordinates: &'a Array2<f64>,
     /// For each part of the mapped frames, those that know nothing of the part, if the first were
-    /// made
-    /// from these very frames.
+    /// made from these very frames.
     pub without_part: Option<&'a [Array2<f64>]>,
     /// Others, by which frames are found a second time.
     pub second_opinion: Option<&'a Array2<f64>>,
@@ -448,8 +442,7 @@ fn by_distance(coordinates: &Array2<f64>, mapped: &[FrameId], frame: FrameId) ->
 }
 
 /// The blends of a mapped frame with their errors, one for each round of what is left out; none
-/// where
-/// too few frames are left.
+/// where too few frames are left.
 fn blends_without(
     navigator: &Navigator,
     likeness: Likeness<'_>,

@@ -1,10 +1,9 @@
 //! What the views of one room differ in: the principal components of its own features.
 //!
 //! A latent holds what tells motion in any room, and little of what tells two places of this room
-//! apart.
-//! In six calibration rooms of which every second frame was mapped the frame that was nearest by
-//! its
-//! latent was .035 m off, by its feature .015 m, and by 32 components of the feature .017 m.
+//! apart. In six calibration rooms of which every second frame was mapped the frame that was
+//! nearest by its latent was .035 m off, by its feature .015 m, and by 32 components of the feature
+//! .017 m.
 
 use nalgebra::SymmetricEigen;
 use ndarray::{Array1, Array2, ArrayView2, Axis};
@@ -18,10 +17,9 @@ const COMPONENTS: usize = 32;
 const SAMPLED: usize = 128;
 /// Of fewer frames nothing is told.
 const FEWEST: usize = 48;
-/// A component is divided by the root of its standard deviation, to which this share of the
-/// largest one
-/// is added: those that vary little count for more than they would by themselves, and for less than
-/// if all varied alike. Chosen on calibration rooms, where it makes little difference.
+/// A component is divided by the root of its standard deviation, to which this share of the largest
+/// one is added: those that vary little count for more than they would by themselves, and for less
+/// than if all varied alike. Chosen on calibration rooms, where it makes little difference.
 const LEAST_SHARE: f64 = 0.05;
 /// The root mean square of the coordinates of mapped frames.
 const SPREAD: f64 = 10.0;
@@ -38,9 +36,8 @@ pub struct RoomAppearance {
     pub appearance: Appearance,
     /// By those components, shape (n, c).
     pub coordinates: Array2<f64>,
-    /// By the components without one part of the mapped frames, a part each. A view of a place
-    /// that was
-    /// not mapped is nearer to mapped frames than one whose neighbours the components were made
+    /// By the components without one part of the mapped frames, a part each. A view of a place that
+    /// was not mapped is nearer to mapped frames than one whose neighbours the components were made
     /// for.
     pub without_part: Vec<Array2<f64>>,
 }
@@ -83,8 +80,7 @@ pub struct Appearance {
 
 impl Appearance {
     /// The components of the mapped frames of a room, whose features have shape (n, d). None if
-    /// they are
-    /// few or all alike.
+    /// they are few or all alike.
     pub fn of(features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Option<Self> {
         let every = mapped.len().div_ceil(SAMPLED).max(1);
         let sampled: Vec<usize> = mapped
@@ -180,9 +176,8 @@ mod tests {
     }
 
     /// Oracle: by hand. Features turn a little in a plane, besides a length that says nothing:
-    /// nearly all
-    /// that varies is the sine of the angle, scaled to a root mean square of 10, and lengths do not
-    /// matter.
+    /// nearly all that varies is the sine of the angle, scaled to a root mean square of 10, and
+    /// lengths do not matter.
     #[test]
     fn coordinates_tell_what_varies_and_no_length() {
         let angle = |row: usize| 0.001 * (row as f64 - 49.5);

@@ -25,8 +25,7 @@ pub trait PoseReader: Send + Sync {
     fn read_pose(&self, feature: &[f32]) -> Option<Belief>;
 
     /// How far a view is from the map, over the furthest that the reader was tried at: above 1 it
-    /// reads
-    /// nothing. None if it does not know such a distance.
+    /// reads nothing. None if it does not know such a distance.
     fn distance_over_range(&self, _feature: &[f32]) -> Option<f64> {
         None
     }
@@ -38,8 +37,7 @@ pub struct MapQuery<'a> {
     /// Its latent, shape (k,).
     pub latent: ArrayView1<'a, f64>,
     /// Its raw feature, shape (d,), if it is known. It finds the mapped frames that are nearest
-    /// better
-    /// than the latent does.
+    /// better than the latent does.
     pub feature: Option<&'a [f32]>,
 }
 
@@ -90,8 +88,7 @@ pub struct MapMatch {
     /// latent in standard deviations of frame noise; at least one.
     pub nearest: Vec<Neighbour>,
     /// The distance of the nearest latent, in standard deviations of frame noise: it compares
-    /// between
-    /// rooms.
+    /// between rooms.
     pub distance: f64,
     /// That distance over the room's limit: above 1 the view looks like another place.
     pub out_of_distribution: f64,
@@ -162,10 +159,8 @@ impl Map {
     }
 
     /// The same map with the raw features of its room, shape (n, d), of which the frames `mapped`
-    /// are
-    /// mapped: a view whose feature is known is looked for by it. A room with few frames, or of
-    /// which
-    /// they tell too little, stays as it is.
+    /// are mapped: a view whose feature is known is looked for by it. A room with few frames, or of
+    /// which they tell too little, stays as it is.
     #[must_use]
     pub fn with_features(self, features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Self {
         let measured = || {
@@ -312,8 +307,8 @@ impl Map {
 }
 
 /// The median distance from a mapped frame to the nearest other one that is not among its
-/// `neighbours`
-/// before and after it in time: how far apart views of this room lie when a camera comes back.
+/// `neighbours` before and after it in time: how far apart views of this room lie when a camera
+/// comes back.
 fn typical_distance(
     index: &ExactIndex,
     whitened: &Array2<f64>,

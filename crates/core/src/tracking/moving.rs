@@ -10,15 +10,12 @@ pub(super) type Matrix12 = SMatrix<f64, 12, 12>;
 type Matrix18 = SMatrix<f64, 18, 18>;
 
 /// A person turns and stops more abruptly than a Gaussian velocity of the same variance and
-/// duration:
-/// the variance that is added on the way is multiplied by this. Chosen on calibration rooms, from
-/// 1 to
-/// 16: 1 follows late, from 8 on velocities are worse.
+/// duration: the variance that is added on the way is multiplied by this. Chosen on calibration
+/// rooms, from 1 to 16: 1 follows late, from 8 on velocities are worse.
 const ABRUPTNESS: f64 = 4.0;
 
 /// A pose and a velocity with the covariance of their errors: the pose's δ in its body frame, true
-/// =
-/// pose · exp(δ), and the velocity's, each ordered (v, ω); metres, radians and seconds.
+/// = pose · exp(δ), and the velocity's, each ordered (v, ω); metres, radians and seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MovingBelief {
     /// `parent_from_camera`.
@@ -172,11 +169,9 @@ mod tests {
     }
 
     /// Oracle: the stationary Ornstein–Uhlenbeck process in closed form: after a time t the
-    /// variance
-    /// of the way is 2σ²τ²(t/τ − 1 + e^(−t/τ)), its covariance with the velocity σ²τ(1 − e^(−t/τ)).
-    /// What of that comes from the velocity at the beginning is taken once, the rest as abruptly
-    /// as a
-    /// person moves. And Kalman's gain by hand.
+    /// variance of the way is 2σ²τ²(t/τ − 1 + e^(−t/τ)), its covariance with the velocity σ²τ(1 −
+    /// e^(−t/τ)). What of that comes from the velocity at the beginning is taken once, the rest as
+    /// abruptly as a person moves. And Kalman's gain by hand.
     #[test]
     fn a_measured_pose_tells_the_velocity() {
         let (variance, duration, time) = (0.25, 0.5, 0.1_f64);
@@ -206,8 +201,7 @@ mod tests {
     }
 
     /// Oracle: the definition: a motion that is read exactly is the motion, and leaves the errors
-    /// that
-    /// were there before, carried to the new body frame; one of which nothing is known changes
+    /// that were there before, carried to the new body frame; one of which nothing is known changes
     /// nothing.
     #[test]
     fn a_reading_counts_as_much_as_it_is_sure() {

@@ -18,8 +18,7 @@ pub struct Observation {
     /// Its latent under the tracker's adapter, shape (k,).
     pub latent: Array1<f64>,
     /// The raw feature of that latent, shape (d,), if it is known: mapped frames are found by it,
-    /// and the
-    /// [`super::PoseReader`] of a map reads it.
+    /// and the [`super::PoseReader`] of a map reads it.
     pub feature: Option<Vec<f32>>,
     /// Whether the image is known to show nothing: it is blank, or all bright or dark.
     pub is_blank: bool,
@@ -80,12 +79,10 @@ pub struct Keyframe {
     /// Its latent.
     pub latent: Vec<f64>,
     /// `odom_from_camera` at this frame and the camera's velocity, of which nothing is known but
-    /// what
-    /// motions were read.
+    /// what motions were read.
     pub odom: MovingBelief,
     /// `map_from_camera` as it is reported: with the covariance that its errors were measured to
-    /// have,
-    /// and also after the tracker stopped believing it.
+    /// have, and also after the tracker stopped believing it.
     pub reported_pose: Option<Belief>,
 }
 
@@ -99,8 +96,7 @@ pub struct Place {
     /// `map_from_camera` and the camera's velocity.
     pub belief: MovingBelief,
     /// The covariance of the lasting error of the anchor that corrected it last, which the filter
-    /// cannot
-    /// average away; zero where its errors do not last.
+    /// cannot average away; zero where its errors do not last.
     pub lasting: Matrix6<f64>,
 }
 

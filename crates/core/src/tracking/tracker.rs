@@ -29,8 +29,7 @@ use crate::adapter::{Adapter, ErrorModel, JUMP_WINDOW};
 /// camera that stands still is some tenths.
 const UNCHANGED_DISTANCE: f64 = 0.01;
 /// After so many frames that are the same image a camera is taken to be frozen. Recordings hold
-/// pairs
-/// of the same image where a frame was dropped.
+/// pairs of the same image where a frame was dropped.
 const FROZEN_FRAMES: u32 = 5;
 
 /// What a frame shows of the world.
@@ -56,17 +55,15 @@ impl Sight {
     }
 }
 
-/// After a longer pause than this, in frames of the calibration rooms, a jump could not be
-/// noticed: half
-/// a second at 30 Hz.
+/// After a longer pause than this, in frames of the calibration rooms, a jump could not be noticed:
+/// half a second at 30 Hz.
 const LONGEST_GAP: u64 = 15;
 
 /// Settings of a tracker.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackerSettings {
     /// A new keyframe is taken after the time that so many frames took in the rooms where the
-    /// adapter's
-    /// errors were measured; at least 1.
+    /// adapter's errors were measured; at least 1.
     pub keyframe_frames: u32,
     /// A new keyframe is taken after a motion of this length, ‖(v, ω)‖, metres and radians mixed;
     /// above 0.
@@ -443,8 +440,7 @@ impl Tracker {
 }
 
 /// Keeps the frame, takes it as the keyframe if one is due, and keeps where the camera is believed
-/// to
-/// be if that is new.
+/// to be if that is new.
 fn remember(
     state: &mut State,
     frame: &Observation,

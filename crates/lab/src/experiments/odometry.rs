@@ -172,8 +172,7 @@ impl TrackedRoom<'_> {
     }
 
     /// The pose of the mapped frame whose raw feature is most like one of shape (d,), by the
-    /// cosine: the
-    /// simplest answer.
+    /// cosine: the simplest answer.
     pub fn most_alike(&self, feature: ArrayView1<'_, f32>) -> &Pose {
         let cosine = |frame: &&FrameId| {
             let row = self.features.row(frame.row());

@@ -1,15 +1,11 @@
 //! Planners beside one another: from an unmapped view to a mapped goal, driven without looking
 //! again.
 //!
-//! Every second frame of a room (or what the hold-out says) is a room of its own, which is all
-//! that a
-//! planner knows. A question is the view of another frame, and a mapped frame as the goal. A
-//! planner
-//! answers with where it believes the camera to be and with poses to drive to. A simulated robot
-//! then
-//! drives these motions one after another from where the camera truly is. The planner is right if
-//! the
-//! robot ends within the tolerance of the goal.
+//! Every second frame of a room (or what the hold-out says) is a room of its own, which is all that
+//! a planner knows. A question is the view of another frame, and a mapped frame as the goal. A
+//! planner answers with where it believes the camera to be and with poses to drive to. A simulated
+//! robot then drives these motions one after another from where the camera truly is. The planner is
+//! right if the robot ends within the tolerance of the goal.
 //!
 //! Views of other rooms are asked about too: there a planner should find no way.
 
@@ -50,15 +46,13 @@ pub struct PlanningProtocol {
     pub hold_out: HoldOut,
     /// Questions in each room.
     pub questions: usize,
-    /// The longest hop, ‖(v, ω)‖ with metres and radians mixed. None takes the adapter's own,
-    /// which ours
-    /// and the pose graph exceed where there is no other way.
+    /// The longest hop, ‖(v, ω)‖ with metres and radians mixed. None takes the adapter's own, which
+    /// ours and the pose graph exceed where there is no other way.
     pub longest_hop: Option<f64>,
     /// Of the questions.
     pub seed: u64,
     /// Whether an adapter is fitted to the mapped frames, from the given one's weights, and tells
-    /// ours
-    /// where a view is.
+    /// ours where a view is.
     pub is_fitted: bool,
 }
 

@@ -1,6 +1,5 @@
 //! What a tracker's answers are worth: their errors beside those of the simplest answers to the
-//! same
-//! frames, and how honest their covariances and statuses are.
+//! same frames, and how honest their covariances and statuses are.
 
 use seese3_core::geometry::{Pose, PoseError, body_twist};
 use seese3_core::statistics::{mean, root_mean_square};
@@ -53,9 +52,8 @@ pub struct VelocityErrors {
 }
 
 impl TrackingScores {
-    /// The scores of a replay; `nearest_frame` gives the pose of the mapped frame whose raw
-    /// feature is
-    /// most like that of a row.
+    /// The scores of a replay; `nearest_frame` gives the pose of the mapped frame whose raw feature
+    /// is most like that of a row.
     pub fn of(replay: &Replay, nearest_frame: impl Fn(usize) -> Pose) -> Self {
         Self::of_rows(replay, |_| true, nearest_frame)
     }

@@ -47,8 +47,7 @@ pub struct DisturbedTracking {
     pub statuses: StatusShares,
     /// After how many disturbed frames the status was no longer TRACKING, in the stream where that
     /// took longest; none where it stayed TRACKING to the end. Only of disturbances of a part of
-    /// the
-    /// stream.
+    /// the stream.
     pub noticed_after: Option<usize>,
 }
 
