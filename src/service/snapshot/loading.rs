@@ -8,7 +8,11 @@
 //!   read is tried at every look.
 
 use std::collections::BTreeMap;
+use std::num::NonZero;
 use std::sync::Arc;
+
+use futures_util::StreamExt;
+use tokio::runtime::Handle;
 
 use super::super::image_encoder::{self, ImageEncoder, ImageEncoders};
 use super::super::metrics::Metrics;
@@ -47,6 +51,13 @@ impl Default for RoomMemory {
             bytes: None,
         }
     }
+}
+
+/// What became of a room.
+struct TriedRoom {
+    served: Option<Arc<ServedRoom>>,
+    /// Why its current revision is not what is served.
+    refusal: Option<Refusal>,
 }
 
 /// Loads the snapshots of one server.
@@ -139,11 +150,15 @@ impl Loader {
         // Loading mixes reads with long computation (embedding, indexing). On an async thread it
         // would hold up health checks and requests.
         let loader = self.clone();
-        let runtime = tokio::runtime::Handle::current();
+        let runtime = Handle::current();
         blocking(move || runtime.block_on(loader.load_now(&before, refused))).await
     }
 
-    async fn load_now(&self, before: &Snapshot, refused: Refused) -> Result<Snapshot, RunError> {
+    async fn load_now(
+        &self,
+        before: &Arc<Snapshot>,
+        refused: Refused,
+    ) -> Result<Snapshot, RunError> {
         let mut loaded = Snapshot {
             two_views: self.two_views.clone(),
             ..Snapshot::default()
@@ -156,17 +171,51 @@ impl Loader {
         }
         self.add_image_encoders(&mut loaded, before, refused);
 
-        for (name, revision) in self.store.current_rooms(&defaults).await? {
-            if let Some(adapter) = defaults.adapter(&name) {
-                loaded
-                    .default_adapters
-                    .insert(name.clone(), adapter.to_owned());
-            }
-            self.add_room(&mut loaded, before, refused, name, revision)
-                .await;
+        let rooms = self.store.current_rooms(&defaults).await?;
+        for (name, _) in &rooms {
+            let chosen = defaults.adapter(name).map(str::to_owned);
+            loaded
+                .default_adapters
+                .extend(chosen.map(|adapter| (name.clone(), adapter)));
         }
+        self.add_rooms(&mut loaded, before, refused, rooms).await?;
 
         Ok(loaded)
+    }
+
+    /// Adds rooms, each in its current revision. At the start they are loaded on all processors at the
+    /// same time; later one after another, because requests are being answered.
+    async fn add_rooms(
+        &self,
+        loaded: &mut Snapshot,
+        before: &Arc<Snapshot>,
+        refused: Refused,
+        rooms: Vec<(String, u64)>,
+    ) -> Result<(), RunError> {
+        let at_once = match before.rooms.is_empty() {
+            true => std::thread::available_parallelism().map_or(1, NonZero::get),
+            false => 1,
+        };
+        let adapters = Arc::new(loaded.adapters.clone());
+        let tried = rooms.into_iter().map(|(name, revision)| {
+            let (loader, before, adapters) = (self.clone(), before.clone(), adapters.clone());
+            let runtime = Handle::current();
+            blocking(move || {
+                let tried = loader.tried_room(&name, revision, &adapters, &before, refused);
+                let tried = runtime.block_on(tried);
+                Ok((name, tried))
+            })
+        });
+
+        let mut tried = futures_util::stream::iter(tried).buffered(at_once);
+        while let Some(tried) = tried.next().await {
+            let (name, TriedRoom { served, refusal }) = tried?;
+            loaded.rooms.extend(served.map(|room| (name.clone(), room)));
+            let refusals = &mut loaded.refused.rooms;
+            refusals.extend(refusal.map(|refusal| (name, refusal)));
+        }
+
+        Ok(())
     }
 
     /// The choices of an operator. If the file of the newest ones is damaged, those before it hold.
@@ -273,42 +322,46 @@ impl Loader {
         }
     }
 
-    /// Adds the current revision of a room; if it is refused, the one that was served before.
-    async fn add_room(
+    /// The current revision of a room; if it is refused, the one that was served before.
+    async fn tried_room(
         &self,
-        loaded: &mut Snapshot,
+        name: &str,
+        revision: u64,
+        adapters: &BTreeMap<String, Arc<StoredAdapter>>,
         before: &Snapshot,
         refused: Refused,
-        name: String,
-        revision: u64,
-    ) {
-        let known = before.rooms.get(&name);
+    ) -> TriedRoom {
+        let known = before.rooms.get(name);
         let same = known.filter(|known| known.summary.revision == revision);
         if let Some(same) = same
-            && is_up_to_date(same, &loaded.adapters, refused)
+            && is_up_to_date(same, adapters, refused)
         {
-            loaded.rooms.insert(name, same.clone());
-            return;
+            return TriedRoom {
+                served: Some(same.clone()),
+                refusal: None,
+            };
         }
 
-        let refusal = match kept(&before.refused.rooms, &name, revision, refused) {
+        let refusal = match kept(&before.refused.rooms, name, revision, refused) {
             Some(refusal) => refusal,
-            None => match self.room(&name, revision, &loaded.adapters, known).await {
+            None => match self.room(name, revision, adapters, known).await {
                 Ok(room) => {
-                    loaded.rooms.insert(name, Arc::new(room));
-                    return;
+                    return TriedRoom {
+                        served: Some(Arc::new(room)),
+                        refusal: None,
+                    };
                 }
                 Err(refusal) => {
-                    log_refusal("room", &name, before.refused.rooms.get(&name), &refusal);
+                    log_refusal("room", name, before.refused.rooms.get(name), &refusal);
                     refusal
                 }
             },
         };
 
-        if let Some(known) = known {
-            loaded.rooms.insert(name.clone(), known.clone());
+        TriedRoom {
+            served: known.cloned(),
+            refusal: Some(refusal),
         }
-        loaded.refused.rooms.insert(name, refusal);
     }
 
     /// A room that is to be served. `known` is the room as it was served before: what is in memory of

@@ -3,7 +3,7 @@
 
 use ndarray::ArrayView2;
 
-use super::{Exclusion, Index, Neighbour, by_distance_then_frame, distance};
+use super::{Exclusion, Index, Nearest, Neighbour, distance};
 use crate::room::FrameId;
 
 /// Latents, row by row, with the frame that each belongs to.
@@ -31,35 +31,15 @@ impl ExactIndex {
 
 impl Index for ExactIndex {
     fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbour> {
-        // `best` stays sorted and never grows beyond k, so that nothing has to be sorted at the
-        // end.
-        let mut best: Vec<Neighbour> = Vec::with_capacity(k.min(self.frames.len()) + 1);
+        let mut nearest = Nearest::new(k, self.frames.len());
         for (row, &frame) in self.values.chunks_exact(self.width).zip(&self.frames) {
-            if exclusion.is_some_and(|exclusion| exclusion.covers(frame)) {
-                continue;
+            if !exclusion.is_some_and(|exclusion| exclusion.covers(frame)) {
+                let distance = distance(row, query);
+                nearest.offer(Neighbour { frame, distance });
             }
-
-            let found = Neighbour {
-                frame,
-                distance: distance(row, query),
-            };
-
-            // Most frames are no better than the k-th best so far and are dropped here.
-            let full = best.len() == k;
-            if full
-                && best
-                    .last()
-                    .is_none_or(|worst| by_distance_then_frame(&found, worst).is_ge())
-            {
-                continue;
-            }
-
-            let at = best.partition_point(|other| by_distance_then_frame(other, &found).is_lt());
-            best.insert(at, found);
-            best.truncate(k);
         }
 
-        best
+        nearest.found()
     }
 
     fn memory_bytes(&self) -> usize {

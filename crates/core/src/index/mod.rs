@@ -66,11 +66,59 @@ fn by_distance_then_frame(a: &Neighbour, b: &Neighbour) -> std::cmp::Ordering {
         .then(a.frame.cmp(&b.frame))
 }
 
-/// L2 distance, summed in order of the columns.
-fn distance(a: &[f64], b: &[f64]) -> f64 {
-    a.iter()
-        .zip(b)
-        .map(|(x, y)| (x - y) * (x - y))
-        .sum::<f64>()
-        .sqrt()
+/// L2 distance. Columns are summed in four lanes, which a processor adds at the same time; the order
+/// is always the same, so that equal rows have equal distances.
+pub(crate) fn distance(a: &[f64], b: &[f64]) -> f64 {
+    let ((a_lanes, a_rest), (b_lanes, b_rest)) = (a.as_chunks::<4>(), b.as_chunks::<4>());
+
+    let mut sums = [0.0; 4];
+    for (a, b) in a_lanes.iter().zip(b_lanes) {
+        for lane in 0..4 {
+            sums[lane] += (a[lane] - b[lane]) * (a[lane] - b[lane]);
+        }
+    }
+
+    let rest = a_rest.iter().zip(b_rest).map(|(a, b)| (a - b) * (a - b));
+    let sum = sums.iter().sum::<f64>() + rest.sum::<f64>();
+    sum.sqrt()
+}
+
+/// The nearest of all neighbours that are offered, by distance and then by frame.
+#[derive(Debug)]
+pub(crate) struct Nearest {
+    count: usize,
+    /// Always sorted and never longer than `count`, so that nothing has to be sorted at the end.
+    best: Vec<Neighbour>,
+}
+
+impl Nearest {
+    /// None yet, and at most `count` of the `offered` ones.
+    pub fn new(count: usize, offered: usize) -> Self {
+        Self {
+            count,
+            best: Vec::with_capacity(count.min(offered) + 1),
+        }
+    }
+
+    #[inline]
+    pub fn offer(&mut self, found: Neighbour) {
+        // Most are no better than the worst so far and are dropped here.
+        let is_full = self.best.len() == self.count;
+        let worst = self.best.last();
+        if is_full && worst.is_none_or(|worst| found.distance > worst.distance) {
+            return;
+        }
+        self.insert(found);
+    }
+
+    fn insert(&mut self, found: Neighbour) {
+        let is_before = |other: &Neighbour| by_distance_then_frame(other, &found).is_lt();
+        let place = self.best.partition_point(is_before);
+        self.best.insert(place, found);
+        self.best.truncate(self.count);
+    }
+
+    pub fn found(self) -> Vec<Neighbour> {
+        self.best
+    }
 }

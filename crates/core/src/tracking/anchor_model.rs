@@ -14,7 +14,7 @@ use super::appearance::part_of;
 use super::clock::seconds_between;
 use crate::adapter::ErrorModel;
 use crate::geometry::{Pose, Twist, body_twist, exp};
-use crate::index::Neighbour;
+use crate::index::{Nearest, Neighbour, distance};
 use crate::navigation::Navigator;
 use crate::room::FrameId;
 use crate::statistics::{median, robust_covariance};
@@ -418,27 +418,17 @@ pub struct Likeness<'a> {
     pub second_opinion: Option<&'a Array2<f64>>,
 }
 
-/// The mapped frames by their distance from one of them, the nearest first.
-fn by_distance(coordinates: &Array2<f64>, mapped: &[FrameId], frame: FrameId) -> Vec<Neighbour> {
-    let row = coordinates.row(frame.row());
-    let distance_to = |other: FrameId| {
-        let difference = &coordinates.row(other.row()) - &row;
-        difference.dot(&difference).sqrt()
-    };
-    let mut nearest: Vec<Neighbour> = mapped
-        .iter()
-        .map(|&other| Neighbour {
-            frame: other,
-            distance: distance_to(other),
-        })
-        .collect();
-    nearest.sort_by(|a, b| {
-        a.distance
-            .total_cmp(&b.distance)
-            .then(a.frame.cmp(&b.frame))
-    });
+/// How far the mapped frames are from one of them.
+fn distances_from(coordinates: &Array2<f64>, mapped: &[FrameId], frame: FrameId) -> Vec<Neighbour> {
+    // Rows of an array in standard layout are slices.
+    let coordinates = coordinates.as_standard_layout();
+    let row = |frame: FrameId| coordinates.row(frame.row()).to_slice().unwrap_or_default();
 
-    nearest
+    let of = |&other: &FrameId| Neighbour {
+        frame: other,
+        distance: distance(row(other), row(frame)),
+    };
+    mapped.iter().map(of).collect()
 }
 
 /// The blends of a mapped frame with their errors, one for each round of what is left out; none
@@ -449,14 +439,14 @@ fn blends_without(
     mapped: &[FrameId],
     frame: FrameId,
 ) -> Vec<Option<(Blend, Vector6<f64>)>> {
-    let nearest = by_distance(likeness.coordinates, mapped, frame);
-    let nearest_unseen = likeness.without_part.map(|coordinates| {
+    let distances = distances_from(likeness.coordinates, mapped, frame);
+    let distances_unseen = likeness.without_part.map(|coordinates| {
         let place = mapped.partition_point(|other| other < &frame);
-        by_distance(&coordinates[part_of(place, mapped.len())], mapped, frame)
+        distances_from(&coordinates[part_of(place, mapped.len())], mapped, frame)
     });
     let second = likeness
         .second_opinion
-        .map(|coordinates| by_distance(coordinates, mapped, frame));
+        .map(|coordinates| distances_from(coordinates, mapped, frame));
 
     let timeline = navigator.room().timeline();
     let rounds = LEFT_OUT_ROWS.map(Some).into_iter().chain([None]);
@@ -465,21 +455,20 @@ fn blends_without(
             Some(rows) => other.frame.0.abs_diff(frame.0) > rows,
             None => !timeline.joins(other.frame, frame),
         };
-        let left = |nearest: &[Neighbour]| -> Option<Vec<Neighbour>> {
-            let left: Vec<Neighbour> = nearest
-                .iter()
-                .filter(is_left)
-                .take(LOOKED_AT)
-                .copied()
-                .collect();
+        let left = |distances: &[Neighbour]| -> Option<Vec<Neighbour>> {
+            let mut nearest = Nearest::new(LOOKED_AT, distances.len());
+            for other in distances.iter().filter(is_left) {
+                nearest.offer(*other);
+            }
+            let left = nearest.found();
             (left.len() == LOOKED_AT).then_some(left)
         };
 
         // A frame with neighbours is told from them by coordinates that were made for its place.
         let is_unseen = rows.is_none_or(|rows| rows >= UNSEEN_ROWS);
-        let nearest = match &nearest_unseen {
-            Some(nearest_unseen) if is_unseen => nearest_unseen,
-            _ => &nearest,
+        let distances = match &distances_unseen {
+            Some(distances_unseen) if is_unseen => distances_unseen,
+            _ => &distances,
         };
 
         let latents = navigator.latents();
@@ -488,7 +477,7 @@ fn blends_without(
             .as_deref()
             .and_then(left)
             .map(|left| Blend::of(navigator, &left, latent, None).pose);
-        let blend = Blend::of(navigator, &left(nearest)?, latent, second.as_ref());
+        let blend = Blend::of(navigator, &left(distances)?, latent, second.as_ref());
         let error = body_twist(&blend.pose, &navigator.room().poses()[frame.row()]);
         let is_known = error.is_unique_logarithm();
         is_known.then(|| (blend, error.to_vector()))

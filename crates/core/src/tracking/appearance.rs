@@ -6,7 +6,7 @@
 //! .017 m.
 
 use nalgebra::SymmetricEigen;
-use ndarray::{Array1, Array2, ArrayView2, Axis};
+use ndarray::{Array1, Array2, ArrayView2, ArrayViewMut1, Axis};
 
 use crate::matrices::to_nalgebra;
 use crate::room::FrameId;
@@ -43,24 +43,62 @@ pub struct RoomAppearance {
 }
 
 impl RoomAppearance {
-    /// Of the mapped frames of a room, as [`Appearance::of`].
+    /// Of the mapped frames of a room, whose features have shape (n, d). None if they are few or all
+    /// alike.
     pub fn of(features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Option<Self> {
-        let appearance = Appearance::of(features, mapped)?;
+        let unit = MappedFeatures::at_length_one(features, mapped);
+        let every: Vec<usize> = (0..mapped.len()).collect();
+        let appearance = Appearance::of(&unit, &every)?;
+
         let without = |part: usize| {
-            let rest: Vec<FrameId> = mapped
-                .iter()
-                .enumerate()
-                .filter(|(place, _)| part_of(*place, mapped.len()) != part)
-                .map(|(_, frame)| *frame)
-                .collect();
-            Some(Appearance::of(features, &rest)?.coordinates_of(features, mapped))
+            let is_of_rest = |place: &usize| part_of(*place, mapped.len()) != part;
+            let rest: Vec<usize> = every.iter().copied().filter(is_of_rest).collect();
+            Some(unit.coordinates(&Appearance::of(&unit, &rest)?))
         };
 
         Some(Self {
-            coordinates: appearance.coordinates_of(features, mapped),
+            coordinates: unit.coordinates(&appearance),
             without_part: (0..FOLDS).map(without).collect::<Option<_>>()?,
             appearance,
         })
+    }
+}
+
+/// The features of mapped frames at length 1.
+struct MappedFeatures<'a> {
+    mapped: &'a [FrameId],
+    /// How many frames the room has, mapped or not.
+    frame_count: usize,
+    /// A row per mapped frame, shape (m, d).
+    rows: Array2<f64>,
+}
+
+impl<'a> MappedFeatures<'a> {
+    fn at_length_one(features: ArrayView2<'_, f32>, mapped: &'a [FrameId]) -> Self {
+        let mut rows = Array2::zeros((mapped.len(), features.ncols()));
+        for (mut row, frame) in rows.outer_iter_mut().zip(mapped) {
+            row.assign(&features.row(frame.row()).mapv(f64::from));
+            to_length_one(&mut row);
+        }
+
+        Self {
+            mapped,
+            frame_count: features.nrows(),
+            rows,
+        }
+    }
+
+    /// The coordinates of the mapped frames, row by frame of the room, shape (n, c); those of other
+    /// frames are zeros.
+    fn coordinates(&self, appearance: &Appearance) -> Array2<f64> {
+        let Appearance { mean, components } = appearance;
+        let of_mapped = self.rows.dot(components) - mean.dot(components);
+
+        let mut coordinates = Array2::zeros((self.frame_count, components.ncols()));
+        for (row, frame) in of_mapped.outer_iter().zip(self.mapped) {
+            coordinates.row_mut(frame.row()).assign(&row);
+        }
+        coordinates
     }
 }
 
@@ -79,24 +117,15 @@ pub struct Appearance {
 }
 
 impl Appearance {
-    /// The components of the mapped frames of a room, whose features have shape (n, d). None if
-    /// they are few or all alike.
-    pub fn of(features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Option<Self> {
-        let every = mapped.len().div_ceil(SAMPLED).max(1);
-        let sampled: Vec<usize> = mapped
-            .iter()
-            .step_by(every)
-            .map(|frame| frame.row())
-            .collect();
+    /// The components of the mapped frames at these places. None if they are few or all alike.
+    fn of(unit: &MappedFeatures<'_>, places: &[usize]) -> Option<Self> {
+        let every = places.len().div_ceil(SAMPLED).max(1);
+        let sampled: Vec<usize> = places.iter().copied().step_by(every).collect();
         if sampled.len() < FEWEST {
             return None;
         }
 
-        let rows = features.select(Axis(0), &sampled);
-        let mut centred = Array2::zeros(rows.raw_dim());
-        for (mut row, feature) in centred.outer_iter_mut().zip(rows.outer_iter()) {
-            row.assign(&at_length_one(feature.iter().copied()));
-        }
+        let mut centred = unit.rows.select(Axis(0), &sampled);
         let mean = centred.mean_axis(Axis(0))?;
         centred -= &mean;
 
@@ -115,43 +144,35 @@ impl Appearance {
         order.retain(|place| eigen.eigenvalues[*place] > ROUNDING * largest);
         order.truncate(COMPONENTS);
 
-        let mut components = Array2::zeros((features.ncols(), order.len()));
+        // A component is a sum of centred frames: the weights make it a unit vector, divided by the
+        // root of its scale.
+        let mut weights = Array2::zeros((sampled.len(), order.len()));
         let mut mean_square = 0.0;
-        for (mut column, place) in components.columns_mut().into_iter().zip(order) {
+        for (mut column, place) in weights.columns_mut().into_iter().zip(order) {
             let variance = eigen.eigenvalues[place];
             let scale = variance.sqrt() + LEAST_SHARE * largest.sqrt();
             mean_square += variance / scale;
 
-            // A unit vector along the component, divided by the root of the scale.
-            let weights = Array1::from_iter(eigen.eigenvectors.column(place).iter().copied());
-            column.assign(&(centred.t().dot(&weights) / (count * variance * scale).sqrt()));
+            let length = (count * variance * scale).sqrt();
+            let vector = eigen.eigenvectors.column(place);
+            column.assign(
+                &vector
+                    .iter()
+                    .map(|weight| weight / length)
+                    .collect::<Array1<f64>>(),
+            );
         }
+        let mut components = centred.t().dot(&weights);
         components *= SPREAD / mean_square.sqrt();
 
         Some(Self { mean, components })
     }
 
-    /// The coordinates of the mapped frames, row by frame, shape (n, c); those of other frames are
-    /// zeros.
-    pub fn coordinates_of(&self, features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Array2<f64> {
-        let mut centred = Array2::zeros((mapped.len(), features.ncols()));
-        for (mut row, frame) in centred.outer_iter_mut().zip(mapped) {
-            let feature = features.row(frame.row());
-            row.assign(&(at_length_one(feature.iter().copied()) - &self.mean));
-        }
-
-        let of_mapped = centred.dot(&self.components);
-        let mut coordinates = Array2::zeros((features.nrows(), self.components.ncols()));
-        for (row, frame) in of_mapped.outer_iter().zip(mapped) {
-            coordinates.row_mut(frame.row()).assign(&row);
-        }
-        coordinates
-    }
-
     /// The coordinates of a feature of shape (d,).
     pub fn coordinates(&self, feature: &[f32]) -> Array1<f64> {
-        let centred = at_length_one(feature.iter().copied()) - &self.mean;
-        centred.dot(&self.components)
+        let mut row: Array1<f64> = feature.iter().copied().map(f64::from).collect();
+        to_length_one(&mut row.view_mut());
+        (row - &self.mean).dot(&self.components)
     }
 
     /// About how much memory it holds, bytes.
@@ -160,11 +181,12 @@ impl Appearance {
     }
 }
 
-/// A feature divided by its length; a feature of zeros as it is.
-fn at_length_one(feature: impl Iterator<Item = f32>) -> Array1<f64> {
-    let row: Array1<f64> = feature.map(f64::from).collect();
-    let length = row.dot(&row).sqrt();
-    if length > 0.0 { row / length } else { row }
+/// Divides a feature by its length; a feature of zeros stays as it is.
+fn to_length_one(feature: &mut ArrayViewMut1<'_, f64>) {
+    let length = feature.dot(feature).sqrt();
+    if length > 0.0 {
+        *feature /= length;
+    }
 }
 
 #[cfg(test)]
@@ -186,7 +208,9 @@ mod tests {
             let direction = [angle(row).cos(), angle(row).sin(), 0.0];
             (length * direction[column]) as f32
         });
-        let found = Appearance::of(features.view(), &frames(100)).unwrap();
+        let found = RoomAppearance::of(features.view(), &frames(100))
+            .unwrap()
+            .appearance;
         let coordinates: Vec<Array1<f64>> = features
             .outer_iter()
             .map(|row| found.coordinates(&row.to_vec()))
@@ -213,10 +237,10 @@ mod tests {
     #[test]
     fn nothing_is_told_of_frames_that_are_few_or_alike() {
         let alike = Array2::from_elem((100, 5), 2.0);
-        assert!(Appearance::of(alike.view(), &frames(100)).is_none());
-        assert!(Appearance::of(Array2::zeros((100, 5)).view(), &frames(100)).is_none());
+        assert!(RoomAppearance::of(alike.view(), &frames(100)).is_none());
+        assert!(RoomAppearance::of(Array2::zeros((100, 5)).view(), &frames(100)).is_none());
 
         let few = Array2::from_shape_fn((47, 5), |(row, column)| (row * column) as f32);
-        assert!(Appearance::of(few.view(), &frames(47)).is_none());
+        assert!(RoomAppearance::of(few.view(), &frames(47)).is_none());
     }
 }
