@@ -61,6 +61,9 @@ const MOST_GROWTH: f64 = 3.0;
 /// Below the lowest one they fall to this factor at least.
 const LEAST_SHRINKAGE: f64 = 0.7;
 
+/// Which of a blend's predictors tells how far the second opinion is off.
+const DISAGREEMENT: usize = 4;
+
 /// What the frames most like a view say of its pose.
 #[derive(Debug, Clone)]
 pub struct Blend {
@@ -200,12 +203,30 @@ impl AnchorModel {
         likeness: Likeness<'_>,
         mapped: &[FrameId],
     ) -> Option<Self> {
-        let left_out = left_out_blends(navigator, likeness, mapped);
+        Self::of(&left_out_blends(navigator, likeness, mapped))
+    }
+
+    /// The same with a second opinion, and then of the same blends without it.
+    pub fn measured_with_and_without(
+        navigator: &Navigator,
+        likeness: Likeness<'_>,
+        mapped: &[FrameId],
+    ) -> Option<[Self; 2]> {
+        let mut left_out = left_out_blends(navigator, likeness, mapped);
+        let with_second_opinion = Self::of(&left_out)?;
+
+        for found in &mut left_out {
+            found.blend.predictors[DISAGREEMENT] = LEAST.ln();
+        }
+        Some([with_second_opinion, Self::of(&left_out)?])
+    }
+
+    fn of(left_out: &[LeftOut]) -> Option<Self> {
         if left_out.len() < FEWEST_BLENDS {
             return None;
         }
 
-        let coefficients = size_coefficients(&left_out)?;
+        let coefficients = size_coefficients(left_out)?;
         let size = |found: &LeftOut| found.blend.predictors.dot(&coefficients).exp();
         let mut by_size: Vec<(f64, &LeftOut)> =
             left_out.iter().map(|found| (size(found), found)).collect();

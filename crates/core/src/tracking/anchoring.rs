@@ -3,6 +3,7 @@
 use nalgebra::Matrix6;
 
 use super::dead_reckoning::{EarlierView, Poses};
+use super::health::TrackingHealth;
 use super::map::MapMatch;
 use super::state::{Candidate, Observation, State};
 use super::tracker::Tracker;
@@ -51,6 +52,19 @@ impl Correction {
         is_applied: false,
         surprise: None,
     };
+}
+
+impl BestMap {
+    /// Whether the view is tried as an anchor although it does not look like the room: images that
+    /// are blurred, noisy or partly hidden do not, and their features still tell where they were
+    /// taken. Only where the camera is known to be in the room, and only if the features tell more
+    /// than a view of an unmapped part does. The limit was chosen on calibration rooms and the
+    /// kitchen: at three times [`Belief::tells_a_place`] unmapped parts make poses worse.
+    pub(super) fn is_hint(&self, health: TrackingHealth) -> bool {
+        health.is_confirmed()
+            && self.matched.is_by_feature
+            && self.matched.anchor.belief.hints_at_a_place()
+    }
 }
 
 impl Tracker {

@@ -123,8 +123,17 @@ impl Belief {
 
     /// Whether it may be relied on to half a metre and 15 degrees.
     pub fn tells_a_place(&self) -> bool {
-        self.position_deviation_m() <= PLACE_DEVIATION_M
-            && self.rotation_deviation_rad() <= PLACE_DEVIATION_RAD
+        self.is_within(1.0)
+    }
+
+    /// Whether it may be relied on to a metre and 30 degrees.
+    pub(super) fn hints_at_a_place(&self) -> bool {
+        self.is_within(2.0)
+    }
+
+    fn is_within(&self, share: f64) -> bool {
+        self.position_deviation_m() <= share * PLACE_DEVIATION_M
+            && self.rotation_deviation_rad() <= share * PLACE_DEVIATION_RAD
     }
 
     /// The largest standard deviation of the position along any direction, metres.

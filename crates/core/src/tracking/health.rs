@@ -88,6 +88,17 @@ impl TrackingHealth {
         matches!(self, Self::Lost { .. })
     }
 
+    /// Whether the stream is certainly in the room.
+    pub fn is_confirmed(self) -> bool {
+        matches!(
+            self,
+            Self::Consistent {
+                confirmed: true,
+                ..
+            }
+        )
+    }
+
     /// One frame matched the room, and nothing is known of those before it.
     const ONE_MATCH: Self = Self::Consistent {
         score: 1,

@@ -56,6 +56,8 @@ struct AppearanceMap {
     appearance: Appearance,
     index: ExactIndex,
     anchor_model: AnchorModel,
+    /// For views whose latents are of no use as a second opinion.
+    anchor_model_alone: AnchorModel,
 }
 
 impl AppearanceMap {
@@ -96,6 +98,8 @@ pub struct MapMatch {
     pub is_certain: bool,
     /// The pose that the nearest frames tell.
     pub anchor: MapAnchor,
+    /// Whether that was found by the view's raw feature; else by its latent.
+    pub is_by_feature: bool,
 }
 
 impl Map {
@@ -181,8 +185,11 @@ impl Map {
                 second_opinion: Some(&whitened),
             };
 
+            let [anchor_model, anchor_model_alone] =
+                AnchorModel::measured_with_and_without(&self.navigator, likeness, mapped)?;
             Some(AppearanceMap {
-                anchor_model: AnchorModel::measured(&self.navigator, likeness, mapped)?,
+                anchor_model,
+                anchor_model_alone,
                 index: ExactIndex::new(coordinates.view(), mapped),
                 appearance,
             })
@@ -250,15 +257,29 @@ impl Map {
             });
         }
 
+        let limits = self.error_model.statistics();
         let distance = by_latent[0].distance;
+        let relative_distance = distance / self.typical_distance;
+        let out_of_distribution = relative_distance / limits.out_of_distribution_ratio;
+
         let blend = Blend::of(&self.navigator, &by_latent, query.latent, None);
-        let (mut nearest, anchor) = match self.by_appearance.as_ref().zip(query.feature) {
+        let by_feature = self.by_appearance.as_ref().zip(query.feature);
+        let (mut nearest, anchor) = match by_feature {
             Some((map, feature)) => {
                 let alike = map.nearest(feature, count.max(LOOKED_AT));
-                let second = Some(blend.pose());
+
+                // A latent that looks like another place has no opinion on this one: images that are
+                // blurred, noisy or partly hidden spoil latents before they spoil features.
+                let has_opinion = out_of_distribution <= 1.0;
+                let second = Some(blend.pose()).filter(|_| has_opinion);
+                let model = match has_opinion {
+                    true => &map.anchor_model,
+                    false => &map.anchor_model_alone,
+                };
+
                 let blend = Blend::of(&self.navigator, &alike, query.latent, second);
                 let nearest = self.with_latent_distances(&alike, &whitened);
-                (nearest, map.anchor_model.anchor(&blend))
+                (nearest, model.anchor(&blend))
             }
             None => {
                 let anchor = match &self.anchor_model {
@@ -270,14 +291,13 @@ impl Map {
         };
         nearest.truncate(count.max(1));
 
-        let limits = self.error_model.statistics();
-        let relative_distance = distance / self.typical_distance;
         MapMatch {
             nearest,
             distance,
-            out_of_distribution: relative_distance / limits.out_of_distribution_ratio,
+            out_of_distribution,
             is_certain: relative_distance <= limits.certain_match_ratio,
             anchor,
+            is_by_feature: by_feature.is_some(),
         }
     }
 

@@ -263,7 +263,9 @@ impl Tracker {
 
         // 4. Correction: the mapped frames that look alike are tried as an anchor. An image that is
         //    repeated tells nothing new.
-        let correction = if matches_room && state.unchanged_frames == 0 {
+        let is_hint = sight == Sight::Clear && best.is_hint(state.health);
+        let is_tried = (matches_room || is_hint) && state.unchanged_frames == 0;
+        let correction = if is_tried {
             self.correct_by_match(state, &mut poses, frame, &best)
         } else {
             Correction::NONE
