@@ -126,8 +126,8 @@ fn check_size(width: usize, height: usize, bounds: Bounds) -> Result<(), String>
 
 /// Decodes a JPEG strictly: a truncated image is an error and is not filled up with grey.
 fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
-    let pixels = compressed_pixels(bytes).unwrap_or_default();
-    if !pixels.windows(2).rev().any(|marker| marker == END_OF_IMAGE) {
+    let rest = after_header(bytes).unwrap_or_default();
+    if !rest.windows(2).rev().any(|marker| marker == END_OF_IMAGE) {
         return Err("has no end-of-image marker: the file is truncated".to_owned());
     }
 
@@ -159,7 +159,7 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
 
 /// What follows the header of a JPEG: an end-of-image marker before it belongs to a thumbnail. None if
 /// the header does not end.
-fn compressed_pixels(bytes: &[u8]) -> Option<&[u8]> {
+fn after_header(bytes: &[u8]) -> Option<&[u8]> {
     // A header is a list of segments: 0xff, a code, the length in two bytes, which it includes, and as
     // much content. Only the start of the image, at the beginning, has no length.
     let mut rest = bytes.get(2..)?;
@@ -309,7 +309,7 @@ mod tests {
             let image = decode("9.jpg", &whole, Bounds::LOCAL).unwrap();
             assert_eq!((image.width, image.height), (8, 6));
 
-            for cut in 0..whole.len() - 1 {
+            for cut in 0..whole.len() {
                 assert!(
                     decode("9.jpg", &whole[..cut], Bounds::LOCAL).is_err(),
                     "cut at {cut} of {}",

@@ -204,7 +204,8 @@ impl Inner {
         );
         registry.register(
             "refused",
-            "Newest revisions in the store that cannot be served: rooms, adapters, adapters in one of their rooms, and choices of defaults",
+            "Newest revisions in the store that cannot be served: rooms, adapters, adapters in one of \
+             their rooms, and choices of defaults",
             self.refused.clone(),
         );
         registry.register(

@@ -81,7 +81,9 @@ use seese3_core::navigation::{IndexKind, Limits};
 use snapshot::Loader;
 use workers::Workers;
 
-/// What questions for health may hold in memory, bytes.
+/// What those may hold in memory who watch health: this part of what requests may.
+const WATCHERS: usize = 8;
+/// What health checks may hold in memory, bytes.
 const PROBES: usize = 16 << 20;
 /// After the drain time, how long the server still waits for callers to receive the error of their
 /// abandoned requests.
@@ -438,6 +440,7 @@ fn memory_layer(config: &Config) -> MemoryLayer {
         receive_within: config.receive_within,
         response_timeout: config.response_timeout,
         probes: Memory::new(PROBES, config.metrics.clone()),
+        watchers: Memory::new(config.memory_bytes / WATCHERS, config.metrics.clone()),
     }
 }
 

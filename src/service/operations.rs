@@ -3,6 +3,7 @@
 //! It has connections of its own, so that it answers while the gRPC port is full; few of them, and
 //! none for long, because it asks for no credentials.
 
+use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::time::Duration;
 
@@ -16,7 +17,7 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
-use tokio::task::JoinSet;
+use tokio::task::{AbortHandle, JoinSet};
 
 use super::Phase;
 use super::metrics::Metrics;
@@ -30,8 +31,9 @@ struct Operated {
     phase: watch::Receiver<Phase>,
 }
 
-/// So many connections may be open; a further one waits to be accepted.
-const CONNECTIONS: usize = 32;
+/// So many connections may be open; a further one takes the place of the oldest, so that whoever asks
+/// at once is answered however many stay silent.
+const CONNECTIONS: usize = 64;
 /// A connection that asks nothing for so long is closed.
 const SILENCE: Duration = Duration::from_secs(5);
 /// No connection lives longer; whoever scrapes opens the next one.
@@ -51,19 +53,29 @@ pub(super) async fn serve(
         .route("/readyz", get(ready))
         .with_state(Operated { metrics, phase });
 
+    // Trouble that lasts is logged once.
+    let mut is_refused = false;
+
+    // When the set is dropped, so are the connections.
     let mut connections = JoinSet::new();
+    let mut open: VecDeque<AbortHandle> = VecDeque::new();
     loop {
         while connections.try_join_next().is_some() {}
-        if connections.len() >= CONNECTIONS {
-            connections.join_next().await;
-        }
+        open.retain(|connection| !connection.is_finished());
 
         match listener.accept().await {
             Ok((stream, _)) => {
-                connections.spawn(answer(stream, router.clone()));
+                is_refused = false;
+                if open.len() >= CONNECTIONS {
+                    open.pop_front().inspect(AbortHandle::abort);
+                }
+                open.push_back(connections.spawn(answer(stream, router.clone())));
             }
             Err(error) => {
-                tracing::debug!(%error, "no connection for metrics can be accepted");
+                if !is_refused {
+                    tracing::error!(%error, "no connection for metrics can be accepted");
+                }
+                is_refused = true;
                 tokio::time::sleep(ACCEPT_PAUSE).await;
             }
         }

@@ -74,8 +74,11 @@ pub(super) async fn keep_current(
         };
 
         let now = match loader.load(before.clone(), refused).await {
-            // Whoever changes the store through this server may remove the last room.
-            Ok(now) if now.rooms().is_empty() && !is_writable => {
+            // Whoever changes the store through this server may remove the last room, of which a trace
+            // is left.
+            Ok(now)
+                if now.rooms().is_empty() && !(is_writable && loader.remembers_rooms().await) =>
+            {
                 Err("the store has no room any more".to_owned())
             }
             Ok(now) => Ok(now),

@@ -52,6 +52,15 @@ pub struct StandingDefaults {
     pub refused: Option<Error>,
 }
 
+/// The choices before the last change.
+struct Before {
+    /// The number of the newest file.
+    newest: u64,
+    /// The number of the file that made these choices; 0 for none.
+    back_to: u64,
+    defaults: Defaults,
+}
+
 /// One choice.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Choice {
@@ -193,20 +202,26 @@ impl Store {
         Ok(self.numbered_defaults().await?.1)
     }
 
-    /// The choices by which to serve: those before, where the file of the newest ones is damaged.
+    /// The newest choices that can be read, and why newer files were passed over.
     ///
     /// # Errors
     /// [`Error::Io`] if the store cannot be read.
     pub async fn standing_defaults(&self) -> Result<StandingDefaults, Error> {
         let mut refused = None;
+        let numbers = match self.numbers_of_defaults().await {
+            Err(error @ Error::Damaged { .. }) => {
+                refused = Some(error);
+                Vec::new()
+            }
+            numbers => numbers?,
+        };
 
-        for number in self.numbers_of_defaults().await?.into_iter().rev() {
-            match self.read_defaults(number).await {
+        for number in numbers.into_iter().rev() {
+            match self.readable_defaults(number).await? {
                 Ok(Body { defaults, .. }) => return Ok(StandingDefaults { defaults, refused }),
-                Err(error @ (Error::Damaged { .. } | Error::Schema { .. })) => {
+                Err(error) => {
                     refused.get_or_insert(error);
                 }
-                Err(error) => return Err(error),
             }
         }
 
@@ -257,24 +272,11 @@ impl Store {
     /// [`Error::NothingToTakeBack`] if nothing was ever chosen; otherwise as [`Store::choose`].
     pub async fn take_back_choice(&self) -> Result<Defaults, Error> {
         for _ in 0..ATTEMPTS {
-            let number = self.numbers_of_defaults().await?.last().copied();
-            let number = number.unwrap_or_default();
-            let holds = match number {
-                0 => 0,
-                _ => match self.read_defaults(number).await {
-                    Ok(body) => body.back_to.unwrap_or(number),
-                    Err(Error::Damaged { .. }) => number,
-                    Err(error) => return Err(error),
-                },
-            };
-            let (back_to, mut before) = match holds {
-                0 => return Err(Error::NothingToTakeBack),
-                1 => (0, Defaults::default()),
-                _ => {
-                    let body = self.read_defaults(holds - 1).await?;
-                    (body.back_to.unwrap_or(holds - 1), body.defaults)
-                }
-            };
+            let Before {
+                newest,
+                back_to,
+                defaults: mut before,
+            } = self.before_last_change().await?;
 
             for resource in before.named() {
                 match self.check_exists(&resource).await {
@@ -285,7 +287,7 @@ impl Store {
                 }
             }
             if self
-                .write_defaults(number + 1, Some(back_to), &before)
+                .write_defaults(newest + 1, Some(back_to), &before)
                 .await?
             {
                 return Ok(before);
@@ -293,6 +295,46 @@ impl Store {
         }
 
         Err(contended())
+    }
+
+    /// The choices before the last change. Files that cannot be read are passed over.
+    async fn before_last_change(&self) -> Result<Before, Error> {
+        let numbers = self.numbers_of_defaults().await?;
+        let newest = numbers.last().copied().unwrap_or_default();
+        let holds = match newest {
+            0 => 0,
+            _ => match self.readable_defaults(newest).await? {
+                Ok(body) => body.back_to.unwrap_or(newest),
+                Err(_) => newest,
+            },
+        };
+        if holds == 0 {
+            return Err(Error::NothingToTakeBack);
+        }
+
+        for number in numbers.into_iter().rev().filter(|number| *number < holds) {
+            if let Ok(body) = self.readable_defaults(number).await? {
+                return Ok(Before {
+                    newest,
+                    back_to: body.back_to.unwrap_or(number),
+                    defaults: body.defaults,
+                });
+            }
+        }
+
+        Ok(Before {
+            newest,
+            back_to: 0,
+            defaults: Defaults::default(),
+        })
+    }
+
+    /// The file of this number; the inner error says why it can never be read by this program.
+    async fn readable_defaults(&self, number: u64) -> Result<Result<Body, Error>, Error> {
+        match self.read_defaults(number).await {
+            Err(error @ (Error::Damaged { .. } | Error::Schema { .. })) => Ok(Err(error)),
+            read => read.map(Ok),
+        }
     }
 
     /// The choices that hold now, with the number of their file; 0 if nothing was ever chosen.

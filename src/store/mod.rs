@@ -95,7 +95,7 @@ pub enum Error {
     #[error("{file} is missing; restore it, or publish again")]
     Absent { file: String },
     #[error(
-        "could not publish '{name}': another publisher took every revision number that was tried"
+        "could not publish '{name}': every number that was tried is taken, by other publishers or by something that is not a file"
     )]
     Contended { name: String },
     #[error("features '{name}' have {rows} rows, room '{room}' has {frame_count} frames")]
@@ -146,6 +146,8 @@ pub struct Published {
     pub manifest: String,
 }
 
+/// Larger numbers are never given, so that there is always a next one.
+const HIGHEST: u64 = 999_999_999_999;
 /// How many revision numbers publishing tries before it fails, each lost to a faster publisher.
 const ATTEMPTS: u64 = 16;
 
@@ -424,9 +426,39 @@ impl Store {
         Ok(numbered)
     }
 
+    /// Whether there is, or ever was, a room or an adapter.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if the store cannot be listed.
+    pub async fn remembers(&self, kind: Kind) -> Result<bool, Error> {
+        for (_, folder) in self.folders(kind).await? {
+            if self.revisions(&folder).await?.highest > 0 {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// Refuses a path of a local store where there is something else than a folder: it would be listed
+    /// as an empty one.
+    fn check_folder(&self, path: &Path) -> Result<(), Error> {
+        let Some(root) = &self.folder else {
+            return Ok(());
+        };
+        let place = root.join(path.as_ref());
+        if std::fs::symlink_metadata(&place).is_ok() && !place.is_dir() {
+            return Err(Error::Damaged {
+                file: self.shown(path),
+                problem: "is not a folder; restore it".to_owned(),
+            });
+        }
+        Ok(())
+    }
+
     /// The folders of a kind, whether they have a revision or not, by name; sorted.
     async fn folders(&self, kind: Kind) -> Result<Vec<(String, Path)>, Error> {
         let folder = Path::from(kind.collection());
+        self.check_folder(&folder)?;
         let listed = self.objects.list_with_delimiter(Some(&folder)).await;
         let listed = listed.map_err(|error| self.io(&folder, &error))?;
 
@@ -451,6 +483,7 @@ impl Store {
 
     /// The numbers of the files in a folder.
     async fn numbered_files(&self, folder: &Path) -> Result<Numbers, Error> {
+        self.check_folder(folder)?;
         let mut listed = self.objects.list(Some(folder));
         let mut numbers = Numbers::default();
 
@@ -460,7 +493,7 @@ impl Store {
             let Some((number, extension)) = name.split_once('.') else {
                 continue;
             };
-            let Ok(number) = number.parse::<u64>() else {
+            let Some(number) = number.parse().ok().filter(|number| *number <= HIGHEST) else {
                 continue;
             };
 

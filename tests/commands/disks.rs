@@ -1,5 +1,5 @@
 //! A server whose disk is full, or can only be read: what is served is served on, and a change that
-//! cannot be written is refused with a clear error and leaves nothing behind.
+//! cannot be written is refused with a clear error and leaves no revision behind.
 
 use std::fs::File;
 use std::path::Path;

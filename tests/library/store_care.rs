@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use object_store::local::LocalFileSystem;
-use seese3::store::{Choice, Error, ResourceName, RoomFit, Store};
+use seese3::store::{Choice, Defaults, Error, ResourceName, RoomFit, Store};
 use seese3_core::features::Features;
 use seese3_core::fitting::fit;
 use seese3_core::room::{FrameId, Room};
@@ -329,6 +329,20 @@ async fn damaged_choices_can_be_taken_back() {
     let current = store.current_rooms(&standing.defaults).await.unwrap();
     assert_eq!(current, [("a".to_owned(), 3)]);
     assert!(standing.refused.is_some());
+
+    assert_eq!(store.take_back_choice().await.unwrap(), Defaults::default());
+    assert!(store.standing_defaults().await.unwrap().refused.is_none());
+
+    // A number that leaves no room for a next one was not given by us.
+    let alien = folder.path().join(format!("defaults/{}.json", u64::MAX));
+    std::fs::write(alien, "{").unwrap();
+    store.choose(&third).await.unwrap();
+    assert_eq!(current_rooms(&store).await, [("a".to_owned(), 3)]);
+
+    std::fs::remove_dir_all(folder.path().join("defaults")).unwrap();
+    std::fs::write(folder.path().join("defaults"), "").unwrap();
+    assert!(store.standing_defaults().await.unwrap().refused.is_some());
+    assert!(!store.verify(&|_| ()).await.unwrap().is_empty());
 }
 
 /// Oracle: the damage that the test does. Each file is found by its name.

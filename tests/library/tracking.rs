@@ -92,6 +92,54 @@ fn a_wrong_match_cannot_pull_the_pose() {
     assert!(refused > 0, "no wrong match was met");
 }
 
+/// Oracle: the true poses, and the same camera without features. Latents that are all off by the same
+/// large number look like no place of the room, and tell no motion wrongly. A camera that is known to
+/// be in the room is corrected by its features all the same, and is not TRACKING.
+#[test]
+fn a_known_camera_with_spoilt_latents_is_corrected_by_its_features() {
+    let adapter = Arc::new(calibrated().0);
+    let (room, features) = served("hall");
+    let mapped: Vec<FrameId> = (0..FRAMES as u32).step_by(2).map(FrameId).collect();
+    let map =
+        map(&adapter, room.poses().to_vec(), &features).with_features(features.rows(), &mapped);
+    let tracker = Tracker::new(vec![Arc::new(map)], TrackerSettings::of(&adapter)).unwrap();
+
+    let errors = |with_features: bool, initial_pose: Option<Belief>| {
+        let mut state = tracker.start(initial_pose);
+        let mut errors = Vec::new();
+        for row in (41..141).step_by(2) {
+            let feature = features.rows().row(row).to_vec();
+            let observation = Observation {
+                time_ns: row as i64 * 33_000_000,
+                sequence: row as u64,
+                latent: adapter.embed_one(&feature).unwrap() + 50.0,
+                feature: with_features.then_some(feature),
+                is_blank: false,
+                measured: None,
+            };
+
+            let update = tracker.observe(&mut state, &observation).unwrap();
+            assert!(update.out_of_distribution > 1.0, "row {row}");
+            if row > 71 {
+                assert_ne!(update.status, Status::Tracking, "row {row}");
+            }
+            errors.extend(update.map_pose.map(|believed| {
+                PoseError::between(&believed.pose, &room.poses()[row]).translation_m
+            }));
+        }
+        errors
+    };
+
+    let known = Some(Belief::known(room.poses()[41], 0.05, 0.05));
+    let (with, without) = (errors(true, known), errors(false, known));
+    assert_eq!((with.len(), without.len()), (50, 50));
+    let (with, without) = (root_mean_square(&with), root_mean_square(&without));
+    assert!(with < 0.5 * without, "{with} against {without}");
+
+    // Nobody knows where this camera is, and its views do not say.
+    assert!(errors(true, None).is_empty());
+}
+
 /// Oracle: the definition: odom goes on from frame to frame by no more than the camera moves at
 /// most, but for half of that as the error of a reading, also where map is found, lost and found
 /// elsewhere.

@@ -102,12 +102,12 @@ async fn health_answers_for_the_server_its_services_and_its_rooms() {
         .unwrap();
 }
 
-/// Oracle: the bounds by hand: a request holds 16 KiB at least, so that 60 watchers are more than
-/// 800 kB have room for. Those who only check are answered beside them.
+/// Oracle: the bounds by hand: a request holds 16 KiB at least, so that an eighth of 2 MB has room for
+/// 15 watchers. Those who check, and requests, are answered beside them.
 #[tokio::test]
 async fn watchers_leave_room_for_those_who_check() {
     let config = Config {
-        memory_bytes: 800_000,
+        memory_bytes: 2_000_000,
         ..Config::default()
     };
     let server = start(config).await;
@@ -124,11 +124,12 @@ async fn watchers_leave_room_for_those_who_check() {
             }
         }
     }
-    assert!(refused > 0 && !watchers.is_empty());
+    assert_eq!((watchers.len(), refused), (15, 45));
 
     for _ in 0..100 {
         let checked = check(&server.address, "").await;
         assert_eq!(checked, Ok(ServingStatus::Serving));
+        server.client.navigate(question()).await.unwrap();
     }
 }
 

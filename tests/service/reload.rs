@@ -234,10 +234,25 @@ async fn a_server_starts_beside_damage_and_outlives_its_store() {
     assert!(server.client.navigate(question()).await.is_ok());
     assert!(!server.client.serves("rooms/synthetic_b").await.unwrap());
 
-    std::fs::remove_dir_all(server.folder.path().join("rooms")).unwrap();
-    std::fs::remove_dir_all(server.folder.path().join("adapters")).unwrap();
+    let writable = Config {
+        writable: true,
+        reload: Reload {
+            every: Some(Duration::from_millis(20)),
+            ..Reload::default()
+        },
+        ..Config::default()
+    };
+    let (other_folder, other_store) = filled_store().await;
+    let other = start_on(other_folder, other_store, writable).await;
+
+    for server in [&server, &other] {
+        std::fs::remove_dir_all(server.folder.path().join("rooms")).unwrap();
+        std::fs::remove_dir_all(server.folder.path().join("adapters")).unwrap();
+    }
     tokio::time::sleep(Duration::from_millis(200)).await;
-    assert!(server.client.navigate(question()).await.is_ok());
+    for server in [&server, &other] {
+        assert!(server.client.navigate(question()).await.is_ok());
+    }
 }
 
 /// Oracle: the promise: where the newest choices of defaults are damaged, the ones before them hold, at

@@ -9,6 +9,7 @@ use tokio::sync::Notify;
 use tonic::Code;
 
 use crate::harness::{TestServer, feature, feature_row, filled_store, frame, question, start_on};
+use crate::tracking::{begin, config as in_hall, seen, start_followed};
 
 /// A server with rooms in memory as said, which looks for changes when it is asked to.
 async fn start_with(rooms: RoomMemory) -> (TestServer, Config) {
@@ -175,4 +176,39 @@ async fn a_store_that_is_away_costs_what_is_not_in_memory() {
     std::fs::rename(&away, &rooms).unwrap();
     let after = client.navigate(in_room("synthetic")).await.unwrap();
     assert_eq!(after, before);
+}
+
+/// Oracle: the promise: a stream that is open holds the room that it is in, and none that was removed
+/// since it began.
+#[tokio::test]
+async fn a_stream_holds_its_own_room_alone() {
+    let config = Config {
+        reload: Reload {
+            every: None,
+            asked: Arc::new(Notify::new()),
+        },
+        ..Config::default()
+    };
+    let asked = config.reload.asked.clone();
+    let server = start_followed(config.clone()).await;
+    assert_eq!(metric(&config, "seese3_rooms_in_memory"), 2.0);
+
+    let (sender, requests) = tokio::sync::mpsc::channel(4);
+    sender.send(begin(in_hall())).await.unwrap();
+    let requests = tokio_stream::wrappers::ReceiverStream::new(requests);
+    let mut stream = server.client.track(requests).await.unwrap();
+    stream.message().await.unwrap().unwrap();
+
+    std::fs::remove_dir_all(server.folder.path().join("rooms/attic")).unwrap();
+    asked.notify_one();
+    let one_is_left = async {
+        while metric(&config, "seese3_rooms_in_memory") > 1.0 {
+            tokio::time::sleep(std::time::Duration::from_millis(10)).await;
+        }
+    };
+    let waited = tokio::time::timeout(std::time::Duration::from_secs(30), one_is_left).await;
+    waited.expect("the removed room is still in memory");
+
+    sender.send(seen(0)).await.unwrap();
+    assert!(stream.message().await.unwrap().is_some());
 }

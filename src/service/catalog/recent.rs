@@ -7,8 +7,8 @@ use super::super::Error;
 
 /// How long an answer is remembered.
 const KEPT_FOR: Duration = Duration::from_secs(3_600);
-/// How many answers are remembered. Beyond it, the caller who has the most loses the oldest, so that
-/// nobody makes the server forget the changes of others.
+/// How many answers are remembered. Beyond it, the caller who has the most loses the oldest: whoever
+/// makes very many changes makes the server forget its own, not those of callers who make few.
 const KEPT: usize = 1_000;
 /// The longest request id, characters.
 const LONGEST_ID: usize = 100;

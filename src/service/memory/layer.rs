@@ -20,9 +20,10 @@ use super::decoded::{decoded_size, has_unary_response, is_stream};
 use super::response::{ResponseTimeout, in_pieces};
 use super::{HELD, Held, Memory};
 
-/// The path of a question for health. Watch is not among them: it stays open, and many would hold
-/// all of the memory of probes.
-const PROBE: &str = "/grpc.health.v1.Health/Check";
+/// The paths of the health service. Those who watch stay, and have memory of their own: else many of
+/// them would hold that of those who check, or of requests.
+const CHECK: &str = "/grpc.health.v1.Health/Check";
+const WATCH: &str = "/grpc.health.v1.Health/Watch";
 /// What stands before a message: whether it is compressed, and its length.
 const PREFIX: usize = 5;
 
@@ -31,8 +32,10 @@ const PREFIX: usize = 5;
 pub struct MemoryLayer {
     /// The memory of all requests but those of health.
     pub memory: Memory,
-    /// The memory of health's requests, which are answered when the other memory is full.
+    /// The memory of health checks, which are answered when the other memory is full.
     pub probes: Memory,
+    /// The memory of those who watch health.
+    pub watchers: Memory,
     /// The largest message, bytes.
     pub message_bytes: usize,
     /// How long a request with one message may take to arrive.
@@ -99,9 +102,10 @@ impl MemoryLayer {
     /// Receives a request as far as it has to be before a handler sees it.
     async fn received(&self, request: Request<Body>) -> Result<(Held, Request<Body>), Error> {
         let path = request.uri().path().to_owned();
-        let memory = match path == PROBE {
-            true => &self.probes,
-            false => &self.memory,
+        let memory = match path.as_str() {
+            CHECK => &self.probes,
+            WATCH => &self.watchers,
+            _ => &self.memory,
         };
         let held = memory.begin()?;
 

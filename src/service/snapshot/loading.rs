@@ -23,7 +23,7 @@ use super::room_loading::{Problem, RoomLoader, contained};
 use super::served::{Candidate, ServedRoom};
 use super::{Refusal, Snapshot};
 use crate::encoder;
-use crate::store::{self, Defaults, RoomFit, StandingDefaults, Store, StoredAdapter};
+use crate::store::{self, Defaults, Kind, RoomFit, StandingDefaults, Store, StoredAdapter};
 use seese3_core::features::FeatureSource;
 use seese3_core::room::RoomId;
 
@@ -138,6 +138,12 @@ impl Loader {
         }
     }
 
+    /// Whether the store has rooms, or had some that were removed from it. One that has vanished, for
+    /// instance with its disk, has neither.
+    pub async fn remembers_rooms(&self) -> bool {
+        self.store.remembers(Kind::Room).await.unwrap_or(false)
+    }
+
     /// Loads what differs from `before`, on a blocking thread.
     ///
     /// # Errors
@@ -183,8 +189,8 @@ impl Loader {
         Ok(loaded)
     }
 
-    /// Adds rooms, each in its current revision. At the start they are loaded on all processors at the
-    /// same time; later one after another, because requests are being answered.
+    /// Adds rooms, each in its current revision. While no room is served, they are loaded
+    /// on all processors at the same time; later one after another, because requests are answered.
     async fn add_rooms(
         &self,
         loaded: &mut Snapshot,
@@ -232,8 +238,8 @@ impl Loader {
         {
             tracing::error!(
                 reason,
-                "the choices of defaults cannot be read; those before them hold; take the last change back with \
-                 `seese3 store default --back`"
+                "the newest choices of defaults cannot be read: older ones hold, or none; take the \
+                 last change back with `seese3 store default --back`"
             );
         }
 

@@ -105,6 +105,14 @@ impl Snapshot {
         }
     }
 
+    /// The image encoders alone.
+    pub fn without_rooms(&self) -> Self {
+        Self {
+            image_encoders: self.image_encoders.clone(),
+            ..Self::default()
+        }
+    }
+
     /// How many adapters are refused in one of their rooms, over all rooms.
     pub fn refused_in_rooms(&self) -> usize {
         let rooms = self.rooms.values();

@@ -43,9 +43,7 @@ pub(super) enum Problem {
         adapter: String,
         problem: Box<seese3_core::fitting::Error>,
     },
-    #[error(
-        "loading it panicked, which is a defect of this program: the lines before this one say where"
-    )]
+    #[error("loading it panicked, which is a defect of this program; the server's log says where")]
     Panicked,
 }
 

@@ -25,7 +25,9 @@ const FIELD: &str = "config";
 /// A configured stream and the state of its tracker. The server keeps it only while the stream is
 /// open; every answer carries it as a resume token.
 pub struct Session {
-    snapshot: Arc<Snapshot>,
+    /// What encodes images. The rooms of the snapshot are not held: a stream may last for days, and
+    /// would keep every room in memory that was replaced since.
+    encoders: Snapshot,
     served: Vec<Arc<ServedNavigator>>,
     tracker: Tracker,
     config: pb::TrackConfig,
@@ -175,9 +177,8 @@ impl Session {
         let tracker =
             Tracker::new(maps, settings).map_err(|error| Error::Precondition(error.to_string()))?;
         let state = tracker.start(begins);
-        let snapshot = snapshot.clone();
         Ok(Self {
-            snapshot,
+            encoders: snapshot.without_rooms(),
             served,
             tracker,
             config,
@@ -364,14 +365,14 @@ impl Session {
         }) = &view
         {
             let field = format!("{FIELD}.image");
-            let encoder = self.snapshot.image_encoder(adapter)?;
+            let encoder = self.encoders.image_encoder(adapter)?;
             let pixels = encoder.decoded(&field, image)?;
             let is_blank = pixels.is_blank();
             let feature = encoder.feature_of(&field, pixels)?;
             return Ok((View::Feature(feature), is_blank));
         }
 
-        match convert::source(FIELD, view, adapter, &self.snapshot)? {
+        match convert::source(FIELD, view, adapter, &self.encoders)? {
             Source::Feature(feature) => Ok((View::Feature(feature), false)),
             Source::Latent(latent) => Ok((View::Latent(latent), false)),
             Source::Frame(_) => Err(Error::invalid(

@@ -54,7 +54,9 @@ pub enum Error {
         frame: room::FrameId,
         split: splits::Split,
     },
-    #[error("the retrieved frame {frame} is excluded with its source")]
+    #[error(
+        "the retrieved frame {frame} is excluded: it is the source or the frame that the last step started from, or near to it"
+    )]
     Excluded { frame: room::FrameId },
     #[error("({source_frame}, {target_frame}) is no test pair under the split '{split}'")]
     NotATestPair {

@@ -31,7 +31,7 @@ impl ExactIndex {
 
 impl Index for ExactIndex {
     fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbour> {
-        let mut nearest = Nearest::new(k, self.frames.len());
+        let mut nearest = Nearest::new(k);
         for (row, &frame) in self.values.chunks_exact(self.width).zip(&self.frames) {
             if !exclusion.is_some_and(|exclusion| exclusion.covers(frame)) {
                 let distance = distance(row, query);

@@ -92,11 +92,11 @@ pub(crate) struct Nearest {
 }
 
 impl Nearest {
-    /// None yet, and at most `count` of the `offered` ones.
-    pub fn new(count: usize, offered: usize) -> Self {
+    /// None yet, and never more than `count`.
+    pub fn new(count: usize) -> Self {
         Self {
             count,
-            best: Vec::with_capacity(count.min(offered) + 1),
+            best: Vec::new(),
         }
     }
 

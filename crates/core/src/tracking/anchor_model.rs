@@ -61,7 +61,7 @@ const MOST_GROWTH: f64 = 3.0;
 /// Below the lowest one they fall to this factor at least.
 const LEAST_SHRINKAGE: f64 = 0.7;
 
-/// Which of a blend's predictors tells how far the second opinion is off.
+/// Which of a blend's predictors tells how far the second opinion is from it.
 const DISAGREEMENT: usize = 4;
 
 /// What the frames most like a view say of its pose.
@@ -92,6 +92,15 @@ pub struct AnchorModel {
     /// Of the predictors, for the logarithm of the size of the error.
     coefficients: Vector5<f64>,
     strata: Vec<Stratum>,
+}
+
+/// How wrong blends are in one room, for views with and without a latent that looks like the room.
+#[derive(Debug, Clone)]
+pub struct AnchorModels {
+    /// The latent gives a second opinion on the place, and the motion from there to the view.
+    pub with_latent: AnchorModel,
+    /// It gives neither.
+    pub without_latent: AnchorModel,
 }
 
 /// Blends whose errors are expected to be of about one size.
@@ -190,6 +199,14 @@ impl Blend {
         &self.pose
     }
 
+    /// The same of a view whose latent says nothing: neither on the place, nor on the motion there.
+    #[must_use]
+    pub fn without_latent(mut self) -> Self {
+        self.read = Vector6::zeros();
+        self.predictors[DISAGREEMENT] = LEAST.ln();
+        self
+    }
+
     /// The pose when a share of the read motion is believed.
     fn pose_with(&self, gain: f64) -> Pose {
         self.pose * exp(&Twist::from_vector(&(self.read * gain)))
@@ -206,19 +223,22 @@ impl AnchorModel {
         Self::of(&left_out_blends(navigator, likeness, mapped))
     }
 
-    /// The same with a second opinion, and then of the same blends without it.
+    /// Two models of the same blends: with the views' latents, and without them.
     pub fn measured_with_and_without(
         navigator: &Navigator,
         likeness: Likeness<'_>,
         mapped: &[FrameId],
-    ) -> Option<[Self; 2]> {
+    ) -> Option<AnchorModels> {
         let mut left_out = left_out_blends(navigator, likeness, mapped);
-        let with_second_opinion = Self::of(&left_out)?;
+        let with_latent = Self::of(&left_out)?;
 
         for found in &mut left_out {
-            found.blend.predictors[DISAGREEMENT] = LEAST.ln();
+            found.blend = found.blend.clone().without_latent();
         }
-        Some([with_second_opinion, Self::of(&left_out)?])
+        Some(AnchorModels {
+            with_latent,
+            without_latent: Self::of(&left_out)?,
+        })
     }
 
     fn of(left_out: &[LeftOut]) -> Option<Self> {
@@ -477,7 +497,7 @@ fn blends_without(
             None => !timeline.joins(other.frame, frame),
         };
         let left = |distances: &[Neighbour]| -> Option<Vec<Neighbour>> {
-            let mut nearest = Nearest::new(LOOKED_AT, distances.len());
+            let mut nearest = Nearest::new(LOOKED_AT);
             for other in distances.iter().filter(is_left) {
                 nearest.offer(*other);
             }

@@ -54,13 +54,55 @@ impl Correction {
     };
 }
 
+/// Corrects the map pose by an anchor that is within the gate of it; else nothing changes.
+fn correct_believed(
+    state: &mut State,
+    poses: &mut Poses,
+    frame: &Observation,
+    room: usize,
+    counted: CountedAnchor,
+) -> Correction {
+    let anchor = counted.belief;
+    let Some(believed) = poses.map_pose.filter(|_| state.room == Some(room)) else {
+        return Correction::NONE;
+    };
+    let surprise = surprise_at(&believed.place(), &anchor);
+    if surprise > REFUSED_BEYOND * GATE {
+        return Correction {
+            is_applied: false,
+            surprise: Some(surprise),
+        };
+    }
+
+    // Motions and errors have heavier tails than a Gaussian: a surprising anchor is believed less,
+    // but believed.
+    let doubted = Belief {
+        covariance: anchor.covariance * (surprise / GATE).max(1.0).powi(2),
+        ..anchor
+    };
+    poses.map_pose = Some(believed.corrected(&doubted));
+    poses.lasting = counted.lasting;
+    state.corrected_ns = Some(frame.time_ns);
+    Correction {
+        is_applied: true,
+        surprise: Some(surprise),
+    }
+}
+
+/// The squared Mahalanobis distance of an anchor from a believed pose.
+fn surprise_at(believed: &Belief, anchor: &Belief) -> f64 {
+    believed
+        .innovation(anchor)
+        .map_or(f64::INFINITY, |innovation| innovation.squared_length)
+}
+
 impl BestMap {
     /// Whether the view is tried as an anchor although it does not look like the room: images that
     /// are blurred, noisy or partly hidden do not, and their features still tell where they were
     /// taken. Only where the camera is known to be in the room, and only if the features tell more
     /// than a view of an unmapped part does. The limit was chosen on calibration rooms and the
     /// kitchen: at three times [`Belief::tells_a_place`] unmapped parts make poses worse.
-    pub(super) fn is_hint(&self, health: TrackingHealth) -> bool {
+    fn is_hint(&self, health: TrackingHealth) -> bool {
         health.is_confirmed()
             && self.matched.is_by_feature
             && self.matched.anchor.belief.hints_at_a_place()
@@ -83,6 +125,23 @@ impl Tracker {
 
         let anchor = self.anchor(state, frame, view);
         self.correct(state, poses, frame, view.room, anchor)
+    }
+
+    /// Corrects a believed pose by a view that does not look like the room; see [`BestMap::is_hint`].
+    /// Such a view speaks for no other place.
+    pub(super) fn correct_by_hint(
+        &self,
+        state: &mut State,
+        poses: &mut Poses,
+        frame: &Observation,
+        view: &BestMap,
+    ) -> Correction {
+        if !(self.settings.fuse && view.is_hint(state.health)) {
+            return Correction::NONE;
+        }
+
+        let anchor = self.anchor(state, frame, view);
+        correct_believed(state, poses, frame, view.room, anchor)
     }
 
     /// The pose of a view by the reader of its room if there is one and the view certainly shows the
@@ -142,30 +201,9 @@ impl Tracker {
             return Correction::NONE;
         }
 
-        let surprise_at = |belief: &Belief| {
-            belief
-                .innovation(&anchor)
-                .map_or(f64::INFINITY, |innovation| innovation.squared_length)
-        };
-
-        let believed = poses.map_pose.filter(|_| state.room == Some(room));
-        let surprise = believed.map(|believed| surprise_at(&believed.place()));
-        if let (Some(believed), Some(surprise)) = (believed, surprise)
-            && surprise <= REFUSED_BEYOND * GATE
-        {
-            // Motions and errors have heavier tails than a Gaussian: a surprising anchor is believed
-            // less, but believed.
-            let doubted = Belief {
-                covariance: anchor.covariance * (surprise / GATE).max(1.0).powi(2),
-                ..anchor
-            };
-            poses.map_pose = Some(believed.corrected(&doubted));
-            poses.lasting = counted.lasting;
-            state.corrected_ns = Some(frame.time_ns);
-            return Correction {
-                is_applied: true,
-                surprise: Some(surprise),
-            };
+        let within_gate = correct_believed(state, poses, frame, room, counted);
+        if within_gate.is_applied {
+            return within_gate;
         }
 
         // The earlier candidate was seen some frames ago: carry it to this frame, then compare.
@@ -173,7 +211,7 @@ impl Tracker {
             .filter(|candidate| candidate.room == room)
             .map(|candidate| self.carried_candidate(candidate, frame));
         let (map_pose, agreeing_anchors) = match carried {
-            Some((map_pose, agreeing)) if surprise_at(&map_pose) <= GATE => {
+            Some((map_pose, agreeing)) if surprise_at(&map_pose, &anchor) <= GATE => {
                 (map_pose.corrected(&anchor), agreeing + 1)
             }
             _ => (anchor, 1),
@@ -199,7 +237,7 @@ impl Tracker {
 
         Correction {
             is_applied,
-            surprise,
+            ..within_gate
         }
     }
 

@@ -46,18 +46,18 @@ impl RoomAppearance {
     /// Of the mapped frames of a room, whose features have shape (n, d). None if they are few or all
     /// alike.
     pub fn of(features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Option<Self> {
-        let unit = MappedFeatures::at_length_one(features, mapped);
-        let every: Vec<usize> = (0..mapped.len()).collect();
-        let appearance = Appearance::of(&unit, &every)?;
+        let features = MappedFeatures::at_length_one(features, mapped);
+        let places: Vec<usize> = (0..mapped.len()).collect();
+        let appearance = Appearance::of(&features, &places)?;
 
         let without = |part: usize| {
             let is_of_rest = |place: &usize| part_of(*place, mapped.len()) != part;
-            let rest: Vec<usize> = every.iter().copied().filter(is_of_rest).collect();
-            Some(unit.coordinates(&Appearance::of(&unit, &rest)?))
+            let rest: Vec<usize> = places.iter().copied().filter(is_of_rest).collect();
+            Some(features.coordinates(&Appearance::of(&features, &rest)?))
         };
 
         Some(Self {
-            coordinates: unit.coordinates(&appearance),
+            coordinates: features.coordinates(&appearance),
             without_part: (0..FOLDS).map(without).collect::<Option<_>>()?,
             appearance,
         })
@@ -118,14 +118,14 @@ pub struct Appearance {
 
 impl Appearance {
     /// The components of the mapped frames at these places. None if they are few or all alike.
-    fn of(unit: &MappedFeatures<'_>, places: &[usize]) -> Option<Self> {
+    fn of(features: &MappedFeatures<'_>, places: &[usize]) -> Option<Self> {
         let every = places.len().div_ceil(SAMPLED).max(1);
         let sampled: Vec<usize> = places.iter().copied().step_by(every).collect();
         if sampled.len() < FEWEST {
             return None;
         }
 
-        let mut centred = unit.rows.select(Axis(0), &sampled);
+        let mut centred = features.rows.select(Axis(0), &sampled);
         let mean = centred.mean_axis(Axis(0))?;
         centred -= &mean;
 

@@ -131,9 +131,9 @@ impl Belief {
         self.is_within(2.0)
     }
 
-    fn is_within(&self, share: f64) -> bool {
-        self.position_deviation_m() <= share * PLACE_DEVIATION_M
-            && self.rotation_deviation_rad() <= share * PLACE_DEVIATION_RAD
+    fn is_within(&self, factor: f64) -> bool {
+        self.position_deviation_m() <= factor * PLACE_DEVIATION_M
+            && self.rotation_deviation_rad() <= factor * PLACE_DEVIATION_RAD
     }
 
     /// The largest standard deviation of the position along any direction, metres.

@@ -88,7 +88,7 @@ impl TrackingHealth {
         matches!(self, Self::Lost { .. })
     }
 
-    /// Whether the stream is certainly in the room.
+    /// Whether the stream was certainly in the room once and has not been lost since.
     pub fn is_confirmed(self) -> bool {
         matches!(
             self,

@@ -4,7 +4,9 @@ use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
 
-use super::anchor_model::{AnchorModel, Blend, LOOKED_AT, Likeness, MapAnchor, calibrated_anchor};
+use super::anchor_model::{
+    AnchorModel, AnchorModels, Blend, LOOKED_AT, Likeness, MapAnchor, calibrated_anchor,
+};
 use super::appearance::{Appearance, RoomAppearance};
 use super::clock::frame_period_s;
 use super::motion_prior::MotionPrior;
@@ -55,9 +57,7 @@ impl<'a> MapQuery<'a> {
 struct AppearanceMap {
     appearance: Appearance,
     index: ExactIndex,
-    anchor_model: AnchorModel,
-    /// For views whose latents are of no use as a second opinion.
-    anchor_model_alone: AnchorModel,
+    anchor_models: AnchorModels,
 }
 
 impl AppearanceMap {
@@ -185,11 +185,10 @@ impl Map {
                 second_opinion: Some(&whitened),
             };
 
-            let [anchor_model, anchor_model_alone] =
+            let anchor_models =
                 AnchorModel::measured_with_and_without(&self.navigator, likeness, mapped)?;
             Some(AppearanceMap {
-                anchor_model,
-                anchor_model_alone,
+                anchor_models,
                 index: ExactIndex::new(coordinates.view(), mapped),
                 appearance,
             })
@@ -268,18 +267,18 @@ impl Map {
             Some((map, feature)) => {
                 let alike = map.nearest(feature, count.max(LOOKED_AT));
 
-                // A latent that looks like another place has no opinion on this one: images that are
+                // A latent that looks like another place says nothing of this one: images that are
                 // blurred, noisy or partly hidden spoil latents before they spoil features.
-                let has_opinion = out_of_distribution <= 1.0;
-                let second = Some(blend.pose()).filter(|_| has_opinion);
-                let model = match has_opinion {
-                    true => &map.anchor_model,
-                    false => &map.anchor_model_alone,
+                let second = Some(blend.pose());
+                let blend = Blend::of(&self.navigator, &alike, query.latent, second);
+                let models = &map.anchor_models;
+                let anchor = match out_of_distribution <= 1.0 {
+                    true => models.with_latent.anchor(&blend),
+                    false => models.without_latent.anchor(&blend.without_latent()),
                 };
 
-                let blend = Blend::of(&self.navigator, &alike, query.latent, second);
                 let nearest = self.with_latent_distances(&alike, &whitened);
-                (nearest, model.anchor(&blend))
+                (nearest, anchor)
             }
             None => {
                 let anchor = match &self.anchor_model {

@@ -263,12 +263,12 @@ impl Tracker {
 
         // 4. Correction: the mapped frames that look alike are tried as an anchor. An image that is
         //    repeated tells nothing new.
-        let is_hint = sight == Sight::Clear && best.is_hint(state.health);
-        let is_tried = (matches_room || is_hint) && state.unchanged_frames == 0;
-        let correction = if is_tried {
+        let correction = if sight != Sight::Clear || state.unchanged_frames > 0 {
+            Correction::NONE
+        } else if matches_room {
             self.correct_by_match(state, &mut poses, frame, &best)
         } else {
-            Correction::NONE
+            self.correct_by_hint(state, &mut poses, frame, &best)
         };
         if let Some(believed) = &poses.map_pose {
             poses.reported_pose = Some(self.reported(believed, &poses.lasting));
