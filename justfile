@@ -12,7 +12,7 @@ large:
 # The long forms of what the tests show in short: a thousand reloads under load, ten thousand streams that say nothing,
 # half an hour of a steady load.
 soak:
-    SEESE3_RELOADS=1000 cargo test --release --test service swapped
+    SEESE3_RELOADS=1000 cargo test --release --test service swapped -- --nocapture
     SEESE3_IDLE_STREAMS=10000 cargo test --release --test service idle_streams
     SEESE3_SOAK_SECONDS=1800 cargo test --release --test service steady_load -- --nocapture
 

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use seese3::service::{Config, Reload};
 use seese3::store::{Choice, Store};
@@ -326,25 +326,33 @@ async fn answers_are_whole_over(reloads: u64, askers: usize) {
     assert_ne!(of_odd.steps, of_even.steps, "the test can tell them apart");
 
     let stop = Arc::new(AtomicBool::new(false));
+    let swapping = Arc::new(AtomicBool::new(false));
     let asking: Vec<_> = (0..askers)
         .map(|_| {
-            let stop = stop.clone();
+            let (stop, swapping) = (stop.clone(), swapping.clone());
             let address = server.address.clone();
             let expected = [of_even.clone(), of_odd.clone()];
             tokio::spawn(async move {
                 let client = Client::connect(&address, PATIENCE).await.unwrap();
-                let mut answers = 0_u64;
+                let mut took = Took::default();
                 while !stop.load(Ordering::Relaxed) {
+                    let begun = Instant::now();
                     let answer = client.navigate(question()).await.unwrap();
+                    match swapping.load(Ordering::Relaxed) {
+                        true => took.swapping.push(begun.elapsed()),
+                        false => took.quiet.push(begun.elapsed()),
+                    }
                     let (revision, answer) = without_revision(answer);
                     assert_eq!(answer, expected[(revision % 2) as usize], "{revision}");
-                    answers += 1;
                 }
-                answers
+                took
             })
         })
         .collect();
 
+    // The control: the same questions while nothing is swapped.
+    tokio::time::sleep(Duration::from_millis(50 * reloads)).await;
+    swapping.store(true, Ordering::Relaxed);
     for reload in 0..reloads {
         let features = if reload % 2 == 0 { &forward } else { &backward };
         let revision = publish(features).await;
@@ -352,9 +360,32 @@ async fn answers_are_whole_over(reloads: u64, askers: usize) {
     }
 
     stop.store(true, Ordering::Relaxed);
+    let mut all = Took::default();
     for asker in asking {
-        assert!(asker.await.unwrap() > 0, "nobody asked");
+        let Took { quiet, swapping } = asker.await.unwrap();
+        assert!(!quiet.is_empty() && !swapping.is_empty(), "nobody asked");
+        all.quiet.extend(quiet);
+        all.swapping.extend(swapping);
     }
+    println!("quiet: {}", percentiles(&mut all.quiet));
+    println!(
+        "while rooms are swapped: {}",
+        percentiles(&mut all.swapping)
+    );
+}
+
+/// How long answers took.
+#[derive(Default)]
+struct Took {
+    quiet: Vec<Duration>,
+    swapping: Vec<Duration>,
+}
+
+fn percentiles(took: &mut [Duration]) -> String {
+    took.sort();
+    let at = |share: f64| took[((took.len() - 1) as f64 * share) as usize];
+    let (count, half, most) = (took.len(), at(0.5), at(0.99));
+    format!("{count} answers, p50 {half:?}, p99 {most:?}")
 }
 
 /// Oracle: the answers of either revision while nothing changes. SEESE3_RELOADS says how many swaps,
