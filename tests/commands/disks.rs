@@ -4,6 +4,7 @@
 use std::fs::File;
 use std::path::Path;
 use std::process::{Command, Stdio};
+use std::time::Duration;
 
 use crate::kills::{Running, address_of, import, words};
 use crate::program::{refuses, seese3, succeeds, text};
@@ -95,6 +96,18 @@ impl Apart {
     }
 }
 
+/// Waits until the server's log, which is written beside its answers, says this.
+fn until_logged(folder: &Path, words: &str) {
+    let log = || std::fs::read_to_string(folder.join("log")).unwrap();
+    for _ in 0..600 {
+        if log().contains(words) {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    panic!("{words} is not in the log: {}", log());
+}
+
 /// Oracle: the promise: clear errors, serving goes on, and what makes room lets changes through.
 #[test]
 fn a_full_and_a_read_only_disk_stop_changes_and_nothing_else() {
@@ -123,7 +136,6 @@ fn a_full_and_a_read_only_disk_stop_changes_and_nothing_else() {
 
     let server = Apart::start(source, folder.path());
     server.answers();
-    let log = || std::fs::read_to_string(folder.path().join("log")).unwrap();
 
     // Until the disk is full.
     let fits = |version: &u32| {
@@ -137,7 +149,7 @@ fn a_full_and_a_read_only_disk_stop_changes_and_nothing_else() {
         &server.push(source),
         &["the store cannot be read or written"],
     );
-    assert!(log().contains("No space left on device"), "{}", log());
+    until_logged(folder.path(), "No space left on device");
     server.answers();
     server.seese3(&["store", "verify"]);
 
@@ -154,7 +166,7 @@ fn a_full_and_a_read_only_disk_stop_changes_and_nothing_else() {
         &server.push(source),
         &["the store cannot be read or written"],
     );
-    assert!(log().contains("Read-only file system"), "{}", log());
+    until_logged(folder.path(), "Read-only file system");
     server.answers();
 
     remount("rw");
