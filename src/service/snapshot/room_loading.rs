@@ -303,8 +303,8 @@ mod tests {
     /// Oracle: the promise itself: what panics is refused, and tried again only when that is asked for.
     #[tokio::test]
     async fn a_panic_refuses_one_thing() {
-        let panicked = contained(async { panic!("on purpose") }).await;
-        let problem: Problem = panicked.map(|()| ()).unwrap_err();
+        let panicked: Result<(), Problem> = contained(async { panic!("on purpose") }).await;
+        let problem = panicked.unwrap_err();
         assert!(matches!(problem, Problem::Panicked) && !problem.may_pass());
 
         assert_eq!(contained(async { Ok(7) }).await.unwrap(), 7);
