@@ -1,5 +1,5 @@
-//! TUM RGB-D: `rgb.txt` ("timestamp file") and `groundtruth.txt` ("timestamp tx ty tz qx qy qz
-//! qw"), camera-to-world.
+//! TUM RGB-D: `rgb.txt` ("timestamp file") and `groundtruth.txt`
+//! ("timestamp tx ty tz qx qy qz qw"), camera-to-world.
 //!
 //! An image takes the pose nearest in time if it is at most 10 ms away, as evo associates them.
 //! Times are decimal text and are read exactly to the nanosecond. Lines are parsed at least as

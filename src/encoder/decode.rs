@@ -157,11 +157,11 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
     })
 }
 
-/// What follows the header of a JPEG: an end-of-image marker before it belongs to a thumbnail. None if
-/// the header does not end.
+/// What follows the header of a JPEG: an end-of-image marker before it belongs to a thumbnail. None
+/// if the header does not end.
 fn after_header(bytes: &[u8]) -> Option<&[u8]> {
-    // A header is a list of segments: 0xff, a code, the length in two bytes, which it includes, and as
-    // much content. Only the start of the image, at the beginning, has no length.
+    // A header is a list of segments: 0xff, a code, the length in two bytes, which it includes, and
+    // as much content. Only the start of the image, at the beginning, has no length.
     let mut rest = bytes.get(2..)?;
     loop {
         let &[0xff, code, ..] = rest else {

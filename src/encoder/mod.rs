@@ -467,8 +467,8 @@ impl Encoder {
 
         let outputs = match &self.backbone {
             Backbone::Builtin => Vec::new(),
-            // Clips of raw pixels have one image, whose axis is dropped to give maps (clip, 3, H,
-            // W).
+            // Clips of raw pixels have one image, whose axis is dropped to give maps
+            // (clip, 3, H, W).
             Backbone::Pixels => vec![frames.index_axis_move(Axis(1), 0)],
             Backbone::Model {
                 runner, clip_axis, ..

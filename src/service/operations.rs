@@ -31,8 +31,8 @@ struct Operated {
     phase: watch::Receiver<Phase>,
 }
 
-/// So many connections may be open; a further one takes the place of the oldest, so that whoever asks
-/// at once is answered however many stay silent.
+/// So many connections may be open; a further one takes the place of the oldest, so that whoever
+/// asks at once is answered however many stay silent.
 const CONNECTIONS: usize = 64;
 /// A connection that asks nothing for so long is closed.
 const SILENCE: Duration = Duration::from_secs(5);

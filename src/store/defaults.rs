@@ -36,8 +36,8 @@ struct Body {
     number: u64,
     /// When it was written, RFC 3339.
     created: String,
-    /// The number of the file whose choices these are again, if they were taken back to it; 0 for no
-    /// choices at all.
+    /// The number of the file whose choices these are again, if they were taken back to it; 0 for
+    /// no choices at all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     back_to: Option<u64>,
     defaults: Defaults,
@@ -248,8 +248,8 @@ impl Store {
     /// Makes a choice. Choosing again what holds already changes nothing.
     ///
     /// # Errors
-    /// As [`Store::check_choice`] and [`Store::defaults`]; [`Error::Contended`] if others changed the
-    /// choices all the time.
+    /// As [`Store::check_choice`] and [`Store::defaults`]; [`Error::Contended`] if others changed
+    /// the choices all the time.
     pub async fn choose(&self, choice: &Choice) -> Result<Defaults, Error> {
         self.check_choice(choice).await?;
 
@@ -264,9 +264,9 @@ impl Store {
         Err(contended())
     }
 
-    /// Takes the last change of the choices back: those before it hold again, as far as what they name
-    /// is still there. Done again, the change before that one is taken back. A change whose file is
-    /// damaged is taken back as well.
+    /// Takes the last change of the choices back: those before it hold again, as far as what they
+    /// name is still there. Done again, the change before that one is taken back. A change whose
+    /// file is damaged is taken back as well.
     ///
     /// # Errors
     /// [`Error::NothingToTakeBack`] if nothing was ever chosen; otherwise as [`Store::choose`].

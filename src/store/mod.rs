@@ -439,8 +439,8 @@ impl Store {
         Ok(false)
     }
 
-    /// Refuses a path of a local store where there is something else than a folder: it would be listed
-    /// as an empty one.
+    /// Refuses a path of a local store where there is something else than a folder: it would be
+    /// listed as an empty one.
     fn check_folder(&self, path: &Path) -> Result<(), Error> {
         let Some(root) = &self.folder else {
             return Ok(());

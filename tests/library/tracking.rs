@@ -92,9 +92,9 @@ fn a_wrong_match_cannot_pull_the_pose() {
     assert!(refused > 0, "no wrong match was met");
 }
 
-/// Oracle: the true poses, and the same camera without features. Latents that are all off by the same
-/// large number look like no place of the room, and tell no motion wrongly. A camera that is known to
-/// be in the room is corrected by its features all the same, and is not TRACKING.
+/// Oracle: the true poses, and the same camera without features. Latents that are all off by the
+/// same large number look like no place of the room, and tell no motion wrongly. A camera that is
+/// known to be in the room is corrected by its features all the same, and is not TRACKING.
 #[test]
 fn a_known_camera_with_spoilt_latents_is_corrected_by_its_features() {
     let adapter = Arc::new(calibrated().0);

@@ -123,9 +123,10 @@ async fn evaluate_streams_progress_and_the_oracles_table() {
     }
 }
 
-/// Oracle: two ways to one number: the frames that Navigate retrieves in the last of three steps, handed
-/// in with the frame that this step started from, get the scores that Evaluate gives the same walks.
-/// Without that frame, some of them are refused, since a walk may come back to its source.
+/// Oracle: two ways to one number: the frames that Navigate retrieves in the last of three steps,
+/// handed in with the frame that this step started from, get the scores that Evaluate gives the
+/// same walks. Without that frame, some of them are refused, since a walk may come back to its
+/// source.
 #[tokio::test]
 async fn walks_that_snap_can_be_handed_in() {
     let server = start(Config::default()).await;

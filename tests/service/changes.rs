@@ -393,8 +393,8 @@ async fn a_change_that_is_sent_again_is_made_once() {
     );
 }
 
-/// Oracle: by hand. The newest adapter answers until another one is chosen; what was chosen is taken
-/// back by one call; a chosen one cannot be removed.
+/// Oracle: by hand. The newest adapter answers until another one is chosen; what was chosen is
+/// taken back by one call; a chosen one cannot be removed.
 #[tokio::test]
 async fn defaults_are_chosen_and_taken_back() {
     let (server, store) = start_writable().await;
@@ -723,8 +723,8 @@ async fn only_those_who_may_change_what_they_may() {
     }
 }
 
-/// Oracle: the bound on waiting changes: each is made or refused as one too many, and the server goes
-/// on. More than one blocking thread each would be more than there are.
+/// Oracle: the bound on waiting changes: each is made or refused as one too many, and the server
+/// goes on. More than one blocking thread each would be more than there are.
 #[tokio::test]
 async fn many_changes_at_once_are_made_or_refused() {
     let (server, store) = start_writable().await;
@@ -758,8 +758,8 @@ async fn many_changes_at_once_are_made_or_refused() {
     assert!(store.verify(&|_| ()).await.unwrap().is_empty());
 }
 
-/// Oracle: the promise: a change that was admitted is made, whoever waits for it, and the same change
-/// that is sent again meanwhile is the same change.
+/// Oracle: the promise: a change that was admitted is made, whoever waits for it, and the same
+/// change that is sent again meanwhile is the same change.
 #[tokio::test]
 async fn a_caller_that_goes_away_leaves_its_change() {
     let (server, store) = start_writable().await;

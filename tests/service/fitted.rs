@@ -105,8 +105,8 @@ async fn a_view_is_located_in_the_room_of_its_adapter() {
     assert!(answer.located.is_none());
 }
 
-/// Oracle: the promise of NavigateTo: nothing is planned for a view that tells no place. An adapter that
-/// was fitted to a room and calibrated nowhere knows that too.
+/// Oracle: the promise of NavigateTo: nothing is planned for a view that tells no place. An adapter
+/// that was fitted to a room and calibrated nowhere knows that too.
 #[tokio::test]
 async fn a_fitted_adapter_starts_no_way_from_elsewhere() {
     use pb::navigate_to_request::Goal;
@@ -174,8 +174,9 @@ async fn a_fitted_adapter_serves_no_other_room() {
     assert_eq!(hall.adapter.unwrap().name, "hall.fitted");
 }
 
-/// Oracle: the promise of the protocol: the room that an adapter was fitted to answers with the pose
-/// that it locates, the other room with that of its nearest frame; a latent has no feature to locate.
+/// Oracle: the promise of the protocol: the room that an adapter was fitted to answers with the
+/// pose that it locates, the other room with that of its nearest frame; a latent has no feature to
+/// locate.
 #[tokio::test]
 async fn a_fitted_room_is_relocalised_by_its_own_adapter() {
     let server = server().await;

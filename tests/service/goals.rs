@@ -69,9 +69,9 @@ async fn a_goal_is_reached_frame_by_frame() {
     );
 }
 
-/// Oracle: composition: the start moved by the motions of all steps is the pose of the last frame, and
-/// no motion is longer than the step that was asked for. What cannot be reached in such steps can be
-/// in steps as long as the answer says.
+/// Oracle: composition: the start moved by the motions of all steps is the pose of the last frame,
+/// and no motion is longer than the step that was asked for. What cannot be reached in such steps
+/// can be in steps as long as the answer says.
 #[tokio::test]
 async fn a_way_is_driven_by_its_motions() {
     let server = start(Config::default()).await;
@@ -325,8 +325,8 @@ async fn a_pursuit_ends_at_its_bounds() {
     }
 }
 
-/// Oracle: the worlds of the test: an attic is not the hall, and a frame of the hall stands where it was
-/// recorded.
+/// Oracle: the worlds of the test: an attic is not the hall, and a frame of the hall stands where
+/// it was recorded.
 #[tokio::test]
 async fn a_view_that_tells_no_place_starts_no_way() {
     let server = start_followed(Config::default()).await;

@@ -102,8 +102,8 @@ async fn health_answers_for_the_server_its_services_and_its_rooms() {
         .unwrap();
 }
 
-/// Oracle: the bounds by hand: a request holds 16 KiB at least, so that an eighth of 2 MB has room for
-/// 15 watchers. Those who check, and requests, are answered beside them.
+/// Oracle: the bounds by hand: a request holds 16 KiB at least, so that an eighth of 2 MB has room
+/// for 15 watchers. Those who check, and requests, are answered beside them.
 #[tokio::test]
 async fn watchers_leave_room_for_those_who_check() {
     let config = Config {
@@ -399,8 +399,8 @@ async fn stopping_answers_what_is_in_flight_within_a_bound() {
     drop((server.folder, stuck.folder));
 }
 
-/// Oracle: the meaning of the setting: health says NOT_SERVING, requests are still answered, and then
-/// the server ends.
+/// Oracle: the meaning of the setting: health says NOT_SERVING, requests are still answered, and
+/// then the server ends.
 #[tokio::test]
 async fn a_lame_duck_still_answers() {
     let server = start(Config {

@@ -106,8 +106,8 @@ async fn an_answer_that_finds_no_memory_is_refused() {
     assert!(server.client.navigate(question()).await.is_ok());
 }
 
-/// Oracle: the time limit itself. The caller's window is closed, or has room for one byte, and it reads
-/// or does not read what else the server sends.
+/// Oracle: the time limit itself. The caller's window is closed, or has room for one byte, and it
+/// reads or does not read what else the server sends.
 #[tokio::test]
 async fn a_response_that_is_not_received_is_not_kept() {
     let metrics = Metrics::default();

@@ -255,8 +255,8 @@ async fn a_server_starts_beside_damage_and_outlives_its_store() {
     }
 }
 
-/// Oracle: the promise: where the newest choices of defaults are damaged, the ones before them hold, at
-/// a reload and at the start, and everything else goes on.
+/// Oracle: the promise: where the newest choices of defaults are damaged, the ones before them
+/// hold, at a reload and at the start, and everything else goes on.
 #[tokio::test]
 async fn damaged_choices_leave_those_before_them() {
     let (server, store, asked) = start_watched().await;
@@ -388,8 +388,8 @@ fn percentiles(took: &mut [Duration]) -> String {
     format!("{count} answers, p50 {half:?}, p99 {most:?}")
 }
 
-/// Oracle: the answers of either revision while nothing changes. SEESE3_RELOADS says how many swaps,
-/// 20 if it is not set; `just soak` asks for a thousand.
+/// Oracle: the answers of either revision while nothing changes. SEESE3_RELOADS says how many
+/// swaps, 20 if it is not set; `just soak` asks for a thousand.
 #[tokio::test]
 async fn no_answer_fails_or_mixes_revisions_while_rooms_are_swapped() {
     let given = std::env::var("SEESE3_RELOADS").ok();

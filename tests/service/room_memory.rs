@@ -89,8 +89,8 @@ async fn answers_do_not_depend_on_what_is_in_memory() {
     }
 }
 
-/// Oracle: the promise: a damaged room is refused by itself, if only when it is first asked for, and
-/// a repaired one is served after SIGHUP.
+/// Oracle: the promise: a damaged room is refused by itself, if only when it is first asked for,
+/// and a repaired one is served after SIGHUP.
 #[tokio::test]
 async fn damage_is_noticed_when_a_room_is_first_asked_for() {
     let lazy = RoomMemory {
@@ -178,8 +178,8 @@ async fn a_store_that_is_away_costs_what_is_not_in_memory() {
     assert_eq!(after, before);
 }
 
-/// Oracle: the promise: a stream that is open holds the room that it is in, and none that was removed
-/// since it began.
+/// Oracle: the promise: a stream that is open holds the room that it is in, and none that was
+/// removed since it began.
 #[tokio::test]
 async fn a_stream_holds_its_own_room_alone() {
     let config = Config {

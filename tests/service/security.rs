@@ -160,8 +160,8 @@ async fn a_caller_may_what_its_verbs_say_and_nothing_else() {
     }
 }
 
-/// Oracle: the meaning of the file, for every verb with every kind of scope, and every room: what is
-/// not in both does not exist or is forbidden. Each caller has one verb.
+/// Oracle: the meaning of the file, for every verb with every kind of scope, and every room: what
+/// is not in both does not exist or is forbidden. Each caller has one verb.
 #[tokio::test]
 async fn every_verb_is_held_to_every_scope() {
     let scopes = [
@@ -373,8 +373,8 @@ async fn serves(client: &Client) -> bool {
     false
 }
 
-/// Oracle: what TLS promises: a client that trusts the authority is answered, and neither plain text
-/// nor another authority is; a replaced certificate is used without a restart.
+/// Oracle: what TLS promises: a client that trusts the authority is answered, and neither plain
+/// text nor another authority is; a replaced certificate is used without a restart.
 #[tokio::test]
 async fn tls_answers_who_trusts_it_and_takes_a_new_certificate() {
     let folder = tempfile::tempdir().unwrap();

@@ -7,8 +7,9 @@ use super::super::Error;
 
 /// How long an answer is remembered.
 const KEPT_FOR: Duration = Duration::from_secs(3_600);
-/// How many answers are remembered. Beyond it, the caller who has the most loses the oldest: whoever
-/// makes very many changes makes the server forget its own, not those of callers who make few.
+/// How many answers are remembered. Beyond it, the caller who has the most loses the oldest:
+/// whoever makes very many changes makes the server forget its own, not those of callers who make
+/// few.
 const KEPT: usize = 1_000;
 /// The longest request id, characters.
 const LONGEST_ID: usize = 100;
@@ -130,8 +131,8 @@ mod tests {
         assert!(recent.answer(&identity("a", &"x".repeat(101), 7)).is_err());
     }
 
-    /// Oracle: the bound itself: the caller who changes most loses its oldest answer, and nobody else
-    /// loses one.
+    /// Oracle: the bound itself: the caller who changes most loses its oldest answer, and nobody
+    /// else loses one.
     #[test]
     fn memory_is_bounded() {
         let mut recent = Recent::default();

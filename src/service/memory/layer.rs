@@ -20,8 +20,8 @@ use super::decoded::{decoded_size, has_unary_response, is_stream};
 use super::response::{ResponseTimeout, in_pieces};
 use super::{HELD, Held, Memory};
 
-/// The paths of the health service. Those who watch stay, and have memory of their own: else many of
-/// them would hold that of those who check, or of requests.
+/// The paths of the health service. Those who watch stay, and have memory of their own: else many
+/// of them would hold that of those who check, or of requests.
 const CHECK: &str = "/grpc.health.v1.Health/Check";
 const WATCH: &str = "/grpc.health.v1.Health/Watch";
 /// What stands before a message: whether it is compressed, and its length.

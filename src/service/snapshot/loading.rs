@@ -37,8 +37,8 @@ pub enum Refused {
 /// Which rooms are in memory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RoomMemory {
-    /// Whether every room is loaded, and thereby verified, before it is served. Else a room is loaded
-    /// when it is first asked for.
+    /// Whether every room is loaded, and thereby verified, before it is served. Else a room is
+    /// loaded when it is first asked for.
     pub preload: bool,
     /// About how many bytes the rooms in memory may hold together; none for no bound.
     pub bytes: Option<usize>,
@@ -138,8 +138,8 @@ impl Loader {
         }
     }
 
-    /// Whether the store has rooms, or had some that were removed from it. One that has vanished, for
-    /// instance with its disk, has neither.
+    /// Whether the store has rooms, or had some that were removed from it. One that has vanished,
+    /// for instance with its disk, has neither.
     pub async fn remembers_rooms(&self) -> bool {
         self.store.remembers(Kind::Room).await.unwrap_or(false)
     }
@@ -189,8 +189,8 @@ impl Loader {
         Ok(loaded)
     }
 
-    /// Adds rooms, each in its current revision. While no room is served, they are loaded
-    /// on all processors at the same time; later one after another, because requests are answered.
+    /// Adds rooms, each in its current revision. While no room is served, they are loaded on all
+    /// processors at the same time; later one after another, because requests are answered.
     async fn add_rooms(
         &self,
         loaded: &mut Snapshot,
@@ -294,8 +294,8 @@ impl Loader {
     }
 
     /// Adds the image encoders of all adapters. An adapter whose encoder cannot be used is served
-    /// without one: callers may still send features. One that failed before is tried again when that
-    /// is asked for.
+    /// without one: callers may still send features. One that failed before is tried again when
+    /// that is asked for.
     fn add_image_encoders(&self, loaded: &mut Snapshot, before: &Snapshot, refused: Refused) {
         let Some(encoders) = &self.encoders else {
             return;
@@ -370,8 +370,8 @@ impl Loader {
         }
     }
 
-    /// A room that is to be served. `known` is the room as it was served before: what is in memory of
-    /// it is loaded anew now, so that no request has to wait for it.
+    /// A room that is to be served. `known` is the room as it was served before: what is in memory
+    /// of it is loaded anew now, so that no request has to wait for it.
     async fn room(
         &self,
         name: &str,
@@ -497,9 +497,9 @@ fn opened_for(
     })
 }
 
-/// The adapters that fit a room with features of these sources, in order of preference: those fitted
-/// to this room, then those trained in it, then the newest. The first is the room's default where an
-/// operator chose none.
+/// The adapters that fit a room with features of these sources, in order of preference: those
+/// fitted to this room, then those trained in it, then the newest. The first is the room's default
+/// where an operator chose none.
 fn fitting(
     adapters: &BTreeMap<String, Arc<StoredAdapter>>,
     room: &RoomId,

@@ -26,7 +26,8 @@ pub struct PredictedPair {
     /// What is expected at the target.
     pub prediction: Prediction,
     /// The frame that the last step started from, where the motion was divided into steps that each
-    /// went on from a frame: the exclusion is around it, as it is in `evaluate`. None for the source.
+    /// went on from a frame: the exclusion is around it, as it is in `evaluate`. None for the
+    /// source.
     pub last_step_from: Option<FrameId>,
 }
 

@@ -66,8 +66,8 @@ fn by_distance_then_frame(a: &Neighbour, b: &Neighbour) -> std::cmp::Ordering {
         .then(a.frame.cmp(&b.frame))
 }
 
-/// L2 distance. Columns are summed in four lanes, which a processor adds at the same time; the order
-/// is always the same, so that equal rows have equal distances.
+/// L2 distance. Columns are summed in four lanes, which a processor adds at the same time; the
+/// order is always the same, so that equal rows have equal distances.
 pub(crate) fn distance(a: &[f64], b: &[f64]) -> f64 {
     let ((a_lanes, a_rest), (b_lanes, b_rest)) = (a.as_chunks::<4>(), b.as_chunks::<4>());
 

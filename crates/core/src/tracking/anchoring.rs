@@ -16,8 +16,8 @@ const REFUSED_BEYOND: f64 = 4.0;
 /// Anchors in a row that must agree on a place before it replaces another one, or is believed where
 /// none was.
 pub const ANCHORS_TO_AGREE: u32 = 10;
-/// Anchors are taken to be as far apart in time at most, seconds: after a pause the next one is as good
-/// as an independent one.
+/// Anchors are taken to be as far apart in time at most, seconds: after a pause the next one is as
+/// good as an independent one.
 const LONGEST_PAUSE_S: f64 = 10.0;
 
 /// The map that a view matches best.
@@ -110,8 +110,8 @@ impl BestMap {
 }
 
 impl Tracker {
-    /// Tries the best match of a view that looks like the room as an anchor, if it looks clearly like
-    /// one map.
+    /// Tries the best match of a view that looks like the room as an anchor, if it looks clearly
+    /// like one map.
     pub(super) fn correct_by_match(
         &self,
         state: &mut State,
@@ -127,8 +127,8 @@ impl Tracker {
         self.correct(state, poses, frame, view.room, anchor)
     }
 
-    /// Corrects a believed pose by a view that does not look like the room; see [`BestMap::is_hint`].
-    /// Such a view speaks for no other place.
+    /// Corrects a believed pose by a view that does not look like the room; see
+    /// [`BestMap::is_hint`]. Such a view speaks for no other place.
     pub(super) fn correct_by_hint(
         &self,
         state: &mut State,
@@ -144,9 +144,9 @@ impl Tracker {
         correct_believed(state, poses, frame, view.room, anchor)
     }
 
-    /// The pose of a view by the reader of its room if there is one and the view certainly shows the
-    /// room, else by the frames that it matches: beyond the mapped part a reader is surer than it
-    /// should be. Its covariance is that with which it counts beside the anchors before it.
+    /// The pose of a view by the reader of its room if there is one and the view certainly shows
+    /// the room, else by the frames that it matches: beyond the mapped part a reader is surer than
+    /// it should be. Its covariance is that with which it counts beside the anchors before it.
     fn anchor(&self, state: &State, frame: &Observation, view: &BestMap) -> CountedAnchor {
         let MapAnchor { belief, memory_s } = view.matched.anchor;
         let feature = frame.feature.as_deref().filter(|_| view.matched.is_certain);

@@ -43,8 +43,8 @@ pub struct RoomAppearance {
 }
 
 impl RoomAppearance {
-    /// Of the mapped frames of a room, whose features have shape (n, d). None if they are few or all
-    /// alike.
+    /// Of the mapped frames of a room, whose features have shape (n, d). None if they are few or
+    /// all alike.
     pub fn of(features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Option<Self> {
         let features = MappedFeatures::at_length_one(features, mapped);
         let places: Vec<usize> = (0..mapped.len()).collect();
