@@ -229,8 +229,7 @@ async fn load(
                         timestamp_ns,
                         sequence,
                         view,
-                        with_token: false,
-                        odometry: None,
+                        ..pb::TrackFrame::default()
                     };
 
                     if sender

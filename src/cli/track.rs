@@ -355,8 +355,7 @@ fn frame(row: usize, view: pb::view::View, hz: f64) -> pb::TrackFrame {
         timestamp_ns: (row as f64 / hz * 1e9) as i64,
         sequence: row as u64 + 1,
         view,
-        with_token: false,
-        odometry: None,
+        ..pb::TrackFrame::default()
     }
 }
 

@@ -48,14 +48,7 @@ fn observe(tracker: &Tracker, state: &mut State, features: &Features, row: usize
         .adapter()
         .embed_one(&features.rows().row(row).to_vec())
         .unwrap();
-    let observation = Observation {
-        time_ns: row as i64 * 33_000_000,
-        sequence: row as u64,
-        latent,
-        feature: None,
-        is_blank: false,
-        measured: None,
-    };
+    let observation = Observation::new(row as i64 * 33_000_000, row as u64, latent);
 
     tracker.observe(state, &observation).unwrap()
 }
@@ -110,12 +103,12 @@ fn a_known_camera_with_spoilt_latents_is_corrected_by_its_features() {
         for row in (41..141).step_by(2) {
             let feature = features.rows().row(row).to_vec();
             let observation = Observation {
-                time_ns: row as i64 * 33_000_000,
-                sequence: row as u64,
-                latent: adapter.embed_one(&feature).unwrap() + 50.0,
                 feature: with_features.then_some(feature),
-                is_blank: false,
-                measured: None,
+                ..Observation::new(
+                    row as i64 * 33_000_000,
+                    row as u64,
+                    adapter.embed_one(&feature).unwrap() + 50.0,
+                )
             };
 
             let update = tracker.observe(&mut state, &observation).unwrap();
@@ -171,17 +164,7 @@ fn odom_never_jumps() {
         let sequence = number as u64 * 2;
 
         let update = tracker
-            .observe(
-                &mut state,
-                &Observation {
-                    time_ns,
-                    sequence,
-                    latent,
-                    feature: None,
-                    is_blank: false,
-                    measured: None,
-                },
-            )
+            .observe(&mut state, &Observation::new(time_ns, sequence, latent))
             .unwrap();
 
         if let Some((odom, place)) = before {
@@ -227,14 +210,11 @@ fn what_a_gap_hid_is_not_taken_on_trust() {
     let other = elsewhere.rows().row(41).to_owned();
     let observe_view = |state: &mut State, share: f32, sequence: u64| {
         let view = &own + &((&other - &own) * share);
-        let observation = Observation {
-            time_ns: sequence as i64 * 33_000_000,
+        let observation = Observation::new(
+            sequence as i64 * 33_000_000,
             sequence,
-            latent: adapter.embed_one(&view.to_vec()).unwrap(),
-            feature: None,
-            is_blank: false,
-            measured: None,
-        };
+            adapter.embed_one(&view.to_vec()).unwrap(),
+        );
         tracker.observe(state, &observation).unwrap()
     };
 
@@ -295,12 +275,8 @@ fn the_reader_of_a_room_gives_the_anchors() {
         for row in (41..101).step_by(2) {
             let latent = adapter.embed_one(&features.rows().row(row).to_vec());
             let observation = Observation {
-                time_ns: row as i64 * 33_000_000,
-                sequence: row as u64,
-                latent: latent.unwrap(),
                 feature: has_feature.then(|| vec![row as f32]),
-                is_blank: false,
-                measured: None,
+                ..Observation::new(row as i64 * 33_000_000, row as u64, latent.unwrap())
             };
             let update = tracker.observe(&mut state, &observation).unwrap();
             if update.match_used {
@@ -377,12 +353,8 @@ fn a_camera_that_sees_nothing_new_is_not_tracked() {
         number += 1;
         let latent = adapter.embed_one(&features.rows().row(row).to_vec());
         let observation = Observation {
-            time_ns: number * 33_000_000,
-            sequence: number as u64,
-            latent: latent.unwrap(),
-            feature: None,
             is_blank,
-            measured: None,
+            ..Observation::new(number * 33_000_000, number as u64, latent.unwrap())
         };
         tracker.observe(&mut state, &observation).unwrap()
     };
@@ -470,12 +442,6 @@ fn wheels_carry_a_blind_camera() {
 
             let is_blind = row >= 71;
             let observation = Observation {
-                time_ns: row as i64 * 33_000_000,
-                sequence: row as u64,
-                latent: adapter
-                    .embed_one(&features.rows().row(row).to_vec())
-                    .unwrap(),
-                feature: None,
                 is_blank: is_blind,
                 measured: has_wheels.then_some(MeasuredPose {
                     pose: wheels,
@@ -484,6 +450,13 @@ fn wheels_carry_a_blind_camera() {
                         rotation_share: 0.05,
                     },
                 }),
+                ..Observation::new(
+                    row as i64 * 33_000_000,
+                    row as u64,
+                    adapter
+                        .embed_one(&features.rows().row(row).to_vec())
+                        .unwrap(),
+                )
             };
             let update = tracker.observe(&mut state, &observation).unwrap();
             if is_blind {

@@ -66,8 +66,7 @@ fn seen_of(room: &str, row: usize) -> pb::TrackRequest {
         timestamp_ns: row as i64 * 33_000_000,
         sequence: row as u64 + 1,
         view,
-        with_token: false,
-        odometry: None,
+        ..pb::TrackFrame::default()
     })
 }
 
@@ -396,48 +395,42 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
     .unwrap();
 
     let late = pb::TrackFrame {
-        with_token: false,
-        odometry: None,
+        ..pb::TrackFrame::default()
         timestamp_ns: 0,
         sequence: 100,
         view: feature(vec![0.0; 48]),
     };
 
     let duplicate = pb::TrackFrame {
-        with_token: false,
-        odometry: None,
+        ..pb::TrackFrame::default()
         timestamp_ns: i64::MAX,
         sequence: 3,
         view: feature(vec![0.0; 48]),
     };
 
     let narrow = pb::TrackFrame {
-        with_token: false,
-        odometry: None,
+        ..pb::TrackFrame::default()
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: feature(vec![0.0; 47]),
     };
 
     let nan = pb::TrackFrame {
-        with_token: false,
-        odometry: None,
+        ..pb::TrackFrame::default()
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: feature(vec![f32::NAN; 48]),
     };
 
     let of_room = pb::TrackFrame {
-        with_token: false,
-        odometry: None,
+        ..pb::TrackFrame::default()
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: frame(3),
     };
 
     let empty = pb::TrackFrame {
-        with_token: false,
-        odometry: None,
+        ..pb::TrackFrame::default()
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: None,
@@ -494,8 +487,7 @@ async fn a_camera_in_another_place_is_lost_and_less_and_less_sure() {
         );
 
         message(pb::TrackFrame {
-            with_token: false,
-            odometry: None,
+            ..pb::TrackFrame::default()
             timestamp_ns: row as i64 * 33_000_000,
             sequence: row as u64 + 1,
             view,

@@ -7,7 +7,7 @@ use super::super::convert;
 use super::super::relocalization::rooms_to_track_in;
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use seese3_client::proto::v1 as pb;
-use seese3_core::geometry::{Pose, adjoint};
+use seese3_core::geometry::Pose;
 use seese3_core::tracking::{Belief, Drift, MeasuredPose, TrackerSettings};
 
 /// The standard deviation by axis of a pose whose sender states none: 0.1 m and 0.1 rad.
@@ -17,7 +17,7 @@ const DEVIATIONS: std::ops::RangeInclusive<f64> = 1e-6..=1e3;
 /// The names of the map, odometry, camera and base frames if the stream does not choose its own.
 const FRAME_NAMES: [&str; 4] = ["map", "odom", "camera", "base_link"];
 /// The longest name of a frame.
-const LONGEST_NAME: usize = 100;
+pub const LONGEST_NAME: usize = 100;
 /// How fast the odometry of another sensor drifts if its sender does not say, and what it may say:
 /// metres per metre, radians per radian.
 const DRIFT_SHARE: f64 = 0.05;
@@ -33,11 +33,18 @@ pub fn rooms(
     snapshot: &Snapshot,
     config: &pb::TrackConfig,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
-    let served = named_rooms(snapshot, config)?;
-    match &config.camera {
-        Some(camera) => seen_alike(camera, served),
-        None => Ok(served),
+    let mut served = named_rooms(snapshot, config)?;
+    if let Some(camera) = &config.camera {
+        served = seen_alike(camera, served)?;
     }
+    for (number, other) in config.other_cameras.iter().enumerate() {
+        if let Some(camera) = &other.camera {
+            served = seen_alike(camera, served)
+                .map_err(|error| error.within(&format!("other_cameras[{number}]")))?;
+        }
+    }
+
+    Ok(served)
 }
 
 fn named_rooms(
@@ -268,31 +275,18 @@ impl StreamFrames {
         Body::Camera
     }
 
-    /// A belief of a body's pose as one of the camera's. The error is in the body's own frame, so
-    /// that it is carried over by the adjoint.
+    /// A belief of a body's pose as one of the camera's.
     fn of_camera(&self, belief: Belief, body: Body) -> Belief {
         match (body, self.base_from_camera) {
-            (Body::Base, Some(base_from_camera)) => on_another_body(&belief, &base_from_camera),
+            (Body::Base, Some(base_from_camera)) => belief.of_attached(&base_from_camera),
             _ => belief,
         }
     }
 }
 
-/// A belief of a body's pose as one of another body that is fixed to it at `body_from_other`.
-pub fn on_another_body(belief: &Belief, body_from_other: &Pose) -> Belief {
-    let other = adjoint(&body_from_other.inverse());
-    let covariance = other * belief.covariance * other.transpose();
-
-    // Rounding leaves it a little asymmetric, and a token keeps one half of it.
-    Belief {
-        pose: belief.pose * body_from_other,
-        covariance: (covariance + covariance.transpose()) * 0.5,
-    }
-}
-
 /// A pose between two of the stream's frames, whose names were cleared: what is left is none of
 /// them.
-fn unnamed(pose: pb::Pose) -> Result<Pose, Error> {
+pub fn unnamed(pose: pb::Pose) -> Result<Pose, Error> {
     for (field, name) in [
         ("parent_frame", &pose.parent_frame),
         ("child_frame", &pose.child_frame),
@@ -308,13 +302,13 @@ fn unnamed(pose: pb::Pose) -> Result<Pose, Error> {
     convert::pose(pose, "")
 }
 
-fn clear_name(name: &mut String, own: &str) {
+pub fn clear_name(name: &mut String, own: &str) {
     if name == own {
         name.clear();
     }
 }
 
-fn within(field: &str, value: f64, range: std::ops::RangeInclusive<f64>) -> Result<f64, Error> {
+pub fn within(field: &str, value: f64, range: std::ops::RangeInclusive<f64>) -> Result<f64, Error> {
     if range.contains(&value) {
         return Ok(value);
     }

@@ -5,6 +5,7 @@
 
 mod configuration;
 mod sealed;
+mod sensors;
 mod session;
 mod token;
 mod wire;

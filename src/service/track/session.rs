@@ -4,6 +4,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use ndarray::Array1;
 use prost::Message;
 
 use super::super::Error;
@@ -14,11 +15,14 @@ use super::super::status::view_error;
 use super::Overtaken;
 use super::configuration::{StreamFrames, back_pressure, rooms, settings};
 use super::sealed::{Sealed, SealedRoom, SealedState};
+use super::sensors::Sensors;
 use super::token::TokenKey;
 use super::wire;
 use seese3_client::proto::v1 as pb;
 use seese3_core::navigation::Source;
-use seese3_core::tracking::{Belief, Observation, Refusal, State, Tracker, View};
+use seese3_core::tracking::{
+    Belief, Observation, OtherView, Refusal, State, Tracker, Update, View,
+};
 
 const FIELD: &str = "config";
 
@@ -32,6 +36,7 @@ pub struct Session {
     tracker: Tracker,
     config: pb::TrackConfig,
     frames: StreamFrames,
+    sensors: Sensors,
     state: State,
     key: TokenKey,
 }
@@ -111,6 +116,7 @@ impl Session {
             place,
             recent,
             candidate,
+            other_cameras,
             initial_pose: _,
             health: _,
             frames_off_map: _,
@@ -122,7 +128,7 @@ impl Session {
         let latents = [
             last.as_ref().map(|last| &last.latent),
             keyframe.as_ref().map(|keyframe| &keyframe.latent),
-            place.as_ref().map(|place| &place.latent),
+            place.as_ref().and_then(|place| place.latent.as_ref()),
             candidate.as_ref().map(|candidate| &candidate.latent),
         ];
 
@@ -133,6 +139,7 @@ impl Session {
             .all(|latent| adapter.check_latent(latent).is_ok())
             && recent
                 .iter()
+                .chain(other_cameras.iter().map(|other| &other.last))
                 .all(|row| row.len() == adapter.coordinate_count())
             && named.into_iter().flatten().all(|room| room < rooms)
     }
@@ -150,6 +157,7 @@ impl Session {
         let settings = settings(&config, &adapter.adapter)?;
 
         let frames = StreamFrames::of(&config)?;
+        let sensors = Sensors::of(&config, &frames)?;
         back_pressure(config.back_pressure)?;
 
         // A pose only has a meaning in the world of a room, so the room must be known as well.
@@ -183,6 +191,7 @@ impl Session {
             tracker,
             config,
             frames,
+            sensors,
             state,
             key: key.clone(),
         })
@@ -231,17 +240,15 @@ impl Session {
         let pb::TrackFrame {
             timestamp_ns,
             sequence,
-            view,
             with_token,
-            odometry,
+            ..
         } = frame;
 
-        let stamp = Stamp {
-            time_ns: timestamp_ns,
-            sequence,
-        };
-        let answer = match self.observe(stamp, view, odometry) {
+        let answer = match self.observe(frame) {
             Ok(update) => {
+                let best_camera = update
+                    .best_camera
+                    .map_or_else(String::new, |number| self.sensors.camera_name(number));
                 let update = wire::update(&update, &self.frames, &self.served);
 
                 // Counted from the frame's arrival, so that the wait for a thread is included.
@@ -252,6 +259,7 @@ impl Session {
                     timestamp_ns,
                     sequence,
                     elapsed_ns,
+                    best_camera,
                     ..update
                 })
             }
@@ -354,74 +362,130 @@ impl Session {
         ))
     }
 
-    /// What a frame's view shows, and whether its image is blank, which nobody can tell of a
+    /// What a view in this field shows, and whether its image is blank, which nobody can tell of a
     /// feature.
-    fn seen(&self, view: Option<pb::View>) -> Result<(View, bool), Error> {
-        const FIELD: &str = "frame.view";
+    fn seen(&self, field: &str, view: Option<pb::View>) -> Result<SeenView, Error> {
         let adapter = &self.served[0].adapter;
-
-        if let Some(pb::View {
-            view: Some(pb::view::View::Image(image)),
-        }) = &view
-        {
-            let field = format!("{FIELD}.image");
-            let encoder = self.encoders.image_encoder(adapter)?;
-            let pixels = encoder.decoded(&field, image)?;
-            let is_blank = pixels.is_blank();
-            let feature = encoder.feature_of(&field, pixels)?;
-            return Ok((View::Feature(feature), is_blank));
-        }
-
-        match convert::source(FIELD, view, adapter, &self.encoders)? {
-            Source::Feature(feature) => Ok((View::Feature(feature), false)),
-            Source::Latent(latent) => Ok((View::Latent(latent), false)),
-            Source::Frame(_) => Err(Error::invalid(
-                format!("{FIELD}.frame_id"),
-                "is a stored frame; give a feature, a latent or an image of the camera",
-            )),
-        }
-    }
-
-    fn observe(
-        &mut self,
-        stamp: Stamp,
-        view: Option<pb::View>,
-        odometry: Option<pb::MeasuredOdometry>,
-    ) -> Result<seese3_core::tracking::Update, Refused> {
-        use pb::TrackRefusalReason as Reason;
-
-        // What is wrong with the view is the caller's error and refuses only this frame. Anything
-        // else is the server's and ends the stream.
-        let view_refused = |error: Error| match error {
-            Error::Invalid { .. } | Error::Precondition(_) => {
-                Refused::Frame(Reason::View, error.to_string())
+        let (view, is_blank) = match view {
+            Some(pb::View {
+                view: Some(pb::view::View::Image(image)),
+            }) => {
+                let field = format!("{field}.image");
+                let encoder = self.encoders.image_encoder(adapter)?;
+                let pixels = encoder.decoded(&field, &image)?;
+                let is_blank = pixels.is_blank();
+                (View::Feature(encoder.feature_of(&field, pixels)?), is_blank)
             }
-            other => Refused::Server(other),
+            view => match convert::source(field, view, adapter, &self.encoders)? {
+                Source::Feature(feature) => (View::Feature(feature), false),
+                Source::Latent(latent) => (View::Latent(latent), false),
+                Source::Frame(_) => {
+                    return Err(Error::invalid(
+                        format!("{field}.frame_id"),
+                        "is a stored frame; give a feature, a latent or an image of the camera",
+                    ));
+                }
+            },
         };
 
-        let adapter = &self.served[0].adapter;
-        let (view, is_blank) = self.seen(view).map_err(view_refused)?;
         let latent = view
             .latent(&adapter.adapter)
-            .map_err(|error| view_refused(view_error(&error).within("frame.view")))?;
+            .map_err(|error| view_error(&error).within(field))?;
         let feature = match view {
             View::Feature(feature) => Some(feature),
             View::Latent(_) => None,
         };
+        Ok(SeenView {
+            latent,
+            feature,
+            is_blank,
+        })
+    }
+
+    /// What the other cameras of a frame see.
+    fn seen_beside(&self, views: Vec<pb::OtherView>) -> Result<Vec<OtherView>, Error> {
+        let mut seen: Vec<OtherView> = Vec::with_capacity(views.len());
+        for (number, given) in views.into_iter().enumerate() {
+            let field = format!("frame.other_views[{number}]");
+            let camera = self
+                .sensors
+                .other_camera(&given.camera)
+                .map_err(|error| error.within(&field))?;
+            if seen.iter().any(|other| other.camera == camera.number) {
+                return Err(Error::invalid(
+                    format!("{field}.camera"),
+                    "is the same camera twice",
+                ));
+            }
+
+            let SeenView {
+                latent,
+                feature,
+                is_blank,
+            } = self.seen(&format!("{field}.view"), given.view)?;
+            seen.push(OtherView {
+                camera: camera.number,
+                camera_from_other: camera.camera_from_other,
+                latent,
+                feature,
+                is_blank,
+            });
+        }
+
+        Ok(seen)
+    }
+
+    fn observe(&mut self, frame: pb::TrackFrame) -> Result<Update, Refused> {
+        use pb::TrackRefusalReason as Reason;
+
+        let pb::TrackFrame {
+            timestamp_ns,
+            sequence,
+            view,
+            with_token: _,
+            odometry,
+            gravity,
+            other_views,
+        } = frame;
+
+        let refused = |reason: Reason| {
+            move |error: Error| match error {
+                Error::Invalid { .. } | Error::Precondition(_) => {
+                    Refused::Frame(reason, error.to_string())
+                }
+                // What is not the frame's fault is the server's, and ends the stream.
+                other => Refused::Server(other),
+            }
+        };
+
+        let SeenView {
+            latent,
+            feature,
+            is_blank,
+        } = self
+            .seen("frame.view", view)
+            .map_err(refused(Reason::View))?;
+        let other_views = self
+            .seen_beside(other_views)
+            .map_err(refused(Reason::View))?;
         let measured = odometry
             .map(|given| self.frames.measured(given))
             .transpose()
-            .map_err(|error| {
-                let error = error.within("frame.odometry");
-                Refused::Frame(Reason::Odometry, error.to_string())
-            })?;
+            .map_err(|error| refused(Reason::Odometry)(error.within("frame.odometry")))?;
+        let gravity = gravity
+            .map(|given| self.sensors.gravity(&given))
+            .transpose()
+            .map_err(|error| refused(Reason::Gravity)(error.within("frame.gravity")))?;
+
         let observation = Observation {
-            time_ns: stamp.time_ns,
-            sequence: stamp.sequence,
+            time_ns: timestamp_ns,
+            sequence,
             latent,
             feature,
             is_blank,
             measured,
+            gravity,
+            other_views,
         };
 
         // Late and duplicate frames are refused too. A refused frame leaves the state as it was.
@@ -460,10 +524,11 @@ fn without_token(answer: pb::track_response::Answer) -> pb::TrackResponse {
     }
 }
 
-/// When a frame was taken, and its number.
-struct Stamp {
-    time_ns: i64,
-    sequence: u64,
+/// What a camera sees.
+struct SeenView {
+    latent: Array1<f64>,
+    feature: Option<Vec<f32>>,
+    is_blank: bool,
 }
 
 /// Why a frame gets no update.

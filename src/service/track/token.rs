@@ -10,7 +10,7 @@ use sha2::{Digest, Sha256};
 use super::super::Error;
 
 /// The first bytes of a token: its kind and the version of its layout.
-const MAGIC: &[u8; 4] = b"S3T4";
+const MAGIC: &[u8; 4] = b"S3T5";
 /// Bytes of the id of the key that sealed it.
 const KEY_ID: usize = 8;
 /// Bytes of the seal, an HMAC-SHA-256.

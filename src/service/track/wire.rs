@@ -4,14 +4,14 @@ use std::sync::Arc;
 
 use super::super::convert;
 use super::super::snapshot::ServedNavigator;
-use super::configuration::{StreamFrames, on_another_body};
+use super::configuration::StreamFrames;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::{Pose, Twist, adjoint};
 use seese3_core::navigation::RetrievedFrame;
 use seese3_core::tracking::{ANCHORS_TO_AGREE, Belief, Status, Update};
 
-/// An update as a wire message. Its `timestamp_ns`, `sequence` and `elapsed_ns` are left 0; the
-/// session fills them in.
+/// An update as a wire message. Its `timestamp_ns`, `sequence`, `elapsed_ns` and `best_camera` are
+/// left 0 or empty; the session fills them in.
 pub fn update(
     update: &Update,
     frames: &StreamFrames,
@@ -42,7 +42,7 @@ pub fn update(
         .map_pose
         .as_ref()
         .zip(camera_from_base.as_ref())
-        .map(|(camera, camera_from_base)| on_another_body(camera, camera_from_base));
+        .map(|(camera, camera_from_base)| camera.of_attached(camera_from_base));
     let base_velocity = update.velocity.zip(frames.base_from_camera);
 
     pb::TrackUpdate {
@@ -92,6 +92,7 @@ pub fn update(
             let velocity = adjoint(&base_from_camera) * velocity.to_vector();
             convert::twist_to_wire(&Twist::from_vector(&velocity))
         }),
+        best_camera: String::new(),
     }
 }
 

@@ -4,9 +4,9 @@ use nalgebra::Matrix6;
 
 use super::dead_reckoning::{EarlierView, Poses};
 use super::health::TrackingHealth;
-use super::map::MapMatch;
+use super::rig::{MatchedView, Seen};
 use super::state::{Candidate, Observation, State};
-use super::tracker::Tracker;
+use super::tracker::{Sight, Tracker};
 use super::{Belief, MapAnchor, MovingBelief};
 
 /// 99 % of χ² with six degrees of freedom: an anchor whose surprise is larger counts for less.
@@ -19,15 +19,6 @@ pub const ANCHORS_TO_AGREE: u32 = 10;
 /// Anchors are taken to be as far apart in time at most, seconds: after a pause the next one is as
 /// good as an independent one.
 const LONGEST_PAUSE_S: f64 = 10.0;
-
-/// The map that a view matches best.
-pub(super) struct BestMap {
-    /// An index of [`Tracker::maps`].
-    pub room: usize,
-    /// Whether no other map matches nearly as well.
-    pub is_clear: bool,
-    pub matched: MapMatch,
-}
 
 /// An anchor as it counts beside those before it.
 #[derive(Debug, Clone, Copy)]
@@ -96,7 +87,16 @@ fn surprise_at(believed: &Belief, anchor: &Belief) -> f64 {
         .map_or(f64::INFINITY, |innovation| innovation.squared_length)
 }
 
-impl BestMap {
+impl MatchedView<'_> {
+    /// Whether the view is tried as an anchor at all.
+    fn may_correct(&self, health: TrackingHealth) -> bool {
+        if self.matches_room() {
+            self.is_clear
+        } else {
+            self.is_hint(health)
+        }
+    }
+
     /// Whether the view is tried as an anchor although it does not look like the room: images that
     /// are blurred, noisy or partly hidden do not, and their features still tell where they were
     /// taken. Only where the camera is known to be in the room, and only if the features tell more
@@ -110,49 +110,85 @@ impl BestMap {
 }
 
 impl Tracker {
-    /// Tries the best match of a view that looks like the room as an anchor, if it looks clearly
-    /// like one map.
-    pub(super) fn correct_by_match(
+    /// Corrects the map pose by what all cameras see: first by the view that leads, which may find the
+    /// camera at another place, then by the others, which may not. The errors of several cameras at
+    /// one time are taken to be independent.
+    pub(super) fn correct_by_views(
         &self,
         state: &mut State,
         poses: &mut Poses,
         frame: &Observation,
-        view: &BestMap,
+        seen: &Seen<'_>,
     ) -> Correction {
-        if !(self.settings.fuse && view.is_clear) {
-            return Correction::NONE;
+        let leading = &seen.leading;
+        let beside = |view: &&MatchedView<'_>| {
+            self.settings.fuse && view.room == leading.room && view.may_correct(state.health)
+        };
+        let anchors: Vec<CountedAnchor> = seen
+            .beside
+            .iter()
+            .filter(beside)
+            .map(|view| self.anchor(state, frame, view))
+            .collect();
+
+        // An image that is repeated tells nothing new.
+        let correction = if leading.is_repeated || leading.sight != Sight::Clear {
+            Correction::NONE
+        } else {
+            self.correct_by_leading(state, poses, frame, leading)
+        };
+
+        for anchor in anchors {
+            let lasting = poses.lasting;
+            let applied = correct_believed(state, poses, frame, leading.room, anchor).is_applied;
+            // What lasts is at most the least of what the anchors leave.
+            if applied && correction.is_applied && lasting.trace() < poses.lasting.trace() {
+                poses.lasting = lasting;
+            }
         }
 
-        let anchor = self.anchor(state, frame, view);
-        self.correct(state, poses, frame, view.room, anchor)
+        correction
     }
 
-    /// Corrects a believed pose by a view that does not look like the room; see
-    /// [`BestMap::is_hint`]. Such a view speaks for no other place.
-    pub(super) fn correct_by_hint(
+    /// Tries the match of the view that leads as an anchor: one that looks clearly like one map may
+    /// speak for another place than the believed one; a hint may not, see
+    /// [`MatchedView::is_hint`].
+    fn correct_by_leading(
         &self,
         state: &mut State,
         poses: &mut Poses,
         frame: &Observation,
-        view: &BestMap,
+        view: &MatchedView<'_>,
     ) -> Correction {
-        if !(self.settings.fuse && view.is_hint(state.health)) {
+        if !self.settings.fuse || !view.may_correct(state.health) {
             return Correction::NONE;
         }
 
         let anchor = self.anchor(state, frame, view);
-        correct_believed(state, poses, frame, view.room, anchor)
+        if view.matches_room() {
+            self.correct(state, poses, frame, view.room, anchor)
+        } else {
+            correct_believed(state, poses, frame, view.room, anchor)
+        }
     }
 
-    /// The pose of a view by the reader of its room if there is one and the view certainly shows
-    /// the room, else by the frames that it matches: beyond the mapped part a reader is surer than
-    /// it should be. Its covariance is that with which it counts beside the anchors before it.
-    fn anchor(&self, state: &State, frame: &Observation, view: &BestMap) -> CountedAnchor {
+    /// The pose of the stream's camera by a view: by the reader of its room if there is one and the
+    /// view certainly shows the room, else by the frames that it matches: beyond the mapped part a
+    /// reader is surer than it should be. Its covariance is that with which it counts beside the
+    /// anchors before it.
+    fn anchor(&self, state: &State, frame: &Observation, view: &MatchedView<'_>) -> CountedAnchor {
         let MapAnchor { belief, memory_s } = view.matched.anchor;
-        let feature = frame.feature.as_deref().filter(|_| view.matched.is_certain);
-        let belief = self.maps[view.room]
+        let feature = view.feature.filter(|_| view.matched.is_certain);
+        let mut belief = self.maps[view.room]
             .pose_by_reader(feature)
             .unwrap_or(belief);
+
+        if let Some(other) = view.other {
+            belief = belief.of_attached(&other.camera_from_other.inverse());
+        }
+        if let Some(gravity) = &frame.gravity {
+            belief = belief.levelled(gravity);
+        }
 
         // Anchors whose errors are alike tell less than independent ones: a row of them with the
         // correlation ρ from one to the next tells as much as independent ones of (1 + ρ)/(1 − ρ)

@@ -65,6 +65,17 @@ impl Belief {
         }
     }
 
+    /// The pose of another body that is fixed to this one at `body_from_other`. The error is in the
+    /// body's own frame, so that it is carried over by the adjoint.
+    #[must_use]
+    pub fn of_attached(&self, body_from_other: &Pose) -> Self {
+        let other = adjoint(&body_from_other.inverse());
+        Self {
+            pose: self.pose * *body_from_other,
+            covariance: symmetric(&(other * self.covariance * other.transpose())),
+        }
+    }
+
     /// How far a measured pose is from this one; none when the sum of the covariances is not
     /// positive definite.
     pub fn innovation(&self, measured: &Belief) -> Option<Innovation> {

@@ -129,10 +129,10 @@ impl Tracker {
         let odom = self.carried_odom(state, keyframe, frame, reading);
         let errors = self.motion_errors(state.room);
         let map_pose = state.place.as_ref().map(|place| {
-            let from = EarlierView {
-                latent: &place.latent,
+            let from = place.latent.as_ref().map(|latent| EarlierView {
+                latent,
                 time_ns: place.time_ns,
-            };
+            });
             let frames = self.frames_between(place.time_ns, frame.time_ns);
             let is_worth_it = errors.gain(frames) >= LEAST_GAIN;
             let is_read = is_worth_it && reading == MotionReading::Complete;
@@ -144,7 +144,9 @@ impl Tracker {
                 room: state.room,
                 from_ns: place.time_ns,
                 to_ns: frame.time_ns,
-                read: is_read.then(|| self.read_motion(state.room, from, frame)),
+                read: from
+                    .filter(|_| is_read)
+                    .map(|from| self.read_motion(state.room, from, frame)),
             };
             self.carried(&place.belief, way)
         });

@@ -196,12 +196,12 @@ mod tests {
         };
 
         let observed = |frame: u32| Observation {
-            time_ns: i64::from(frame),
-            sequence: u64::from(frame),
-            latent: ndarray::Array1::zeros(1),
-            feature: None,
-            is_blank: false,
             measured: measured(frame),
+            ..Observation::new(
+                i64::from(frame),
+                u64::from(frame),
+                ndarray::Array1::zeros(1),
+            )
         };
 
         let mut since = MeasuredSince::default().after(&observed(0), true, true);

@@ -13,6 +13,7 @@ mod appearance;
 mod belief;
 mod clock;
 mod dead_reckoning;
+mod gravity;
 mod health;
 mod map;
 mod measured;
@@ -20,6 +21,7 @@ mod motion_prior;
 mod moving;
 mod relocalize;
 mod replay;
+mod rig;
 mod room_errors;
 mod state;
 mod status;
@@ -30,6 +32,7 @@ pub use anchor_model::MapAnchor;
 pub use anchoring::ANCHORS_TO_AGREE;
 pub use belief::{Belief, Innovation};
 pub use clock::{ASSUMED_PERIOD_S, frame_period_s, seconds_between};
+pub use gravity::MeasuredGravity;
 pub use health::{Continuity, FrameEvidence, TrackingHealth};
 pub use map::{Map, MapMatch, MapQuery, PoseReader};
 pub use measured::{Drift, Driven, LastMeasured, MeasuredPose, MeasuredSince};
@@ -40,6 +43,7 @@ pub use replay::{
     InitialPose, MapPath, MotionSurprise, Played, Replay, Segment, joined, period_ns, replay,
     replay_frames, replay_streams,
 };
+pub use rig::{OtherCamera, OtherView};
 pub use state::{Candidate, Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
 pub use tracker::{Tracker, TrackerSettings};
 pub use view::{View, motion};

@@ -80,14 +80,14 @@ pub fn replay(
             let time_ns = sequence as i64 * period_ns;
             frames.push(Played {
                 frame: Observation {
-                    time_ns,
-                    sequence,
-                    latent: segment.latents.row(frame.row()).to_owned(),
                     feature: segment
                         .features
                         .map(|features| features.row(frame.row()).to_vec()),
-                    is_blank: false,
-                    measured: None,
+                    ..Observation::new(
+                        time_ns,
+                        sequence,
+                        segment.latents.row(frame.row()).to_owned(),
+                    )
                 },
                 truth: segment.poses[frame.row()],
             });

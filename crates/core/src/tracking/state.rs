@@ -4,7 +4,10 @@ use nalgebra::Matrix6;
 use ndarray::Array1;
 
 use super::health::TrackingHealth;
-use super::{Belief, MeasuredPose, MeasuredSince, MovingBelief, Status};
+use super::{
+    Belief, MeasuredGravity, MeasuredPose, MeasuredSince, MovingBelief, OtherCamera, OtherView,
+    Status,
+};
 use crate::geometry::Twist;
 use crate::index::Neighbour;
 
@@ -24,6 +27,26 @@ pub struct Observation {
     pub is_blank: bool,
     /// Where another sensor says that the camera is, in an odometry frame of its own.
     pub measured: Option<MeasuredPose>,
+    /// Which way is down, if a sensor tells.
+    pub gravity: Option<MeasuredGravity>,
+    /// What other cameras on the same robot saw at the same time.
+    pub other_views: Vec<OtherView>,
+}
+
+impl Observation {
+    /// A view with this latent, of which nothing else is known.
+    pub fn new(time_ns: i64, sequence: u64, latent: Array1<f64>) -> Self {
+        Self {
+            time_ns,
+            sequence,
+            latent,
+            feature: None,
+            is_blank: false,
+            measured: None,
+            gravity: None,
+            other_views: Vec::new(),
+        }
+    }
 }
 
 /// Everything that a tracker knows of a stream.
@@ -54,6 +77,8 @@ pub struct State {
     pub corrected_ns: Option<i64>,
     /// What other sensors measured since the keyframe and the last place.
     pub measured: MeasuredSince,
+    /// What is remembered of the robot's other cameras.
+    pub other_cameras: Vec<OtherCamera>,
 }
 
 /// The last frame of a stream.
@@ -91,8 +116,8 @@ pub struct Keyframe {
 pub struct Place {
     /// When the frame was taken, nanoseconds on the sensor's clock.
     pub time_ns: i64,
-    /// Its latent.
-    pub latent: Vec<f64>,
+    /// Its latent; none if the image was blank, and another camera told the place.
+    pub latent: Option<Vec<f64>>,
     /// `map_from_camera` and the camera's velocity.
     pub belief: MovingBelief,
     /// The covariance of the lasting error of the anchor that corrected it last, which the filter
@@ -149,6 +174,8 @@ pub struct Update {
     pub room: Option<usize>,
     /// The map and the mapped frame that the view resembles most.
     pub best_match: (usize, Neighbour),
+    /// Which of the robot's other cameras saw that view; none for the stream's own.
+    pub best_camera: Option<u32>,
     /// Whether that frame corrected the pose.
     pub match_used: bool,
     /// The squared Mahalanobis distance of the best match from the expected place, if an anchor was

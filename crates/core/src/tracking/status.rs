@@ -3,6 +3,7 @@
 use super::belief::PLACE_DEVIATION_M;
 use super::health::{FRAMES_TO_RECOVER, TrackingHealth};
 use super::map::MapMatch;
+use super::rig::MatchedView;
 use super::state::State;
 use super::tracker::{Sight, Tracker};
 use super::{ANCHORS_TO_AGREE, Belief, Status};
@@ -17,11 +18,13 @@ impl Tracker {
         &self,
         state: &State,
         reported_pose: Option<&Belief>,
-        matched: &MapMatch,
-        sight: Sight,
+        leading: &MatchedView<'_>,
     ) -> (Status, String) {
         if let TrackingHealth::Lost { certain_matches } = state.health {
-            return (Status::Lost, reason_of_loss(certain_matches, matched));
+            return (
+                Status::Lost,
+                reason_of_loss(certain_matches, &leading.matched),
+            );
         }
 
         let agreeing = state
@@ -49,7 +52,7 @@ impl Tracker {
             return (Status::Lost, reason);
         }
 
-        let blind = match sight {
+        let blind = match leading.sight {
             Sight::Clear => None,
             Sight::Nothing => {
                 Some("the image shows nothing: it is blank, or all bright or dark".to_owned())

@@ -6,6 +6,7 @@
 //!
 //! - A tracker keeps nothing: all that it knows of a stream is its [`State`], and the same state
 //!   and frame give the same answer to the bit.
+//! - A robot may have several cameras: what they see at the same time is in `rig.rs`.
 //! - `odom_from_camera` is continuous: motions are composed and never corrected. `map_from_camera`
 //!   is corrected and may jump.
 //! - The map pose is kept twice. The *believed* pose is the filter's own, with the covariance that
@@ -16,18 +17,17 @@
 use std::sync::Arc;
 
 use nalgebra::Matrix6;
-use ndarray::{Axis, s};
+use ndarray::{ArrayView1, Axis, s};
 
-use super::anchoring::{BestMap, Correction};
 use super::dead_reckoning::{MotionReading, Poses, Prediction};
 use super::health::{Continuity, FrameEvidence, TrackingHealth};
 use super::state::{Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
-use super::{Belief, Error, Map, MapMatch, MapQuery, MovingBelief, ROOM_RATIO};
+use super::{Belief, Error, Map, MovingBelief};
 use crate::adapter::{Adapter, ErrorModel, JUMP_WINDOW};
 
 /// Views this near to one another, in deviations of frame noise, are the same image: the noise of a
 /// camera that stands still is some tenths.
-const UNCHANGED_DISTANCE: f64 = 0.01;
+pub(super) const UNCHANGED_DISTANCE: f64 = 0.01;
 /// After so many frames that are the same image a camera is taken to be frozen. Recordings hold
 /// pairs of the same image where a frame was dropped.
 const FROZEN_FRAMES: u32 = 5;
@@ -44,10 +44,11 @@ pub(super) enum Sight {
 }
 
 impl Sight {
-    fn of(state: &State, frame: &Observation) -> Self {
-        if frame.is_blank {
+    /// Of a view that showed exactly what the `unchanged_frames` before it did.
+    pub(super) fn of(is_blank: bool, unchanged_frames: u32) -> Self {
+        if is_blank {
             Self::Nothing
-        } else if state.unchanged_frames >= FROZEN_FRAMES {
+        } else if unchanged_frames >= FROZEN_FRAMES {
             Self::Unchanged
         } else {
             Self::Clear
@@ -188,7 +189,7 @@ impl Tracker {
                 });
                 state.place = Some(Place {
                     time_ns: last.time_ns,
-                    latent: last.latent.clone(),
+                    latent: Some(last.latent.clone()),
                     belief: MovingBelief::at(pose, self.prior(state.room)),
                     lasting: Matrix6::zeros(),
                 });
@@ -220,8 +221,11 @@ impl Tracker {
             }
         }
 
-        self.adapter()
-            .check_latent(frame.latent.as_slice().unwrap_or_default())?;
+        let others = frame.other_views.iter().map(|other| &other.latent);
+        for latent in others.chain([&frame.latent]) {
+            self.adapter()
+                .check_latent(latent.as_slice().unwrap_or_default())?;
+        }
 
         Ok(self.step(state, frame))
     }
@@ -231,17 +235,17 @@ impl Tracker {
     }
 
     fn step(&self, state: &mut State, frame: &Observation) -> Update {
-        // 1. What the frame looks like: the best map, the mapped frame nearest to it, and whether
-        //    the view follows from the views before.
-        let best = self.match_maps(state.room, frame);
+        // 1. What the frame looks like: whether the view follows from the views before, and the view
+        //    of the robot's cameras that looks most like a map, with the mapped frame nearest to it.
         let continuity = self.record_view(state, frame);
-        let sight = Sight::of(state, frame);
-        let matches_room = sight == Sight::Clear && best.matched.out_of_distribution <= 1.0;
+        let sight = Sight::of(frame.is_blank, state.unchanged_frames);
+        let seen = self.look(state, frame);
+        let matches_room = seen.leading.matches_room();
 
         // 2. What that says of the stream's health.
         state.health = state.health.after(FrameEvidence {
             matches_room,
-            matches_certainly: matches_room && best.matched.is_certain,
+            matches_certainly: matches_room && seen.leading.matched.is_certain,
             continuity,
         });
         state.frames_off_map = if matches_room {
@@ -260,16 +264,10 @@ impl Tracker {
         if state.health.is_lost() {
             self.stop_believing(state, &mut poses);
         }
+        level(state, &mut poses, frame);
 
-        // 4. Correction: the mapped frames that look alike are tried as an anchor. An image that is
-        //    repeated tells nothing new.
-        let correction = if sight != Sight::Clear || state.unchanged_frames > 0 {
-            Correction::NONE
-        } else if matches_room {
-            self.correct_by_match(state, &mut poses, frame, &best)
-        } else {
-            self.correct_by_hint(state, &mut poses, frame, &best)
-        };
+        // 4. Correction: the mapped frames that look alike are tried as an anchor.
+        let correction = self.correct_by_views(state, &mut poses, frame, &seen);
         if let Some(believed) = &poses.map_pose {
             poses.reported_pose = Some(self.reported(believed, &poses.lasting));
         }
@@ -284,14 +282,16 @@ impl Tracker {
         // Motions cannot be read from a blank image.
         let shows = sight != Sight::Nothing || state.keyframe.is_none();
         let is_keyframe = shows && self.is_keyframe_due(state, frame.time_ns, &prediction);
-        let is_place = shows && (correction.is_applied || self.is_place_old(state, frame.time_ns));
+        let is_corrected = state.corrected_ns == Some(frame.time_ns);
+        let is_place = is_corrected || (shows && self.is_place_old(state, frame.time_ns));
         remember(state, frame, &poses, is_keyframe, is_place);
         state.measured = state.measured.after(frame, is_keyframe, is_place);
 
         // 6. The answer. The status judges the reported pose, but only while the filter still
         //    believes one.
         let judged_pose = poses.map_pose.and(poses.reported_pose);
-        let (status, reason) = self.status(state, judged_pose.as_ref(), &best.matched, sight);
+        let best = &seen.leading;
+        let (status, reason) = self.status(state, judged_pose.as_ref(), best);
 
         Update {
             motion: prediction.motion,
@@ -306,45 +306,10 @@ impl Tracker {
             out_of_distribution: best.matched.out_of_distribution,
             room: state.room,
             best_match: (best.room, best.matched.nearest[0]),
+            best_camera: best.other.map(|other| other.camera),
             match_used: correction.is_applied,
             surprise: correction.surprise,
             candidate: state.candidate.clone(),
-        }
-    }
-
-    /// How the view matches the believed room or, if no room is believed yet, the one of all maps
-    /// that it matches best.
-    fn match_maps(&self, room: Option<usize>, frame: &Observation) -> BestMap {
-        let query = MapQuery {
-            latent: frame.latent.view(),
-            feature: frame.feature.as_deref(),
-        };
-        if let Some(room) = room {
-            return BestMap {
-                room,
-                is_clear: true,
-                matched: self.maps[room].match_view(query, 1),
-            };
-        }
-
-        let mut matches: Vec<(usize, MapMatch)> = self
-            .maps
-            .iter()
-            .enumerate()
-            .map(|(room, map)| (room, map.match_view(query, 1)))
-            .collect();
-        let distance = |found: &(usize, MapMatch)| found.1.distance;
-        matches.sort_by(|a, b| distance(a).total_cmp(&distance(b)).then(a.0.cmp(&b.0)));
-
-        let is_clear = matches
-            .get(1)
-            .is_none_or(|second| distance(&matches[0]) <= ROOM_RATIO * distance(second));
-        let (room, matched) = matches.swap_remove(0);
-
-        BestMap {
-            room,
-            is_clear,
-            matched,
         }
     }
 
@@ -355,14 +320,7 @@ impl Tracker {
             return Continuity::Continuous;
         }
 
-        let coordinates = frame.latent.slice(s![..self.adapter().coordinate_count()]);
-        let whitened = self
-            .error_model
-            .frame_noise()
-            .whitened(coordinates.insert_axis(Axis(0)))
-            .row(0)
-            .to_vec();
-
+        let whitened = self.whitened(frame.latent.view());
         let nearest = state
             .recent
             .iter()
@@ -406,6 +364,16 @@ impl Tracker {
         state.recent.push(whitened);
 
         continuity
+    }
+
+    /// A latent of shape (k,) in standard deviations of frame noise.
+    pub(super) fn whitened(&self, latent: ArrayView1<'_, f64>) -> Vec<f64> {
+        let coordinates = latent.slice(s![..self.adapter().coordinate_count()]);
+        self.error_model
+            .frame_noise()
+            .whitened(coordinates.insert_axis(Axis(0)))
+            .row(0)
+            .to_vec()
     }
 
     /// Stops believing the map pose of a lost stream. In a single room the last pose is still
@@ -465,9 +433,10 @@ fn remember(
 
     match &poses.map_pose {
         Some(belief) if is_place => {
+            let shows = !frame.is_blank;
             state.place = Some(Place {
                 time_ns: frame.time_ns,
-                latent: latent.clone(),
+                latent: shows.then(|| latent.clone()),
                 belief: *belief,
                 lasting: poses.lasting,
             });
@@ -484,6 +453,18 @@ fn remember(
     });
 }
 
+/// Corrects the tilt of the map pose by gravity, if that was measured.
+fn level(state: &State, poses: &mut Poses, frame: &Observation) {
+    let (Some(believed), Some(gravity)) = (&mut poses.map_pose, &frame.gravity) else {
+        return;
+    };
+
+    let seconds = state.last.as_ref().map_or(f64::INFINITY, |last| {
+        frame.time_ns.abs_diff(last.time_ns) as f64 * 1e-9
+    });
+    *believed = believed.levelled(gravity, seconds);
+}
+
 /// How many frames the camera took since the last accepted one, this one included: numbers that are
 /// missing are frames that are missing.
 fn frames_since_last(state: &State, frame: &Observation) -> u64 {
@@ -493,7 +474,8 @@ fn frames_since_last(state: &State, frame: &Observation) -> u64 {
         .map_or(1, |last| frame.sequence - last.sequence)
 }
 
-fn distance(a: &[f64], b: &[f64]) -> f64 {
+/// The Euclidean distance of two whitened latents.
+pub(super) fn distance(a: &[f64], b: &[f64]) -> f64 {
     let squares = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b));
     squares.sum::<f64>().sqrt()
 }

@@ -121,14 +121,15 @@ pub fn evaluate(
             let row = first_row + taken.view;
             played.push(Played {
                 frame: Observation {
-                    time_ns,
-                    sequence: taken
-                        .own_number
-                        .unwrap_or_else(|| u64::from(frame.0 - frames[0].0)),
-                    latent: latents.row(row).to_owned(),
                     feature: Some(views.features.row(row).to_vec()),
                     is_blank: taken.is_disturbed && views.is_blank[row],
-                    measured: None,
+                    ..Observation::new(
+                        time_ns,
+                        taken
+                            .own_number
+                            .unwrap_or_else(|| u64::from(frame.0 - frames[0].0)),
+                        latents.row(row).to_owned(),
+                    )
                 },
                 truth: disturbance.truth(&room.room().poses()[frame.row()]),
             });

@@ -1,0 +1,1 @@
+"""Has a SeeSE3 server follow a robot's camera."""

@@ -1,0 +1,217 @@
+"""The node: subscriptions, publishers, and the thread that follows the server's answers."""
+
+import functools
+import threading
+import time
+
+import grpc
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
+from seese3.v1 import odometry_pb2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
+from tf2_ros import TransformBroadcaster
+
+from . import answers, requests
+from .stream import Stream
+
+LEVELS = {"TRACKING": 0, "DEGRADED": 1, "RELOCALIZING": 1, "LOST": 2}
+# What another sensor said so long ago says nothing of a frame, nanoseconds.
+OLD_NS = 50_000_000
+# Images of several cameras belong together when they were taken within this time, nanoseconds.
+TOGETHER_NS = 20_000_000
+PARAMETERS = {"server": "127.0.0.1:50051", "room": "", "adapter": "", "camera_frame": "camera_optical_frame",
+              "base_frame": "base_link", "publish_tf": False, "use_camera_info": False, "wheel_drift": 0.05}
+
+
+class Bridge(Node):
+    def __init__(self):
+        super().__init__("seese3")
+        self.given = {name: self.declare_parameter(name, plain).value for name, plain in PARAMETERS.items()}
+        self.config = self.configuration()
+        self.counts = {"images": 0, "updates": 0, "refusals": 0, "images not sent": 0, "odometry begun anew": 0}
+        # The last of each sensor, with its stamp.
+        self.wheels = self.gravity = None
+        self.beside, self.gravity_of = {}, requests.Gravity()
+        self.begins = threading.Event()
+        if not self.given["use_camera_info"]:
+            self.begins.set()
+
+        self.odom = self.create_publisher(Odometry, "~/odom", 10)
+        self.pose = self.create_publisher(PoseWithCovarianceStamped, "~/pose", 10)
+        self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        has_base = self.config.HasField("base_from_camera")
+        self.tf = TransformBroadcaster(self) if has_base or self.given["publish_tf"] else None
+
+        self.channel = grpc.insecure_channel(self.given["server"])
+        self.stream = Stream(self.channel, self.config)
+        self.subscribe(has_base)
+
+    def numbers(self, name):
+        """A parameter of numbers. It is declared by its type: the elements of an empty list have none."""
+        return self.declare_parameter(name, Parameter.Type.DOUBLE_ARRAY).value
+
+    def configuration(self):
+        given = self.given
+        config = odometry_pb2.TrackConfig(
+            room=given["room"], adapter=given["adapter"], back_pressure=odometry_pb2.BACK_PRESSURE_NEWEST,
+            frames=odometry_pb2.FrameNames(camera=given["camera_frame"], base=given["base_frame"]),
+            base_from_camera=requests.mounting("base_from_camera", self.numbers("base_from_camera")),
+            gravity_in_map=requests.direction("gravity_in_map", self.numbers("gravity_in_map")))
+
+        for name in self.declare_parameter("other_cameras", Parameter.Type.STRING_ARRAY).value or []:
+            parameter = f"{name}.base_from_camera"
+            pose = requests.mounting(parameter, self.numbers(parameter))
+            if pose is None:
+                raise ValueError(f"{parameter} must be given: x, y, z and the quaternion x, y, z, w")
+            config.other_cameras.append(odometry_pb2.RigCamera(name=name, pose=pose))
+        return config
+
+    def subscribe(self, has_base):
+        sensor = qos_profile_sensor_data
+        compressed, raw = requests.view_of_compressed, requests.view_of_raw
+        self.create_subscription(CompressedImage, "~/image", functools.partial(self.on_image, compressed), sensor)
+        self.create_subscription(Image, "~/image_raw", functools.partial(self.on_image, raw), sensor)
+        for other in self.config.other_cameras:
+            callback = functools.partial(self.on_other_image, other.name)
+            self.create_subscription(CompressedImage, f"~/{other.name}/image", functools.partial(callback, compressed), sensor)
+            self.create_subscription(Image, f"~/{other.name}/image_raw", functools.partial(callback, raw), sensor)
+
+        self.create_subscription(PoseWithCovarianceStamped, "/initialpose", self.on_initial_pose, 10)
+        if self.given["use_camera_info"]:
+            self.create_subscription(CameraInfo, "~/camera_info", self.on_camera_info, sensor)
+        if has_base:
+            self.create_subscription(Odometry, "~/wheels", self.on_wheels, sensor)
+        if self.config.HasField("gravity_in_map"):
+            self.create_subscription(Imu, "~/imu", self.on_imu, sensor)
+
+    # What sensors say.
+
+    def view_of(self, reader, image):
+        """The view of an image message, or None of one that cannot be read, which is said."""
+        try:
+            return reader(image)
+        except ValueError as error:
+            self.counts["images not sent"] += 1
+            self.get_logger().warning(f"image not sent: {error}", throttle_duration_sec=1.0)
+            self.report(1, f"image not sent: {error}", requests.nanoseconds(image.header.stamp))
+            return None
+
+    def on_image(self, reader, image):
+        if (view := self.view_of(reader, image)) is None:
+            return
+
+        self.counts["images"] += 1
+        stamp = requests.nanoseconds(image.header.stamp)
+        frame = odometry_pb2.TrackFrame(timestamp_ns=stamp, sequence=self.counts["images"], view=view)
+        if self.wheels is not None and abs(self.wheels[0] - stamp) <= OLD_NS:
+            frame.odometry.CopyFrom(self.wheels[1])
+        if self.gravity is not None and abs(self.gravity[0] - stamp) <= OLD_NS:
+            frame.gravity.CopyFrom(self.gravity[1])
+        for name, (other_stamp, other_view) in self.beside.items():
+            if abs(other_stamp - stamp) <= TOGETHER_NS:
+                frame.other_views.add(camera=name, view=other_view)
+        self.stream.offer(odometry_pb2.TrackRequest(frame=frame))
+
+    def on_other_image(self, name, reader, image):
+        if (view := self.view_of(reader, image)) is not None:
+            self.beside[name] = requests.nanoseconds(image.header.stamp), view
+
+    def on_camera_info(self, info):
+        if self.begins.is_set():
+            return
+        if (camera := requests.pinhole(info)) is None:
+            self.get_logger().warning("camera_info is not calibrated: fields of view are not compared")
+        else:
+            self.config.camera.CopyFrom(camera)
+        self.begins.set()
+
+    def on_wheels(self, message):
+        measured = requests.measured_odometry(message, self.given["base_frame"], self.given["wheel_drift"])
+        self.wheels = requests.nanoseconds(message.header.stamp), measured
+
+    def on_imu(self, imu):
+        self.gravity = requests.nanoseconds(imu.header.stamp), self.gravity_of.after(imu)
+
+    def on_initial_pose(self, message):
+        has_base = self.config.HasField("base_from_camera")
+        body = self.given["base_frame"] if has_base else self.given["camera_frame"]
+        known = odometry_pb2.InitialPose(pose=requests.wire_pose(message.pose.pose, "map", body))
+        self.stream.offer(odometry_pb2.TrackRequest(set_initial_pose=odometry_pb2.SetInitialPose(initial_pose=known)))
+
+    # What the server says.
+
+    def report(self, level, text, timestamp_ns):
+        values = [KeyValue(key=key, value=str(value)) for key, value in self.counts.items()]
+        message = DiagnosticArray(status=[
+            DiagnosticStatus(level=bytes([level]), name="seese3: tracking", message=text, values=values)])
+        answers.set_stamp(message.header, timestamp_ns, "")
+        self.diagnostics.publish(message)
+
+    def publish(self, update):
+        self.counts["updates"] += 1
+        self.odom.publish(answers.odometry_message(update, Odometry))
+        if (message := answers.pose_message(update, PoseWithCovarianceStamped)) is not None:
+            self.pose.publish(message)
+        if self.tf is not None:
+            self.tf.sendTransform(answers.transforms(update, TransformStamped))
+        name = answers.status_name(update)
+        self.report(LEVELS.get(name, 2), f"{name}: {update.reason}", update.timestamp_ns)
+
+    def refused(self, refusal):
+        self.counts["refusals"] += 1
+        reason = odometry_pb2.TrackRefusalReason.Name(refusal.reason).removeprefix("TRACK_REFUSAL_REASON_")
+        # Frames that a newer one overtook are no fault.
+        if reason != "SUPERSEDED":
+            text = f"refused, {reason}: {refusal.message}"
+            self.get_logger().warning(text, throttle_duration_sec=1.0)
+            self.report(1, text, refusal.timestamp_ns)
+
+    def follow(self):
+        """Takes the server's answers until the node ends."""
+        while rclpy.ok() and not self.begins.wait(timeout=1.0):
+            self.get_logger().warning("waiting for camera_info", throttle_duration_sec=10.0)
+
+        while rclpy.ok():
+            try:
+                for answer in self.stream.answers():
+                    kind = answer.WhichOneof("answer")
+                    if kind == "update":
+                        self.publish(answer.update)
+                    elif kind == "refusal":
+                        self.refused(answer.refusal)
+            except grpc.RpcError as error:
+                if not rclpy.ok():
+                    return
+                self.get_logger().warning(f"{error.code().name}: {error.details()}")
+                if self.stream.token and error.code() not in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED):
+                    self.stream.token = b""
+                    self.counts["odometry begun anew"] += 1
+                    self.get_logger().error("the stream cannot be resumed: odometry begins anew")
+                time.sleep(1.0)
+
+
+def main():
+    rclpy.init()
+    node = Bridge()
+    thread = threading.Thread(target=node.follow)
+    thread.start()
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+        # Ends the call, and with it the thread.
+        node.channel.close()
+        thread.join()
+        node.destroy_node()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""What the robot's sensors say, as messages of the server's protocol."""
+
+import io
+import math
+
+from PIL import Image as Picture
+from seese3.v1 import geometry_pb2, odometry_pb2
+
+# Encodings of sensor_msgs/Image, as Pillow names the modes of the picture and of its bytes.
+ENCODINGS = {"rgb8": ("RGB", "RGB"), "bgr8": ("RGB", "BGR"), "rgba8": ("RGB", "RGBX"), "bgra8": ("RGB", "BGRX"),
+             "mono8": ("L", "L"), "8UC1": ("L", "L"), "8UC3": ("RGB", "BGR")}
+# The acceleration of a robot that drives is averaged over this time for the direction of gravity, seconds.
+AVERAGED_S = 1.0
+
+
+def nanoseconds(stamp):
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
+def view_of_compressed(image):
+    """The view of a sensor_msgs/CompressedImage: the server reads JPEG and PNG."""
+    return geometry_pb2.View(image=bytes(image.data))
+
+
+def view_of_raw(image):
+    """The view of a sensor_msgs/Image, as PNG.
+
+    Raises ValueError for an encoding that is none of ENCODINGS, and for data that are too short."""
+    if image.encoding not in ENCODINGS:
+        raise ValueError(f"encoding '{image.encoding}' is none of: {', '.join(ENCODINGS)}")
+    if image.height * image.step > len(image.data) or image.height == 0 or image.width == 0:
+        raise ValueError(f"{len(image.data)} bytes are no image of {image.height} rows of {image.step} bytes")
+
+    mode, of_bytes = ENCODINGS[image.encoding]
+    picture = Picture.frombytes(mode, (image.width, image.height), bytes(image.data), "raw", of_bytes, image.step)
+    encoded = io.BytesIO()
+    picture.save(encoded, "PNG", compress_level=1)
+    return geometry_pb2.View(image=encoded.getvalue())
+
+
+def wire_pose(pose, parent, child):
+    """A geometry_msgs/Pose as a wire pose."""
+    found = geometry_pb2.Pose(parent_frame=parent, child_frame=child)
+    for axis in "xyz":
+        setattr(found.position, axis, getattr(pose.position, axis))
+    for axis in "wxyz":
+        setattr(found.orientation, axis, getattr(pose.orientation, axis))
+    return found
+
+
+def mounting(name, numbers):
+    """A pose on the base of seven numbers, or None of none."""
+    if not numbers:
+        return None
+    if len(numbers) != 7:
+        raise ValueError(f"{name} must be x, y, z and the quaternion x, y, z, w")
+    x, y, z, qx, qy, qz, qw = numbers
+    return geometry_pb2.Pose(position=geometry_pb2.Vector3(x=x, y=y, z=z),
+                             orientation=geometry_pb2.Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
+def direction(name, numbers):
+    """A vector of three numbers, or None of none."""
+    if not numbers:
+        return None
+    if len(numbers) != 3:
+        raise ValueError(f"{name} must be x, y, z")
+    return geometry_pb2.Vector3(x=numbers[0], y=numbers[1], z=numbers[2])
+
+
+def pinhole(info):
+    """The camera of a sensor_msgs/CameraInfo, or None of one that is not calibrated."""
+    if info.width == 0 or info.height == 0 or info.k[0] <= 0:
+        return None
+    return geometry_pb2.Pinhole(width=info.width, height=info.height, focal=info.k[0])
+
+
+def measured_odometry(message, base_frame, drift):
+    """The nav_msgs/Odometry of the wheels. Its own covariance is not taken: drivers rarely mean it."""
+    return odometry_pb2.MeasuredOdometry(pose=wire_pose(message.pose.pose, "", base_frame),
+                                         translation_share=drift, rotation_share=drift)
+
+
+class Gravity:
+    """The direction of gravity of sensor_msgs/Imu messages, in their axes: by the orientation where there is one, else by
+    the mean acceleration of a second, which points up at rest."""
+
+    def __init__(self):
+        self.mean, self.stamp = None, None
+
+    def after(self, imu):
+        if imu.orientation_covariance[0] >= 0 and any(getattr(imu.orientation, axis) for axis in "wxyz"):
+            q = imu.orientation
+            # The last row of the rotation: the world's z axis, which points up (REP-103), in the sensor's axes.
+            up = (2 * (q.x * q.z - q.w * q.y), 2 * (q.y * q.z + q.w * q.x), 1 - 2 * (q.x * q.x + q.y * q.y))
+        else:
+            up = self._mean(imu)
+        return odometry_pb2.MeasuredGravity(direction=geometry_pb2.Vector3(x=-up[0], y=-up[1], z=-up[2]))
+
+    def _mean(self, imu):
+        stamp, seen = nanoseconds(imu.header.stamp), imu.linear_acceleration
+        new = (seen.x, seen.y, seen.z)
+        if self.mean is None:
+            self.mean = new
+        else:
+            seconds = max(0.0, (stamp - self.stamp) * 1e-9)
+            share = 1 - math.exp(-seconds / AVERAGED_S)
+            self.mean = tuple(old + share * (value - old) for old, value in zip(self.mean, new))
+        self.stamp = stamp
+        return self.mean

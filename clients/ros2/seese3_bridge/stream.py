@@ -1,0 +1,46 @@
+"""One Track stream: requests in, answers out, by however many calls it takes."""
+
+import queue
+
+from seese3.v1 import odometry_pb2, odometry_pb2_grpc
+
+# So many requests wait for the server; the oldest goes when another comes.
+WAITING = 8
+
+
+class Stream:
+    """Frames in, answers out; goes on with the last token when the server goes away."""
+
+    def __init__(self, channel, config):
+        self.stub, self.config, self.token = odometry_pb2_grpc.OdometryServiceStub(channel), config, b""
+        self.frames = queue.Queue(maxsize=WAITING)
+
+    def requests(self, frames):
+        resumed = odometry_pb2.TrackConfig(resume_token=self.token)
+        yield odometry_pb2.TrackRequest(config=resumed if self.token else self.config)
+        while (request := frames.get()) is not None:
+            yield request
+
+    def offer(self, request):
+        """Takes a request; the oldest that waits goes when there is no room."""
+        while True:
+            try:
+                return self.frames.put_nowait(request)
+            except queue.Full:
+                try:
+                    self.frames.get_nowait()
+                except queue.Empty:
+                    pass
+
+    def answers(self):
+        """Answers until the call ends. Every call has a queue of its own: an old one must not take a new one's frames."""
+        frames = self.frames = queue.Queue(maxsize=WAITING)
+        try:
+            for answer in self.stub.Track(self.requests(frames)):
+                self.token = answer.resume_token or self.token
+                yield answer
+        finally:
+            # Ends the requests of the call that is over.
+            while frames.full():
+                frames.get_nowait()
+            frames.put_nowait(None)

@@ -1,0 +1,156 @@
+"""Stands in for ROS where there is none: message classes by the definitions that the library rosbags has of ROS 2 Humble, and
+so much of rclpy as the bridge uses. A test publishes by calling Node.deliver and reads Node.published."""
+
+import sys
+import types
+
+import numpy
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.base import Nodetype
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+MESSAGES = {
+    "diagnostic_msgs": ["DiagnosticArray", "DiagnosticStatus", "KeyValue"],
+    "geometry_msgs": ["PoseWithCovarianceStamped", "TransformStamped"],
+    "nav_msgs": ["Odometry"],
+    "sensor_msgs": ["CameraInfo", "CompressedImage", "Image", "Imu"],
+}
+
+
+def plain(kind):
+    """The value of a field that nobody set, as ROS has it."""
+    node, detail = kind
+    if node == Nodetype.BASE:
+        return {"string": "", "bool": False}.get(detail[0], 0.0 if "float" in detail[0] else 0)
+    if node == Nodetype.NAME:
+        return message_class(detail)()
+    if node == Nodetype.SEQUENCE:
+        return []
+    return [plain(detail[0]) for _ in range(detail[1])]
+
+
+CLASSES = {}
+
+
+def message_class(name):
+    """A message class whose fields may be left out, as those of ROS."""
+    if name not in CLASSES:
+        fields = STORE.fielddefs[name][1]
+
+        def init(self, **given):
+            for field, kind in fields:
+                setattr(self, field, given.pop(field) if field in given else plain(kind))
+            assert not given, f"{name} has no {list(given)}"
+
+        CLASSES[name] = type(name.split("/")[-1], (), {"__init__": init, "type_name": name})
+    return CLASSES[name]
+
+
+def to_bag(message):
+    """A message as rosbags writes it."""
+    def field(kind, value):
+        node, detail = kind
+        if node == Nodetype.NAME:
+            return to_bag(value)
+        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            inner = detail[0]
+            if inner[0] == Nodetype.NAME:
+                return [to_bag(item) for item in value]
+            if inner[1][0] == "string":
+                return list(value)
+            name = {"octet": "uint8", "byte": "uint8", "char": "uint8", "bool": "bool"}.get(inner[1][0], inner[1][0])
+            if isinstance(value, (bytes, bytearray)):
+                return numpy.frombuffer(bytes(value), numpy.uint8)
+            return numpy.asarray(value, dtype=name)
+        return value
+
+    fields = STORE.fielddefs[message.type_name][1]
+    return STORE.types[message.type_name](**{name: field(kind, getattr(message, name)) for name, kind in fields})
+
+
+class Logger:
+    def __init__(self):
+        self.lines = []
+
+    def _write(self, text, **_):
+        self.lines.append(text)
+
+    warning = error = info = _write
+
+
+class Publisher:
+    def __init__(self):
+        self.messages = []
+
+    def publish(self, message):
+        # As ROS does, which refuses a message whose fields have other types.
+        self.messages.append(STORE.deserialize_cdr(
+            STORE.serialize_cdr(to_bag(message), message.type_name), message.type_name))
+
+
+class Value:
+    def __init__(self, value):
+        self.value = value
+
+
+class Node:
+    """A node whose parameters a test sets in Node.given before it is made."""
+
+    given = {}
+
+    def __init__(self, name):
+        self.name, self.published, self.subscribed, self.logger = name, {}, {}, Logger()
+
+    def declare_parameter(self, name, plain_value):
+        return Value(Node.given.get(name, None if isinstance(plain_value, str) and plain_value.startswith("type ") else plain_value))
+
+    def create_publisher(self, _, topic, __):
+        self.published[topic] = Publisher()
+        return self.published[topic]
+
+    def create_subscription(self, kind, topic, callback, _):
+        self.subscribed[topic] = kind, callback
+
+    def deliver(self, topic, message):
+        """What a subscription to a topic gets; nothing where there is none."""
+        if topic in self.subscribed:
+            self.subscribed[topic][1](message)
+
+    def get_logger(self):
+        return self.logger
+
+    def destroy_node(self):
+        pass
+
+
+class Broadcaster:
+    def __init__(self, node):
+        self.node, self.sent = node, []
+        node.broadcaster = self
+
+    def sendTransform(self, messages):  # noqa: N802, the name that tf2 has
+        for message in messages:
+            STORE.serialize_cdr(to_bag(message), message.type_name)
+        self.sent.append(messages)
+
+
+def install():
+    """Puts the stand-ins where the bridge imports them from."""
+    is_up = {"up": True}
+    modules = {
+        "rclpy": {"init": lambda: None, "ok": lambda: is_up["up"], "spin": lambda node: None,
+                  "try_shutdown": lambda: is_up.update(up=False)},
+        "rclpy.executors": {"ExternalShutdownException": type("ExternalShutdownException", (Exception,), {})},
+        "rclpy.node": {"Node": Node},
+        "rclpy.parameter": {"Parameter": types.SimpleNamespace(
+            Type=types.SimpleNamespace(DOUBLE_ARRAY="type double array", STRING_ARRAY="type string array"))},
+        "rclpy.qos": {"qos_profile_sensor_data": "sensor data"},
+        "tf2_ros": {"TransformBroadcaster": Broadcaster},
+    }
+    for package, names in MESSAGES.items():
+        modules[package] = {}
+        modules[f"{package}.msg"] = {name: message_class(f"{package}/msg/{name}") for name in names}
+    for name, content in modules.items():
+        module = types.ModuleType(name)
+        module.__dict__.update(content)
+        sys.modules[name] = module

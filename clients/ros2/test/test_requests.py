@@ -1,0 +1,89 @@
+"""What sensors say, as requests. Expectations are by hand, from the definitions of ROS messages."""
+
+import io
+import math
+
+import pytest
+import stand_in
+from PIL import Image as Picture
+
+stand_in.install()
+
+from sensor_msgs.msg import CameraInfo, Image, Imu  # noqa: E402
+from seese3_bridge import requests  # noqa: E402
+
+
+def raw(encoding, rows, step):
+    return Image(height=len(rows), width=2, encoding=encoding, step=step, data=b"".join(rows))
+
+
+@pytest.mark.parametrize(("encoding", "bytes_of_red", "expected"), [
+    ("rgb8", b"\xff\x00\x00", (255, 0, 0)),
+    ("bgr8", b"\x00\x00\xff", (255, 0, 0)),
+    ("bgra8", b"\x00\x00\xff\x80", (255, 0, 0)),
+    ("mono8", b"\x4c", 76),
+])
+def test_raw_images_keep_their_colours_and_lose_their_padding(encoding, bytes_of_red, expected):
+    row = bytes_of_red * 2 + b"\x99\x99"
+    view = requests.view_of_raw(raw(encoding, [row, row, row], len(row)))
+    picture = Picture.open(io.BytesIO(view.image))
+    assert picture.size == (2, 3)
+    assert all(picture.getpixel((x, y)) == expected for x in range(2) for y in range(3))
+
+
+@pytest.mark.parametrize(("message", "says"), [
+    (raw("bayer_rggb8", [b"\x00\x00"], 2), "bayer_rggb8"),
+    (raw("rgb8", [b"\x00" * 6], 7), "6 bytes are no image"),
+    (raw("rgb8", [], 6), "no image"),
+])
+def test_what_is_no_image_is_said(message, says):
+    with pytest.raises(ValueError, match=says):
+        requests.view_of_raw(message)
+
+
+def test_a_camera_that_is_not_calibrated_is_none():
+    assert requests.pinhole(CameraInfo(width=640, height=480)) is None
+    camera = requests.pinhole(CameraInfo(width=640, height=480, k=[585.0] + [0.0] * 8))
+    assert (camera.width, camera.height, camera.focal) == (640, 480, 585.0)
+
+
+def imu(seconds, acceleration, orientation=None):
+    message = Imu()
+    message.header.stamp.sec = seconds
+    for axis, value in zip("xyz", acceleration):
+        setattr(message.linear_acceleration, axis, value)
+    message.orientation_covariance[0] = -1.0
+    if orientation is not None:
+        message.orientation_covariance[0] = 0.0
+        for axis, value in zip("xyzw", orientation):
+            setattr(message.orientation, axis, value)
+    return message
+
+
+def direction(measured):
+    return measured.direction.x, measured.direction.y, measured.direction.z
+
+
+def test_gravity_points_down():
+    # At rest the acceleration points up. A robot that is rolled by +90 degrees about x has up along its own y.
+    assert direction(requests.Gravity().after(imu(0, (0.0, 0.0, 9.8)))) == pytest.approx((0, 0, -9.8))
+    half = math.sqrt(0.5)
+    rolled = requests.Gravity().after(imu(0, (5.0, 5.0, 5.0), (half, 0.0, 0.0, half)))
+    assert direction(rolled) == pytest.approx((0, -1, 0), abs=1e-12)
+    # Pitched by +90 degrees about y (REP-103: nose down), up is along its own -x.
+    pitched = requests.Gravity().after(imu(0, (5.0, 5.0, 5.0), (0.0, half, 0.0, half)))
+    assert direction(pitched) == pytest.approx((1, 0, 0), abs=1e-12)
+
+
+def test_acceleration_is_averaged():
+    gravity = requests.Gravity()
+    gravity.after(imu(0, (0.0, 0.0, 10.0)))
+    share = 1 - math.exp(-1)
+    assert direction(gravity.after(imu(1, (4.0, 0.0, 10.0)))) == pytest.approx((-4 * share, 0, -10))
+
+
+@pytest.mark.parametrize("numbers", [[1.0], [1.0] * 6, [1.0] * 8])
+def test_a_mounting_has_seven_numbers(numbers):
+    with pytest.raises(ValueError, match="rear.base_from_camera"):
+        requests.mounting("rear.base_from_camera", numbers)
+    assert requests.mounting("any", []) is None
