@@ -395,45 +395,45 @@ async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
     .unwrap();
 
     let late = pb::TrackFrame {
-        ..pb::TrackFrame::default()
         timestamp_ns: 0,
         sequence: 100,
         view: feature(vec![0.0; 48]),
+        ..pb::TrackFrame::default()
     };
 
     let duplicate = pb::TrackFrame {
-        ..pb::TrackFrame::default()
         timestamp_ns: i64::MAX,
         sequence: 3,
         view: feature(vec![0.0; 48]),
+        ..pb::TrackFrame::default()
     };
 
     let narrow = pb::TrackFrame {
-        ..pb::TrackFrame::default()
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: feature(vec![0.0; 47]),
+        ..pb::TrackFrame::default()
     };
 
     let nan = pb::TrackFrame {
-        ..pb::TrackFrame::default()
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: feature(vec![f32::NAN; 48]),
+        ..pb::TrackFrame::default()
     };
 
     let of_room = pb::TrackFrame {
-        ..pb::TrackFrame::default()
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: frame(3),
+        ..pb::TrackFrame::default()
     };
 
     let empty = pb::TrackFrame {
-        ..pb::TrackFrame::default()
         timestamp_ns: i64::MAX,
         sequence: 100,
         view: None,
+        ..pb::TrackFrame::default()
     };
     let bad = [late, duplicate, narrow, nan, of_room, empty].map(message);
     let requests = [begin(config())]
@@ -487,10 +487,10 @@ async fn a_camera_in_another_place_is_lost_and_less_and_less_sure() {
         );
 
         message(pb::TrackFrame {
-            ..pb::TrackFrame::default()
             timestamp_ns: row as i64 * 33_000_000,
             sequence: row as u64 + 1,
             view,
+            ..pb::TrackFrame::default()
         })
     };
 

@@ -117,6 +117,7 @@ impl Session {
             recent,
             candidate,
             other_cameras,
+            recent_matches: _,
             initial_pose: _,
             health: _,
             frames_off_map: _,

@@ -179,9 +179,11 @@ impl Tracker {
     fn anchor(&self, state: &State, frame: &Observation, view: &MatchedView<'_>) -> CountedAnchor {
         let MapAnchor { belief, memory_s } = view.matched.anchor;
         let feature = view.feature.filter(|_| view.matched.is_certain);
-        let mut belief = self.maps[view.room]
-            .pose_by_reader(feature)
-            .unwrap_or(belief);
+        let by_reader = self.maps[view.room].pose_by_reader(feature);
+        let mut belief = by_reader.unwrap_or_else(|| match &state.recent_matches {
+            Some(recent) if view.other.is_none() => recent.tempered(belief),
+            _ => belief,
+        });
 
         if let Some(other) = view.other {
             belief = belief.of_attached(&other.camera_from_other.inverse());

@@ -19,6 +19,7 @@ mod map;
 mod measured;
 mod motion_prior;
 mod moving;
+mod recent_matches;
 mod relocalize;
 mod replay;
 mod rig;
@@ -38,6 +39,7 @@ pub use map::{Map, MapMatch, MapQuery, PoseReader};
 pub use measured::{Drift, Driven, LastMeasured, MeasuredPose, MeasuredSince};
 pub use motion_prior::MotionPrior;
 pub use moving::MovingBelief;
+pub use recent_matches::RecentMatches;
 pub use relocalize::{ROOM_RATIO, Relocalization, RoomMatch, relocalize};
 pub use replay::{
     InitialPose, MapPath, MotionSurprise, Played, Replay, Segment, joined, period_ns, replay,

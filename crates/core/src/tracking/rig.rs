@@ -11,7 +11,7 @@ use ndarray::{Array1, ArrayView1};
 use super::map::MapMatch;
 use super::state::{Observation, State};
 use super::tracker::{Sight, Tracker, UNCHANGED_DISTANCE, distance};
-use super::{MapQuery, ROOM_RATIO};
+use super::{MapQuery, ROOM_RATIO, RecentMatches};
 use crate::geometry::Pose;
 
 /// What another camera on the same robot saw at the time of a frame.
@@ -90,6 +90,11 @@ impl Tracker {
             unchanged_frames: state.unchanged_frames,
         };
         let mut leading = self.matched(state.room, &own, None);
+        if leading.sight == Sight::Clear {
+            let anchor = &leading.matched.anchor.belief;
+            let recent = RecentMatches::after(state.recent_matches, frame.time_ns, anchor);
+            state.recent_matches = Some(recent);
+        }
         let mut beside = Vec::new();
 
         for other in &frame.other_views {

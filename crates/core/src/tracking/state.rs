@@ -6,7 +6,7 @@ use ndarray::Array1;
 use super::health::TrackingHealth;
 use super::{
     Belief, MeasuredGravity, MeasuredPose, MeasuredSince, MovingBelief, OtherCamera, OtherView,
-    Status,
+    RecentMatches, Status,
 };
 use crate::geometry::Twist;
 use crate::index::Neighbour;
@@ -79,6 +79,8 @@ pub struct State {
     pub measured: MeasuredSince,
     /// What is remembered of the robot's other cameras.
     pub other_cameras: Vec<OtherCamera>,
+    /// How sure the matches of its own camera lately were.
+    pub recent_matches: Option<RecentMatches>,
 }
 
 /// The last frame of a stream.

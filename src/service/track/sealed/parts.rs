@@ -9,7 +9,7 @@ use super::numbers::{
     upper_triangle,
 };
 use seese3_core::tracking::{
-    Candidate, Keyframe, LastFrame, LastMeasured, MeasuredSince, OtherCamera, Place,
+    Candidate, Keyframe, LastFrame, LastMeasured, MeasuredSince, OtherCamera, Place, RecentMatches,
 };
 
 /// What other sensors measured; absent if none ever did.
@@ -316,6 +316,43 @@ impl From<&OtherCamera> for SealedCamera {
             camera: *camera,
             last: last.clone(),
             unchanged_frames: *unchanged_frames,
+        }
+    }
+}
+
+/// How sure matches lately were.
+#[derive(Clone, PartialEq, Message)]
+pub(super) struct SealedMatches {
+    #[prost(int64, tag = "1")]
+    time_ns: i64,
+    #[prost(double, tag = "2")]
+    log_deviation: f64,
+}
+
+impl SealedMatches {
+    pub(super) fn opened(self) -> RecentMatches {
+        let Self {
+            time_ns,
+            log_deviation,
+        } = self;
+
+        RecentMatches {
+            time_ns,
+            log_deviation,
+        }
+    }
+}
+
+impl From<&RecentMatches> for SealedMatches {
+    fn from(recent: &RecentMatches) -> Self {
+        let RecentMatches {
+            time_ns,
+            log_deviation,
+        } = *recent;
+
+        Self {
+            time_ns,
+            log_deviation,
         }
     }
 }

@@ -5,7 +5,8 @@ use prost::Message;
 use super::super::super::Error;
 use super::numbers::{belief_of_numbers, numbers};
 use super::parts::{
-    SealedCamera, SealedCandidate, SealedKeyframe, SealedLast, SealedMeasured, SealedPlace,
+    SealedCamera, SealedCandidate, SealedKeyframe, SealedLast, SealedMatches, SealedMeasured,
+    SealedPlace,
 };
 use seese3_core::tracking::{MeasuredSince, State, TrackingHealth};
 
@@ -43,6 +44,8 @@ pub struct SealedState {
     measured: Option<SealedMeasured>,
     #[prost(message, repeated, tag = "15")]
     other_cameras: Vec<SealedCamera>,
+    #[prost(message, optional, tag = "16")]
+    recent_matches: Option<SealedMatches>,
 }
 
 impl From<&State> for SealedState {
@@ -62,6 +65,7 @@ impl From<&State> for SealedState {
             corrected_ns,
             measured,
             other_cameras,
+            recent_matches,
         } = state;
 
         // Tracking health is stored as a number for its state and the state's counter.
@@ -89,6 +93,7 @@ impl From<&State> for SealedState {
             unchanged_frames: *unchanged_frames,
             measured: SealedMeasured::of(measured),
             other_cameras: other_cameras.iter().map(SealedCamera::from).collect(),
+            recent_matches: recent_matches.as_ref().map(SealedMatches::from),
         }
     }
 }
@@ -116,6 +121,7 @@ impl SealedState {
             unchanged_frames,
             measured,
             other_cameras,
+            recent_matches,
         } = self;
 
         let health = match health {
@@ -155,6 +161,7 @@ impl SealedState {
                 Some(measured) => measured.opened()?,
                 None => MeasuredSince::default(),
             },
+            recent_matches: recent_matches.map(SealedMatches::opened),
             other_cameras: other_cameras
                 .into_iter()
                 .map(SealedCamera::opened)
@@ -171,7 +178,7 @@ mod tests {
     use seese3_core::geometry::{Pose, Twist};
     use seese3_core::tracking::{
         Belief, Candidate, Driven, Keyframe, LastFrame, LastMeasured, MovingBelief, OtherCamera,
-        Place,
+        Place, RecentMatches,
     };
 
     fn odd_moving(pose: Pose) -> MovingBelief {
@@ -253,6 +260,10 @@ mod tests {
             corrected_ns: Some(-7),
             unchanged_frames: 3,
             measured: odd_measured(belief.pose),
+            recent_matches: Some(RecentMatches {
+                time_ns: -8,
+                log_deviation: 1.0 / 3.0,
+            }),
             other_cameras: vec![OtherCamera {
                 camera: 2,
                 last: vec![-0.0, 0.1],
