@@ -328,7 +328,7 @@ impl Tracker {
     pub(super) fn reported(&self, believed: &MovingBelief, lasting: &Matrix6<f64>) -> Belief {
         let place = believed.place();
         Belief {
-            covariance: (place.covariance + lasting) * self.map_pose_factor,
+            covariance: place.covariance * self.map_pose_factor + lasting,
             ..place
         }
     }

@@ -4,17 +4,17 @@
 //! views of a level camera at the same place. Gravity tells the tilt and nothing else: neither the
 //! heading nor the position.
 
-use nalgebra::{Cholesky, Matrix3, SMatrix, SVector, Unit, Vector3};
+use nalgebra::{Cholesky, Matrix3, Matrix6, SMatrix, SVector, Unit, Vector3};
 
 use super::{Belief, MovingBelief};
-use crate::geometry::{Pose, Twist, exp};
+use crate::geometry::{Pose, Twist, adjoint, exp};
 
 /// 99 % of χ² with two degrees of freedom, those of a tilt.
 const GATE: f64 = 9.21;
 /// Errors of measured directions last for about so long, seconds: those of a robot that speeds up
 /// or brakes. Those of the mounting last longer still, but are small.
 const MEMORY_S: f64 = 2.0;
-/// A pose is doubted by this factor of its variances at most.
+/// The variances of a view are multiplied by this at most.
 const MOST_DOUBT: f64 = 1e6;
 
 /// The direction of gravity, as an accelerometer measures it in the camera's frame.
@@ -68,7 +68,9 @@ impl Tilt {
     }
 
     /// The step of an error whose rotation is at 3, 4 and 5, and its covariance after the tilt was
-    /// measured; none if the covariances are not positive definite.
+    /// measured; none if the covariances are not positive definite. Only the tilt is corrected: that
+    /// it goes along with heading and position holds for views that are taken for one another, and
+    /// not for a camera that is mounted askew.
     fn update<const N: usize>(
         &self,
         covariance: &SMatrix<f64, N, N>,
@@ -80,10 +82,13 @@ impl Tilt {
             .fixed_view_mut::<3, 3>(0, 3)
             .copy_from(&self.projection);
 
-        let sum = Cholesky::new(of_error * covariance * of_error.transpose() + noise)?;
-        let gain = covariance * of_error.transpose() * sum.inverse();
+        let of_tilt = of_error * covariance * of_error.transpose();
+        let sum = Cholesky::new(of_tilt + noise)?;
+        let mut gain = SMatrix::<f64, N, 3>::zeros();
+        gain.fixed_view_mut::<3, 3>(3, 0)
+            .copy_from(&(of_tilt * sum.inverse()));
 
-        // Joseph's form: (I − K H) P (I − K H)ᵀ + K R Kᵀ.
+        // Joseph's form, which holds for any gain: (I − K H) P (I − K H)ᵀ + K R Kᵀ.
         let rest = SMatrix::<f64, N, N>::identity() - gain * of_error;
         let joseph = rest * covariance * rest.transpose() + gain * noise * gain.transpose();
         let symmetric = (joseph + joseph.transpose()) * 0.5;
@@ -93,37 +98,43 @@ impl Tilt {
 }
 
 impl Belief {
-    /// The pose of a view, corrected by the gravity that was measured beside it. A pose that gravity
-    /// contradicts is doubted as a whole, until the contradiction is within 99 % of what both
-    /// covariances allow: what looks alike from another tilt does so from another place too.
+    /// The pose of a view, corrected by the gravity that was measured beside it. A view that gravity
+    /// contradicts was taken from another tilt than the mapped views that it looks like: it is
+    /// turned as gravity says, and its position and heading are doubted by as much as the
+    /// contradiction exceeds 99 % of what both covariances allow.
     #[must_use]
     pub(super) fn levelled(&self, gravity: &MeasuredGravity) -> Self {
         let tilt = gravity.tilt(&self.pose);
         let variance = gravity.deviation_rad.powi(2);
         let of_rotation = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
-        let surprise = |doubt: f64| tilt.surprise(&(of_rotation * doubt), variance);
+        let doubt = tilt.surprise(&of_rotation, variance) / GATE;
 
-        // The surprise falls with the doubt: bisection of its logarithm.
-        let mut doubt = 1.0;
-        if surprise(1.0) > GATE {
-            let (mut low, mut high) = (0.0, MOST_DOUBT.ln());
-            for _ in 0..40 {
-                let middle = 0.5 * (low + high);
-                if surprise(middle.exp()) > GATE {
-                    low = middle;
-                } else {
-                    high = middle;
-                }
-            }
-            doubt = high.exp();
+        if doubt <= 1.0 {
+            return match tilt.update(&self.covariance, variance) {
+                Some((step, covariance)) => Self {
+                    pose: self.pose * exp(&Twist::from_vector(&step)),
+                    covariance,
+                },
+                None => *self,
+            };
         }
 
-        match tilt.update(&(self.covariance * doubt), variance) {
-            Some((step, covariance)) => Self {
-                pose: self.pose * exp(&Twist::from_vector(&step)),
-                covariance,
-            },
-            None => *self,
+        let turn = Pose::rotation(tilt.turn);
+        let back = adjoint(&turn.inverse());
+        let carried = back * self.covariance * back.transpose();
+
+        // What is left of the rotation's error is that about the vertical.
+        let down = gravity.in_camera.into_inner();
+        let vertical = down * down.transpose();
+        let mut kept = Matrix6::identity();
+        kept.fixed_view_mut::<3, 3>(3, 3).copy_from(&vertical);
+        let mut covariance = kept * carried * kept.transpose() * doubt.min(MOST_DOUBT);
+        let mut of_rotation = covariance.fixed_view_mut::<3, 3>(3, 3);
+        of_rotation += (Matrix3::identity() - vertical) * variance;
+
+        Self {
+            pose: self.pose * turn,
+            covariance: (covariance + covariance.transpose()) * 0.5,
         }
     }
 }
@@ -147,11 +158,11 @@ impl MovingBelief {
             return *self;
         };
 
-        let part = |at: usize| change.fixed_rows::<6>(at).into_owned();
+        let step = change.fixed_rows::<6>(0).into_owned();
         Self {
-            pose: self.pose * exp(&Twist::from_vector(&part(0))),
-            velocity: Twist::from_vector(&(self.velocity.to_vector() + part(6))),
+            pose: self.pose * exp(&Twist::from_vector(&step)),
             covariance,
+            ..*self
         }
     }
 }
@@ -209,21 +220,24 @@ mod tests {
     }
 
     /// Oracle: by hand. A view that is sure to stand level to .005 rad and a gravity of .02 rad that
-    /// says .2 rad differ by .2² / (.005² + .02²) = 94 squared deviations, far beyond the gate: all
-    /// variances are multiplied until it is 9.21, by (.2² / 9.21 − .02²) / .005² = 157.7; what is
-    /// believed of the turn then is the share 1 − .02² · 9.21 / .2².
+    /// says .2 rad differ by .2² / (.005² + .02²) = 94 squared deviations, 10.2 times the gate: the
+    /// view is turned, and the other variances are multiplied by that.
     #[test]
-    fn a_view_that_gravity_contradicts_is_doubted() {
+    fn a_view_that_gravity_contradicts_is_turned_and_doubted() {
         let view = Belief::known(turned(DOWN, -0.4), 0.005, 0.005);
         let truth = view.pose * exp(&Twist::from_vector(&Vector6::new(0., 0., 0., 0.2, 0., 0.)));
         let found = view.levelled(&gravity_at(&truth, 0.02));
 
-        let turn = log(&view.pose.inv_mul(&found.pose)).to_vector();
-        let share = 1.0 - 0.02_f64.powi(2) * GATE / 0.2_f64.powi(2);
-        assert!((turn[3] - 0.2 * share).abs() < 1e-6, "{turn}");
-        let doubt = (0.2_f64.powi(2) / GATE - 0.02_f64.powi(2)) / 0.005_f64.powi(2);
+        let error = log(&found.pose.inv_mul(&truth)).to_vector();
+        assert!(error.norm() < 1e-9, "{error}");
+        let doubt = 0.2_f64.powi(2) / (0.005_f64.powi(2) + 0.02_f64.powi(2)) / GATE;
         let expected = 0.005_f64.powi(2) * doubt;
-        assert!((found.covariance[(0, 0)] / expected - 1.0).abs() < 1e-6);
+        let down = truth.rotation.inverse() * DOWN;
+        let of_rotation = found.covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        let about = |axis: Vector3<f64>| (axis.transpose() * of_rotation * axis)[0];
+        assert!((found.covariance[(0, 0)] / expected - 1.0).abs() < 1e-9);
+        assert!((about(down) / expected - 1.0).abs() < 1e-9);
+        assert!((about(Vector3::x()) - 0.02_f64.powi(2)).abs() < 1e-12);
 
         // Without a contradiction nothing is doubted.
         let same = view.levelled(&gravity_at(&view.pose, 0.02));

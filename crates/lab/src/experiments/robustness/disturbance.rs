@@ -8,6 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use seese3_core::geometry::Pose;
 use seese3_core::image::RgbImage;
 use seese3_core::statistics::normal_deviates;
+use seese3_core::tracking::MeasuredGravity;
 
 /// The width in pixels for which blurs are stated; in other images they are as large a part.
 const STATED_WIDTH: f64 = 640.0;
@@ -15,6 +16,11 @@ const STATED_WIDTH: f64 = 640.0;
 const OCCLUDER_PERIOD: usize = 40;
 /// The brightness of the occluder, 0 to 255.
 const OCCLUDER_BRIGHTNESS: u8 = 60;
+
+/// How far off measured directions of gravity are, and what the tracker is told of it, radians: the
+/// service's own assumption.
+const GRAVITY_ERROR_RAD: f64 = 0.02;
+const GRAVITY_DEVIATION_RAD: f64 = 0.03;
 
 /// A disturbance of a stream.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -25,6 +31,8 @@ pub enum Disturbance {
     Roll {
         /// Clockwise, degrees.
         degrees: f64,
+        /// Whether the robot measures which way is down.
+        with_gravity: bool,
     },
     /// A Gaussian blur.
     Blur {
@@ -76,10 +84,12 @@ pub enum Extent {
 
 impl Disturbance {
     /// The disturbances of a full evaluation, in the order of tables.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 19] = [
         Self::None,
-        Self::Roll { degrees: 10.0 },
-        Self::Roll { degrees: -10.0 },
+        Self::roll(10.0, false),
+        Self::roll(-10.0, false),
+        Self::roll(10.0, true),
+        Self::roll(-10.0, true),
         Self::Blur { deviation: 2.0 },
         Self::Blur { deviation: 4.0 },
         Self::Exposure { factor: 0.6 },
@@ -96,11 +106,22 @@ impl Disturbance {
         Self::Rate { every: 8 },
     ];
 
+    const fn roll(degrees: f64, with_gravity: bool) -> Self {
+        Self::Roll {
+            degrees,
+            with_gravity,
+        }
+    }
+
     /// Its name in tables and JSON.
     pub fn name(self) -> String {
         match self {
             Self::None => "none".to_owned(),
-            Self::Roll { degrees } => format!("roll {degrees}°"),
+            Self::Roll {
+                degrees,
+                with_gravity: false,
+            } => format!("roll {degrees}°"),
+            Self::Roll { degrees, .. } => format!("roll {degrees}°, gravity"),
             Self::Blur { deviation } => format!("blur {deviation} px"),
             Self::Exposure { factor } => format!("exposure × {factor}"),
             Self::Occluder { share } => format!("occluder {:.0} %", 100.0 * share),
@@ -131,7 +152,7 @@ impl Disturbance {
     /// camera that is turned clockwise about its axis is turned about +z, from x, right, to y, down.
     pub fn truth(self, pose: &Pose) -> Pose {
         match self {
-            Self::Roll { degrees } => {
+            Self::Roll { degrees, .. } => {
                 let turn = Vector3::new(0.0, 0.0, degrees.to_radians());
                 pose * Pose::new(Vector3::zeros(), turn)
             }
@@ -139,11 +160,30 @@ impl Disturbance {
         }
     }
 
+    /// Which way is down, as a robot measures it whose camera is at `pose`; none if it does not. The
+    /// world's +y axis is taken for down, which a tracker cannot tell from any other, and the
+    /// measured direction is off by [`GRAVITY_ERROR_RAD`] about the camera's axis all the time.
+    pub fn gravity(self, pose: &Pose) -> Option<MeasuredGravity> {
+        let Self::Roll {
+            with_gravity: true, ..
+        } = self
+        else {
+            return None;
+        };
+
+        let error = Pose::rotation(Vector3::z() * GRAVITY_ERROR_RAD);
+        Some(MeasuredGravity {
+            in_world: Vector3::y_axis(),
+            in_camera: error.rotation * (pose.rotation.inverse() * Vector3::y_axis()),
+            deviation_rad: GRAVITY_DEVIATION_RAD,
+        })
+    }
+
     /// The image that the camera takes as frame `number` of its stream.
     pub fn disturbed(self, picture: &RgbImage, number: usize) -> RgbImage {
         match self {
             Self::None | Self::Frozen | Self::Rate { .. } => picture.clone(),
-            Self::Roll { degrees } => turned(picture, degrees.to_radians()),
+            Self::Roll { degrees, .. } => turned(picture, degrees.to_radians()),
             Self::Blur { deviation } => {
                 blurred(picture, deviation * picture.width as f64 / STATED_WIDTH)
             }
@@ -280,7 +320,7 @@ mod tests {
     /// is then above it.
     #[test]
     fn a_camera_that_rolls_clockwise_sees_the_world_turn_the_other_way() {
-        let quarter = Disturbance::Roll { degrees: 90.0 };
+        let quarter = Disturbance::roll(90.0, false);
         let turned = quarter.disturbed(&point(30, 15), 0);
         assert_eq!(brightest(&turned), (20, 5));
 

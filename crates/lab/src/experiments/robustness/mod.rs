@@ -119,10 +119,12 @@ pub fn evaluate(
             let time_ns = i64::from(frame.0 - frames[0].0) * period;
 
             let row = first_row + taken.view;
+            let truth = disturbance.truth(&room.room().poses()[frame.row()]);
             played.push(Played {
                 frame: Observation {
                     feature: Some(views.features.row(row).to_vec()),
                     is_blank: taken.is_disturbed && views.is_blank[row],
+                    gravity: disturbance.gravity(&truth),
                     ..Observation::new(
                         time_ns,
                         taken
@@ -131,7 +133,7 @@ pub fn evaluate(
                         latents.row(row).to_owned(),
                     )
                 },
-                truth: disturbance.truth(&room.room().poses()[frame.row()]),
+                truth,
             });
             is_scored.push(part.holds(number));
             view_rows.push(row);
