@@ -28,5 +28,6 @@ mod refusals;
 mod reload;
 mod room_memory;
 mod security;
+mod sensors;
 mod soak;
 mod tracking;

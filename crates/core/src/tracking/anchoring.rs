@@ -247,7 +247,7 @@ impl Tracker {
         // The earlier candidate was seen some frames ago: carry it to this frame, then compare.
         let carried = earlier_candidate
             .filter(|candidate| candidate.room == room)
-            .map(|candidate| self.carried_candidate(candidate, frame));
+            .map(|candidate| self.carried_candidate(state, candidate, frame));
         let (map_pose, agreeing_anchors) = match carried {
             Some((map_pose, agreeing)) if surprise_at(&map_pose, &anchor) <= GATE => {
                 (map_pose.corrected(&anchor), agreeing + 1)
@@ -280,12 +280,22 @@ impl Tracker {
     }
 
     /// Where a candidate's camera would be at this frame, and how many anchors agreed on it.
-    fn carried_candidate(&self, candidate: Candidate, frame: &Observation) -> (Belief, u32) {
+    fn carried_candidate(
+        &self,
+        state: &State,
+        candidate: Candidate,
+        frame: &Observation,
+    ) -> (Belief, u32) {
         let from = EarlierView {
             latent: &candidate.latent,
             time_ns: candidate.time_ns,
         };
-        let (motion, covariance) = self.motion_between(Some(candidate.room), from, frame);
+        let (motion, mut covariance) = self.motion_between(Some(candidate.room), from, frame);
+
+        // Where another camera speaks for the place, the stream's own may see no motion.
+        if Sight::of(frame.is_blank, state.unchanged_frames) != Sight::Clear {
+            covariance += self.error_model.unread_errors();
+        }
 
         let map_pose = candidate.map_pose.moved(motion, &covariance);
         (map_pose, candidate.agreeing_anchors)

@@ -212,6 +212,20 @@ mod tests {
         let of_rotation = found.covariance.fixed_view::<3, 3>(3, 3).into_owned();
         let about = |axis: Vector3<f64>| (axis.transpose() * of_rotation * axis)[0];
         assert!(about(Vector3::z()) < 1e-9);
+
+        // Also where errors of roll went along with those of position and heading.
+        let mut covariance = believed.covariance;
+        for other in [0, 4] {
+            covariance[(5, other)] = 0.9 * (covariance[(5, 5)] * covariance[(other, other)]).sqrt();
+            covariance[(other, 5)] = covariance[(5, other)];
+        }
+        let found = Belief {
+            covariance,
+            ..believed
+        };
+        let found = found.levelled(&gravity_at(&truth, 1e-3));
+        let error = log(&found.pose.inv_mul(&truth)).to_vector();
+        assert!(error.norm() < 1e-4, "{error}");
         assert!(
             (about(down) - 0.04).abs() < 0.04 * roll.powi(2),
             "{}",
