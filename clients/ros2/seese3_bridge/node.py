@@ -173,7 +173,15 @@ class Bridge(Node):
             self.report(1, text, refusal.timestamp_ns)
 
     def follow(self):
-        """Takes the server's answers until the node ends."""
+        """Takes the server's answers until the node ends; what nobody expected ends the node, so that it is started again."""
+        try:
+            self.take_answers()
+        except Exception as error:
+            self.get_logger().fatal(f"{type(error).__name__}: {error}")
+            rclpy.try_shutdown()
+            raise
+
+    def take_answers(self):
         while rclpy.ok() and not self.begins.wait(timeout=1.0):
             self.get_logger().warning("waiting for camera_info", throttle_duration_sec=10.0)
 

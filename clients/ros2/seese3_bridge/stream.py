@@ -1,6 +1,7 @@
 """One Track stream: requests in, answers out, by however many calls it takes."""
 
 import queue
+import threading
 
 from seese3.v1 import odometry_pb2, odometry_pb2_grpc
 
@@ -13,7 +14,7 @@ class Stream:
 
     def __init__(self, channel, config):
         self.stub, self.config, self.token = odometry_pb2_grpc.OdometryServiceStub(channel), config, b""
-        self.frames = queue.Queue(maxsize=WAITING)
+        self.frames, self.lock = queue.Queue(maxsize=WAITING), threading.Lock()
 
     def requests(self, frames):
         resumed = odometry_pb2.TrackConfig(resume_token=self.token)
@@ -23,18 +24,28 @@ class Stream:
 
     def offer(self, request):
         """Takes a request; the oldest that waits goes when there is no room."""
-        while True:
-            try:
-                return self.frames.put_nowait(request)
-            except queue.Full:
+        with self.lock:
+            while True:
                 try:
-                    self.frames.get_nowait()
-                except queue.Empty:
-                    pass
+                    return self.frames.put_nowait(request)
+                except queue.Full:
+                    try:
+                        self.frames.get_nowait()
+                    except queue.Empty:
+                        pass
+
+    def begin(self):
+        """A queue for a new call, with what waits for one: an old call must not take a new one's frames."""
+        with self.lock:
+            waiting, self.frames = self.frames, queue.Queue(maxsize=WAITING)
+            while not waiting.empty():
+                if (request := waiting.get_nowait()) is not None:
+                    self.frames.put_nowait(request)
+            return self.frames
 
     def answers(self):
-        """Answers until the call ends. Every call has a queue of its own: an old one must not take a new one's frames."""
-        frames = self.frames = queue.Queue(maxsize=WAITING)
+        """Answers until the call ends."""
+        frames = self.begin()
         try:
             for answer in self.stub.Track(self.requests(frames)):
                 self.token = answer.resume_token or self.token

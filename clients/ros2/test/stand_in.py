@@ -62,7 +62,8 @@ def to_bag(message):
             if isinstance(value, (bytes, bytearray)):
                 return numpy.frombuffer(bytes(value), numpy.uint8)
             return numpy.asarray(value, dtype=name)
-        return value
+        # ROS takes a byte as bytes of length one, rosbags as a number.
+        return value[0] if isinstance(value, bytes) else value
 
     fields = STORE.fielddefs[message.type_name][1]
     return STORE.types[message.type_name](**{name: field(kind, getattr(message, name)) for name, kind in fields})
@@ -75,7 +76,7 @@ class Logger:
     def _write(self, text, **_):
         self.lines.append(text)
 
-    warning = error = info = _write
+    warning = error = fatal = info = _write
 
 
 class Publisher:
