@@ -110,27 +110,6 @@ pub fn replay_frames(tracker: &Tracker, frames: &[Played], initial_pose: Initial
     for Played { frame, truth } in frames {
         // A frame of another adapter, or out of order, is refused and left out.
         if let Ok(update) = tracker.observe(&mut state, frame) {
-            if std::env::var("DUMP").is_ok() {
-                if let Some(m) = update.map_pose {
-                    let d = crate::geometry::log(&m.pose.inv_mul(truth)).to_vector();
-                    eprintln!(
-                        "DUMP {} {:?} used {} ood {:.2} sd {:.3} rsd {:.2} sur {:.1} | {:.2} {:.2} {:.2} | {:.1} {:.1} {:.1}",
-                        frame.sequence,
-                        update.status,
-                        update.match_used as u8,
-                        update.out_of_distribution,
-                        m.position_deviation_m(),
-                        m.rotation_deviation_rad().to_degrees(),
-                        update.surprise.unwrap_or(-1.0),
-                        d[0],
-                        d[1],
-                        d[2],
-                        d[3].to_degrees(),
-                        d[4].to_degrees(),
-                        d[5].to_degrees()
-                    );
-                }
-            }
             found.truth.times_ns.push(frame.time_ns);
             found.truth.poses.push(*truth);
             found.sequences.push(frame.sequence);
