@@ -102,13 +102,10 @@ fn a_known_camera_with_spoilt_latents_is_corrected_by_its_features() {
         let mut errors = Vec::new();
         for row in (41..141).step_by(2) {
             let feature = features.rows().row(row).to_vec();
+            let latent = adapter.embed_one(&feature).unwrap() + 50.0;
             let observation = Observation {
                 feature: with_features.then_some(feature),
-                ..Observation::new(
-                    row as i64 * 33_000_000,
-                    row as u64,
-                    adapter.embed_one(&feature).unwrap() + 50.0,
-                )
+                ..Observation::new(row as i64 * 33_000_000, row as u64, latent)
             };
 
             let update = tracker.observe(&mut state, &observation).unwrap();

@@ -204,9 +204,8 @@ mod tests {
         }
     }
 
-    /// Oracle: the contract: a sealed state comes back bit by bit.
-    #[test]
-    fn a_state_comes_back_to_the_bit() {
+    /// A state whose numbers are all odd ones.
+    fn odd_state() -> State {
         let odd = Pose::new(
             nalgebra::Vector3::new(0.1, -2.3, 1e-17),
             nalgebra::Vector3::new(0.3, 1.0 / 3.0, -0.7),
@@ -221,7 +220,7 @@ mod tests {
         );
         let moving = odd_moving(odd);
 
-        let state = State {
+        State {
             room: Some(3),
             last: Some(LastFrame {
                 time_ns: -5,
@@ -269,11 +268,22 @@ mod tests {
                 last: vec![-0.0, 0.1],
                 unchanged_frames: 4,
             }],
-        };
+        }
+    }
 
+    /// Oracle: the contract: a sealed state comes back bit by bit.
+    #[test]
+    fn a_state_comes_back_to_the_bit() {
         for state in [
-            state,
+            odd_state(),
             State::default(),
+            State {
+                place: odd_state().place.map(|place| Place {
+                    latent: None,
+                    ..place
+                }),
+                ..odd_state()
+            },
             State {
                 health: TrackingHealth::Lost { certain_matches: 4 },
                 ..State::default()
