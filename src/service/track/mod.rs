@@ -210,7 +210,13 @@ impl Handlers {
         since: Instant,
     ) -> Result<(Session, Result<pb::TrackResponse, Error>), Error> {
         let lane = match &message {
-            Message::Frame(frame) => Lane::of(&frame.view),
+            Message::Frame(frame) => {
+                let others = frame
+                    .other_views
+                    .iter()
+                    .filter_map(|other| other.view.as_ref());
+                Lane::of(frame.view.iter().chain(others))
+            }
             _ => Lane::Short,
         };
         self.workers

@@ -56,12 +56,18 @@ impl Sensors {
             .gravity_in_map
             .map(|given| direction("gravity_in_map", given))
             .transpose()?;
+        if gravity_in_map.is_some() && config.room.is_empty() {
+            return Err(Error::invalid(
+                "gravity_in_map",
+                "needs the room in whose world frame it is",
+            ));
+        }
 
         if config.other_cameras.len() > MOST_CAMERAS {
             return Err(Error::invalid(
                 "other_cameras",
                 format!(
-                    "are {}, and at most {MOST_CAMERAS}",
+                    "must be at most {MOST_CAMERAS}, not {}",
                     config.other_cameras.len()
                 ),
             ));
@@ -188,7 +194,8 @@ impl Sensors {
 fn direction(field: &str, given: pb::Vector3) -> Result<Unit<Vector3<f64>>, Error> {
     let given = Vector3::new(given.x, given.y, given.z);
     let largest = given.amax();
-    if !(largest.is_finite() && largest > SHORTEST) {
+    let is_finite = given.iter().all(|value| value.is_finite());
+    if !(is_finite && largest > SHORTEST) {
         return Err(Error::invalid(field, "must be finite and longer than 0"));
     }
 

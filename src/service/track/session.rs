@@ -118,6 +118,8 @@ impl Session {
             candidate,
             other_cameras,
             recent_matches: _,
+            seen_ns: _,
+            gravity_ns: _,
             initial_pose: _,
             health: _,
             frames_off_map: _,
@@ -130,7 +132,9 @@ impl Session {
             last.as_ref().map(|last| &last.latent),
             keyframe.as_ref().map(|keyframe| &keyframe.latent),
             place.as_ref().and_then(|place| place.latent.as_ref()),
-            candidate.as_ref().map(|candidate| &candidate.latent),
+            candidate
+                .as_ref()
+                .and_then(|candidate| candidate.latent.as_ref()),
         ];
 
         let named = [*room, candidate.as_ref().map(|candidate| candidate.room)];

@@ -3,11 +3,13 @@
 use nalgebra::Matrix6;
 
 use super::dead_reckoning::{EarlierView, Poses};
+use super::gravity::CountedGravity;
 use super::health::TrackingHealth;
 use super::rig::{MatchedView, Seen};
 use super::state::{Candidate, Observation, State};
 use super::tracker::{Sight, Tracker};
 use super::{Belief, MapAnchor, MovingBelief};
+use crate::geometry::Twist;
 
 /// 99 % of χ² with six degrees of freedom: an anchor whose surprise is larger counts for less.
 const GATE: f64 = 16.81;
@@ -27,6 +29,19 @@ struct CountedAnchor {
     belief: Belief,
     /// The covariance of its error, if that lasts; else zero.
     lasting: Matrix6<f64>,
+}
+
+impl CountedAnchor {
+    /// The anchor as one of several of one time, which together tell as much as one.
+    fn shared_by(self, count: usize) -> Self {
+        Self {
+            belief: Belief {
+                covariance: self.belief.covariance * count as f64,
+                ..self.belief
+            },
+            ..self
+        }
+    }
 }
 
 /// What an anchor did to the map pose.
@@ -111,40 +126,46 @@ impl MatchedView<'_> {
 
 impl Tracker {
     /// Corrects the map pose by what all cameras see: first by the view that leads, which may find the
-    /// camera at another place, then by the others, which may not. The errors of several cameras at
-    /// one time are taken to be independent.
+    /// camera at another place, then by the others, which may not, and cannot object.
     pub(super) fn correct_by_views(
         &self,
         state: &mut State,
         poses: &mut Poses,
         frame: &Observation,
         seen: &Seen<'_>,
+        gravity: Option<&CountedGravity>,
     ) -> Correction {
         let leading = &seen.leading;
         let beside = |view: &&MatchedView<'_>| {
             self.settings.fuse && view.room == leading.room && view.may_correct(state.health)
         };
-        let anchors: Vec<CountedAnchor> = seen
-            .beside
-            .iter()
-            .filter(beside)
-            .map(|view| self.anchor(state, frame, view))
-            .collect();
+        let others: Vec<&MatchedView<'_>> = seen.beside.iter().filter(beside).collect();
+        // Cameras on one robot see the same part of the map, or of what is not mapped: several count
+        // as much as one.
+        let of_others = others.iter().map(|view| {
+            let anchor = self.anchor(state, frame, view, gravity);
+            anchor.shared_by(1 + others.len())
+        });
+        let of_others: Vec<CountedAnchor> = of_others.collect();
 
         // An image that is repeated tells nothing new.
         let correction = if leading.is_repeated || leading.sight != Sight::Clear {
             Correction::NONE
         } else {
-            self.correct_by_leading(state, poses, frame, leading)
+            let anchor = self.anchor(state, frame, leading, gravity);
+            let anchor = anchor.shared_by(1 + of_others.len());
+            self.correct_by_leading(state, poses, frame, leading, anchor)
         };
 
-        for anchor in anchors {
+        let mut is_corrected = correction.is_applied;
+        for anchor in of_others {
             let lasting = poses.lasting;
             let applied = correct_believed(state, poses, frame, leading.room, anchor).is_applied;
-            // What lasts is at most the least of what the anchors leave.
-            if applied && correction.is_applied && lasting.trace() < poses.lasting.trace() {
+            // Of the anchors of one frame, the lasting error is that of the best.
+            if applied && is_corrected && lasting.trace() < poses.lasting.trace() {
                 poses.lasting = lasting;
             }
+            is_corrected |= applied;
         }
 
         correction
@@ -159,12 +180,12 @@ impl Tracker {
         poses: &mut Poses,
         frame: &Observation,
         view: &MatchedView<'_>,
+        anchor: CountedAnchor,
     ) -> Correction {
         if !self.settings.fuse || !view.may_correct(state.health) {
             return Correction::NONE;
         }
 
-        let anchor = self.anchor(state, frame, view);
         if view.matches_room() {
             self.correct(state, poses, frame, view.room, anchor)
         } else {
@@ -176,7 +197,13 @@ impl Tracker {
     /// view certainly shows the room, else by the frames that it matches: beyond the mapped part a
     /// reader is surer than it should be. Its covariance is that with which it counts beside the
     /// anchors before it.
-    fn anchor(&self, state: &State, frame: &Observation, view: &MatchedView<'_>) -> CountedAnchor {
+    fn anchor(
+        &self,
+        state: &State,
+        frame: &Observation,
+        view: &MatchedView<'_>,
+        gravity: Option<&CountedGravity>,
+    ) -> CountedAnchor {
         let MapAnchor { belief, memory_s } = view.matched.anchor;
         let feature = view.feature.filter(|_| view.matched.is_certain);
         let by_reader = self.maps[view.room].pose_by_reader(feature);
@@ -188,7 +215,7 @@ impl Tracker {
         if let Some(other) = view.other {
             belief = belief.of_attached(&other.camera_from_other.inverse());
         }
-        if let Some(gravity) = &frame.gravity {
+        if let Some(gravity) = gravity {
             belief = belief.levelled(gravity);
         }
 
@@ -263,11 +290,12 @@ impl Tracker {
             poses.map_pose = Some(MovingBelief::at(map_pose, prior));
             poses.lasting = counted.lasting;
         } else {
+            let sight = Sight::of(frame.is_blank, state.unchanged_frames);
             state.candidate = Some(Candidate {
                 room,
                 time_ns: frame.time_ns,
                 sequence: frame.sequence,
-                latent: frame.latent.to_vec(),
+                latent: (sight == Sight::Clear).then(|| frame.latent.to_vec()),
                 map_pose,
                 agreeing_anchors,
             });
@@ -286,16 +314,19 @@ impl Tracker {
         candidate: Candidate,
         frame: &Observation,
     ) -> (Belief, u32) {
-        let from = EarlierView {
-            latent: &candidate.latent,
-            time_ns: candidate.time_ns,
-        };
-        let (motion, mut covariance) = self.motion_between(Some(candidate.room), from, frame);
-
         // Where another camera speaks for the place, the stream's own may see no motion.
-        if Sight::of(frame.is_blank, state.unchanged_frames) != Sight::Clear {
-            covariance += self.error_model.unread_errors();
-        }
+        let sight = Sight::of(frame.is_blank, state.unchanged_frames);
+        let seen = candidate.latent.filter(|_| sight == Sight::Clear);
+        let (motion, covariance) = match &seen {
+            Some(latent) => {
+                let from = EarlierView {
+                    latent,
+                    time_ns: candidate.time_ns,
+                };
+                self.motion_between(Some(candidate.room), from, frame)
+            }
+            None => (Twist::default(), self.error_model.unread_errors()),
+        };
 
         let map_pose = candidate.map_pose.moved(motion, &covariance);
         (map_pose, candidate.agreeing_anchors)

@@ -4,17 +4,17 @@
 //! views of a level camera at the same place. Gravity tells the tilt and nothing else: neither the
 //! heading nor the position.
 
-use nalgebra::{Cholesky, Matrix3, Matrix6, SMatrix, SVector, Unit, Vector3};
+use nalgebra::{Cholesky, Matrix3, SMatrix, SVector, Unit, Vector3};
 
-use super::{Belief, MovingBelief};
-use crate::geometry::{Pose, Twist, adjoint, exp};
+use super::{Belief, MovingBelief, Observation, State};
+use crate::geometry::{Pose, Twist, exp};
 
 /// 99 % of χ² with two degrees of freedom, those of a tilt.
 const GATE: f64 = 9.21;
-/// Errors of measured directions last for about so long, seconds: those of a robot that speeds up
-/// or brakes. Those of the mounting last longer still, but are small.
+/// For how long the error of a measured direction is correlated, seconds: it is mostly that of a
+/// robot that speeds up or brakes.
 const MEMORY_S: f64 = 2.0;
-/// The variances of a view are multiplied by this at most.
+/// The largest multiple of the gate by which a contradiction is counted.
 const MOST_DOUBT: f64 = 1e6;
 
 /// The direction of gravity, as an accelerometer measures it in the camera's frame.
@@ -28,22 +28,54 @@ pub struct MeasuredGravity {
     pub deviation_rad: f64,
 }
 
+/// A measured direction as it counts beside those before it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct CountedGravity {
+    measured: MeasuredGravity,
+    /// The variance that its error has, radians².
+    variance: f64,
+    /// The larger variance with which it counts: those before it had about the same error.
+    counted_variance: f64,
+}
+
 /// How a pose is tilted against measured gravity.
 struct Tilt {
     /// The rotation that would take the pose's own direction of gravity to the measured one, in the
     /// camera's body frame, radians.
     turn: Vector3<f64>,
-    /// What of an error of rotation is one of tilt: all but that about the vertical.
+    /// Takes an error of rotation, in the camera's body frame, to its part across the vertical.
     projection: Matrix3<f64>,
 }
 
 impl MeasuredGravity {
+    /// The direction that a frame brings, as it counts; the stream remembers when that was.
+    pub(super) fn after(self, state: &mut State, frame: &Observation) -> CountedGravity {
+        let seconds = state.gravity_ns.map_or(f64::INFINITY, |before| {
+            frame.time_ns.abs_diff(before) as f64 * 1e-9
+        });
+        state.gravity_ns = Some(frame.time_ns);
+        self.counted_after(seconds)
+    }
+
+    /// The direction as it counts some seconds after another. A row of measurements with the
+    /// correlation ρ from one to the next tells as much as independent ones of (1 + ρ)/(1 − ρ)
+    /// times the variance.
+    fn counted_after(self, seconds: f64) -> CountedGravity {
+        let correlation = (-seconds / MEMORY_S).exp();
+        let variance = self.deviation_rad.powi(2);
+        CountedGravity {
+            measured: self,
+            variance,
+            counted_variance: variance * (1.0 + correlation) / (1.0 - correlation),
+        }
+    }
+
     fn tilt(&self, pose: &Pose) -> Tilt {
         let expected = pose.rotation.inverse() * self.in_world.into_inner();
         let measured = self.in_camera.into_inner();
 
         // A camera that is turned by ω sees a direction h at h − ω × h: the turn is about measured ×
-        // expected. One upside down may have been turned about any axis across.
+        // expected. Where the two are opposite, any perpendicular axis will do.
         let across = measured.cross(&expected);
         let angle = across.norm().atan2(measured.dot(&expected));
         let axis = across.try_normalize(1e-9).unwrap_or_else(|| {
@@ -68,9 +100,10 @@ impl Tilt {
     }
 
     /// The step of an error whose rotation is at 3, 4 and 5, and its covariance after the tilt was
-    /// measured; none if the covariances are not positive definite. Only the tilt is corrected: that
-    /// it goes along with heading and position holds for views that are taken for one another, and
-    /// not for a camera that is mounted askew.
+    /// measured, in the body frame before the step; none if the covariances are not positive
+    /// definite. Heading and position are left alone: that they are correlated with the tilt comes
+    /// from views that are taken for one another, and does not hold for a camera that is mounted
+    /// askew.
     fn update<const N: usize>(
         &self,
         covariance: &SMatrix<f64, N, N>,
@@ -97,64 +130,55 @@ impl Tilt {
     }
 }
 
+impl CountedGravity {
+    /// The tilt of a pose with this covariance of rotation, and the factor by which this measurement
+    /// counts for less: the more, the further beyond 99 % the two contradict one another. A robot
+    /// that brakes measures another direction, and so does one whose sensor is mounted otherwise
+    /// than it was told.
+    fn against(&self, pose: &Pose, of_rotation: &Matrix3<f64>) -> (Tilt, f64) {
+        let tilt = self.measured.tilt(pose);
+        let excess = tilt.surprise(of_rotation, self.variance) / GATE;
+        (tilt, excess.clamp(1.0, MOST_DOUBT).powi(2))
+    }
+
+    /// By how much it contradicts a pose, radians; none if it does not.
+    pub(super) fn contradicts(&self, pose: &Belief) -> Option<f64> {
+        let tilt = self.measured.tilt(&pose.pose);
+        let of_rotation = pose.covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        let is_surprise = tilt.surprise(&of_rotation, self.variance) > GATE;
+        is_surprise.then(|| tilt.turn.norm())
+    }
+}
+
 impl Belief {
-    /// The pose of a view, corrected by the gravity that was measured beside it. A view that gravity
-    /// contradicts was taken from another tilt than the mapped views that it looks like: it is
-    /// turned as gravity says, and its position and heading are doubted by as much as the
-    /// contradiction exceeds 99 % of what both covariances allow.
+    /// The pose of a view, corrected by the gravity that was measured beside it: however many views
+    /// there are, each is turned at most to where gravity says.
     #[must_use]
-    pub(super) fn levelled(&self, gravity: &MeasuredGravity) -> Self {
-        let tilt = gravity.tilt(&self.pose);
-        let variance = gravity.deviation_rad.powi(2);
+    pub(super) fn levelled(&self, gravity: &CountedGravity) -> Self {
         let of_rotation = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
-        let doubt = tilt.surprise(&of_rotation, variance) / GATE;
-
-        if doubt <= 1.0 {
-            return match tilt.update(&self.covariance, variance) {
-                Some((step, covariance)) => Self {
-                    pose: self.pose * exp(&Twist::from_vector(&step)),
+        let (tilt, factor) = gravity.against(&self.pose, &of_rotation);
+        match tilt.update(&self.covariance, gravity.variance * factor) {
+            Some((step, covariance)) => {
+                let step = exp(&Twist::from_vector(&step));
+                Self {
                     covariance,
-                },
-                None => *self,
-            };
-        }
-
-        let turn = Pose::rotation(tilt.turn);
-        let back = adjoint(&turn.inverse());
-        let carried = back * self.covariance * back.transpose();
-
-        // What is left of the rotation's error is that about the vertical.
-        let down = gravity.in_camera.into_inner();
-        let vertical = down * down.transpose();
-        let mut kept = Matrix6::identity();
-        kept.fixed_view_mut::<3, 3>(3, 3).copy_from(&vertical);
-        let mut covariance = kept * carried * kept.transpose() * doubt.min(MOST_DOUBT);
-        let mut of_rotation = covariance.fixed_view_mut::<3, 3>(3, 3);
-        of_rotation += (Matrix3::identity() - vertical) * variance;
-
-        Self {
-            pose: self.pose * turn,
-            covariance: (covariance + covariance.transpose()) * 0.5,
+                    ..*self
+                }
+                .of_attached(&step)
+            }
+            None => *self,
         }
     }
 }
 
 impl MovingBelief {
-    /// The belief when gravity was measured, some seconds after it was measured before. Measurements
-    /// in a row have like errors, so that each counts for little; one that contradicts the belief
-    /// counts for less: a robot that brakes measures another direction.
+    /// The belief when gravity was measured.
     #[must_use]
-    pub(super) fn levelled(&self, gravity: &MeasuredGravity, seconds: f64) -> Self {
-        let tilt = gravity.tilt(&self.pose);
-        let correlation = (-seconds / MEMORY_S).exp();
-        let alike = (1.0 + correlation) / (1.0 - correlation);
-        let variance = gravity.deviation_rad.powi(2) * alike;
-
+    pub(super) fn levelled(&self, gravity: &CountedGravity) -> Self {
         let of_rotation = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
-        let doubt = (tilt.surprise(&of_rotation, variance) / GATE)
-            .max(1.0)
-            .powi(2);
-        let Some((change, covariance)) = tilt.update(&self.covariance, variance * doubt) else {
+        let (tilt, factor) = gravity.against(&self.pose, &of_rotation);
+        let variance = gravity.counted_variance * factor;
+        let Some((change, covariance)) = tilt.update(&self.covariance, variance) else {
             return *self;
         };
 
@@ -187,75 +211,76 @@ mod tests {
         }
     }
 
+    /// The same, as the first that a stream brings.
+    fn first_at(pose: &Pose, deviation_rad: f64) -> CountedGravity {
+        gravity_at(pose, deviation_rad).counted_after(f64::INFINITY)
+    }
+
     fn turned(axis: Vector3<f64>, angle_rad: f64) -> Pose {
         Pose::new(Vector3::new(1.0, 2.0, 3.0), axis * angle_rad)
     }
 
     /// Oracle: by hand. A camera that is believed to stand level is rolled by 10 degrees about its
-    /// optical axis: gravity, which is much surer, turns it so, about no other axis. Neither its
-    /// position nor its heading are known better afterwards.
+    /// optical axis: gravity, which is much surer, turns it so, about no other axis. Its tilt is
+    /// known afterwards; neither its position nor its heading are known better.
     #[test]
     fn gravity_tells_the_tilt_and_nothing_else() {
         let level = turned(DOWN, 0.7);
-        let roll = 10_f64.to_radians();
-        let truth = level * exp(&Twist::from_vector(&Vector6::new(0., 0., 0., 0., 0., roll)));
+        let roll = Twist::from_vector(&Vector6::new(0., 0., 0., 0., 0., 10_f64.to_radians()));
+        let truth = level * exp(&roll);
+        let (right, down) = (Vector3::x(), truth.rotation.inverse() * DOWN);
 
-        let believed = Belief::known(level, 0.1, 0.2);
-        let found = believed.levelled(&gravity_at(&truth, 1e-6));
-        let error = log(&found.pose.inv_mul(&truth)).to_vector();
-        assert!(error.norm() < 1e-6, "{error}");
-
-        let position = found.covariance.fixed_view::<3, 3>(0, 0).into_owned();
-        assert!((position - Matrix3::identity() * 0.01).amax() < 1e-12);
-        // The vertical of the rolled camera.
-        let down = truth.rotation.inverse() * DOWN;
-        let of_rotation = found.covariance.fixed_view::<3, 3>(3, 3).into_owned();
-        let about = |axis: Vector3<f64>| (axis.transpose() * of_rotation * axis)[0];
-        assert!(about(Vector3::z()) < 1e-9);
-
+        let independent = Belief::known(level, 0.1, 0.2);
         // Also where errors of roll went along with those of position and heading.
-        let mut covariance = believed.covariance;
+        let mut together = independent;
         for other in [0, 4] {
-            covariance[(5, other)] = 0.9 * (covariance[(5, 5)] * covariance[(other, other)]).sqrt();
+            let covariance = &mut together.covariance;
+            covariance[(5, other)] = 0.6 * (covariance[(5, 5)] * covariance[(other, other)]).sqrt();
             covariance[(other, 5)] = covariance[(5, other)];
         }
-        let found = Belief {
-            covariance,
-            ..believed
-        };
-        let found = found.levelled(&gravity_at(&truth, 1e-3));
-        let error = log(&found.pose.inv_mul(&truth)).to_vector();
-        assert!(error.norm() < 1e-4, "{error}");
-        assert!(
-            (about(down) - 0.04).abs() < 0.04 * roll.powi(2),
-            "{}",
-            about(down)
-        );
+
+        for believed in [independent, together] {
+            assert!(believed.covariance.cholesky().is_some());
+            let found = believed.levelled(&first_at(&truth, 1e-6));
+            let error = log(&found.pose.inv_mul(&truth)).to_vector();
+            assert!(error.norm() < 1e-6, "{error}");
+
+            let part = |at: usize, axis: Vector3<f64>| {
+                let block = found.covariance.fixed_view::<3, 3>(at, at).into_owned();
+                (axis.transpose() * block * axis)[0]
+            };
+            let across = right.cross(&down).normalize();
+            for axis in [across, across.cross(&down)] {
+                assert!(part(3, axis) < 1e-9, "{}", part(3, axis));
+            }
+            assert!((part(3, down) - 0.04).abs() < 1e-6, "{}", part(3, down));
+            for axis in [right, down, across] {
+                assert!((part(0, axis) - 0.01).abs() < 1e-9, "{}", part(0, axis));
+            }
+        }
     }
 
     /// Oracle: by hand. A view that is sure to stand level to .005 rad and a gravity of .02 rad that
-    /// says .2 rad differ by .2² / (.005² + .02²) = 94 squared deviations, 10.2 times the gate: the
-    /// view is turned, and the other variances are multiplied by that.
+    /// says .2 rad differ by .2² / (.005² + .02²) = 94.118 squared deviations, 10.219 times the 9.21
+    /// of χ²: gravity counts with 104.43 times its variance, and turns the view by .2 · 25e-6 / (25e-6
+    /// + 104.43 · 400e-6) = .0001196 rad. And that is a contradiction of .2 rad, while one of .02 rad
+    /// is none.
     #[test]
-    fn a_view_that_gravity_contradicts_is_turned_and_doubted() {
+    fn gravity_that_a_sure_view_contradicts_is_doubted() {
         let view = Belief::known(turned(DOWN, -0.4), 0.005, 0.005);
-        let truth = view.pose * exp(&Twist::from_vector(&Vector6::new(0., 0., 0., 0.2, 0., 0.)));
-        let found = view.levelled(&gravity_at(&truth, 0.02));
+        let pitched = |angle: f64| {
+            let truth = view.pose
+                * exp(&Twist::from_vector(&Vector6::new(
+                    0., 0., 0., angle, 0., 0.,
+                )));
+            first_at(&truth, 0.02)
+        };
 
-        let error = log(&found.pose.inv_mul(&truth)).to_vector();
-        assert!(error.norm() < 1e-9, "{error}");
-        let doubt = 0.2_f64.powi(2) / (0.005_f64.powi(2) + 0.02_f64.powi(2)) / GATE;
-        let expected = 0.005_f64.powi(2) * doubt;
-        let down = truth.rotation.inverse() * DOWN;
-        let of_rotation = found.covariance.fixed_view::<3, 3>(3, 3).into_owned();
-        let about = |axis: Vector3<f64>| (axis.transpose() * of_rotation * axis)[0];
-        assert!((found.covariance[(0, 0)] / expected - 1.0).abs() < 1e-9);
-        assert!((about(down) / expected - 1.0).abs() < 1e-9);
-        assert!((about(Vector3::x()) - 0.02_f64.powi(2)).abs() < 1e-12);
-
-        // Without a contradiction nothing is doubted.
-        let same = view.levelled(&gravity_at(&view.pose, 0.02));
-        assert!((same.covariance[(0, 0)] - 0.005_f64.powi(2)).abs() < 1e-15);
+        let found = view.levelled(&pitched(0.2));
+        let turn = log(&view.pose.inv_mul(&found.pose)).to_vector();
+        assert!((turn[3] - 1.196e-4).abs() < 1e-6, "{turn}");
+        assert!((pitched(0.2).contradicts(&view).unwrap() - 0.2).abs() < 1e-9);
+        assert!(pitched(0.02).contradicts(&view).is_none());
     }
 
     /// Oracle: the definition: where a camera is upside down it was turned by half, about an axis
@@ -273,27 +298,24 @@ mod tests {
         assert!(tilt.turn.dot(&down.in_camera).abs() < 1e-9);
     }
 
-    /// Oracle: the rules, by hand: at once, with a pause much longer than errors last, a measured
-    /// direction counts by Kalman's gain; a tenth of a second later it counts for much less.
+    /// Oracle: by hand. The first direction, as sure as what is believed, takes the camera half of
+    /// the way. One that comes a tenth of a second later, with the correlation e^(−1/20) = .951,
+    /// counts with 39.7 times the variance, and takes it 1/40.7 of the way.
     #[test]
     fn directions_in_a_row_count_as_few() {
         let prior = MotionPrior::assumed();
         let level = turned(DOWN, 0.0);
         let truth = level * exp(&Twist::from_vector(&Vector6::new(0., 0., 0., 0., 0., 0.02)));
         let believed = MovingBelief::at(Belief::known(level, 0.1, 0.02), &prior);
-        let gravity = gravity_at(&truth, 0.02);
 
-        let roll = |seconds: f64| {
-            let found = believed.levelled(&gravity, seconds);
-            log(&level.inv_mul(&found.pose)).to_vector()[5]
-        };
-        assert!((roll(1e3) - 0.01).abs() < 1e-6, "{}", roll(1e3));
-        let correlation = (-0.1_f64 / MEMORY_S).exp();
-        let alike = (1.0 + correlation) / (1.0 - correlation);
-        assert!(
-            (roll(0.1) - 0.02 / (1.0 + alike)).abs() < 1e-6,
-            "{}",
-            roll(0.1)
-        );
+        for (seconds, expected) in [(f64::INFINITY, 0.01), (0.1, 0.02 / 41.01)] {
+            let gravity = gravity_at(&truth, 0.02).counted_after(seconds);
+            let found = believed.levelled(&gravity);
+            let roll = log(&level.inv_mul(&found.pose)).to_vector()[5];
+            assert!(
+                (roll / expected - 1.0).abs() < 1e-3,
+                "{roll}, not {expected}"
+            );
+        }
     }
 }

@@ -11,7 +11,7 @@ use ndarray::{Array1, ArrayView1};
 use super::map::MapMatch;
 use super::state::{Observation, State};
 use super::tracker::{Sight, Tracker, UNCHANGED_DISTANCE, distance};
-use super::{MapQuery, ROOM_RATIO, RecentMatches};
+use super::{Belief, MapQuery, ROOM_RATIO, RecentMatches};
 use crate::geometry::Pose;
 
 /// What another camera on the same robot saw at the time of a frame.
@@ -19,7 +19,7 @@ use crate::geometry::Pose;
 pub struct OtherView {
     /// Which camera it is: always the same number for the same one.
     pub camera: u32,
-    /// Its pose in the frame of the stream's own camera.
+    /// Its pose in the frame of the stream's own camera, metres.
     pub camera_from_other: Pose,
     /// Its latent under the tracker's adapter, shape (k,).
     pub latent: Array1<f64>,
@@ -34,7 +34,7 @@ pub struct OtherView {
 pub struct OtherCamera {
     /// Which one.
     pub camera: u32,
-    /// The whitened latent of its last view that was not blank.
+    /// The latent of its last view that was not blank, in standard deviations of frame noise.
     pub last: Vec<f64>,
     /// Views in a row that showed exactly what the one before did.
     pub unchanged_frames: u32,
@@ -62,11 +62,22 @@ impl MatchedView<'_> {
         self.sight == Sight::Clear && self.matched.out_of_distribution <= 1.0
     }
 
-    /// How little it resembles the room; a view that shows nothing resembles none.
+    /// Where the mapped frames that it resembles place the stream's own camera.
+    pub(super) fn placed(&self) -> Belief {
+        let belief = self.matched.anchor.belief;
+        match self.other {
+            Some(other) => belief.of_attached(&other.camera_from_other.inverse()),
+            None => belief,
+        }
+    }
+
+    /// How little it resembles the room, for the choice of the view that leads: one that shows
+    /// nothing, nothing new, or what several rooms show as well, leads only if all do.
     fn strangeness(&self) -> f64 {
-        match self.sight {
-            Sight::Clear => self.matched.out_of_distribution,
-            Sight::Nothing | Sight::Unchanged => f64::INFINITY,
+        if self.sight == Sight::Clear && !self.is_repeated && self.is_clear {
+            self.matched.out_of_distribution
+        } else {
+            f64::INFINITY
         }
     }
 }
@@ -75,6 +86,8 @@ impl MatchedView<'_> {
 pub(super) struct Seen<'a> {
     /// The view that looks most like a room: the stream's own, if none looks more like it.
     pub leading: MatchedView<'a>,
+    /// Whether the stream's own view looks like a room.
+    pub own_matches_room: bool,
     /// The others that may correct what is believed: those that show something.
     pub beside: Vec<MatchedView<'a>>,
 }
@@ -95,6 +108,7 @@ impl Tracker {
             let recent = RecentMatches::after(state.recent_matches, frame.time_ns, anchor);
             state.recent_matches = Some(recent);
         }
+        let own_matches_room = leading.matches_room();
         let mut beside = Vec::new();
 
         for other in &frame.other_views {
@@ -112,10 +126,14 @@ impl Tracker {
         }
 
         beside.retain(|view| view.sight == Sight::Clear && !view.is_repeated);
-        Seen { leading, beside }
+        Seen {
+            leading,
+            own_matches_room,
+            beside,
+        }
     }
 
-    /// How often the view of another camera has shown the same in a row.
+    /// Records another camera's view; how many views in a row have been identical to it.
     fn record_other(&self, state: &mut State, other: &OtherView) -> u32 {
         let mut cameras = state.other_cameras.iter_mut();
         let known = cameras.find(|known| known.camera == other.camera);

@@ -79,6 +79,10 @@ pub struct State {
     pub measured: MeasuredSince,
     /// What is remembered of the robot's other cameras.
     pub other_cameras: Vec<OtherCamera>,
+    /// When its own camera last showed anything new, nanoseconds on the sensor's clock.
+    pub seen_ns: Option<i64>,
+    /// When gravity was last measured, nanoseconds on the sensor's clock.
+    pub gravity_ns: Option<i64>,
     /// How sure the matches of its own camera lately were.
     pub recent_matches: Option<RecentMatches>,
 }
@@ -118,7 +122,7 @@ pub struct Keyframe {
 pub struct Place {
     /// When the frame was taken, nanoseconds on the sensor's clock.
     pub time_ns: i64,
-    /// Its latent; none if the image was blank, and another camera told the place.
+    /// Its latent; none if the camera was covered or frozen, and another one told the place.
     pub latent: Option<Vec<f64>>,
     /// `map_from_camera` and the camera's velocity.
     pub belief: MovingBelief,
@@ -136,8 +140,8 @@ pub struct Candidate {
     pub time_ns: i64,
     /// That frame's number.
     pub sequence: u64,
-    /// That frame's latent.
-    pub latent: Vec<f64>,
+    /// That frame's latent; none if the camera was covered or frozen, and another one spoke.
+    pub latent: Option<Vec<f64>>,
     /// `map_from_camera` at that frame.
     pub map_pose: Belief,
     /// How many anchors in a row agreed.

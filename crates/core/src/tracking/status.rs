@@ -13,12 +13,14 @@ const FRAMES_UNTIL_DOUBT: u32 = 10;
 
 impl Tracker {
     /// The status after a frame, and the reason in words. `reported_pose` is where the frame was
-    /// taken, if that is believed.
+    /// taken, if that is believed; `contradiction` is by how much measured gravity contradicts it,
+    /// radians.
     pub(super) fn status(
         &self,
         state: &State,
         reported_pose: Option<&Belief>,
         leading: &MatchedView<'_>,
+        contradiction: Option<f64>,
     ) -> (Status, String) {
         if let TrackingHealth::Lost { certain_matches } = state.health {
             return (
@@ -80,6 +82,14 @@ impl Tracker {
                 "the pose is known to {:.2} m and {:.0}° only, 2.5 standard deviations",
                 2.5 * deviation,
                 2.5 * turn
+            );
+            return (Status::Degraded, reason);
+        }
+
+        if let Some(angle) = contradiction {
+            let reason = format!(
+                "gravity is measured {:.0}° from where the views place it: the robot speeds up or brakes, or gravity_in_map or the sensor's axes are not what was said",
+                angle.to_degrees()
             );
             return (Status::Degraded, reason);
         }

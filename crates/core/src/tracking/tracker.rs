@@ -1,7 +1,7 @@
 //! Tracking a camera frame by frame: dead reckoning from keyframes, corrected by mapped frames that
 //! look alike.
 //!
-//! Start reading at [`Tracker::observe`], which hands a frame to `step`, the whole algorithm in six
+//! Start reading at [`Tracker::observe`], which hands a frame to `step`, the whole algorithm in seven
 //! paragraphs. Its third one is in `dead_reckoning.rs`, the fourth in `anchoring.rs`.
 //!
 //! - A tracker keeps nothing: all that it knows of a stream is its [`State`], and the same state
@@ -242,11 +242,17 @@ impl Tracker {
         let seen = self.look(state, frame);
         let matches_room = seen.leading.matches_room();
 
-        // 2. What that says of the stream's health.
+        // 2. What that says of the stream's health. The own view may jump, as when something covers
+        //    the lens, while another camera certainly sees the room.
+        let matches_certainly = matches_room && seen.leading.matched.is_certain;
+        let is_seen_by_other = seen.leading.other.is_some() && matches_certainly;
         state.health = state.health.after(FrameEvidence {
             matches_room,
-            matches_certainly: matches_room && seen.leading.matched.is_certain,
-            continuity,
+            matches_certainly,
+            continuity: match continuity {
+                Continuity::Jump if is_seen_by_other => Continuity::Continuous,
+                continuity => continuity,
+            },
         });
         state.frames_off_map = if matches_room {
             0
@@ -256,7 +262,7 @@ impl Tracker {
 
         // 3. Dead reckoning: the motion since the keyframe carries every pose forward.
         let reading = match sight {
-            Sight::Clear => MotionReading::of(continuity, matches_room),
+            Sight::Clear => MotionReading::of(continuity, seen.own_matches_room),
             Sight::Nothing | Sight::Unchanged => MotionReading::Unseen,
         };
         let prediction = self.predict(state, frame, reading);
@@ -264,10 +270,13 @@ impl Tracker {
         if state.health.is_lost() {
             self.stop_believing(state, &mut poses);
         }
-        level(state, &mut poses, frame);
+        let gravity = frame.gravity.map(|measured| measured.after(state, frame));
+        if let (Some(believed), Some(gravity)) = (&mut poses.map_pose, &gravity) {
+            *believed = believed.levelled(gravity);
+        }
 
         // 4. Correction: the mapped frames that look alike are tried as an anchor.
-        let correction = self.correct_by_views(state, &mut poses, frame, &seen);
+        let correction = self.correct_by_views(state, &mut poses, frame, &seen, gravity.as_ref());
         if let Some(believed) = &poses.map_pose {
             poses.reported_pose = Some(self.reported(believed, &poses.lasting));
         }
@@ -287,11 +296,18 @@ impl Tracker {
         remember(state, frame, &poses, is_keyframe, is_place);
         state.measured = state.measured.after(frame, is_keyframe, is_place);
 
-        // 6. The answer. The status judges the reported pose, but only while the filter still
+        // 6. Whether gravity contradicts the view, or the pose that several views told.
+        let contradiction = gravity.and_then(|gravity| {
+            let placed = matches_room.then(|| seen.leading.placed());
+            let by_view = placed.and_then(|placed| gravity.contradicts(&placed));
+            by_view.or_else(|| gravity.contradicts(poses.reported_pose.as_ref()?))
+        });
+
+        // 7. The answer. The status judges the reported pose, but only while the filter still
         //    believes one.
         let judged_pose = poses.map_pose.and(poses.reported_pose);
         let best = &seen.leading;
-        let (status, reason) = self.status(state, judged_pose.as_ref(), best);
+        let (status, reason) = self.status(state, judged_pose.as_ref(), best, contradiction);
 
         Update {
             motion: prediction.motion,
@@ -343,10 +359,20 @@ impl Tracker {
             .last
             .as_ref()
             .map_or(1, |last| self.frames_between(last.time_ns, frame.time_ns));
-        let limit = self.error_model.statistics().jump_distance * (periods as f64).cbrt();
+        let jump = self.error_model.statistics().jump_distance;
+        let limit = jump * (periods as f64).cbrt();
+
+        // A camera that was covered or frozen meanwhile may have been moved like one that was silent.
+        let unseen = state
+            .seen_ns
+            .map_or(1, |seen_ns| self.frames_between(seen_ns, frame.time_ns));
+        if !is_unchanged {
+            state.seen_ns = Some(frame.time_ns);
+        }
 
         let missing = frames_since_last(state, frame) > JUMP_WINDOW as u64;
-        let continuity = if missing || periods > LONGEST_GAP {
+        let is_unseen = unseen > LONGEST_GAP && nearest > jump;
+        let continuity = if missing || periods > LONGEST_GAP || is_unseen {
             Continuity::Gap
         } else if !state.recent.is_empty() && nearest > limit {
             Continuity::Jump
@@ -433,10 +459,10 @@ fn remember(
 
     match &poses.map_pose {
         Some(belief) if is_place => {
-            let shows = !frame.is_blank;
+            let sight = Sight::of(frame.is_blank, state.unchanged_frames);
             state.place = Some(Place {
                 time_ns: frame.time_ns,
-                latent: shows.then(|| latent.clone()),
+                latent: (sight == Sight::Clear).then(|| latent.clone()),
                 belief: *belief,
                 lasting: poses.lasting,
             });
@@ -451,18 +477,6 @@ fn remember(
         latent,
         odom: poses.odom.place(),
     });
-}
-
-/// Corrects the tilt of the map pose by gravity, if that was measured.
-fn level(state: &State, poses: &mut Poses, frame: &Observation) {
-    let (Some(believed), Some(gravity)) = (&mut poses.map_pose, &frame.gravity) else {
-        return;
-    };
-
-    let seconds = state.last.as_ref().map_or(f64::INFINITY, |last| {
-        frame.time_ns.abs_diff(last.time_ns) as f64 * 1e-9
-    });
-    *believed = believed.levelled(gravity, seconds);
 }
 
 /// How many frames the camera took since the last accepted one, this one included: numbers that are

@@ -153,7 +153,7 @@ impl SealedCandidate {
             room: usize::try_from(room).map_err(|_| Error::Internal)?,
             time_ns,
             sequence,
-            latent,
+            latent: (!latent.is_empty()).then_some(latent),
             map_pose: required(&map_pose)?,
             agreeing_anchors,
         })
@@ -232,7 +232,7 @@ impl From<&Candidate> for SealedCandidate {
             map_pose: belief_to_numbers(map_pose),
             agreeing_anchors: *agreeing_anchors,
             sequence: *sequence,
-            latent: latent.clone(),
+            latent: latent.clone().unwrap_or_default(),
             time_ns: *time_ns,
         }
     }

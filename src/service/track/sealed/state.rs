@@ -46,6 +46,10 @@ pub struct SealedState {
     other_cameras: Vec<SealedCamera>,
     #[prost(message, optional, tag = "16")]
     recent_matches: Option<SealedMatches>,
+    #[prost(int64, optional, tag = "17")]
+    seen_ns: Option<i64>,
+    #[prost(int64, optional, tag = "18")]
+    gravity_ns: Option<i64>,
 }
 
 impl From<&State> for SealedState {
@@ -66,6 +70,8 @@ impl From<&State> for SealedState {
             measured,
             other_cameras,
             recent_matches,
+            seen_ns,
+            gravity_ns,
         } = state;
 
         // Tracking health is stored as a number for its state and the state's counter.
@@ -94,6 +100,8 @@ impl From<&State> for SealedState {
             measured: SealedMeasured::of(measured),
             other_cameras: other_cameras.iter().map(SealedCamera::from).collect(),
             recent_matches: recent_matches.as_ref().map(SealedMatches::from),
+            seen_ns: *seen_ns,
+            gravity_ns: *gravity_ns,
         }
     }
 }
@@ -122,6 +130,8 @@ impl SealedState {
             measured,
             other_cameras,
             recent_matches,
+            seen_ns,
+            gravity_ns,
         } = self;
 
         let health = match health {
@@ -162,6 +172,8 @@ impl SealedState {
                 None => MeasuredSince::default(),
             },
             recent_matches: recent_matches.map(SealedMatches::opened),
+            seen_ns,
+            gravity_ns,
             other_cameras: other_cameras
                 .into_iter()
                 .map(SealedCamera::opened)
@@ -251,13 +263,15 @@ mod tests {
                 room: 1,
                 time_ns: 12,
                 sequence: 8,
-                latent: vec![0.5; 20],
+                latent: Some(vec![0.5; 20]),
                 map_pose: belief,
                 agreeing_anchors: 2,
             }),
             frames_off_map: 7,
             corrected_ns: Some(-7),
             unchanged_frames: 3,
+            seen_ns: Some(-11),
+            gravity_ns: Some(13),
             measured: odd_measured(belief.pose),
             recent_matches: Some(RecentMatches {
                 time_ns: -8,
