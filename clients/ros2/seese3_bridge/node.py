@@ -1,6 +1,7 @@
 """The node: subscriptions, publishers, and the thread that follows the server's answers."""
 
 import functools
+import sys
 import threading
 import time
 
@@ -25,6 +26,7 @@ LEVELS = {"TRACKING": 0, "DEGRADED": 1, "RELOCALIZING": 1, "LOST": 2}
 OLD_NS = 50_000_000
 # Images of several cameras belong together when they were taken within this time, nanoseconds.
 TOGETHER_NS = 20_000_000
+KEEPALIVE = [("grpc.keepalive_time_ms", 20_000), ("grpc.keepalive_timeout_ms", 10_000)]
 PARAMETERS = {"server": "127.0.0.1:50051", "room": "", "adapter": "", "camera_frame": "camera_optical_frame",
               "base_frame": "base_link", "publish_tf": False, "use_camera_info": False, "wheel_drift": 0.05}
 
@@ -34,10 +36,13 @@ class Bridge(Node):
         super().__init__("seese3")
         self.given = {name: self.declare_parameter(name, plain).value for name, plain in PARAMETERS.items()}
         self.config = self.configuration()
-        self.counts = {"images": 0, "updates": 0, "refusals": 0, "images not sent": 0, "odometry begun anew": 0}
+        self.counts = {"images": 0, "updates": 0, "refusals": 0, "images not sent": 0, "requests dropped": 0, "images overtaken": 0,
+                       "odometry begun anew": 0}
         # The last of each sensor, with its stamp.
         self.wheels = self.gravity = None
         self.beside, self.gravity_of = {}, requests.Gravity()
+        # A frame that waits for the images of the other cameras.
+        self.waiting, self.has_failed = None, False
         self.begins = threading.Event()
         if not self.given["use_camera_info"]:
             self.begins.set()
@@ -48,7 +53,8 @@ class Bridge(Node):
         has_base = self.config.HasField("base_from_camera")
         self.tf = TransformBroadcaster(self) if has_base or self.given["publish_tf"] else None
 
-        self.channel = grpc.insecure_channel(self.given["server"])
+        # A link that is gone is noticed by pings.
+        self.channel = grpc.insecure_channel(self.given["server"], KEEPALIVE)
         self.stream = Stream(self.channel, self.config)
         self.subscribe(has_base)
 
@@ -106,21 +112,43 @@ class Bridge(Node):
         if (view := self.view_of(reader, image)) is None:
             return
 
+        self.send_waiting()
         self.counts["images"] += 1
         stamp = requests.nanoseconds(image.header.stamp)
         frame = odometry_pb2.TrackFrame(timestamp_ns=stamp, sequence=self.counts["images"], view=view)
+        # Wheels that come less often than images are sent once: sent twice, the robot would stand still in between.
         if self.wheels is not None and abs(self.wheels[0] - stamp) <= OLD_NS:
             frame.odometry.CopyFrom(self.wheels[1])
+            self.wheels = None
         if self.gravity is not None and abs(self.gravity[0] - stamp) <= OLD_NS:
             frame.gravity.CopyFrom(self.gravity[1])
-        for name, (other_stamp, other_view) in self.beside.items():
-            if abs(other_stamp - stamp) <= TOGETHER_NS:
-                frame.other_views.add(camera=name, view=other_view)
-        self.stream.offer(odometry_pb2.TrackRequest(frame=frame))
+        self.waiting = frame
+        if len(self.views_beside(stamp)) == len(self.config.other_cameras):
+            self.send_waiting()
 
     def on_other_image(self, name, reader, image):
-        if (view := self.view_of(reader, image)) is not None:
-            self.beside[name] = requests.nanoseconds(image.header.stamp), view
+        if (view := self.view_of(reader, image)) is None:
+            return
+        self.beside[name] = requests.nanoseconds(image.header.stamp), view
+        if self.waiting and len(self.views_beside(self.waiting.timestamp_ns)) == len(self.config.other_cameras):
+            self.send_waiting()
+
+    def views_beside(self, stamp):
+        """What the other cameras saw at a time, by their names."""
+        return {name: view for name, (other, view) in self.beside.items() if abs(other - stamp) <= TOGETHER_NS}
+
+    def send_waiting(self):
+        """Sends the frame that waits for other cameras, with what they have brought: when all have, or at the next image."""
+        if self.waiting is None:
+            return
+        for name, view in self.views_beside(self.waiting.timestamp_ns).items():
+            self.waiting.other_views.add(camera=name, view=view)
+        self.offer(odometry_pb2.TrackRequest(frame=self.waiting))
+        self.waiting = None
+
+    def offer(self, request):
+        if self.stream.offer(request):
+            self.counts["requests dropped"] += 1
 
     def on_camera_info(self, info):
         if self.begins.is_set():
@@ -136,13 +164,17 @@ class Bridge(Node):
         self.wheels = requests.nanoseconds(message.header.stamp), measured
 
     def on_imu(self, imu):
-        self.gravity = requests.nanoseconds(imu.header.stamp), self.gravity_of.after(imu)
+        if (measured := self.gravity_of.after(imu)) is not None:
+            self.gravity = requests.nanoseconds(imu.header.stamp), measured
 
     def on_initial_pose(self, message):
+        if message.header.frame_id not in ("", "map"):
+            self.get_logger().error(f"/initialpose is in {message.header.frame_id}, and must be in map: not sent")
+            return
         has_base = self.config.HasField("base_from_camera")
         body = self.given["base_frame"] if has_base else self.given["camera_frame"]
         known = odometry_pb2.InitialPose(pose=requests.wire_pose(message.pose.pose, "map", body))
-        self.stream.offer(odometry_pb2.TrackRequest(set_initial_pose=odometry_pb2.SetInitialPose(initial_pose=known)))
+        self.offer(odometry_pb2.TrackRequest(set_initial_pose=odometry_pb2.SetInitialPose(initial_pose=known)))
 
     # What the server says.
 
@@ -154,7 +186,6 @@ class Bridge(Node):
         self.diagnostics.publish(message)
 
     def publish(self, update):
-        self.counts["updates"] += 1
         self.odom.publish(answers.odometry_message(update, Odometry))
         if (message := answers.pose_message(update, PoseWithCovarianceStamped)) is not None:
             self.pose.publish(message)
@@ -162,15 +193,18 @@ class Bridge(Node):
             self.tf.sendTransform(answers.transforms(update, TransformStamped))
         name = answers.status_name(update)
         self.report(LEVELS.get(name, 2), f"{name}: {update.reason}", update.timestamp_ns)
+        self.counts["updates"] += 1
 
     def refused(self, refusal):
-        self.counts["refusals"] += 1
         reason = odometry_pb2.TrackRefusalReason.Name(refusal.reason).removeprefix("TRACK_REFUSAL_REASON_")
-        # Frames that a newer one overtook are no fault.
-        if reason != "SUPERSEDED":
-            text = f"refused, {reason}: {refusal.message}"
-            self.get_logger().warning(text, throttle_duration_sec=1.0)
-            self.report(1, text, refusal.timestamp_ns)
+        if reason == "SUPERSEDED":
+            # Frames that a newer one overtook are no fault.
+            self.counts["images overtaken"] += refusal.frames
+            return
+        self.counts["refusals"] += 1
+        text = f"refused, {reason}: {refusal.message}"
+        self.get_logger().warning(text, throttle_duration_sec=1.0)
+        self.report(1, text, refusal.timestamp_ns)
 
     def follow(self):
         """Takes the server's answers until the node ends; what nobody expected ends the node, so that it is started again."""
@@ -178,6 +212,7 @@ class Bridge(Node):
             self.take_answers()
         except Exception as error:
             self.get_logger().fatal(f"{type(error).__name__}: {error}")
+            self.has_failed = True
             rclpy.try_shutdown()
             raise
 
@@ -196,8 +231,11 @@ class Bridge(Node):
             except grpc.RpcError as error:
                 if not rclpy.ok():
                     return
-                self.get_logger().warning(f"{error.code().name}: {error.details()}")
-                if self.stream.token and error.code() not in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED):
+                text = f"{error.code().name}: {error.details()}"
+                self.get_logger().warning(text)
+                self.report(2, text, self.get_clock().now().nanoseconds)
+                # Only these say that the token is at fault.
+                if self.stream.token and error.code() in (grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.FAILED_PRECONDITION):
                     self.stream.token = b""
                     self.counts["odometry begun anew"] += 1
                     self.get_logger().error("the stream cannot be resumed: odometry begins anew")
@@ -219,6 +257,8 @@ def main():
         node.channel.close()
         thread.join()
         node.destroy_node()
+    # What starts nodes again tells by this that it should.
+    sys.exit(1 if node.has_failed else 0)
 
 
 if __name__ == "__main__":

@@ -83,28 +83,44 @@ def measured_odometry(message, base_frame, drift):
 
 class Gravity:
     """The direction of gravity of sensor_msgs/Imu messages, in their axes: by the orientation where there is one, else by
-    the mean acceleration of a second, which points up at rest."""
+    the mean acceleration of a second, which points up at rest and is turned by the angular velocity (a complementary filter). A driver that leaves the orientation and its covariance as
+    they are made has none."""
 
     def __init__(self):
         self.mean, self.stamp = None, None
 
     def after(self, imu):
-        if imu.orientation_covariance[0] >= 0 and any(getattr(imu.orientation, axis) for axis in "wxyz"):
-            q = imu.orientation
+        """The direction after a message, or None of one that tells none."""
+        q = imu.orientation
+        is_plain = (q.x, q.y, q.z) == (0, 0, 0) and not any(imu.orientation_covariance)
+        if imu.orientation_covariance[0] >= 0 and not is_plain and any((q.w, q.x, q.y, q.z)):
             # The last row of the rotation: the world's z axis, which points up (REP-103), in the sensor's axes.
             up = (2 * (q.x * q.z - q.w * q.y), 2 * (q.y * q.z + q.w * q.x), 1 - 2 * (q.x * q.x + q.y * q.y))
         else:
             up = self._mean(imu)
+        if up is None or not all(map(math.isfinite, up)) or not any(up):
+            return None
         return odometry_pb2.MeasuredGravity(direction=geometry_pb2.Vector3(x=-up[0], y=-up[1], z=-up[2]))
+
+    def _turned(self, rate, seconds):
+        """The mean in the sensor's axes after it has turned: what is fixed in the world turns the other way."""
+        x, y, z = self.mean
+        if not all(map(math.isfinite, (rate.x, rate.y, rate.z))):
+            return self.mean
+        return (x - seconds * (rate.y * z - rate.z * y), y - seconds * (rate.z * x - rate.x * z),
+                z - seconds * (rate.x * y - rate.y * x))
 
     def _mean(self, imu):
         stamp, seen = nanoseconds(imu.header.stamp), imu.linear_acceleration
         new = (seen.x, seen.y, seen.z)
+        if not all(map(math.isfinite, new)):
+            return None
         if self.mean is None:
             self.mean = new
         else:
             seconds = max(0.0, (stamp - self.stamp) * 1e-9)
             share = 1 - math.exp(-seconds / AVERAGED_S)
-            self.mean = tuple(old + share * (value - old) for old, value in zip(self.mean, new))
+            turned = self._turned(imu.angular_velocity, seconds)
+            self.mean = tuple(old + share * (value - old) for old, value in zip(turned, new))
         self.stamp = stamp
         return self.mean

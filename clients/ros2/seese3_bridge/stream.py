@@ -23,16 +23,13 @@ class Stream:
             yield request
 
     def offer(self, request):
-        """Takes a request; the oldest that waits goes when there is no room."""
+        """Takes a request; whether the oldest that waited went, because there was no room."""
         with self.lock:
-            while True:
-                try:
-                    return self.frames.put_nowait(request)
-                except queue.Full:
-                    try:
-                        self.frames.get_nowait()
-                    except queue.Empty:
-                        pass
+            is_full = self.frames.full()
+            if is_full:
+                self.frames.get_nowait()
+            self.frames.put_nowait(request)
+            return is_full
 
     def begin(self):
         """A queue for a new call, with what waits for one: an old call must not take a new one's frames."""
@@ -51,7 +48,11 @@ class Stream:
                 self.token = answer.resume_token or self.token
                 yield answer
         finally:
-            # Ends the requests of the call that is over.
-            while frames.full():
-                frames.get_nowait()
-            frames.put_nowait(None)
+            # Ends the requests of the call that is over; what waits is for the next one.
+            with self.lock:
+                waiting = queue.Queue(maxsize=WAITING)
+                while not frames.empty():
+                    waiting.put_nowait(frames.get_nowait())
+                frames.put_nowait(None)
+                if self.frames is frames:
+                    self.frames = waiting

@@ -78,7 +78,16 @@ def image_messages(row, file, camera):
     return compressed, raw, info
 
 
-def sensor_messages(row, base, begin):
+def turn_rate(before, base):
+    """The angular velocity in the base's axes from one pose to the next, rad/s."""
+    turn = before[:3, :3].T @ base[:3, :3]
+    axis = numpy.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    sine = numpy.linalg.norm(axis)
+    return axis / max(sine, 1e-12) * numpy.arcsin(min(1.0, sine)) / (PERIOD_NS * 1e-9)
+
+
+def sensor_messages(row, bases):
+    base, begin = bases[row], bases[0]
     wheels = stamped(Odometry, row, "wheel_odom")
     since = numpy.linalg.inv(begin) @ base
     position, orientation = wheels.pose.pose.position, wheels.pose.pose.orientation
@@ -89,6 +98,8 @@ def sensor_messages(row, base, begin):
     imu.orientation_covariance[0] = -1.0
     seen = imu.linear_acceleration
     seen.x, seen.y, seen.z = -9.81 * base[:3, :3].T @ GRAVITY_IN_MAP
+    rate = imu.angular_velocity
+    rate.x, rate.y, rate.z = turn_rate(bases[max(0, row - 1)], base)
     return wheels, imu
 
 
@@ -103,14 +114,17 @@ def record(path, images, bases, camera):
             data = stand_in.STORE.serialize_cdr(stand_in.to_bag(message), message.type_name)
             writer.write(connections[topic], (row + 1) * PERIOD_NS, data)
 
-        for row, (file, base) in enumerate(zip(images, bases)):
+        for row, file in enumerate(images):
             compressed, raw, info = image_messages(row, file, camera)
-            wheels, imu = sensor_messages(row, base, bases[0])
+            wheels, imu = sensor_messages(row, bases)
             write("/camera_info", info, row)
             write("/wheels", wheels, row)
             write("/imu", imu, row)
-            write("/second/image", compressed, row)
-            write(*(("/image_raw", raw) if row % 2 else ("/image", compressed)), row)
+            # The second camera's images come before the first one's and after them by turns.
+            own = ("/image_raw", raw) if row % 2 else ("/image", compressed)
+            other = ("/second/image", compressed)
+            for topic, message in (own, other) if row % 3 else (other, own):
+                write(topic, message, row)
 
 
 def camera_of(channel, room):
@@ -127,12 +141,18 @@ def play(path, node):
             topic = f"~{connection.topic}"
             node.deliver(topic, stand_in.STORE.deserialize_cdr(data, connection.msgtype))
             if topic in ("~/image", "~/image_raw"):
+                # One frame may wait for its second image.
+                wait_for_answers(node, images)
                 images += 1
-                until = time.monotonic() + 60
-                while node.counts["updates"] + node.counts["refusals"] < images:
-                    assert time.monotonic() < until, f"no answer to image {images}: {node.logger.lines}"
-                    time.sleep(0.001)
+    wait_for_answers(node, images)
     return images
+
+
+def wait_for_answers(node, count):
+    until = time.monotonic() + 60
+    while node.counts["updates"] + node.counts["refusals"] < count:
+        assert time.monotonic() < until, f"no answer to image {count}: {node.logger.lines}"
+        time.sleep(0.001)
 
 
 def main():
@@ -147,6 +167,9 @@ def main():
         "other_cameras": ["second"], "second.base_from_camera": BASE_FROM_CAMERA,
     }
     node = bridge_node.Bridge()
+    sent = []
+    offer = node.stream.offer
+    node.stream.offer = lambda request: sent.append(request.frame) or offer(request)
     thread = threading.Thread(target=node.follow, daemon=True)
     thread.start()
 
@@ -168,9 +191,11 @@ def main():
     print(f"{count} images, {node.counts['refusals']} refused, {len(poses)} poses of base_link; median error "
           f"{numpy.median(off):.3f} m, of standing still {numpy.median(standing):.3f} m; TRACKING {tracking:.2f}")
     assert node.counts["refusals"] == 0, node.logger.lines
+    assert len(sent) == count and all(len(frame.other_views) == 1 for frame in sent)
+    assert all(frame.HasField("gravity") and frame.HasField("odometry") for frame in sent)
     assert len(node.published["~/odom"].messages) == count and tracking > 0.6
     assert numpy.median(off) < 0.05 < numpy.median(standing)
-    assert any(len(sent) == 2 for sent in node.broadcaster.sent), "TF of map was never sent"
+    assert any(len(transforms) == 2 for transforms in node.broadcaster.sent), "TF of map was never sent"
 
     # An encoding that cannot be read is said, and the stream goes on.
     node.deliver("~/image_raw", Image(width=2, height=2, step=2, encoding="bayer_rggb8", data=b"abcd"))

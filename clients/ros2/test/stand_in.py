@@ -120,6 +120,9 @@ class Node:
     def get_logger(self):
         return self.logger
 
+    def get_clock(self):
+        return types.SimpleNamespace(now=lambda: types.SimpleNamespace(nanoseconds=0))
+
     def destroy_node(self):
         pass
 

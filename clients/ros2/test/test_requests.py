@@ -87,3 +87,24 @@ def test_a_mounting_has_seven_numbers(numbers):
     with pytest.raises(ValueError, match="rear.base_from_camera"):
         requests.mounting("rear.base_from_camera", numbers)
     assert requests.mounting("any", []) is None
+
+
+def test_the_mean_turns_with_the_sensor():
+    # Up is along z; the sensor turns by 0.01 rad about x, so that up has a part of 0.1 of 10 along y then.
+    gravity = requests.Gravity()
+    gravity.after(imu(0, (0.0, 0.0, 10.0)))
+    later = imu(0, (0.0, 0.1, 10.0))
+    later.header.stamp.nanosec = 10_000_000
+    later.angular_velocity.x = 1.0
+    assert direction(gravity.after(later)) == pytest.approx((0, -0.1, -10))
+
+
+def test_what_tells_no_direction_is_not_sent():
+    # As a driver makes the message that has no orientation: the identity, and a covariance of zeros.
+    plain = imu(0, (0.0, 9.8, 0.0), (0.0, 0.0, 0.0, 1.0))
+    assert direction(requests.Gravity().after(plain)) == pytest.approx((0, -9.8, 0))
+
+    gravity = requests.Gravity()
+    assert gravity.after(imu(0, (0.0, 0.0, 0.0))) is None
+    assert gravity.after(imu(0, (math.nan, 0.0, 9.8))) is None
+    assert direction(gravity.after(imu(60, (0.0, 0.0, 9.8)))) == pytest.approx((0, 0, -9.8))

@@ -88,6 +88,8 @@ pub(super) struct Seen<'a> {
     pub leading: MatchedView<'a>,
     /// Whether the stream's own view looks like a room.
     pub own_matches_room: bool,
+    /// Whether another camera's view certainly shows the room.
+    pub is_seen_by_other: bool,
     /// The others that may correct what is believed: those that show something.
     pub beside: Vec<MatchedView<'a>>,
 }
@@ -109,6 +111,7 @@ impl Tracker {
             state.recent_matches = Some(recent);
         }
         let own_matches_room = leading.matches_room();
+        let mut is_seen_by_other = false;
         let mut beside = Vec::new();
 
         for other in &frame.other_views {
@@ -119,6 +122,8 @@ impl Tracker {
                 unchanged_frames: self.record_other(state, other),
             };
             let mut matched = self.matched(state.room, &view, Some(other));
+            is_seen_by_other |=
+                matched.matches_room() && matched.matched.is_certain && !matched.is_repeated;
             if matched.strangeness() < leading.strangeness() {
                 std::mem::swap(&mut leading, &mut matched);
             }
@@ -129,6 +134,7 @@ impl Tracker {
         Seen {
             leading,
             own_matches_room,
+            is_seen_by_other,
             beside,
         }
     }

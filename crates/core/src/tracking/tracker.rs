@@ -243,14 +243,12 @@ impl Tracker {
         let matches_room = seen.leading.matches_room();
 
         // 2. What that says of the stream's health. The own view may jump, as when something covers
-        //    the lens, while another camera certainly sees the room.
-        let matches_certainly = matches_room && seen.leading.matched.is_certain;
-        let is_seen_by_other = seen.leading.other.is_some() && matches_certainly;
+        //    the lens and goes, while another camera certainly sees the room.
         state.health = state.health.after(FrameEvidence {
             matches_room,
-            matches_certainly,
+            matches_certainly: matches_room && seen.leading.matched.is_certain,
             continuity: match continuity {
-                Continuity::Jump if is_seen_by_other => Continuity::Continuous,
+                Continuity::Jump if seen.is_seen_by_other => Continuity::Continuous,
                 continuity => continuity,
             },
         });
