@@ -262,9 +262,9 @@ mod tests {
 
     /// Oracle: by hand. A view that is sure to stand level to .005 rad and a gravity of .02 rad that
     /// says .2 rad differ by .2² / (.005² + .02²) = 94.118 squared deviations, 10.219 times the 9.21
-    /// of χ²: gravity counts with 104.43 times its variance, and turns the view by .2 · 25e-6 / (25e-6
-    /// + 104.43 · 400e-6) = .0001196 rad. And that is a contradiction of .2 rad, while one of .02 rad
-    /// is none.
+    /// of χ²: gravity counts with 104.43 times its variance, .04177, and turns the view by the share
+    /// 25e-6 / .041797 of .2, which is .0001196 rad. And that is a contradiction of .2 rad, while one
+    /// of .02 rad is none.
     #[test]
     fn gravity_that_a_sure_view_contradicts_is_doubted() {
         let view = Belief::known(turned(DOWN, -0.4), 0.005, 0.005);

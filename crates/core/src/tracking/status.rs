@@ -54,16 +54,7 @@ impl Tracker {
             return (Status::Lost, reason);
         }
 
-        let blind = match leading.sight {
-            Sight::Clear => None,
-            Sight::Nothing => {
-                Some("the image shows nothing: it is blank, or all bright or dark".to_owned())
-            }
-            Sight::Unchanged => Some(format!(
-                "{} frames in a row are the same image: the camera is frozen, or a simulation without noise stands still",
-                state.unchanged_frames + 1
-            )),
-        };
+        let blind = reason_of_blindness(leading.sight, state.unchanged_frames);
         if let Some(reason) = blind {
             return (Status::Degraded, reason);
         }
@@ -104,6 +95,20 @@ impl Tracker {
                 format!("no mapped place for {frames} frames"),
             ),
         }
+    }
+}
+
+/// Why a view shows nothing, if it does not.
+fn reason_of_blindness(sight: Sight, unchanged_frames: u32) -> Option<String> {
+    match sight {
+        Sight::Clear => None,
+        Sight::Nothing => {
+            Some("the image shows nothing: it is blank, or all bright or dark".to_owned())
+        }
+        Sight::Unchanged => Some(format!(
+            "{} frames in a row are the same image: the camera is frozen, or a simulation without noise stands still",
+            unchanged_frames + 1
+        )),
     }
 }
 

@@ -1,7 +1,7 @@
 //! Tracking a camera frame by frame: dead reckoning from keyframes, corrected by mapped frames that
 //! look alike.
 //!
-//! Start reading at [`Tracker::observe`], which hands a frame to `step`, the whole algorithm in seven
+//! Start reading at [`Tracker::observe`], which hands a frame to `step`, the whole algorithm in six
 //! paragraphs. Its third one is in `dead_reckoning.rs`, the fourth in `anchoring.rs`.
 //!
 //! - A tracker keeps nothing: all that it knows of a stream is its [`State`], and the same state
@@ -20,7 +20,9 @@ use nalgebra::Matrix6;
 use ndarray::{ArrayView1, Axis, s};
 
 use super::dead_reckoning::{MotionReading, Poses, Prediction};
+use super::gravity::CountedGravity;
 use super::health::{Continuity, FrameEvidence, TrackingHealth};
+use super::rig::MatchedView;
 use super::state::{Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
 use super::{Belief, Error, Map, MovingBelief};
 use crate::adapter::{Adapter, ErrorModel, JUMP_WINDOW};
@@ -294,17 +296,11 @@ impl Tracker {
         remember(state, frame, &poses, is_keyframe, is_place);
         state.measured = state.measured.after(frame, is_keyframe, is_place);
 
-        // 6. Whether gravity contradicts the view, or the pose that several views told.
-        let contradiction = gravity.and_then(|gravity| {
-            let placed = matches_room.then(|| seen.leading.placed());
-            let by_view = placed.and_then(|placed| gravity.contradicts(&placed));
-            by_view.or_else(|| gravity.contradicts(poses.reported_pose.as_ref()?))
-        });
-
-        // 7. The answer. The status judges the reported pose, but only while the filter still
+        // 6. The answer. The status judges the reported pose, but only while the filter still
         //    believes one.
         let judged_pose = poses.map_pose.and(poses.reported_pose);
         let best = &seen.leading;
+        let contradiction = gravity.and_then(|gravity| contradiction(&gravity, best, &poses));
         let (status, reason) = self.status(state, judged_pose.as_ref(), best, contradiction);
 
         Update {
@@ -475,6 +471,14 @@ fn remember(
         latent,
         odom: poses.odom.place(),
     });
+}
+
+/// By how much measured gravity contradicts where a view that looks like the room was taken, or the
+/// pose that several views told, radians; none if it does not.
+fn contradiction(gravity: &CountedGravity, view: &MatchedView<'_>, poses: &Poses) -> Option<f64> {
+    let placed = view.matches_room().then(|| view.placed());
+    let by_view = placed.and_then(|placed| gravity.contradicts(&placed));
+    by_view.or_else(|| gravity.contradicts(poses.reported_pose.as_ref()?))
 }
 
 /// How many frames the camera took since the last accepted one, this one included: numbers that are
