@@ -25,7 +25,7 @@ const LONGEST_PAUSE_S: f64 = 10.0;
 /// An anchor as it counts beside those before it.
 #[derive(Debug, Clone, Copy)]
 struct CountedAnchor {
-    /// The larger its covariance, the more its error is like those before it.
+    /// Its covariance is multiplied for the likeness of its error to those of anchors before it.
     belief: Belief,
     /// The covariance of its error, if that lasts; else zero.
     lasting: Matrix6<f64>,

@@ -1,8 +1,8 @@
 //! How sure the matches of the last views were.
 //!
-//! Where nothing near is mapped, the frames that look most alike say so in most views and agree by
-//! chance in a few: one view in ten may seem to be known to two centimetres and be ten off. What
-//! the views just before it were known to tells better what to think of it.
+//! Where nothing near is mapped, most views are known to be placed badly; in a few the frames that
+//! look most alike agree by chance, so that a view seems to be placed to two centimetres and is ten
+//! centimetres off. How well the views just before it were placed tells better what to think of it.
 
 use super::Belief;
 

@@ -41,7 +41,8 @@ pub(super) enum Sight {
     Clear,
     /// Nothing: the image is blank.
     Nothing,
-    /// Exactly what the frames before it showed: no camera sees that.
+    /// Exactly what the frames before it showed, which the noise of a real camera rules out: it is
+    /// frozen.
     Unchanged,
 }
 

@@ -1,7 +1,7 @@
 //! What is done to a camera's images on the way to a tracker.
 
 use image::imageops;
-use nalgebra::{Vector2, Vector3};
+use nalgebra::{Unit, Vector2, Vector3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -17,9 +17,9 @@ const OCCLUDER_PERIOD: usize = 40;
 /// The brightness of the occluder, 0 to 255.
 const OCCLUDER_BRIGHTNESS: u8 = 60;
 
-/// How far off measured directions of gravity are, and what the tracker is told of it, radians: the
-/// service's own assumption.
+/// How far off measured directions of gravity are, radians.
 const GRAVITY_ERROR_RAD: f64 = 0.02;
+/// What the tracker is told of that, radians: what the service assumes if nobody says.
 const GRAVITY_DEVIATION_RAD: f64 = 0.03;
 
 /// A disturbance of a stream.
@@ -160,10 +160,10 @@ impl Disturbance {
         }
     }
 
-    /// Which way is down, as a robot measures it whose camera is at `pose`; none if it does not. The
-    /// world's +y axis is taken for down, which a tracker cannot tell from any other, and the
-    /// measured direction is off by [`GRAVITY_ERROR_RAD`] about the camera's axis all the time.
-    pub fn gravity(self, pose: &Pose) -> Option<MeasuredGravity> {
+    /// Which way is down, as a robot measures it whose camera is at `pose`; none if it does not.
+    /// `down` is the direction in the world's frame. The measured direction is off by
+    /// [`GRAVITY_ERROR_RAD`] about the camera's axis all the time.
+    pub fn gravity(self, pose: &Pose, down: Unit<Vector3<f64>>) -> Option<MeasuredGravity> {
         let Self::Roll {
             with_gravity: true, ..
         } = self
@@ -173,8 +173,8 @@ impl Disturbance {
 
         let error = Pose::rotation(Vector3::z() * GRAVITY_ERROR_RAD);
         Some(MeasuredGravity {
-            in_world: Vector3::y_axis(),
-            in_camera: error.rotation * (pose.rotation.inverse() * Vector3::y_axis()),
+            in_world: down,
+            in_camera: error.rotation * (pose.rotation.inverse() * down),
             deviation_rad: GRAVITY_DEVIATION_RAD,
         })
     }

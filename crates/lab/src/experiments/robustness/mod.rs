@@ -6,8 +6,10 @@
 
 mod disturbance;
 
+use nalgebra::{Unit, Vector3};
 use ndarray::ArrayView2;
 
+use seese3_core::geometry::Pose;
 use seese3_core::room::FrameId;
 use seese3_core::splits::HoldOut;
 use seese3_core::tracking::{
@@ -77,6 +79,14 @@ impl Part {
     }
 }
 
+/// The direction that is down in a recording's world frame, on average for its camera, whose y axis
+/// points down where it is level: of the six directions of the axes the nearest.
+fn down_of(poses: &[Pose]) -> Unit<Vector3<f64>> {
+    let sum: Vector3<f64> = poses.iter().map(|pose| pose.rotation * Vector3::y()).sum();
+    let axis = sum.iamax();
+    Unit::new_unchecked(Vector3::ith(axis, sum[axis].signum()))
+}
+
 /// The tracked frames of a room under a hold-out, stream by stream.
 pub fn streams(room: &TrackedRoom<'_>, hold_out: HoldOut) -> Vec<Vec<FrameId>> {
     let timeline = room.room().timeline();
@@ -100,6 +110,7 @@ pub fn evaluate(
     let adapter = room.tracker().maps()[0].navigator().adapter().clone();
     let latents = adapter.embed(views.features)?;
 
+    let down = down_of(room.room().poses());
     let mut replays = Vec::new();
     let mut scored_rows = Vec::new();
     let mut view_rows = Vec::new();
@@ -124,7 +135,7 @@ pub fn evaluate(
                 frame: Observation {
                     feature: Some(views.features.row(row).to_vec()),
                     is_blank: taken.is_disturbed && views.is_blank[row],
-                    gravity: disturbance.gravity(&truth),
+                    gravity: disturbance.gravity(&truth, down),
                     ..Observation::new(
                         time_ns,
                         taken
@@ -249,4 +260,21 @@ pub fn changed_images(
     }
 
     changed
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand. A camera that looks along the world's x axis in a world whose z axis points up
+    /// has its y axis, down, along −z; it looks a little up and down, and that changes nothing.
+    #[test]
+    fn down_is_where_cameras_have_their_feet() {
+        let half = std::f64::consts::FRAC_PI_2;
+        let ahead = Pose::rotation(Vector3::z() * -half) * Pose::rotation(Vector3::x() * -half);
+        assert!((ahead.rotation * Vector3::z() - Vector3::x()).norm() < 1e-12);
+
+        let tilted = [-0.3, 0.1, 0.5].map(|angle| ahead * Pose::rotation(Vector3::x() * angle));
+        assert_eq!(down_of(&tilted).into_inner(), -Vector3::z());
+    }
 }
