@@ -162,7 +162,7 @@ impl Disturbance {
 
     /// Which way is down, as a robot measures it whose camera is at `pose`; none if it does not.
     /// `down` is the direction in the world's frame. The measured direction is off by
-    /// [`GRAVITY_ERROR_RAD`] about the camera's axis all the time.
+    /// 1.1 degrees about the camera's axis all the time.
     pub fn gravity(self, pose: &Pose, down: Unit<Vector3<f64>>) -> Option<MeasuredGravity> {
         let Self::Roll {
             with_gravity: true, ..
