@@ -140,6 +140,7 @@ impl Tracker {
             self.settings.fuse && view.room == leading.room && view.may_correct(state.health)
         };
         let others: Vec<&MatchedView<'_>> = seen.beside.iter().filter(beside).collect();
+
         // Cameras on one robot see the same part of the map, or of what is not mapped: several count
         // as much as one.
         let of_others = others.iter().map(|view| {
@@ -161,6 +162,7 @@ impl Tracker {
         for anchor in of_others {
             let lasting = poses.lasting;
             let applied = correct_believed(state, poses, frame, leading.room, anchor).is_applied;
+
             // Of the anchors of one frame, the lasting error is that of the best.
             if applied && is_corrected && lasting.trace() < poses.lasting.trace() {
                 poses.lasting = lasting;

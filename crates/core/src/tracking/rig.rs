@@ -110,6 +110,7 @@ impl Tracker {
             let recent = RecentMatches::after(state.recent_matches, frame.time_ns, anchor);
             state.recent_matches = Some(recent);
         }
+
         let own_matches_room = leading.matches_room();
         let mut is_seen_by_other = false;
         let mut beside = Vec::new();
@@ -122,6 +123,7 @@ impl Tracker {
                 unchanged_frames: self.record_other(state, other),
             };
             let mut matched = self.matched(state.room, &view, Some(other));
+
             is_seen_by_other |=
                 matched.matches_room() && matched.matched.is_certain && !matched.is_repeated;
             if matched.strangeness() < leading.strangeness() {

@@ -271,6 +271,7 @@ impl Tracker {
         if state.health.is_lost() {
             self.stop_believing(state, &mut poses);
         }
+
         let gravity = frame.gravity.map(|measured| measured.after(state, frame));
         if let (Some(believed), Some(gravity)) = (&mut poses.map_pose, &gravity) {
             *believed = believed.levelled(gravity);
@@ -289,6 +290,7 @@ impl Tracker {
             .map_or(frame.sequence, |keyframe| keyframe.sequence);
         let believed = poses.map_pose.as_ref().unwrap_or(&poses.odom);
         let velocity = state.last.as_ref().map(|_| believed.velocity);
+
         // Motions cannot be read from a blank image.
         let shows = sight != Sight::Nothing || state.keyframe.is_none();
         let is_keyframe = shows && self.is_keyframe_due(state, frame.time_ns, &prediction);
@@ -300,6 +302,7 @@ impl Tracker {
         // 6. The answer. The status judges the reported pose, but only while the filter still
         //    believes one.
         let judged_pose = poses.map_pose.and(poses.reported_pose);
+
         let best = &seen.leading;
         let contradiction = gravity.and_then(|gravity| contradiction(&gravity, best, &poses));
         let (status, reason) = self.status(state, judged_pose.as_ref(), best, contradiction);
