@@ -119,6 +119,10 @@ pub struct Serve {
     /// --auth-file only those with the verb "write"
     #[arg(long, env = "SEESE3_WRITABLE")]
     writable: bool,
+    /// Let callers that list a room's frames also see its images, as thumbnails of at most 512 pixels in
+    /// width. They are read from where the room was imported from
+    #[arg(long, env = "SEESE3_THUMBNAILS")]
+    thumbnails: bool,
     /// What all uploads in progress may hold in memory together, 1048576 to 1099511627776 bytes
     #[arg(long, env = "SEESE3_MAX_UPLOAD_BYTES", default_value_t = Config::default().upload_bytes, value_parser = bounded(1 << 20, 1 << 40))]
     max_upload_bytes: usize,
@@ -359,6 +363,7 @@ impl Serve {
             },
             memory_bytes: self.max_memory_bytes,
             writable: self.writable,
+            thumbnails: self.thumbnails,
             upload_bytes: self.max_upload_bytes,
             message_bytes: self.max_message_bytes,
             threads,

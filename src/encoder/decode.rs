@@ -1,8 +1,11 @@
 //! Decodes JPEG and PNG files to 8-bit RGB, within limits on their size.
+//!
+//! Images are turned upright as their EXIF orientation says, as every viewer shows them: a phone stores
+//! what its sensor saw, however it was held.
 
 use std::fs::File;
 use std::io::{Cursor, Read, Seek, SeekFrom};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use zune_core::bytestream::ZCursor;
 use zune_core::colorspace::ColorSpace;
@@ -10,7 +13,10 @@ use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
 
 use image::codecs::png::PngEncoder;
-use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Limits};
+use image::metadata::Orientation;
+use image::{
+    DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits,
+};
 
 use super::Error;
 use seese3_core::image::RgbImage;
@@ -35,6 +41,9 @@ const START_OF_SCAN: u8 = 0xda;
 /// The most bytes that may be allocated to read the header of a PNG: a colour profile in it is
 /// compressed, and may be a decompression bomb.
 const HEADER_ALLOC: u64 = 16 << 20;
+/// The most bytes that are read to find an image's size. A header with a thumbnail and a colour
+/// profile is well below.
+const HEADER_BYTES: u64 = 1 << 20;
 
 impl Bounds {
     /// Limits for the user's own files.
@@ -95,16 +104,26 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
     let most = (u64::from(width) * u64::from(height))
         .saturating_mul(16)
         .saturating_add(HEADER_ALLOC);
-    let decoded = read(most)
-        .decode()
+    let mut decoder = read(most)
+        .into_decoder()
         .map_err(|error| bad(error.to_string()))?;
-    let bytes = decoded.into_rgb8().into_raw();
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    let decoded = DynamicImage::from_decoder(decoder).map_err(|error| bad(error.to_string()))?;
 
-    Ok(RgbImage {
-        width: width as usize,
-        height: height as usize,
-        bytes,
-    })
+    Ok(upright(decoded.into_rgb8(), orientation))
+}
+
+/// Turns an image as its orientation says.
+fn upright(image: image::RgbImage, orientation: Orientation) -> RgbImage {
+    let mut image = DynamicImage::ImageRgb8(image);
+    image.apply_orientation(orientation);
+    let image = image.into_rgb8();
+
+    RgbImage {
+        width: image.width() as usize,
+        height: image.height() as usize,
+        bytes: image.into_raw(),
+    }
 }
 
 fn check_size(width: usize, height: usize, bounds: Bounds) -> Result<(), String> {
@@ -146,15 +165,13 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
     let (width, height) = decoder.dimensions().ok_or("does not state its size")?;
     check_size(width, height, bounds)?;
     let bytes = decoder.decode().map_err(|error| error.to_string())?;
-    if bytes.len() != width * height * 3 {
-        return Err("has colours that cannot be converted to RGB".to_owned());
-    }
+    let image = image::RgbImage::from_raw(width as u32, height as u32, bytes)
+        .ok_or("has colours that cannot be converted to RGB")?;
 
-    Ok(RgbImage {
-        width,
-        height,
-        bytes,
-    })
+    let exif = decoder
+        .exif()
+        .and_then(|exif| Orientation::from_exif_chunk(exif));
+    Ok(upright(image, exif.unwrap_or(Orientation::NoTransforms)))
 }
 
 /// What follows the header of a JPEG: an end-of-image marker before it belongs to a thumbnail. None
@@ -188,11 +205,83 @@ fn after_header(bytes: &[u8]) -> Option<&[u8]> {
 /// [`Error::Io`] if the file cannot be read, [`Error::BadImage`] if the part lies outside the file
 /// or the image cannot be decoded within [`Bounds::LOCAL`].
 pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
-    let bad = |problem: String| Error::BadImage {
-        image: root.join(image).display().to_string(),
-        problem,
+    let ImagePart { path, file, length } = open_part(root, image)?;
+
+    // `decode` checks this too, but only after the bytes were read into memory.
+    if length > Bounds::LOCAL.bytes {
+        return Err(Error::BadImage {
+            image: path.display().to_string(),
+            problem: format!(
+                "is {length} bytes, over the limit of {}",
+                Bounds::LOCAL.bytes
+            ),
+        });
+    }
+
+    let mut bytes = Vec::with_capacity(length as usize);
+    file.take(length)
+        .read_to_end(&mut bytes)
+        .map_err(|cause| Error::Io {
+            file: path.clone(),
+            cause,
+        })?;
+
+    decode(&path.display().to_string(), &bytes, Bounds::LOCAL)
+}
+
+/// The width and height of a room's image, upright, in pixels, from its header alone.
+///
+/// # Errors
+/// [`Error::Io`] if the file cannot be read, [`Error::BadImage`] if it has no header of a JPEG or a
+/// PNG.
+pub fn image_size(root: &Path, image: &str) -> Result<(u32, u32), Error> {
+    let ImagePart { path, file, length } = open_part(root, image)?;
+    let io = |cause| Error::Io {
+        file: path.clone(),
+        cause,
+    };
+    let bad = |error: image::ImageError| Error::BadImage {
+        image: path.display().to_string(),
+        problem: error.to_string(),
     };
 
+    let mut header = Vec::new();
+    file.take(length.min(HEADER_BYTES))
+        .read_to_end(&mut header)
+        .map_err(io)?;
+
+    let mut reader = ImageReader::new(Cursor::new(header))
+        .with_guessed_format()
+        .map_err(io)?;
+    let mut limits = Limits::default();
+    limits.max_alloc = Some(HEADER_ALLOC);
+    reader.limits(limits);
+
+    let mut decoder = reader.into_decoder().map_err(bad)?;
+    let (width, height) = decoder.dimensions();
+    let is_lying = matches!(
+        decoder.orientation(),
+        Ok(Orientation::Rotate90
+            | Orientation::Rotate270
+            | Orientation::Rotate90FlipH
+            | Orientation::Rotate270FlipH)
+    );
+    Ok(if is_lying {
+        (height, width)
+    } else {
+        (width, height)
+    })
+}
+
+/// An image's file, at the image's first byte.
+struct ImagePart {
+    path: PathBuf,
+    file: File,
+    /// Of the image, bytes.
+    length: u64,
+}
+
+fn open_part(root: &Path, image: &str) -> Result<ImagePart, Error> {
     // A name that does not end in `@OFFSET+LENGTH` is the name of a whole file, so that '@' may
     // occur in file names.
     let part = image.rsplit_once('@').and_then(|(file, part)| {
@@ -214,27 +303,17 @@ pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
 
     if let Some((_, offset, part_length)) = part {
         if offset.saturating_add(part_length) > length {
-            return Err(bad(format!(
-                "reaches past the end of the file, which has {length} bytes"
-            )));
+            return Err(Error::BadImage {
+                image: root.join(image).display().to_string(),
+                problem: format!("reaches past the end of the file, which has {length} bytes"),
+            });
         }
 
         file.seek(SeekFrom::Start(offset)).map_err(io)?;
         length = part_length;
     }
 
-    // `decode` checks this too, but only after the bytes were read into memory.
-    if length > Bounds::LOCAL.bytes {
-        return Err(bad(format!(
-            "is {length} bytes, over the limit of {}",
-            Bounds::LOCAL.bytes
-        )));
-    }
-
-    let mut bytes = Vec::with_capacity(length as usize);
-    file.take(length).read_to_end(&mut bytes).map_err(io)?;
-
-    decode(&path.display().to_string(), &bytes, Bounds::LOCAL)
+    Ok(ImagePart { path, file, length })
 }
 
 /// Encodes an image as PNG.
@@ -316,6 +395,42 @@ mod tests {
                     whole.len()
                 );
             }
+        }
+    }
+
+    /// Oracle: EXIF's definition: orientation 6 means that what lies right in the file is the bottom of
+    /// the upright image, that is, the file has to be turned clockwise by a quarter.
+    #[test]
+    fn an_image_is_turned_upright() {
+        // EXIF in its shortest form: little-endian, one entry: orientation (0x112), one short, 6.
+        let exif = [
+            &b"II*\0\x08\0\0\0\x01\0"[..],
+            &[0x12, 0x01, 3, 0, 1, 0, 0, 0, 6, 0, 0, 0],
+            &[0; 4],
+        ]
+        .concat();
+
+        // The left half is dark, the right one bright.
+        let lying = image::RgbImage::from_fn(32, 16, |x, _| {
+            image::Rgb([if x < 16 { 20 } else { 230 }; 3])
+        });
+        let mut jpeg = Vec::new();
+        let mut encoder = image::codecs::jpeg::JpegEncoder::new(&mut jpeg);
+        encoder.set_exif_metadata(exif.clone()).unwrap();
+        lying.write_with_encoder(encoder).unwrap();
+        let mut png = Vec::new();
+        let mut encoder = PngEncoder::new(&mut png);
+        encoder.set_exif_metadata(exif).unwrap();
+        lying.write_with_encoder(encoder).unwrap();
+
+        let folder = tempfile::tempdir().unwrap();
+        for (name, bytes) in [("a.jpg", jpeg), ("a.png", png)] {
+            let upright = decode(name, &bytes, Bounds::LOCAL).unwrap();
+            assert_eq!((upright.width, upright.height), (16, 32), "{name}");
+            assert!(upright.pixel(8, 4)[0] < 60 && upright.pixel(8, 28)[0] > 190);
+
+            std::fs::write(folder.path().join(name), bytes).unwrap();
+            assert_eq!(image_size(folder.path(), name).unwrap(), (16, 32));
         }
     }
 

@@ -16,17 +16,19 @@ mod pooling;
 mod preparation;
 mod recipes;
 mod run;
+mod thumbnail;
 #[cfg(feature = "onnx")]
 mod tract;
 
 pub use backbone::{Runtime, RuntimeKind};
 pub use builtin::{BUILTIN_DIM, builtin_source, encode_builtin};
-pub use decode::{Bounds, decode, encode_png, read_image};
+pub use decode::{Bounds, decode, encode_png, image_size, read_image};
 pub use journal::{Journal, NumberedRows};
 pub use pooling::Pooling;
 pub use preparation::{Filter, Preparation, Resize, normalised};
 pub use recipes::{EncoderRecipe, RECIPES, recipe};
 pub use run::{Encoded, Kept, OnBadImage, Task, encode_room};
+pub use thumbnail::thumbnail;
 
 use std::path::{Path, PathBuf};
 

@@ -317,7 +317,7 @@ pub(super) fn three(what: &'static str, text: &str) -> Result<[f32; 3], Error> {
     }
 }
 
-fn resized(
+pub(super) fn resized(
     image: &RgbImage,
     width: usize,
     height: usize,

@@ -112,6 +112,8 @@ pub struct Config {
     pub response_timeout: Duration,
     /// Whether callers may change the catalog.
     pub writable: bool,
+    /// Whether callers may see the images of rooms, as thumbnails.
+    pub thumbnails: bool,
     /// What all uploads in progress may hold in memory together, bytes.
     pub upload_bytes: usize,
     /// The largest message that is received, bytes.
@@ -156,6 +158,7 @@ impl Default for Config {
             receive_within: Duration::from_secs(30),
             response_timeout: Duration::from_secs(60),
             writable: false,
+            thumbnails: false,
             upload_bytes: 1 << 30,
             message_bytes: 4 << 20,
             threads: std::thread::available_parallelism().map_or(1, usize::from),

@@ -1,13 +1,16 @@
 //! The frames of a room over the wire, and views turned into latents.
 
+use seese3::encoder::{Bounds, decode, encode_png};
 use seese3::service::Config;
 use seese3_client::convert;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::catalog_service_client::CatalogServiceClient;
 use seese3_core::geometry::{Twist, body_twist, exp};
+use seese3_core::image::RgbImage;
+use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use tonic::Code;
 
-use crate::harness::{feature, features_of, frame, room_of, start};
+use crate::harness::{feature, features_of, filled_store, frame, room_of, start, start_on};
 
 /// Oracle: the recorded poses, and a search of all pairs by the definition.
 #[tokio::test]
@@ -17,7 +20,11 @@ async fn a_room_lists_its_frames_and_their_neighbours() {
     let room = room_of("synthetic", "synthetic");
     let poses = room.poses();
 
-    let frames = server.client.frames("synthetic", Some(HOP)).await.unwrap();
+    let frames = server
+        .client
+        .frames("synthetic", Some(HOP), None)
+        .await
+        .unwrap();
     assert_eq!(frames.len(), poses.len());
     assert!(frames.iter().any(|frame| frame.neighbours.len() > 2));
 
@@ -46,7 +53,7 @@ async fn a_room_lists_its_frames_and_their_neighbours() {
         }
     }
 
-    let plain = server.client.frames("synthetic", None).await.unwrap();
+    let plain = server.client.frames("synthetic", None, None).await.unwrap();
     assert!(plain.iter().all(|frame| frame.neighbours.is_empty()));
 
     for (hop, room, code) in [
@@ -54,7 +61,7 @@ async fn a_room_lists_its_frames_and_their_neighbours() {
         (Some(f64::NAN), "synthetic", Code::InvalidArgument),
         (None, "nowhere", Code::NotFound),
     ] {
-        let error = server.client.frames(room, hop).await.unwrap_err();
+        let error = server.client.frames(room, hop, None).await.unwrap_err();
         assert_eq!(error.code(), Some(code), "{error}");
     }
 }
@@ -72,6 +79,7 @@ async fn frames_come_page_by_page() {
             page_size,
             page_token: page_token.to_owned(),
             neighbours_within: None,
+            thumbnail_width: None,
         };
         service
             .list_frames(asked)
@@ -107,6 +115,89 @@ async fn frames_come_page_by_page() {
         .await
         .unwrap();
     assert!(beyond.frames.is_empty() && beyond.next_page_token.is_empty());
+}
+
+/// The room `synthetic` again, as `pictured`, with images below a folder: of every three frames one is
+/// red, one green, and one has no file.
+fn pictured_room(folder: &std::path::Path) -> Room {
+    for (name, colour) in [("red.png", [250, 0, 0]), ("green.png", [0, 250, 0])] {
+        let picture = RgbImage {
+            width: 64,
+            height: 48,
+            bytes: colour.repeat(64 * 48),
+        };
+        std::fs::write(folder.join(name), encode_png(&picture).unwrap()).unwrap();
+    }
+
+    let poses = room_of("synthetic", "synthetic").poses().to_vec();
+    let name = |row: usize| ["red.png", "green.png", "lost.png"][row % 3].to_owned();
+    let frames = Frames {
+        images: (0..poses.len()).map(name).collect(),
+        poses,
+        ..Frames::default()
+    };
+    let provenance = Provenance {
+        images_root: folder.to_str().unwrap().to_owned(),
+        ..Provenance::default()
+    };
+    Room::new(RoomId::new("pictured").unwrap(), frames, provenance).unwrap()
+}
+
+/// Oracle: the images that were drawn. Images leave a server only where its operator says so.
+#[tokio::test]
+async fn frames_come_with_thumbnails_where_images_are_shown() {
+    let images = tempfile::tempdir().unwrap();
+    for shown in [true, false] {
+        let (folder, store) = filled_store().await;
+        let features = [features_of("synthetic")];
+        let room = pictured_room(images.path());
+        store.publish_room(&room, &features).await.unwrap();
+        let config = Config {
+            thumbnails: shown,
+            ..Config::default()
+        };
+        let server = start_on(folder, store, config).await;
+        let asked = async |room: &str, width: u32| {
+            let asked = server.client.frames(room, None, Some(width)).await;
+            asked.map_err(|error| error.code().unwrap())
+        };
+
+        if !shown {
+            assert_eq!(
+                asked("pictured", 32).await.unwrap_err(),
+                Code::FailedPrecondition
+            );
+            continue;
+        }
+
+        let frames = asked("pictured", 32).await.unwrap();
+        assert_eq!(frames.len(), room.frame_count());
+        for (row, frame) in frames.iter().enumerate() {
+            if row % 3 == 2 {
+                assert!(frame.thumbnail.is_empty(), "frame {row}");
+                continue;
+            }
+            let seen = decode("thumbnail", &frame.thumbnail, Bounds::LOCAL).unwrap();
+            assert_eq!((seen.width, seen.height), (32, 24));
+            let [red, green, blue] = seen.pixel(16, 12);
+            let lit = if row % 3 == 0 { red } else { green };
+            assert!(lit > 240 && red.min(green) < 10 && blue < 10, "frame {row}");
+        }
+
+        // An image that is narrower keeps its size.
+        let large = asked("pictured", 512).await.unwrap();
+        let seen = decode("thumbnail", &large[0].thumbnail, Bounds::LOCAL).unwrap();
+        assert_eq!((seen.width, seen.height), (64, 48));
+
+        assert_eq!(
+            asked("synthetic", 32).await.unwrap_err(),
+            Code::FailedPrecondition
+        );
+        for width in [0, 15, 513, u32::MAX] {
+            let refused = asked("pictured", width).await.unwrap_err();
+            assert_eq!(refused, Code::InvalidArgument, "{width}");
+        }
+    }
 }
 
 /// Oracle: the promise: a latent says what the view says. The frames that are found by it are those

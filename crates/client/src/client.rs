@@ -337,7 +337,8 @@ impl Client {
     }
 
     /// All frames of a room, page by page; with `neighbours_within` also those that a motion of at most
-    /// this norm leads to, metres and radians mixed.
+    /// this norm leads to, metres and radians mixed; with `thumbnail_width` also a JPEG of each, so many
+    /// pixels wide, from a server that shows images.
     ///
     /// # Errors
     /// [`Error::Refused`]; also when the room changes between two pages.
@@ -345,6 +346,7 @@ impl Client {
         &self,
         room: &str,
         neighbours_within: Option<f64>,
+        thumbnail_width: Option<u32>,
     ) -> Result<Vec<pb::RoomFrame>, Error> {
         let mut service = CatalogServiceClient::new(self.channel.clone())
             .max_decoding_message_size(MESSAGE_BYTES);
@@ -356,6 +358,7 @@ impl Client {
                 page_size: 0,
                 page_token,
                 neighbours_within,
+                thumbnail_width,
             });
             let page = service.list_frames(request).await?.into_inner();
             frames.extend(page.frames);

@@ -1,10 +1,14 @@
 //! The frames of a room with their poses, and the pose graph that they make.
 
+use std::ops::RangeInclusive;
+use std::path::Path;
+
 use super::super::convert;
 use super::super::snapshot::Snapshot;
 use super::super::workers::Lane;
 use super::super::{Error, Handlers};
 use super::page_length;
+use crate::encoder::thumbnail;
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 use seese3_core::planning::PoseGraph;
@@ -12,6 +16,12 @@ use seese3_core::room::{FrameId, Room};
 
 /// The most neighbours that a frame is given.
 const MOST_NEIGHBOURS: usize = 32;
+
+/// Widths of thumbnails, pixels.
+const THUMBNAIL_WIDTHS: RangeInclusive<u32> = 16..=512;
+/// A page ends once its thumbnails have so many bytes, so that it fits into the 4 MiB that clients
+/// of gRPC take if they are told nothing else.
+const THUMBNAILS_OF_A_PAGE: usize = 2 << 20;
 
 impl Handlers {
     /// Answers a ListFrames request on a worker thread.
@@ -23,8 +33,14 @@ impl Handlers {
         let budget = self.workers.budget(request.metadata());
         let request = request.into_inner();
 
+        let lane = match request.thumbnail_width {
+            None => Lane::Short,
+            Some(_) if self.config.thumbnails => Lane::Images,
+            Some(_) => return Err(no_thumbnails("this server shows no images (--thumbnails)")),
+        };
+
         self.workers
-            .run(Lane::Short, budget, move |cancel| {
+            .run(lane, budget, move |cancel| {
                 answer(&snapshot, request, cancel)
             })
             .await
@@ -41,6 +57,7 @@ fn answer(
         page_size,
         page_token,
         neighbours_within,
+        thumbnail_width,
     } = request;
 
     if neighbours_within.is_some_and(|hop| !(hop.is_finite() && hop > 0.0)) {
@@ -49,20 +66,31 @@ fn answer(
             "must be finite and above 0",
         ));
     }
+    if thumbnail_width.is_some_and(|width| !THUMBNAIL_WIDTHS.contains(&width)) {
+        return Err(Error::invalid("thumbnail_width", "must be 16 to 512"));
+    }
 
     let length = page_length(page_size)?;
     let served = snapshot.navigator(&room, "")?;
     let room = served.navigator.room();
     let first = first_frame(&page_token, served.room_revision)?;
+    if thumbnail_width.is_some() && room.images().is_empty() {
+        return Err(no_thumbnails("the server has no images of this room"));
+    }
 
     let frame_count = room.frame_count();
     let all: Vec<FrameId> = (0..frame_count as u32).map(FrameId).collect();
     let graph = PoseGraph::new(room.poses(), &all);
-    let end = first.saturating_add(length).min(frame_count);
+    let last = first.saturating_add(length).min(frame_count);
 
     let mut frames = Vec::new();
-    for &frame in all.get(first..end).unwrap_or_default() {
+    let mut picture_bytes = 0;
+    for &frame in all.get(first..last).unwrap_or_default() {
         cancel.check()?;
+        if picture_bytes >= THUMBNAILS_OF_A_PAGE {
+            break;
+        }
+
         let mut wire = frame_to_wire(room, frame);
         if let Some(hop) = neighbours_within {
             wire.neighbours = graph
@@ -74,9 +102,14 @@ fn answer(
                 })
                 .collect();
         }
+        if let Some(width) = thumbnail_width {
+            wire.thumbnail = picture(room, frame, width);
+            picture_bytes += wire.thumbnail.len();
+        }
         frames.push(wire);
     }
 
+    let end = first.saturating_add(frames.len());
     Ok(pb::ListFramesResponse {
         room: Some(convert::room_revision(&served)),
         frames,
@@ -123,5 +156,22 @@ fn frame_to_wire(room: &Room, frame: FrameId) -> pb::RoomFrame {
         timestamp_ns: room.timestamps_ns().get(row).copied(),
         sequence: room.timeline().sequences.get(row).copied().unwrap_or(0),
         neighbours: Vec::new(),
+        thumbnail: Vec::new(),
     }
+}
+
+/// The thumbnail of a frame; empty if its image cannot be read.
+fn picture(room: &Room, frame: FrameId, width: u32) -> Vec<u8> {
+    let root = Path::new(&room.provenance().images_root);
+    let image = &room.images()[frame.row()];
+
+    thumbnail(root, image, width as usize).unwrap_or_else(|error| {
+        // The paths are the operator's affair and stay in the log.
+        tracing::warn!(room = %room.id(), frame = frame.0, %error, "no thumbnail");
+        Vec::new()
+    })
+}
+
+fn no_thumbnails(problem: &str) -> Error {
+    Error::Precondition(format!("thumbnail_width: {problem}; ask without it"))
 }
