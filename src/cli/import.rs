@@ -8,9 +8,11 @@ use clap::{Args, Subcommand};
 
 use super::camera::CameraOption;
 use super::encode::same_poses;
+use super::pose_options::{DirectionName, DirectionOption, PoseOptions};
+use super::pose_report::PoseReport;
 use super::progress::bar;
 use super::say;
-use crate::datasets::{self, Dropped, Reader, Recording, SevenScenes, Unusable};
+use crate::datasets::{self, Dropped, Kitti, Reader, Recording, SevenScenes, Unusable};
 use crate::store::{Store, check_features};
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
@@ -38,6 +40,16 @@ enum Format {
     /// 7-Scenes: a scene's folder (seq-XX/frame-XXXXXX.pose.txt), or one sequence's
     #[command(name = "7scenes")]
     SevenScenes(Seven),
+    /// A folder of your own: images/, and poses.npy (n, 4, 4) in the order of the images' names
+    Folder(Plain),
+    /// COLMAP: a model (cameras and images, .bin or .txt), or a project's folder with sparse/0
+    Colmap(Colmap),
+    /// NeRF, instant-ngp and nerfstudio: a transforms.json, or its folder
+    Transforms(Plain),
+    /// KITTI odometry: a file of poses, with the folder of its images
+    Kitti(KittiFiles),
+    /// EuRoC MAV: a sequence's folder (mav0/cam0, mav0/state_groundtruth_estimate0)
+    Euroc(Euroc),
     /// NumPy files: poses (n, 4, 4) world_from_camera in metres, features (n, d)
     Numpy(Numpy),
     /// A folder that `seese3 export numpy` wrote
@@ -48,6 +60,8 @@ enum Format {
 struct Plain {
     /// The folder or file to read
     path: PathBuf,
+    #[command(flatten)]
+    poses: DirectionOption,
     #[command(flatten)]
     to: Destination,
 }
@@ -64,23 +78,83 @@ struct Seven {
     #[arg(long, value_name = "FILE")]
     rgb_from_depth: Option<PathBuf>,
     #[command(flatten)]
+    poses: DirectionOption,
+    #[command(flatten)]
     to: Destination,
 }
 
 #[derive(Debug, Args)]
 struct Numpy {
     /// A folder of poses.npy and, optionally, timestamps.npy, frame_ids.npy and features_NAME.npy
-    #[arg(required_unless_present = "poses", conflicts_with_all = ["poses", "timestamps"])]
+    #[arg(required_unless_present = "poses", conflicts_with = "timestamps")]
     path: Option<PathBuf>,
-    /// NumPy file of poses, world_from_camera, shape (n, 4, 4), f64 or f32, metres; instead of a
-    /// folder
-    #[arg(long)]
-    poses: Option<PathBuf>,
+    /// Two things, and may be given for each: world_from_camera or camera_from_world, which transform
+    /// the poses are; or, instead of a folder, the NumPy file of poses, shape (n, 4, 4), f64 or f32
+    #[arg(long, value_name = "TRANSFORM|FILE", action = clap::ArgAction::Append)]
+    poses: Vec<PosesOption>,
     /// NumPy file of timestamps, shape (n,), int64 nanoseconds or float seconds; only with --poses
     #[arg(long)]
     timestamps: Option<PathBuf>,
     #[command(flatten)]
     to: Destination,
+}
+
+#[derive(Debug, Args)]
+struct Colmap {
+    /// The model's folder, or the project's
+    path: PathBuf,
+    /// The folder that the names of images start from; looked for beside the model if omitted
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
+    #[command(flatten)]
+    poses: DirectionOption,
+    #[command(flatten)]
+    to: Destination,
+}
+
+#[derive(Debug, Args)]
+struct KittiFiles {
+    /// The file of poses, twelve numbers a line
+    path: PathBuf,
+    /// The folder of the images, in the order of their numbers, such as sequences/00/image_2
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
+    /// The file of times, seconds, one a line, such as sequences/00/times.txt
+    #[arg(long, value_name = "FILE")]
+    times: Option<PathBuf>,
+    #[command(flatten)]
+    poses: DirectionOption,
+    #[command(flatten)]
+    to: Destination,
+}
+
+#[derive(Debug, Args)]
+struct Euroc {
+    /// The sequence's folder
+    path: PathBuf,
+    /// Which of its cameras
+    #[arg(long = "device", value_name = "NAME", default_value = "cam0")]
+    device: String,
+    #[command(flatten)]
+    poses: DirectionOption,
+    #[command(flatten)]
+    to: Destination,
+}
+
+/// A value of `import numpy --poses`.
+#[derive(Debug, Clone)]
+enum PosesOption {
+    Direction(DirectionName),
+    File(PathBuf),
+}
+
+impl std::str::FromStr for PosesOption {
+    type Err = std::convert::Infallible;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let direction = <DirectionName as clap::ValueEnum>::from_str(text, false);
+        Ok(direction.map_or_else(|_| Self::File(PathBuf::from(text)), Self::Direction))
+    }
 }
 
 #[derive(Debug, Args)]
@@ -111,12 +185,17 @@ struct Destination {
     /// The camera of the images, in pixels; motions between two images are read with it
     #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]")]
     camera: Option<CameraOption>,
+    #[command(flatten)]
+    read_as: PoseOptions,
+    /// Do not compare the poses with the images
+    #[arg(long)]
+    skip_pose_check: bool,
 }
 
 impl Import {
     pub async fn run(self) -> anyhow::Result<()> {
         match self.format {
-            Format::Scannet(Plain { path, to }) => {
+            Format::Scannet(Plain { path, poses, to }) => {
                 let recording = to.read(|reader| {
                     // A .sens file holds a whole scan; otherwise an exporter has unpacked it into
                     // a folder.
@@ -127,24 +206,23 @@ impl Import {
                     }
                 })?;
 
-                to.publish("scannet", &path, recording).await
+                to.publish("scannet", &path, recording, poses.direction)
+                    .await
             }
-            Format::Arkitscenes(Plain { path, to }) => {
-                let recording = to.read(|reader| datasets::read_arkitscenes(&path, reader))?;
-                to.publish("arkitscenes", &path, recording).await
+            Format::Arkitscenes(plain) => {
+                plain
+                    .import("arkitscenes", datasets::read_arkitscenes)
+                    .await
             }
-            Format::Tum(Plain { path, to }) => {
-                let recording = to.read(|reader| datasets::read_tum(&path, reader))?;
-                to.publish("tum", &path, recording).await
-            }
-            Format::TwelveScenes(Plain { path, to }) => {
-                let recording = to.read(|reader| datasets::read_twelve_scenes(&path, reader))?;
-                to.publish("12scenes", &path, recording).await
+            Format::Tum(plain) => plain.import("tum", datasets::read_tum).await,
+            Format::TwelveScenes(plain) => {
+                plain.import("12scenes", datasets::read_twelve_scenes).await
             }
             Format::SevenScenes(Seven {
                 path,
                 sequence,
                 rgb_from_depth,
+                poses,
                 to,
             }) => {
                 let choice = SevenScenes {
@@ -154,40 +232,121 @@ impl Import {
                 let recording =
                     to.read(|reader| datasets::read_seven_scenes(&path, &choice, reader))?;
 
-                to.publish("7scenes", &path, recording).await
-            }
-            Format::Numpy(Numpy {
-                path,
-                poses,
-                timestamps,
-                to,
-            }) => {
-                // Arrays come either as a folder with fixed file names or as single files.
-                let recording = match (&path, &poses) {
-                    (Some(folder), _) => datasets::read_numpy(folder)?,
-                    (None, Some(file)) => {
-                        let recording = datasets::read_poses(file)?;
-                        match &timestamps {
-                            Some(file) => recording.with_timestamps(file)?,
-                            None => recording,
-                        }
-                    }
-                    (None, None) => bail!("a folder or --poses FILE is required"),
-                };
-
-                // Single files have no folder that the room could be named after.
-                if path.is_none() && to.name.is_none() {
-                    bail!("--name NAME is required");
-                }
-
-                to.publish("numpy", path.as_deref().unwrap_or(Path::new("")), recording)
+                to.publish("7scenes", &path, recording, poses.direction)
                     .await
             }
-            Format::Bundle(Plain { path, to }) => {
+            Format::Folder(plain) => {
+                plain
+                    .import("folder", |path, _| datasets::read_folder(path))
+                    .await
+            }
+            Format::Colmap(Colmap {
+                path,
+                images,
+                poses,
+                to,
+            }) => {
+                let recording =
+                    to.read(|reader| datasets::read_colmap(&path, images.as_deref(), reader))?;
+                to.publish("colmap", &path, recording, poses.direction)
+                    .await
+            }
+            Format::Transforms(plain) => {
+                plain.import("transforms", datasets::read_transforms).await
+            }
+            Format::Kitti(KittiFiles {
+                path,
+                images,
+                times,
+                poses,
+                to,
+            }) => {
+                let beside = Kitti { images, times };
+                let recording = to.read(|reader| datasets::read_kitti(&path, &beside, reader))?;
+                to.publish("kitti", &path, recording, poses.direction).await
+            }
+            Format::Euroc(Euroc {
+                path,
+                device,
+                poses,
+                to,
+            }) => {
+                let recording = to.read(|reader| datasets::read_euroc(&path, &device, reader))?;
+                to.publish("euroc", &path, recording, poses.direction).await
+            }
+            Format::Numpy(numpy) => numpy.import().await,
+            Format::Bundle(Plain { path, poses, to }) => {
                 let recording = datasets::read_bundle(&path)?;
-                to.publish("bundle", &path, recording).await
+                to.publish("bundle", &path, recording, poses.direction)
+                    .await
             }
         }
+    }
+}
+
+impl Plain {
+    /// Reads a recording of one format and publishes it.
+    async fn import(
+        self,
+        format: &str,
+        read: impl FnOnce(&Path, &mut Reader<'_>) -> Result<Recording, datasets::Error>,
+    ) -> anyhow::Result<()> {
+        let recording = self.to.read(|reader| read(&self.path, reader))?;
+        self.to
+            .publish(format, &self.path, recording, self.poses.direction)
+            .await
+    }
+}
+
+impl Numpy {
+    async fn import(self) -> anyhow::Result<()> {
+        let mut file = None;
+        let mut direction = DirectionName::WorldFromCamera;
+        for given in self.poses {
+            match given {
+                PosesOption::Direction(given) => direction = given,
+                PosesOption::File(given) if file.is_none() => file = Some(given),
+                PosesOption::File(given) => bail!(
+                    "--poses: {} is a second file, and neither world_from_camera nor camera_from_world",
+                    given.display()
+                ),
+            }
+        }
+
+        // Arrays come either as a folder with fixed file names or as single files.
+        let recording = match (&self.path, &file) {
+            (Some(folder), Some(file)) => bail!(
+                "--poses: {} is neither world_from_camera nor camera_from_world; as the file of \
+                 poses it is read instead of the folder {}: give one of them",
+                file.display(),
+                folder.display()
+            ),
+            (Some(folder), None) => {
+                if folder.join("images").is_dir() {
+                    eprintln!(
+                        "warning: {} is not read; `import folder` reads the images too",
+                        folder.join("images").display()
+                    );
+                }
+                datasets::read_numpy(folder)?
+            }
+            (None, Some(file)) => {
+                let recording = datasets::read_poses(file)?;
+                match &self.timestamps {
+                    Some(file) => recording.with_timestamps(file)?,
+                    None => recording,
+                }
+            }
+            (None, None) => bail!("a folder or --poses FILE is required"),
+        };
+
+        // Single files have no folder that the room could be named after.
+        if self.path.is_none() && self.to.name.is_none() {
+            bail!("--name NAME is required");
+        }
+
+        let path = self.path.as_deref().unwrap_or(Path::new(""));
+        self.to.publish("numpy", path, recording, direction).await
     }
 }
 
@@ -331,6 +490,7 @@ impl Destination {
         format: &str,
         path: &Path,
         mut recording: Recording,
+        direction: DirectionName,
     ) -> anyhow::Result<()> {
         let read_count = recording.frames.poses.len();
 
@@ -360,7 +520,13 @@ impl Destination {
             .map(|set| set.select(&kept))
             .collect::<Vec<_>>();
 
-        let frames = recording.frames.select(&kept);
+        // The images are compared with the poses as they are stated, so that a mistake can be named
+        // by the options that mend it.
+        let mut frames = recording.frames.select(&kept);
+        let read_as = self.read_as.convention(direction);
+        let stated = self.read_as.scaled(&frames.poses);
+        let read = stated.iter().map(|pose| read_as.to_world_from_camera(pose));
+        frames.poses = read.collect();
         let room = self.room(format, path, &recording, frames)?;
 
         // The last checks come before the first write: a refused import leaves the store as it
@@ -374,6 +540,11 @@ impl Destination {
         };
 
         self.say_read(&room, &features, &recording, read_count);
+        let mut report = PoseReport::of_path(&room);
+        if !self.skip_pose_check && !room.images().is_empty() {
+            report.look_at_images(&room, Path::new(&recording.images_root), &stated, read_as);
+        }
+        report.say();
 
         // Publishing the same content again makes no new revision, so an import can safely be
         // repeated.

@@ -3,6 +3,7 @@
 
 mod ask;
 mod camera;
+mod check;
 mod config;
 #[cfg(feature = "lab")]
 mod cross_room;
@@ -21,6 +22,8 @@ mod log;
 mod named;
 #[cfg(feature = "lab")]
 mod probe;
+mod pose_options;
+mod pose_report;
 mod progress;
 mod push;
 #[cfg(feature = "lab")]
@@ -60,6 +63,8 @@ enum Command {
     Demo(demo::Demo),
     /// Read a recording from disk and publish it as a room in a store
     Import(import::Import),
+    /// Check a stored room: what its camera did, and whether its poses can be those of its images
+    Check(check::Check),
     /// Write a stored room in a format that other programs read
     Export(export::Export),
     /// Encode a room's images as features
@@ -131,6 +136,7 @@ impl Cli {
 pub async fn run(cli: Cli) -> anyhow::Result<()> {
     match cli.command {
         Command::Import(arguments) => arguments.run().await,
+        Command::Check(arguments) => arguments.run().await,
         Command::Export(arguments) => arguments.run().await,
         Command::Encode(arguments) => arguments.run().await,
         Command::Fit(arguments) => arguments.run().await,

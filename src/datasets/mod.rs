@@ -7,21 +7,32 @@
 mod arkitscenes;
 mod bundle;
 mod collect;
+mod colmap;
+mod euroc;
+mod folder;
+mod kitti;
+mod natural;
 mod numpy;
 mod scannet;
 mod sens;
 mod seven_scenes;
 mod text;
+mod transforms;
 mod tum;
 mod twelve_scenes;
 
 pub use arkitscenes::read_arkitscenes;
 pub use bundle::{read_bundle, read_numpy, write_numpy};
 pub use collect::pose_of_matrix;
+pub use colmap::read_colmap;
+pub use euroc::read_euroc;
+pub use folder::read_folder;
+pub use kitti::{Kitti, read_kitti};
 pub use numpy::{read_features, read_poses, read_timestamps};
 pub use scannet::read_scannet;
 pub use sens::read_sens;
 pub use seven_scenes::{SevenScenes, read_seven_scenes};
+pub use transforms::read_transforms;
 pub use tum::{read_tum, read_tum_trajectory};
 pub use twelve_scenes::read_twelve_scenes;
 

@@ -68,12 +68,14 @@
 //! | [`matrices`] | between ndarray and nalgebra |
 //! | [`room`] | a recording: frames with poses, times and image names |
 //! | [`image`] | 8-bit RGB pictures |
+//! | [`image_motion`] | how an image moved between two views |
 //! | [`features`] | one row of encoder output per frame, and what made it |
 //! | [`index`] | nearest neighbours: the exact scan, HNSW |
 //! | [`ridge`] | ridge regression in closed form |
 //! | [`splits`] | which pairs of frames train and which test; which frames a map holds |
 //! | [`statistics`] | means, quantiles, rates, the bootstrap over rooms, coverage of covariances |
 //! | [`motion_scores`] | R² of predicted motions |
+//! | [`pose_check`] | whether poses can be those of a recording's images |
 //! | [`trajectory`] | paths against the true ones: association, alignment, APE, RPE |
 //! | [`adapter`] | features to latents, latents to motions and back; networks and their training |
 //! | [`training`] | from rooms to an adapter and its scores |
@@ -94,12 +96,14 @@ pub mod geometry;
 pub mod matrices;
 pub mod room;
 pub mod image;
+pub mod image_motion;
 pub mod features;
 pub mod index;
 pub mod ridge;
 pub mod splits;
 pub mod statistics;
 pub mod motion_scores;
+pub mod pose_check;
 pub mod trajectory;
 pub mod adapter;
 pub mod training;

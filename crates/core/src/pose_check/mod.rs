@@ -1,0 +1,325 @@
+//! Whether the poses of a recording can be those of its images.
+//!
+//! Poses in a wrong convention (inverted, along other axes, of other frames) train and score almost
+//! as well as right ones, and then mislead whoever uses them. The images know better: when a camera
+//! turns right, everything moves left. So the motion of the images ([`crate::image_motion`]) is
+//! compared with the motion that the poses state, read in every convention that is in use.
+//!
+//! | what the camera does | what the image does |
+//! | --- | --- |
+//! | turns right, ω_y | shifts left by focal · ω_y |
+//! | turns up, ω_x | shifts down by focal · ω_x |
+//! | turns clockwise, ω_z | turns the other way by ω_z |
+//! | moves right, t_x, or down, t_y | shifts left or up by focal · t / depth |
+//! | moves forward, t_z | grows by t_z / depth |
+//!
+//! The focal length and the depth are not known. They are fitted, may not be negative, and are worth
+//! reading themselves: a wrong unit of length shows as an impossible depth.
+//!
+//! | file | what |
+//! | --- | --- |
+//! | `convention` | the conventions and how each is read |
+//! | `translations` | ways in which translations alone can be wrong |
+//! | `follows` | how well poses explain the motion of images |
+//! | `path` | what the poses alone tell: extents, steps, jumps |
+//!
+//! Not a method of the paper. The limits were chosen on a real recording and eighteen drawn rooms;
+//! docs/rooms-and-encoders.md reports them on rooms that were drawn afterwards.
+
+mod convention;
+mod follows;
+mod path;
+mod translations;
+
+pub use convention::{Axes, Convention, Direction, QuaternionOrder};
+pub use follows::{Follows, Seen};
+pub use path::{PathFacts, PathWarning};
+pub use translations::Translations;
+
+use crate::geometry::Pose;
+use crate::image_motion::ImageMotion;
+use crate::room::{FrameId, Room};
+use follows::follows;
+
+/// Pairs of frames that are looked at.
+const PAIRS: usize = 100;
+/// Between the frames of a pair the camera should turn by this, radians: 3 degrees, enough to see and
+/// not too much to follow.
+const WANTED_TURN_RAD: f64 = 0.052;
+/// The frames of a pair are at most this many rows apart.
+const FURTHEST_ROWS: u32 = 60;
+/// Alignments with a lower correlation are not used.
+const LEAST_CORRELATION: f64 = 0.7;
+/// Fewer pairs than this decide nothing.
+const FEWEST_PAIRS: usize = 12;
+/// Images that move less than this on average, image widths, decide nothing.
+const LEAST_MOTION: f64 = 0.005;
+
+/// Poses that explain this share of the images' motion agree with it.
+const AGREES: f64 = 0.6;
+/// Another convention is named where it explains this share at least,
+const EXPLAINS: f64 = 0.6;
+/// and by this much more than the stated one.
+const BETTER_BY: f64 = 0.15;
+/// Other translations are named where they explain by this much more than the stated ones.
+const TRANSLATIONS_BETTER_BY: f64 = 0.05;
+/// Poses of other frames are named where they explain by this much more than those of the same.
+const ROWS_BETTER_BY: f64 = 0.05;
+/// Poses are looked for so many rows away from their images.
+const FURTHEST_SHIFT: i64 = 60;
+/// Conventions within this of the best one may be meant as well.
+const AS_GOOD: f64 = 0.03;
+/// Poses that explain less than this in every convention are not those of the images.
+const UNRELATED: f64 = 0.4;
+
+/// Two frames of a recording and how the image moved between them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ObservedPair {
+    /// The frame that the motion starts from.
+    pub first: FrameId,
+    /// The frame that it leads to.
+    pub second: FrameId,
+    /// Where the contents of the first image are in the second.
+    pub motion: ImageMotion,
+    /// How alike the two images are when laid over one another, -1 to 1.
+    pub correlation: f64,
+}
+
+/// What a comparison of poses and images says.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Verdict {
+    /// The poses can be those of the images.
+    Agrees(Seen),
+    /// The poses are written in another convention.
+    OtherConvention {
+        /// The likely ones, the best first.
+        likely: Vec<Convention>,
+        /// How much of the motion the best of them explains, 0 to 1.
+        explained: f64,
+    },
+    /// The rotations are right, and the translations do not go with them.
+    OtherTranslations {
+        /// The likely ones.
+        likely: Translations,
+        /// How much of the motion they explain, 0 to 1.
+        explained: f64,
+    },
+    /// The poses are those of images so many rows later, or earlier if below 0.
+    OtherRows {
+        /// The rows.
+        rows: i64,
+        /// How much of the motion the poses then explain, 0 to 1.
+        explained: f64,
+    },
+    /// The images move, and no convention makes the poses explain how: they are of other frames, in
+    /// another order, or of another recording.
+    Unrelated {
+        /// How much of the motion the best convention explains, 0 to 1.
+        explained: f64,
+    },
+    /// Poses and images do not contradict each other, and do not agree well either.
+    Unclear {
+        /// How much of the motion the best convention explains, 0 to 1.
+        explained: f64,
+    },
+    /// Too few pairs of frames could be laid over one another.
+    TooFewPairs,
+    /// The camera hardly moves.
+    TooLittleMotion,
+}
+
+/// The comparison of poses with images.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PoseCheck {
+    /// What it says.
+    pub verdict: Verdict,
+    /// How much of the images' motion the poses explain as they are, 0 to 1; 0 if nothing was
+    /// compared.
+    pub explained: f64,
+    /// The pairs that were compared.
+    pub pair_count: usize,
+}
+
+/// Pairs of frames to look at, spread over the recording.
+pub fn pairs_to_look_at(room: &Room) -> Vec<(FrameId, FrameId)> {
+    let frame_count = room.frame_count() as u32;
+    let every = (room.frame_count() / PAIRS).max(1);
+
+    let starts = (0..frame_count).step_by(every).map(FrameId);
+    let pairs = starts.filter_map(|first| Some((first, turned_since(room, first)?)));
+    pairs.take(PAIRS).collect()
+}
+
+/// The next frame of the same sequence at which the camera has turned by enough; if there is none,
+/// the one at which it has turned most. None at the end of a sequence.
+fn turned_since(room: &Room, first: FrameId) -> Option<FrameId> {
+    let poses = room.poses();
+    let turn = |other: &FrameId| {
+        let rotation = poses[other.row()].rotation;
+        poses[first.row()].rotation.angle_to(&rotation)
+    };
+
+    let end = (first.0 + FURTHEST_ROWS).min(room.frame_count() as u32 - 1);
+    let later = (first.0 + 1..=end).map(FrameId);
+    let later: Vec<FrameId> = later
+        .take_while(|other| room.timeline().joins(first, *other))
+        .collect();
+
+    let enough = later.iter().find(|other| turn(other) >= WANTED_TURN_RAD);
+    let most = later.iter().max_by(|a, b| turn(a).total_cmp(&turn(b)));
+    enough.or(most).copied()
+}
+
+/// Compares poses with how images moved.
+///
+/// `poses` are as they were stated, one a frame; `read_as` is the convention in which they are taken.
+pub fn check(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) -> PoseCheck {
+    let observed: Vec<ObservedPair> = observed
+        .iter()
+        .filter(|pair| pair.correlation >= LEAST_CORRELATION)
+        .copied()
+        .collect();
+    let pair_count = observed.len();
+    let nothing = |verdict| PoseCheck {
+        verdict,
+        explained: 0.0,
+        pair_count,
+    };
+    if pair_count < FEWEST_PAIRS {
+        return nothing(Verdict::TooFewPairs);
+    }
+
+    let shifts = observed.iter().map(|pair| pair.motion.shift.norm());
+    if shifts.sum::<f64>() / (pair_count as f64) < LEAST_MOTION {
+        return nothing(Verdict::TooLittleMotion);
+    }
+
+    let stated = follows(&motions(poses, read_as, &observed), &observed);
+    PoseCheck {
+        verdict: verdict(poses, read_as, &observed, &stated),
+        explained: stated.explained,
+        pair_count,
+    }
+}
+
+fn verdict(
+    poses: &[Pose],
+    read_as: Convention,
+    observed: &[ObservedPair],
+    stated: &Follows,
+) -> Verdict {
+    let all = Convention::all();
+    let explained = |convention: &Convention| {
+        let motions = motions(poses, *convention, observed);
+        follows(&motions, observed).explained
+    };
+    let readings: Vec<f64> = all.iter().map(explained).collect();
+    let best = readings.iter().copied().fold(0.0, f64::max);
+
+    if best >= EXPLAINS && best - stated.explained >= BETTER_BY {
+        let readings = readings.iter().zip(&all);
+        let mut likely: Vec<(f64, Convention)> = readings
+            .filter(|(explained, _)| best - *explained <= AS_GOOD)
+            .map(|(explained, convention)| (*explained, *convention))
+            .collect();
+        likely.sort_by(|a, b| b.0.total_cmp(&a.0));
+
+        let likely = likely.into_iter().map(|(_, convention)| convention);
+        return Verdict::OtherConvention {
+            likely: likely.collect(),
+            explained: best,
+        };
+    }
+    if let Some(shifted) = best_shift(poses, read_as, observed) {
+        return shifted;
+    }
+    if best < UNRELATED {
+        return Verdict::Unrelated { explained: best };
+    }
+
+    let (likely, explained) = best_translations(poses, read_as, observed);
+    if explained >= EXPLAINS && explained - stated.explained >= TRANSLATIONS_BETTER_BY {
+        return Verdict::OtherTranslations { likely, explained };
+    }
+    if stated.explained >= AGREES {
+        Verdict::Agrees(stated.seen)
+    } else {
+        Verdict::Unclear { explained: best }
+    }
+}
+
+/// The verdict that poses are those of other rows, if they are.
+fn best_shift(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) -> Option<Verdict> {
+    let mut best = (0, 0.0);
+    for rows in -FURTHEST_SHIFT..=FURTHEST_SHIFT {
+        // The pose of an image stands so many rows before it.
+        let shifted = |frame: FrameId| {
+            let row = i64::from(frame.0) - rows;
+            let is_there = (0..poses.len() as i64).contains(&row);
+            is_there.then_some(FrameId(row as u32))
+        };
+        let moved = observed.iter().filter_map(|pair| {
+            Some(ObservedPair {
+                first: shifted(pair.first)?,
+                second: shifted(pair.second)?,
+                ..*pair
+            })
+        });
+        let moved: Vec<ObservedPair> = moved.collect();
+        if moved.len() < FEWEST_PAIRS {
+            continue;
+        }
+
+        // Compared with the stated rows on the same pairs.
+        let back = |frame: FrameId| FrameId((i64::from(frame.0) + rows) as u32);
+        let there = moved.iter().map(|pair| ObservedPair {
+            first: back(pair.first),
+            second: back(pair.second),
+            ..*pair
+        });
+        let there: Vec<ObservedPair> = there.collect();
+        let explained = follows(&motions(poses, read_as, &moved), &moved).explained;
+        let stated = follows(&motions(poses, read_as, &there), &there).explained;
+        if explained - stated >= ROWS_BETTER_BY && explained > best.1 {
+            best = (rows, explained);
+        }
+    }
+
+    (best.1 >= EXPLAINS).then_some(Verdict::OtherRows {
+        rows: best.0,
+        explained: best.1,
+    })
+}
+
+/// The translations that explain most beside the stated rotations, and how much that is.
+fn best_translations(
+    poses: &[Pose],
+    read_as: Convention,
+    observed: &[ObservedPair],
+) -> (Translations, f64) {
+    let read: Vec<Pose> = poses
+        .iter()
+        .map(|pose| read_as.to_world_from_camera(pose))
+        .collect();
+
+    let mut best = (Translations::STATED, 0.0);
+    for translations in Translations::all() {
+        let meant = |frame: FrameId| translations.meant(&read[frame.row()]);
+        let motions = observed
+            .iter()
+            .map(|pair| meant(pair.first).inverse() * meant(pair.second));
+        let explained = follows(&motions.collect::<Vec<_>>(), observed).explained;
+        if explained > best.1 {
+            best = (translations, explained);
+        }
+    }
+    best
+}
+
+/// The stated camera motions of the pairs, if poses are read in a convention.
+fn motions(poses: &[Pose], convention: Convention, observed: &[ObservedPair]) -> Vec<Pose> {
+    let read = |frame: FrameId| convention.to_world_from_camera(&poses[frame.row()]);
+    let motion = |pair: &ObservedPair| read(pair.first).inverse() * read(pair.second);
+
+    observed.iter().map(motion).collect()
+}

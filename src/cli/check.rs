@@ -1,0 +1,79 @@
+//! `seese3 check`: looks for mistakes in what is stored.
+
+use std::path::PathBuf;
+
+use anyhow::bail;
+use clap::{Args, Subcommand};
+
+use super::encode::images_root;
+use super::pose_report::PoseReport;
+use super::say;
+use crate::store::Store;
+use seese3_core::pose_check::Convention;
+
+#[derive(Debug, Args)]
+pub struct Check {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    /// A room: what its camera did, and whether its poses can be those of its images. Fails if they
+    /// contradict each other
+    Room(CheckRoom),
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = "Example:\n  seese3 check room --store store --room kitchen")]
+struct CheckRoom {
+    /// The store: a folder, or a bucket by its URL
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// Name of the room
+    #[arg(long)]
+    room: String,
+    /// The folder of the images, if it is no longer where the room was imported from
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
+    /// Print JSON instead of text
+    #[arg(long)]
+    json: bool,
+}
+
+impl Check {
+    pub async fn run(self) -> anyhow::Result<()> {
+        let What::Room(arguments) = self.what;
+        arguments.run().await
+    }
+}
+
+impl CheckRoom {
+    async fn run(self) -> anyhow::Result<()> {
+        let store = Store::open(&self.store)?;
+        let room = store.load_room(&self.room, None).await?.room;
+
+        let mut report = PoseReport::of_path(&room);
+        if !room.images().is_empty() {
+            let root = images_root(&room, self.images.as_deref())?;
+            // What is stored has been read in its convention already.
+            report.look_at_images(&room, &root, room.poses(), Convention::default());
+        }
+
+        if self.json {
+            say(serde_json::to_string_pretty(&report.json(&room))?);
+        } else {
+            say(format_args!(
+                "room '{}': {} frames",
+                room.id(),
+                room.frame_count()
+            ));
+            report.say();
+        }
+
+        if report.is_contradicted() {
+            bail!("the poses of room '{}' contradict its images", room.id());
+        }
+        Ok(())
+    }
+}

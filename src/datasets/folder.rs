@@ -1,0 +1,69 @@
+//! A folder of one's own: `images/` and `poses.npy`, and the other arrays that `import numpy` reads.
+//!
+//! The images belong to the poses by their order: that of the numbers in their names.
+
+use std::path::Path;
+
+use super::natural::sort_naturally;
+use super::{Error, Recording, Stated, entries, read_numpy};
+
+/// The folder of the images.
+pub(super) const IMAGES: &str = "images";
+
+/// Reads a folder with `poses.npy` and `images/`.
+///
+/// # Errors
+/// [`Error`] if a file cannot be read or has another shape, or if there are not as many images as
+/// poses. The message names the file or the folder.
+pub fn read_folder(folder: &Path) -> Result<Recording, Error> {
+    let mut recording = read_numpy(folder)?;
+    let images = image_files(&folder.join(IMAGES))?;
+    let pose_count = recording.frames.poses.len();
+    if images.len() != pose_count {
+        return Err(Error::Malformed {
+            file: folder.join(IMAGES),
+            problem: format!(
+                "has {} images (.jpg, .jpeg, .png), and poses.npy {pose_count} poses; each image needs one, \
+                 in the order of the numbers in their names",
+                images.len()
+            ),
+        });
+    }
+
+    recording.frames.names.clone_from(&images);
+    recording.frames.images = images
+        .into_iter()
+        .map(|image| format!("{IMAGES}/{image}"))
+        .collect();
+    recording.images_root = resolved(folder)?;
+    recording.stated = Stated::default();
+    Ok(recording)
+}
+
+/// The names of the images in a folder, in the order of the numbers in them.
+pub(super) fn image_files(folder: &Path) -> Result<Vec<String>, Error> {
+    let is_image = |name: &String| {
+        let extension = Path::new(name).extension().map(|e| e.to_ascii_lowercase());
+        extension.is_some_and(|extension| {
+            extension == "jpg" || extension == "jpeg" || extension == "png"
+        })
+    };
+
+    let mut images: Vec<String> = entries(folder)?.into_iter().filter(is_image).collect();
+    sort_naturally(&mut images, |name| name);
+    Ok(images)
+}
+
+/// A folder's path from the root of the file system: it is stored, and used from other folders.
+pub(super) fn resolved(folder: &Path) -> Result<String, Error> {
+    let whole = folder.canonicalize().map_err(|cause| Error::Io {
+        file: folder.to_owned(),
+        cause,
+    })?;
+    let text = whole.to_str().ok_or_else(|| Error::Malformed {
+        file: folder.to_owned(),
+        problem: "the path is not UTF-8".to_owned(),
+    })?;
+
+    Ok(text.to_owned())
+}
