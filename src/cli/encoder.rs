@@ -6,8 +6,8 @@ use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 
 use crate::encoder::{
-    self, Encoder, EncoderRecipe, Filter, Layer, ModelTask, Pooling, Preparation, Resize, Runtime,
-    RuntimeKind,
+    self, Encoder, EncoderRecipe, Filter, Layer, ModelTask, Pooling, Preparation, Preprocess,
+    Resize, Runtime, RuntimeKind,
 };
 
 /// Which runtime runs ONNX models, and on how many threads.
@@ -68,6 +68,10 @@ pub struct EncoderOptions {
     /// lists; the options below override single values
     #[arg(long)]
     recipe: Option<String>,
+    /// Preprocessing of a family of encoders, where there is no recipe: `imagenet` (torchvision, most of
+    /// timm), `clip`, `half` (-1 to 1: SigLIP, Inception) or `unit` (0 to 1)
+    #[arg(long, value_parser = preprocess, conflicts_with = "recipe")]
+    preprocess: Option<Preprocess>,
     /// Layers to keep, by output name, separated by commas; `all` keeps every output that the model
     /// declares
     #[arg(long, value_delimiter = ',', default_value = "all")]
@@ -115,6 +119,13 @@ pub struct EncoderOptions {
     /// omitted, else 1
     #[arg(long, value_name = "R,G,B")]
     std: Option<String>,
+}
+
+fn preprocess(name: &str) -> Result<Preprocess, String> {
+    let family = Preprocess::ALL
+        .into_iter()
+        .find(|family| family.name() == name);
+    family.ok_or_else(|| "is none of imagenet, clip, half, unit".to_owned())
 }
 
 impl EncoderOptions {
@@ -216,6 +227,7 @@ impl EncoderOptions {
         // Destructured with no `..`, so that a new option breaks the build here.
         let Self {
             recipe,
+            preprocess,
             layers,
             pool,
             prefix_tokens,
@@ -233,7 +245,10 @@ impl EncoderOptions {
         let words = [recipe, pool, base, norm, resize, filter, crop, mean, std];
         let numbers = [prefix_tokens.is_some(), window.is_some(), divisor.is_some()];
 
-        layers == &["all"] && words.iter().all(|word| word.is_none()) && numbers == [false; 3]
+        preprocess.is_none()
+            && layers == &["all"]
+            && words.iter().all(|word| word.is_none())
+            && numbers == [false; 3]
     }
 
     fn recipe(&self) -> anyhow::Result<Option<&'static EncoderRecipe>> {
@@ -263,11 +278,16 @@ impl EncoderOptions {
 
         // There is no default normalisation: a wrong one gives features that look plausible and
         // are wrong. Either a recipe or explicit numbers are required.
-        let mut preparation = match recipe {
-            Some(recipe) => recipe.preparation.clone(),
+        let family = match self.preprocess {
+            Some(family) => Some(family.preparation(encoder::declared_size(file)?)?),
+            None => None,
+        };
+        let known = recipe.map(|recipe| recipe.preparation.clone()).or(family);
+        let mut preparation = match known {
+            Some(preparation) => preparation,
             None if !says => bail!(
-                "how are images prepared for {}? give --recipe NAME (see `seese3 encoders`), or --divisor, --mean and \
-                 --std, with --resize and --crop where they are needed",
+                "how are images prepared for {}? give --recipe NAME (see `seese3 encoders`), --preprocess imagenet, \
+                 clip, half or unit, or --divisor, --mean and --std, with --resize and --crop where they are needed",
                 file.display()
             ),
             None => {

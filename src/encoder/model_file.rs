@@ -1,9 +1,12 @@
 //! Reads an ONNX file: its input, its outputs, the names of its inner values, and its identity.
 //!
-//! Only those few fields of ONNX's protobuf messages are declared here that are needed.
+//! - Only those few fields of ONNX's protobuf messages are declared here that are needed.
+//! - Weights may lie in other files of the same folder, as `torch.onnx.export` writes them. The identity
+//!   covers them too: the same graph with other weights is another encoder.
 
-use std::collections::HashSet;
-use std::path::Path;
+use std::collections::{BTreeSet, HashSet};
+use std::fs::File;
+use std::path::{Component, Path};
 
 use prost::Message;
 use sha2::{Digest, Sha256};
@@ -32,15 +35,34 @@ struct GraphProto {
 struct NodeProto {
     #[prost(string, repeated, tag = "2")]
     output: Vec<String>,
+    #[prost(message, repeated, tag = "5")]
+    attribute: Vec<AttributeProto>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct AttributeProto {
+    #[prost(message, optional, tag = "5")]
+    tensor: Option<TensorProto>,
 }
 
 #[derive(Clone, PartialEq, Message)]
 struct TensorProto {
     #[prost(string, tag = "8")]
     name: String,
+    /// Where the numbers are in another file: among others, its name as `location`.
+    #[prost(message, repeated, tag = "13")]
+    external: Vec<EntryProto>,
     /// 1 if the weights are stored in another file.
     #[prost(int32, tag = "14")]
     location: i32,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct EntryProto {
+    #[prost(string, tag = "1")]
+    key: String,
+    #[prost(string, tag = "2")]
+    value: String,
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -81,9 +103,10 @@ struct DimProto {
 /// The number by which ONNX denotes the element type f32.
 const FLOAT: i32 = 1;
 
-/// An ONNX file that was read and checked: it has one input and holds its own weights.
+/// An ONNX file that was read and checked: it has one input, and its weights are there.
 pub(super) struct ModelFile {
-    /// The file's name without extension, `@`, and the first 8 bytes of its SHA-256 in hexadecimal.
+    /// The file's name without extension, `@`, and the first 8 bytes of the SHA-256, in hexadecimal, of
+    /// the file and of those that hold its weights.
     pub id: String,
     /// The whole file.
     pub bytes: Vec<u8>,
@@ -102,22 +125,8 @@ impl ModelFile {
             problem,
         };
 
-        let bytes = std::fs::read(file).map_err(|cause| Error::Io {
-            file: file.to_owned(),
-            cause,
-        })?;
-        let model = ModelProto::decode(bytes.as_slice());
-        let graph = model.ok().and_then(|model| model.graph);
-        let graph =
-            graph.ok_or_else(|| wrong("is not an ONNX model; is it cut off?".to_owned()))?;
-
-        // The identity is a hash of this file, so it holds only for weights that are in it.
-        if graph.initializer.iter().any(|tensor| tensor.location != 0) {
-            let inline = "onnx.save(onnx.load(\"FILE.onnx\"), \"WHOLE.onnx\")";
-            return Err(wrong(format!(
-                "keeps weights in another file; merge them into one file, in Python: {inline}"
-            )));
-        }
+        let (bytes, graph) = read_graph(file)?;
+        let id = id_of(file, &bytes, &graph)?;
 
         // A file may list its weights among the inputs; only the other inputs are given by the
         // caller.
@@ -168,7 +177,7 @@ impl ModelFile {
             .collect();
 
         Ok(Self {
-            id: id_of(file, &bytes),
+            id,
             bytes,
             input,
             outputs,
@@ -214,26 +223,88 @@ impl ModelFile {
     }
 }
 
-/// The identity of a model's file, which is not parsed.
+/// The identity of a model.
 pub(super) fn identity(file: &Path) -> Result<String, Error> {
+    let (bytes, graph) = read_graph(file)?;
+    id_of(file, &bytes, &graph)
+}
+
+fn read_graph(file: &Path) -> Result<(Vec<u8>, GraphProto), Error> {
     let bytes = std::fs::read(file).map_err(|cause| Error::Io {
         file: file.to_owned(),
         cause,
     })?;
-    Ok(id_of(file, &bytes))
+    let model = ModelProto::decode(bytes.as_slice());
+    let graph = model.ok().and_then(|model| model.graph);
+    let graph = graph.ok_or_else(|| Error::Model {
+        file: file.to_owned(),
+        problem: "is not an ONNX model; is it cut off?".to_owned(),
+    })?;
+
+    Ok((bytes, graph))
 }
 
-fn id_of(file: &Path, bytes: &[u8]) -> String {
+/// The names of the files that hold the graph's weights, besides the model's own.
+fn weight_files(graph: &GraphProto) -> BTreeSet<&str> {
+    let constants = graph.node.iter().flat_map(|node| &node.attribute);
+    let constants = constants.filter_map(|attribute| attribute.tensor.as_ref());
+    let outside = graph
+        .initializer
+        .iter()
+        .chain(constants)
+        .filter(|tensor| tensor.location != 0);
+
+    let names = outside.flat_map(|tensor| &tensor.external);
+    names
+        .filter(|entry| entry.key == "location")
+        .map(|entry| entry.value.as_str())
+        .collect()
+}
+
+/// The name of the file, and a digest of all that decides what the model computes.
+fn id_of(file: &Path, bytes: &[u8], graph: &GraphProto) -> Result<String, Error> {
     let stem = file
         .file_stem()
         .map(|stem| stem.to_string_lossy().into_owned())
         .unwrap_or_default();
 
-    let digest: String = Sha256::digest(bytes)
+    let mut digest = Sha256::new();
+    digest.update(bytes);
+    for name in weight_files(graph) {
+        let wrong = |problem: String| Error::Model {
+            file: file.to_owned(),
+            problem,
+        };
+
+        // A model from elsewhere must not make this program read whatever file it names.
+        let is_beside = Path::new(name)
+            .components()
+            .all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
+        if !is_beside {
+            return Err(wrong(format!(
+                "keeps weights in '{name}', which does not lie in the model's folder; move it there and \
+                 export again"
+            )));
+        }
+
+        let weights = file.parent().unwrap_or(Path::new("")).join(name);
+        let mut weights = File::open(&weights).map_err(|cause| {
+            wrong(format!(
+                "keeps weights in {}, which cannot be read: {cause}; copy it beside the model",
+                weights.display()
+            ))
+        })?;
+        std::io::copy(&mut weights, &mut digest).map_err(|cause| Error::Io {
+            file: file.to_owned(),
+            cause,
+        })?;
+    }
+
+    let digest: String = digest
+        .finalize()
         .iter()
         .take(8)
         .map(|byte| format!("{byte:02x}"))
         .collect();
-
-    format!("{stem}@{digest}")
+    Ok(format!("{stem}@{digest}"))
 }

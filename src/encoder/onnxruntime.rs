@@ -13,6 +13,8 @@ use super::model_file::ModelFile;
 use super::{Error, RuntimeKind};
 
 const NAME: &str = "onnxruntime";
+/// The setting of a session that names the folder of weights in files of their own.
+const WEIGHTS_FOLDER: &str = "session.model_external_initializers_file_folder_path";
 
 /// The loaded library, or why it could not be loaded. It is loaded once per process.
 static LOADED: OnceLock<Result<Environment, String>> = OnceLock::new();
@@ -42,6 +44,15 @@ impl OnnxRuntime {
         let builder = Session::builder(environment).map_err(|error| failed(&error))?;
         let mut builder = builder
             .with_intra_threads(runtime.threads)
+            .map_err(|error| failed(&error))?;
+
+        // A copy in memory finds the files of its weights by the folder of the model.
+        let folder = file
+            .parent()
+            .filter(|folder| !folder.as_os_str().is_empty());
+        let folder = folder.unwrap_or(Path::new(".")).to_string_lossy();
+        builder = builder
+            .with_config_entry(WEIGHTS_FOLDER, folder)
             .map_err(|error| failed(&error))?;
 
         // onnxruntime returns declared outputs only. For an inner value,

@@ -39,7 +39,11 @@ impl Tract {
         let shape: Vec<usize> = std::iter::once(1).chain(fixed).collect();
 
         let plan = || {
+            // What a file says of the shapes of inner values is left over from its export, and wrong
+            // where the batch was open then: tract derives them itself.
             tract_onnx::onnx()
+                .with_ignore_value_info(true)
+                .with_ignore_output_shapes(true)
                 .model_for_path(file)
                 .and_then(|mut model| {
                     model.select_outputs_by_name(names)?;
@@ -58,7 +62,11 @@ impl Tract {
         let model = std::panic::catch_unwind(plan).map_err(|_| {
             wrong("cannot be run by tract, which stopped while it planned the model".to_owned())
         })?;
-        let model = model.map_err(|error| wrong(format!("cannot be run by tract: {error:#}")))?;
+        let model = model.map_err(|error| {
+            wrong(format!(
+                "cannot be run by tract: {error:#}; --runtime onnxruntime may run it"
+            ))
+        })?;
         Ok(Self {
             model,
             names: names.to_vec(),

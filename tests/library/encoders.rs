@@ -399,7 +399,65 @@ fn a_layer_that_does_not_count_images_is_refused() {
         );
         let message = outside.map(|_| ()).unwrap_err().to_string();
 
-        assert!(message.contains("weights in another file"), "{message}");
+        assert!(
+            message.contains("outside.bin") && message.contains("beside the model"),
+            "{message}"
+        );
+    }
+}
+
+/// Oracle: NumPy, as for the same model in one file; and the definition of an identity: other weights
+/// are another encoder.
+#[test]
+#[cfg_attr(
+    not(any(feature = "onnx", feature = "onnxruntime")),
+    ignore = "built without a runtime of models"
+)]
+fn weights_may_lie_beside_the_model() {
+    let expected = Tensors::open(&golden().join("encoder/expected.safetensors"));
+    let images = tiny_images();
+    let clips: Vec<Vec<&RgbImage>> = images.iter().map(|image| vec![image]).collect();
+    let whole = golden().join("encoder");
+
+    for runtime in runtimes() {
+        // A declared output, and an inner value, which one runtime takes from a copy in memory.
+        for (name, grid) in [("map", "map_grid2x2"), ("hidden", "hidden_mean")] {
+            let pooling = if name == "map" { "grid2x2" } else { "mean" };
+            let task = tiny("beside.onnx", vec![layer(name, pooling)], 1);
+            let encoder = Encoder::model(task, &runtime).unwrap();
+            let rows = encoder.encode(&clips).unwrap();
+            close(name, &rows, &expected.rows(grid), 1e-5);
+        }
+
+        let copy = tempfile::tempdir().unwrap();
+        let model = copy.path().join("beside.onnx");
+        let weights = copy.path().join("beside.bin");
+        std::fs::copy(whole.join("beside.onnx"), &model).unwrap();
+        let mut bytes = std::fs::read(whole.join("beside.bin")).unwrap();
+        std::fs::write(&weights, &bytes).unwrap();
+        let id = |file: &Path| {
+            let mut task = tiny("beside.onnx", vec![layer("map", "mean")], 1);
+            task.file = file.to_owned();
+            Encoder::model(task, &runtime).map(|encoder| encoder.id().to_owned())
+        };
+        assert_eq!(id(&model).unwrap(), id(&whole.join("beside.onnx")).unwrap());
+
+        bytes[0] ^= 1;
+        std::fs::write(&weights, &bytes).unwrap();
+        assert_ne!(id(&model).unwrap(), id(&whole.join("beside.onnx")).unwrap());
+
+        // A model does not make the program read what lies elsewhere.
+        let graph = std::fs::read(&model).unwrap();
+        let at = graph.windows(10).position(|w| w == b"beside.bin").unwrap();
+        let mut elsewhere = graph;
+        for place in (0..elsewhere.len() - 10).filter(|&place| place >= at) {
+            if elsewhere[place..place + 10] == *b"beside.bin" {
+                elsewhere[place..place + 10].copy_from_slice(b"../top.bin");
+            }
+        }
+        std::fs::write(&model, elsewhere).unwrap();
+        let message = id(&model).unwrap_err().to_string();
+        assert!(message.contains("does not lie in the model's folder"), "{message}");
     }
 }
 

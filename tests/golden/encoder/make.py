@@ -54,7 +54,11 @@ save("turned", [helper.make_node("ReduceMean", ["image"], ["means"], axes=[3], k
                 helper.make_node("Transpose", ["means"], ["turned"], perm=[2, 0, 1]),
                 helper.make_node("ReduceMean", ["image"], ["scalar"], keepdims=0)], {},
      [tensor("image", ["batch", 3, H, W])], [tensor("turned", [H, "batch", 3]), tensor("scalar", [])])
-# weights in another file (which is not there: the model is refused before it is looked for)
+# the same model as torch.onnx.export leaves it: weights in a file beside it, and shapes of inner values with a named batch
+beside = onnx.load(HERE / "image.onnx")
+beside.graph.value_info.append(tensor("hidden", ["batch", C, H // 2, W // 2]))
+onnx.save_model(beside, HERE / "beside.onnx", save_as_external_data=True, location="beside.bin", size_threshold=0)
+# weights in another file, which is not there
 outside = onnx.load(HERE / "image.onnx")
 for weight in outside.graph.initializer:
     if weight.name == "K":

@@ -48,6 +48,13 @@ const FEWEST_BLENDS: usize = 240;
 /// Errors of blends in this many of the strata are independent from frame to frame: they come from
 /// which mapped frames a view lies between. Chosen on calibration rooms.
 const INDEPENDENT_STRATA: usize = 3;
+/// Where mapped frames follow one another faster than this, seconds, such errors average out. Chosen on
+/// calibration rooms.
+const DENSE_STEP_S: f64 = 0.14;
+/// Where they follow more slowly than this, a camera sees the same two frames for a while,
+const SPARSE_STEP_S: f64 = 0.2;
+/// and this share of the covariance stays, however many views there are.
+const LASTING_ON_SPARSE_MAPS: f64 = 0.15;
 /// A view of a camera that passes between mapped frames is nearer to them than a mapped frame is to
 /// its neighbours: the variances of the lowest strata are this share of what the left-out frames
 /// show. Chosen on calibration rooms.
@@ -84,6 +91,8 @@ pub struct MapAnchor {
     pub belief: Belief,
     /// The errors of later anchors of this kind resemble this one's for about so long, seconds.
     pub memory_s: f64,
+    /// The share of the covariance that no number of anchors takes away, 0 to 1.
+    pub lasting_share: f64,
 }
 
 /// How wrong blends are in one room.
@@ -92,6 +101,8 @@ pub struct AnchorModel {
     /// Of the predictors, for the logarithm of the size of the error.
     coefficients: Vector5<f64>,
     strata: Vec<Stratum>,
+    /// Of anchors whose errors are independent.
+    lasting_share: f64,
 }
 
 /// How wrong blends are in one room, for views with and without a latent that looks like the room.
@@ -269,9 +280,11 @@ impl AnchorModel {
             strata.push(stratum);
         }
 
+        let steps: Vec<f64> = left_out.iter().map(|found| found.seconds).collect();
         Some(Self {
             coefficients,
             strata,
+            lasting_share: lasting_share(median(&steps)),
         })
     }
 
@@ -291,6 +304,11 @@ impl AnchorModel {
                 covariance,
             },
             memory_s,
+            lasting_share: if memory_s > 0.0 {
+                1.0
+            } else {
+                self.lasting_share
+            },
         }
     }
 
@@ -338,7 +356,14 @@ pub fn calibrated_anchor(error_model: &ErrorModel, blend: &Blend) -> MapAnchor {
             covariance: errors.covariance,
         },
         memory_s: ASSUMED_MEMORY_S,
+        lasting_share: 1.0,
     }
+}
+
+/// The share of independent errors that lasts, in a map with so many seconds from frame to frame.
+fn lasting_share(step_s: f64) -> f64 {
+    let sparseness = (step_s - DENSE_STEP_S) / (SPARSE_STEP_S - DENSE_STEP_S);
+    LASTING_ON_SPARSE_MAPS * sparseness.clamp(0.0, 1.0)
 }
 
 impl Stratum {

@@ -206,7 +206,11 @@ impl Tracker {
         view: &MatchedView<'_>,
         gravity: Option<&CountedGravity>,
     ) -> CountedAnchor {
-        let MapAnchor { belief, memory_s } = view.matched.anchor;
+        let MapAnchor {
+            belief,
+            memory_s,
+            lasting_share,
+        } = view.matched.anchor;
         let feature = view.feature.filter(|_| view.matched.is_certain);
         let by_reader = self.maps[view.room].pose_by_reader(feature);
         let mut belief = by_reader.unwrap_or_else(|| match &state.recent_matches {
@@ -239,11 +243,7 @@ impl Tracker {
                 covariance: belief.covariance * inflation,
                 ..belief
             },
-            lasting: if memory_s > 0.0 {
-                belief.covariance
-            } else {
-                Matrix6::zeros()
-            },
+            lasting: belief.covariance * lasting_share,
         }
     }
 
