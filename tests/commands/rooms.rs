@@ -2,9 +2,11 @@
 
 use std::path::Path;
 
-use crate::program::{refuses, succeeds};
+use crate::program::{refuses, seese3, succeeds};
 use crate::support::{golden, json, npy};
-use ndarray::Array2;
+use ndarray::{Array2, Array3};
+use seese3::encoder::encode_png;
+use seese3_core::image::RgbImage;
 
 fn path(folder: &Path, name: &str) -> String {
     folder.join(name).to_str().unwrap().to_owned()
@@ -563,4 +565,84 @@ fn models_need_a_build_that_can_run_them() {
             &["--features full"],
         );
     }
+}
+
+/// A folder of one's own: images of a far wall of waves that a camera turns before, and poses that say
+/// so, or their inverse.
+fn looking_about(folder: &Path, is_inverted: bool) {
+    std::fs::create_dir_all(folder.join("images")).unwrap();
+    let mut poses = Array3::zeros((60, 4, 4));
+    for row in 0..60 {
+        let time = row as f64;
+        let right = 0.3 * (time / 5.0).sin();
+        let up = 0.2 * (time / 7.0).cos();
+        let turn =
+            nalgebra::UnitQuaternion::from_scaled_axis(nalgebra::Vector3::new(up, right, 0.0));
+
+        // A wall far away: its directions in the world are all that counts.
+        let mut bytes = Vec::new();
+        for y in 0..96 {
+            for x in 0..128 {
+                let seen = nalgebra::Vector3::new(f64::from(x) - 63.5, f64::from(y) - 47.5, 100.0);
+                let wall = turn * seen;
+                let [x, y] = [wall.x / wall.z, wall.y / wall.z];
+                let wave = (21.0 * x).sin() * (17.0 * y).cos() + (9.0 * x + 7.0 * y).sin();
+                bytes.extend([(120.0 + 50.0 * wave) as u8; 3]);
+            }
+        }
+        let picture = RgbImage {
+            width: 128,
+            height: 96,
+            bytes,
+        };
+        let file = folder.join(format!("images/{row}.png"));
+        std::fs::write(file, encode_png(&picture).unwrap()).unwrap();
+
+        let stated = if is_inverted { turn.inverse() } else { turn };
+        let matrix = stated.to_homogeneous();
+        for (at, value) in poses
+            .index_axis_mut(ndarray::Axis(0), row)
+            .indexed_iter_mut()
+        {
+            *value = matrix[at];
+        }
+    }
+    ndarray_npy::write_npy(folder.join("poses.npy"), &poses).unwrap();
+}
+
+/// Oracle: the poses by which the images were drawn, and their inverse.
+#[test]
+fn inverted_poses_are_named_at_import_and_by_check() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = path(folder.path(), "store");
+    for (name, is_inverted) in [("right", false), ("wrong", true)] {
+        looking_about(&folder.path().join(name), is_inverted);
+    }
+
+    let import = |room: &str, more: &[&str]| {
+        let place = path(folder.path(), room);
+        let arguments = ["import", "folder", &place, "--store", &store, "--replace"];
+        let output = seese3(&[&arguments, more].concat());
+        assert!(output.status.success());
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let check =
+        |room: &str| seese3(&["check", "room", "--store", &store, "--room", room, "--json"]);
+
+    assert_eq!(import("right", &[]), "");
+    assert!(check("right").status.success());
+
+    let warned = import("wrong", &[]);
+    assert!(warned.contains("contradict the poses"), "{warned}");
+    assert!(warned.contains("--poses camera_from_world"), "{warned}");
+
+    let checked = check("wrong");
+    assert!(!checked.status.success());
+    let said: serde_json::Value = serde_json::from_slice(&checked.stdout).unwrap();
+    assert_eq!(said["images"]["verdict"], "other_convention");
+    assert_eq!(said["images"]["sizes"][0]["count"], 60);
+
+    // Read as the warning says, all is well.
+    assert_eq!(import("wrong", &["--poses", "camera_from_world"]), "");
+    assert!(check("wrong").status.success());
 }

@@ -457,7 +457,10 @@ fn weights_may_lie_beside_the_model() {
         }
         std::fs::write(&model, elsewhere).unwrap();
         let message = id(&model).unwrap_err().to_string();
-        assert!(message.contains("does not lie in the model's folder"), "{message}");
+        assert!(
+            message.contains("does not lie in the model's folder"),
+            "{message}"
+        );
     }
 }
 

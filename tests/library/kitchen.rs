@@ -12,15 +12,20 @@ use rayon::prelude::*;
 use seese3::datasets::{
     Reader, SevenScenes, Unusable, read_features, read_poses, read_seven_scenes,
 };
+use seese3::encoder::read_image;
 use seese3_core::adapter::{Preset, Reading};
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{Protocol, evaluate};
 use seese3_core::features::{FeatureSource, Features};
-use seese3_core::geometry::body_twist;
+use seese3_core::geometry::{Pose, body_twist};
+use seese3_core::image_motion::{SmallImage, align};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{IndexKind, Navigator, RetrievalMetric, StepKind};
-use seese3_core::room::{Provenance, Room, RoomId, Timeline};
+use seese3_core::pose_check::{
+    Convention, Direction, ObservedPair, QuaternionOrder, Verdict, check, pairs_to_look_at,
+};
+use seese3_core::room::{FrameId, Provenance, Room, RoomId, Timeline};
 use seese3_core::splits::Split;
 use seese3_core::statistics::mean;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
@@ -231,5 +236,73 @@ fn the_pose_files_give_the_poses_of_the_array() {
 
     for (a, b) in from_array.frames.poses.iter().zip(&from_files.frames.poses) {
         assert!((a.to_homogeneous() - b.to_homogeneous()).abs().max() < 1e-9);
+    }
+}
+
+/// Oracle: the convention in which the published poses were written down again, each of the usual ones.
+#[test]
+#[ignore = "needs the folder of large inputs: SEESE3_SHARED or ../shared"]
+fn photographs_name_the_convention_of_poses() {
+    let folder = shared().join("rooms/kitchen");
+    let mut reader = Reader {
+        unusable: Unusable::Refuse,
+        progress: &mut |_, _| (),
+    };
+    let read = read_seven_scenes(&folder, &SevenScenes::default(), &mut reader).unwrap();
+    let root = folder.canonicalize().unwrap();
+    let id = RoomId::new("kitchen").unwrap();
+    let room = Room::new(id, read.frames, Provenance::default()).unwrap();
+
+    let small = |frame: FrameId| {
+        let image = read_image(&root, &room.images()[frame.row()]).unwrap();
+        SmallImage::of(&image).unwrap()
+    };
+    let observed: Vec<ObservedPair> = pairs_to_look_at(&room)
+        .into_par_iter()
+        .filter_map(|(first, second)| {
+            let found = align(&small(first), &small(second))?;
+            Some(ObservedPair {
+                first,
+                second,
+                motion: found.motion,
+                correlation: found.correlation,
+            })
+        })
+        .collect();
+    assert!(observed.len() > 80);
+
+    let usual = Convention::default();
+    for convention in Convention::all() {
+        // Poses that are the published ones when they are read in the convention.
+        let turn = Convention {
+            direction: Direction::WorldFromCamera,
+            quaternions: QuaternionOrder::Stated,
+            ..convention
+        }
+        .to_world_from_camera(&Pose::identity());
+        let written = room.poses().iter().map(|pose| {
+            let mut written = pose * turn.inverse();
+            if convention.direction == Direction::CameraFromWorld {
+                written = written.inverse();
+            }
+            if convention.quaternions == QuaternionOrder::ScalarFirst {
+                let q = written.rotation.quaternion();
+                let places = nalgebra::Quaternion::new(q.k, q.w, q.i, q.j);
+                written.rotation = nalgebra::UnitQuaternion::from_quaternion(places);
+            }
+            written
+        });
+        let written: Vec<Pose> = written.collect();
+
+        let verdict = check(&written, usual, &observed).verdict;
+        match verdict {
+            Verdict::Agrees(seen) => {
+                assert_eq!(convention, usual);
+                // The sensor's focal length is 525 to 585 pixels of 640.
+                assert!((0.75..1.0).contains(&seen.focal), "{seen:?}");
+            }
+            Verdict::OtherConvention { likely, .. } => assert_eq!(likely[0], convention),
+            other => panic!("{convention:?}: {other:?}"),
+        }
     }
 }

@@ -57,7 +57,7 @@ save("turned", [helper.make_node("ReduceMean", ["image"], ["means"], axes=[3], k
 # the same model as torch.onnx.export leaves it: weights in a file beside it, and shapes of inner values with a named batch
 beside = onnx.load(HERE / "image.onnx")
 beside.graph.value_info.append(tensor("hidden", ["batch", C, H // 2, W // 2]))
-onnx.save_model(beside, HERE / "beside.onnx", save_as_external_data=True, location="beside.bin", size_threshold=0)
+onnx.save_model(beside, HERE / "beside.onnx", save_as_external_data=True, location="beside.bin", size_threshold=100)
 # weights in another file, which is not there
 outside = onnx.load(HERE / "image.onnx")
 for weight in outside.graph.initializer:
