@@ -195,20 +195,7 @@ struct Destination {
 impl Import {
     pub async fn run(self) -> anyhow::Result<()> {
         match self.format {
-            Format::Scannet(Plain { path, poses, to }) => {
-                let recording = to.read(|reader| {
-                    // A .sens file holds a whole scan; otherwise an exporter has unpacked it into
-                    // a folder.
-                    if path.is_file() {
-                        datasets::read_sens(&path, reader)
-                    } else {
-                        datasets::read_scannet(&path, reader)
-                    }
-                })?;
-
-                to.publish("scannet", &path, recording, poses.direction)
-                    .await
-            }
+            Format::Scannet(plain) => plain.import("scannet", scannet).await,
             Format::Arkitscenes(plain) => {
                 plain
                     .import("arkitscenes", datasets::read_arkitscenes)
@@ -218,69 +205,89 @@ impl Import {
             Format::TwelveScenes(plain) => {
                 plain.import("12scenes", datasets::read_twelve_scenes).await
             }
-            Format::SevenScenes(Seven {
-                path,
-                sequence,
-                rgb_from_depth,
-                poses,
-                to,
-            }) => {
-                let choice = SevenScenes {
-                    sequence,
-                    rgb_from_depth,
-                };
-                let recording =
-                    to.read(|reader| datasets::read_seven_scenes(&path, &choice, reader))?;
-
-                to.publish("7scenes", &path, recording, poses.direction)
-                    .await
-            }
+            Format::SevenScenes(seven) => seven.import().await,
             Format::Folder(plain) => {
                 plain
                     .import("folder", |path, _| datasets::read_folder(path))
                     .await
             }
-            Format::Colmap(Colmap {
-                path,
-                images,
-                poses,
-                to,
-            }) => {
-                let recording =
-                    to.read(|reader| datasets::read_colmap(&path, images.as_deref(), reader))?;
-                to.publish("colmap", &path, recording, poses.direction)
-                    .await
-            }
+            Format::Colmap(colmap) => colmap.import().await,
             Format::Transforms(plain) => {
                 plain.import("transforms", datasets::read_transforms).await
             }
-            Format::Kitti(KittiFiles {
-                path,
-                images,
-                times,
-                poses,
-                to,
-            }) => {
-                let beside = Kitti { images, times };
-                let recording = to.read(|reader| datasets::read_kitti(&path, &beside, reader))?;
-                to.publish("kitti", &path, recording, poses.direction).await
-            }
-            Format::Euroc(Euroc {
-                path,
-                device,
-                poses,
-                to,
-            }) => {
-                let recording = to.read(|reader| datasets::read_euroc(&path, &device, reader))?;
-                to.publish("euroc", &path, recording, poses.direction).await
-            }
+            Format::Kitti(kitti) => kitti.import().await,
+            Format::Euroc(euroc) => euroc.import().await,
             Format::Numpy(numpy) => numpy.import().await,
-            Format::Bundle(Plain { path, poses, to }) => {
-                let recording = datasets::read_bundle(&path)?;
-                to.publish("bundle", &path, recording, poses.direction)
+            Format::Bundle(plain) => {
+                plain
+                    .import("bundle", |path, _| datasets::read_bundle(path))
                     .await
             }
         }
+    }
+}
+
+/// A `.sens` file holds a whole scan; otherwise an exporter has unpacked it into a folder.
+fn scannet(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, datasets::Error> {
+    if path.is_file() {
+        datasets::read_sens(path, reader)
+    } else {
+        datasets::read_scannet(path, reader)
+    }
+}
+
+impl Seven {
+    async fn import(self) -> anyhow::Result<()> {
+        let choice = SevenScenes {
+            sequence: self.sequence,
+            rgb_from_depth: self.rgb_from_depth,
+        };
+        let read =
+            |reader: &mut Reader<'_>| datasets::read_seven_scenes(&self.path, &choice, reader);
+        let recording = self.to.read(read)?;
+
+        self.to
+            .publish("7scenes", &self.path, recording, self.poses.direction)
+            .await
+    }
+}
+
+impl Colmap {
+    async fn import(self) -> anyhow::Result<()> {
+        let read = |reader: &mut Reader<'_>| {
+            datasets::read_colmap(&self.path, self.images.as_deref(), reader)
+        };
+        let recording = self.to.read(read)?;
+
+        self.to
+            .publish("colmap", &self.path, recording, self.poses.direction)
+            .await
+    }
+}
+
+impl KittiFiles {
+    async fn import(self) -> anyhow::Result<()> {
+        let beside = Kitti {
+            images: self.images,
+            times: self.times,
+        };
+        let read = |reader: &mut Reader<'_>| datasets::read_kitti(&self.path, &beside, reader);
+        let recording = self.to.read(read)?;
+
+        self.to
+            .publish("kitti", &self.path, recording, self.poses.direction)
+            .await
+    }
+}
+
+impl Euroc {
+    async fn import(self) -> anyhow::Result<()> {
+        let read = |reader: &mut Reader<'_>| datasets::read_euroc(&self.path, &self.device, reader);
+        let recording = self.to.read(read)?;
+
+        self.to
+            .publish("euroc", &self.path, recording, self.poses.direction)
+            .await
     }
 }
 

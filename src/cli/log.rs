@@ -85,7 +85,10 @@ pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
         // A request is logged once, when its span closes.
         .with_span_events(FmtSpan::CLOSE)
         .with_writer(writer)
-        .with_ansi(io::stderr().is_terminal())
+        .with_ansi(
+            io::stderr().is_terminal()
+                && std::env::var_os("NO_COLOR").is_none_or(|set| set.is_empty()),
+        )
         // It would print to standard error, and panic where that cannot be written.
         .log_internal_errors(false);
     let log = match format {

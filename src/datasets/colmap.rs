@@ -214,10 +214,11 @@ impl Model {
     fn camera(&self, width: f64, height: f64, numbers: &[f64]) -> Camera {
         // A fisheye is no pinhole, whatever its focal length.
         let is_pinhole = !self.name.contains("FISHEYE") && self.name != "FOV";
-        let pinhole = match numbers {
-            _ if !is_pinhole => None,
-            &[x, y, cx, cy, ..] if self.has_two_focals => Some([x, y, cx, cy]),
-            &[focal, cx, cy, ..] if !self.has_two_focals => Some([focal, focal, cx, cy]),
+        let pinhole = match *numbers {
+            [x, y, cx, cy, ..] if is_pinhole && self.has_two_focals => Some([x, y, cx, cy]),
+            [focal, cx, cy, ..] if is_pinhole && !self.has_two_focals => {
+                Some([focal, focal, cx, cy])
+            }
             _ => None,
         };
 
