@@ -81,14 +81,14 @@ pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| {
         EnvFilter::new("info,hnsw_rs=warn,opentelemetry=warn,opentelemetry_sdk=warn")
     });
+    // As no-color.org asks: any text in NO_COLOR means none.
+    let no_colour = std::env::var_os("NO_COLOR").is_some_and(|set| !set.is_empty());
+    let is_coloured = io::stderr().is_terminal() && !no_colour;
     let log = tracing_subscriber::fmt::layer()
         // A request is logged once, when its span closes.
         .with_span_events(FmtSpan::CLOSE)
         .with_writer(writer)
-        .with_ansi(
-            io::stderr().is_terminal()
-                && std::env::var_os("NO_COLOR").is_none_or(|set| set.is_empty()),
-        )
+        .with_ansi(is_coloured)
         // It would print to standard error, and panic where that cannot be written.
         .log_internal_errors(false);
     let log = match format {

@@ -21,7 +21,7 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
         "direct.",
         "magnit.",
         "train R²",
-        "mean R²",
+        "R² of mean",
         "Hit@0.1",
         "s",
     ];
