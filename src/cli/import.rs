@@ -552,6 +552,12 @@ impl Destination {
             report.look_at_images(&room, Path::new(&recording.images_root), &stated, read_as);
         }
         report.say();
+        if format == "colmap" && self.read_as.has_no_scale() {
+            eprintln!(
+                "warning: COLMAP's unit of length is arbitrary, and everything here is in metres: give --scale \
+                 FACTOR, or --scale 1 if the model was aligned with known positions"
+            );
+        }
 
         // Publishing the same content again makes no new revision, so an import can safely be
         // repeated.

@@ -18,8 +18,8 @@ pub struct PoseOptions {
     #[arg(long, value_name = "DEGREES", default_value_t = 0, value_parser = quarter_turns)]
     images_turned: u16,
     /// Multiply all translations by this, to get metres: 0.001 for millimetres
-    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = scale)]
-    scale: f64,
+    #[arg(long, value_name = "FACTOR", value_parser = scale)]
+    scale: Option<f64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -93,11 +93,16 @@ impl PoseOptions {
         }
     }
 
+    /// Whether nothing was said of the unit of translations.
+    pub fn has_no_scale(&self) -> bool {
+        self.scale.is_none()
+    }
+
     /// Poses with their translations in metres, still in the convention in which they are stated.
     pub fn scaled(&self, poses: &[Pose]) -> Vec<Pose> {
         let scaled = poses.iter().map(|pose| {
             let mut pose = *pose;
-            pose.translation.vector *= self.scale;
+            pose.translation.vector *= self.scale.unwrap_or(1.0);
             pose
         });
         scaled.collect()

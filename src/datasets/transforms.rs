@@ -58,8 +58,11 @@ pub fn read_transforms(path: &Path, reader: &mut Reader<'_>) -> Result<Recording
         problem,
     };
 
-    let transforms: Transforms = serde_json::from_slice(&read_bytes(&file)?)
-        .map_err(|error| malformed(error.to_string()))?;
+    // Some editors put a byte order mark before the text.
+    let content = read_bytes(&file)?;
+    let text = content.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&content);
+    let transforms: Transforms =
+        serde_json::from_slice(text).map_err(|error| malformed(error.to_string()))?;
     let mut frames = transforms.frames;
     sort_naturally(&mut frames, |frame| &frame.file_path);
 
