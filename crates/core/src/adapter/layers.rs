@@ -49,6 +49,11 @@ pub(super) fn linear<T: Real>(
     weight: &Array2<T>,
     bias: &Array2<T>,
 ) -> Array2<T> {
+    // A product of matrices first copies the weight into blocks, which a single row does not repay.
+    if input.nrows() == 1 {
+        return weight.dot(&input.row(0)).insert_axis(Axis(0)) + bias;
+    }
+
     input.dot(&weight.t()) + bias
 }
 

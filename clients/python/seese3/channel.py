@@ -1,0 +1,104 @@
+"""How a client connects: TLS, tokens, message sizes, and which calls are made again when a server does not answer.
+
+Reads are made again after UNAVAILABLE and RESOURCE_EXHAUSTED, at most three times, each time after a longer wait.
+Changes of the catalog carry a request id, with which a server gives the same change the same answer, so that they are
+made again too. Uploads and other streams are not: a tracking stream resumes by its token instead (see `Track`).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import grpc
+
+# A page of frames with thumbnails, or a batch of answers, may be larger than the 4 MiB that gRPC allows by itself.
+MESSAGE_BYTES = 64 << 20
+
+RETRIED = {
+    "CatalogService": (
+        "ListRooms",
+        "GetRoom",
+        "ListFrames",
+        "ListAdapters",
+        "GetAdapter",
+        "SetDefault",
+        "RollBackDefault",
+        "DeleteRoom",
+        "DeleteAdapter",
+    ),
+    "NavigationService": ("Navigate", "BatchNavigate"),
+    "LocalizationService": ("Localize", "Relocalize"),
+    "OdometryService": ("EstimateMotion", "Encode"),
+    "EvaluationService": ("ScorePredictions",),
+}
+
+
+@dataclass(frozen=True)
+class Tls:
+    """Certificates in PEM files: whom to trust, and who the client is, if the server asks for that.
+
+    Without `authorities`, those that gRPC brings along are trusted.
+    """
+
+    authorities: Path | str | None = None
+    certificate: Path | str | None = None
+    key: Path | str | None = None
+
+
+def _credentials(tls: Tls) -> grpc.ChannelCredentials:
+    if (tls.certificate is None) != (tls.key is None):
+        raise ValueError("tls: a client's certificate and its key belong together; give both or neither")
+
+    def content(path: Path | str | None) -> bytes | None:
+        return None if path is None else Path(path).read_bytes()
+
+    return grpc.ssl_channel_credentials(content(tls.authorities), content(tls.key), content(tls.certificate))
+
+
+def _options(retries: int) -> list[tuple[str, Any]]:
+    methods = [
+        {"service": f"seese3.v1.{service}", "method": method} for service, names in RETRIED.items() for method in names
+    ]
+    policy = {
+        "maxAttempts": retries + 1,
+        "initialBackoff": "0.1s",
+        "maxBackoff": "2s",
+        "backoffMultiplier": 3,
+        "retryableStatusCodes": ["UNAVAILABLE", "RESOURCE_EXHAUSTED"],
+    }
+    config = {"methodConfig": [{"name": methods, "retryPolicy": policy}]} if retries else {}
+    return [
+        ("grpc.service_config", json.dumps(config)),
+        ("grpc.enable_retries", int(retries > 0)),
+        ("grpc.max_receive_message_length", MESSAGE_BYTES),
+        ("grpc.max_send_message_length", MESSAGE_BYTES),
+    ]
+
+
+def _check(address: str, retries: int) -> None:
+    host, colon, port = address.rpartition(":")
+    if "://" in address or not (colon and host and port.isdigit()):
+        raise ValueError(f"address: {address!r} is no server address; write HOST:PORT, for instance 127.0.0.1:50051")
+    if not 0 <= retries <= 4:
+        raise ValueError(f"retries: {retries} is not 0 to 4")
+
+
+def open_sync(address: str, tls: Tls | None, retries: int) -> Any:
+    """A channel for the synchronous client."""
+    _check(address, retries)
+    if tls is None:
+        return grpc.insecure_channel(address, _options(retries))
+    return grpc.secure_channel(address, _credentials(tls), _options(retries))
+
+
+def open_async(address: str, tls: Tls | None, retries: int) -> Any:
+    """A channel for the asynchronous client."""
+    import grpc.aio
+
+    _check(address, retries)
+    if tls is None:
+        return grpc.aio.insecure_channel(address, _options(retries))
+    return grpc.aio.secure_channel(address, _credentials(tls), _options(retries))

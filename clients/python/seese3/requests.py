@@ -1,0 +1,313 @@
+"""Requests on the wire from Python's values. A `ValueError` names the argument to change."""
+
+from __future__ import annotations
+
+import hashlib
+import uuid
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from .answers import Camera, FeatureSource
+from .geometry import wire_pose, wire_twist, wire_vector
+from .v1 import catalog_pb2, geometry_pb2, navigation_pb2, odometry_pb2
+from .views import View, wire_view
+
+# About so many bytes of frames go into one message of an upload.
+UPLOAD_BYTES = 1 << 20
+
+Bytes: TypeAlias = "bytes | Path"
+
+
+def enum_value(enum: Any, prefix: str, word: str | None, argument: str) -> int:
+    """The value of an enum by its word: "snap" is MODE_SNAP; None is the server's default."""
+    if word is None:
+        return 0
+    words: dict[str, int] = {name.removeprefix(prefix).lower(): number for name, number in enum.items() if number != 0}
+    if word not in words:
+        raise ValueError(f"{argument}: {word!r} is none of {', '.join(words)}")
+    return words[word]
+
+
+def mode(word: str | None) -> Any:
+    return enum_value(navigation_pb2.Mode, "MODE_", word, "mode")
+
+
+def pinhole(camera: Camera | None) -> geometry_pb2.Pinhole | None:
+    if camera is None:
+        return None
+    return geometry_pb2.Pinhole(
+        width=camera.width,
+        height=camera.height,
+        focal=camera.focal,
+        centre_x=camera.centre_x,
+        centre_y=camera.centre_y,
+    )
+
+
+def displacement(
+    to: int | None, twist: npt.ArrayLike | None, pose: npt.ArrayLike | None
+) -> navigation_pb2.Displacement:
+    """A motion by the frame at its end, as one twist (6,) or several (n, 6), or by the pose at its end."""
+    if (to is not None) + (twist is not None) + (pose is not None) != 1:
+        raise ValueError("give exactly one of to (a frame's row), twist and pose")
+    if to is not None:
+        return navigation_pb2.Displacement(target_frame_id=to)
+    if pose is not None:
+        return navigation_pb2.Displacement(target_pose=wire_pose(pose))
+
+    twists = np.asarray(twist, dtype=np.float64)
+    if twists.ndim == 1:
+        return navigation_pb2.Displacement(twist=wire_twist(twists))
+    return navigation_pb2.Displacement(twists=navigation_pb2.TwistList(twists=[wire_twist(row) for row in twists]))
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """One navigation: from a view, by a motion. See `Client.navigate` for what the arguments mean."""
+
+    source: View
+    to: int | None = None
+    twist: npt.ArrayLike | None = None
+    pose: npt.ArrayLike | None = None
+    source_pose: npt.ArrayLike | None = None
+    steps: int | None = None
+    mode: str | None = None
+    reading: str | None = None
+    navigator: str = ""
+    top_k: int | None = None
+    exclude_source: bool = False
+    exclude_radius: int = 0
+    thresholds: Sequence[float] = ()
+
+    def request(self, room: str, adapter: str) -> navigation_pb2.NavigateRequest:
+        return navigation_pb2.NavigateRequest(
+            room=room,
+            adapter=adapter,
+            source=wire_view(self.source),
+            source_pose=None if self.source_pose is None else wire_pose(self.source_pose),
+            displacement=displacement(self.to, self.twist, self.pose),
+            steps=self.steps,
+            mode=mode(self.mode),
+            reading=enum_value(navigation_pb2.Reading, "READING_", self.reading, "reading"),  # type: ignore[arg-type]
+            navigator=self.navigator,
+            top_k=self.top_k,
+            exclude_source=self.exclude_source,
+            exclude_radius=self.exclude_radius,
+            thresholds=self.thresholds,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class InitialPose:
+    """A known pose (4, 4) of the camera in the map, or of the base if `frame` is its name, with its deviations."""
+
+    pose: npt.ArrayLike
+    translation_deviation_m: float | None = None
+    rotation_deviation_rad: float | None = None
+    frame: str = ""
+
+    def message(self) -> odometry_pb2.InitialPose:
+        return odometry_pb2.InitialPose(
+            pose=wire_pose(self.pose, child_frame=self.frame),
+            translation_deviation_m=self.translation_deviation_m,
+            rotation_deviation_rad=self.rotation_deviation_rad,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RigCamera:
+    """Another camera on the robot: its name, its pose (4, 4) on the base, and its intrinsics if they are known."""
+
+    name: str
+    pose: npt.ArrayLike
+    camera: Camera | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TrackConfig:
+    """What a tracking stream is to do. What is left out is chosen by the server."""
+
+    room: str = ""
+    rooms: Sequence[str] = ()
+    adapter: str = ""
+    initial_pose: InitialPose | None = None
+    keyframe_displacement: float | None = None
+    keyframe_frames: int | None = None
+    fusion: str | None = None
+    """"anchors" (the default) or "none"."""
+    newest_only: bool = False
+    """Whether frames that arrive faster than they can be answered are dropped for newer ones."""
+    token_every: int = 1
+    """Which answers bring the token by which a cut stream resumes: every n-th."""
+    base_from_camera: npt.ArrayLike | None = None
+    camera: Camera | None = None
+    gravity_in_map: npt.ArrayLike | None = None
+    other_cameras: Sequence[RigCamera] = ()
+
+    def message(self) -> odometry_pb2.TrackConfig:
+        if self.token_every < 1:
+            raise ValueError("token_every: a stream that can resume needs a token now and then; give 1 or more")
+        keyframes = None
+        if self.keyframe_displacement is not None or self.keyframe_frames is not None:
+            keyframes = odometry_pb2.KeyframePolicy(
+                displacement=self.keyframe_displacement, frames=self.keyframe_frames
+            )
+        others = [
+            odometry_pb2.RigCamera(name=other.name, pose=wire_pose(other.pose), camera=pinhole(other.camera))
+            for other in self.other_cameras
+        ]
+        pressure = odometry_pb2.BACK_PRESSURE_NEWEST if self.newest_only else odometry_pb2.BACK_PRESSURE_UNSPECIFIED
+        return odometry_pb2.TrackConfig(
+            room=self.room,
+            rooms=self.rooms,
+            adapter=self.adapter,
+            initial_pose=self.initial_pose.message() if self.initial_pose else None,
+            keyframes=keyframes,
+            fusion=enum_value(odometry_pb2.Fusion, "FUSION_", self.fusion, "fusion"),  # type: ignore[arg-type]
+            back_pressure=pressure,
+            token_every=self.token_every,
+            base_from_camera=None if self.base_from_camera is None else wire_pose(self.base_from_camera),
+            camera=pinhole(self.camera),
+            gravity_in_map=None if self.gravity_in_map is None else wire_vector(self.gravity_in_map),
+            other_cameras=others,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Odometry:
+    """The pose (4, 4) of the wheels' or another odometry at a frame, and how far it drifts, as shares of the motion."""
+
+    pose: npt.ArrayLike
+    child_frame: str = ""
+    translation_share: float | None = None
+    rotation_share: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Gravity:
+    """The direction of gravity (3,) in the frame of the camera, or of the base if `frame` is its name."""
+
+    direction: npt.ArrayLike
+    frame: str = ""
+    deviation_rad: float | None = None
+
+
+def track_frame(
+    view: View,
+    timestamp_ns: int,
+    sequence: int,
+    odometry: Odometry | None,
+    gravity: Gravity | None,
+    other_views: dict[str, View],
+) -> odometry_pb2.TrackRequest:
+    """A frame of a tracking stream."""
+    measured = None
+    if odometry is not None:
+        measured = odometry_pb2.MeasuredOdometry(
+            pose=wire_pose(odometry.pose, child_frame=odometry.child_frame),
+            translation_share=odometry.translation_share,
+            rotation_share=odometry.rotation_share,
+        )
+    down = None
+    if gravity is not None:
+        down = odometry_pb2.MeasuredGravity(
+            direction=wire_vector(gravity.direction), frame=gravity.frame, deviation_rad=gravity.deviation_rad
+        )
+    others = [odometry_pb2.OtherView(camera=name, view=wire_view(other)) for name, other in other_views.items()]
+    return odometry_pb2.TrackRequest(
+        frame=odometry_pb2.TrackFrame(
+            timestamp_ns=timestamp_ns,
+            sequence=sequence,
+            view=wire_view(view),
+            odometry=measured,
+            gravity=down,
+            other_views=others,
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a navigator of one's own answers to a pair of frames: a latent (k,) to retrieve by, or a frame's row."""
+
+    source: int
+    target: int
+    latent: npt.ArrayLike | None = None
+    frame: int | None = None
+    last_step_frame: int | None = None
+
+
+def new_id() -> str:
+    """A request id, by which a change that is sent again is known as the same one."""
+    return uuid.uuid4().hex
+
+
+def feature_source(source: FeatureSource) -> catalog_pb2.FeatureSource:
+    return catalog_pb2.FeatureSource(**{name: getattr(source, name) for name in FeatureSource.__dataclass_fields__})
+
+
+@dataclass(frozen=True, eq=False)
+class Upload:
+    """A room to upload: poses world_from_camera (n, 4, 4), and features (n, d) by their sources or n images."""
+
+    poses: npt.ArrayLike
+    features: Sequence[tuple[FeatureSource, npt.NDArray[np.floating]]] = ()
+    images: Sequence[Bytes] = ()
+    timestamps_ns: Sequence[int] | npt.NDArray[np.int64] | None = None
+    names: Sequence[str] = ()
+    sequences: Sequence[int] | npt.NDArray[np.integer] | None = None
+
+    def __post_init__(self) -> None:
+        poses = np.asarray(self.poses, dtype="<f8")
+        if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
+            raise ValueError(f"poses: are (n, 4, 4) with at least one frame, not {poses.shape}")
+        counts = {"images": self.images, "names": self.names}
+        counts |= {"timestamps_ns": self.timestamps_ns, "sequences": self.sequences}  # type: ignore[dict-item]
+        for argument, values in counts.items():
+            if values is not None and len(values) not in (0, len(poses)):
+                raise ValueError(f"{argument}: has {len(values)} entries, there are {len(poses)} poses")
+        for source, rows in self.features:
+            if np.asarray(rows).shape != (len(poses), source.dim):
+                shape = np.asarray(rows).shape
+                raise ValueError(f"features: {source.name!r} is ({len(poses)}, {source.dim}), not {shape}")
+        object.__setattr__(self, "poses", poses)
+
+    def messages(self, room: catalog_pb2.RoomUpload) -> Iterator[catalog_pb2.CreateRoomRequest]:
+        """The messages of the upload, the description first and the checksum last."""
+        yield catalog_pb2.CreateRoomRequest(room=room)
+        digest = hashlib.sha256()
+        poses = np.asarray(self.poses)
+        for rows in self._batches():
+            batch = self._batch(slice(rows.start, rows.stop))
+            for content in (batch.poses, *batch.features, *batch.images):
+                digest.update(content)
+            yield catalog_pb2.CreateRoomRequest(frames=batch)
+
+        end = catalog_pb2.UploadEnd(frame_count=len(poses), sha256=digest.digest())
+        yield catalog_pb2.CreateRoomRequest(end=end)
+
+    def _batches(self) -> Iterator[range]:
+        count = len(np.asarray(self.poses))
+        if self.images:
+            # An image may have several megabytes.
+            yield from (range(row, row + 1) for row in range(count))
+            return
+        bytes_per_frame = 128 + sum(4 * source.dim for source, _ in self.features)
+        size = max(1, UPLOAD_BYTES // bytes_per_frame)
+        yield from (range(start, min(start + size, count)) for start in range(0, count, size))
+
+    def _batch(self, rows: slice) -> catalog_pb2.FrameBatch:
+        poses = np.asarray(self.poses)[rows]
+        return catalog_pb2.FrameBatch(
+            poses=poses.tobytes(),
+            features=[np.asarray(values)[rows].astype("<f4").tobytes() for _, values in self.features],
+            images=[image if isinstance(image, bytes) else image.read_bytes() for image in self.images[rows]],
+            timestamps_ns=[] if self.timestamps_ns is None else [int(time) for time in self.timestamps_ns[rows]],
+            frame_names=self.names[rows],
+            sequences=[] if self.sequences is None else [int(number) for number in self.sequences[rows]],
+        )

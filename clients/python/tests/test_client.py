@@ -1,0 +1,237 @@
+"""Every call against the real server."""
+
+import hashlib
+import re
+import secrets
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import seese3
+from conftest import FEATURES, ROOM, ROOMS
+from seese3 import Question
+from seese3.v1 import catalog_pb2, evaluation_pb2, localization_pb2, navigation_pb2, odometry_pb2
+
+
+def test_every_call_of_the_protocol_has_a_method() -> None:
+    source = Path(seese3.client.__file__).read_text()  # type: ignore[attr-defined]
+    modules = (catalog_pb2, evaluation_pb2, localization_pb2, navigation_pb2, odometry_pb2)
+    services = [service for module in modules for service in module.DESCRIPTOR.services_by_name.values()]
+    calls = [method.name for service in services for method in service.methods]
+    assert len(calls) >= 20
+    missing = [name for name in calls if not re.search(rf'\.{name}\b|"{name}"', source)]
+    assert missing == []
+
+
+def test_the_catalog(client: seese3.Client, drawn: Path) -> None:
+    assert [room.name for room in client.rooms()] == list(ROOMS)
+    room = client.room(ROOM)
+    assert room.frame_count == 120 and room.adapters == ("robot",)
+
+    stored = seese3.Store(drawn).room(ROOM)
+    frames = client.frames(ROOM, neighbours_within=0.2)
+    np.testing.assert_allclose(frames.poses, stored.poses, atol=1e-12)
+    assert frames.neighbours is not None
+    near, motion = frames.neighbours[60][0]
+    # The motion is log(P₁⁻¹P₂): of frames so near its translation is that of the relative pose, to a hundredth.
+    relative = np.linalg.inv(stored.poses[60]) @ stored.poses[near]
+    np.testing.assert_allclose(motion[:3], relative[:3, 3], atol=0.01)
+
+    adapter = client.adapter("robot")
+    assert adapter.split == "whole" and adapter.test.overall is None
+    assert {room.name for room in adapter.calibration_rooms} == set(ROOMS[1:])
+
+
+def test_navigation(client: seese3.Client) -> None:
+    answer = client.navigate(ROOM, 20, to=30, steps=2, mode="snap", thresholds=[0.25])
+    assert len(answer.steps) == 2 and answer.mode == "snap"
+    assert answer.steps[-1].error is not None and list(answer.steps[-1].error.within) == [0.25]
+
+    # The same motion as a twist leads to the same frame.
+    assert client.navigate(ROOM, 20, twist=answer.displacement, steps=2, mode="snap").frame.id == answer.frame.id
+
+    batch = client.navigate_batch(ROOM, [Question(20, to=30, steps=2, mode="snap"), Question(20, to=9999)])
+    assert isinstance(batch[0], seese3.Navigation) and batch[0].frame.id == answer.frame.id
+    assert isinstance(batch[1], seese3.NotFoundError)
+
+    seen: list[int] = []
+    way = client.navigate_to(ROOM, 5, goal=60, on_step=lambda step: seen.append(step.step))
+    assert way.outcome == "reached" and seen == [step.step for step in way.steps]
+    assert way.steps[0].start_pose is not None and way.steps[-1].frame is not None
+
+    with pytest.raises(ValueError, match="exactly one of"):
+        client.navigate(ROOM, 5)
+    with pytest.raises(ValueError, match="mode: 'Snap' is none of open_loop, snap, closed_loop"):
+        client.navigate(ROOM, 5, to=6, mode="Snap")
+
+
+def test_localization_of_features_and_images(client: seese3.Client, drawn: Path) -> None:
+    room = seese3.Store(drawn).room(ROOM)
+    assert room.images is not None
+    for view in (room.features[FEATURES][33], room.images[33], room.images[33].read_bytes()):
+        found = client.localize(view, rooms=ROOM, top_k=3)
+        assert found.places[0].frame.id == 33 and len(found.places) == 3
+
+    views = list(room.features[FEATURES][30:34])
+    placed = client.relocalize(views)
+    assert placed.rooms[0].room.name == ROOM
+    assert placed.rooms[0].covariance is not None and placed.rooms[0].covariance.shape == (6, 6)
+    # Of a room that is searched alone there is no second one to compare with.
+    assert client.relocalize(views, rooms=[ROOM]).margin is None
+
+
+def test_motions_and_latents(client: seese3.Client, drawn: Path) -> None:
+    rows = seese3.Store(drawn).room(ROOM).features[FEATURES]
+    encoding = client.encode([3, rows[9]], room=ROOM, with_features=True)
+    assert encoding.features is not None and encoding.features[0] is None
+    np.testing.assert_array_equal(encoding.features[1].values, rows[9])  # type: ignore[union-attr]
+
+    by_rows = client.motion(3, 9, room=ROOM)
+    by_latents = client.motion(*map(seese3.Latent, encoding.latents), room=ROOM)
+    np.testing.assert_allclose(by_rows.twist, by_latents.twist, atol=1e-9)
+    assert by_rows.true_motion is not None and by_latents.true_motion is None and by_rows.covariance is None
+
+
+def test_evaluation_and_predictions_of_ones_own(client: seese3.Client, drawn: Path) -> None:
+    progress: list[tuple[int, int]] = []
+    report = client.evaluate(ROOM, stride=10, on_progress=lambda done, total: progress.append((done, total)))
+    scores = {one.name: one for one in report.navigators}
+    assert scores["oracle"].hits[0.1].rate == 1.0 and progress
+
+    # A navigator that stays where it is scores what the identity scores.
+    pairs = [(row, row + 10) for row in range(110)]
+    mine = client.score(ROOM, [seese3.requests.Prediction(a, b, frame=a) for a, b in pairs])
+    assert mine.r2 is None and mine.n == 110
+    table = report.table()
+    assert list(table.index) == list(scores) and table.loc["oracle", "hit@0.1"] == 1.0
+    assert len(report.plot().lines) == len(scores)
+
+
+def test_errors_say_which_field_and_why(client: seese3.Client) -> None:
+    with pytest.raises(seese3.InvalidFieldError) as error:
+        client.localize(np.zeros(3), rooms=ROOM)
+    assert (error.value.field, error.value.reason) == ("view.feature.values", "INVALID_FIELD")
+    assert isinstance(error.value, ValueError) and error.value.request_id
+
+    with pytest.raises(seese3.NotFoundError, match="did you mean") as missing:
+        client.room("studio7-000")
+    assert missing.value.reason == "NOT_SERVED" and isinstance(missing.value, LookupError)
+
+    with pytest.raises(seese3.DeadlineError):
+        client.evaluate(ROOM, deadline_s=1e-4)
+    with pytest.raises(seese3.PreconditionError):
+        client.delete_room(ROOM)
+
+
+def test_no_server_is_said_so() -> None:
+    with pytest.raises(seese3.UnavailableError, match="is it running"), seese3.Client("127.0.0.1:1", retries=0) as none:
+        none.rooms()
+    for address in ("localhost", "http://127.0.0.1:50051", ":50051", "host:port"):
+        with pytest.raises(ValueError, match="HOST:PORT"):
+            seese3.Client(address)
+
+
+def test_reads_are_made_again_until_the_server_is_there(drawn: Path) -> None:
+    with seese3.serve(drawn) as first:
+        address = first.address
+    # Nobody listens now; a server comes back while the client waits.
+    with seese3.Client(address, retries=4) as client:
+        begun = subprocess.Popen(
+            [seese3.program.program(), "serve", "--store", drawn, "--listen", address], stdout=subprocess.DEVNULL
+        )
+        try:
+            last = time.monotonic() + 30
+            while True:
+                try:
+                    assert len(client.rooms()) == 3
+                    break
+                except seese3.UnavailableError:
+                    assert time.monotonic() < last
+        finally:
+            begun.terminate()
+            begun.wait()
+
+
+def test_changes_of_the_catalog(store: Path) -> None:
+    room = seese3.Store(store).room(ROOM)
+    source, rows = room.sources[FEATURES], room.features[FEATURES]
+    first, rest = slice(0, 80), slice(80, None)
+    with seese3.serve(store, "--writable") as server, server.client(deadline_s=60) as client:
+        upload = seese3.Upload(room.poses[first], [(source, rows[first])])
+        made = client.create_room("copy", upload)
+        assert made.created and made.served and client.room("copy").frame_count == 80
+        assert not client.create_room("copy", upload).created
+
+        more = seese3.Upload(room.poses[rest], [(source, rows[rest])])
+        assert client.create_room("copy", more, extend=True).revision.revision == 2
+        np.testing.assert_array_equal(seese3.Store(store).room("copy").features[FEATURES], rows)
+
+        manifest, weights = seese3.Store(store).adapter_files("robot")
+        assert client.publish_adapter("again", manifest, weights).served
+        assert "again" in [adapter.name for adapter in client.adapters()]
+
+        done: list[int] = []
+        fitted = client.refit_room("copy", features=FEATURES, on_progress=lambda n, _: done.append(n))
+        assert fitted.created and done
+        defaults = client.set_default(room="copy", adapter="again")
+        assert [(one.name, one.adapter) for one in defaults] == [("rooms/copy", "adapters/again")]
+        assert client.room("copy").adapters[0] == "again"
+        assert client.set_default(room="copy", revision=1) and client.room("copy").frame_count == 80
+        assert client.roll_back_default() and client.room("copy").frame_count == 120
+        client.roll_back_default()
+
+        assert client.delete_room("copy", revision=1) == [1]
+        client.delete_adapter(fitted.revision.name)
+        assert client.delete_room("copy") == [2]
+        assert client.delete_adapter("again") == [1]
+        assert [one.name for one in client.rooms()] == list(ROOMS)
+
+
+def test_unfit_uploads_are_refused_before_they_are_sent() -> None:
+    source = seese3.FeatureSource("mine", 3)
+    with pytest.raises(ValueError, match="poses: are"):
+        seese3.Upload(np.eye(4))
+    with pytest.raises(ValueError, match=r"'mine' is \(2, 3\)"):
+        seese3.Upload(np.tile(np.eye(4), (2, 1, 1)), [(source, np.zeros((3, 3)))])
+    with pytest.raises(ValueError, match="names: has 1"):
+        seese3.Upload(np.tile(np.eye(4), (2, 1, 1)), names=["one"])
+
+
+def test_tokens_and_tls(drawn: Path, tmp_path: Path) -> None:
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not there to make a certificate")
+    key, certificate = tmp_path / "key.pem", tmp_path / "cert.pem"
+    request = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", certificate]
+    names = ["-subj", "/CN=localhost", "-addext", "subjectAltName=IP:127.0.0.1", "-days", "2"]
+    # Without this a certificate is one of an authority, which the server's library does not take as its own.
+    names += ["-addext", "basicConstraints=critical,CA:FALSE"]
+    subprocess.run([*request, *names], check=True, capture_output=True)
+
+    token = secrets.token_hex(16)
+    callers = tmp_path / "callers.toml"
+    digest = hashlib.sha256(token.encode()).hexdigest()
+    callers.write_text(f'[[principal]]\nname = "me"\ntoken_sha256 = "{digest}"\nverbs = ["catalog"]\nrooms = ["*"]\n')
+    arguments = ["--tls-cert", certificate, "--tls-key", key, "--auth-file", callers]
+    with seese3.serve(drawn, *arguments) as server:
+        tls = seese3.Tls(authorities=certificate)
+        with server.client(tls=tls, token=token) as client:
+            assert len(client.rooms()) == 3
+        with seese3.Client(server.address, tls=tls) as client, pytest.raises(seese3.ForbiddenError) as error:
+            client.rooms()
+        assert error.value.reason == "UNAUTHENTICATED"
+        with server.client(tls=tls, token=token) as client, pytest.raises(seese3.ForbiddenError) as error:
+            client.localize(0, rooms=ROOM)
+        assert error.value.reason == "FORBIDDEN"
+        with seese3.Client(server.address, retries=0) as client, pytest.raises(seese3.UnavailableError):
+            client.rooms()
+
+
+def test_a_command_that_fails_says_why(tmp_path: Path) -> None:
+    with pytest.raises(seese3.CommandError, match="does not exist") as error:
+        seese3.run("evaluate", "--store", tmp_path / "none", "--room", "kitchen")
+    assert error.value.returncode == 1
+    with pytest.raises(seese3.CommandError, match="does not exist"):
+        seese3.serve(tmp_path / "none")

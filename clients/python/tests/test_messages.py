@@ -1,0 +1,55 @@
+"""Poses and views on the wire."""
+
+import numpy as np
+import pytest
+from seese3.geometry import pose_matrix, wire_pose, wire_twist
+from seese3.v1 import geometry_pb2 as pb
+from seese3.views import Feature, wire_view
+
+
+def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rodrigues' formula."""
+    x, y, z = axis / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def test_a_pose_comes_back_from_the_wire_for_every_angle() -> None:
+    random = np.random.default_rng(1)
+    for angle in (0.0, 1e-9, 0.3, 2.0, np.pi - 1e-9, np.pi):
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_about(random.normal(size=3), angle)
+        pose[:3, 3] = random.normal(size=3)
+        np.testing.assert_allclose(pose_matrix(wire_pose(pose)), pose, atol=1e-12)
+
+
+def test_a_quarter_turn_about_z_is_the_quaternion_of_the_textbook() -> None:
+    pose = np.eye(4)
+    pose[:2, :2] = [[0, -1], [1, 0]]
+    q = wire_pose(pose).orientation
+    np.testing.assert_allclose([q.w, q.x, q.y, q.z], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-15)
+
+
+@pytest.mark.parametrize("pose", [np.eye(3), np.full((4, 4), np.nan), np.diag([1, 1, -1, 1]), 2 * np.eye(4)])
+def test_what_is_no_pose_is_refused(pose: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="a pose is"):
+        wire_pose(pose)
+    with pytest.raises(ValueError, match="a twist is six numbers"):
+        wire_twist(np.zeros(5))
+
+
+@pytest.mark.parametrize("columns", [1, 31, 32, 768, 5000])
+def test_a_feature_packed_by_its_bytes_is_the_message_that_protobuf_makes(columns: int) -> None:
+    row = np.random.default_rng(columns).normal(size=columns).astype(np.float32)
+    expected = pb.View(feature=pb.Feature(values=row.tolist(), source_name="größe"))
+    assert wire_view(Feature(row, "größe")) == expected
+    assert wire_view(row.astype(np.float64)).feature.values == expected.feature.values
+
+
+def test_a_view_that_is_nothing_of_the_kind_is_refused() -> None:
+    for view in ("frame.jpg", True, None, [1.0, 2.0]):
+        with pytest.raises(TypeError, match="a view is"):
+            wire_view(view)  # type: ignore[arg-type]
+    for rows in (np.zeros((2, 3)), np.arange(3)):
+        with pytest.raises(ValueError, match="a feature is one row"):
+            wire_view(rows)

@@ -1,0 +1,140 @@
+"""Stores without a server. What is written here the program reads, and the other way round."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import seese3
+from conftest import FEATURES, ROOM
+
+RANDOM = np.random.default_rng(3)
+
+
+def poses(count: int) -> np.ndarray:
+    angles = np.linspace(0, 1, count)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 0] = poses[:, 2, 2] = np.cos(angles)
+    poses[:, 0, 2] = np.sin(angles)
+    poses[:, 2, 0] = -np.sin(angles)
+    poses[:, :3, 3] = RANDOM.normal(size=(count, 3))
+    return poses
+
+
+def test_a_room_is_read_as_the_program_exports_it(drawn: Path, tmp_path: Path) -> None:
+    seese3.run("export", "numpy", "--store", drawn, "--room", ROOM, "--out", tmp_path / "out")
+    room = seese3.Store(drawn).room(ROOM)
+    np.testing.assert_allclose(room.poses, np.load(tmp_path / "out/poses.npy"), atol=1e-12)
+    np.testing.assert_array_equal(room.features[FEATURES], np.load(tmp_path / f"out/features_{FEATURES}.npy"))
+    assert room.images is not None and room.images[0].is_file()
+
+
+def test_a_room_that_is_written_is_exported_by_the_program(tmp_path: Path) -> None:
+    store = seese3.Store(tmp_path / "store")
+    rows = RANDOM.normal(size=(9, 5)).astype(np.float32)
+    stated = poses(9)
+    camera = seese3.Camera(640, 480, 525.0)
+    times = np.arange(9) * 33_000_000
+    assert store.write_room("hall", stated, {"mine": rows}, timestamps_ns=times, camera=camera).revision == 1
+
+    seese3.run("store", "verify", "--store", store.folder)
+    seese3.run("export", "numpy", "--store", store.folder, "--room", "hall", "--out", tmp_path / "out")
+    np.testing.assert_allclose(np.load(tmp_path / "out/poses.npy"), stated, atol=1e-12)
+    np.testing.assert_array_equal(np.load(tmp_path / "out/features_mine.npy"), rows)
+
+    # The same again is no new revision; other features of the same poses are added to those that were there.
+    assert store.write_room("hall", stated, {"mine": rows}, timestamps_ns=times, camera=camera).revision == 1
+    assert store.write_room("hall", stated, {"other": rows[:, :2]}).revision == 2
+    room = store.room("hall")
+    assert list(room.features) == ["mine", "other"]
+    np.testing.assert_array_equal(room.timestamps_ns, times)
+    assert store.room("hall", 1).features.keys() == {"mine"}
+    seese3.run("store", "verify", "--store", store.folder)
+
+
+def test_a_server_serves_what_was_written(tmp_path: Path) -> None:
+    """Weights of no meaning: the latents that the server computes are those of the definition."""
+    store = seese3.Store(tmp_path)
+    rows = RANDOM.normal(size=(20, 6)).astype(np.float32)
+    source = seese3.FeatureSource("mine", 6)
+    store.write_room("hall", poses(20), {source: rows})
+    shapes = {
+        "phi.0.weight": (8, 6),
+        "phi.0.bias": (8,),
+        "phi.1.weight": (8,),
+        "phi.1.bias": (8,),
+        "phi.3.weight": (7, 8),
+        "phi.3.bias": (7,),
+        "W.weight": (6, 7),
+    }
+    weights = {name: RANDOM.normal(size=shape) for name, shape in shapes.items()}
+    scale = {"target_mean": np.full(6, 0.1), "target_deviation": np.full(6, 0.2)}
+    told = {"source": source, "features": rows, "rooms": {"hall": 1}, "stride": 5, "epochs": 1}
+    store.write_adapter("mine", weights, **scale, **told)
+
+    adapter = store.adapter("mine")
+    with seese3.serve(store.folder) as server, server.client() as client:
+        latents = client.encode(list(rows), adapter="mine").latents
+        np.testing.assert_allclose(latents, adapter.embed(rows), atol=1e-9)
+        motion = client.motion(3, 9, room="hall").twist
+        np.testing.assert_allclose(motion, adapter.motion(latents[3], latents[9])[0], atol=1e-9)
+        # Nothing was held out, so there is no R²: None, and not 0.
+        assert client.adapter("mine").test.overall is None
+
+
+def test_damage_is_noticed(store: Path) -> None:
+    manifest = store / "rooms" / ROOM / "revisions" / "000001.json"
+    text = manifest.read_text()
+    manifest.write_text(text.replace('"frame_count": 120', '"frame_count": 121'))
+    with pytest.raises(seese3.DamagedError, match="checksum"):
+        seese3.Store(store).room(ROOM, 1)
+    manifest.write_text(text[:-50])
+    with pytest.raises(seese3.DamagedError, match="truncated"):
+        seese3.Store(store).room(ROOM, 1)
+
+    weights = next((store / "adapters/robot/objects").iterdir())
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+    with pytest.raises(seese3.DamagedError, match="altered"):
+        seese3.Store(store).adapter("robot")
+
+
+def test_unfit_rooms_are_refused_and_leave_nothing(tmp_path: Path) -> None:
+    store = seese3.Store(tmp_path / "store")
+    good, rows = poses(4), np.zeros((4, 3), np.float32)
+    turned = good.transpose(0, 2, 1)
+    broken = good.copy()
+    broken[2, 0, 3] = np.nan
+    for wrong, features, problem in (
+        (good[:, :3], {"a": rows}, "poses: are"),
+        (turned, {"a": rows}, "transposed"),
+        (broken, {"a": rows}, "row 2"),
+        (good, {"a": rows[:3]}, "features: 'a' is"),
+        (good, {"a": rows * np.nan}, "row 0"),
+        (good, {"../a": rows}, "cannot name"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            store.write_room("hall", wrong, features)
+    with pytest.raises(ValueError, match="cannot name"):
+        store.write_room("../hall", good, {"a": rows})
+    assert not store.folder.exists()
+
+
+def test_of_many_writers_each_gets_a_number_of_its_own(tmp_path: Path) -> None:
+    store = seese3.Store(tmp_path)
+    rooms = [poses(3) for _ in range(12)]
+    with ThreadPoolExecutor(6) as pool:
+        revisions = list(pool.map(lambda one: store.write_room("hall", one, {"a": np.ones((3, 2))}).revision, rooms))
+    assert sorted(revisions) == list(range(1, 13))
+    seese3.run("store", "verify", "--store", store.folder)
+
+
+def test_a_chosen_revision_is_what_the_name_means(tmp_path: Path) -> None:
+    store = seese3.Store(tmp_path)
+    for _ in range(2):
+        store.write_room("hall", poses(3), {"a": np.ones((3, 2))})
+    seese3.run("store", "default", "--store", tmp_path, "rooms/hall/revisions/1")
+    assert store.room("hall").revision.revision == 1
+    assert json.loads((tmp_path / "rooms/hall/revisions/000002.json").read_text())["body"]["revision"] == 2

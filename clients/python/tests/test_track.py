@@ -1,0 +1,96 @@
+"""Tracking streams, and that a stream which is cut goes on as if it had not been."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import seese3
+from conftest import FEATURES, ROOM
+
+PERIOD_NS = 33_333_333
+
+
+def followed(track: seese3.Track, rows: np.ndarray, start: int = 0) -> list[seese3.TrackUpdate]:
+    updates = []
+    for row, feature in enumerate(rows, start):
+        update = track.step(feature, row * PERIOD_NS)
+        assert isinstance(update, seese3.TrackUpdate)
+        updates.append(update)
+    return updates
+
+
+def poses_of(updates: list[seese3.TrackUpdate]) -> np.ndarray:
+    unknown = np.full((4, 4), np.nan)
+    return np.array([unknown if one.map_from_camera is None else one.map_from_camera for one in updates])
+
+
+def test_a_camera_is_followed(client: seese3.Client, drawn: Path) -> None:
+    room = seese3.Store(drawn).room(ROOM)
+    # The room was recorded in two visits, and a camera cannot jump from one to the other.
+    assert room.sequences is not None
+    first_visit = int((room.sequences == 0).sum())
+    config = seese3.TrackConfig(room=ROOM, initial_pose=seese3.InitialPose(room.poses[0]))
+    with client.track(config) as track:
+        updates = followed(track, room.features[FEATURES][:first_visit])
+        refused = track.step(room.features[FEATURES][0], 0)
+    assert [one.sequence for one in updates] == list(range(1, first_visit + 1))
+    assert {one.status for one in updates[10:]} == {"tracking"}
+
+    # The frames are the map's own: whoever finds the nearest frame knows the pose.
+    errors = np.linalg.norm(poses_of(updates)[:, :3, 3] - room.poses[:first_visit, :3, 3], axis=1)
+    assert np.median(errors) < 0.05
+    assert updates[-1].map_from_camera_covariance is not None and updates[-1].map_from_base is None
+    assert isinstance(refused, seese3.TrackRefusal) and refused.reason == "late"
+
+
+def test_a_stream_that_is_cut_goes_on_as_if_it_had_not_been(drawn: Path, tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    key.write_bytes(bytes(range(32)))
+    rows = seese3.Store(drawn).room(ROOM).features[FEATURES][:60]
+    arguments = ("--token-key-file", key)
+    config = seese3.TrackConfig(room=ROOM, token_every=7)
+
+    with seese3.serve(drawn, *arguments) as server, server.client() as client, client.track(config) as track:
+        whole = followed(track, rows)
+        assert track.resumed == 0
+
+    first = seese3.serve(drawn, *arguments)
+    with first.client() as client, client.track(config) as track:
+        updates = followed(track, rows[:30])
+        first.stop()
+        with seese3.serve(drawn, *arguments, listen=first.address):
+            updates += followed(track, rows[30:], start=30)
+            assert track.resumed >= 1
+            token = track.resume_token
+            assert token
+
+    np.testing.assert_array_equal(poses_of(updates), poses_of(whole))
+    assert [one.status for one in updates] == [one.status for one in whole]
+
+
+def test_a_token_carries_a_stream_to_another_client(server: seese3.Server, drawn: Path) -> None:
+    rows = seese3.Store(drawn).room(ROOM).features[FEATURES][:40]
+    with server.client() as client, client.track(seese3.TrackConfig(room=ROOM)) as track:
+        whole = followed(track, rows)
+    with server.client() as client, client.track(seese3.TrackConfig(room=ROOM)) as track:
+        followed(track, rows[:20])
+        token = track.resume_token
+    with server.client() as client, client.track(resume_token=token) as track:
+        track._sequence = 20
+        rest = followed(track, rows[20:], start=20)
+    np.testing.assert_array_equal(poses_of(rest), poses_of(whole)[20:])
+
+
+def test_what_a_stream_refuses(client: seese3.Client) -> None:
+    with pytest.raises(seese3.NotFoundError), client.track(seese3.TrackConfig(room="nowhere")):
+        pass
+    with pytest.raises(ValueError, match="token_every"):
+        client.track(seese3.TrackConfig(room=ROOM, token_every=0))
+    with pytest.raises(ValueError, match="exactly one"):
+        client.track()
+    with client.track(seese3.TrackConfig(room=ROOM)) as track:
+        refused = track.step(np.zeros(3), 0)
+        assert isinstance(refused, seese3.TrackRefusal) and refused.reason == "view"
+        track.reset()
+        with pytest.raises(seese3.InvalidFieldError):
+            track.set_initial_pose(seese3.InitialPose(np.eye(4), translation_deviation_m=-1.0))
