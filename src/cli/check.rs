@@ -6,8 +6,8 @@ use anyhow::bail;
 use clap::{Args, Subcommand};
 
 use super::encode::images_root;
+use super::output::{JsonOutput, say};
 use super::pose_report::PoseReport;
-use super::say;
 use crate::store::Store;
 use seese3_core::pose_check::Convention;
 
@@ -25,7 +25,6 @@ enum What {
 }
 
 #[derive(Debug, Args)]
-#[command(after_help = "Example:\n  seese3 check room --store store --room kitchen")]
 struct CheckRoom {
     /// The store: a folder, or a bucket by its URL
     #[arg(long, env = "SEESE3_STORE")]
@@ -36,9 +35,8 @@ struct CheckRoom {
     /// The folder of the images, if it is no longer where the room was imported from
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
-    /// Print JSON instead of text
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Check {
@@ -50,6 +48,7 @@ impl Check {
 
 impl CheckRoom {
     async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
         let store = Store::open(&self.store)?;
         let room = store.load_room(&self.room, None).await?.room;
 
@@ -60,16 +59,13 @@ impl CheckRoom {
             report.look_at_images(&room, &root, room.poses(), Convention::default());
         }
 
-        if self.json {
-            say(serde_json::to_string_pretty(&report.json(&room))?);
-        } else {
-            say(format_args!(
-                "room '{}': {} frames",
-                room.id(),
-                room.frame_count()
-            ));
-            report.say();
-        }
+        self.json.write(&report.json(&room))?;
+        say(format_args!(
+            "room '{}': {} frames",
+            room.id(),
+            room.frame_count()
+        ));
+        report.say();
 
         if report.is_contradicted() {
             bail!("the poses of room '{}' contradict its images", room.id());

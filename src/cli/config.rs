@@ -19,8 +19,10 @@ use anyhow::{Context, bail};
 use clap::parser::ValueSource;
 use clap::{ArgMatches, Args, Command, CommandFactory, FromArgMatches, Subcommand};
 
+use super::Cli;
+use super::examples::with_examples;
+use super::output::say;
 use super::serve::Serve;
-use super::{Cli, say};
 
 /// The environment variable that names the file.
 const VARIABLE: &str = "SEESE3_CONFIG";
@@ -119,7 +121,7 @@ impl std::fmt::Display for Setting {
 /// and ends the program.
 pub fn parse() -> anyhow::Result<Cli> {
     let arguments: Vec<OsString> = std::env::args_os().collect();
-    let mut command = Cli::command();
+    let mut command = with_examples(Cli::command());
 
     let reads_file = arguments
         .get(1)

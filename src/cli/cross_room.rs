@@ -1,17 +1,15 @@
 //! `seese3 cross-room`: train on some rooms, navigate zero-shot in others.
 
-use std::path::PathBuf;
-
 use anyhow::{Context, bail};
 use clap::Args;
 use serde::Serialize;
 
 use super::evaluate::navigators_named;
 use super::named::one_of;
+use super::output::{JsonOutput, say};
 use super::progress::bar;
 use super::protocol::ProtocolOptions;
 use super::rooms::{data, load_rooms, room_words};
-use super::{check_writable, say, write_json};
 use crate::store::{Store, StoredRoom};
 use seese3_core::adapter::Reading;
 use seese3_core::eval::{Protocol, check_thresholds};
@@ -81,9 +79,8 @@ pub struct CrossRoom {
     /// Also print a table with one line per held-out room
     #[arg(long)]
     rooms: bool,
-    /// Write all runs, with scores by room, to this JSON file
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 type Loaded = (StoredRoom, Features);
@@ -110,9 +107,7 @@ impl CrossRoom {
         reason = "one command, from its arguments to what it prints"
     )]
     pub async fn run(self) -> anyhow::Result<()> {
-        if let Some(file) = &self.json {
-            check_writable(file)?;
-        }
+        self.json.begin()?;
 
         let store = Store::open(&self.store)?;
         let train = load_rooms(&store, &self.train, self.features.as_deref()).await?;
@@ -187,7 +182,7 @@ impl CrossRoom {
         self.say(&train, &test, &plan, &runs)?;
 
         // The protocol is written beside the scores, which mean little without it.
-        if let Some(file) = &self.json {
+        if self.json.is_wanted() {
             let record = CrossRoomRecord {
                 results: cross_room_json(&runs, &self.baseline),
                 features: source,
@@ -200,8 +195,7 @@ impl CrossRoom {
                 test_split: protocol.split.name(),
                 threshold: self.threshold,
             };
-            write_json(file, &record)?;
-            say(format_args!("wrote {}", file.display()));
+            self.json.write(&record)?;
         }
 
         Ok(())

@@ -11,10 +11,10 @@ use rayon::prelude::*;
 use tokio::net::TcpListener;
 
 use super::ask::say_navigation;
+use super::output::say_published;
+use super::output::{say, write_file};
 use super::progress::bar;
-use super::say_published;
 use super::train::{default_name, train_with_progress};
-use super::{say, write_file};
 use crate::encoder::{BUILTIN_DIM, builtin_source, encode_builtin};
 use crate::service;
 use crate::store::{Store, StoredRoom};

@@ -5,10 +5,11 @@ use std::time::Instant;
 
 use anyhow::{Context, bail};
 use clap::Args;
+use serde_json::json;
 
 use super::encoder::{EncoderOptions, RuntimeOptions};
+use super::output::{JsonOutput, say};
 use super::progress::bar;
-use super::say;
 use crate::encoder::{Encoded, Encoder, Journal, Kept, OnBadImage, Task, encode_room, read_image};
 use crate::store::{Published, Store, StoredRoom};
 use seese3_core::cancel::Cancellation;
@@ -55,10 +56,13 @@ pub struct Encode {
     /// interrupted run can resume; STORE/unfinished if omitted, required for a bucket
     #[arg(long, value_name = "DIR")]
     journal: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Encode {
     pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
         let runtime = self.runtime.runtime();
         let encoder = self.encoder.open(&self.model, &runtime)?;
         let store = Store::open(&self.store)?;
@@ -81,7 +85,7 @@ impl Encode {
                 names.join(", ")
             ));
 
-            return Ok(());
+            return self.write_record(&sources, revision, 0, &[]);
         }
 
         say_replaced(&stored, &sources);
@@ -149,7 +153,34 @@ impl Encode {
             self.room, published.manifest
         ));
 
-        Ok(())
+        let encoded_now = encoded.good.len() - encoded.resumed.min(encoded.good.len());
+        self.write_record(&sources, revision, encoded_now, &encoded.bad)
+    }
+
+    /// What was done, as JSON.
+    fn write_record(
+        &self,
+        sources: &[FeatureSource],
+        revision: u64,
+        encoded: usize,
+        left_out: &[(usize, String)],
+    ) -> anyhow::Result<()> {
+        let features: Vec<_> = sources
+            .iter()
+            .map(|source| json!({ "name": source.name, "columns": source.dim }))
+            .collect();
+        let left_out: Vec<_> = left_out
+            .iter()
+            .map(|(frame, problem)| json!({ "frame": frame, "problem": problem }))
+            .collect();
+
+        self.json.write(&json!({
+            "room": self.room,
+            "revision": revision,
+            "features": features,
+            "encoded": encoded,
+            "left_out": left_out,
+        }))
     }
 
     fn prefix(&self) -> String {

@@ -1,18 +1,23 @@
 //! `seese3 encoders`: the known encoders and how their images are prepared.
 
 use clap::Args;
+use serde_json::json;
 
-use super::say;
+use super::output::{JsonOutput, say};
 use crate::encoder::{RECIPES, RuntimeKind};
 
 #[derive(Debug, Args)]
 pub struct Encoders {
     /// Show only this recipe, with its script for the ONNX export
     name: Option<String>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Encoders {
     pub fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+
         // With a name, one recipe is printed with its export script; without, all of them without
         // scripts.
         let chosen: Vec<_> = RECIPES
@@ -28,6 +33,21 @@ impl Encoders {
                 known.join(", ")
             );
         }
+
+        let records: Vec<_> = chosen
+            .iter()
+            .map(|recipe| {
+                json!({
+                    "name": recipe.name,
+                    "about": recipe.about,
+                    "images": recipe.preparation.describe(recipe.window),
+                    "layers": recipe.layers,
+                    "pooling": recipe.pooling.to_string(),
+                    "prefix_tokens": recipe.prefix_tokens,
+                })
+            })
+            .collect();
+        self.json.write(&records)?;
 
         if self.name.is_none() {
             say("Without a model:");

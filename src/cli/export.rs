@@ -4,8 +4,9 @@ use std::path::PathBuf;
 
 use anyhow::bail;
 use clap::{Args, Subcommand};
+use serde_json::json;
 
-use super::{check_writable, say, write_file};
+use super::output::{JsonOutput, check_folder, check_writable, say, write_file};
 use crate::datasets::write_numpy;
 use crate::export::{kitti_trajectory, tum_trajectory};
 use crate::store::{Store, StoredRoom};
@@ -41,6 +42,8 @@ struct From {
     /// Output path: a folder for numpy, a file for the other formats
     #[arg(long)]
     out: PathBuf,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 #[derive(Debug, Args)]
@@ -58,11 +61,11 @@ impl Export {
         match self.format {
             Format::Numpy(from) => {
                 let stored = from.load().await?;
-                for file in write_numpy(&from.out, &stored.room, &stored.features)? {
+                let files = write_numpy(&from.out, &stored.room, &stored.features)?;
+                for file in &files {
                     say(format_args!("wrote {}", file.display()));
                 }
-
-                Ok(())
+                from.json.write(&json!({ "files": files }))
             }
             Format::Tum(Timed { from, rate }) => {
                 let stored = from.load().await?;
@@ -102,15 +105,17 @@ impl Export {
 
 impl From {
     async fn load(&self) -> anyhow::Result<StoredRoom> {
-        check_writable(&self.out)?;
+        self.json.begin()?;
+        check_folder(&self.out)?;
         Ok(Store::open(&self.store)?
             .load_room(&self.room, self.revision)
             .await?)
     }
 
     fn write(&self, text: &str) -> anyhow::Result<()> {
+        check_writable(&self.out)?;
         write_file(&self.out, text.as_bytes())?;
         say(format_args!("wrote {}", self.out.display()));
-        Ok(())
+        self.json.write(&json!({ "files": [&self.out] }))
     }
 }

@@ -2,12 +2,13 @@
 
 use clap::Args;
 use indicatif::ProgressBar;
+use serde_json::json;
 
 use seese3_core::fitting::{FITTING_EPOCHS, Fitted, PartRule};
 use seese3_core::training::RoomData;
 
+use super::output::{JsonOutput, say, say_published};
 use super::progress::bar;
-use super::{say, say_published};
 use crate::refit::{self, Refit};
 use crate::store::Store;
 
@@ -32,10 +33,13 @@ pub struct Fit {
     /// Name of the fitted adapter in the store; ROOM.FEATURES.fitted if omitted
     #[arg(long)]
     name: Option<String>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Fit {
     pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
         let store = Store::open(&self.store)?;
         let request = refit::Request {
             room: self.room,
@@ -54,7 +58,13 @@ impl Fit {
         say_fitted(&fitted, &refit.data());
         say_published(&store, refit.name(), &published);
 
-        Ok(())
+        self.json.write(&json!({
+            "adapter": refit.name(),
+            "revision": published.revision,
+            "created": published.is_new,
+            "room": refit.data().room.id().as_str(),
+            "train_r2": fitted.record.train.overall,
+        }))
     }
 }
 

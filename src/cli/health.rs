@@ -2,9 +2,10 @@
 
 use anyhow::bail;
 use clap::Args;
+use serde_json::json;
 
 use super::ask::Server;
-use super::say;
+use super::output::{JsonOutput, say};
 
 #[derive(Debug, Args)]
 pub struct Health {
@@ -13,11 +14,16 @@ pub struct Health {
     /// What to check: a gRPC service's full name, or rooms/NAME; the whole server if empty
     #[arg(long, default_value = "")]
     name: String,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Health {
     pub async fn run(self) -> anyhow::Result<()> {
-        if !self.server.connect().await?.serves(&self.name).await? {
+        self.json.begin()?;
+        let is_serving = self.server.connect().await?.serves(&self.name).await?;
+        self.json.write(&json!({ "serving": is_serving }))?;
+        if !is_serving {
             bail!("the server is not serving: it is still loading, or shutting down");
         }
 

@@ -5,16 +5,18 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
+use serde_json::json;
 
 use super::camera::CameraOption;
 use super::encode::same_poses;
+use super::output::{JsonOutput, say};
 use super::pose_options::{DirectionName, DirectionOption, PoseOptions};
 use super::pose_report::PoseReport;
 use super::progress::bar;
-use super::say;
-use crate::datasets::{self, Dropped, Kitti, Reader, Recording, SevenScenes, Unusable};
+use crate::datasets::{self, Bag, Dropped, Kitti, Reader, Recording, SevenScenes, Unusable};
 use crate::store::{Store, check_features};
 use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::Pose;
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 
 /// The number of dropped frames that are listed one by one; beyond that they are only counted.
@@ -50,6 +52,8 @@ enum Format {
     Kitti(KittiFiles),
     /// EuRoC MAV: a sequence's folder (mav0/cam0, mav0/state_groundtruth_estimate0)
     Euroc(Euroc),
+    /// MCAP: a bag of ROS 2 or a recording of Foxglove, with images and poses or /tf
+    Mcap(McapFile),
     /// NumPy files: poses (n, 4, 4) world_from_camera in metres, features (n, d)
     Numpy(Numpy),
     /// A folder that `seese3 export numpy` wrote
@@ -141,6 +145,33 @@ struct Euroc {
     to: Destination,
 }
 
+#[derive(Debug, Args)]
+struct McapFile {
+    /// The .mcap file
+    path: PathBuf,
+    /// The topic of the images; may be omitted if there is only one
+    #[arg(long, value_name = "TOPIC")]
+    image_topic: Option<String>,
+    /// The topic of the poses: PoseStamped, PoseWithCovarianceStamped or Odometry; may be omitted if
+    /// there is only one
+    #[arg(long, value_name = "TOPIC", conflicts_with = "world_frame")]
+    pose_topic: Option<String>,
+    /// Take the poses from /tf instead: those of the images' frame in this one, such as map
+    #[arg(long, value_name = "FRAME")]
+    world_frame: Option<String>,
+    /// The camera on what the poses are of, x,y,z,qx,qy,qz,qw in metres, where the transforms do not
+    /// tell it
+    #[arg(long, value_delimiter = ',', allow_hyphen_values = true, num_args = 1)]
+    base_from_camera: Option<Vec<f64>>,
+    /// The folder for the images, which the room refers to; FILE-images beside the file if omitted
+    #[arg(long, value_name = "DIR")]
+    images_to: Option<PathBuf>,
+    #[command(flatten)]
+    poses: DirectionOption,
+    #[command(flatten)]
+    to: Destination,
+}
+
 /// A value of `import numpy --poses`.
 #[derive(Debug, Clone)]
 enum PosesOption {
@@ -190,6 +221,8 @@ struct Destination {
     /// Do not compare the poses with the images
     #[arg(long)]
     skip_pose_check: bool,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Import {
@@ -217,6 +250,7 @@ impl Import {
             }
             Format::Kitti(kitti) => kitti.import().await,
             Format::Euroc(euroc) => euroc.import().await,
+            Format::Mcap(file) => file.import().await,
             Format::Numpy(numpy) => numpy.import().await,
             Format::Bundle(plain) => {
                 plain
@@ -278,6 +312,53 @@ impl KittiFiles {
             .publish("kitti", &self.path, recording, self.poses.direction)
             .await
     }
+}
+
+impl McapFile {
+    async fn import(self) -> anyhow::Result<()> {
+        let base_from_camera = self.base_from_camera.as_deref().map(mounting).transpose()?;
+        let beside = || {
+            let mut name = self.path.file_stem().unwrap_or_default().to_owned();
+            name.push("-images");
+            self.path.with_file_name(name)
+        };
+        let bag = Bag {
+            image_topic: self.image_topic.clone(),
+            pose_topic: self.pose_topic.clone(),
+            world: self.world_frame.clone(),
+            base_from_camera,
+            images: self.images_to.clone().unwrap_or_else(beside),
+        };
+
+        let read = |reader: &mut Reader<'_>| datasets::read_bag(&self.path, &bag, reader);
+        let recording = self.to.read(read)?;
+        self.to
+            .publish("mcap", &self.path, recording, self.poses.direction)
+            .await
+    }
+}
+
+/// The pose of a camera on a robot.
+fn mounting(numbers: &[f64]) -> anyhow::Result<Pose> {
+    let &[x, y, z, qx, qy, qz, qw] = numbers else {
+        bail!(
+            "--base-from-camera needs seven numbers, x,y,z,qx,qy,qz,qw, got {}",
+            numbers.len()
+        );
+    };
+    let quaternion = nalgebra::Quaternion::new(qw, qx, qy, qz);
+    let is_unit = (quaternion.norm() - 1.0).abs() < 1e-2;
+    if !(is_unit && [x, y, z].iter().all(|number| number.is_finite())) {
+        bail!(
+            "--base-from-camera: the last four numbers are no unit quaternion, or a number is not finite"
+        );
+    }
+
+    let rotation = nalgebra::UnitQuaternion::from_quaternion(quaternion);
+    Ok(Pose::from_parts(
+        nalgebra::Translation3::new(x, y, z),
+        rotation,
+    ))
 }
 
 impl Euroc {
@@ -499,6 +580,7 @@ impl Destination {
         mut recording: Recording,
         direction: DirectionName,
     ) -> anyhow::Result<()> {
+        self.json.begin()?;
         let read_count = recording.frames.poses.len();
 
         // Feature files have one row per usable frame. They are checked against that count before
@@ -574,7 +656,11 @@ impl Destination {
             published.manifest
         ));
 
-        Ok(())
+        let mut record = report.json(&room);
+        record["revision"] = json!(published.revision);
+        record["created"] = json!(published.is_new);
+        record["dropped"] = json!(recording.dropped.len());
+        self.json.write(&record)
     }
 }
 

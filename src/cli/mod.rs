@@ -12,6 +12,7 @@ mod demo;
 mod encode;
 mod encoder;
 mod encoders;
+mod examples;
 #[cfg(feature = "lab")]
 mod evaluate;
 mod export;
@@ -19,7 +20,9 @@ mod fit;
 mod health;
 mod import;
 mod log;
+mod manual;
 mod named;
+mod output;
 #[cfg(feature = "lab")]
 mod probe;
 mod pose_options;
@@ -54,6 +57,9 @@ use clap::{Parser, Subcommand};
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
+    /// Print nothing but warnings and errors; files that options name are written
+    #[arg(short, long, global = true)]
+    quiet: bool,
 }
 
 #[derive(Debug, Subcommand)]
@@ -111,6 +117,9 @@ enum Command {
     Navigate(ask::Navigate),
     /// Ask a server for the frames of its rooms that look most like a view
     Localize(ask::Localize),
+    /// Ask a server in which room a camera is, and where in it, from some of its views; and how sure
+    /// that is
+    Relocalize(ask::Relocalize),
     /// Ask a server for the camera motion between two views
     Motion(ask::Motion),
     /// Track a camera with a server, from a file of features or a folder of images
@@ -119,6 +128,10 @@ enum Command {
     Catalog(ask::Catalog),
     /// Exit successfully if a server is serving, for containers and supervisors
     Health(health::Health),
+    /// Print the completions of a shell
+    Completions(manual::Completions),
+    /// Write the manual pages, one for each command
+    Man(manual::Man),
 }
 
 impl Cli {
@@ -134,6 +147,10 @@ impl Cli {
 /// # Errors
 /// When the command fails: one line that says what went wrong and what to change.
 pub async fn run(cli: Cli) -> anyhow::Result<()> {
+    if cli.quiet {
+        output::silence();
+    }
+
     match cli.command {
         Command::Import(arguments) => arguments.run().await,
         Command::Check(arguments) => arguments.run().await,
@@ -165,91 +182,12 @@ pub async fn run(cli: Cli) -> anyhow::Result<()> {
         Command::Config(arguments) => arguments.run(),
         Command::Navigate(arguments) => arguments.run().await,
         Command::Localize(arguments) => arguments.run().await,
+        Command::Relocalize(arguments) => arguments.run().await,
         Command::Motion(arguments) => arguments.run().await,
         Command::Track(arguments) => arguments.run().await,
         Command::Catalog(arguments) => arguments.run().await,
         Command::Health(arguments) => arguments.run().await,
+        Command::Completions(arguments) => arguments.run(),
+        Command::Man(arguments) => arguments.run(),
     }
-}
-
-/// Prints a line to standard output. A closed pipe (`seese3 … | head`) is not an error, so failed
-/// writes are ignored.
-fn say(line: impl std::fmt::Display) {
-    use std::io::Write;
-    let _ = writeln!(std::io::stdout(), "{line}");
-}
-
-/// Prints where an adapter was published.
-fn say_published(store: &crate::store::Store, name: &str, published: &crate::store::Published) {
-    let state = if published.is_new {
-        "published"
-    } else {
-        "already there, unchanged:"
-    };
-
-    say(format_args!(
-        "{state} adapter '{name}' revision {}: {}/{}",
-        published.revision,
-        store.location(),
-        published.manifest
-    ));
-}
-
-/// Rejects an output file whose folder does not exist, before any long computation is started for
-/// it.
-fn check_writable(path: &std::path::Path) -> anyhow::Result<()> {
-    let folder = path
-        .parent()
-        .filter(|folder| !folder.as_os_str().is_empty());
-    if path.is_dir() {
-        anyhow::bail!("{} is a folder; name a file in it", path.display());
-    }
-
-    match folder {
-        Some(folder) if !folder.is_dir() => {
-            anyhow::bail!("{}: the folder does not exist", path.display())
-        }
-        _ => Ok(()),
-    }
-}
-
-/// Writes a file atomically: readers see either the old file or the complete new one. What is no
-/// regular file, such as a device or a pipe, is written into and never replaced.
-fn write_file(path: &std::path::Path, content: &[u8]) -> anyhow::Result<()> {
-    use anyhow::Context;
-
-    let failed = || format!("{} cannot be written", path.display());
-
-    // A symbolic link stays, and what it points to is replaced.
-    let target = std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
-    if std::fs::metadata(&target).is_ok_and(|found| !found.is_file()) {
-        return std::fs::OpenOptions::new()
-            .write(true)
-            .open(&target)
-            .and_then(|mut file| std::io::Write::write_all(&mut file, content))
-            .with_context(failed);
-    }
-
-    // The content goes into a neighbouring file first: renaming within one folder replaces the
-    // target in a single step.
-    let mut partial = target.as_os_str().to_owned();
-    partial.push(".partial");
-    let partial = std::path::PathBuf::from(partial);
-
-    let written =
-        std::fs::write(&partial, content).and_then(|()| std::fs::rename(&partial, &target));
-    if written.is_err() {
-        // Half a file is of no use, and on a full disk it takes what space there is.
-        let _ = std::fs::remove_file(&partial);
-    }
-    written.with_context(failed)
-}
-
-/// Writes indented JSON, with a newline at the end.
-#[cfg(feature = "lab")]
-fn write_json(path: &std::path::Path, record: &impl serde::Serialize) -> anyhow::Result<()> {
-    let mut text = serde_json::to_string_pretty(record)?;
-    text.push('\n');
-
-    write_file(path, text.as_bytes())
 }

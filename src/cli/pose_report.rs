@@ -5,9 +5,9 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
+use super::output::say;
 use super::pose_options::{flags_of, in_words};
 use super::progress::bar;
-use super::say;
 use crate::encoder::{image_size, read_image};
 use seese3_core::geometry::{Pinhole, Pose};
 use seese3_core::image_motion::{SmallImage, align};

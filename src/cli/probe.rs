@@ -1,15 +1,13 @@
 //! `seese3 probe`: how much SE(3) structure features carry, metrics M1 to M4 of the paper.
 
-use std::path::PathBuf;
-
 use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 
+use super::output::{JsonOutput, say};
 use super::progress::bar;
 use super::protocol::ProtocolOptions;
 use super::rooms::{data, load_rooms, room_words};
-use super::{check_writable, say, write_json};
 use crate::store::{Store, StoredRoom};
 use seese3_core::features::Features;
 use seese3_core::motion_scores::MotionScores;
@@ -72,9 +70,8 @@ pub struct Probe {
     /// M2: of identical rows keep the first, instead of dropping every row that has a duplicate
     #[arg(long)]
     m2_keep_first: bool,
-    /// Write all scores and their settings to this JSON file
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -105,9 +102,7 @@ impl Probe {
         reason = "one command, from its arguments to what it prints"
     )]
     pub async fn run(self) -> anyhow::Result<()> {
-        if let Some(file) = &self.json {
-            check_writable(file)?;
-        }
+        self.json.begin()?;
 
         let store = Store::open(&self.store)?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
@@ -189,16 +184,14 @@ impl Probe {
             );
         }
 
-        if let Some(file) = &self.json {
+        if self.json.is_wanted() {
             let context = ProbeContext {
                 features: rooms[0].1.source().name.clone(),
                 split: self.protocol.split_name(),
                 preset: base.preset.name(),
                 skipped,
             };
-            write_json(file, &probe_json(&scores, context))?;
-
-            say(format_args!("wrote {}", file.display()));
+            self.json.write(&probe_json(&scores, context))?;
         }
 
         Ok(())

@@ -2,10 +2,11 @@
 
 use anyhow::bail;
 use clap::Args;
+use serde_json::json;
 use sha2::{Digest, Sha256};
 
 use super::ask::Server;
-use super::say;
+use super::output::{JsonOutput, say};
 use crate::service::{pinhole_to_wire, source_to_wire};
 use crate::store::{Kind, ResourceName, Store, StoredRoom};
 use seese3_client::proto::v1 as pb;
@@ -41,10 +42,13 @@ pub struct Push {
     validate_only: bool,
     #[command(flatten)]
     server: Server,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Push {
     pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
         let store = Store::open(&self.store)?;
         let target = target(&self.name, self.renamed.as_deref())?;
         if (self.extend || self.refit) && self.name.kind == Kind::Adapter {
@@ -70,7 +74,9 @@ impl Push {
 
         let Some(revision) = revision else {
             say(format_args!("{target} would be accepted"));
-            return Ok(());
+            return self
+                .json
+                .write(&json!({ "name": target.to_string(), "valid": true }));
         };
         let state = match (created, served) {
             (true, true) => "published and served",
@@ -84,6 +90,7 @@ impl Push {
             target.clone().at(revision.revision)
         ));
 
+        let mut fitted_adapter = None;
         if self.refit {
             let request = pb::RefitRoomRequest {
                 name: target.to_string(),
@@ -95,8 +102,16 @@ impl Push {
                 "adapters/{}/revisions/{}: fitted to it",
                 fitted.name, fitted.revision
             ));
+            fitted_adapter = Some(json!({ "name": fitted.name, "revision": fitted.revision }));
         }
-        Ok(())
+
+        self.json.write(&json!({
+            "name": target.to_string(),
+            "revision": revision.revision,
+            "created": created,
+            "served": served,
+            "fitted_adapter": fitted_adapter,
+        }))
     }
 
     /// The description of a room's upload.

@@ -16,9 +16,9 @@ use seese3_lab::reproduction::{
     ReproductionRecord, adapter_names, check, reproduce,
 };
 
+use super::output::{say, write_file, write_json};
 use super::progress::bar;
 use super::rooms::{data, load_rooms};
-use super::{say, write_file, write_json};
 use crate::encoder::{encode_png, read_image};
 use crate::store::{Store, StoredRoom};
 
@@ -205,7 +205,7 @@ async fn publish(
     for reproduced in adapters {
         let record = &reproduced.record;
         let revision = store
-            .publish_adapter(
+            .publish_experiment(
                 &reproduced.name,
                 &reproduced.adapter,
                 record,

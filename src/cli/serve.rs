@@ -11,7 +11,7 @@ use tokio::sync::Notify;
 
 use super::encoder::RuntimeName;
 use super::log::{LogFormat, Traces, start_log};
-use super::say;
+use super::output::say;
 use crate::encoder::{Bounds, Runtime};
 use crate::service::{
     Config, ImageEncoders, Keyring, Listeners, Reload, RoomMemory, Tls, TlsFiles, TokenKey, run,

@@ -6,8 +6,8 @@ use anyhow::bail;
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 
+use super::output::{JsonOutput, say};
 use super::progress::spinner;
-use super::say;
 use crate::store::{Choice, Contents, Kind, ResourceName, RevisionContents, Store};
 
 #[derive(Debug, Args)]
@@ -38,9 +38,15 @@ struct Common {
     /// The store: a folder, or a bucket by its URL
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// Print JSON instead of text
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Common {
+    fn open(&self) -> anyhow::Result<Store> {
+        self.json.begin()?;
+        Ok(Store::open(&self.store)?)
+    }
 }
 
 #[derive(Debug, Args)]
@@ -58,11 +64,6 @@ struct Show {
 }
 
 #[derive(Debug, Args)]
-#[command(after_help = "Examples:\n  seese3 store default --store DIR\n  \
-                  seese3 store default --store DIR rooms/kitchen adapters/base\n  \
-                  seese3 store default --store DIR adapters/base/revisions/2\n  \
-                  seese3 store default --store DIR adapters/base --unset\n  \
-                  seese3 store default --store DIR --back")]
 struct Default {
     /// What the default is of: a room or an adapter with a revision, or a room followed by an
     /// adapter. All defaults are shown if omitted
@@ -124,12 +125,10 @@ impl StoreCommand {
 
 impl List {
     async fn run(self) -> anyhow::Result<()> {
-        let store = Store::open(&self.common.store)?;
+        let store = self.common.open()?;
         let contents = store.contents().await?;
-        if self.common.json {
-            say_json(&Value::Array(contents.iter().map(contents_json).collect()));
-            return Ok(());
-        }
+        let listed: Vec<Value> = contents.iter().map(contents_json).collect();
+        self.common.json.write(&listed)?;
 
         for held in &contents {
             let current = held
@@ -145,12 +144,9 @@ impl List {
 
 impl Show {
     async fn run(self) -> anyhow::Result<()> {
-        let store = Store::open(&self.common.store)?;
+        let store = self.common.open()?;
         let held = store.contents_of(&self.name).await?;
-        if self.common.json {
-            say_json(&contents_json(&held));
-            return Ok(());
-        }
+        self.common.json.write(&contents_json(&held))?;
 
         say(headline(&held));
         for revision in &held.revisions {
@@ -170,7 +166,7 @@ impl Show {
 
 impl Default {
     async fn run(self) -> anyhow::Result<()> {
-        let store = Store::open(&self.common.store)?;
+        let store = self.common.open()?;
 
         if self.back {
             store.take_back_choice().await?;
@@ -180,10 +176,8 @@ impl Default {
 
         // What holds now, in each case.
         let contents = store.contents().await?;
-        if self.common.json {
-            say_json(&Value::Array(contents.iter().map(contents_json).collect()));
-            return Ok(());
-        }
+        let listed: Vec<Value> = contents.iter().map(contents_json).collect();
+        self.common.json.write(&listed)?;
 
         let chosen: Vec<&Contents> = contents
             .iter()
@@ -225,20 +219,17 @@ impl Default {
 
 impl Remove {
     async fn run(self) -> anyhow::Result<()> {
-        let store = Store::open(&self.common.store)?;
+        let store = self.common.open()?;
         let removed = match self.dry_run {
             true => store.check_removable(&self.name).await?,
             false => store.remove(&self.name).await?,
         };
 
-        if self.common.json {
-            say_json(&json!({
-                "name": self.name.to_string(),
-                "revisions": removed.revisions,
-                "dry_run": self.dry_run,
-            }));
-            return Ok(());
-        }
+        self.common.json.write(&json!({
+            "name": self.name.to_string(),
+            "revisions": removed.revisions,
+            "dry_run": self.dry_run,
+        }))?;
 
         let word = match self.dry_run {
             true => "would remove",
@@ -256,27 +247,24 @@ impl Remove {
 
 impl CollectGarbage {
     async fn run(self) -> anyhow::Result<()> {
-        let store = Store::open(&self.common.store)?;
+        let store = self.common.open()?;
         let older_than = Duration::from_secs(self.older_than);
         let garbage = match self.dry_run {
             true => store.find_garbage(older_than).await?,
             false => store.collect_garbage(older_than).await?,
         };
 
-        if self.common.json {
-            let files: Vec<Value> = garbage
-                .files
-                .iter()
-                .map(|file| json!({ "path": file.path, "bytes": file.bytes }))
-                .collect();
-            say_json(&json!({
-                "files": files,
-                "bytes": garbage.bytes(),
-                "left_alone": garbage.left_alone,
-                "dry_run": self.dry_run,
-            }));
-            return Ok(());
-        }
+        let files: Vec<Value> = garbage
+            .files
+            .iter()
+            .map(|file| json!({ "path": file.path, "bytes": file.bytes }))
+            .collect();
+        self.common.json.write(&json!({
+            "files": files,
+            "bytes": garbage.bytes(),
+            "left_alone": garbage.left_alone,
+            "dry_run": self.dry_run,
+        }))?;
 
         for file in &garbage.files {
             say(&file.path);
@@ -299,27 +287,23 @@ impl CollectGarbage {
 
 impl Verify {
     async fn run(self) -> anyhow::Result<()> {
-        let store = Store::open(&self.common.store)?;
+        let store = self.common.open()?;
         let progress = spinner("verifying");
         let findings = store
             .verify(&|resource| progress.set_message(resource.to_string()))
             .await?;
         progress.finish_and_clear();
 
-        if self.common.json {
-            let findings: Vec<Value> = findings
-                .iter()
-                .map(|finding| json!({ "name": finding.resource, "problem": finding.problem }))
-                .collect();
-            say_json(&json!({ "findings": findings }));
-        } else {
-            for finding in &findings {
-                say(format_args!("{}: {}", finding.resource, finding.problem));
-            }
+        let listed: Vec<Value> = findings
+            .iter()
+            .map(|finding| json!({ "name": finding.resource, "problem": finding.problem }))
+            .collect();
+        self.common.json.write(&json!({ "findings": listed }))?;
+        for finding in &findings {
+            say(format_args!("{}: {}", finding.resource, finding.problem));
         }
 
         match findings.len() {
-            0 if self.common.json => Ok(()),
             0 => {
                 say("everything can be read and belongs together");
                 Ok(())
@@ -382,8 +366,4 @@ fn contents_json(held: &Contents) -> Value {
 /// A size in the unit that suits it.
 fn size(bytes: u64) -> indicatif::DecimalBytes {
     indicatif::DecimalBytes(bytes)
-}
-
-fn say_json(value: &Value) {
-    say(format_args!("{value:#}"));
 }

@@ -7,12 +7,13 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use clap::Args;
 use rayon::prelude::*;
+use serde_json::json;
 
 use super::encode::{by_layer, check_names, has, same_poses};
 use super::encoder::{EncoderOptions, RuntimeOptions};
 use super::named::{ClosedSet, one_of};
+use super::output::{JsonOutput, check_writable, say, write_file};
 use super::progress::bar;
-use super::{check_writable, say, write_file};
 use crate::encoder::{Encoder, Error, OnBadImage, Task, encode_png, encode_room, read_image};
 use crate::store::{Store, StoredRoom};
 use seese3_core::cancel::Cancellation;
@@ -75,6 +76,8 @@ pub struct Studio {
     /// this PNG file
     #[arg(long, value_name = "FILE")]
     sheet: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 /// Time spent: rendering summed over threads, microseconds, and wall time of the rooms that were
@@ -87,6 +90,7 @@ struct Spent {
 
 impl Studio {
     pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
         if self.suite == Suite::Walks && !self.without.is_empty() {
             bail!("--without belongs to the suite visits: walks are plain already");
         }
@@ -146,7 +150,14 @@ impl Studio {
             ));
         }
 
-        Ok(())
+        let features: Vec<&str> = sources.iter().map(|source| source.name.as_str()).collect();
+        self.json.write(&json!({
+            "store": out,
+            "drawn": drawn,
+            "there_before": there,
+            "frames": self.frame_count(),
+            "features": features,
+        }))
     }
 
     /// Renders, encodes and publishes the rooms that the store does not have yet. Returns how many

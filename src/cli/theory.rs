@@ -1,12 +1,10 @@
 //! `seese3 theory`: numerical checks of the paper's theorems.
 
-use std::path::PathBuf;
-
 use anyhow::bail;
 use clap::Args;
 
+use super::output::{JsonOutput, say};
 use super::progress::bar;
-use super::{check_writable, say, write_json};
 use seese3_lab::report::{theory_json, theory_table};
 use seese3_lab::theory::{Effort, checks};
 
@@ -21,16 +19,13 @@ pub struct Theory {
     /// Number of sampled pose pairs and directions in the other checks, 8 to 100000
     #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u32).range(8..=100_000))]
     samples: u32,
-    /// Write every check to this JSON file
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Theory {
     pub fn run(self) -> anyhow::Result<()> {
-        if let Some(file) = &self.json {
-            check_writable(file)?;
-        }
+        self.json.begin()?;
 
         let effort = Effort {
             seed: self.seed,
@@ -47,10 +42,7 @@ impl Theory {
 
         progress.finish_and_clear();
         say(theory_table(&found).trim_end());
-        if let Some(file) = &self.json {
-            write_json(file, &theory_json(&found))?;
-            say(format_args!("wrote {}", file.display()));
-        }
+        self.json.write(&theory_json(&found))?;
 
         // The table and the file show every check; the exit status tells scripts whether all
         // bounds hold.

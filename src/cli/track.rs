@@ -6,16 +6,16 @@ use anyhow::{Context, bail};
 use clap::Args;
 use tokio_stream::wrappers::ReceiverStream;
 
-use super::ask::Server;
+use super::ask::{Server, wire_json};
+use super::output::{JsonOutput, check_writable, say, write_file};
 use super::progress::bar;
-use super::{check_writable, say, write_file};
 use crate::datasets::read_features;
-use crate::export::{McapRecording, tum_trajectory};
+use crate::export::{McapRecording, RecordedOdometry, tum_trajectory};
 use seese3_client::convert;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::track_request::Message;
 use seese3_client::proto::v1::track_response::Answer;
-use seese3_core::geometry::Pose;
+use seese3_core::geometry::{Pose, Twist};
 
 /// The number of requests that may be buffered before they are sent.
 const WAITING: usize = 32;
@@ -65,6 +65,8 @@ pub struct Track {
     /// Write poses, transforms and images as an MCAP file, which Foxglove opens
     #[arg(long = "mcap", value_name = "FILE")]
     recording: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 /// The server's answers, sorted by kind, with the frame names and the last resume token.
@@ -82,6 +84,8 @@ impl Track {
         reason = "one command, from its arguments to what it prints"
     )]
     pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+
         // An output path that cannot be written is reported before the stream, not after it.
         for path in [&self.save_token, &self.tum, &self.odom_tum, &self.recording]
             .into_iter()
@@ -142,6 +146,7 @@ impl Track {
         let progress = bar((end - from) as u64, "tracking");
         let mut heard = Heard::default();
         let mut ended = Ok(());
+        let mut lines = self.json.lines()?;
 
         loop {
             let answer = match answers.message().await {
@@ -162,8 +167,18 @@ impl Track {
 
             match answer.answer {
                 Some(Answer::Started(started)) => heard.names = started.frames.unwrap_or_default(),
-                Some(Answer::Update(update)) => heard.updates.push(update),
-                Some(Answer::Refusal(refusal)) => heard.refusals.push(refusal),
+                Some(Answer::Update(update)) => {
+                    if let Some(lines) = &mut lines {
+                        lines.write(&wire_json("TrackUpdate", &update)?)?;
+                    }
+                    heard.updates.push(update);
+                }
+                Some(Answer::Refusal(refusal)) => {
+                    if let Some(lines) = &mut lines {
+                        lines.write(&wire_json("TrackRefusal", &refusal)?)?;
+                    }
+                    heard.refusals.push(refusal);
+                }
                 _ => {}
             }
 
@@ -389,6 +404,19 @@ fn recorded(heard: &Heard, seen: &[Seen]) -> anyhow::Result<Vec<u8>> {
         }
         if let Some(pose) = map(update) {
             recording.pose("/pose", time, &names.map, &pose)?;
+
+            let velocity = update.body_velocity.as_ref();
+            let odometry = RecordedOdometry {
+                frame: &names.map,
+                child_frame: &names.camera,
+                pose,
+                covariance: &update.map_from_camera_covariance,
+                velocity: velocity.and_then(|wire| {
+                    let convert::Twist { linear, angular } = convert::twist(wire).ok()?;
+                    Some(Twist { linear, angular })
+                }),
+            };
+            recording.odometry("/odometry", time, &odometry)?;
         }
 
         // The sequence number leads back to the input row, and so to the image file.

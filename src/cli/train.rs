@@ -1,7 +1,5 @@
 //! `seese3 train`: trains an adapter and publishes it.
 
-use std::path::PathBuf;
-
 use anyhow::{Context, bail};
 use clap::Args;
 
@@ -13,10 +11,10 @@ use seese3_core::training::{RoomData, TrainingPlan};
 use seese3_lab::experiments::seeds::{SeededTraining, train_seeds};
 use seese3_lab::report::{training_json, training_table};
 
+use super::output::{JsonOutput, say, say_published};
 use super::progress::bar;
 use super::protocol::ProtocolOptions;
 use super::rooms::{data, load_rooms, room_words};
-use super::{check_writable, say, say_published, write_json};
 use crate::store::{Store, StoredRoom};
 
 /// The largest number of seeds in one command.
@@ -57,9 +55,8 @@ pub struct Train {
     /// Name of the adapter in the store; made from the rooms, features and protocol if omitted
     #[arg(long)]
     name: Option<String>,
-    /// Write the scores of every seed to this JSON file
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Train {
@@ -71,9 +68,7 @@ impl Train {
         if self.seeds == 0 || self.seeds > MAX_SEEDS {
             bail!("--seeds must be 1 to {MAX_SEEDS}, got {}", self.seeds);
         }
-        if let Some(path) = &self.json {
-            check_writable(path)?;
-        }
+        self.json.begin()?;
 
         let store = Store::open(&self.store)?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
@@ -157,10 +152,8 @@ impl Train {
         }
 
         say_published(&store, &name, &published);
-        if let Some(path) = &self.json {
-            write_json(path, &training_json(&runs, &name, published.revision))?;
-            say(format_args!("wrote {}", path.display()));
-        }
+        self.json
+            .write(&training_json(&runs, &name, published.revision))?;
 
         Ok(())
     }

@@ -5,6 +5,7 @@
 //! of its own; `collect` holds what they share.
 
 mod arkitscenes;
+mod bag;
 mod bundle;
 mod collect;
 mod colmap;
@@ -22,6 +23,7 @@ mod tum;
 mod twelve_scenes;
 
 pub use arkitscenes::read_arkitscenes;
+pub use bag::{Bag, read_bag};
 pub use bundle::{read_bundle, read_numpy, write_numpy};
 pub use collect::pose_of_matrix;
 pub use colmap::read_colmap;

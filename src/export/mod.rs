@@ -3,5 +3,5 @@
 mod recording;
 mod trajectory;
 
-pub use recording::McapRecording;
+pub use recording::{McapRecording, RecordedOdometry};
 pub use trajectory::{kitti_trajectory, tum_trajectory};

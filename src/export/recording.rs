@@ -1,23 +1,38 @@
-//! Poses, transforms and images as an MCAP file that Foxglove and other viewers open. Messages are
-//! JSON in Foxglove's schemas.
+//! Poses, transforms and images as an MCAP file that Foxglove, Rerun and other viewers open. Messages
+//! are Protobuf in Foxglove's schemas, whose types and descriptors come with Foxglove's own library.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
 
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
+use foxglove::Encode;
+use foxglove::messages::{
+    CompressedImage, FrameTransform, Odometry, PoseInFrame, Quaternion, Timestamp, Vector3,
+};
 use mcap::records::MessageHeader;
 use mcap::{McapError, WriteOptions, Writer};
-use serde_json::{Value, json};
 
-use seese3_core::geometry::Pose;
+use seese3_core::geometry::{Pose, Twist};
 
 /// An MCAP recording that is being written, in memory.
 pub struct McapRecording {
     writer: Writer<Cursor<Vec<u8>>>,
-    schemas: BTreeMap<&'static str, u16>,
     channels: BTreeMap<String, u16>,
     sequence: u32,
+}
+
+/// Where a camera was and how it moved, by a tracker.
+#[derive(Debug, Clone)]
+pub struct RecordedOdometry<'a> {
+    /// The frame of the pose, for instance `map`.
+    pub frame: &'a str,
+    /// The frame of the camera.
+    pub child_frame: &'a str,
+    /// `frame_from_camera`.
+    pub pose: Pose,
+    /// The covariance of the pose's error, 6×6, row-major, in ROS's order; empty if it is not known.
+    pub covariance: &'a [f64],
+    /// In the camera's frame, metres and radians a second, if it is known.
+    pub velocity: Option<Twist>,
 }
 
 impl McapRecording {
@@ -26,12 +41,12 @@ impl McapRecording {
     /// # Errors
     /// [`McapError`] if the MCAP library cannot begin the file.
     pub fn new() -> Result<Self, McapError> {
+        // Not compressed, so that every viewer opens it; images are compressed by themselves.
         let options = WriteOptions::new().compression(None).library("seese3");
         let writer = options.create(Cursor::new(Vec::new()))?;
 
         Ok(Self {
             writer,
-            schemas: BTreeMap::new(),
             channels: BTreeMap::new(),
             sequence: 0,
         })
@@ -48,9 +63,40 @@ impl McapRecording {
         frame: &str,
         pose: &Pose,
     ) -> Result<(), McapError> {
-        let message = json!({ "timestamp": time(time_ns), "frame_id": frame,
-            "pose": { "position": vector(pose), "orientation": quaternion(pose) } });
-        self.message("foxglove.PoseInFrame", topic, time_ns, &message)
+        let message = PoseInFrame {
+            timestamp: Some(timestamp(time_ns)),
+            frame_id: frame.to_owned(),
+            pose: Some(foxglove_pose(pose)),
+        };
+        self.message(topic, time_ns, &message)
+    }
+
+    /// Adds a pose with its covariance and a velocity as a foxglove.Odometry message on `topic`.
+    ///
+    /// # Errors
+    /// [`McapError`] if the MCAP library cannot write the message.
+    pub fn odometry(
+        &mut self,
+        topic: &str,
+        time_ns: i64,
+        odometry: &RecordedOdometry<'_>,
+    ) -> Result<(), McapError> {
+        let vector = |v: nalgebra::Vector3<f64>| Vector3 {
+            x: v.x,
+            y: v.y,
+            z: v.z,
+        };
+        let message = Odometry {
+            timestamp: Some(timestamp(time_ns)),
+            frame_id: odometry.frame.to_owned(),
+            body_frame_id: odometry.child_frame.to_owned(),
+            pose: Some(foxglove_pose(&odometry.pose)),
+            linear_velocity: odometry.velocity.map(|twist| vector(twist.linear)),
+            angular_velocity: odometry.velocity.map(|twist| vector(twist.angular)),
+            pose_covariance: odometry.covariance.to_vec(),
+            ..Odometry::default()
+        };
+        self.message(topic, time_ns, &message)
     }
 
     /// Adds the pose `parent_from_child` as a foxglove.FrameTransform message on `/tf`.
@@ -64,9 +110,14 @@ impl McapRecording {
         child: &str,
         pose: &Pose,
     ) -> Result<(), McapError> {
-        let message = json!({ "timestamp": time(time_ns), "parent_frame_id": parent, "child_frame_id": child,
-            "translation": vector(pose), "rotation": quaternion(pose) });
-        self.message("foxglove.FrameTransform", "/tf", time_ns, &message)
+        let message = FrameTransform {
+            timestamp: Some(timestamp(time_ns)),
+            parent_frame_id: parent.to_owned(),
+            child_frame_id: child.to_owned(),
+            translation: Some(translation(pose)),
+            rotation: Some(rotation(pose)),
+        };
+        self.message("/tf", time_ns, &message)
     }
 
     /// Adds the bytes of a JPEG or PNG file as a foxglove.CompressedImage message on
@@ -82,14 +133,13 @@ impl McapRecording {
         } else {
             "jpeg"
         };
-        let message = json!({ "timestamp": time(time_ns), "frame_id": frame, "format": format, "data": STANDARD.encode(file) });
-
-        self.message(
-            "foxglove.CompressedImage",
-            "/camera/image",
-            time_ns,
-            &message,
-        )
+        let message = CompressedImage {
+            timestamp: Some(timestamp(time_ns)),
+            frame_id: frame.to_owned(),
+            data: bytes::Bytes::copy_from_slice(file),
+            format: format.to_owned(),
+        };
+        self.message("/camera/image", time_ns, &message)
     }
 
     /// Completes the recording and returns the bytes of the file.
@@ -101,14 +151,13 @@ impl McapRecording {
         Ok(self.writer.into_inner().into_inner())
     }
 
-    fn message(
+    fn message<M: Encode>(
         &mut self,
-        schema: &'static str,
         topic: &str,
         time_ns: i64,
-        message: &Value,
+        message: &M,
     ) -> Result<(), McapError> {
-        let channel_id = self.channel(schema, topic)?;
+        let channel_id = self.channel::<M>(topic)?;
         self.sequence += 1;
 
         // MCAP times are unsigned nanoseconds since the epoch: earlier times are clamped to it.
@@ -120,95 +169,92 @@ impl McapRecording {
             publish_time: log_time,
         };
 
-        self.writer
-            .write_to_known_channel(&header, message.to_string().as_bytes())
+        let mut encoded = Vec::new();
+        message
+            .encode(&mut encoded)
+            .map_err(|error| McapError::Io(std::io::Error::other(error.to_string())))?;
+        self.writer.write_to_known_channel(&header, &encoded)
     }
 
-    fn channel(&mut self, schema: &'static str, topic: &str) -> Result<u16, McapError> {
+    fn channel<M: Encode>(&mut self, topic: &str) -> Result<u16, McapError> {
         // A channel, and the schema behind it, is registered with the first message on its topic.
         if let Some(&id) = self.channels.get(topic) {
             return Ok(id);
         }
 
-        let schema_id = match self.schemas.get(schema) {
-            Some(&id) => id,
-            None => self.writer.add_schema(
-                schema,
-                "jsonschema",
-                schema_of(schema).to_string().as_bytes(),
-            )?,
+        let schema_id = match M::get_schema() {
+            Some(schema) => self
+                .writer
+                .add_schema(&schema.name, &schema.encoding, &schema.data)?,
+            None => 0,
         };
-
-        self.schemas.insert(schema, schema_id);
-        let id = self
-            .writer
-            .add_channel(schema_id, topic, "json", &BTreeMap::new())?;
+        let id = self.writer.add_channel(
+            schema_id,
+            topic,
+            &M::get_message_encoding(),
+            &BTreeMap::new(),
+        )?;
         self.channels.insert(topic.to_owned(), id);
 
         Ok(id)
     }
 }
 
-fn time(time_ns: i64) -> Value {
-    json!({ "sec": time_ns.div_euclid(1_000_000_000), "nsec": time_ns.rem_euclid(1_000_000_000) })
+/// A time of the message; what was before the epoch is the epoch.
+fn timestamp(time_ns: i64) -> Timestamp {
+    let seconds = u32::try_from(time_ns.div_euclid(1_000_000_000)).unwrap_or(0);
+    // The rest of a division by 10⁹ is smaller than that.
+    Timestamp::new(seconds, time_ns.rem_euclid(1_000_000_000) as u32)
 }
 
-fn vector(pose: &Pose) -> Value {
+fn foxglove_pose(pose: &Pose) -> foxglove::messages::Pose {
+    foxglove::messages::Pose {
+        position: Some(translation(pose)),
+        orientation: Some(rotation(pose)),
+    }
+}
+
+fn translation(pose: &Pose) -> Vector3 {
     let t = pose.translation.vector;
-    json!({ "x": t.x, "y": t.y, "z": t.z })
+    Vector3 {
+        x: t.x,
+        y: t.y,
+        z: t.z,
+    }
 }
 
-fn quaternion(pose: &Pose) -> Value {
+fn rotation(pose: &Pose) -> Quaternion {
     let q = pose.rotation.coords;
-    json!({ "x": q.x, "y": q.y, "z": q.z, "w": q.w })
-}
-
-/// The JSON schema of a Foxglove message, reduced to the fields that are written here.
-fn schema_of(name: &str) -> Value {
-    let number = json!({ "type": "number" });
-    let text = json!({ "type": "string" });
-    let object = |fields: Value| json!({ "type": "object", "properties": fields });
-    let time = object(json!({ "sec": { "type": "integer" }, "nsec": { "type": "integer" } }));
-
-    let vector = object(json!({ "x": number, "y": number, "z": number }));
-    let quaternion = object(json!({ "x": number, "y": number, "z": number, "w": number }));
-
-    let mut schema = match name {
-        "foxglove.PoseInFrame" => object(json!({ "timestamp": time, "frame_id": text,
-            "pose": object(json!({ "position": vector, "orientation": quaternion })) })),
-        "foxglove.FrameTransform" => object(
-            json!({ "timestamp": time, "parent_frame_id": text, "child_frame_id": text,
-            "translation": vector, "rotation": quaternion }),
-        ),
-        _ => object(json!({ "timestamp": time, "frame_id": text, "format": text,
-            "data": { "type": "string", "contentEncoding": "base64" } })),
-    };
-
-    schema["title"] = name.into();
-    schema
+    Quaternion {
+        x: q.x,
+        y: q.y,
+        z: q.z,
+        w: q.w,
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use prost_reflect::{DescriptorPool, DynamicMessage};
 
-    /// Oracle: the library's own reader, and Foxglove's field names by hand.
+    /// Oracle: the MCAP library's own reader, and a Protobuf reader that knows nothing but the
+    /// schemas in the file.
     #[test]
     fn what_is_recorded_is_read_again() {
         let mut recording = McapRecording::new().unwrap();
         let pose = Pose::translation(1.0, 2.0, 3.0);
-        recording
-            .pose("/pose", 1_500_000_000, "map", &pose)
-            .unwrap();
-
-        recording
-            .transform(1_500_000_000, "map", "odom", &pose)
-            .unwrap();
-
-        recording
-            .pose("/pose", 2_000_000_000, "map", &pose)
-            .unwrap();
-
+        let time = 1_500_000_000;
+        recording.pose("/pose", time, "map", &pose).unwrap();
+        recording.transform(time, "map", "odom", &pose).unwrap();
+        let odometry = RecordedOdometry {
+            frame: "map",
+            child_frame: "camera",
+            pose,
+            covariance: &[0.25; 36],
+            velocity: None,
+        };
+        recording.odometry("/odometry", time, &odometry).unwrap();
         recording
             .image(2_000_000_000, "camera", &[0x89, b'P', b'N', b'G'])
             .unwrap();
@@ -218,36 +264,24 @@ mod tests {
             .unwrap()
             .map(Result::unwrap)
             .collect();
-
-        assert_eq!(messages.len(), 4);
-
-        let names: Vec<&str> = messages
+        let read: Vec<serde_json::Value> = messages
             .iter()
-            .map(|message| message.channel.schema.as_ref().unwrap().name.as_str())
+            .map(|message| {
+                let schema = message.channel.schema.as_ref().unwrap();
+                assert_eq!(schema.encoding, "protobuf");
+                let pool = DescriptorPool::decode(schema.data.as_ref()).unwrap();
+                let descriptor = pool.get_message_by_name(&schema.name).unwrap();
+                let message = DynamicMessage::decode(descriptor, message.data.as_ref()).unwrap();
+                serde_json::to_value(&message).unwrap()
+            })
             .collect();
 
-        assert_eq!(
-            names
-                .iter()
-                .filter(|&&name| name == "foxglove.PoseInFrame")
-                .count(),
-            2
-        );
-
-        let first: Value = serde_json::from_slice(&messages[0].data).unwrap();
-        assert_eq!(first["timestamp"], json!({ "sec": 1, "nsec": 500_000_000 }));
-
-        assert_eq!(
-            (&first["frame_id"], &first["pose"]["position"]["z"]),
-            (&json!("map"), &json!(3.0))
-        );
-
-        assert_eq!(messages[0].log_time, 1_500_000_000);
-
-        let last: Value = serde_json::from_slice(&messages[3].data).unwrap();
-        assert_eq!(
-            (&last["format"], &last["data"]),
-            (&json!("png"), &json!("iVBORw=="))
-        );
+        assert_eq!(read[0]["timestamp"], "1970-01-01T00:00:01.500Z");
+        assert_eq!(read[0]["pose"]["position"]["z"], 3.0);
+        assert_eq!(read[1]["childFrameId"], "odom");
+        assert_eq!(read[2]["poseCovariance"][35], 0.25);
+        assert_eq!(read[2]["bodyFrameId"], "camera");
+        assert_eq!(read[3]["data"], "iVBORw==");
+        assert_eq!(messages[3].log_time, 2_000_000_000);
     }
 }

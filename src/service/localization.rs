@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use ndarray::ArrayView1;
 use tonic::{Request, Response, Status};
 
 use super::convert;
@@ -17,7 +18,9 @@ use seese3_core::cancel::Cancellation;
 use seese3_core::fitting::RoomReader;
 use seese3_core::localization::localize;
 use seese3_core::navigation::{Error as E, Source, StepError};
+use seese3_core::planning::{BelievedStart, KnownRoom};
 use seese3_core::room;
+use seese3_core::tracking::{Belief, PoseReader};
 
 #[tonic::async_trait]
 impl LocalizationService for Handlers {
@@ -135,13 +138,52 @@ fn answer(
         ([only], Source::Feature(feature)) => located(only, feature)?,
         _ => None,
     };
+    let believed = match (served.as_slice(), &source) {
+        (_, Source::Frame(_)) => None,
+        ([only], Source::Feature(feature)) => {
+            Some(believed(only, start.latent.view(), Some(feature)))
+        }
+        ([only], Source::Latent(_)) => Some(believed(only, start.latent.view(), None)),
+        _ => None,
+    };
 
     Ok(pb::LocalizeResponse {
         adapter: Some(convert::adapter_revision(first)),
         places: places.iter().map(place).collect::<Result<_, Error>>()?,
         room_count: served.len() as u32,
         located,
+        believed,
     })
+}
+
+/// Where the camera of a view is believed to be, and whether the view looks like the room.
+fn believed(
+    served: &ServedNavigator,
+    latent: ArrayView1<'_, f64>,
+    feature: Option<&[f32]>,
+) -> pb::BelievedPose {
+    let room = KnownRoom {
+        navigator: &served.navigator,
+        map: served.map.as_deref(),
+        reader: served.room_reader().map(|reader| reader as &dyn PoseReader),
+    };
+    let seen = BelievedStart::seen(room, latent, feature);
+
+    let covariance = seen.covariance.map(|covariance| {
+        let belief = Belief {
+            pose: seen.pose,
+            covariance,
+        };
+        convert::matrix_to_wire(&belief.ros_covariance())
+    });
+    pb::BelievedPose {
+        pose: Some(convert::pose_to_wire(
+            &seen.pose,
+            served.navigator.room().id().as_str(),
+        )),
+        covariance: covariance.unwrap_or_default(),
+        out_of_distribution: seen.out_of_distribution,
+    }
 }
 
 /// Where the camera of a feature is, if the adapter was fitted to the room.

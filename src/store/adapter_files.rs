@@ -143,6 +143,7 @@ pub(super) fn assembled(
 
     Ok(StoredAdapter {
         room_fit,
+        is_experiment: body.experiment,
         name: body.adapter,
         revision: body.revision,
         created: body.created,

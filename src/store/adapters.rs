@@ -32,6 +32,15 @@ pub struct StoredAdapter {
     /// The room that it was fitted to, and how far it may be believed there; none for an adapter
     /// that is meant for any room.
     pub room_fit: Option<RoomFit>,
+    /// Whether it belongs to an experiment: it answers where it is named, or where no other does.
+    pub is_experiment: bool,
+}
+
+/// What an adapter is published for.
+enum Purpose<'a> {
+    AnyRoom,
+    OneRoom(&'a RoomFit),
+    Experiment,
 }
 
 /// What makes an adapter one of a single room.
@@ -73,7 +82,24 @@ impl Store {
         record: &TrainingRecord,
         features: ArrayView2<'_, f32>,
     ) -> Result<Published, Error> {
-        self.publish(name, adapter, record, features, None).await
+        self.publish(name, adapter, record, features, &Purpose::AnyRoom)
+            .await
+    }
+
+    /// Publishes an adapter of an experiment, as [`Store::publish_adapter`] does. It answers where it is
+    /// named; by default only where no other adapter fits.
+    ///
+    /// # Errors
+    /// As [`Store::publish_adapter`].
+    pub async fn publish_experiment(
+        &self,
+        name: &str,
+        adapter: &Adapter,
+        record: &TrainingRecord,
+        features: ArrayView2<'_, f32>,
+    ) -> Result<Published, Error> {
+        self.publish(name, adapter, record, features, &Purpose::Experiment)
+            .await
     }
 
     /// Publishes an adapter that was fitted to a room, as [`Store::publish_adapter`] does.
@@ -90,7 +116,7 @@ impl Store {
         let Fitted {
             adapter, record, ..
         } = fitted;
-        self.publish(name, adapter, record, features, Some(room_fit))
+        self.publish(name, adapter, record, features, &Purpose::OneRoom(room_fit))
             .await
     }
 
@@ -100,7 +126,7 @@ impl Store {
         adapter: &Adapter,
         record: &TrainingRecord,
         features: ArrayView2<'_, f32>,
-        room_fit: Option<&RoomFit>,
+        purpose: &Purpose<'_>,
     ) -> Result<Published, Error> {
         if !is_plain_name(name) {
             return Err(Error::Name {
@@ -109,6 +135,10 @@ impl Store {
             });
         }
 
+        let room_fit = match purpose {
+            Purpose::OneRoom(fit) => Some(*fit),
+            Purpose::AnyRoom | Purpose::Experiment => None,
+        };
         let bytes = adapter_file(name, adapter, features, room_fit)?;
         let body = AdapterBody {
             schema: SCHEMA,
@@ -118,6 +148,7 @@ impl Store {
             deviation_ddof: 0,
             training: TrainingEntry::new(record, adapter),
             fitted_to: room_fit.map(FittedEntry::from),
+            experiment: matches!(purpose, Purpose::Experiment),
             // What follows is set when it is published.
             adapter: String::new(),
             revision: 0,

@@ -132,6 +132,9 @@ pub struct AdapterBody {
     /// The room that the adapter was fitted to; absent for one that is meant for any room.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fitted_to: Option<FittedEntry>,
+    /// Whether it belongs to an experiment, and is not meant to answer in rooms.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub experiment: bool,
 }
 
 impl AdapterBody {

@@ -49,12 +49,14 @@ const CRATES: [CrateRules; 4] = [
         fewest_modules: 6,
         reserved: &[
             ("seese3_lab", &["cli"]),
-            ("mcap", &["export"]),
+            // It is also a word of the command line.
+            ("mcap", &["datasets", "export", "cli"]),
+            ("foxglove", &["datasets", "export"]),
             ("ort", &["encoder"]),
             ("tract_onnx", &["encoder"]),
             ("fast_image_resize", &["encoder"]),
             ("tonic", &["service", "cli"]),
-            ("prost", &["service", "encoder"]),
+            ("prost", &["service", "encoder", "cli"]),
             ("tokio", &["service", "cli", "main"]),
             (
                 "std::fs",

@@ -1,14 +1,14 @@
 //! COLMAP, nerfstudio, KITTI, EuRoC and folders of one's own, on files that other programs wrote
-//! (tests/golden/datasets/make_models.py).
+//! (tests/golden/datasets/make_models.py and make_bags.py).
 
 use std::path::{Path, PathBuf};
 
 use nalgebra::Matrix4;
 use seese3::datasets::{
-    DropReason, Error, Kitti, Reader, Recording, Unusable, read_colmap, read_euroc, read_folder,
-    read_kitti, read_transforms,
+    Bag, DropReason, Error, Kitti, Reader, Recording, Unusable, read_bag, read_colmap, read_euroc,
+    read_folder, read_kitti, read_transforms,
 };
-use seese3_core::geometry::{Pinhole, PixelCamera};
+use seese3_core::geometry::{Pinhole, PixelCamera, Pose};
 
 use crate::support::{golden, json};
 
@@ -212,4 +212,147 @@ fn a_folder_of_ones_own_pairs_images_with_poses() {
         error.contains("7 images") && error.contains("6 poses"),
         "{error}"
     );
+}
+
+/// Oracle: SciPy's interpolation of the poses that rosbags wrote (make_bags.py).
+fn expected_of_bags(name: &str) -> Vec<Matrix4<f64>> {
+    let file = json(&folder("expected_bags.json"));
+    let matrix = |numbers: &serde_json::Value| {
+        let numbers = numbers.as_array().unwrap().iter();
+        Matrix4::from_row_iterator(numbers.map(|x| x.as_f64().unwrap()))
+    };
+    file[name].as_array().unwrap().iter().map(matrix).collect()
+}
+
+fn read_bag_of(file: &str, bag: Bag) -> (tempfile::TempDir, Result<Recording, Error>) {
+    let images = tempfile::tempdir().unwrap();
+    let bag = Bag {
+        images: images.path().join("images"),
+        ..bag
+    };
+    let found = lenient(|reader| read_bag(&folder(file), &bag, reader));
+    (images, found)
+}
+
+#[test]
+fn a_bag_of_ros_gives_the_poses_at_the_times_of_its_images() {
+    let text = |text: &str| Some(text.to_owned());
+    // The camera on the base, as make_bags.py has it.
+    let base_from_camera = Pose::from_parts(
+        nalgebra::Translation3::new(0.2, 0.0, 0.4),
+        nalgebra::UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(0.5, -0.5, 0.5, -0.5)),
+    );
+
+    let cases = [
+        // The odometry is that of the base; /tf_static says where the camera is on it.
+        (text("/odom"), None, None, "odom_from_camera"),
+        (
+            text("/odom"),
+            None,
+            Some(base_from_camera),
+            "odom_from_camera",
+        ),
+        (
+            text("/odom"),
+            None,
+            Some(Pose::identity()),
+            "odom_from_base",
+        ),
+        (None, text("map"), None, "map_from_camera"),
+        (None, text("/odom"), None, "odom_from_camera"),
+    ];
+    for (pose_topic, world, base_from_camera, expected) in cases {
+        for topic in ["/camera/compressed", "/camera/raw"] {
+            let bag = Bag {
+                image_topic: text(topic),
+                pose_topic: pose_topic.clone(),
+                world: world.clone(),
+                base_from_camera,
+                ..Bag::default()
+            };
+            let (images, found) = read_bag_of("bag.mcap", bag);
+            let found = found.unwrap();
+
+            // The last image lies behind the last pose.
+            assert_eq!(found.dropped.len(), 1);
+            assert_eq!(found.dropped[0].reason, DropReason::NoPoseWithinTolerance);
+            for (pose, expected) in found.frames.poses.iter().zip(expected_of_bags(expected)) {
+                let off = (pose.to_homogeneous() - expected).amax();
+                assert!(off < 1e-9, "{topic}, {expected}: off by {off}");
+            }
+            let times = json(&folder("expected_bags.json"))["times_ns"].clone();
+            assert_eq!(serde_json::json!(found.frames.timestamps_ns), times);
+
+            // Red counts the images, 40 by 40; JPEG changes it by a few.
+            let image = images.path().join("images").join(&found.frames.images[3]);
+            let pixel = image::open(image).unwrap().to_rgb8().get_pixel(4, 3).0;
+            assert!(
+                pixel[0].abs_diff(120) < 4 && pixel[2].abs_diff(10) < 4,
+                "{topic}: {pixel:?}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_recording_of_foxglove_is_read() {
+    let (_images, found) = read_bag_of("foxglove.mcap", Bag::default());
+    let found = found.unwrap();
+    assert_eq!(found.frames.poses.len(), 6);
+    for (pose, expected) in found
+        .frames
+        .poses
+        .iter()
+        .zip(expected_of_bags("odom_from_base"))
+    {
+        assert!((pose.to_homogeneous() - expected).amax() < 1e-9);
+    }
+}
+
+#[test]
+fn what_a_bag_lacks_is_said() {
+    let refused = |file: &str, bag: Bag| read_bag_of(file, bag).1.unwrap_err().to_string();
+    let named = |image: Option<&str>, pose: Option<&str>, world: Option<&str>| Bag {
+        image_topic: image.map(str::to_owned),
+        pose_topic: pose.map(str::to_owned),
+        world: world.map(str::to_owned),
+        ..Bag::default()
+    };
+
+    let problem = refused("bag.mcap", Bag::default());
+    assert!(
+        problem.contains("--image-topic, one of /camera/compressed, /camera/raw"),
+        "{problem}"
+    );
+    let problem = refused("bag.mcap", named(Some("/chatter"), None, None));
+    assert!(
+        problem.contains("no image topic /chatter; it has /camera/compressed"),
+        "{problem}"
+    );
+    let problem = refused("bag.mcap", named(Some("/camera/raw"), Some("/pose"), None));
+    assert!(
+        problem.contains("no pose topic /pose; it has /odom"),
+        "{problem}"
+    );
+    let problem = refused("bag.mcap", named(Some("/camera/raw"), None, Some("world")));
+    assert!(
+        problem.contains("from 'world' to 'camera_optical'; it has base_link"),
+        "{problem}"
+    );
+
+    let whole = std::fs::read(folder("bag.mcap")).unwrap();
+    let cut = tempfile::tempdir().unwrap();
+    let file = cut.path().join("cut.mcap");
+    for length in [0, 5, 100, whole.len() / 2] {
+        std::fs::write(&file, &whole[..length]).unwrap();
+        let bag = Bag {
+            images: cut.path().join("images"),
+            ..named(Some("/camera/raw"), None, Some("map"))
+        };
+        let problem = lenient(|reader| read_bag(&file, &bag, reader)).unwrap_err();
+        assert!(
+            problem.to_string().contains("is no whole MCAP file"),
+            "{length}: {problem}"
+        );
+    }
 }

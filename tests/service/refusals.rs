@@ -620,10 +620,10 @@ async fn the_other_calls_name_the_field() {
     );
 
     refused(
-        "33 thresholds",
+        "257 thresholds",
         c.evaluate(
             pb::EvaluateRequest {
-                thresholds: vec![0.1; 33],
+                thresholds: vec![0.1; 257],
                 ..e()
             },
             |_| (),

@@ -346,13 +346,25 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
+class BelievedPose:
+    """Where a view is believed to be, world_from_camera. `out_of_distribution` above 1: it looks like another place,
+    and the pose means nothing; None under an adapter that is not calibrated."""
+
+    pose: Array
+    covariance: Array | None
+    out_of_distribution: float | None
+
+
+@dataclass(frozen=True, eq=False)
 class Localization:
-    """Which stored frames look most like a view, the best first."""
+    """Which stored frames look most like a view, the best first. `believed` is there if one room was searched: the pose
+    to use, and how sure it is; `located` is what the adapter fitted to the room says by itself."""
 
     adapter: Revision
     places: tuple[Place, ...]
     room_count: int
     located: LocatedPose | None
+    believed: BelievedPose | None
 
     @classmethod
     def of(cls, message: localization_pb2.LocalizeResponse) -> Localization:
@@ -360,7 +372,13 @@ class Localization:
             Place(Revision.of(place.room), Frame.of(place.frame), PoseError.of(place, "error"))
             for place in message.places
         )
-        return cls(Revision.of(message.adapter), places, message.room_count, LocatedPose.of(message, "located"))
+        believed = None
+        if message.HasField("believed"):
+            wire = message.believed
+            far = _known(wire, "out_of_distribution")
+            believed = BelievedPose(pose_matrix(wire.pose), covariance_matrix(wire.covariance), far)
+        located = LocatedPose.of(message, "located")
+        return cls(Revision.of(message.adapter), places, message.room_count, located, believed)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,5 @@
 //! `seese3 evaluate localization`: maps a part of a room and locates the views of the other part.
 
-use std::path::PathBuf;
-
 use anyhow::bail;
 use clap::Args;
 
@@ -10,7 +8,7 @@ use seese3_lab::experiments::localization::{LocalizationProtocol, RuleScores, ev
 use seese3_lab::report::{LocalizationContext, localization_json, localization_table};
 
 use super::super::fit::fitting_bar;
-use super::super::{check_writable, say, write_json};
+use super::super::output::{JsonOutput, say};
 use crate::store::Store;
 use seese3_core::training::RoomData;
 
@@ -43,16 +41,13 @@ pub struct Localization {
     /// Seed of the fitted adapter
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
-    /// Write the errors to this file as JSON
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Localization {
     pub async fn run(self) -> anyhow::Result<()> {
-        if let Some(path) = &self.json {
-            check_writable(path)?;
-        }
+        self.json.begin()?;
         if self.adapter.is_none() && !self.fit {
             bail!("give --adapter, or --fit to fit one to the mapped frames");
         }
@@ -108,7 +103,7 @@ impl Localization {
             say_rules(rules);
         }
 
-        if let Some(path) = &self.json {
+        if self.json.is_wanted() {
             let context = LocalizationContext {
                 room: self.room.clone(),
                 features: features.source().name.clone(),
@@ -117,8 +112,7 @@ impl Localization {
                 map_blocks: self.map_blocks,
                 seed: self.seed,
             };
-            write_json(path, &localization_json(&found, context))?;
-            say(format_args!("wrote {}", path.display()));
+            self.json.write(&localization_json(&found, context))?;
         }
 
         Ok(())

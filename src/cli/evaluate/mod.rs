@@ -8,20 +8,21 @@ mod planning;
 mod robustness;
 mod trajectory;
 
-use std::path::PathBuf;
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
 
 use super::named::one_of;
+use super::output::{JsonOutput, STANDARD_OUTPUT, check_writable, say, write_file};
 use super::progress::bar;
-use super::{check_writable, say, write_json};
 use crate::store::{Store, StoredAdapter, StoredRoom};
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{
-    Baselines, Leak, Protocol, TestPairs, TrainedOn, evaluate, has_seen, is_calibrated_in,
+    Baselines, Leak, Protocol, Report, TestPairs, TrainedOn, evaluate, has_seen, is_calibrated_in,
 };
 use seese3_core::features::Features;
 use seese3_core::motion_scores::MotionScores;
@@ -31,8 +32,9 @@ use seese3_core::room::RoomId;
 use seese3_core::splits::Split;
 use seese3_core::training::{motions, predictions};
 use seese3_lab::report::{
-    AdapterJson, EvaluationContext, MotionBaselines, RoomJson, baselines_text, evaluation_json,
-    evaluation_table,
+    AdapterJson, EvaluationContext, MotionBaselines, RoomJson, baselines_text, curve_thresholds,
+    curves_svg, evaluation_csv, evaluation_json, evaluation_latex, evaluation_table, hit_curves,
+    report_at,
 };
 
 #[derive(Debug, Args)]
@@ -131,9 +133,25 @@ struct Navigation {
     /// Seed of the random navigator
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Write the table here as JSON
-    #[arg(long)]
+    /// Draw Hit@ε over ε up to 1, a curve for each navigator, to this SVG file
+    #[arg(long, value_name = "FILE.svg")]
+    plot: Option<PathBuf>,
+    /// Write the table to this file: .csv for programs, .tex for LaTeX with booktabs
+    #[arg(long, value_name = "FILE.csv|FILE.tex", value_parser = table_file)]
+    table: Option<PathBuf>,
+    // Flattened, it would keep clap from telling whether any option of the table was given.
+    /// Also write the results as JSON to this file; "-", or no name, is standard output, where
+    /// nothing else is then printed
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = STANDARD_OUTPUT)]
     json: Option<PathBuf>,
+}
+
+/// A file whose name says in which form the table is wanted.
+fn table_file(text: &str) -> Result<PathBuf, String> {
+    match Path::new(text).extension().and_then(OsStr::to_str) {
+        Some("csv" | "tex") => Ok(PathBuf::from(text)),
+        _ => Err("must end with .csv or .tex".to_owned()),
+    }
 }
 
 impl Navigation {
@@ -142,8 +160,10 @@ impl Navigation {
         reason = "one command, from its arguments to what it prints"
     )]
     async fn run(self) -> anyhow::Result<()> {
-        if let Some(path) = &self.json {
-            check_writable(path)?;
+        let json = JsonOutput::to(self.json.clone());
+        json.begin()?;
+        for file in self.plot.iter().chain(&self.table) {
+            check_writable(file)?;
         }
 
         let store = Store::open(&self.store)?;
@@ -178,6 +198,10 @@ impl Navigation {
         )?;
 
         progress.finish_and_clear();
+
+        // A curve has more thresholds than the table.
+        let curves = report;
+        let report = report_at(&curves, &self.thresholds);
 
         let trained_on = store
             .trained_on(&record, navigator.room().id(), stored.revision)
@@ -216,7 +240,8 @@ impl Navigation {
         let motion = motion_baselines(&navigator, &features, &record, &protocol, learned_here)?;
         say(baselines_text(&motion));
 
-        if let Some(path) = &self.json {
+        self.write_files(&report, &curves)?;
+        if json.is_wanted() {
             // The file says what was evaluated and whether it leaks, so that it can be judged by
             // itself.
             let context = EvaluationContext {
@@ -236,11 +261,50 @@ impl Navigation {
                 in_room,
                 leaks: leak.is_some(),
             };
-            write_json(path, &evaluation_json(&report, &motion, context))?;
-
-            say(format_args!("wrote {}", path.display()));
+            json.write(&evaluation_json(&report, &motion, context))?;
         }
 
+        Ok(())
+    }
+
+    /// The thresholds of the table, and those of the curves if they are drawn.
+    fn all_thresholds(&self) -> Vec<f64> {
+        let mut all = self.thresholds.clone();
+        if self.plot.is_some() {
+            all.extend(curve_thresholds());
+            all.sort_by(f64::total_cmp);
+            all.dedup();
+        }
+        all
+    }
+
+    /// Writes the table and the curves to the files that were asked for.
+    fn write_files(&self, report: &Report, curves: &Report) -> anyhow::Result<()> {
+        if let Some(file) = &self.table {
+            let text = match file.extension().and_then(OsStr::to_str) {
+                Some("tex") => evaluation_latex(report),
+                _ => evaluation_csv(report),
+            };
+            write_file(file, text.as_bytes())?;
+            say(format_args!("wrote {}", file.display()));
+        }
+
+        if let Some(file) = &self.plot {
+            let title = format!(
+                "{}: {} motions over {} frames, split {}",
+                self.room, report.n, report.protocol.stride, report.protocol.split
+            );
+            let mut drawn = hit_curves(curves, title);
+            if self.navigators.is_empty() {
+                // Other metrics of a navigator, and those that have seen the test pairs, would hide
+                // the rest.
+                let is_plain = |name: &str| !name.contains('+') && !name.ends_with("-in-sample");
+                drawn.series.retain(|series| is_plain(&series.name));
+            }
+            let svg = curves_svg(&drawn)?;
+            write_file(file, svg.as_bytes())?;
+            say(format_args!("wrote {}", file.display()));
+        }
         Ok(())
     }
 
@@ -250,7 +314,7 @@ impl Navigation {
             split: self.split.unwrap_or(record.split),
             stride: self.stride.unwrap_or(record.stride),
             exclude_source: self.exclude_source.then_some(0),
-            thresholds: self.thresholds.clone(),
+            thresholds: self.all_thresholds(),
             seed: self.seed,
             steps: self.steps,
             mode: self.mode,
@@ -378,8 +442,15 @@ async fn choose(
             .is_none_or(|stride| stride == stored.record.stride)
     };
 
-    // Compared in this order: the right stride, then the date, then the name.
-    let best = |a: &StoredAdapter| (same_stride(a), a.created.clone(), a.name.clone());
+    // Compared in this order: none of an experiment, the right stride, then the date, then the name.
+    let best = |a: &StoredAdapter| {
+        (
+            !a.is_experiment,
+            same_stride(a),
+            a.created.clone(),
+            a.name.clone(),
+        )
+    };
 
     match fitting.into_iter().max_by(|a, b| best(a).cmp(&best(b))) {
         Some(stored) => Ok(stored),

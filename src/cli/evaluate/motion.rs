@@ -1,7 +1,5 @@
 //! `seese3 evaluate motion`: how well the motion between two views of a room is read.
 
-use std::path::PathBuf;
-
 use anyhow::Context;
 use clap::Args;
 
@@ -13,8 +11,8 @@ use seese3_lab::experiments::motion::{Maps, evaluate};
 use seese3_lab::report::{motion_evaluation_json, motion_table};
 
 use super::super::camera::CameraOption;
+use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
-use super::super::{check_writable, say, write_json};
 use crate::encoder::{Pooling, Preparation};
 use crate::store::{Store, StoredAdapter};
 
@@ -39,16 +37,13 @@ pub struct Motion {
     /// Frames from the first view to the second
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
     stride: u32,
-    /// Write the errors to this file as JSON
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Motion {
     pub async fn run(self) -> anyhow::Result<()> {
-        if let Some(path) = &self.json {
-            check_writable(path)?;
-        }
+        self.json.begin()?;
 
         let store = Store::open(&self.store)?;
         let stored = store.load_room(&self.room, None).await?;
@@ -105,11 +100,10 @@ impl Motion {
         }
         say(motion_table(&found).trim_end());
 
-        if let Some(path) = &self.json {
+        if self.json.is_wanted() {
             let named = self.adapter.as_deref().zip(in_room);
             let record = motion_evaluation_json(&found, &self.room, named, self.stride);
-            write_json(path, &record)?;
-            say(format_args!("wrote {}", path.display()));
+            self.json.write(&record)?;
         }
 
         Ok(())

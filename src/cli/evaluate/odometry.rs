@@ -19,9 +19,9 @@ use seese3_lab::report::{
 };
 
 use super::super::named::{ClosedSet, one_of};
+use super::super::output::{JsonOutput, say, write_file};
 use super::super::progress::bar;
 use super::super::rooms::{data, load_rooms};
-use super::super::{check_writable, say, write_file, write_json};
 use super::say_leaks;
 use crate::export::{kitti_trajectory, tum_trajectory};
 use crate::store::Store;
@@ -57,9 +57,8 @@ pub struct Odometry {
     /// Print a line for every room, not only the mean
     #[arg(long)]
     each: bool,
-    /// Write all results to this file as JSON
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Odometry {
@@ -68,9 +67,7 @@ impl Odometry {
         reason = "one command, from its arguments to what it prints"
     )]
     pub async fn run(self) -> anyhow::Result<()> {
-        if let Some(path) = &self.json {
-            check_writable(path)?;
-        }
+        self.json.begin()?;
 
         let store = Store::open(&self.store)?;
         let stored = store.load_adapter(&self.adapter, None).await?;
@@ -152,10 +149,8 @@ impl Odometry {
             "{APE_FORMULA}; root mean square without alignment"
         ));
 
-        if let Some(path) = &self.json {
-            write_json(path, &odometry_json(&tracked, relocalised.as_ref()))?;
-            say(format_args!("wrote {}", path.display()));
-        }
+        self.json
+            .write(&odometry_json(&tracked, relocalised.as_ref()))?;
 
         Ok(())
     }

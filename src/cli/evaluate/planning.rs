@@ -1,8 +1,6 @@
 //! `seese3 evaluate planning`: ways from unmapped views to mapped goals, beside those of simple
 //! planners.
 
-use std::path::PathBuf;
-
 use clap::Args;
 
 use seese3_core::splits::HoldOut;
@@ -11,9 +9,9 @@ use seese3_lab::experiments::planning::{PlanningProtocol, evaluate};
 use seese3_lab::report::{planning_json, planning_table};
 
 use super::super::named::one_of;
+use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
 use super::super::rooms::{data, load_rooms};
-use super::super::{check_writable, say, write_json};
 use super::say_leaks;
 use crate::store::Store;
 
@@ -45,16 +43,13 @@ pub struct Planning {
     /// Seed of the questions
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Write the scores to this file as JSON
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Planning {
     pub async fn run(self) -> anyhow::Result<()> {
-        if let Some(path) = &self.json {
-            check_writable(path)?;
-        }
+        self.json.begin()?;
 
         let store = Store::open(&self.store)?;
         let stored = store.load_adapter(&self.adapter, None).await?;
@@ -85,10 +80,8 @@ impl Planning {
         ));
         say(planning_table(&found).trim_end());
 
-        if let Some(path) = &self.json {
-            write_json(path, &planning_json(&found, &protocol, &stored.name))?;
-            say(format_args!("wrote {}", path.display()));
-        }
+        self.json
+            .write(&planning_json(&found, &protocol, &stored.name))?;
 
         Ok(())
     }

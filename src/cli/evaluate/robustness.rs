@@ -22,9 +22,9 @@ use seese3_lab::report::{robustness_json, robustness_table};
 use super::super::encode::images_root;
 use super::super::encoder::RuntimeOptions;
 use super::super::named::one_of;
+use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
 use super::super::rooms::{data, load_rooms};
-use super::super::{check_writable, say, write_json};
 use super::say_leaks;
 use crate::encoder::{Encoder, read_image};
 use crate::store::Store;
@@ -54,9 +54,8 @@ pub struct Robustness {
     only: Vec<String>,
     #[command(flatten)]
     runtime: RuntimeOptions,
-    /// Write the results to this file as JSON
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 /// Images that are encoded together.
@@ -64,9 +63,7 @@ const BATCH: usize = 16;
 
 impl Robustness {
     pub async fn run(self) -> anyhow::Result<()> {
-        if let Some(path) = &self.json {
-            check_writable(path)?;
-        }
+        self.json.begin()?;
 
         let store = Store::open(&self.store)?;
         let stored = store.load_adapter(&self.adapter, None).await?;
@@ -121,10 +118,8 @@ impl Robustness {
         ));
         say(robustness_table(&found).trim_end());
 
-        if let Some(path) = &self.json {
-            write_json(path, &robustness_json(&found, &stored.name, self.hold_out))?;
-            say(format_args!("wrote {}", path.display()));
-        }
+        self.json
+            .write(&robustness_json(&found, &stored.name, self.hold_out))?;
 
         Ok(())
     }

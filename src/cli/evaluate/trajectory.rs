@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Context, bail};
 use clap::Args;
 
-use super::super::{check_writable, say, write_json};
+use super::super::output::{JsonOutput, say};
 use crate::datasets::read_tum_trajectory;
 use seese3_core::trajectory::{RpePairs, associate};
 use seese3_lab::experiments::path_comparison::{PathComparison, PathProtocol};
@@ -24,9 +24,8 @@ pub struct EvaluateTrajectory {
     max_difference_ms: u64,
     #[command(flatten)]
     relative: RelativeOptions,
-    /// Write the errors here as JSON
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 /// Between which poses the relative error is taken.
@@ -56,9 +55,7 @@ impl RelativeOptions {
 
 impl EvaluateTrajectory {
     pub fn run(self) -> anyhow::Result<()> {
-        if let Some(path) = &self.json {
-            check_writable(path)?;
-        }
+        self.json.begin()?;
 
         let reference = read_tum_trajectory(&self.reference)?;
         let estimate = read_tum_trajectory(&self.estimate)?;
@@ -87,10 +84,7 @@ impl EvaluateTrajectory {
         ));
 
         say(path_errors_table(&errors).trim_end());
-        if let Some(path) = &self.json {
-            write_json(path, &path_errors_json(&errors))?;
-            say(format_args!("wrote {}", path.display()));
-        }
+        self.json.write(&path_errors_json(&errors))?;
 
         Ok(())
     }

@@ -8,10 +8,10 @@ use clap::Args;
 use rayon::prelude::*;
 
 use super::super::named::one_of;
+use super::super::output::{say, write_file};
 use super::super::progress::bar;
 use super::super::protocol::ProtocolOptions;
 use super::super::rooms::{data, load_rooms};
-use super::super::{say, write_file};
 use super::journal::{self, SweepJournal};
 use crate::store::{Store, StoredRoom};
 use seese3_core::adapter::{Loss, TrainConfig};

@@ -1,13 +1,11 @@
 //! `seese3 sweep formulations`: the adapter and the paper's alternatives A to D.
 
-use std::path::PathBuf;
-
 use clap::Args;
 
+use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
 use super::super::protocol::ProtocolOptions;
 use super::super::rooms::{data, load_rooms, room_words};
-use super::super::{check_writable, say, write_json};
 use crate::store::Store;
 use seese3_core::training::RoomData;
 use seese3_lab::experiments::formulations::{RoomPooling, compare};
@@ -33,16 +31,13 @@ pub struct Formulations {
     /// Seeds of each formulation, from 0 on; the paper used 15
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1_000))]
     seeds: u64,
-    /// Write all results to this file as JSON
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Formulations {
     pub async fn run(self) -> anyhow::Result<()> {
-        if let Some(file) = &self.json {
-            check_writable(file)?;
-        }
+        self.json.begin()?;
 
         self.protocol.needs_test_pairs()?;
         let store = Store::open(&self.store)?;
@@ -93,10 +88,7 @@ impl Formulations {
         ));
 
         say(formulations_table(&comparison).trim_end());
-        if let Some(file) = &self.json {
-            write_json(file, &formulations_json(&comparison))?;
-            say(format_args!("wrote {}", file.display()));
-        }
+        self.json.write(&formulations_json(&comparison))?;
 
         Ok(())
     }

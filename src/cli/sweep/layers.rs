@@ -1,15 +1,13 @@
 //! `seese3 sweep layers`: M1 to M4 of every layer of an encoder's features.
 
-use std::path::PathBuf;
-
 use anyhow::{Context, bail, ensure};
 use clap::Args;
 use rayon::prelude::*;
 
 use super::super::named::{ClosedSet, one_of};
+use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
 use super::super::protocol::SplitChoice;
-use super::super::{check_writable, say, write_json};
 use crate::store::{Store, StoredRoom};
 use seese3_core::adapter::Preset;
 use seese3_core::features::Features;
@@ -65,9 +63,8 @@ pub struct Layers {
     /// Also print one line per encoder, by its best layer: to compare checkpoints of one encoder
     #[arg(long)]
     by_encoder: bool,
-    /// Write all results to this file as JSON
-    #[arg(long)]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Layers {
@@ -76,9 +73,7 @@ impl Layers {
         reason = "one command, from its arguments to what it prints"
     )]
     pub async fn run(self) -> anyhow::Result<()> {
-        if let Some(file) = &self.json {
-            check_writable(file)?;
-        }
+        self.json.begin()?;
 
         ensure!(
             self.split != SplitChoice::One(Split::Whole),
@@ -161,10 +156,7 @@ impl Layers {
         }
 
         say("* the best: M1 highest, M2 nearest to 6 (SE(3)), M3 and M4 highest; means over rooms");
-        if let Some(file) = &self.json {
-            write_json(file, &layers_json(&scores))?;
-            say(format_args!("wrote {}", file.display()));
-        }
+        self.json.write(&layers_json(&scores))?;
 
         Ok(())
     }

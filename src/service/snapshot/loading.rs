@@ -498,8 +498,8 @@ fn opened_for(
 }
 
 /// The adapters that fit a room with features of these sources, in order of preference: those
-/// fitted to this room, then those trained in it, then the newest. The first is the room's default
-/// where an operator chose none.
+/// fitted to this room, then those trained in it, then the newest, and behind all of them those of
+/// experiments. The first is the room's default where an operator chose none.
 fn fitting(
     adapters: &BTreeMap<String, Arc<StoredAdapter>>,
     room: &RoomId,
@@ -519,6 +519,7 @@ fn fitting(
         let is_trained_here = adapter.record.rooms.iter().any(|(name, _)| name == room);
         let is_fitted_here = adapter.room_fit.is_some();
         (
+            !adapter.is_experiment,
             is_fitted_here,
             is_trained_here,
             adapter.created.clone(),

@@ -72,7 +72,7 @@ pub enum Error {
 pub const MAX_THRESHOLD: f64 = 1e6;
 
 /// The largest number of thresholds in one report.
-pub const MAX_THRESHOLDS: usize = 32;
+pub const MAX_THRESHOLDS: usize = 256;
 
 /// Checks the thresholds ε of Hit@ε.
 ///

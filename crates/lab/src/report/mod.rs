@@ -9,6 +9,7 @@ mod cross_room;
 mod curves;
 mod document;
 mod evaluation;
+mod evaluation_files;
 mod formulations;
 mod json;
 mod layers;
@@ -36,6 +37,9 @@ pub use document::{Block, Document, Picture, Section};
 pub use evaluation::{
     AdapterJson, EvaluationContext, EvaluationJson, MotionBaselines, RoomJson, baselines_text,
     evaluation_json, evaluation_table,
+};
+pub use evaluation_files::{
+    curve_thresholds, evaluation_csv, evaluation_latex, hit_curves, report_at,
 };
 pub use formulations::{FormulationsJson, formulations_json, formulations_table};
 pub use json::{BaselinesJson, MotionJson, PartsJson, RateJson, RoomMeanJson};

@@ -48,7 +48,7 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
 
     for run in runs {
         let mut cells = vec![run.record.config.seed.to_string()];
-        cells.extend(numbers(run).iter().map(|value| format!("{value:.3}")));
+        cells.extend(numbers(run).into_iter().map(number_text));
         lines.push(cells);
     }
 
@@ -58,7 +58,7 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
             let mut cells = vec![label.to_owned()];
             cells.extend((0..9).map(|column| {
                 let values: Vec<f64> = runs.iter().map(|run| numbers(run)[column]).collect();
-                format!("{:.3}", of(&values))
+                number_text(of(&values))
             }));
 
             lines.push(cells);
@@ -66,6 +66,15 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
     }
 
     aligned(&lines)
+}
+
+/// A score; one that is not defined, as those of a test without pairs, is a dash.
+fn number_text(value: f64) -> String {
+    if value.is_finite() {
+        format!("{value:.3}")
+    } else {
+        "–".to_owned()
+    }
 }
 
 /// The record of `seese3 train`: one entry per seed, and the protocol that they share.

@@ -126,7 +126,7 @@ pub fn section(
     );
 
     let curves = Curves {
-        title: "Test R² by stride, five folds".to_owned(),
+        title: "Test R² by stride, five folds (rooms below −1 count as −1)".to_owned(),
         x: "stride, frames".to_owned(),
         y: "mean over rooms of max(R², −1)".to_owned(),
         series,
