@@ -4,7 +4,7 @@ use clap::Args;
 use serde_json::json;
 
 use super::output::{JsonOutput, say};
-use crate::encoder::{RECIPES, RuntimeKind};
+use crate::encoder::{EncoderRecipe, RECIPES, RuntimeKind};
 
 #[derive(Debug, Args)]
 pub struct Encoders {
@@ -34,19 +34,7 @@ impl Encoders {
             );
         }
 
-        let records: Vec<_> = chosen
-            .iter()
-            .map(|recipe| {
-                json!({
-                    "name": recipe.name,
-                    "about": recipe.about,
-                    "images": recipe.preparation.describe(recipe.window),
-                    "layers": recipe.layers,
-                    "pooling": recipe.pooling.to_string(),
-                    "prefix_tokens": recipe.prefix_tokens,
-                })
-            })
-            .collect();
+        let records: Vec<_> = chosen.iter().map(|recipe| recipe_json(recipe)).collect();
         self.json.write(&records)?;
 
         if self.name.is_none() {
@@ -112,4 +100,15 @@ impl Encoders {
 
         Ok(())
     }
+}
+
+fn recipe_json(recipe: &EncoderRecipe) -> serde_json::Value {
+    json!({
+        "name": recipe.name,
+        "about": recipe.about,
+        "images": recipe.preparation.describe(recipe.window),
+        "layers": recipe.layers,
+        "pooling": recipe.pooling.to_string(),
+        "prefix_tokens": recipe.prefix_tokens,
+    })
 }

@@ -60,10 +60,6 @@ pub struct Train {
 }
 
 impl Train {
-    #[expect(
-        clippy::too_many_lines,
-        reason = "one command, from its arguments to what it prints"
-    )]
     pub async fn run(self) -> anyhow::Result<()> {
         if self.seeds == 0 || self.seeds > MAX_SEEDS {
             bail!("--seeds must be 1 to {MAX_SEEDS}, got {}", self.seeds);

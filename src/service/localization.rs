@@ -73,13 +73,7 @@ fn answer(
     } = request;
 
     let thresholds = convert::thresholds(thresholds)?;
-    let k = top_k.unwrap_or(1);
-    if k == 0 || k > most {
-        return Err(Error::invalid(
-            "top_k",
-            format!("must be 1 to {most}, got {k}"),
-        ));
-    }
+    let k = checked_count(top_k, most)?;
 
     // All rooms share one adapter, so that the view is embedded once and its distances compare
     // between rooms.
@@ -133,18 +127,15 @@ fn answer(
         })
     };
 
-    // A feature of one room that has a fitted adapter is also located.
-    let located = match (served.as_slice(), &source) {
-        ([only], Source::Feature(feature)) => located(only, feature)?,
-        _ => None,
-    };
-    let believed = match (served.as_slice(), &source) {
-        (_, Source::Frame(_)) => None,
-        ([only], Source::Feature(feature)) => {
-            Some(believed(only, start.latent.view(), Some(feature)))
-        }
-        ([only], Source::Latent(_)) => Some(believed(only, start.latent.view(), None)),
-        _ => None,
+    // In one room a view that is no stored frame is also located.
+    let (located, believed) = match (served.as_slice(), &source) {
+        (_, Source::Frame(_)) => (None, None),
+        ([only], Source::Feature(feature)) => (
+            located(only, feature)?,
+            Some(believed(only, start.latent.view(), Some(feature))),
+        ),
+        ([only], Source::Latent(_)) => (None, Some(believed(only, start.latent.view(), None))),
+        _ => (None, None),
     };
 
     Ok(pb::LocalizeResponse {
@@ -154,6 +145,17 @@ fn answer(
         located,
         believed,
     })
+}
+
+/// The number of frames to return.
+fn checked_count(top_k: Option<u32>, most: u32) -> Result<u32, Error> {
+    match top_k.unwrap_or(1) {
+        count if count == 0 || count > most => Err(Error::invalid(
+            "top_k",
+            format!("must be 1 to {most}, got {count}"),
+        )),
+        count => Ok(count),
+    }
 }
 
 /// Where the camera of a view is believed to be, and whether the view looks like the room.

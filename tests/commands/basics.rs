@@ -7,7 +7,7 @@ use crate::program::{refuses, seese3, succeeds, text};
 use crate::support::golden;
 
 /// Imports the oracle's room, and trains on it for a moment.
-fn trained(store: &str) {
+pub fn imported(store: &str) {
     let poses = golden().join("rooms/synthetic/poses.npy");
 
     let features = format!(
@@ -47,7 +47,7 @@ fn import_train_and_evaluate_write_what_scripts_read() {
     let folder = tempfile::tempdir().unwrap();
     let store = folder.path().join("store");
     let store = text(&store);
-    trained(store);
+    imported(store);
 
     let train_json = folder.path().join("t.json");
     let table_json = folder.path().join("e.json");
@@ -168,7 +168,7 @@ fn a_seed_gives_the_same_adapter_again() {
     let folder = tempfile::tempdir().unwrap();
     let store = folder.path().join("store");
     let store = text(&store);
-    trained(store);
+    imported(store);
 
     let train = [
         "train",
@@ -257,7 +257,7 @@ fn a_served_room_is_asked_and_the_server_stops_when_told() {
     let folder = tempfile::tempdir().unwrap();
     let store = folder.path().join("store");
     let store = text(&store);
-    trained(store);
+    imported(store);
 
     succeeds(&["train", "--store", store, "--room", "r", "--epochs", "5"]);
     let mut server = Server::start(store);
@@ -410,7 +410,7 @@ fn bad_input_gets_one_line() {
         &["does not exist", "import"],
     );
 
-    trained(store);
+    imported(store);
 
     refuses(
         &["train", "--store", store, "--room", "x"],

@@ -14,6 +14,7 @@ mod basics;
 #[cfg(target_os = "linux")]
 mod disks;
 mod kills;
+mod manners;
 mod program;
 mod research;
 mod rooms;

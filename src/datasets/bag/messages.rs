@@ -142,15 +142,15 @@ impl Picture {
     }
 }
 
-/// The message in `data`; none of a kind that says nothing here. `log_time`, nanoseconds, stands for a
+/// What the message in `data` says. `log_time`, nanoseconds, stands for a
 /// stamp of zero. The error says what is wrong.
-pub fn decode(kind: &Kind, data: &[u8], log_time: i64) -> Result<Option<Located>, String> {
+pub fn decode(kind: &Kind, data: &[u8], log_time: i64) -> Result<Located, String> {
     let image = |time_ns: i64, frame: String, picture: Picture| {
-        Some(Located::Image(Image {
+        Located::Image(Image {
             time_ns: if time_ns == 0 { log_time } else { time_ns },
             frame,
             picture,
-        }))
+        })
     };
 
     Ok(match kind {
@@ -175,7 +175,7 @@ pub fn decode(kind: &Kind, data: &[u8], log_time: i64) -> Result<Option<Located>
             };
             image(foxglove_time(message.timestamp), message.frame_id, picture)
         }
-        _ => Some(Located::Poses(decode_poses(kind, data, log_time)?)),
+        _ => Located::Poses(decode_poses(kind, data, log_time)?),
     })
 }
 

@@ -57,27 +57,15 @@ pub fn read_bag(file: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recor
         problem,
     };
 
-    let mut poses = Poses::default();
-    let mut image_counts = BTreeMap::new();
-    let topics = each_message(file, |topic, log_time, data| {
-        match messages::decode(&topic.kind, data, log_time)
-            .map_err(|problem| of_topic(&topic.name, &problem))?
-        {
-            Some(Located::Poses(found)) => poses.add(&topic.name, found),
-            Some(Located::Image(image)) => {
-                let counted = image_counts
-                    .entry(topic.name.clone())
-                    .or_insert((0, image.frame));
-                counted.0 += 1;
-            }
-            None => {}
-        }
-        Ok(())
-    })?;
+    let Contents {
+        topics,
+        mut poses,
+        mut images,
+    } = contents(file)?;
 
     let image_topic = chosen_topic(&topics, bag.image_topic.as_deref(), Kind::is_image, "image")
         .map_err(&malformed)?;
-    let (count, camera_frame) = image_counts.remove(&image_topic).unwrap_or_default();
+    let (count, camera_frame) = images.remove(&image_topic).unwrap_or_default();
     let pose_topic = match (&bag.pose_topic, &bag.world) {
         (None, Some(_)) => None,
         (given, _) => Some(
@@ -112,7 +100,7 @@ pub fn read_bag(file: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recor
 
         let decoded = messages::decode(&topic.kind, data, log_time)
             .map_err(|problem| of_topic(&topic.name, &problem))?;
-        let Some(Located::Image(image)) = decoded else {
+        let Located::Image(image) = decoded else {
             return Ok(());
         };
         let name = format!("{done:06}");
@@ -133,6 +121,38 @@ pub fn read_bag(file: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recor
     })?;
 
     collected.finish(&bag.images, reader)
+}
+
+/// What the first pass finds.
+struct Contents {
+    topics: Vec<Topic>,
+    poses: Poses,
+    /// By topic, the number of images and the frame of the camera.
+    images: BTreeMap<String, (usize, String)>,
+}
+
+fn contents(file: &Path) -> Result<Contents, Error> {
+    let mut poses = Poses::default();
+    let mut images = BTreeMap::new();
+
+    let topics = each_message(file, |topic, log_time, data| {
+        let decoded = messages::decode(&topic.kind, data, log_time)
+            .map_err(|problem| of_topic(&topic.name, &problem))?;
+        match decoded {
+            Located::Poses(found) => poses.add(&topic.name, found),
+            Located::Image(image) => {
+                let counted = images.entry(topic.name.clone()).or_insert((0, image.frame));
+                counted.0 += 1;
+            }
+        }
+        Ok(())
+    })?;
+
+    Ok(Contents {
+        topics,
+        poses,
+        images,
+    })
 }
 
 fn of_topic(topic: &str, problem: &str) -> String {
