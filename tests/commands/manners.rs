@@ -151,5 +151,8 @@ fn exit_codes_are_those_of_the_help() {
             .code(),
         Some(1)
     );
-    assert_eq!(seese3(&["evaluate", "--sotre"]).status.code(), Some(2));
+    assert_eq!(
+        seese3(&["evaluate", "--no-such-option"]).status.code(),
+        Some(2)
+    );
 }
