@@ -68,10 +68,11 @@ pub struct EncoderOptions {
     /// lists; the options below override single values
     #[arg(long)]
     recipe: Option<String>,
-    /// Preprocessing of a family of encoders, where there is no recipe: `imagenet` (torchvision, most of
-    /// timm), `clip`, `half` (-1 to 1: SigLIP, Inception) or `unit` (0 to 1)
-    #[arg(long, value_parser = preprocess, conflicts_with = "recipe")]
-    preprocess: Option<Preprocess>,
+    /// Preprocessing, where there is no recipe: the JSON FILE that the model's authors publish (the
+    /// preprocessor_config.json of transformers, the config.json of timm), or that of a family: `imagenet`
+    /// (torchvision), `clip`, `half` (-1 to 1: SigLIP, Inception) or `unit` (0 to 1)
+    #[arg(long, value_name = "FAMILY|FILE", value_parser = preprocessing, conflicts_with = "recipe")]
+    preprocess: Option<Preprocessing>,
     /// Layers to keep, by output name, separated by commas; `all` keeps every output that the model
     /// declares
     #[arg(long, value_delimiter = ',', default_value = "all")]
@@ -81,7 +82,7 @@ pub struct EncoderOptions {
     #[arg(long)]
     pool: Option<String>,
     /// Number of tokens before the patch tokens (class token and registers), which pooling skips;
-    /// the recipe's if omitted, else 0
+    /// the recipe's if omitted, else 0, which is refused where the number of tokens speaks against it
     #[arg(long, value_name = "N")]
     prefix_tokens: Option<usize>,
     /// What layer numbers count from: 0, 1, or `name` for unnumbered layers; only recorded with the
@@ -121,11 +122,26 @@ pub struct EncoderOptions {
     std: Option<String>,
 }
 
-fn preprocess(name: &str) -> Result<Preprocess, String> {
+/// Where the preprocessing comes from if no recipe has it.
+#[derive(Debug, Clone)]
+enum Preprocessing {
+    Family(Preprocess),
+    File(PathBuf),
+}
+
+fn preprocessing(text: &str) -> Result<Preprocessing, String> {
     let family = Preprocess::ALL
         .into_iter()
-        .find(|family| family.name() == name);
-    family.ok_or_else(|| "is none of imagenet, clip, half, unit".to_owned())
+        .find(|family| family.name() == text);
+    let file = || {
+        let file = PathBuf::from(text);
+        file.is_file().then_some(Preprocessing::File(file))
+    };
+
+    family
+        .map(Preprocessing::Family)
+        .or_else(file)
+        .ok_or_else(|| "is none of imagenet, clip, half, unit, and no file".to_owned())
 }
 
 impl EncoderOptions {
@@ -217,6 +233,7 @@ impl EncoderOptions {
                 preparation,
                 layers,
                 window,
+                is_prefix_stated: self.prefix_tokens.is_some() || recipe.is_some(),
             },
             runtime,
         )?)
@@ -278,16 +295,19 @@ impl EncoderOptions {
 
         // There is no default normalisation: a wrong one gives features that look plausible and
         // are wrong. Either a recipe or explicit numbers are required.
-        let family = match self.preprocess {
-            Some(family) => Some(family.preparation(encoder::declared_size(file)?)?),
+        let chosen = match &self.preprocess {
+            Some(Preprocessing::Family(family)) => {
+                Some(family.preparation(encoder::declared_size(file)?)?)
+            }
+            Some(Preprocessing::File(config)) => Some(encoder::read_preprocess_file(config)?),
             None => None,
         };
-        let known = recipe.map(|recipe| recipe.preparation.clone()).or(family);
+        let known = recipe.map(|recipe| recipe.preparation.clone()).or(chosen);
         let mut preparation = match known {
             Some(preparation) => preparation,
             None if !says => bail!(
                 "how are images prepared for {}? give --recipe NAME (see `seese3 encoders`), --preprocess imagenet, \
-                 clip, half or unit, or --divisor, --mean and --std, with --resize and --crop where they are needed",
+                 clip, half, unit or its authors' JSON file, or --divisor, --mean and --std, with --resize and --crop where they are needed",
                 file.display()
             ),
             None => {

@@ -116,6 +116,14 @@ pub(super) fn open(
 
     let clip_axis = clip_axis(&model.input, window).map_err(&wrong)?;
 
+    // A room is no multiple of such a batch, and a server's image is a batch of one.
+    if let Some(batch) = model.input[0].filter(|&batch| batch > 1) {
+        return Err(wrong(format!(
+            "takes batches of exactly {batch} images; export it with an example of one image, or with \
+             dynamic_shapes={{\"image\": {{0: \"batch\"}}}}"
+        )));
+    }
+
     // The shape of the model's input. Axes that the file leaves open get the sizes of the prepared
     // images and of the clips, because tract needs all but the first.
     let mut shape = model.input.clone();

@@ -15,6 +15,7 @@ mod onnxruntime;
 mod pooling;
 mod preparation;
 mod preprocess;
+mod preprocess_file;
 mod recipes;
 mod run;
 mod thumbnail;
@@ -28,6 +29,7 @@ pub use journal::{Journal, NumberedRows};
 pub use pooling::Pooling;
 pub use preparation::{Filter, Preparation, Resize, normalised};
 pub use preprocess::Preprocess;
+pub use preprocess_file::read_preprocess_file;
 pub use recipes::{EncoderRecipe, RECIPES, recipe};
 pub use run::{Encoded, Kept, OnBadImage, Task, encode_room};
 pub use thumbnail::thumbnail;
@@ -109,6 +111,9 @@ pub struct ModelTask {
     pub layers: Vec<Layer>,
     /// The number of images in a clip; 1 for a model of single images.
     pub window: usize,
+    /// Whether somebody said how many tokens stand before the patches. If nobody did, a mean over
+    /// tokens of which some are no patches is refused.
+    pub is_prefix_stated: bool,
 }
 
 /// The identity of the encoder [`Encoder::pixels`].
@@ -191,6 +196,7 @@ impl Encoder {
             preparation,
             layers,
             window,
+            is_prefix_stated,
         } = task;
         let (backbone, id, size) = backbone::open(&file, &preparation, &layers, window, runtime)?;
 
@@ -232,6 +238,11 @@ impl Encoder {
 
             // An output that is a vector already is not pooled, whatever was asked for.
             layer.pooling = layer.pooling.for_rank(one.ndim());
+            if !is_prefix_stated {
+                let checked = layer.pooling.check_prefix(one.shape(), seen);
+                checked.map_err(|error| problem(format!("layer '{}': {error}", layer.name)))?;
+            }
+
             let row = layer.pooling.pool(one, seen);
             let row = row.map_err(|error| problem(format!("layer '{}': {error}", layer.name)))?;
             encoder.dims.push(row.len());
@@ -288,6 +299,7 @@ impl Encoder {
                 preparation,
                 layers: vec![layer],
                 window,
+                is_prefix_stated: true,
             };
 
             return Self::model(task, runtime).map(Some);

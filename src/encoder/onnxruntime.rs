@@ -23,8 +23,8 @@ pub(super) struct OnnxRuntime {
     session: Mutex<Session>,
     /// The outputs that were asked for, in that order.
     names: Vec<String>,
-    /// The number of clips in one run, if the model fixes it.
-    batch: Option<usize>,
+    /// Whether the model takes one clip in a run, and not as many as come.
+    is_of_one: bool,
 }
 
 impl OnnxRuntime {
@@ -65,12 +65,12 @@ impl OnnxRuntime {
 
         let session =
             session.map_err(|error| wrong(format!("cannot be run by {NAME}: {error}")))?;
-        let batch = shape.first().copied().flatten();
+        let is_of_one = shape.first().copied().flatten().is_some();
 
         Ok(Self {
             session: Mutex::new(session),
             names: names.to_vec(),
-            batch,
+            is_of_one,
         })
     }
 
@@ -103,18 +103,9 @@ impl OnnxRuntime {
 
 impl Runner for OnnxRuntime {
     fn run(&self, input: ArrayD<f32>) -> Result<Vec<ArrayD<f32>>, Error> {
-        // The whole batch is one run, unless the model was exported with another batch size.
-        let Some(batch) = self.batch.filter(|&batch| batch != input.shape()[0]) else {
+        // The whole batch is one run, unless the model takes one clip at a time.
+        if !self.is_of_one || input.shape()[0] == 1 {
             return self.batch(input.view());
-        };
-        if batch != 1 {
-            let problem = format!(
-                "the model takes batches of {batch} only; give --batch {batch}, or export it with 1"
-            );
-            return Err(Error::Runtime {
-                runtime: NAME,
-                problem,
-            });
         }
 
         // A model that was exported with a batch size of 1 is run once for each clip.

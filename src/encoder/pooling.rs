@@ -44,6 +44,20 @@ impl Pooling {
         if rank == 1 { Self::Vector } else { self }
     }
 
+    /// Refuses a mean or a grid over all tokens of an output whose first tokens are no patches: a
+    /// class token or registers, by the number of tokens.
+    pub(super) fn check_prefix(self, shape: &[usize], seen: Seen) -> Result<(), Problem> {
+        let is_over_all = matches!(self, Self::Mean { skip: 0 } | Self::Grid { skip: 0, .. });
+
+        match (shape, is_over_all) {
+            (&[tokens, _], true) => match seen.prefix(tokens) {
+                Some(prefix) => Err(Problem::Prefix { tokens, prefix }),
+                None => Ok(()),
+            },
+            _ => Ok(()),
+        }
+    }
+
     /// The same pooling with `skip` tokens before the patches.
     #[must_use]
     pub fn after(self, skip: usize) -> Self {
@@ -169,7 +183,22 @@ pub(super) struct Seen {
     pub window: usize,
 }
 
+/// The largest number of tokens before the patches that is looked for: a class token, a token of
+/// distillation, and registers.
+const MOST_PREFIX_TOKENS: usize = 8;
+
 impl Seen {
+    /// The number of tokens before the patches, where `tokens` are too many for the patches of the
+    /// image alone, and a few of them fewer are not.
+    fn prefix(self, tokens: usize) -> Option<usize> {
+        if self.patches(tokens).is_some() {
+            return None;
+        }
+
+        (1..=MOST_PREFIX_TOKENS.min(tokens.saturating_sub(1)))
+            .find(|prefix| self.patches(tokens - prefix).is_some())
+    }
+
     /// The shape (times, rows, columns) of a number of patch tokens, if the image can be cut into
     /// that many square patches. A token of a clip may cover two images, one image, or the whole
     /// clip.
@@ -228,6 +257,12 @@ pub(super) enum Problem {
          --pool mean or a grid"
     )]
     NoPrefix { tokens: usize },
+    #[error(
+        "its {tokens} tokens are {} patches of the image and {prefix} before them (a class token, registers); give \
+         --prefix-tokens {prefix} to pool the patches alone, or --prefix-tokens 0 to pool all of them",
+        tokens - prefix
+    )]
+    Prefix { tokens: usize, prefix: usize },
 }
 
 impl fmt::Display for Pooling {
@@ -396,6 +431,13 @@ mod tests {
         assert_eq!(seen(384, 384, 16).patches(8 * 576), Some((8, 24, 24)));
 
         assert_eq!(seen(224, 224, 1).patches(257), None);
+
+        let prefixes = [257, 201, 197, 196].map(|tokens| seen(224, 224, 1).prefix(tokens));
+        assert_eq!(
+            prefixes,
+            [Some(1), Some(5), Some(1), None],
+            "14 and 16 pixels a patch"
+        );
         assert_eq!(seen(512, 384, 1).patches(576), None);
 
         let wide = Array2::from_shape_fn((8, 1), |(n, _)| n as f32).into_dyn();

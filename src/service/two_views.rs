@@ -51,6 +51,7 @@ impl TwoViewReader {
                 },
             }],
             window: recipe.window,
+            is_prefix_stated: true,
         };
 
         let failed = |problem: String| RunError::TwoView {

@@ -71,6 +71,7 @@ fn tiny(file: &str, layers: Vec<Layer>, window: usize) -> ModelTask {
         preparation,
         layers,
         window,
+        is_prefix_stated: false,
     }
 }
 
@@ -231,7 +232,22 @@ fn models_that_cannot_be_used_are_refused_by_name() {
         let task = |name: &str, pooling: &str| tiny("image.onnx", vec![layer(name, pooling)], 1);
         refused(task("block9", "mean"), "map, tokens, vector");
         refused(task("map", "cls"), "cannot be pooled");
-        refused(task("classed", "grid2x2"), "image's shape");
+        refused(
+            task("classed", "grid2x2"),
+            "12 patches of the image and 1 before",
+        );
+        refused(task("classed", "mean"), "--prefix-tokens 1");
+        refused(
+            tiny("pairs.onnx", vec![layer("vector", "mean")], 1),
+            "exactly 2 images",
+        );
+
+        // Whoever says that every token counts is believed.
+        let stated = ModelTask {
+            is_prefix_stated: true,
+            ..task("classed", "mean")
+        };
+        assert!(Encoder::model(stated, &runtime).is_ok());
 
         refused(task("tokens", "cls"), "--prefix-tokens 0");
 
@@ -545,6 +561,7 @@ fn real_models_give_pytorchs_features() {
                 preparation: model.preparation.clone(),
                 layers,
                 window: 1,
+                is_prefix_stated: true,
             };
 
             let encoder = Encoder::model(task, &runtime).unwrap();
@@ -604,6 +621,7 @@ fn real_models_give_pytorchs_maps() {
                         preparation,
                         layers,
                         window: 1,
+                        is_prefix_stated: true,
                     },
                     &runtime,
                 )
@@ -692,6 +710,7 @@ fn the_kitchens_photographs_give_its_features() {
                 preparation,
                 layers: vec![layer(name, pooling)],
                 window: 1,
+                is_prefix_stated: true,
             };
             agree(&Encoder::model(task, &runtime).unwrap(), file, bound);
         }

@@ -54,6 +54,9 @@ save("turned", [helper.make_node("ReduceMean", ["image"], ["means"], axes=[3], k
                 helper.make_node("Transpose", ["means"], ["turned"], perm=[2, 0, 1]),
                 helper.make_node("ReduceMean", ["image"], ["scalar"], keepdims=0)], {},
      [tensor("image", ["batch", 3, H, W])], [tensor("turned", [H, "batch", 3]), tensor("scalar", [])])
+# a model that takes two images at a time, neither one nor as many as come
+save("pairs", [helper.make_node("ReduceMean", ["image"], ["vector"], axes=[2, 3], keepdims=0)], {},
+     [tensor("image", [2, 3, H, W])], [tensor("vector", [2, 3])])
 # the same model as torch.onnx.export leaves it: weights in a file beside it, and shapes of inner values with a named batch
 beside = onnx.load(HERE / "image.onnx")
 beside.graph.value_info.append(tensor("hidden", ["batch", C, H // 2, W // 2]))
