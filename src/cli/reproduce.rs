@@ -16,13 +16,13 @@ use seese3_lab::reproduction::{
     ReproductionRecord, adapter_names, check, reproduce,
 };
 
-use super::output::{say, write_file, write_json};
+use super::output::{JsonOutput, say, write_file, write_json};
 use super::progress::bar;
 use super::rooms::{data, load_rooms};
 use crate::encoder::{encode_png, read_image};
 use crate::store::{Store, StoredRoom};
 
-#[derive(Debug, Clone, Args)]
+#[derive(Debug, Args)]
 pub struct Reproduce {
     /// The store
     #[arg(long, env = "SEESE3_STORE")]
@@ -66,6 +66,8 @@ pub struct Reproduce {
     /// Folder of the report; created if it does not exist
     #[arg(long, default_value = "reproduction")]
     out: PathBuf,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 type Loaded = (StoredRoom, Features);
@@ -105,6 +107,7 @@ impl Images for RecordedImages {
 
 impl Reproduce {
     pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
         let begun = Instant::now();
         let store = Store::open(&self.store)?;
         let sets = self.load(&store).await?;
@@ -140,7 +143,8 @@ impl Reproduce {
             seconds: begun.elapsed().as_secs_f64(),
         };
 
-        write(&self.out, &document, &record)
+        write(&self.out, &document, &record)?;
+        self.json.write(&record)
     }
 
     fn options(&self) -> Options {

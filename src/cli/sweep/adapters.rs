@@ -6,9 +6,10 @@ use std::path::PathBuf;
 use anyhow::{Context, bail, ensure};
 use clap::Args;
 use rayon::prelude::*;
+use serde_json::json;
 
 use super::super::named::one_of;
-use super::super::output::{say, write_file};
+use super::super::output::{JsonOutput, say, write_file};
 use super::super::progress::bar;
 use super::super::protocol::ProtocolOptions;
 use super::super::rooms::{data, load_rooms};
@@ -66,6 +67,8 @@ pub struct Adapters {
     /// Folder of the results; runs that it already holds are not repeated
     #[arg(long)]
     out: PathBuf,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 /// A run to do, with its row still without scores.
@@ -77,6 +80,7 @@ struct Task<'a> {
 
 impl Adapters {
     pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
         let (part, parts) = self.shard()?;
         self.protocol.needs_test_pairs()?;
         self.protocol.leaves_to_the_grid()?;
@@ -153,6 +157,8 @@ impl Adapters {
             file.display(),
             in_folder.len()
         ));
+
+        self.json.write(&json!({ "runs": rows }))?;
 
         // Failed runs are rows like others, but a sweep without any score has failed.
         ensure!(
