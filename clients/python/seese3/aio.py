@@ -286,12 +286,17 @@ class AsyncClient:
         )
         return answers.Encoding.of(await self._ask(self._odometry.Encode, request, deadline_s), with_features)
 
-    def track(self, config: TrackConfig | None = None, *, resume_token: bytes = b"") -> AsyncTrack:
-        """Opens a stream that follows a camera: `async with client.track(TrackConfig(room="kitchen")) as track`."""
+    def track(
+        self, config: TrackConfig | None = None, *, resume_token: bytes = b"", last_sequence: int = 0
+    ) -> AsyncTrack:
+        """Opens a stream that follows a camera: `async with client.track(TrackConfig(room="kitchen")) as track`.
+
+        To go on with a stream of another program, give its `resume_token` and its `last_sequence`.
+        """
         if (config is None) == (not resume_token):
             raise ValueError("give exactly one of config and resume_token")
         message = config.message() if config else odometry_pb2.TrackConfig(resume_token=resume_token)
-        return AsyncTrack(self._odometry.Track, self._metadata, message)
+        return AsyncTrack(self._odometry.Track, self._metadata, message, last_sequence)
 
     # Evaluation.
 
@@ -578,14 +583,17 @@ class AsyncTrack:
 
     A stream that is cut (the server was restarted, the network was gone for a moment) is opened again by the token of
     its last answer, and the frames since then are sent again: the answers are those that would have come. `resumed`
-    counts how often that was done. `resume_token` carries the stream on in another program.
+    counts how often that was done. `resume_token`, and `last_sequence`, the number of the last frame, carry the stream
+    on in another program.
     """
 
-    def __init__(self, method: Any, metadata: list[tuple[str, str]], config: odometry_pb2.TrackConfig) -> None:
+    def __init__(
+        self, method: Any, metadata: list[tuple[str, str]], config: odometry_pb2.TrackConfig, last_sequence: int
+    ) -> None:
         self._method = method
         self._metadata = metadata
         self._config = config
-        self._sequence = 0
+        self.last_sequence = last_sequence
         self._unsaved: deque[odometry_pb2.TrackRequest] = deque()
         self._call: Any = None
         self._requests: asyncio.Queue[odometry_pb2.TrackRequest | None] = asyncio.Queue()
@@ -619,8 +627,9 @@ class AsyncTrack:
         other_views: dict[str, View] | None = None,
     ) -> TrackUpdate | TrackRefusal:
         """Sends a frame, taken at a time on the camera's clock, and returns what the server says of it."""
-        self._sequence = self._sequence + 1 if sequence is None else sequence
-        frame = requests.track_frame(view, timestamp_ns, self._sequence, odometry, gravity, other_views or {})
+        number = self.last_sequence + 1 if sequence is None else sequence
+        frame = requests.track_frame(view, timestamp_ns, number, odometry, gravity, other_views or {})
+        self.last_sequence = number
         answer = await self._exchange(frame)
         if answer.HasField("refusal"):
             return TrackRefusal.of(answer.refusal)

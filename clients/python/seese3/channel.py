@@ -17,6 +17,15 @@ import grpc
 # A page of frames with thumbnails, or a batch of answers, may be larger than the 4 MiB that gRPC allows by itself.
 MESSAGE_BYTES = 64 << 20
 
+# A server that answers nothing at all while calls are open is given up after so long, milliseconds: a machine that was
+# switched off says no goodbye, and a stream without a deadline would wait for it for ever.
+SILENCE_MS = 10_000
+PING_ANSWER_MS = 10_000
+
+# How long an attempt to connect may take, and the longest wait before the next one, milliseconds. gRPC's own are 20 s
+# and 2 minutes, in which a robot is long past a server that came back.
+CONNECTING_MS = 2_000
+
 RETRIED = {
     "CatalogService": (
         "ListRooms",
@@ -73,6 +82,13 @@ def _options(retries: int) -> list[tuple[str, Any]]:
     return [
         ("grpc.service_config", json.dumps(config)),
         ("grpc.enable_retries", int(retries > 0)),
+        ("grpc.initial_reconnect_backoff_ms", 100),
+        ("grpc.min_reconnect_backoff_ms", CONNECTING_MS),
+        ("grpc.max_reconnect_backoff_ms", CONNECTING_MS),
+        ("grpc.keepalive_time_ms", SILENCE_MS),
+        ("grpc.keepalive_timeout_ms", PING_ANSWER_MS),
+        ("grpc.http2.ping_timeout_ms", PING_ANSWER_MS),
+        ("grpc.http2.max_pings_without_data", 0),
         ("grpc.max_receive_message_length", MESSAGE_BYTES),
         ("grpc.max_send_message_length", MESSAGE_BYTES),
     ]

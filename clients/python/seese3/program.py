@@ -6,6 +6,7 @@ PATH: the first of them that is there, with the variable before everything else.
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
 import subprocess
@@ -69,21 +70,21 @@ def run(*arguments: object) -> str:
     Progress and warnings go to standard error as they come. A command that fails raises a `CommandError`.
     """
     command = [str(argument) for argument in arguments]
-    process = subprocess.Popen(
-        [program(), *command], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
     said: deque[str] = deque(maxlen=KEPT_LINES)
-    listener = threading.Thread(target=_pass_on, args=(process, said), daemon=True)
-    listener.start()
+    with subprocess.Popen(
+        [program(), *command], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        listener = threading.Thread(target=_pass_on, args=(process, said), daemon=True)
+        listener.start()
+        assert process.stdout is not None
+        try:
+            printed = process.stdout.read()
+            returncode = process.wait()
+        except BaseException:
+            process.terminate()
+            raise
+        listener.join()
 
-    assert process.stdout is not None
-    try:
-        printed = process.stdout.read()
-        returncode = process.wait()
-    except BaseException:
-        process.terminate()
-        raise
-    listener.join()
     if returncode != 0:
         raise CommandError(command, returncode, "".join(said))
     return printed
@@ -97,12 +98,16 @@ def _pass_on(process: subprocess.Popen[str], said: deque[str]) -> None:
 
 
 class Server:
-    """A server of a store on this machine, for as long as it is open: `with seese3.serve("store") as server`."""
+    """A server of a store on this machine, for as long as it is open: `with seese3.serve("store") as server`.
+
+    Without `with`, it runs until `stop`, or until Python ends. A Python that is killed leaves it behind.
+    """
 
     def __init__(self, process: subprocess.Popen[str], address: str, log: deque[str]) -> None:
         self._process = process
         self._log = log
         self.address = address
+        atexit.register(self.stop)
 
     def __enter__(self) -> Server:
         return self
@@ -123,6 +128,7 @@ class Server:
 
     def stop(self) -> None:
         """Lets the server finish what it is asked, and ends it."""
+        atexit.unregister(self.stop)
         if self._process.poll() is None:
             self._process.terminate()
             try:

@@ -1,11 +1,14 @@
 """Tracking streams, and that a stream which is cut goes on as if it had not been."""
 
+import os
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import seese3
 from conftest import FEATURES, ROOM
+from seese3 import channel
 
 PERIOD_NS = 33_333_333
 
@@ -68,15 +71,33 @@ def test_a_stream_that_is_cut_goes_on_as_if_it_had_not_been(drawn: Path, tmp_pat
     assert [one.status for one in updates] == [one.status for one in whole]
 
 
+def test_a_server_that_stands_still_is_given_up(drawn: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(channel, "SILENCE_MS", 500)
+    monkeypatch.setattr(channel, "PING_ANSWER_MS", 500)
+    monkeypatch.setattr(seese3.client, "RESUMPTIONS", 0)
+    monkeypatch.setattr(channel, "CONNECTING_MS", 500)
+    rows = seese3.Store(drawn).room(ROOM).features[FEATURES][:3]
+    with seese3.serve(drawn) as server, server.client() as client:
+        with client.track(seese3.TrackConfig(room=ROOM)) as track:
+            followed(track, rows[:2])
+            server._process.send_signal(signal.SIGSTOP)
+            os.waitpid(server._process.pid, os.WUNTRACED)
+            try:
+                with pytest.raises(seese3.UnavailableError):
+                    track.step(rows[2], 2 * PERIOD_NS)
+            finally:
+                server._process.send_signal(signal.SIGCONT)
+
+
 def test_a_token_carries_a_stream_to_another_client(server: seese3.Server, drawn: Path) -> None:
     rows = seese3.Store(drawn).room(ROOM).features[FEATURES][:40]
     with server.client() as client, client.track(seese3.TrackConfig(room=ROOM)) as track:
         whole = followed(track, rows)
     with server.client() as client, client.track(seese3.TrackConfig(room=ROOM)) as track:
         followed(track, rows[:20])
-        token = track.resume_token
-    with server.client() as client, client.track(resume_token=token) as track:
-        track._sequence = 20
+        token, sent = track.resume_token, track.last_sequence
+    assert sent == 20
+    with server.client() as client, client.track(resume_token=token, last_sequence=sent) as track:
         rest = followed(track, rows[20:], start=20)
     np.testing.assert_array_equal(poses_of(rest), poses_of(whole)[20:])
 
