@@ -156,15 +156,14 @@ impl EncoderOptions {
                     --resize and the other options for models"
                 )
             }
-            "builtin" => return Ok(Encoder::builtin()),
-            "pixels" => return Ok(Encoder::pixels()),
-            _ => {}
+            "builtin" => Ok(Encoder::builtin()),
+            "pixels" => Ok(Encoder::pixels()),
+            _ => self.open_file(Path::new(model), runtime),
         }
+    }
 
-        let file = Path::new(model);
-
-        // From here on the model is an ONNX file, which needs a runtime that this program was
-        // built with.
+    fn open_file(&self, file: &Path, runtime: &Runtime) -> anyhow::Result<Encoder> {
+        // An ONNX file needs a runtime that this program was built with.
         if !runtime.kind.is_built() {
             return Err(encoder::Error::NotBuilt {
                 runtime: runtime.kind.name(),
@@ -173,7 +172,10 @@ impl EncoderOptions {
         }
 
         if !file.is_file() {
-            bail!("{model} is not a file; give an ONNX file, `pixels` or `builtin`");
+            bail!(
+                "{} is not a file; give an ONNX file, `pixels` or `builtin`",
+                file.display()
+            );
         }
 
         let recipe = self.recipe()?;

@@ -26,6 +26,7 @@ pub struct JsonOutput {
 
 impl JsonOutput {
     /// Of a value of `--json` that was read by itself.
+    #[cfg(feature = "lab")]
     pub fn to(json: Option<PathBuf>) -> Self {
         Self { json }
     }
@@ -43,6 +44,7 @@ impl JsonOutput {
     }
 
     /// Whether JSON is wanted.
+    #[cfg(feature = "lab")]
     pub fn is_wanted(&self) -> bool {
         self.json.is_some()
     }

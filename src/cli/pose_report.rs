@@ -246,6 +246,11 @@ fn path_warning(warning: PathWarning) -> String {
         PathWarning::NeverMoves => {
             "all poses are the same: these are not the poses of a moving camera".to_owned()
         }
+        PathWarning::OnlyTurns => {
+            "all positions are the same, and the camera only turns: were the \
+             translations lost? Nothing can be learned about moving from these poses"
+                .to_owned()
+        }
         PathWarning::Identities { count, first } => format!(
             "{count} poses are exactly the identity after others that are not, the first of frame {first}: \
              recorders write it when tracking is lost; remove these frames"
@@ -275,7 +280,8 @@ fn verdict_warning(check: &PoseCheck, read_as: Convention) -> Option<String> {
                 .collect();
             Some(format!(
                 "the images contradict the poses: read as {} they explain {stated:.0} % of how the images \
-                 move, and {:.0} % as {}; import again that way",
+                 move, and {:.0} % as {}; import again that way, and see whether they agree then: something \
+                 else may be wrong as well",
                 in_words(read_as),
                 100.0 * explained,
                 likely.join(", or as ")

@@ -234,6 +234,16 @@ fn the_facts_of_a_path_are_told() {
     let still = vec![straight[3]; 60];
     assert_eq!(warnings(still, Vec::new()), [PathWarning::NeverMoves]);
 
+    // A camera on a tripod, or translations that were lost.
+    let turning = (0..60).map(|row| {
+        let turn = nalgebra::UnitQuaternion::from_euler_angles(0.0, 0.01 * f64::from(row), 0.0);
+        Pose::from_parts(straight[3].translation, turn)
+    });
+    assert_eq!(
+        warnings(turning.collect(), Vec::new()),
+        [PathWarning::OnlyTurns]
+    );
+
     // Tracking is lost in two frames: the identity is written, 10 m off.
     let mut lost = straight.clone();
     lost[30] = Pose::identity();

@@ -10,7 +10,9 @@ mod wire_json;
 pub use catalog::Catalog;
 pub use localize::Localize;
 pub use motion::Motion;
-pub use navigate::{Navigate, say_navigation};
+pub use navigate::Navigate;
+#[cfg(feature = "lab")]
+pub use navigate::say_navigation;
 pub use relocalize::Relocalize;
 pub use wire_json::wire_json;
 

@@ -43,6 +43,8 @@ pub struct PathFacts {
 pub enum PathWarning {
     /// All poses are the same.
     NeverMoves,
+    /// All positions are the same, and the camera turns.
+    OnlyTurns,
     /// Poses are exactly the identity, after others that are not.
     Identities {
         /// How many.
@@ -133,6 +135,10 @@ fn warnings(room: &Room, steps: &[Step]) -> Vec<PathWarning> {
     }
 
     let mut warnings = Vec::new();
+    if steps.iter().all(|step| step.metres == 0.0) && !steps.is_empty() {
+        warnings.push(PathWarning::OnlyTurns);
+    }
+
     let is_identity = |pose: &Pose| *pose == Pose::identity();
     let moved = poses
         .iter()
