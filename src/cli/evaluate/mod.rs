@@ -134,7 +134,7 @@ struct Navigation {
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Draw Hit@ε over ε up to 1, a curve for each navigator, to this SVG file
-    #[arg(long, value_name = "FILE.svg")]
+    #[arg(long, value_name = "FILE.svg", value_parser = plot_file)]
     plot: Option<PathBuf>,
     /// Write the table to this file: .csv for programs, .tex for LaTeX with booktabs
     #[arg(long, value_name = "FILE.csv|FILE.tex", value_parser = table_file)]
@@ -144,6 +144,14 @@ struct Navigation {
     /// nothing else is then printed
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = STANDARD_OUTPUT)]
     json: Option<PathBuf>,
+}
+
+/// A file whose name does not promise another kind of picture.
+fn plot_file(text: &str) -> Result<PathBuf, String> {
+    match Path::new(text).extension().and_then(OsStr::to_str) {
+        Some("svg") => Ok(PathBuf::from(text)),
+        _ => Err("must end with .svg".to_owned()),
+    }
 }
 
 /// A file whose name says in which form the table is wanted.
