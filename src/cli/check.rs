@@ -20,7 +20,7 @@ pub struct Check {
 #[derive(Debug, Subcommand)]
 enum What {
     /// A room: what its camera did, and whether its poses can be those of its images. Fails if they
-    /// contradict each other
+    /// are wrong for certain
     Room(CheckRoom),
 }
 
@@ -67,8 +67,11 @@ impl CheckRoom {
         ));
         report.say();
 
-        if report.is_contradicted() {
-            bail!("the poses of room '{}' contradict its images", room.id());
+        if report.is_wrong() {
+            bail!(
+                "the poses of room '{}' are wrong: see the warnings",
+                room.id()
+            );
         }
         Ok(())
     }

@@ -199,7 +199,9 @@ struct Destination {
     /// Keep every K-th usable frame of each sequence
     #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// Fail if a frame is unusable, instead of dropping that frame
+    /// Fail and publish nothing if a frame is unusable, instead of dropping it, and if the poses are
+    /// wrong for certain (contradicted by the images, all the same, identities where tracking was
+    /// lost, in another unit), instead of warning
     #[arg(long)]
     strict: bool,
     /// Publish a new revision even if the store has a room of this name with other frames; the
@@ -623,10 +625,6 @@ impl Destination {
         check_features(&room, &features)?;
         let store = Store::create(&self.store)?;
         let room = self.check_same(&store, room).await?;
-        let published = match self.replace {
-            true => store.publish_room(&room, &features).await?,
-            false => store.publish_same_frames(&room, &features).await?,
-        };
 
         self.say_read(&room, &features, &recording, read_count);
         let mut report = PoseReport::of_path(&room);
@@ -640,6 +638,17 @@ impl Destination {
                  FACTOR, or --scale 1 if the model was aligned with known positions"
             );
         }
+
+        if self.strict && report.is_wrong() {
+            bail!(
+                "the poses of room '{}' are wrong, see the warnings; nothing was published (--strict)",
+                room.id()
+            );
+        }
+        let published = match self.replace {
+            true => store.publish_room(&room, &features).await?,
+            false => store.publish_same_frames(&room, &features).await?,
+        };
 
         // Publishing the same content again makes no new revision, so an import can safely be
         // repeated.

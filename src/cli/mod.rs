@@ -147,6 +147,11 @@ impl Cli {
 /// # Errors
 /// When the command fails: one line that says what went wrong and what to change.
 pub async fn run(cli: Cli) -> anyhow::Result<()> {
+    dispatch(cli).await?;
+    output::check_printed()
+}
+
+async fn dispatch(cli: Cli) -> anyhow::Result<()> {
     if cli.quiet {
         output::silence();
     }

@@ -3,6 +3,7 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
@@ -11,6 +12,9 @@ use serde::Serialize;
 
 /// Whether lines for people are left out. It belongs to the process, as standard output does.
 static IS_SILENT: AtomicBool = AtomicBool::new(false);
+
+/// Why the first write to standard output that failed did so.
+static PRINT_PROBLEM: OnceLock<String> = OnceLock::new();
 
 /// The path that stands for standard output.
 pub const STANDARD_OUTPUT: &str = "-";
@@ -110,11 +114,30 @@ pub fn is_silent() -> bool {
     IS_SILENT.load(Ordering::Relaxed)
 }
 
-/// Prints a line to standard output. A closed pipe (`seese3 … | head`) is not an error, so failed
-/// writes are ignored.
+/// Prints a line to standard output.
 pub fn say(line: impl std::fmt::Display) {
     if !is_silent() {
-        let _ = writeln!(std::io::stdout(), "{line}");
+        print(format!("{line}\n").as_bytes());
+    }
+}
+
+/// Writes to standard output. What cannot be written is remembered for [`check_printed`]: the work
+/// itself goes on. A closed pipe (`seese3 … | head`) is no error.
+fn print(content: &[u8]) {
+    let mut output = std::io::stdout().lock();
+    let written = output.write_all(content).and_then(|()| output.flush());
+    if let Err(error) = written
+        && error.kind() != std::io::ErrorKind::BrokenPipe
+    {
+        let _ = PRINT_PROBLEM.set(error.to_string());
+    }
+}
+
+/// Fails if anything could not be written to standard output, as on a full disk.
+pub fn check_printed() -> anyhow::Result<()> {
+    match PRINT_PROBLEM.get() {
+        Some(problem) => anyhow::bail!("standard output cannot be written: {problem}"),
+        None => Ok(()),
     }
 }
 
@@ -167,7 +190,7 @@ pub fn write_json(path: &Path, record: &impl Serialize) -> anyhow::Result<()> {
 /// Writes results to a file, or to standard output.
 pub fn write_result(path: &Path, content: &[u8]) -> anyhow::Result<()> {
     if is_standard_output(path) {
-        let _ = std::io::stdout().write_all(content);
+        print(content);
         return Ok(());
     }
     write_file(path, content)

@@ -64,7 +64,12 @@ impl PoseReport {
         let (sizes, problem) = sizes(room, root);
         self.warnings.extend(problem);
 
-        let check = check(stated, read_as, &observe(room, root));
+        // Poses that are no poses say nothing about the others, and have been named already.
+        let mut observed = observe(room, root);
+        let lost = |frame: FrameId| self.is_lost(&room.poses()[frame.row()]);
+        observed.retain(|pair| !lost(pair.first) && !lost(pair.second));
+
+        let check = check(stated, read_as, &observed);
         self.warnings.extend(verdict_warning(&check, read_as));
         if let Verdict::Agrees(seen) = check.verdict {
             let camera = room.provenance().camera;
@@ -74,8 +79,33 @@ impl PoseReport {
         self.images = Some(Images { sizes, check });
     }
 
-    /// Whether the images contradict the poses.
-    pub fn is_contradicted(&self) -> bool {
+    /// Whether this pose is one of those that recorders write when tracking is lost.
+    fn is_lost(&self, pose: &Pose) -> bool {
+        let mut warnings = self.path.iter().flat_map(|path| &path.warnings);
+        warnings.any(|warning| match warning {
+            PathWarning::NeverMoves => true,
+            PathWarning::Identities { .. } => *pose == Pose::identity(),
+            _ => false,
+        })
+    }
+
+    /// Whether the poses are wrong for certain: contradicted by the images, or by themselves.
+    pub fn is_wrong(&self) -> bool {
+        let warnings = self.path.iter().flat_map(|path| &path.warnings);
+        let is_wrong = |warning: &PathWarning| {
+            matches!(
+                warning,
+                PathWarning::NeverMoves
+                    | PathWarning::Identities { .. }
+                    | PathWarning::OtherUnit { .. }
+                    | PathWarning::TimesFall { .. }
+            )
+        };
+
+        self.is_contradicted() || warnings.into_iter().any(is_wrong)
+    }
+
+    fn is_contradicted(&self) -> bool {
         let verdict = self.images.as_ref().map(|images| &images.check.verdict);
         matches!(
             verdict,

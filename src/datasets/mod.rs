@@ -230,13 +230,12 @@ fn entries(folder: &Path) -> Result<Vec<String>, Error> {
 
     let mut names = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(io)? {
-        names.push(
-            entry
-                .map_err(io)?
-                .file_name()
-                .to_string_lossy()
-                .into_owned(),
-        );
+        let name = entry.map_err(io)?.file_name();
+        let name = name.into_string().map_err(|name| Error::Malformed {
+            file: folder.join(&name),
+            problem: "has a name that is not UTF-8; rename the file".to_owned(),
+        })?;
+        names.push(name);
     }
 
     names.sort();

@@ -281,8 +281,10 @@ fn adapter_without_room<'a>(
     match snapshot.adapters().len() {
         1 => snapshot.adapters().values().next().ok_or(Error::Internal),
         count => {
-            let problem =
-                format!("is required when no room is named: the server has {count} adapters");
+            let problem = format!(
+                "is required when no room is named: the server has {count} adapters; where it has a two-view model, a \
+                 camera does in its place, for two images"
+            );
             Err(Error::invalid("adapter", problem))
         }
     }

@@ -57,6 +57,34 @@ fn json_on_standard_output_stands_alone() {
 }
 
 #[test]
+fn output_that_cannot_be_written_is_an_error() {
+    let program = || std::process::Command::new(env!("CARGO_BIN_EXE_seese3"));
+    for arguments in [["encoders", "--json"], ["completions", "bash"]] {
+        let full = std::fs::OpenOptions::new().write(true).open("/dev/full");
+        let output = program()
+            .args(arguments)
+            .stdout(full.unwrap())
+            .output()
+            .unwrap();
+        let error = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{error}");
+        assert!(
+            error.contains("standard output cannot be written"),
+            "{error}"
+        );
+    }
+
+    // A reader that has seen enough is no error.
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let output = program()
+        .args(["encoders", "--json"])
+        .stdout(writer)
+        .output();
+    assert!(output.unwrap().status.success());
+}
+
+#[test]
 fn tables_and_plots_are_what_their_names_say() {
     let folder = tempfile::tempdir().unwrap();
     let store = folder.path().join("store");

@@ -165,7 +165,7 @@ impl Snapshot {
             let encoder = &adapter.adapter.source().encoder;
             Error::Precondition(format!(
                 "images cannot be sent for adapter '{}': this server has no encoder '{encoder}'; start it with \
-                 --encoder, or send the feature",
+                 --encoder, name another adapter, or send the feature",
                 adapter.name
             ))
         })

@@ -153,9 +153,10 @@ pub fn section(
 
     section.text(format!(
         "Means over the rooms that are learned alone: stride {}, last fifth of each recording, candidates are its \
-         frames, source included, one seed; adapters and correctors of {NAVIGATION_EPOCHS} epochs on all pairs at the \
+         frames, source included, one seed; adapters and correctors of {} epochs on all pairs at the \
          stride. 'in-sample' is fitted on the scored pairs: a leak, and the likely protocol of the paper's refit.",
-        given.options.stride
+        given.options.stride,
+        given.options.epochs.unwrap_or(NAVIGATION_EPOCHS)
     ));
 
     notes.claims.push(Claim {

@@ -162,6 +162,10 @@ pub fn section(
         .collect();
     let above: Vec<Option<bool>> = over_control.iter().map(is_above_zero).collect();
     let differences: Vec<String> = over_control.iter().map(room_difference_text).collect();
+    let differences = match differences.as_slice() {
+        [] => "there is no other feature set".to_owned(),
+        all => all.join("; "),
+    };
 
     claims.push(Claim {
         claim: "topology: a trained encoder's neighbours at a long stride are neighbours by pose, more than raw pixels' (M1)",
@@ -169,7 +173,7 @@ pub fn section(
         found: format!(
             "M1 at the long stride over that of {}, room by room: {}",
             control.name,
-            differences.join("; ")
+            differences
         ),
     });
 
