@@ -9,7 +9,7 @@ use seese3_core::features::Features;
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan};
 use seese3_lab::experiments::seeds::{SeededTraining, train_seeds};
-use seese3_lab::report::{training_json, training_table};
+use seese3_lab::report::{training_json, training_remark, training_table};
 
 use super::output::{JsonOutput, say, say_published};
 use super::progress::bar;
@@ -138,6 +138,9 @@ impl Train {
         ));
 
         say(training_table(&runs).trim_end());
+        if let Some(remark) = training_remark(&runs) {
+            say(remark);
+        }
 
         // A motion component that is constant over the test pairs has no R².
         let still = record.test.still_components();

@@ -250,6 +250,19 @@ impl Drop for Server {
     }
 }
 
+/// Oracle: by hand, a fifth of 600 frames has four pairs of frames that are 116 apart.
+#[test]
+fn too_few_test_pairs_are_said_to_be() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = folder.path().join("store");
+    let store = text(&store);
+    imported(store);
+
+    let train = ["train", "--store", store, "--room", "r", "--epochs", "1"];
+    let printed = succeeds(&[&train[..], &["--stride", "116"]].concat());
+    assert!(printed.contains("4 test pairs are too few"), "{printed}");
+}
+
 /// Oracle: a frame is its own place, and standing still is no motion; SIGTERM ends the server with
 /// success.
 #[test]

@@ -61,7 +61,7 @@ pub use probe::{ProbeContext, ProbeJson, probe_json, probe_table};
 pub use robustness::{RobustnessJson, robustness_json, robustness_table};
 pub use table::aligned;
 pub use theory::{TheoryJson, theory_json, theory_table, theory_table_rows};
-pub use training::{TrainingJson, training_json, training_table};
+pub use training::{TrainingJson, training_json, training_remark, training_table};
 
 /// Why a result could not be rendered.
 #[derive(Debug, thiserror::Error)]

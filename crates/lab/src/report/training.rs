@@ -8,7 +8,11 @@ use super::json::{MotionJson, RateJson};
 use super::table::aligned;
 use crate::experiments::seeds::TrainingRun;
 use seese3_core::adapter::{PairPlan, TrainingRecord};
+use seese3_core::eval::LEAST_CONSTANT_R2;
 use seese3_core::statistics::{deviation, mean};
+
+/// Fewer test pairs than this tell nothing.
+const FEWEST_TEST_PAIRS: usize = 10;
 
 /// R² by part of the motion, one line per seed; with several seeds also their mean and sample
 /// standard deviation.
@@ -66,6 +70,35 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
     }
 
     aligned(&lines)
+}
+
+/// What a reader of the table should not miss: the adapter is worse than the constant, or the test
+/// pairs are too few to tell. `None` if there is nothing of the kind.
+pub fn training_remark(runs: &[TrainingRun]) -> Option<String> {
+    let test_count = runs.first()?.record.test.n;
+    if (1..FEWEST_TEST_PAIRS).contains(&test_count) {
+        return Some(format!(
+            "{test_count} test pairs are too few to tell how good the adapter is"
+        ));
+    }
+
+    let mean_of = |value: fn(&TrainingRun) -> f64| -> f64 {
+        mean(&runs.iter().map(value).collect::<Vec<f64>>())
+    };
+    let read = mean_of(|run| run.record.test.overall);
+    let constant = mean_of(|run| run.record.train_mean_r2);
+    if read >= constant {
+        return None;
+    }
+
+    let verdict = if constant >= LEAST_CONSTANT_R2 {
+        "no motion was learned that carries over to them"
+    } else {
+        "the constant is so far below 0 that they cannot tell how good the adapter is; try another --split"
+    };
+    Some(format!(
+        "always answering the mean training motion is better on these pairs (R² {constant:.3} against {read:.3}): {verdict}"
+    ))
 }
 
 /// A score; one that is not defined, as those of a test without pairs, is a dash.
