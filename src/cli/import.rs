@@ -575,22 +575,14 @@ impl Destination {
         say_dropped(&recording.dropped);
     }
 
-    async fn publish(
-        &self,
-        format: &str,
-        path: &Path,
-        mut recording: Recording,
-        direction: DirectionName,
-    ) -> anyhow::Result<()> {
-        self.json.begin()?;
-        let read_count = recording.frames.poses.len();
-
-        // Feature files have one row per usable frame. They are checked against that count before
-        // --every thins both.
+    /// Reads the feature files that options name. They have one row per usable frame, and are checked
+    /// against that count before --every thins both.
+    fn read_features(&self, recording: &mut Recording) -> anyhow::Result<()> {
         for given in &self.features {
             recording.features.push(read_features(given)?);
         }
 
+        let read_count = recording.frames.poses.len();
         for set in &recording.features {
             let rows = set.rows().nrows();
             let unusable = recording.dropped.len();
@@ -602,6 +594,21 @@ impl Destination {
                 );
             }
         }
+
+        Ok(())
+    }
+
+    async fn publish(
+        &self,
+        format: &str,
+        path: &Path,
+        mut recording: Recording,
+        direction: DirectionName,
+    ) -> anyhow::Result<()> {
+        self.json.begin()?;
+        let read_count = recording.frames.poses.len();
+
+        self.read_features(&mut recording)?;
 
         // Frames and features keep the same rows; counting starts anew in each sequence.
         let kept = recording.every(self.every as usize);

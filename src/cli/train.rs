@@ -8,7 +8,7 @@ use seese3_core::calibration::{calibrate, check_unseen};
 use seese3_core::features::Features;
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan};
-use seese3_lab::experiments::seeds::{SeededTraining, train_seeds};
+use seese3_lab::experiments::seeds::{SeededTraining, TrainingRun, train_seeds};
 use seese3_lab::report::{training_json, training_remark, training_table};
 
 use super::output::{JsonOutput, say, say_published};
@@ -137,24 +137,29 @@ impl Train {
             record.pair_count, record.config.epochs
         ));
 
-        say(training_table(&runs).trim_end());
-        if let Some(remark) = training_remark(&runs) {
-            say(remark);
-        }
-
-        // A motion component that is constant over the test pairs has no R².
-        let still = record.test.still_components();
-        if record.test.n > 0 && still > 0 {
-            say(format_args!(
-                "{still} of the 6 components of the motion never vary and are left out of the means"
-            ));
-        }
-
+        say_scores(&runs);
         say_published(&store, &name, &published);
         self.json
             .write(&training_json(&runs, &name, published.revision))?;
 
         Ok(())
+    }
+}
+
+/// Prints the table of the seeds, and what its reader should not miss.
+fn say_scores(runs: &[TrainingRun]) {
+    say(training_table(runs).trim_end());
+    if let Some(remark) = training_remark(runs) {
+        say(remark);
+    }
+
+    // A motion component that is constant over the test pairs has no R².
+    let test = &runs[0].record.test;
+    let still = test.still_components();
+    if test.n > 0 && still > 0 {
+        say(format_args!(
+            "{still} of the 6 components of the motion never vary and are left out of the means"
+        ));
     }
 }
 
