@@ -8,11 +8,11 @@ use anyhow::Context;
 use clap::Args;
 use ndarray::Array2;
 use rayon::prelude::*;
+use serde_json::json;
 use tokio::net::TcpListener;
 
-use super::ask::say_navigation;
-use super::output::say_published;
-use super::output::{say, write_file};
+use super::ask::{say_navigation, wire_json};
+use super::output::{JsonOutput, say, say_published, write_file};
 use super::progress::bar;
 use super::train::{default_name, train_with_progress};
 use crate::encoder::{BUILTIN_DIM, builtin_source, encode_builtin};
@@ -30,7 +30,7 @@ use seese3_core::room::{Frames, Provenance, Room, RoomId, Timeline};
 use seese3_core::splits::Split;
 use seese3_core::training::TrainingPlan;
 use seese3_lab::experiments::seeds::SeededTraining;
-use seese3_lab::report::{PathPlot, evaluation_table, path_svg, training_table};
+use seese3_lab::report::{PathPlot, evaluation_table, path_svg, training_json, training_table};
 use seese3_lab::studio::{Camera, Scene, camera_path, render};
 
 const ROOM: &str = "studio";
@@ -52,6 +52,8 @@ pub struct Demo {
     /// Number of images to render, at most 100000
     #[arg(long, default_value_t = 2_000)]
     frames: usize,
+    #[command(flatten)]
+    json: JsonOutput,
 }
 
 impl Demo {
@@ -60,6 +62,8 @@ impl Demo {
         reason = "one command, from its arguments to what it prints"
     )]
     pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+
         // The last 20 % of the path must hold at least one test pair. A path too short for that
         // would only fail after rendering and training.
         Split::Time
@@ -128,7 +132,7 @@ impl Demo {
         ));
 
         let picture = self.out.join("path.svg");
-        serve_and_ask(&store, &room, &name, &picture).await?;
+        let answer = serve_and_ask(&store, &room, &name, &picture).await?;
 
         say("Files written:");
 
@@ -157,7 +161,13 @@ impl Demo {
         ));
 
         say("(`cargo run --release --` stands for `seese3` in a checkout)");
-        Ok(())
+        self.json.write(&json!({
+            "store": location,
+            "room": ROOM,
+            "training": training_json(&runs, &name, adapter_published.revision),
+            "navigation": wire_json("NavigateResponse", &answer)?,
+            "picture": picture,
+        }))
     }
 }
 
@@ -225,13 +235,13 @@ fn score(room: &Arc<Room>, features: &Features, adapter: Adapter) -> anyhow::Res
 }
 
 /// Starts a server on a free loopback port, sends it one navigation, draws the answer to `picture`,
-/// and stops the server.
+/// stops the server, and returns the answer.
 async fn serve_and_ask(
     store: &Store,
     room: &Arc<Room>,
     adapter: &str,
     picture: &Path,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<pb::NavigateResponse> {
     let listener = TcpListener::bind("127.0.0.1:0")
         .await
         .context("cannot listen on a loopback port")?;
@@ -276,7 +286,7 @@ async fn serve_and_ask(
     server.await??;
     say("   server stopped");
 
-    Ok(())
+    Ok(answer)
 }
 
 /// The frame that the example starts from: five sixths of the way through the held-out frames that

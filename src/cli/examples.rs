@@ -22,7 +22,7 @@ const EXAMPLES: &[(&[&str], &[&str])] = &[
         &[
             "seese3 import folder photos --room kitchen --store store",
             "seese3 import colmap project --store store --scale 1",
-            "seese3 import mcap drive.mcap --room hall --store store --image-topic /camera/image/compressed",
+            "seese3 import bag rosbag2_hall --room hall --store store --image-topic /camera/image/compressed",
             "seese3 import numpy --poses poses.npy --features mine=features.npy --room kitchen --store store",
         ],
     ),
@@ -45,9 +45,10 @@ const EXAMPLES: &[(&[&str], &[&str])] = &[
         ],
     ),
     (
-        &["import", "mcap"],
+        &["import", "bag"],
         &[
-            "seese3 import mcap drive.mcap --room hall --store store --image-topic /camera/image/compressed --pose-topic /odom",
+            "seese3 import bag rosbag2_hall --store store --image-topic /camera/image/compressed --pose-topic /odom",
+            "seese3 import bag drive.mcap --room hall --store store --world-frame map",
         ],
     ),
     (
@@ -248,7 +249,7 @@ const EXAMPLES: &[(&[&str], &[&str])] = &[
         &["motion"],
         &[
             "seese3 motion --images a.jpg,b.jpg --camera 640x480,585",
-            "seese3 motion --room kitchen --frames 100,110",
+            "seese3 motion --room kitchen --from 100 --to 110",
         ],
     ),
     (

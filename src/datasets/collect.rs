@@ -161,7 +161,16 @@ impl Collected {
 
     /// Records that a frame is left out.
     pub fn drop(&mut self, name: String, reason: DropReason) {
-        self.0.dropped.push(Dropped { name, reason });
+        self.drop_without(String::new(), name, reason);
+    }
+
+    /// Records that a frame is left out because a file of it is missing, `looked_for` in vain.
+    pub fn drop_without(&mut self, looked_for: String, name: String, reason: DropReason) {
+        self.0.dropped.push(Dropped {
+            name,
+            reason,
+            looked_for,
+        });
     }
 
     /// The complete recording, with image paths relative to `root`.

@@ -105,7 +105,8 @@ fn collected(root: &Path, frames: &[Image], reader: &mut Reader<'_>) -> Result<R
         (reader.progress)(done, count);
         let name = frame.name.clone();
         if !root.join(&name).is_file() {
-            collected.drop(name, DropReason::MissingImage);
+            let looked_for = root.join(&name).display().to_string();
+            collected.drop_without(looked_for, name, DropReason::MissingImage);
             continue;
         }
 

@@ -46,7 +46,8 @@ pub fn read_euroc(
         (reader.progress)(done, images.len());
         let image = format!("data/{name}");
         if !camera_folder.join(&image).is_file() {
-            collected.drop(name.clone(), DropReason::MissingImage);
+            let looked_for = camera_folder.join(&image).display().to_string();
+            collected.drop_without(looked_for, name.clone(), DropReason::MissingImage);
             continue;
         }
 

@@ -71,7 +71,7 @@ pub enum Error {
         frame: usize,
         problem: String,
     },
-    #[error("{}: {} frames are unusable, the first is {}: {}; leave out --strict to drop them", folder.display(), dropped.len(), dropped[0].name, dropped[0].reason)]
+    #[error("{}: {} frames are unusable, the first is {}; leave out --strict to drop them", folder.display(), dropped.len(), dropped[0])]
     Strict {
         folder: PathBuf,
         dropped: Vec<Dropped>,
@@ -90,6 +90,25 @@ pub struct Dropped {
     pub name: String,
     /// Why it was left out.
     pub reason: DropReason,
+    /// The files that were looked for; empty if none is missing.
+    pub looked_for: String,
+}
+
+impl std::fmt::Display for Dropped {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self {
+            name,
+            reason,
+            looked_for,
+        } = self;
+
+        write!(f, "{name}: {reason}")?;
+        if looked_for.is_empty() {
+            Ok(())
+        } else {
+            write!(f, " (looked for {looked_for})")
+        }
+    }
 }
 
 /// Why a frame was left out.
@@ -202,7 +221,7 @@ pub struct Reader<'a> {
 
 fn first_reason(dropped: &[Dropped]) -> String {
     dropped.first().map_or(String::new(), |first| {
-        format!(" ({} dropped, the first: {})", dropped.len(), first.reason)
+        format!(" ({} dropped, the first: {first})", dropped.len())
     })
 }
 

@@ -50,11 +50,13 @@ pub fn read_scannet(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording,
         let (image, pose) = match (images.get(&number), poses.get(&number)) {
             (Some(image), Some(pose)) => (image, pose),
             (None, _) => {
-                collected.drop(name, DropReason::MissingImage);
+                let looked_for = format!("{images_at}{number}.jpg or .png");
+                collected.drop_without(looked_for, name, DropReason::MissingImage);
                 continue;
             }
             (_, None) => {
-                collected.drop(name, DropReason::MissingPoseFile);
+                let looked_for = format!("{poses_at}{number}.txt");
+                collected.drop_without(looked_for, name, DropReason::MissingPoseFile);
                 continue;
             }
         };
@@ -87,13 +89,14 @@ pub(super) fn is_suspect(matrix: &Matrix4<f64>, is_first: bool) -> bool {
     !is_first && *matrix == Matrix4::identity()
 }
 
-/// Files `N.EXTENSION` of a folder, by number.
+/// Files `N.EXTENSION` of a folder, by number; the extension in capitals or not.
 fn numbered(folder: &Path, extensions: &[&str]) -> Result<BTreeMap<i64, String>, Error> {
     let number = |name: String| {
         let (stem, extension) = name.rsplit_once('.')?;
-        let number = extensions
-            .contains(&extension)
-            .then(|| stem.parse::<i64>().ok())??;
+        let is_wanted = extensions
+            .iter()
+            .any(|wanted| wanted.eq_ignore_ascii_case(extension));
+        let number = is_wanted.then(|| stem.parse::<i64>().ok())??;
 
         (number >= 0).then_some((number, name))
     };

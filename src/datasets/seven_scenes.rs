@@ -97,8 +97,17 @@ pub fn read_seven_scenes(
         (reader.progress)(done, count);
         let file = root.join(format!("{}.pose.txt", about.name));
         match read_matrix(&file)? {
+            Err(DropReason::MissingPoseFile) => collected.drop_without(
+                format!("{}.pose.txt", about.name),
+                about.name,
+                DropReason::MissingPoseFile,
+            ),
             Err(reason) => collected.drop(about.name, reason),
-            Ok(_) if about.image.is_none() => collected.drop(about.name, DropReason::MissingImage),
+            Ok(_) if about.image.is_none() => collected.drop_without(
+                format!("{}.color.png or .color.jpg", about.name),
+                about.name,
+                DropReason::MissingImage,
+            ),
             Ok(world_from_depth) => collected.take(about, &world_from_depth, &file)?,
         }
     }
@@ -118,12 +127,18 @@ pub fn read_seven_scenes(
     Ok(recording)
 }
 
-/// The stem of the frame that a colour image belongs to; `None` for any other file.
+/// The stem of the frame that a colour image belongs to; `None` for any other file. The extension may
+/// be in capitals.
 fn image_stem(name: &str) -> Option<&str> {
-    let stem = name
-        .strip_suffix(".png")
-        .or_else(|| name.strip_suffix(".jpg"))?;
-    stem.strip_suffix(".color")
+    let (stem, extension) = name.rsplit_once('.')?;
+    let is_image = ["png", "jpg"]
+        .iter()
+        .any(|wanted| wanted.eq_ignore_ascii_case(extension));
+    if is_image {
+        stem.strip_suffix(".color")
+    } else {
+        None
+    }
 }
 
 /// The scene's folder and the names of the sequences to read from it.

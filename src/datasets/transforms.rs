@@ -76,7 +76,11 @@ pub fn read_transforms(path: &Path, reader: &mut Reader<'_>) -> Result<Recording
         (reader.progress)(done, count);
         let name = frame.file_path.trim_start_matches("./").to_owned();
         let Some(image) = image_of(&folder, &name) else {
-            collected.drop(name, DropReason::MissingImage);
+            let looked_for = format!(
+                "{}, as it is or with .png, .jpg or .jpeg",
+                folder.join(&name).display()
+            );
+            collected.drop_without(looked_for, name, DropReason::MissingImage);
             continue;
         };
 

@@ -39,7 +39,8 @@ pub fn read_tum(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Err
         };
 
         if !folder.join(image).is_file() {
-            collected.drop(image.clone(), DropReason::MissingImage);
+            let looked_for = folder.join(image).display().to_string();
+            collected.drop_without(looked_for, image.clone(), DropReason::MissingImage);
             continue;
         }
 

@@ -60,12 +60,13 @@ pub fn read_twelve_scenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Reco
         };
 
         let (Some(pose), Some(_)) = (pose, image) else {
-            let reason = if image.is_none() {
-                DropReason::MissingImage
+            let (ending, reason) = if image.is_none() {
+                ("color.jpg", DropReason::MissingImage)
             } else {
-                DropReason::MissingPoseFile
+                ("pose.txt", DropReason::MissingPoseFile)
             };
-            collected.drop(about.name, reason);
+            let looked_for = format!("{}.{ending}", about.name);
+            collected.drop_without(looked_for, about.name, reason);
 
             continue;
         };

@@ -257,6 +257,11 @@ impl Store {
         let file = self.shown(path);
         match error {
             object_store::Error::NotFound { .. } => Error::Absent { file },
+            // What the file system said, without the name of the library's class of errors.
+            object_store::Error::Generic { source, .. } => Error::Io {
+                file,
+                cause: source.to_string(),
+            },
             other => Error::Io {
                 file,
                 cause: other.to_string(),

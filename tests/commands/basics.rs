@@ -336,8 +336,15 @@ fn a_served_room_is_asked_and_the_server_stops_when_told() {
         "{printed}"
     );
 
-    let motion = ["motion", "--features", text(&features), "--rows", "3,43"];
-    assert!(succeeds(&[&motion[..], &to].concat()).contains("motion v ("));
+    // The same two views, as rows of the file and as frames of the room that was made of it.
+    let of_rows = ["motion", "--feature", text(&features), "--rows", "3,43"];
+    let of_frames = ["motion", "--room", "r", "--from", "3", "--to", "43"];
+    let motion = |arguments: &[&str]| {
+        let printed = succeeds(&[arguments, &to].concat());
+        let line = printed.lines().find(|line| line.contains("motion v ("));
+        line.unwrap().to_owned()
+    };
+    assert_eq!(motion(&of_rows), motion(&of_frames));
 
     refuses(
         &[

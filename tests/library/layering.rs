@@ -51,6 +51,7 @@ const CRATES: [CrateRules; 4] = [
             ("seese3_lab", &["cli"]),
             // It is also a word of the command line.
             ("mcap", &["datasets", "export", "cli"]),
+            ("rusqlite", &["datasets"]),
             ("foxglove", &["datasets", "export"]),
             ("ort", &["encoder"]),
             ("tract_onnx", &["encoder"]),

@@ -262,7 +262,12 @@ fn a_bag_of_ros_gives_the_poses_at_the_times_of_its_images() {
         (None, text("/odom"), None, "odom_from_camera"),
     ];
     for (pose_topic, world, base_from_camera, expected) in cases {
-        for topic in ["/camera/compressed", "/camera/raw"] {
+        for (file, topic) in [
+            ("bag.mcap", "/camera/compressed"),
+            ("bag.mcap", "/camera/raw"),
+            ("bag.db3", "/camera/compressed"),
+            ("bag.db3", "/camera/raw"),
+        ] {
             let bag = Bag {
                 image_topic: text(topic),
                 pose_topic: pose_topic.clone(),
@@ -270,7 +275,7 @@ fn a_bag_of_ros_gives_the_poses_at_the_times_of_its_images() {
                 base_from_camera,
                 ..Bag::default()
             };
-            let (images, found) = read_bag_of("bag.mcap", bag);
+            let (images, found) = read_bag_of(file, bag);
             let found = found.unwrap();
 
             // The last image lies behind the last pose.
@@ -292,6 +297,40 @@ fn a_bag_of_ros_gives_the_poses_at_the_times_of_its_images() {
             );
         }
     }
+}
+
+/// Oracle: the same bag in one file. ROS 2 begins a new file after some time or size; its folder also
+/// holds a description.
+#[test]
+fn a_bag_of_several_files_is_read_as_one() {
+    let bag = tempfile::tempdir().unwrap();
+    let whole = std::fs::read(folder("bag.db3")).unwrap();
+    // Of eleven files, the first half of the messages is in file 9 and the other half in file 10.
+    for (name, others) in [("bag_9.db3", "id > 15"), ("bag_10.db3", "id <= 15")] {
+        let file = bag.path().join(name);
+        std::fs::write(&file, &whole).unwrap();
+        let database = rusqlite::Connection::open(file).unwrap();
+        let sql = format!("DELETE FROM messages WHERE {others}");
+        assert!(database.execute(&sql, ()).unwrap() > 0);
+    }
+    std::fs::write(bag.path().join("metadata.yaml"), "version: 9\n").unwrap();
+
+    let images = tempfile::tempdir().unwrap();
+    let read = |path: &Path, to: &str| {
+        let bag = Bag {
+            image_topic: Some("/camera/raw".to_owned()),
+            world: Some("map".to_owned()),
+            images: images.path().join(to),
+            ..Bag::default()
+        };
+        lenient(|reader| read_bag(path, &bag, reader)).unwrap()
+    };
+    let one = read(&folder("bag.db3"), "one");
+    let split = read(bag.path(), "split");
+    assert_eq!(split.frames.poses.len(), 6);
+    assert_eq!(split.frames.poses, one.frames.poses);
+    assert_eq!(split.frames.timestamps_ns, one.frames.timestamps_ns);
+    assert_eq!(split.dropped, one.dropped);
 }
 
 #[test]
@@ -350,9 +389,104 @@ fn what_a_bag_lacks_is_said() {
             ..named(Some("/camera/raw"), None, Some("map"))
         };
         let problem = lenient(|reader| read_bag(&file, &bag, reader)).unwrap_err();
+        let expected = match length {
+            0 | 5 => "is neither an MCAP file nor a .db3",
+            _ => "is no whole MCAP file",
+        };
         assert!(
-            problem.to_string().contains("is no whole MCAP file"),
+            problem.to_string().contains(expected),
             "{length}: {problem}"
         );
+    }
+}
+
+/// Bags that are no bags, and a topic that has nothing of use: each is told apart from the others.
+#[test]
+fn what_is_no_bag_of_ros_2_is_said() {
+    let scratch = tempfile::tempdir().unwrap();
+    let refused = |name: &str, pose_topic: Option<&str>| {
+        let bag = Bag {
+            image_topic: Some("/camera/raw".to_owned()),
+            pose_topic: pose_topic.map(str::to_owned),
+            images: scratch.path().join("images"),
+            ..Bag::default()
+        };
+        let problem = lenient(|reader| read_bag(&scratch.path().join(name), &bag, reader));
+        problem.unwrap_err().to_string()
+    };
+    let written = |name: &str, bytes: &[u8]| {
+        std::fs::write(scratch.path().join(name), bytes).unwrap();
+        refused(name, None)
+    };
+    let changed = |name: &str, sql: &str, pose_topic: Option<&str>| {
+        let file = scratch.path().join(name);
+        std::fs::copy(folder("bag.db3"), &file).unwrap();
+        let database = rusqlite::Connection::open(file).unwrap();
+        database.execute_batch(sql).unwrap();
+        refused(name, pose_topic)
+    };
+
+    let whole = std::fs::read(folder("bag.db3")).unwrap();
+    let cases = [
+        (
+            written("cut.db3", &whole[..whole.len() / 2]),
+            "is no whole bag",
+        ),
+        (written("one.bag", b"#ROSBAG V2.0\n"), "is a bag of ROS 1"),
+        (
+            written("bag.db3.zstd", b"\x28\xb5\x2f\xfd\x04\x00"),
+            "is compressed as a whole",
+        ),
+        (
+            changed("other.db3", "DROP TABLE messages", None),
+            "without the table 'messages'",
+        ),
+        (
+            changed(
+                "view.db3",
+                "ALTER TABLE messages RENAME TO m; CREATE VIEW messages AS SELECT * FROM m",
+                None,
+            ),
+            "without the table 'messages'",
+        ),
+        (
+            changed("number.db3", "UPDATE messages SET data = 3", None),
+            "is no whole bag",
+        ),
+        (
+            changed("short.db3", "UPDATE messages SET data = x'00010000'", None),
+            "a message is not whole",
+        ),
+        (
+            changed("packed.db3", "UPDATE messages SET data = x'28b52ffd'", None),
+            "messages are compressed one by one",
+        ),
+        (
+            changed(
+                "poseless.db3",
+                "UPDATE topics SET type = 'std_msgs/msg/String' WHERE name = '/odom'",
+                None,
+            ),
+            "no topic of poses that is understood",
+        ),
+        (
+            changed(
+                "silent.db3",
+                "UPDATE topics SET type = 'std_msgs/msg/String' WHERE name = '/odom'",
+                Some("/pose"),
+            ),
+            "its topics are /camera/compressed (sensor_msgs/msg/CompressedImage), ",
+        ),
+        (refused("nothing", None), "No such file"),
+        (
+            {
+                std::fs::create_dir(scratch.path().join("empty")).unwrap();
+                refused("empty", None)
+            },
+            "no .mcap and no .db3",
+        ),
+    ];
+    for (problem, expected) in cases {
+        assert!(problem.contains(expected), "{expected}: {problem}");
     }
 }

@@ -574,6 +574,13 @@ def _stub(kind: Any, channel: Any) -> Any:
     return kind(channel)
 
 
+def _answered(answer: odometry_pb2.TrackResponse) -> TrackUpdate | TrackRefusal:
+    """What a stream says of a frame."""
+    if answer.HasField("refusal"):
+        return TrackRefusal.of(answer.refusal)
+    return TrackUpdate.of(answer.update)
+
+
 def _resource(collection: str, name: str, revision: int | None) -> str:
     return f"{collection}/{name}" + ("" if revision is None else f"/revisions/{revision}")
 
@@ -584,7 +591,7 @@ class AsyncTrack:
     A stream that is cut (the server was restarted, the network was gone for a moment) is opened again by the token of
     its last answer, and the frames since then are sent again: the answers are those that would have come. `resumed`
     counts how often that was done. `resume_token`, and `last_sequence`, the number of the last frame, carry the stream
-    on in another program.
+    on in another program. One stream is for one thread, or one task, at a time.
     """
 
     def __init__(
@@ -594,8 +601,11 @@ class AsyncTrack:
         self._metadata = metadata
         self._config = config
         self.last_sequence = last_sequence
+        # What was answered since the last token, and what has no answer yet: both are sent again when a stream is cut.
         self._unsaved: deque[odometry_pb2.TrackRequest] = deque()
+        self._awaited: deque[odometry_pb2.TrackRequest] = deque()
         self._call: Any = None
+        self._is_cut = False
         self._requests: asyncio.Queue[odometry_pb2.TrackRequest | None] = asyncio.Queue()
         self.resume_token = config.resume_token
         self.resumed = 0
@@ -626,19 +636,30 @@ class AsyncTrack:
         gravity: Gravity | None = None,
         other_views: dict[str, View] | None = None,
     ) -> TrackUpdate | TrackRefusal:
-        """Sends a frame, taken at a time on the camera's clock, and returns what the server says of it."""
-        number = self.last_sequence + 1 if sequence is None else sequence
-        frame = requests.track_frame(view, timestamp_ns, number, odometry, gravity, other_views or {})
-        self.last_sequence = number
-        answer = await self._exchange(frame)
-        if answer.HasField("refusal"):
-            return TrackRefusal.of(answer.refusal)
-        return TrackUpdate.of(answer.update)
+        """Sends a frame, taken at a time on the camera's clock, and returns what the server says of it.
 
-    async def follow(self, frames: AsyncIterable[tuple[int, View]]) -> AsyncIterator[TrackUpdate | TrackRefusal]:
-        """The answers to frames, each a time in nanoseconds and a view, one after the other."""
+        A step that raises, or that is given up, did not happen: the frame may be sent again.
+        """
+        frame = self._frame(view, timestamp_ns, sequence, odometry, gravity, other_views)
+        return _answered(await self._exchange(frame))
+
+    async def follow(
+        self, frames: AsyncIterable[tuple[int, View]], *, ahead: int = 0
+    ) -> AsyncIterator[TrackUpdate | TrackRefusal]:
+        """The answers to frames, each a time in nanoseconds and a view, in the order of the frames.
+
+        `ahead` frames are sent before the answer to the first of them is awaited: 0 for a camera, whose next frame is
+        not there yet; some 16 for a recording, which is then followed faster than frame by frame.
+        """
+        if ahead < 0:
+            raise ValueError(f"ahead: {ahead} is below 0")
+
         async for timestamp_ns, view in frames:
-            yield await self.step(view, timestamp_ns)
+            await self._send(self._frame(view, timestamp_ns))
+            if len(self._awaited) > ahead:
+                yield _answered(await self._receive())
+        while self._awaited:
+            yield _answered(await self._receive())
 
     async def set_initial_pose(self, pose: InitialPose) -> None:
         """Tells where the camera is now."""
@@ -652,7 +673,9 @@ class AsyncTrack:
         await self._exchange(odometry_pb2.TrackRequest(reset=odometry_pb2.Reset()))
 
     async def _open(self) -> None:
-        """Opens the stream, by its token if it has one, and sends what the server does not know of it again."""
+        """Opens the stream, by its token if it has one, and sends again what was answered since then."""
+        self._is_cut = True
+        await self._requests.put(None)
         self._requests = asyncio.Queue()
         outgoing = self._outgoing(self._requests)
         self._call = self._method(outgoing, metadata=self._metadata)
@@ -665,6 +688,7 @@ class AsyncTrack:
         for request in list(self._unsaved):
             await self._requests.put(request)
             await self._next_answer()
+        self._is_cut = False
 
     async def _outgoing(
         self, queue: asyncio.Queue[odometry_pb2.TrackRequest | None]
@@ -686,27 +710,67 @@ class AsyncTrack:
             self.resume_token = answer.resume_token
             self._unsaved.clear()
 
+    def _frame(
+        self,
+        view: View,
+        timestamp_ns: int,
+        sequence: int | None = None,
+        odometry: Odometry | None = None,
+        gravity: Gravity | None = None,
+        other_views: dict[str, View] | None = None,
+    ) -> odometry_pb2.TrackRequest:
+        number = self.last_sequence + 1 if sequence is None else sequence
+        frame = requests.track_frame(view, timestamp_ns, number, odometry, gravity, other_views or {})
+        self.last_sequence = number
+        return frame
+
     async def _exchange(self, request: odometry_pb2.TrackRequest) -> odometry_pb2.TrackResponse:
+        # A `follow` that was left before its end leaves answers behind, which nobody waits for any more.
+        while self._awaited:
+            await self._receive()
+        await self._send(request)
+        return await self._receive()
+
+    async def _send(self, request: odometry_pb2.TrackRequest) -> None:
         if self._call is None:
             raise errors.SeeseError("the stream is not open: use it as `with client.track(…) as track`")
+        if self._is_cut:
+            await self._keep_trying(self._open_again)
+        self._awaited.append(request)
+        await self._requests.put(request)
 
-        async def exchange() -> odometry_pb2.TrackResponse:
-            await self._requests.put(request)
-            return await self._next_answer()
-
-        async def again() -> odometry_pb2.TrackResponse:
-            await self._open()
-            self.resumed += 1
-            return await exchange()
-
+    async def _receive(self) -> odometry_pb2.TrackResponse:
+        """The answer to the oldest request that has none yet."""
         try:
-            answer = await exchange()
-        except errors.UnavailableError:
-            answer = await self._keep_trying(again)
+            answer = await self._answer()
+        except BaseException:
+            # Whoever waited may have given up, by a timeout of its own or by Ctrl-C, and an answer that came later would
+            # be taken for that of the next frame. So the stream is cut: what has no answer did not happen.
+            self._is_cut = True
+            self._awaited.clear()
+            self._call.cancel()
+            raise
 
-        self._unsaved.append(request)
+        self._unsaved.append(self._awaited.popleft())
         self._note(answer)
         return answer
+
+    async def _answer(self) -> odometry_pb2.TrackResponse:
+        try:
+            return await self._next_answer()
+        except errors.UnavailableError:
+            answer: odometry_pb2.TrackResponse = await self._keep_trying(self._answer_again)
+            return answer
+
+    async def _open_again(self) -> None:
+        await self._open()
+        self.resumed += 1
+
+    async def _answer_again(self) -> odometry_pb2.TrackResponse:
+        await self._open_again()
+        for request in self._awaited:
+            await self._requests.put(request)
+        return await self._next_answer()
 
     async def _keep_trying(self, what: Callable[[], Any]) -> Any:
         wait_s = FIRST_WAIT_S

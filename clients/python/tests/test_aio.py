@@ -1,6 +1,7 @@
 """The asynchronous client gives what the synchronous one gives, which is made from it."""
 
 import asyncio
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -49,3 +50,25 @@ def test_an_upload_is_sent_by_the_asynchronous_client_too(store: Path) -> None:
 
     with seese3.serve(store, "--writable") as server:
         assert asyncio.run(send(server.address)).served
+
+
+def test_a_step_that_is_given_up_did_not_happen(drawn: Path) -> None:
+    rows = seese3.Store(drawn).room(ROOM).features[FEATURES][:12]
+
+    async def follow(server: seese3.Server, given_up: int | None) -> list[np.ndarray | None]:
+        poses = []
+        async with seese3.AsyncClient(server.address) as client, client.track(seese3.TrackConfig(room=ROOM)) as track:
+            for row, feature in enumerate(rows):
+                if row == given_up:
+                    server._process.send_signal(signal.SIGSTOP)
+                    with pytest.raises(asyncio.TimeoutError):
+                        await asyncio.wait_for(track.step(feature, row * 33_000_000), 0.2)
+                    server._process.send_signal(signal.SIGCONT)
+                update = await track.step(feature, row * 33_000_000)
+                assert isinstance(update, seese3.TrackUpdate)
+                poses.append(update.odom_from_camera)
+            assert track.resumed == (given_up is not None)
+        return poses
+
+    with seese3.serve(drawn) as server:
+        np.testing.assert_array_equal(asyncio.run(follow(server, 7)), asyncio.run(follow(server, None)))

@@ -89,6 +89,43 @@ def test_a_server_that_stands_still_is_given_up(drawn: Path, tmp_path: Path, mon
                 server._process.send_signal(signal.SIGCONT)
 
 
+def test_a_recording_is_followed_ahead_of_its_answers(drawn: Path, tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    key.write_bytes(bytes(range(32)))
+    rows = seese3.Store(drawn).room(ROOM).features[FEATURES][:60]
+    frames = [(row * PERIOD_NS, feature) for row, feature in enumerate(rows)]
+    config = seese3.TrackConfig(room=ROOM, token_every=7)
+
+    server = seese3.serve(drawn, "--token-key-file", key)
+    with server.client() as client:
+        with client.track(config) as track:
+            whole = followed(track, rows)
+        with client.track(config) as track:
+            ahead = list(track.follow(iter(frames), ahead=16))
+        with client.track(config) as track:
+            # One answer is taken, and the rest of those on their way are left.
+            next(iter(track.follow(iter(frames[:20]), ahead=16)))
+            after = followed(track, rows[20:], start=20)
+
+        # The server is another one in the middle, while frames are on their way.
+        with client.track(config) as track:
+            answers = track.follow(iter(frames), ahead=16)
+            cut = [next(answers) for _ in range(10)]
+            server.stop()
+            with seese3.serve(drawn, "--token-key-file", key, listen=server.address):
+                cut += answers
+            assert track.resumed >= 1
+
+    for updates in (ahead, cut):
+        assert [one.sequence for one in updates] == list(range(1, 61))
+        np.testing.assert_array_equal(poses_of(updates), poses_of(whole))
+    # 17 frames had been sent; nobody asked for the answers to 16 of them, and the stream knows them all the same.
+    assert after[0].sequence == 18
+
+    with pytest.raises(ValueError, match="ahead"), server.client() as client:
+        list(client.track(config).follow(iter(frames), ahead=-1))
+
+
 def test_a_token_carries_a_stream_to_another_client(server: seese3.Server, drawn: Path) -> None:
     rows = seese3.Store(drawn).room(ROOM).features[FEATURES][:40]
     with server.client() as client, client.track(seese3.TrackConfig(room=ROOM)) as track:

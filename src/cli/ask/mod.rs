@@ -203,11 +203,15 @@ fn deviations_text(covariance: &[f64]) -> String {
     };
 
     let deviation = |part: &[f64]| part.iter().sum::<f64>().sqrt();
-    format!(
-        ", ± {:.3} m, ± {:.2}°",
-        deviation(&variances[..3]),
-        deviation(&variances[3..]).to_degrees()
-    )
+    let metres = deviation(&variances[..3]);
+    let degrees = deviation(&variances[3..]).to_degrees();
+
+    // There is no direction further away than the opposite one.
+    if degrees < 180.0 {
+        format!(", ± {metres:.3} m, ± {degrees:.2}°")
+    } else {
+        format!(", ± {metres:.3} m, in any direction")
+    }
 }
 
 fn motion_text(motion: &pb::Twist) -> String {

@@ -20,28 +20,34 @@ pub struct Motion {
     /// Name of the adapter; may be omitted when a room is named or the server has only one adapter
     #[arg(long, default_value = "")]
     adapter: String,
-    /// Name of the room that --frames belong to
+    /// Name of the room that the frames belong to
     #[arg(long, default_value = "")]
     room: String,
-    /// Two frames of the room, A,B (rows, counted from 0); the motion is from A to B
+    /// The frame that the motion starts from: a row of the room, counted from 0
+    #[arg(long, requires = "to", conflicts_with_all = ["frames", "images", "feature"])]
+    from: Option<u32>,
+    /// The frame that it leads to
+    #[arg(long, requires = "from")]
+    to: Option<u32>,
+    /// The same in one: frames A,B of the room
     #[arg(
         long,
         value_delimiter = ',',
         value_name = "A,B",
-        conflicts_with = "features"
+        conflicts_with = "feature"
     )]
     frames: Option<Vec<u32>>,
     /// Two JPEG or PNG files, A,B; the server must have been started with --encoder or --two-view
-    #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "features"])]
+    #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "feature"])]
     images: Option<Vec<PathBuf>>,
     /// The camera that took --images, in pixels. With it, a server started with --two-view compares
     /// the images themselves, unless --adapter names who reads the motion
     #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]", requires = "images")]
     camera: Option<CameraOption>,
     /// A NumPy file of features, shape (n, d); --rows chooses two
-    #[arg(long, value_name = "FILE", requires = "rows")]
-    features: Option<PathBuf>,
-    /// Two rows of the --features file, A,B, counted from 0
+    #[arg(long, alias = "features", value_name = "FILE", requires = "rows")]
+    feature: Option<PathBuf>,
+    /// Two rows of the --feature file, A,B, counted from 0
     #[arg(long, value_delimiter = ',', value_name = "A,B")]
     rows: Option<Vec<usize>>,
     #[command(flatten)]
@@ -54,12 +60,18 @@ impl Motion {
 
         // Both views come from one kind of input: frames of a room, rows of a feature file, or
         // image files.
-        let (first, second) = match (self.frames.as_deref(), &self.features, self.rows.as_deref()) {
+        let frames = match self.from.zip(self.to) {
+            Some((from, to)) => Some(vec![from, to]),
+            None => self.frames,
+        };
+        let (first, second) = match (frames.as_deref(), &self.feature, self.rows.as_deref()) {
             (Some(&[a, b]), _, _) => (frame_view(a), frame_view(b)),
             (None, Some(file), Some(&[a, b])) => (feature_view(file, a)?, feature_view(file, b)?),
             _ => match self.images.as_deref() {
                 Some([a, b]) => (image_view(a)?, image_view(b)?),
-                _ => bail!("--frames A,B, --features FILE --rows A,B or --images A,B is required"),
+                _ => {
+                    bail!("--from A --to B, --feature FILE --rows A,B or --images A,B is required")
+                }
             },
         };
 

@@ -9,6 +9,7 @@ use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
+use super::files::{Message, ZSTD};
 use seese3_core::geometry::Pose;
 
 /// How far the norm of a quaternion may be from 1.
@@ -62,6 +63,7 @@ impl Kind {
         }
     }
 
+    /// Whether its messages are images.
     pub fn is_image(&self) -> bool {
         matches!(
             self,
@@ -69,6 +71,7 @@ impl Kind {
         )
     }
 
+    /// Whether its messages say where something is, one pose each.
     pub fn is_pose(&self) -> bool {
         matches!(
             self,
@@ -142,9 +145,27 @@ impl Picture {
     }
 }
 
-/// What the message in `data` says. `log_time`, nanoseconds, stands for a
-/// stamp of zero. The error says what is wrong.
-pub fn decode(kind: &Kind, data: &[u8], log_time: i64) -> Result<Located, String> {
+/// What a message says. The time of recording stands for a stamp of zero. The error says what is wrong
+/// with which topic.
+pub fn decode(message: &Message<'_>) -> Result<Located, String> {
+    let Message {
+        topic,
+        kind,
+        log_time_ns,
+        data,
+    } = *message;
+
+    // A message of CDR begins with a zero.
+    if data.starts_with(ZSTD) {
+        return Err(format!(
+            "topic {topic}: messages are compressed one by one; `ros2 bag convert` the bag without \
+             compression_mode"
+        ));
+    }
+    decode_data(kind, data, log_time_ns).map_err(|problem| format!("topic {topic}: {problem}"))
+}
+
+fn decode_data(kind: Kind, data: &[u8], log_time: i64) -> Result<Located, String> {
     let image = |time_ns: i64, frame: String, picture: Picture| {
         Located::Image(Image {
             time_ns: if time_ns == 0 { log_time } else { time_ns },
@@ -179,7 +200,7 @@ pub fn decode(kind: &Kind, data: &[u8], log_time: i64) -> Result<Located, String
     })
 }
 
-fn decode_poses(kind: &Kind, data: &[u8], log_time: i64) -> Result<Vec<StampedPose>, String> {
+fn decode_poses(kind: Kind, data: &[u8], log_time: i64) -> Result<Vec<StampedPose>, String> {
     let stamped = |time_ns: i64, parent: String, child: String, pose: Pose| StampedPose {
         time_ns: if time_ns == 0 { log_time } else { time_ns },
         parent,

@@ -1,24 +1,30 @@
-//! MCAP files: bags of ROS 2, and recordings of Foxglove.
+//! Bags of ROS 2, and recordings of Foxglove.
 //!
 //! A bag has images on one topic and says on others where something was: the camera, or a robot's base
 //! that carries it. The poses at the times of the images lie between those before and after. Images
 //! are written to a folder as files, since rooms refer to files.
 //!
-//! The file is read twice, in pieces, whatever its size: first the poses, then the images.
+//! A bag is read twice, message by message, whatever its size: first the poses, then the images.
+//!
+//! | file | what |
+//! | --- | --- |
+//! | `files` | the files of a bag, and the messages of all of them |
+//! | `mcap_file`, `sqlite_file` | the messages of one file |
+//! | `messages` | what a message says |
+//! | `poses` | where the camera was at the time of an image |
 
+mod files;
+mod mcap_file;
 mod messages;
 mod poses;
+mod sqlite_file;
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
-
-use mcap::records::{Channel, Record, SchemaHeader};
-use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader};
 
 use super::collect::{About, Collected};
 use super::{DropReason, Error, Reader, Recording};
+use files::{Topic, each_message};
 use messages::{ImageFile, Kind, Located, Picture};
 use poses::Poses;
 use seese3_core::geometry::Pose;
@@ -39,21 +45,14 @@ pub struct Bag {
     pub images: PathBuf,
 }
 
-/// A topic that is of use here.
-#[derive(Debug, Clone, PartialEq, Eq)]
-struct Topic {
-    name: String,
-    kind: Kind,
-}
-
-/// Reads a bag.
+/// Reads a bag: a folder as ROS 2 writes it, or one of its files.
 ///
 /// # Errors
-/// [`Error`] if the file cannot be read or is damaged, a topic is not in it or has messages of another
+/// [`Error`] if a file cannot be read or is damaged, a topic is not in it or has messages of another
 /// kind, several could be meant, no image has a pose, or an image cannot be written.
-pub fn read_bag(file: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recording, Error> {
+pub fn read_bag(path: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recording, Error> {
     let malformed = |problem: String| Error::Malformed {
-        file: file.to_owned(),
+        file: path.to_owned(),
         problem,
     };
 
@@ -61,7 +60,7 @@ pub fn read_bag(file: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recor
         topics,
         mut poses,
         mut images,
-    } = contents(file)?;
+    } = contents(path)?;
 
     let image_topic = chosen_topic(&topics, bag.image_topic.as_deref(), Kind::is_image, "image")
         .map_err(&malformed)?;
@@ -74,7 +73,7 @@ pub fn read_bag(file: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recor
     };
 
     poses.sort();
-    let path = poses
+    let camera = poses
         .path(
             pose_topic.as_deref(),
             bag.world.as_deref(),
@@ -91,20 +90,18 @@ pub fn read_bag(file: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recor
 
     let mut collected = Collected::default();
     let mut done = 0;
-    each_message(file, |topic, log_time, data| {
-        if topic.name != image_topic {
+    each_message(path, |message| {
+        if message.topic != image_topic {
             return Ok(());
         }
         (reader.progress)(done, count);
         done += 1;
 
-        let decoded = messages::decode(&topic.kind, data, log_time)
-            .map_err(|problem| of_topic(&topic.name, &problem))?;
-        let Located::Image(image) = decoded else {
+        let Located::Image(image) = messages::decode(message)? else {
             return Ok(());
         };
         let name = format!("{done:06}");
-        let Some(world_from_camera) = path.at(image.time_ns) else {
+        let Some(world_from_camera) = camera.at(image.time_ns) else {
             collected.drop(name, DropReason::NoPoseWithinTolerance);
             return Ok(());
         };
@@ -125,23 +122,22 @@ pub fn read_bag(file: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recor
 
 /// What the first pass finds.
 struct Contents {
-    topics: Vec<Topic>,
+    topics: BTreeMap<String, Topic>,
     poses: Poses,
     /// By topic, the number of images and the frame of the camera.
     images: BTreeMap<String, (usize, String)>,
 }
 
-fn contents(file: &Path) -> Result<Contents, Error> {
+fn contents(path: &Path) -> Result<Contents, Error> {
     let mut poses = Poses::default();
     let mut images = BTreeMap::new();
 
-    let topics = each_message(file, |topic, log_time, data| {
-        let decoded = messages::decode(&topic.kind, data, log_time)
-            .map_err(|problem| of_topic(&topic.name, &problem))?;
-        match decoded {
-            Located::Poses(found) => poses.add(&topic.name, found),
+    let topics = each_message(path, |message| {
+        match messages::decode(message)? {
+            Located::Poses(found) => poses.add(message.topic, found),
             Located::Image(image) => {
-                let counted = images.entry(topic.name.clone()).or_insert((0, image.frame));
+                let topic = message.topic.to_owned();
+                let counted = images.entry(topic).or_insert((0, image.frame));
                 counted.0 += 1;
             }
         }
@@ -155,91 +151,24 @@ fn contents(file: &Path) -> Result<Contents, Error> {
     })
 }
 
-fn of_topic(topic: &str, problem: &str) -> String {
-    format!("topic {topic}: {problem}")
-}
-
-/// Calls `take` with every message of a known kind, the time at which it was recorded, and its topic;
-/// returns the topics. What `take` refuses is an error of the file.
-fn each_message(
-    file: &Path,
-    mut take: impl FnMut(&Topic, i64, &[u8]) -> Result<(), String>,
-) -> Result<Vec<Topic>, Error> {
-    let io = |cause| Error::Io {
-        file: file.to_owned(),
-        cause,
-    };
-    let malformed = |problem: String| Error::Malformed {
-        file: file.to_owned(),
-        problem,
-    };
-    let damaged = |error: mcap::McapError| malformed(format!("is no whole MCAP file: {error}"));
-
-    let mut source = File::open(file).map_err(io)?;
-    let mut reader = LinearReader::new();
-    let mut schemas = BTreeMap::new();
-    let mut topics: BTreeMap<u16, Topic> = BTreeMap::new();
-
-    while let Some(event) = reader.next_event() {
-        match event.map_err(damaged)? {
-            LinearReadEvent::ReadRequest(wanted) => {
-                let read = source.read(reader.insert(wanted)).map_err(io)?;
-                reader.notify_read(read);
-            }
-            LinearReadEvent::Record { data, opcode } => {
-                match mcap::parse_record(opcode, data).map_err(damaged)? {
-                    Record::Schema { header, .. } => {
-                        schemas.insert(header.id, header);
-                    }
-                    Record::Channel(channel) => {
-                        let id = channel.id;
-                        if let Some(topic) = topic_of(channel, &schemas) {
-                            topics.insert(id, topic);
-                        }
-                    }
-                    Record::Message { header, data } => {
-                        if let Some(topic) = topics.get(&header.channel_id) {
-                            let log_time = i64::try_from(header.log_time).unwrap_or(i64::MAX);
-                            take(topic, log_time, &data).map_err(malformed)?;
-                        }
-                    }
-                    _ => {}
-                }
-            }
-        }
-    }
-
-    Ok(topics.into_values().collect())
-}
-
-/// A channel whose messages are of a known kind.
-fn topic_of(channel: Channel, schemas: &BTreeMap<u16, SchemaHeader>) -> Option<Topic> {
-    let schema = schemas.get(&channel.schema_id)?;
-    let kind = Kind::of(&schema.name, &channel.message_encoding)?;
-    Some(Topic {
-        name: channel.topic,
-        kind,
-    })
-}
-
 /// The topic that is named, or the only one of its kind.
 fn chosen_topic(
-    topics: &[Topic],
+    topics: &BTreeMap<String, Topic>,
     named: Option<&str>,
     is_of_kind: impl Fn(&Kind) -> bool,
     what: &str,
 ) -> Result<String, String> {
-    let mut names: Vec<&str> = topics
-        .iter()
-        .filter(|topic| is_of_kind(&topic.kind))
-        .map(|topic| topic.name.as_str())
-        .collect();
-    names.sort_unstable();
-    names.dedup();
+    let of_kind = topics
+        .values()
+        .filter(|topic| topic.kind.as_ref().is_some_and(&is_of_kind));
+    let names: Vec<&str> = of_kind.map(|topic| topic.name.as_str()).collect();
 
     match (named, names.as_slice()) {
         (Some(named), _) if names.contains(&named) => Ok(named.to_owned()),
-        (Some(named), []) => Err(format!("has no topic of {what}s, and so not {named}")),
+        (Some(named), []) => Err(format!(
+            "has no topic of {what}s, and so not {named}; {}",
+            all_of(topics)
+        )),
         (Some(named), _) => Err(format!(
             "has no {what} topic {named}; it has {}",
             names.join(", ")
@@ -247,12 +176,25 @@ fn chosen_topic(
         (None, [only]) => Ok((*only).to_owned()),
         (None, []) => Err(format!(
             "has no topic of {what}s that is understood: ROS 2's sensor_msgs, geometry_msgs, nav_msgs and tf2_msgs, and \
-             Foxglove's in Protobuf are"
+             Foxglove's in Protobuf are; {}",
+            all_of(topics)
         )),
         (None, _) => Err(format!(
             "has several {what} topics; give --{what}-topic, one of {}",
             names.join(", ")
         )),
+    }
+}
+
+/// All topics with what they carry, for a message that says what is there instead of what was asked.
+fn all_of(topics: &BTreeMap<String, Topic>) -> String {
+    let words = topics
+        .values()
+        .map(|topic| format!("{} ({})", topic.name, topic.schema));
+    let words: Vec<String> = words.collect();
+    match words.as_slice() {
+        [] => "it has no topics".to_owned(),
+        words => format!("its topics are {}", words.join(", ")),
     }
 }
 

@@ -1,4 +1,4 @@
-"""Tiny bags of ROS 2 and a recording of Foxglove, with the camera's poses that a reader must return.
+"""Tiny bags of ROS 2, in both of their storages, and a recording of Foxglove, with the camera's poses that a reader must return.
 Oracle: rosbags writes and encodes the bag, Foxglove's own schemas with the MCAP project's writer the recording. Poses between
 two messages are those of SciPy's Slerp and of a straight line.
 Run: python make_bags.py (rosbags 0.11.9, mcap-protobuf-support 0.5.4, foxglove-schemas-protobuf, numpy, scipy, pillow)."""
@@ -112,9 +112,11 @@ for number, time in enumerate(IMAGE_TIMES):
     messages.append((time, "/camera/raw", raw))
 messages.append((START, "/chatter", T["std_msgs/msg/String"](data="nothing of use")))
 
-with tempfile.TemporaryDirectory() as folder:
-    writer = Writer(Path(folder) / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
-    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+for plugin, ending in ((StoragePlugin.MCAP, "mcap"), (StoragePlugin.SQLITE3, "db3")):
+    folder = Path(tempfile.mkdtemp())
+    writer = Writer(folder / "bag", version=9, storage_plugin=plugin)
+    if plugin is StoragePlugin.MCAP:
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with writer:
         connections = {}
         for time, topic, message in sorted(messages, key=lambda one: one[0]):
@@ -122,7 +124,8 @@ with tempfile.TemporaryDirectory() as folder:
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
             writer.write(connections[topic], int(time), STORE.serialize_cdr(message, kind))
-    shutil.copy(next((Path(folder) / "bag").glob("*.mcap*")), HERE / "bag.mcap")
+    shutil.copy(next((folder / "bag").glob(f"*.{ending}")), HERE / f"bag.{ending}")
+    shutil.rmtree(folder)
 
 with (HERE / "foxglove.mcap").open("wb") as file, FoxgloveWriter(file) as writer:
     for time, rotation, position in zip(TIMES, ROTATIONS, POSITIONS):

@@ -1,0 +1,98 @@
+//! `seese3 import bag`: bags of ROS 2, and recordings of Foxglove.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::bail;
+use clap::Args;
+
+use super::destination::Destination;
+use crate::cli::pose_options::DirectionOption;
+use crate::datasets::{self, Bag, Reader};
+use seese3_core::geometry::Pose;
+
+#[derive(Debug, Args)]
+pub struct BagPath {
+    /// The bag's folder, or one file of it, .mcap or .db3
+    path: PathBuf,
+    /// The topic of the images; may be omitted if there is only one
+    #[arg(long, value_name = "TOPIC")]
+    image_topic: Option<String>,
+    /// The topic of the poses: PoseStamped, PoseWithCovarianceStamped or Odometry; may be omitted if
+    /// there is only one
+    #[arg(long, value_name = "TOPIC", conflicts_with = "world_frame")]
+    pose_topic: Option<String>,
+    /// Take the poses from /tf instead: those of the images' frame in this one, such as map
+    #[arg(long, value_name = "FRAME")]
+    world_frame: Option<String>,
+    /// The camera on what the poses are of, x,y,z,qx,qy,qz,qw in metres, where the transforms do not
+    /// tell it
+    #[arg(long, value_delimiter = ',', allow_hyphen_values = true, num_args = 1)]
+    base_from_camera: Option<Vec<f64>>,
+    /// The folder for the images, which the room refers to; NAME-images beside the bag if omitted
+    #[arg(long, value_name = "DIR")]
+    images_to: Option<PathBuf>,
+    #[command(flatten)]
+    poses: DirectionOption,
+    #[command(flatten)]
+    to: Destination,
+}
+
+impl BagPath {
+    pub async fn import(self) -> anyhow::Result<()> {
+        let base_from_camera = self.base_from_camera.as_deref().map(mounting).transpose()?;
+        let bag = Bag {
+            image_topic: self.image_topic.clone(),
+            pose_topic: self.pose_topic.clone(),
+            world: self.world_frame.clone(),
+            base_from_camera,
+            images: self
+                .images_to
+                .clone()
+                .unwrap_or_else(|| images_beside(&self.path)),
+        };
+
+        let read = |reader: &mut Reader<'_>| datasets::read_bag(&self.path, &bag, reader);
+        let recording = self.to.read(read)?;
+        self.to
+            .publish("bag", &self.path, recording, self.poses.direction)
+            .await
+    }
+}
+
+/// The pose of a camera on a robot.
+fn mounting(numbers: &[f64]) -> anyhow::Result<Pose> {
+    let &[x, y, z, qx, qy, qz, qw] = numbers else {
+        bail!(
+            "--base-from-camera needs seven numbers, x,y,z,qx,qy,qz,qw, got {}",
+            numbers.len()
+        );
+    };
+    let quaternion = nalgebra::Quaternion::new(qw, qx, qy, qz);
+    let is_unit = (quaternion.norm() - 1.0).abs() < 1e-2;
+    if !(is_unit && [x, y, z].iter().all(|number| number.is_finite())) {
+        bail!(
+            "--base-from-camera: the last four numbers are no unit quaternion, or a number is not finite"
+        );
+    }
+
+    let rotation = nalgebra::UnitQuaternion::from_quaternion(quaternion);
+    Ok(Pose::from_parts(
+        nalgebra::Translation3::new(x, y, z),
+        rotation,
+    ))
+}
+
+/// The folder NAME-images beside a bag, which is a folder NAME or a file NAME.mcap or NAME.db3.
+fn images_beside(bag: &Path) -> PathBuf {
+    // A path such as `.` only has a name once it is resolved.
+    let path = bag.canonicalize().unwrap_or_else(|_| bag.to_owned());
+    let own = if path.is_dir() {
+        path.file_name()
+    } else {
+        path.file_stem()
+    };
+
+    let mut name = own.unwrap_or_default().to_owned();
+    name.push("-images");
+    path.with_file_name(name)
+}
