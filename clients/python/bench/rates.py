@@ -1,5 +1,6 @@
-"""Calls or frames a second by this package and by the raw stubs, by turns, against one server; what the ratio is below 1
-is the package's cost.
+"""Calls or frames a second by this package and by the raw stubs, by turns, against one server.
+
+What the ratio is below 1 is the package's cost.
 
 python rates.py [SECONDS]: so long is each measured; 2 s if nothing is said. Features of 768 columns, 1,000 frames.
 """
@@ -12,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeAlias
 
 import grpc
 import numpy as np
@@ -32,6 +34,8 @@ STREAMED = 100
 AHEAD = 16
 PERIOD_NS = 33_333_333
 ROUNDS = 3
+
+Cases: TypeAlias = dict[str, tuple[Callable[[int], object], ...]]
 MOTION = (0.1, 0.0, 0.2, 0.0, 0.1, 0.0)
 
 
@@ -66,7 +70,7 @@ def rate(call: Callable[[int], object], seconds: float) -> float:
     return calls * getattr(call, "frames", 1) / (time.perf_counter() - begun)
 
 
-def streams(client: seese3.Client, channel: grpc.Channel, rows: np.ndarray) -> dict[str, tuple[Callable[[int], object], ...]]:
+def streams(client: seese3.Client, channel: grpc.Channel, rows: np.ndarray) -> Cases:
     """Tracking, frame by frame as a camera is followed, and a recording, whose frames are all there."""
     odometry = odometry_pb2_grpc.OdometryServiceStub(channel)  # type: ignore[no-untyped-call]
     config = seese3.TrackConfig(room=ROOM)
@@ -108,7 +112,7 @@ def streams(client: seese3.Client, channel: grpc.Channel, rows: np.ndarray) -> d
     }
 
 
-def cases(client: seese3.Client, address: str, rows: np.ndarray) -> dict[str, tuple[Callable[[int], object], ...]]:
+def cases(client: seese3.Client, address: str, rows: np.ndarray) -> Cases:
     """By name: the package's way, and that of the stubs, with protobuf's lists as their documentation has it."""
     channel = grpc.insecure_channel(address)
     navigation = navigation_pb2_grpc.NavigationServiceStub(channel)  # type: ignore[no-untyped-call]

@@ -744,8 +744,8 @@ class AsyncTrack:
         try:
             answer = await self._answer()
         except BaseException:
-            # Whoever waited may have given up, by a timeout of its own or by Ctrl-C, and an answer that came later would
-            # be taken for that of the next frame. So the stream is cut: what has no answer did not happen.
+            # Whoever waited may have given up, by a timeout of its own or by Ctrl-C, and an answer that came later
+            # would be taken for that of the next frame. So the stream is cut: what has no answer did not happen.
             self._is_cut = True
             self._awaited.clear()
             self._call.cancel()
