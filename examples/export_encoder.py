@@ -78,10 +78,12 @@ def of_transformers(name):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("library", choices=["timm", "transformers"])
-    parser.add_argument("model", help="a name of the library's, or for transformers also a folder")
+    parser.add_argument("model", help="the name of a model, or a folder (transformers)")
     parser.add_argument("--random", action="store_true", help="random weights in place of trained ones (timm)")
     parser.add_argument("--out", type=Path, default=Path("."), help="the folder to write into")
     args = parser.parse_args()
+    if args.random and args.library == "transformers":
+        parser.error("--random is for timm; a model of transformers with random weights is a folder that was saved")
 
     of_library = (lambda name: of_timm(name, args.random)) if args.library == "timm" else of_transformers
     blocks, image, config, prefix_tokens = of_library(args.model)
@@ -94,7 +96,7 @@ def main():
     args.out.mkdir(parents=True, exist_ok=True)
     model_file, config_file = args.out / f"{name}.onnx", args.out / f"{name}.json"
     torch.onnx.export(
-        blocks, (image,), model_file, input_names=["image"], output_names=names, dynamic_shapes={"image": {0: "batch"}}
+        blocks, (image,), model_file, input_names=["image"], output_names=names, dynamic_shapes={"image": {0: "batch"}}, dynamo=True
     )
     config_file.write_text(json.dumps(config, indent=2))
 

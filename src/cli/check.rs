@@ -7,9 +7,8 @@ use clap::{Args, Subcommand};
 
 use super::encode::images_root;
 use super::output::{JsonOutput, say};
-use super::pose_report::PoseReport;
+use super::pose_report::{PoseReport, PosesFrom};
 use crate::store::Store;
-use seese3_core::pose_check::Convention;
 
 #[derive(Debug, Args)]
 pub struct Check {
@@ -20,7 +19,7 @@ pub struct Check {
 #[derive(Debug, Subcommand)]
 enum What {
     /// A room: what its camera did, and whether its poses can be those of its images. Fails if they
-    /// are wrong for certain
+    /// are wrong
     Room(CheckRoom),
 }
 
@@ -55,8 +54,7 @@ impl CheckRoom {
         let mut report = PoseReport::of_path(&room);
         if !room.images().is_empty() {
             let root = images_root(&room, self.images.as_deref())?;
-            // What is stored has been read in its convention already.
-            report.look_at_images(&room, &root, room.poses(), Convention::default());
+            report.look_at_images(&room, &root, room.poses(), PosesFrom::Store);
         }
 
         self.json.write(&report.json(&room))?;

@@ -19,9 +19,9 @@ pub struct RuntimeOptions {
     /// Path of the shared library of onnxruntime
     #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
     library: Option<PathBuf>,
-    /// Number of threads; 0 takes all cores
-    #[arg(long, default_value_t = 0)]
-    threads: usize,
+    /// Number of threads, at most 1024; 0 takes all cores
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u16).range(..=1024))]
+    threads: u16,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -54,7 +54,7 @@ impl RuntimeOptions {
     /// The number of threads, with 0 resolved to the number of cores.
     pub fn threads(&self) -> usize {
         if self.threads > 0 {
-            self.threads
+            usize::from(self.threads)
         } else {
             std::thread::available_parallelism().map_or(1, usize::from)
         }

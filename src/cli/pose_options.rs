@@ -137,7 +137,7 @@ pub fn flags_of(convention: Convention) -> String {
         flags.push(format!("--images-turned {degrees}"));
     }
     if flags.is_empty() {
-        flags.push("no option on poses".to_owned());
+        flags.push("without options on poses".to_owned());
     }
 
     flags.join(" ")

@@ -13,7 +13,7 @@ use seese3_core::geometry::{Pinhole, Pose};
 use seese3_core::image_motion::{SmallImage, align};
 use seese3_core::pose_check::{
     Convention, ObservedPair, PathFacts, PathWarning, PoseCheck, Seen, Translations, Verdict,
-    check, pairs_to_look_at,
+    check, is_identity, pairs_to_look_at,
 };
 use seese3_core::room::{FrameId, Room};
 
@@ -22,6 +22,24 @@ use seese3_core::room::{FrameId, Room};
 const USUAL_DEPTH_M: std::ops::Range<f64> = 0.4..40.0;
 /// A stated focal length that differs from the seen one by more than this factor is asked about.
 const FOCAL_FACTOR: f64 = 1.4;
+
+/// Where the poses come from that are compared with images.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PosesFrom {
+    /// A recording, and are read in this convention: the options that mend them are those of `import`.
+    Recording(Convention),
+    /// The store. Nobody knows by which options they were read when they were imported.
+    Store,
+}
+
+impl PosesFrom {
+    fn read_as(self) -> Convention {
+        match self {
+            Self::Recording(convention) => convention,
+            Self::Store => Convention::default(),
+        }
+    }
+}
 
 /// The facts about a room's poses and images, and what looks wrong in them.
 pub struct PoseReport {
@@ -35,7 +53,10 @@ pub struct PoseReport {
 struct Images {
     /// How many have which width and height, pixels.
     sizes: BTreeMap<(u32, u32), usize>,
+    unreadable_count: usize,
     check: PoseCheck,
+    /// Whether no pose was left to compare, since all are the same or those of lost tracking.
+    are_lost: bool,
 }
 
 impl PoseReport {
@@ -53,30 +74,30 @@ impl PoseReport {
     }
 
     /// Looks at the images below `root` too, and compares them with the room's poses: `stated` are
-    /// those before they were read as `read_as`.
-    pub fn look_at_images(
-        &mut self,
-        room: &Room,
-        root: &Path,
-        stated: &[Pose],
-        read_as: Convention,
-    ) {
+    /// those before they were read in their convention.
+    pub fn look_at_images(&mut self, room: &Room, root: &Path, stated: &[Pose], from: PosesFrom) {
         let (sizes, problem) = sizes(room, root);
         self.warnings.extend(problem);
 
         // Poses that are no poses say nothing about the others, and have been named already.
         let mut observed = observe(room, root);
+        let observed_count = observed.len();
         let lost = |frame: FrameId| self.is_lost(&room.poses()[frame.row()]);
         observed.retain(|pair| !lost(pair.first) && !lost(pair.second));
 
-        let check = check(stated, read_as, &observed);
-        self.warnings.extend(verdict_warning(&check, read_as));
+        let check = check(stated, from.read_as(), &observed);
+        self.warnings.extend(verdict_warning(&check, from));
         if let Verdict::Agrees(seen) = check.verdict {
             let camera = room.provenance().camera;
             self.warnings.extend(seen_warnings(seen, camera));
         }
         self.warnings.extend(camera_warning(room, &sizes));
-        self.images = Some(Images { sizes, check });
+        self.images = Some(Images {
+            unreadable_count: room.images().len() - sizes.values().sum::<usize>(),
+            sizes,
+            check,
+            are_lost: observed_count > 0 && observed.is_empty(),
+        });
     }
 
     /// Whether this pose is one of those that recorders write when tracking is lost.
@@ -84,7 +105,7 @@ impl PoseReport {
         let mut warnings = self.path.iter().flat_map(|path| &path.warnings);
         warnings.any(|warning| match warning {
             PathWarning::NeverMoves => true,
-            PathWarning::Identities { .. } => *pose == Pose::identity(),
+            PathWarning::Identities { .. } => is_identity(pose),
             _ => false,
         })
     }
@@ -105,12 +126,20 @@ impl PoseReport {
         self.is_contradicted() || warnings.into_iter().any(is_wrong)
     }
 
+    /// Whether some of the images that were looked at are no images.
+    pub fn has_unreadable_images(&self) -> bool {
+        let images = self.images.as_ref();
+        images.is_some_and(|images| images.unreadable_count > 0)
+    }
+
     fn is_contradicted(&self) -> bool {
         let verdict = self.images.as_ref().map(|images| &images.check.verdict);
         matches!(
             verdict,
             Some(
                 Verdict::OtherConvention { .. }
+                    | Verdict::MirroredImages { .. }
+                    | Verdict::TransposedRotations { .. }
                     | Verdict::OtherTranslations { .. }
                     | Verdict::OtherRows { .. }
                     | Verdict::Unrelated { .. }
@@ -177,15 +206,16 @@ fn sizes(room: &Room, root: &Path) -> (BTreeMap<(u32, u32), usize>, Option<Strin
     });
     let words: Vec<String> = words.collect();
     let problem = format!(
-        "images have {} sizes: {}; an encoder resizes all to one, which distorts those of another shape",
+        "images have {} sizes: {}; an encoder resizes all images to one size, which distorts those of another \
+         shape",
         sizes.len(),
         words.join(", ")
     );
     (sizes, Some(problem))
 }
 
-/// Lays pairs of images over one another. Images that cannot be read are left out: `sizes` has said
-/// so, or encoding them will.
+/// Lays pairs of images over one another. Images that cannot be read are left out here; `sizes` reports
+/// them, or encoding them will.
 fn observe(room: &Room, root: &Path) -> Vec<ObservedPair> {
     let pairs = pairs_to_look_at(room);
     let progress = bar(pairs.len() as u64, "comparing poses with images");
@@ -243,6 +273,7 @@ fn say_images(images: &Images) {
     } = &images.check;
     let share = format!("{:.0} % of how the images move", 100.0 * explained);
     match verdict {
+        _ if images.are_lost => say("poses against images: cannot tell, the poses say nothing"),
         Verdict::Agrees(seen) => {
             let depth = seen.depth.map_or(String::new(), |depth| {
                 format!(", things in view about {depth:.1} m away")
@@ -263,6 +294,8 @@ fn say_images(images: &Images) {
             "poses against images: unclear, they explain {share} ({pair_count} pairs)"
         )),
         Verdict::OtherConvention { .. }
+        | Verdict::MirroredImages { .. }
+        | Verdict::TransposedRotations { .. }
         | Verdict::OtherTranslations { .. }
         | Verdict::OtherRows { .. }
         | Verdict::Unrelated { .. } => say(format_args!(
@@ -282,13 +315,18 @@ fn path_warning(warning: PathWarning) -> String {
                 .to_owned()
         }
         PathWarning::Identities { count, first } => format!(
-            "{count} poses are exactly the identity after others that are not, the first of frame {first}: \
-             recorders write it when tracking is lost; remove these frames"
+            "{count} poses are exactly the identity (or it along other axes) after others that are not, the \
+             first of frame {first}: recorders write it when tracking is lost; remove these frames"
         ),
-        PathWarning::Jumps { count, first } => format!(
-            "the camera jumps {count} times, first to frame {first}: tracking was lost, or several \
-             recordings are in one sequence"
-        ),
+        PathWarning::Jumps { count, first } => {
+            let times = match count {
+                1 => format!("once, to frame {first}"),
+                count => format!("{count} times, first to frame {first}"),
+            };
+            format!(
+                "the camera jumps {times}: tracking was lost, or several recordings are in one sequence"
+            )
+        }
         PathWarning::OtherUnit { median_step_m } => format!(
             "the median step is {median_step_m:.1} m: are the translations in millimetres (--scale 0.001) \
              or centimetres (--scale 0.01)?"
@@ -300,23 +338,38 @@ fn path_warning(warning: PathWarning) -> String {
     }
 }
 
-fn verdict_warning(check: &PoseCheck, read_as: Convention) -> Option<String> {
+fn verdict_warning(check: &PoseCheck, from: PosesFrom) -> Option<String> {
+    let read_as = from.read_as();
+    let again = match from {
+        PosesFrom::Recording(_) => {
+            "import again with these options, and look at the verdict again: there may be a second mistake"
+        }
+        PosesFrom::Store => {
+            "these are the options if the room was imported without any on poses; import it again, and look \
+             at the verdict again: there may be a second mistake"
+        }
+    };
     let stated = 100.0 * check.explained;
     match &check.verdict {
-        Verdict::OtherConvention { likely, explained } => {
-            let likely: Vec<String> = likely
-                .iter()
-                .map(|convention| format!("{} ({})", in_words(*convention), flags_of(*convention)))
-                .collect();
-            Some(format!(
-                "the images contradict the poses: read as {} they explain {stated:.0} % of how the images \
-                 move, and {:.0} % as {}; import again that way, and see whether they agree then: something \
-                 else may be wrong as well",
-                in_words(read_as),
-                100.0 * explained,
-                likely.join(", or as ")
-            ))
-        }
+        Verdict::OtherConvention { likely, explained } => Some(format!(
+            "the images contradict the poses: read as {} they explain {stated:.0} % of how the images \
+             move, and {:.0} % as {}; {again}",
+            in_words(read_as),
+            100.0 * explained,
+            likely_in_words(likely)
+        )),
+        Verdict::MirroredImages { likely, explained } => Some(format!(
+            "the images are mirrored: the poses explain {stated:.0} % of how they move, and {:.0} % of how \
+             they would with left and right exchanged, read as {}; mirror the images back and import again",
+            100.0 * explained,
+            likely_in_words(likely)
+        )),
+        Verdict::TransposedRotations { explained } => Some(format!(
+            "the images contradict the rotations: the poses explain {stated:.0} % of how the images move, \
+             and {:.0} % with the rotations transposed and the translations as they are; mend the poses and \
+             import again",
+            100.0 * explained
+        )),
         Verdict::OtherTranslations { likely, explained } => Some(format!(
             "the images contradict the translations: the poses explain {stated:.0} % of how the images move, \
              and {:.0} % with translations {}; mend the poses and import again",
@@ -325,8 +378,8 @@ fn verdict_warning(check: &PoseCheck, read_as: Convention) -> Option<String> {
         )),
         Verdict::OtherRows { rows, explained } => Some(format!(
             "the images contradict the poses: they explain {stated:.0} % of how the images move, and {:.0} % \
-             of images {} frames {}; are poses and images counted from the same start, and their clocks the \
-             same?",
+             of how those move that are {} frames {}; do poses and images start at the same frame, and use \
+             the same clock?",
             100.0 * explained,
             rows.abs(),
             if *rows > 0 { "later" } else { "earlier" }
@@ -338,10 +391,19 @@ fn verdict_warning(check: &PoseCheck, read_as: Convention) -> Option<String> {
         Verdict::Unrelated { explained } => Some(format!(
             "the images contradict the poses: no convention explains more than {:.0} % of how the images \
              move; are the poses in another order, of other frames or of another recording?",
-            100.0 * explained.max(0.0)
+            100.0 * explained
         )),
         Verdict::Agrees(_) | Verdict::TooFewPairs | Verdict::TooLittleMotion => None,
     }
+}
+
+/// Conventions in words, each with the options that read it.
+fn likely_in_words(likely: &[Convention]) -> String {
+    let words = likely
+        .iter()
+        .map(|convention| format!("{} ({})", in_words(*convention), flags_of(*convention)));
+
+    words.collect::<Vec<_>>().join(", or as ")
 }
 
 fn translations_in_words(translations: Translations) -> String {
@@ -376,7 +438,8 @@ fn seen_warnings(seen: Seen, camera: Option<Pinhole>) -> Vec<String> {
         let ratio = seen.focal / camera.focal();
         if !(FOCAL_FACTOR.recip()..FOCAL_FACTOR).contains(&ratio) {
             warnings.push(format!(
-                "the images move as through a focal length of {:.2} image widths, and --camera states {:.2}",
+                "the images move as through a focal length of {:.2} image widths, and the room's camera has \
+                 {:.2}: is --camera, or the recording's own camera, right?",
                 seen.focal,
                 camera.focal()
             ));
@@ -416,6 +479,8 @@ fn images_json(images: &Images) -> Value {
     let (verdict, likely, seen) = match &check.verdict {
         Verdict::Agrees(seen) => ("agrees", Vec::new(), Some(*seen)),
         Verdict::OtherConvention { likely, .. } => ("other_convention", likely.clone(), None),
+        Verdict::MirroredImages { likely, .. } => ("mirrored_images", likely.clone(), None),
+        Verdict::TransposedRotations { .. } => ("transposed_rotations", Vec::new(), None),
         Verdict::OtherTranslations { .. } => ("other_translations", Vec::new(), None),
         Verdict::OtherRows { .. } => ("other_rows", Vec::new(), None),
         Verdict::Unrelated { .. } => ("unrelated", Vec::new(), None),
@@ -428,11 +493,19 @@ fn images_json(images: &Images) -> Value {
         |((width, height), count)| json!({ "width": width, "height": height, "count": count }),
     );
 
+    let (rows, translations) = match &check.verdict {
+        Verdict::OtherRows { rows, .. } => (Some(*rows), None),
+        Verdict::OtherTranslations { likely, .. } => (None, Some(translations_in_words(*likely))),
+        _ => (None, None),
+    };
+
     json!({
         "verdict": verdict,
         "explained": check.explained,
         "pairs": check.pair_count,
         "likely": likely,
+        "rows": rows,
+        "translations": translations,
         "focal_widths": seen.map(|seen| seen.focal),
         "depth_m": seen.and_then(|seen| seen.depth),
         "sizes": sizes.collect::<Vec<_>>(),

@@ -161,16 +161,21 @@ impl Collected {
 
     /// Records that a frame is left out.
     pub fn drop(&mut self, name: String, reason: DropReason) {
-        self.drop_without(String::new(), name, reason);
+        self.drop_for(name, reason, String::new());
     }
 
-    /// Records that a frame is left out because a file of it is missing, `looked_for` in vain.
-    pub fn drop_without(&mut self, looked_for: String, name: String, reason: DropReason) {
+    /// The same, with what exactly is wrong.
+    pub fn drop_for(&mut self, name: String, reason: DropReason, detail: String) {
         self.0.dropped.push(Dropped {
             name,
             reason,
-            looked_for,
+            detail,
         });
+    }
+
+    /// Records that a frame is left out because a file of it is missing, which was looked for in vain.
+    pub fn drop_without(&mut self, looked_for: String, name: String, reason: DropReason) {
+        self.drop_for(name, reason, format!("looked for {looked_for}"));
     }
 
     /// The complete recording, with image paths relative to `root`.

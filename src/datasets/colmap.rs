@@ -268,7 +268,7 @@ fn text_cameras(file: &Path) -> Result<BTreeMap<u32, Camera>, Error> {
         };
         let id = id
             .parse()
-            .map_err(|_| wrong(format!("'{id}' is no number of a camera")))?;
+            .map_err(|_| wrong(format!("'{id}' is not the id of a camera")))?;
         let numbers: Result<Vec<f64>, Error> =
             sizes.iter().map(|word| number(file, line, word)).collect();
         let numbers = numbers?;
@@ -336,7 +336,17 @@ fn text_images(file: &Path) -> Result<Vec<Image>, Error> {
         });
 
         // The points seen in the image, a line that may be empty.
-        lines.next();
+        if let Some((line, points)) = lines.next()
+            && points.split_whitespace().count() % 3 != 0
+        {
+            return Err(Error::Line {
+                file: file.to_owned(),
+                line,
+                problem: "is not a line of points, X Y POINT3D_ID each: every image has two lines, of which \
+                          the second may be empty"
+                    .to_owned(),
+            });
+        }
     }
 
     Ok(images)

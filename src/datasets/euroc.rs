@@ -134,7 +134,10 @@ fn read_ground_truth(file: &Path) -> Result<Vec<(i64, Pose)>, Error> {
             return Err(wrong(
                 file,
                 line,
-                format!("is no pose: the quaternion has norm {}", quaternion.norm()),
+                format!(
+                    "has a quaternion of norm {}, or a number that is not finite",
+                    quaternion.norm()
+                ),
             ));
         }
 

@@ -5,7 +5,7 @@
 use std::path::Path;
 
 use super::natural::sort_naturally;
-use super::{Error, Recording, Stated, entries, read_numpy};
+use super::{Error, Recording, entries, read_numpy};
 
 /// The folder of the images.
 pub(super) const IMAGES: &str = "images";
@@ -36,13 +36,16 @@ pub fn read_folder(folder: &Path) -> Result<Recording, Error> {
         .map(|image| format!("{IMAGES}/{image}"))
         .collect();
     recording.images_root = resolved(folder)?;
-    recording.stated = Stated::default();
     Ok(recording)
 }
 
 /// The names of the images in a folder, in the order of the numbers in them.
 pub(super) fn image_files(folder: &Path) -> Result<Vec<String>, Error> {
     let is_image = |name: &String| {
+        // Some systems put a file of their own beside each: ._0001.jpg.
+        if name.starts_with('.') {
+            return false;
+        }
         let extension = Path::new(name).extension().map(|e| e.to_ascii_lowercase());
         extension.is_some_and(|extension| {
             extension == "jpg" || extension == "jpeg" || extension == "png"

@@ -23,7 +23,7 @@ mod tum;
 mod twelve_scenes;
 
 pub use arkitscenes::read_arkitscenes;
-pub use bag::{Bag, read_bag};
+pub use bag::{Bag, WrittenImages, read_bag};
 pub use bundle::{read_bundle, read_numpy, write_numpy};
 pub use collect::pose_of_matrix;
 pub use colmap::read_colmap;
@@ -90,8 +90,8 @@ pub struct Dropped {
     pub name: String,
     /// Why it was left out.
     pub reason: DropReason,
-    /// The files that were looked for; empty if none is missing.
-    pub looked_for: String,
+    /// What exactly is wrong, such as the file that was looked for; empty if the reason says it all.
+    pub detail: String,
 }
 
 impl std::fmt::Display for Dropped {
@@ -99,14 +99,14 @@ impl std::fmt::Display for Dropped {
         let Self {
             name,
             reason,
-            looked_for,
+            detail,
         } = self;
 
         write!(f, "{name}: {reason}")?;
-        if looked_for.is_empty() {
+        if detail.is_empty() {
             Ok(())
         } else {
-            write!(f, " (looked for {looked_for})")
+            write!(f, " ({detail})")
         }
     }
 }
@@ -130,6 +130,9 @@ pub enum DropReason {
     SuspectIdentityPose,
     #[error("no_pose_within_tolerance")]
     NoPoseWithinTolerance,
+    /// A message of a bag, of a pose or an image, that says nothing of use.
+    #[error("malformed_message")]
+    MalformedMessage,
 }
 
 /// What was read from a recording.
@@ -237,7 +240,10 @@ fn read_text(file: &Path) -> Result<String, Error> {
         file: file.to_owned(),
         problem: "is not UTF-8 text".to_owned(),
     };
-    String::from_utf8(read_bytes(file)?).map_err(malformed)
+    // Some editors put a byte order mark before the text.
+    let bytes = read_bytes(file)?;
+    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
+    String::from_utf8(text.to_vec()).map_err(malformed)
 }
 
 /// The names of all entries of a folder, sorted.

@@ -24,11 +24,14 @@ struct Transforms {
 }
 
 /// A pinhole camera, pixels, as far as it is stated.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize)]
 struct Camera {
+    /// Without it, OPENCV, which has no distortion either where its coefficients are left out.
+    camera_model: Option<String>,
     w: Option<f64>,
     h: Option<f64>,
     fl_x: Option<f64>,
+    fl_y: Option<f64>,
     cx: Option<f64>,
     cy: Option<f64>,
     /// The horizontal field of view, radians: of NeRF's own files.
@@ -110,8 +113,21 @@ fn image_of(folder: &Path, name: &str) -> Option<String> {
         .find(|image| folder.join(image).is_file())
 }
 
-/// The camera, if all of it is stated once for all frames.
+/// The camera, if all of it is stated once for all frames. None for cameras that are no pinhole, such as
+/// fisheyes, and for pixels that are not square.
 fn pinhole(camera: Camera) -> Result<Option<Pinhole>, String> {
+    let is_pinhole = match camera.camera_model.as_deref() {
+        None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL") => true,
+        Some(_) => false,
+    };
+    let is_square = match camera.fl_x.zip(camera.fl_y) {
+        Some((x, y)) => (y / x - 1.0).abs() < 0.02,
+        None => true,
+    };
+    if !is_pinhole || !is_square {
+        return Ok(None);
+    }
+
     let Some((width, height)) = camera.w.zip(camera.h) else {
         return Ok(None);
     };

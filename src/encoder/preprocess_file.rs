@@ -1,14 +1,15 @@
 //! Reads how images are prepared for a model from the JSON file that its authors publish beside it:
 //! `preprocessor_config.json` of transformers, or `config.json` of timm. timm's data configuration,
-//! written as JSON, has the fields of the latter without the frame around them.
+//! written as JSON, has the fields of the latter without the object `pretrained_cfg` around them.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::Deserialize;
 
 use super::{Error, Filter, Preparation, Resize};
 
-/// What of the file decides how images are prepared. The fields of the two libraries do not overlap.
+/// The fields that decide how images are prepared. Those of the two libraries do not overlap, but for `crop_pct`.
 #[derive(Deserialize)]
 struct PreprocessFile {
     // timm's hub writes its fields into an object of their own.
@@ -26,7 +27,7 @@ struct TimmConfig {
     interpolation: Option<String>,
     mean: Option<[f32; 3]>,
     std: Option<[f32; 3]>,
-    /// The part of the resized image that is kept, of its edge.
+    /// The edge of the crop, as a share of the edge of the resized image.
     crop_pct: Option<f64>,
     crop_mode: Option<String>,
 }
@@ -34,6 +35,8 @@ struct TimmConfig {
 #[derive(Deserialize)]
 struct TransformersConfig {
     image_processor_type: Option<String>,
+    /// What older files call it.
+    feature_extractor_type: Option<String>,
     do_resize: Option<bool>,
     size: Option<Size>,
     /// Pillow's number of the filter.
@@ -45,9 +48,20 @@ struct TransformersConfig {
     do_normalize: Option<bool>,
     image_mean: Option<[f32; 3]>,
     image_std: Option<[f32; 3]>,
-    do_pad: Option<bool>,
-    keep_aspect_ratio: Option<bool>,
+    /// The rest of the file, in which nothing may change the image.
+    #[serde(flatten)]
+    others: BTreeMap<String, serde_json::Value>,
 }
+
+/// What processors do to images beside what is read here, where a file says `true`. Conversion to three
+/// channels is done with every image.
+const OTHER_STEPS: [&str; 4] = [
+    "rescale_offset",
+    "include_top",
+    "offset",
+    "keep_aspect_ratio",
+];
+const HARMLESS_STEPS: [&str; 1] = ["do_convert_rgb"];
 
 /// A size as transformers write it: older files have one number for both edges.
 #[derive(Clone, Copy, Deserialize)]
@@ -83,6 +97,9 @@ fn parse(text: &[u8]) -> Result<Preparation, String> {
 
     let preparation = if read.transformers.image_mean.is_some() || read.transformers.size.is_some()
     {
+        if read.timm.crop_pct.is_some() {
+            return Err("has a `crop_pct`, which is supported for timm alone".to_owned());
+        }
         of_transformers(&read.transformers)?
     } else {
         of_timm(read.pretrained_cfg.as_ref().unwrap_or(&read.timm))?
@@ -136,21 +153,43 @@ fn of_timm(config: &TimmConfig) -> Result<Preparation, String> {
 }
 
 fn of_transformers(config: &TransformersConfig) -> Result<Preparation, String> {
-    if config.do_pad == Some(true) || config.keep_aspect_ratio == Some(true) {
-        return Err("pads images, or keeps their shape (`do_pad`, `keep_aspect_ratio`)".to_owned());
+    let asks_for = |(key, value): &(&String, &serde_json::Value)| {
+        let is_step = key.starts_with("do_") || OTHER_STEPS.contains(&key.as_str());
+        **value == true && is_step && !HARMLESS_STEPS.contains(&key.as_str())
+    };
+    if let Some((step, _)) = config.others.iter().find(asks_for) {
+        return Err(format!(
+            "asks for a step that is not supported (`{step}`: true)"
+        ));
     }
 
+    let processor = config
+        .image_processor_type
+        .as_deref()
+        .or(config.feature_extractor_type.as_deref())
+        .unwrap_or_default();
     let resize = match (config.do_resize.unwrap_or(true), config.size) {
         (false, _) => Resize::None,
-        (true, Some(size)) => resize_of(size, config.image_processor_type.as_deref())?,
+        (true, Some(size)) => resize_of(size, processor)?,
         (true, None) => return Err("has no `size`".to_owned()),
     };
 
-    let crop = match (config.do_center_crop.unwrap_or(false), config.crop_size) {
+    let is_cropped = match (config.do_center_crop, &config.crop_size) {
+        (Some(is_cropped), _) => is_cropped,
+        // These processors crop unless they are told not to.
+        (None, _) if is_of_family(processor, &["CLIP", "Bit"]) => true,
+        (None, None) => false,
+        (None, Some(_)) => {
+            return Err(
+                "has `crop_size`, and no `do_center_crop` to say whether it is used".to_owned(),
+            );
+        }
+    };
+    let crop = match (is_cropped, config.crop_size) {
         (false, _) => None,
         (true, Some(Size::Edge(edge))) => Some((edge, edge)),
         (true, Some(Size::Whole { height, width })) => Some((width, height)),
-        (true, _) => return Err("has `do_center_crop` and no `crop_size` of both edges".to_owned()),
+        (true, _) => return Err("crops, and has no `crop_size` of both edges".to_owned()),
     };
 
     // Pillow numbers its filters.
@@ -191,16 +230,14 @@ fn of_transformers(config: &TransformersConfig) -> Result<Preparation, String> {
 }
 
 /// What a size means. One number is the shorter edge for some processors, and both edges for others.
-fn resize_of(size: Size, processor: Option<&str>) -> Result<Resize, String> {
-    let is_of = |families: &[&str]| {
-        families
-            .iter()
-            .any(|family| processor.is_some_and(|name| name.starts_with(family)))
-    };
+fn resize_of(size: Size, processor: &str) -> Result<Resize, String> {
+    let is_of = |families: &[&str]| is_of_family(processor, families);
 
     // ConvNeXt's processor crops by a share that this program does not read.
     if is_of(&["ConvNext"]) {
-        return Err("is of ConvNeXt's processor, which crops by a share of its own".to_owned());
+        return Err(
+            "was written for ConvNextImageProcessor, whose crop_pct is not supported".to_owned(),
+        );
     }
 
     match size {
@@ -215,6 +252,11 @@ fn resize_of(size: Size, processor: Option<&str>) -> Result<Resize, String> {
             "has `size` {edge}, and does not say whether that is the shorter edge or both"
         )),
     }
+}
+
+/// Whether a processor's name begins with that of one of these families.
+fn is_of_family(processor: &str, families: &[&str]) -> bool {
+    families.iter().any(|family| processor.starts_with(family))
 }
 
 #[cfg(test)]
@@ -327,8 +369,22 @@ mod tests {
             assert!(problem.contains(field), "{field}: {problem}");
         };
         named(of("OwnProcessor", ""), "shorter edge or both");
-        named(of("ConvNextImageProcessor", ""), "ConvNeXt");
-        named(of("ViTImageProcessor", ", \"do_pad\": true"), "do_pad");
+        named(of("ConvNextImageProcessor", ""), "ConvNext");
+        for step in [
+            "do_pad",
+            "do_flip_channel_order",
+            "rescale_offset",
+            "include_top",
+        ] {
+            named(
+                of("ViTImageProcessor", &format!(", \"{step}\": true")),
+                step,
+            );
+        }
+        named(
+            of("ViTImageProcessor", ", \"crop_size\": 224"),
+            "do_center_crop",
+        );
         named(
             of("ViTImageProcessor", ", \"do_center_crop\": true"),
             "crop_size",

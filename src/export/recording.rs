@@ -202,9 +202,10 @@ impl McapRecording {
 
 /// A time of the message; what was before the epoch is the epoch.
 fn timestamp(time_ns: i64) -> Timestamp {
-    let seconds = u32::try_from(time_ns.div_euclid(1_000_000_000)).unwrap_or(0);
+    let time_ns = time_ns.max(0);
+    let seconds = u32::try_from(time_ns / 1_000_000_000).unwrap_or(u32::MAX);
     // The rest of a division by 10⁹ is smaller than that.
-    Timestamp::new(seconds, time_ns.rem_euclid(1_000_000_000) as u32)
+    Timestamp::new(seconds, (time_ns % 1_000_000_000) as u32)
 }
 
 fn foxglove_pose(pose: &Pose) -> foxglove::messages::Pose {

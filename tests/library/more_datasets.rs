@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use nalgebra::Matrix4;
 use seese3::datasets::{
-    Bag, DropReason, Error, Kitti, Reader, Recording, Unusable, read_bag, read_colmap, read_euroc,
-    read_folder, read_kitti, read_transforms,
+    Bag, DropReason, Error, Kitti, Reader, Recording, Unusable, WrittenImages, read_bag,
+    read_colmap, read_euroc, read_folder, read_kitti, read_transforms,
 };
 use seese3_core::geometry::{Pinhole, PixelCamera, Pose};
 
@@ -224,7 +224,10 @@ fn expected_of_bags(name: &str) -> Vec<Matrix4<f64>> {
     file[name].as_array().unwrap().iter().map(matrix).collect()
 }
 
-fn read_bag_of(file: &str, bag: Bag) -> (tempfile::TempDir, Result<Recording, Error>) {
+fn read_bag_of(
+    file: &str,
+    bag: Bag,
+) -> (tempfile::TempDir, Result<(Recording, WrittenImages), Error>) {
     let images = tempfile::tempdir().unwrap();
     let bag = Bag {
         images: images.path().join("images"),
@@ -275,8 +278,8 @@ fn a_bag_of_ros_gives_the_poses_at_the_times_of_its_images() {
                 base_from_camera,
                 ..Bag::default()
             };
-            let (images, found) = read_bag_of(file, bag);
-            let found = found.unwrap();
+            let (_images, found) = read_bag_of(file, bag);
+            let (found, written) = found.unwrap();
 
             // The last image lies behind the last pose.
             assert_eq!(found.dropped.len(), 1);
@@ -289,7 +292,7 @@ fn a_bag_of_ros_gives_the_poses_at_the_times_of_its_images() {
             assert_eq!(serde_json::json!(found.frames.timestamps_ns), times);
 
             // Red counts the images, 40 by 40; JPEG changes it by a few.
-            let image = images.path().join("images").join(&found.frames.images[3]);
+            let image = written.folder().join(&found.frames.images[3]);
             let pixel = image::open(image).unwrap().to_rgb8().get_pixel(4, 3).0;
             assert!(
                 pixel[0].abs_diff(120) < 4 && pixel[2].abs_diff(10) < 4,
@@ -323,7 +326,7 @@ fn a_bag_of_several_files_is_read_as_one() {
             images: images.path().join(to),
             ..Bag::default()
         };
-        lenient(|reader| read_bag(path, &bag, reader)).unwrap()
+        lenient(|reader| read_bag(path, &bag, reader)).unwrap().0
     };
     let one = read(&folder("bag.db3"), "one");
     let split = read(bag.path(), "split");
@@ -336,7 +339,7 @@ fn a_bag_of_several_files_is_read_as_one() {
 #[test]
 fn a_recording_of_foxglove_is_read() {
     let (_images, found) = read_bag_of("foxglove.mcap", Bag::default());
-    let found = found.unwrap();
+    let (found, _written) = found.unwrap();
     assert_eq!(found.frames.poses.len(), 6);
     for (pose, expected) in found
         .frames
@@ -391,7 +394,7 @@ fn what_a_bag_lacks_is_said() {
         let problem = lenient(|reader| read_bag(&file, &bag, reader)).unwrap_err();
         let expected = match length {
             0 | 5 => "is neither an MCAP file nor a .db3",
-            _ => "is no whole MCAP file",
+            _ => "is a truncated or damaged MCAP file",
         };
         assert!(
             problem.to_string().contains(expected),
@@ -430,7 +433,7 @@ fn what_is_no_bag_of_ros_2_is_said() {
     let cases = [
         (
             written("cut.db3", &whole[..whole.len() / 2]),
-            "is no whole bag",
+            "is a damaged .db3 bag",
         ),
         (written("one.bag", b"#ROSBAG V2.0\n"), "is a bag of ROS 1"),
         (
@@ -451,11 +454,11 @@ fn what_is_no_bag_of_ros_2_is_said() {
         ),
         (
             changed("number.db3", "UPDATE messages SET data = 3", None),
-            "is no whole bag",
+            "is a damaged .db3 bag",
         ),
         (
             changed("short.db3", "UPDATE messages SET data = x'00010000'", None),
-            "a message is not whole",
+            "the first: the message is truncated or malformed",
         ),
         (
             changed("packed.db3", "UPDATE messages SET data = x'28b52ffd'", None),
@@ -488,5 +491,157 @@ fn what_is_no_bag_of_ros_2_is_said() {
     ];
     for (problem, expected) in cases {
         assert!(problem.contains(expected), "{expected}: {problem}");
+    }
+}
+
+/// A bag of the golden one, changed by statements of SQL, and where its images go.
+struct Changed {
+    folder: tempfile::TempDir,
+}
+
+impl Changed {
+    fn new(sql: &str) -> Self {
+        let scratch = tempfile::tempdir().unwrap();
+        let file = scratch.path().join("bag.db3");
+        std::fs::copy(folder("bag.db3"), &file).unwrap();
+        let database = rusqlite::Connection::open(file).unwrap();
+        database.execute_batch(sql).unwrap();
+        Self { folder: scratch }
+    }
+
+    fn images(&self) -> PathBuf {
+        self.folder.path().join("images")
+    }
+
+    fn read(&self, topic: &str, unusable: Unusable) -> Result<(Recording, WrittenImages), Error> {
+        let bag = Bag {
+            image_topic: Some(topic.to_owned()),
+            pose_topic: Some("/odom".to_owned()),
+            images: self.images(),
+            ..Bag::default()
+        };
+        let mut reader = Reader {
+            unusable,
+            progress: &mut |_, _| (),
+        };
+        read_bag(&self.folder.path().join("bag.db3"), &bag, &mut reader)
+    }
+}
+
+/// Oracle: by hand. Messages 4, 7, 11, 17, 23, 27 and 29 are the compressed images, of which the last lies
+/// behind the last pose, and 1, 9, 13, 15, 19, 21 and 25 the odometry.
+#[test]
+fn a_bad_message_costs_its_own_frame() {
+    let bad = "UPDATE messages SET data = x'00010000' WHERE id IN (11, 25)";
+    let changed = Changed::new(bad);
+    let (found, _written) = changed.read("/camera/compressed", Unusable::Drop).unwrap();
+    let reasons: Vec<_> = found
+        .dropped
+        .iter()
+        .map(|dropped| (dropped.name.as_str(), dropped.reason))
+        .collect();
+    assert_eq!(
+        reasons,
+        [
+            ("message 7 of /odom", DropReason::MalformedMessage),
+            ("000003", DropReason::MalformedMessage),
+            // Without the last pose there is none behind these two images.
+            ("000005", DropReason::NoPoseWithinTolerance),
+            ("000006", DropReason::NoPoseWithinTolerance),
+            ("000007", DropReason::NoPoseWithinTolerance),
+        ]
+    );
+    assert_eq!(found.frames.poses.len(), 3);
+
+    let changed = Changed::new(bad);
+    let problem = changed
+        .read("/camera/compressed", Unusable::Refuse)
+        .unwrap_err();
+    assert!(matches!(problem, Error::Strict { .. }), "{problem}");
+    assert!(!changed.images().exists(), "a refused bag leaves nothing");
+}
+
+/// Images that are recorded in another order than they were taken in.
+#[test]
+fn frames_of_a_bag_are_in_the_order_of_their_stamps() {
+    let changed = Changed::new("UPDATE messages SET id = 100 + id WHERE id = 7");
+    let (found, _written) = changed.read("/camera/compressed", Unusable::Drop).unwrap();
+    assert!(found.frames.timestamps_ns.is_sorted());
+    assert_eq!(found.frames.poses.len(), 6);
+    // Of seven images, it is the last one in the bag, and was taken second.
+    assert_eq!(found.frames.images[1], "000007.jpg");
+}
+
+#[test]
+fn images_of_a_bag_never_replace_a_file() {
+    let changed = Changed::new("");
+    let read = |topic: &str| changed.read(topic, Unusable::Drop);
+    let compressed = changed.images().join("camera-compressed");
+
+    // What is not kept leaves nothing behind, not even the folders.
+    drop(read("/camera/compressed").unwrap());
+    assert!(!changed.images().exists());
+
+    // What is kept is used by the same import, and not removed with it.
+    read("/camera/compressed").unwrap().1.keep();
+    drop(read("/camera/compressed").unwrap());
+    assert!(compressed.join("000001.jpg").is_file());
+
+    // Another topic has its own folder.
+    read("/camera/raw").unwrap().1.keep();
+    assert!(changed.images().join("camera-raw/000001.png").is_file());
+
+    // Somebody else's file stays as it is, and so does what a link leads to.
+    let victim = changed.folder.path().join("victim");
+    std::fs::write(&victim, "mine").unwrap();
+    let image = compressed.join("000002.jpg");
+    for is_link in [false, true] {
+        std::fs::remove_file(&image).unwrap();
+        if is_link {
+            std::os::unix::fs::symlink(&victim, &image).unwrap();
+        } else {
+            std::fs::write(&image, "mine").unwrap();
+        }
+        let problem = read("/camera/compressed").unwrap_err().to_string();
+        assert!(problem.contains("--images-to"), "{problem}");
+        assert_eq!(std::fs::read(&image).unwrap(), b"mine");
+    }
+    assert!(compressed.join("000003.jpg").is_file());
+}
+
+/// The first chunk of the bag, with a size that no machine has, with another checksum, and as it is.
+#[test]
+fn a_chunk_that_lies_is_refused() {
+    let whole = std::fs::read(folder("bag.mcap")).unwrap();
+    let length_at = |at: usize| u64::from_le_bytes(whole[at..at + 8].try_into().unwrap()) as usize;
+    // Records are an opcode and a length; that of chunks is 6.
+    let mut at = 8;
+    while whole[at] != 6 {
+        at += 9 + length_at(at + 1);
+    }
+
+    // After the length: the times of the first and the last message, the size and the checksum.
+    let [size, checksum] = [at + 9 + 16, at + 9 + 24];
+    assert!(length_at(size) < 1 << 20);
+    let scratch = tempfile::tempdir().unwrap();
+    for (place, bytes) in [
+        (size, u64::MAX.to_le_bytes().to_vec()),
+        (size, (1_u64 << 62).to_le_bytes().to_vec()),
+        (at + 1, (1_u64 << 62).to_le_bytes().to_vec()),
+        (checksum, vec![!whole[checksum]]),
+        (checksum, vec![whole[checksum]]),
+    ] {
+        let mut changed = whole.clone();
+        changed[place..place + bytes.len()].copy_from_slice(&bytes);
+        let is_changed = changed != whole;
+        let file = scratch.path().join("changed.mcap");
+        std::fs::write(&file, changed).unwrap();
+        let bag = Bag {
+            image_topic: Some("/camera/raw".to_owned()),
+            images: scratch.path().join("images"),
+            ..Bag::default()
+        };
+        let read = lenient(|reader| read_bag(&file, &bag, reader));
+        assert_eq!(read.is_err(), is_changed, "{place}");
     }
 }

@@ -35,8 +35,9 @@ fn path() -> Vec<Pose> {
 }
 
 /// How the image moves between two poses: the similarity that fits best, by least squares, to where a
-/// pinhole camera sees points about three metres before it. It knows nothing of twists.
-fn seen(first: &Pose, second: &Pose, random: &mut ChaCha8Rng) -> ImageMotion {
+/// pinhole camera sees points about three metres before it. It knows nothing of twists. `right` is 1, or
+/// -1 in an image that is mirrored.
+fn seen(first: &Pose, second: &Pose, right: f64, random: &mut ChaCha8Rng) -> ImageMotion {
     let mut moment = Matrix4::zeros();
     let mut product = Vector4::zeros();
     for _ in 0..60 {
@@ -48,7 +49,8 @@ fn seen(first: &Pose, second: &Pose, random: &mut ChaCha8Rng) -> ImageMotion {
         let point = Point3::new(image.x * depth / FOCAL, image.y * depth / FOCAL, depth);
 
         let there = second.inverse() * (first * point);
-        let seen = Vector2::new(there.x, there.y) * (FOCAL / there.z);
+        let seen = Vector2::new(right * there.x, there.y) * (FOCAL / there.z);
+        let image = Vector2::new(right * image.x, image.y);
         let moved = seen - image;
         let rows = [
             (Vector4::new(image.x, -image.y, 1.0, 0.0), moved.x),
@@ -69,6 +71,10 @@ fn seen(first: &Pose, second: &Pose, random: &mut ChaCha8Rng) -> ImageMotion {
 }
 
 fn observed(truth: &[Pose]) -> Vec<ObservedPair> {
+    observed_with(truth, 1.0)
+}
+
+fn observed_with(truth: &[Pose], right: f64) -> Vec<ObservedPair> {
     let mut random = ChaCha8Rng::seed_from_u64(5);
     let pair = |first: u32| ObservedPair {
         first: FrameId(first),
@@ -76,6 +82,7 @@ fn observed(truth: &[Pose]) -> Vec<ObservedPair> {
         motion: seen(
             &truth[first as usize],
             &truth[first as usize + 3],
+            right,
             &mut random,
         ),
         correlation: 0.9,
@@ -168,6 +175,31 @@ fn other_mistakes_are_named() {
     };
     assert_eq!(likely, Translations::OfTheInverse);
 
+    // Rotations of camera_from_world beside positions of the camera.
+    let transposed: Vec<Pose> = truth
+        .iter()
+        .map(|pose| Pose::from_parts(pose.translation, pose.rotation.inverse()))
+        .collect();
+    assert!(matches!(
+        verdict(&transposed),
+        Verdict::TransposedRotations { .. }
+    ));
+
+    // Images that were taken in a mirror, with right poses and with inverted ones.
+    let in_mirror = observed_with(&truth, -1.0);
+    for direction in [Direction::WorldFromCamera, Direction::CameraFromWorld] {
+        let convention = Convention { direction, ..usual };
+        let stated: Vec<Pose> = truth
+            .iter()
+            .map(|pose| stated_in(convention, pose))
+            .collect();
+        let Verdict::MirroredImages { likely, .. } = check(&stated, usual, &in_mirror).verdict
+        else {
+            panic!();
+        };
+        assert_eq!(likely[0], convention);
+    }
+
     // Poses of images four rows later: pose 4 stands at row 0.
     let mut late = truth.clone();
     late.rotate_left(4);
@@ -204,6 +236,34 @@ fn other_mistakes_are_named() {
         })
         .collect();
     assert_eq!(nothing(&still), Verdict::TooLittleMotion);
+}
+
+/// Oracle: the exchange that was made. The camera moves two metres along x, and half a metre along
+/// the axes that are exchanged.
+#[test]
+fn an_exchange_of_axes_that_hardly_matter_is_named() {
+    let mut truth = path();
+    for pose in &mut truth {
+        pose.translation.y *= 0.7;
+        pose.translation.z *= 0.25;
+    }
+    let observed = observed(&truth);
+    let usual = Convention::default();
+    let exchanged = truth
+        .iter()
+        .map(|pose| Pose::from_parts(pose.translation.vector.xzy().into(), pose.rotation));
+    let exchanged: Vec<Pose> = exchanged.collect();
+
+    let wrong = check(&exchanged, usual, &observed);
+    let Verdict::OtherTranslations { likely, explained } = wrong.verdict else {
+        panic!("{wrong:?}");
+    };
+    assert_eq!(likely, Translations::Axes([(0, 1.0), (2, 1.0), (1, 1.0)]));
+    // So little is gained that it is named only since all parts of the recording have it.
+    assert!(explained - wrong.explained < 0.05, "{explained} {wrong:?}");
+
+    let right = check(&truth, usual, &observed);
+    assert!(matches!(right.verdict, Verdict::Agrees(_)), "{right:?}");
 }
 
 fn room(poses: Vec<Pose>, timestamps_ns: Vec<i64>) -> Room {

@@ -144,10 +144,16 @@ def cases(client: seese3.Client, address: str, rows: np.ndarray) -> Cases:
             lambda n: navigation.Navigate(question(view(n))),
         ),
         f"navigate_batch of {BATCH}": (
-            lambda n: client.navigate_batch(
-                ROOM, [seese3.Question(one % FRAMES, twist=MOTION, steps=4) for one in range(n, n + BATCH)]
-            ),
-            lambda n: navigation.BatchNavigate(batch(n)),
+            lambda n: [
+                (answer.frame.id, answer.frame.pose)
+                for answer in client.navigate_batch(
+                    ROOM, [seese3.Question(one % FRAMES, twist=MOTION, steps=4) for one in range(n, n + BATCH)]
+                )
+            ],
+            lambda n: [
+                (result.response.steps[-1].frames[0].frame_id, result.response.steps[-1].frames[0].pose)
+                for result in navigation.BatchNavigate(batch(n)).results
+            ],
         ),
         "localize a feature": (
             lambda n: client.localize(rows[n % FRAMES], rooms=ROOM),

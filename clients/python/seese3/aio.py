@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import answers, channel, errors, requests
-from .answers import Adapter, Camera, Default, Evaluation, Publication, Room, TrackRefusal, TrackUpdate
+from .answers import Adapter, Camera, Default, Evaluation, Publication, Room, TrackRefusal, TrackStart, TrackUpdate
 from .geometry import wire_pose
 from .requests import Gravity, InitialPose, Odometry, Prediction, Question, TrackConfig, Upload
 from .v1 import (
@@ -59,8 +59,9 @@ class AsyncClient:
         retries: int = 3,
     ) -> None:
         self.address = address
+        self._is_closed = False
         self._deadline_s = deadline_s
-        self._metadata = [("authorization", f"Bearer {token}")] if token else []
+        self._metadata = channel.metadata(token)
         self._channel = channel.open_async(address, tls, retries)
         self._catalog = _stub(catalog_pb2_grpc.CatalogServiceStub, self._channel)
         self._navigation = _stub(navigation_pb2_grpc.NavigationServiceStub, self._channel)
@@ -78,16 +79,22 @@ class AsyncClient:
 
     async def aclose(self) -> None:
         """Closes the connection. Calls that are open are cut."""
+        self._is_closed = True
         await self._channel.close()
 
     def _timeout(self, deadline_s: float | None) -> float | None:
-        return self._deadline_s if deadline_s is None else deadline_s
+        return channel.timeout(self._deadline_s if deadline_s is None else deadline_s)
 
     async def _ask(self, method: Any, request: Any, deadline_s: float | None) -> Any:
+        self._check_open()
         try:
             return await method(request, timeout=self._timeout(deadline_s), metadata=self._metadata)
         except grpc.RpcError as error:
             raise errors.refused(error) from None
+
+    def _check_open(self) -> None:
+        if self._is_closed:
+            raise errors.SeeseError("the client is closed")
 
     async def _listen(self, call: Any) -> AsyncIterator[Any]:
         try:
@@ -146,8 +153,17 @@ class AsyncClient:
     async def navigate_batch(
         self, room: str, questions: Sequence[Question], *, adapter: str = "", deadline_s: float | None = None
     ) -> list[answers.Navigation | errors.RefusedError]:
-        """Answers many questions in one call. A question that is refused has its exception in its place."""
-        batch = [question.request(room, adapter) for question in questions]
+        """Answers many questions in one call.
+
+        A question that the server refuses has its exception in its place, also where the room is not there. A question
+        that cannot be asked at all is a `ValueError` that names it.
+        """
+        batch = []
+        for number, question in enumerate(questions):
+            try:
+                batch.append(question.request(room, adapter))
+            except (TypeError, ValueError) as error:
+                raise type(error)(f"questions[{number}]: {error}") from None
         request = navigation_pb2.BatchNavigateRequest(requests=batch)
         return answers.batch_of(await self._ask(self._navigation.BatchNavigate, request, deadline_s))
 
@@ -181,13 +197,13 @@ class AsyncClient:
             adapter=adapter,
             source=wire_view(source),
             source_pose=None if source_pose is None else wire_pose(source_pose),
-            goal_frame_id=goal,
+            goal_frame_id=requests.count(goal, "goal"),
             goal_pose=None if goal_pose is None else wire_pose(goal_pose),
             step=step,
             tolerance_m=tolerance_m,
             tolerance_rad=tolerance_rad,
-            max_steps=max_steps,
-            max_recoveries=max_recoveries,
+            max_steps=requests.count(max_steps, "max_steps"),
+            max_recoveries=requests.count(max_recoveries, "max_recoveries"),
             planner=requests.enum_value(navigation_pb2.Planner, "PLANNER_", planner, "planner"),  # type: ignore[arg-type]
             least_arrival_probability=least_arrival_probability,
         )
@@ -216,10 +232,10 @@ class AsyncClient:
     ) -> answers.Localization:
         """Retrieves the stored frames that look most like a view, in one room, in several, or in all: ()."""
         request = localization_pb2.LocalizeRequest(
-            rooms=[rooms] if isinstance(rooms, str) else rooms,
+            rooms=requests.names(rooms),
             adapter=adapter,
             view=wire_view(view),
-            top_k=top_k,
+            top_k=requests.count(top_k, "top_k"),
             thresholds=thresholds,
         )
         return answers.Localization.of(await self._ask(self._localization.Localize, request, deadline_s))
@@ -236,11 +252,11 @@ class AsyncClient:
     ) -> answers.Relocalization:
         """Says in which room a camera is, where in it, and how sure that is, from some views, the newest last."""
         request = localization_pb2.RelocalizeRequest(
-            rooms=[rooms] if isinstance(rooms, str) else rooms,
+            rooms=requests.names(rooms),
             adapter=adapter,
-            views=[wire_view(view) for view in views],
-            max_rooms=max_rooms,
-            top_k=top_k,
+            views=requests.wire_views(views),
+            max_rooms=requests.count(max_rooms, "max_rooms"),
+            top_k=requests.count(top_k, "top_k"),
         )
         return answers.Relocalization.of(await self._ask(self._localization.Relocalize, request, deadline_s))
 
@@ -281,22 +297,25 @@ class AsyncClient:
         request = odometry_pb2.EncodeRequest(
             room=room,
             adapter=adapter,
-            views=[wire_view(view) for view in views],
+            views=requests.wire_views(views),
             with_features=with_features,
         )
         return answers.Encoding.of(await self._ask(self._odometry.Encode, request, deadline_s), with_features)
 
     def track(
-        self, config: TrackConfig | None = None, *, resume_token: bytes = b"", last_sequence: int = 0
+        self, config: TrackConfig | None = None, *, resume_token: bytes = b"", last_sequence: int | None = None
     ) -> AsyncTrack:
         """Opens a stream that follows a camera: `async with client.track(TrackConfig(room="kitchen")) as track`.
 
         To go on with a stream of another program, give its `resume_token` and its `last_sequence`.
         """
+        self._check_open()
         if (config is None) == (not resume_token):
             raise ValueError("give exactly one of config and resume_token")
+        if bool(resume_token) != (last_sequence is not None):
+            raise ValueError("resume_token and last_sequence belong together: frames go on with the number after it")
         message = config.message() if config else odometry_pb2.TrackConfig(resume_token=resume_token)
-        return AsyncTrack(self._odometry.Track, self._metadata, message, last_sequence)
+        return AsyncTrack(self._odometry.Track, self._metadata, message, last_sequence or 0)
 
     # Evaluation.
 
@@ -307,7 +326,7 @@ class AsyncClient:
         adapter: str = "",
         stride: int | None = None,
         split: str = "",
-        navigators: Sequence[str] = (),
+        navigators: Sequence[str] | str = (),
         exclude_source: bool = False,
         exclude_radius: int = 0,
         thresholds: Sequence[float] = (),
@@ -319,25 +338,29 @@ class AsyncClient:
     ) -> Evaluation:
         """Scores navigators on a room's held-out pairs, beside the identity and a random frame.
 
-        `on_progress` is called with how many of how many questions are done. The deadline is none unless it is given.
+        `on_progress` is called with how many of how many navigators are done. The deadline is none unless it is given.
         """
         request = evaluation_pb2.EvaluateRequest(
             room=room,
             adapter=adapter,
-            stride=stride,
+            stride=requests.count(stride, "stride"),
             split=split,
-            navigators=navigators,
+            navigators=requests.names(navigators),
             exclude_source=exclude_source,
-            exclude_radius=exclude_radius,
+            exclude_radius=requests.count(exclude_radius, "exclude_radius"),
             thresholds=thresholds,
             seed=seed,
-            steps=steps,
+            steps=requests.count(steps, "steps"),
             mode=requests.mode(mode),
         )
-        call = self._evaluation.Evaluate(request, timeout=deadline_s, metadata=self._metadata)
+        self._check_open()
+        call = self._evaluation.Evaluate(request, timeout=channel.timeout(deadline_s), metadata=self._metadata)
         async for message in self._listen(call):
             if message.HasField("report"):
-                return Evaluation.of(message.report)
+                report = Evaluation.of(message.report)
+                if on_progress is not None:
+                    on_progress(len(report.navigators), len(report.navigators))
+                return report
             if on_progress is not None:
                 on_progress(message.progress.done, message.progress.total)
         raise errors.SeeseError("the server ended an evaluation without a report")
@@ -354,7 +377,7 @@ class AsyncClient:
         thresholds: Sequence[float] = (),
         deadline_s: float | None = None,
     ) -> answers.NavigatorScores:
-        """Scores a navigator of one's own by the same rules as `evaluate`."""
+        """Scores a navigator of one's own by the same rules as `evaluate`, on the pairs of its predictions."""
         request = evaluation_pb2.ScorePredictionsRequest(
             room=room,
             adapter=adapter,
@@ -443,11 +466,15 @@ class AsyncClient:
         drop_other_features: bool = False,
         validate_only: bool = False,
         request_id: str = "",
-        deadline_s: float | None = None,
+        deadline_s: float = float("inf"),
     ) -> Publication:
-        """Uploads a room, or with `extend` more frames of it; images, not features, with `encode_for`, an adapter."""
+        """Uploads a room, or with `extend` more frames of it; images, not features, with `encode_for`, an adapter.
+
+        Names of rooms and adapters are plain here, without "rooms/" before them. The deadline is none unless it is
+        given.
+        """
         room = catalog_pb2.RoomUpload(
-            name=f"rooms/{name}",
+            name=_resource("rooms", name),
             features=[requests.feature_source(source) for source, _ in upload.features],
             encode_for=f"adapters/{encode_for}" if encode_for else "",
             format=format,
@@ -469,11 +496,14 @@ class AsyncClient:
         *,
         validate_only: bool = False,
         request_id: str = "",
-        deadline_s: float | None = None,
+        deadline_s: float = float("inf"),
     ) -> Publication:
-        """Uploads an adapter by the two files that a store has of it, see `Store.adapter_files`."""
+        """Uploads an adapter by the two files that a store has of it, see `Store.adapter_files`.
+
+        The deadline is none unless it is given.
+        """
         upload = catalog_pb2.AdapterUpload(
-            name=f"adapters/{name}",
+            name=_resource("adapters", name),
             manifest=manifest,
             request_id=request_id or requests.new_id(),
             validate_only=validate_only,
@@ -507,7 +537,7 @@ class AsyncClient:
             request_id=request_id or requests.new_id(),
             validate_only=validate_only,
         )
-        call = self._catalog.RefitRoom(request, timeout=deadline_s, metadata=self._metadata)
+        call = self._catalog.RefitRoom(request, timeout=channel.timeout(deadline_s), metadata=self._metadata)
         async for message in self._listen(call):
             if message.HasField("result"):
                 return Publication.of(message.result)
@@ -528,12 +558,8 @@ class AsyncClient:
 
         With `room` and `adapter`: the room's adapter. With one of them and `revision`: its revision.
         """
-        if not room and revision is None:
-            raise ValueError("give room and adapter, or one of them and revision")
-        if room and adapter and revision is not None:
-            raise ValueError("give room and adapter, or one of them and revision, not all three")
-        if room and not adapter and revision is None:
-            raise ValueError("give the adapter or the revision that is to be the room's default")
+        if bool(room) + bool(adapter) + (revision is not None) != 2:
+            raise ValueError("give room and adapter, or one of them and revision; `unset_default` takes a choice back")
 
         request = catalog_pb2.SetDefaultRequest(
             name=f"rooms/{room}" if room else f"adapters/{adapter}",
@@ -542,6 +568,16 @@ class AsyncClient:
             request_id=request_id or requests.new_id(),
         )
         answer = await self._ask(self._catalog.SetDefault, request, deadline_s)
+        return [Default.of(default) for default in answer.defaults]
+
+    async def unset_default(self, *, room: str = "", adapter: str = "", request_id: str = "") -> list[Default]:
+        """Chooses nothing for a room or an adapter any more: its name means its newest revision again."""
+        if bool(room) == bool(adapter):
+            raise ValueError("give exactly one of room and adapter")
+        request = catalog_pb2.SetDefaultRequest(
+            name=f"rooms/{room}" if room else f"adapters/{adapter}", request_id=request_id or requests.new_id()
+        )
+        answer = await self._ask(self._catalog.SetDefault, request, None)
         return [Default.of(default) for default in answer.defaults]
 
     async def roll_back_default(self, *, request_id: str = "", deadline_s: float | None = None) -> list[Default]:
@@ -581,7 +617,9 @@ def _answered(answer: odometry_pb2.TrackResponse) -> TrackUpdate | TrackRefusal:
     return TrackUpdate.of(answer.update)
 
 
-def _resource(collection: str, name: str, revision: int | None) -> str:
+def _resource(collection: str, name: str, revision: int | None = None) -> str:
+    if not isinstance(name, str):
+        raise TypeError(f"name: is the name of one of the {collection}, not {name!r}")
     return f"{collection}/{name}" + ("" if revision is None else f"/revisions/{revision}")
 
 
@@ -591,7 +629,7 @@ class AsyncTrack:
     A stream that is cut (the server was restarted, the network was gone for a moment) is opened again by the token of
     its last answer, and the frames since then are sent again: the answers are those that would have come. `resumed`
     counts how often that was done. `resume_token`, and `last_sequence`, the number of the last frame, carry the stream
-    on in another program. One stream is for one thread, or one task, at a time.
+    on in another program. `start` says what the server chose. One stream is for one thread, or one task, at a time.
     """
 
     def __init__(
@@ -607,11 +645,17 @@ class AsyncTrack:
         self._call: Any = None
         self._is_cut = False
         self._requests: asyncio.Queue[odometry_pb2.TrackRequest | None] = asyncio.Queue()
+        self._is_busy = False
+        self.start: TrackStart | None = None
         self.resume_token = config.resume_token
         self.resumed = 0
 
     async def __aenter__(self) -> AsyncTrack:
-        await self._keep_trying(self._open)
+        try:
+            await self._keep_trying(self._open)
+        except BaseException:
+            await self.aclose()
+            raise
         return self
 
     async def __aexit__(
@@ -649,10 +693,12 @@ class AsyncTrack:
         """The answers to frames, each a time in nanoseconds and a view, in the order of the frames.
 
         `ahead` frames are sent before the answer to the first of them is awaited: 0 for a camera, whose next frame is
-        not there yet; some 16 for a recording, which is then followed faster than frame by frame.
+        not there yet; some 16 for a recording, which is then followed faster than frame by frame. Frames that were sent
+        ahead have been seen: after a loop that was left early, the stream goes on behind them.
         """
         if ahead < 0:
             raise ValueError(f"ahead: {ahead} is below 0")
+        await self._drain()
 
         async for timestamp_ns, view in frames:
             await self._send(self._frame(view, timestamp_ns))
@@ -683,8 +729,9 @@ class AsyncTrack:
 
         config = odometry_pb2.TrackConfig(resume_token=self.resume_token) if self.resume_token else self._config
         await self._requests.put(odometry_pb2.TrackRequest(config=config))
-        started = await self._next_answer()
-        self.resume_token = started.resume_token or self.resume_token
+        answer = await self._next_answer()
+        self.start = TrackStart.of(answer.started)
+        self.resume_token = answer.resume_token or self.resume_token
         for request in list(self._unsaved):
             await self._requests.put(request)
             await self._next_answer()
@@ -725,11 +772,14 @@ class AsyncTrack:
         return frame
 
     async def _exchange(self, request: odometry_pb2.TrackRequest) -> odometry_pb2.TrackResponse:
-        # A `follow` that was left before its end leaves answers behind, which nobody waits for any more.
-        while self._awaited:
-            await self._receive()
+        await self._drain()
         await self._send(request)
         return await self._receive()
+
+    async def _drain(self) -> None:
+        """Takes the answers that a `follow` left behind which was left before its end."""
+        while self._awaited:
+            await self._receive()
 
     async def _send(self, request: odometry_pb2.TrackRequest) -> None:
         if self._call is None:
@@ -741,19 +791,35 @@ class AsyncTrack:
 
     async def _receive(self) -> odometry_pb2.TrackResponse:
         """The answer to the oldest request that has none yet."""
+        if self._is_busy:
+            raise errors.SeeseError("the stream waits for an answer already: one stream is for one thread or task")
+        self._is_busy = True
         try:
             answer = await self._answer()
         except BaseException:
             # Whoever waited may have given up, by a timeout of its own or by Ctrl-C, and an answer that came later
             # would be taken for that of the next frame. So the stream is cut: what has no answer did not happen.
             self._is_cut = True
-            self._awaited.clear()
-            self._call.cancel()
+            self._forget_awaited()
+            if self._call is not None:
+                self._call.cancel()
             raise
+        finally:
+            self._is_busy = False
 
-        self._unsaved.append(self._awaited.popleft())
+        # One refusal may stand for several frames, which newer ones took the place of.
+        answered = max(1, answer.refusal.frames) if answer.HasField("refusal") else 1
+        for _ in range(min(answered, len(self._awaited))):
+            self._unsaved.append(self._awaited.popleft())
         self._note(answer)
         return answer
+
+    def _forget_awaited(self) -> None:
+        # A number that is never sent would count as a frame that is missing.
+        for request in reversed(self._awaited):
+            if request.HasField("frame"):
+                self.last_sequence = request.frame.sequence - 1
+        self._awaited.clear()
 
     async def _answer(self) -> odometry_pb2.TrackResponse:
         try:

@@ -1,14 +1,15 @@
 """What a server answers, as dataclasses of NumPy arrays.
 
 What a server left out is None here, and never 0: an absent R² is no R² of 0. Shapes and units are those of `geometry`;
-times are whole nanoseconds. Pictures and tables need the extras `seese3[plots]` and `seese3[pandas]`.
+covariances of motions are on (v, ω), in the body frame of the first camera. Times are whole nanoseconds. Pictures and
+tables need the extras `seese3[plots]` and `seese3[pandas]`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import datetime, timezone
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -111,13 +112,23 @@ class FeatureSource:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera, in pixels or in any other unit of length in the image."""
+    """A pinhole camera, in pixels or in any other unit of length in the image. The middle is its centre by default."""
 
     width: float
     height: float
     focal: float
     centre_x: float | None = None
     centre_y: float | None = None
+
+    def __post_init__(self) -> None:
+        # Not a number is outside every range.
+        if not (0 < self.width < float("inf") and 0.1 <= self.height / self.width <= 10):
+            raise ValueError(f"camera: images of {self.width} x {self.height} are none of a camera")
+        if not 0.1 <= self.focal / self.width <= 10:
+            raise ValueError(f"camera: a focal length of {self.focal} is none for a width of {self.width}")
+        for name, value, size in (("x", self.centre_x, self.width), ("y", self.centre_y, self.height)):
+            if value is not None and not 0 <= value <= size:
+                raise ValueError(f"camera: centre_{name} = {value} is outside of the image, 0 to {size}")
 
     @classmethod
     def of(cls, message: geometry_pb2.Pinhole) -> Camera:
@@ -154,7 +165,7 @@ class Room:
             message.format,
             message.licence,
             message.worst_rotation_deviation,
-            message.create_time.ToDatetime(),
+            message.create_time.ToDatetime(timezone.utc),
             Camera.of(message.camera) if message.HasField("camera") else None,
         )
 
@@ -235,7 +246,7 @@ class Adapter:
             target_deviation=twist_vector(message.target_deviation),
             singular_values=np.array(message.singular_values),
             navigators=tuple(message.navigators),
-            created=message.create_time.ToDatetime(),
+            created=message.create_time.ToDatetime(timezone.utc),
         )
 
 
@@ -282,28 +293,37 @@ class RoomFrames:
 
 @dataclass(frozen=True)
 class Publication:
-    """What became of an upload: the revision, whether it is new, and whether it is served."""
+    """What became of an upload: the revision, whether it is new, and whether it is served.
 
-    revision: Revision
+    `revision` is None if the upload was only validated.
+    """
+
+    revision: Revision | None
     created: bool
     served: bool
 
     @classmethod
     def of(cls, message: Any) -> Publication:
-        return cls(Revision.of(message.revision), message.created, message.served)
+        return cls(_revision(message, "revision"), message.created, message.served)
 
 
 @dataclass(frozen=True)
 class Default:
-    """What an operator chose for a room or an adapter: its revision, the adapter that answers in it, or both."""
+    """What an operator chose for a room or an adapter: its revision, the adapter that answers in it, or both.
 
+    `kind` is "room" or "adapter", and says what `name` is the name of.
+    """
+
+    kind: str
     name: str
     revision: int | None
     adapter: str | None
 
     @classmethod
     def of(cls, message: catalog_pb2.Default) -> Default:
-        return cls(message.name, _known(message, "revision"), message.adapter or None)
+        collection, _, name = message.name.partition("/")
+        adapter = message.adapter.removeprefix("adapters/") or None
+        return cls(collection.removesuffix("s"), name, _known(message, "revision"), adapter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -472,10 +492,10 @@ class Navigation:
     def displacement(self) -> Array:
         return twist_vector(self._message.displacement)
 
-    @property
+    @cached_property
     def frame(self) -> Frame:
         """The frame at which the navigation ends."""
-        return self.steps[-1].frames[0]
+        return Frame.of(self._message.steps[-1].frames[0])
 
     @classmethod
     def of(cls, message: navigation_pb2.NavigateResponse) -> Navigation:
@@ -598,6 +618,33 @@ class Encoding:
             for view in message.views
         )
         return cls(Revision.of(message.adapter), latents, features)
+
+
+@dataclass(frozen=True)
+class TrackStart:
+    """What a tracking stream was opened with, the server's choices included.
+
+    - `room`: None if it is not known yet, and the camera has to be found.
+    - `keyframe_displacement`, `keyframe_frames`: a new keyframe is taken after a motion of this norm, metres and
+      radians mixed, and after the time of so many frames.
+    - `calibration_rooms`: in how many rooms the covariances were calibrated.
+    """
+
+    adapter: Revision
+    room: Revision | None
+    keyframe_displacement: float | None
+    keyframe_frames: int | None
+    calibration_rooms: int
+
+    @classmethod
+    def of(cls, message: odometry_pb2.TrackStarted) -> TrackStart:
+        return cls(
+            Revision.of(message.adapter),
+            _revision(message, "room"),
+            _known(message.keyframes, "displacement"),
+            _known(message.keyframes, "frames"),
+            message.calibration_rooms,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -787,8 +834,15 @@ class Evaluation:
         )
 
     def table(self) -> pandas.DataFrame:
-        """A row for each navigator: its scores, and Hit@ε with the ends of its 95 % interval. Needs pandas."""
-        import pandas
+        """A row for each navigator: its scores, and Hit@ε with the ends of its 95 % interval. Needs pandas.
+
+        `n` questions; `r2` of predicted latents, not of motions; `median_m` and `median_deg` from the frame that was
+        retrieved to the one that was meant.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError('table() needs pandas: pip install "seese3[pandas]"') from error
 
         rows = []
         for scores in self.navigators:
@@ -805,17 +859,24 @@ class Evaluation:
 
     def plot(self, axes: Any = None) -> Any:
         """Draws Hit@ε over ε with 95 % intervals, a line for each navigator, and returns the axes. Needs matplotlib."""
-        from matplotlib import pyplot
+        try:
+            from matplotlib import pyplot
+        except ImportError as error:
+            raise ImportError('plot() needs matplotlib: pip install "seese3[plots]"') from error
 
-        axes = axes if axes is not None else pyplot.subplots(figsize=(7, 4.5), layout="constrained")[1]
-        for scores in self.navigators:
+        axes = axes if axes is not None else pyplot.subplots(figsize=(9, 4.5), layout="constrained")[1]
+        for number, scores in enumerate(self.navigators):
             thresholds = list(scores.hits)
-            axes.plot(thresholds, [hit.rate for hit in scores.hits.values()], marker="o", label=scores.name)
+            # There are ten colours: the next ten lines are dashed, so that no two are alike.
+            colour, dashes = f"C{number % 10}", ("-", "--", ":")[number // 10 % 3]
+            rates = [hit.rate for hit in scores.hits.values()]
+            axes.plot(thresholds, rates, dashes, color=colour, marker=".", label=scores.name)
             axes.fill_between(
                 thresholds,
                 [hit.low for hit in scores.hits.values()],
                 [hit.high for hit in scores.hits.values()],
-                alpha=0.15,
+                color=colour,
+                alpha=0.08,
             )
         axes.set(
             xlabel="ε: metres and radians mixed",
@@ -824,5 +885,5 @@ class Evaluation:
             title=f"{self.room.name}: {self.n} motions over {self.stride} frames, {self.split} split"
             + (" (LEAKS)" if self.leaks else ""),
         )
-        axes.legend(fontsize="small")
+        axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
         return axes

@@ -1,6 +1,7 @@
 """How a client connects: TLS, tokens, message sizes, and which calls are made again when a server does not answer.
 
-Reads are made again after UNAVAILABLE and RESOURCE_EXHAUSTED, at most three times, each time after a longer wait.
+Reads are made again after UNAVAILABLE and RESOURCE_EXHAUSTED, as often as `retries` says, each time after a longer
+wait.
 Changes of the catalog carry a request id, with which a server gives the same change the same answer, so that they are
 made again too. Uploads and other streams are not: a tracking stream resumes by its token instead (see `Track`).
 """
@@ -25,6 +26,9 @@ PING_ANSWER_MS = 10_000
 # How long an attempt to connect may take, and the longest wait before the next one, milliseconds. gRPC's own are 20 s
 # and 2 minutes, in which a robot is long past a server that came back.
 CONNECTING_MS = 2_000
+
+# Longer deadlines than this, a year, are none: gRPC takes them for ones that have passed.
+LONGEST_S = 3.2e7
 
 RETRIED = {
     "CatalogService": (
@@ -95,11 +99,32 @@ def _options(retries: int) -> list[tuple[str, Any]]:
 
 
 def _check(address: str, retries: int) -> None:
+    if not isinstance(address, str):
+        raise TypeError(f"address: is HOST:PORT as text, not {address!r}")
     host, colon, port = address.rpartition(":")
-    if "://" in address or not (colon and host and port.isdigit()):
+    is_port = port.isascii() and port.isdigit() and 0 < int(port) < 1 << 16
+    if "://" in address or not (colon and host and is_port):
         raise ValueError(f"address: {address!r} is no server address; write HOST:PORT, for instance 127.0.0.1:50051")
-    if not 0 <= retries <= 4:
-        raise ValueError(f"retries: {retries} is not 0 to 4")
+    if not isinstance(retries, int) or not 0 <= retries <= 4:
+        raise ValueError(f"retries: {retries!r} is not 0 to 4")
+
+
+def metadata(token: str | None) -> list[tuple[str, str]]:
+    """What is sent with every call."""
+    if not token:
+        return []
+    if not (token.isascii() and token.isprintable()) or " " in token:
+        raise ValueError("token: has a character that no token has, such as a space or the end of a line")
+    return [("authorization", f"Bearer {token}")]
+
+
+def timeout(deadline_s: float | None) -> float | None:
+    """The seconds as gRPC takes them; None, infinity and centuries are for ever."""
+    if deadline_s is None or deadline_s > LONGEST_S:
+        return None
+    if not deadline_s >= 0:
+        raise ValueError(f"deadline_s: {deadline_s} is no number of seconds")
+    return deadline_s
 
 
 def open_sync(address: str, tls: Tls | None, retries: int) -> Any:

@@ -1,7 +1,7 @@
-"""What can go wrong, as exceptions. All are `SeeseError`; those that a server answers with are `RefusedError`.
+"""What can go wrong, as exceptions. All are `SeeseError`; every call that fails raises a `RefusedError`.
 
 The reasons and their codes are listed in docs/errors.md of the repository. Each class of the most frequent reasons also
-is what Python programs expect: a `ValueError`, a `LookupError`, a `TimeoutError` or a `ConnectionError`.
+is what Python programs expect: a `ValueError`, `LookupError`, `TimeoutError`, `ConnectionError` or `PermissionError`.
 """
 
 from __future__ import annotations
@@ -35,8 +35,10 @@ class RefusedError(SeeseError):
     """A call failed.
 
     - `code`: the gRPC code, for instance "INVALID_ARGUMENT".
-    - `reason`: the server's reason, for instance "INVALID_FIELD"; None if the call never reached the server.
-    - `field`: the path of the request field to change, for instance "view.feature"; None if there is none.
+    - `reason`: the server's reason, for instance "INVALID_FIELD"; None if the call never reached the server, and of a
+      question of a batch.
+    - `field`: the path of the request field to change, for instance "view.feature"; None if there is none. The
+      question of a batch has it in its message.
     - `retry_after_s`: how long the server asks to wait before the same call; None if it says nothing.
     - `request_id`: the id under which the server's log has the call; None if it is not known.
     """

@@ -17,6 +17,16 @@ from .v1 import geometry_pb2 as pb
 Array = npt.NDArray[np.float64]
 
 
+def real(values: npt.ArrayLike, what: str) -> Array:
+    """The numbers as a new C-ordered array of doubles; refused if they are complex or masked, or no numbers."""
+    if np.iscomplexobj(values) or np.ma.isMaskedArray(values):
+        raise ValueError(f"{what}: complex numbers and masked arrays are not taken")
+    try:
+        return np.array(values, dtype=np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what}: {error}") from None
+
+
 def pose_matrix(pose: pb.Pose) -> Array:
     """The (4, 4) matrix of a pose from the wire."""
     p, q = pose.position, pose.orientation
@@ -35,13 +45,17 @@ def pose_matrix(pose: pb.Pose) -> Array:
 
 def wire_pose(matrix: npt.ArrayLike, parent_frame: str = "", child_frame: str = "") -> pb.Pose:
     """The pose of a (4, 4) matrix. Its rotation is checked, and refused if it is none."""
-    m = np.asarray(matrix, dtype=np.float64)
+    m = real(matrix, "a pose")
     if m.shape != (4, 4) or not np.isfinite(m).all():
         raise ValueError(f"a pose is a (4, 4) matrix of finite numbers, not {m.shape}")
     rotation = m[:3, :3]
     deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if deviation > 1e-2 or np.linalg.det(rotation) < 0 or np.abs(m[3] - (0, 0, 0, 1)).max() > 1e-6:
+    if np.abs(m[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise ValueError("the last row of a pose is 0, 0, 0, 1; is the matrix transposed?")
+    if deviation > 1e-2:
         raise ValueError(f"a pose is a rotation and a translation; R Rᵀ differs from the identity by {deviation:.1e}")
+    if np.linalg.det(rotation) < 0:
+        raise ValueError("a pose is a rotation and a translation; this matrix mirrors: its determinant is -1")
 
     w, x, y, z = _quaternion_wxyz(rotation)
     return pb.Pose(
@@ -75,7 +89,7 @@ def twist_vector(twist: pb.Twist) -> Array:
 
 def wire_twist(vector: npt.ArrayLike) -> pb.Twist:
     """The twist of a (6,) vector."""
-    xi = np.asarray(vector, dtype=np.float64)
+    xi = real(vector, "a twist")
     if xi.shape != (6,):
         raise ValueError(f"a twist is six numbers (v, ω), not an array of shape {xi.shape}")
     return pb.Twist(linear=wire_vector(xi[:3]), angular=wire_vector(xi[3:]))
@@ -83,7 +97,10 @@ def wire_twist(vector: npt.ArrayLike) -> pb.Twist:
 
 def wire_vector(vector: npt.ArrayLike) -> pb.Vector3:
     """The vector of three numbers."""
-    x, y, z = np.asarray(vector, dtype=np.float64)
+    numbers = real(vector, "a vector")
+    if numbers.shape != (3,):
+        raise ValueError(f"a vector is three numbers, not an array of shape {numbers.shape}")
+    x, y, z = numbers
     return pb.Vector3(x=x, y=y, z=z)
 
 

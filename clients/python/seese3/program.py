@@ -1,13 +1,15 @@
 """The program `seese3` from Python: `run` for its commands, `serve` for a server that a notebook asks.
 
-The program is the one that this package carries, or the one that the environment variable SEESE3 names, or that of the
-PATH: the first of them that is there, with the variable before everything else.
+The program is, in this order: the one that the environment variable SEESE3 names, the one that this package carries,
+the one in the PATH.
 """
 
 from __future__ import annotations
 
 import atexit
+import contextlib
 import os
+import queue
 import shutil
 import subprocess
 import sys
@@ -22,7 +24,7 @@ from .channel import Tls
 from .client import Client
 from .errors import CommandError, SeeseError
 
-# So long may a server take to load its store, seconds.
+# How long a server may take to load its store, and to stop, seconds.
 LOADING_S = 120.0
 STOPPING_S = 30.0
 KEPT_LINES = 200
@@ -71,8 +73,14 @@ def run(*arguments: object) -> str:
     """
     command = [str(argument) for argument in arguments]
     said: deque[str] = deque(maxlen=KEPT_LINES)
+    # What is no UTF-8, such as the name of a file, is shown as it can be.
     with subprocess.Popen(
-        [program(), *command], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [program(), *command],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        encoding="utf-8",
+        errors="backslashreplace",
     ) as process:
         listener = threading.Thread(target=_pass_on, args=(process, said), daemon=True)
         listener.start()
@@ -94,13 +102,15 @@ def _pass_on(process: subprocess.Popen[str], said: deque[str]) -> None:
     assert process.stderr is not None
     for line in process.stderr:
         said.append(line)
-        sys.stderr.write(line)
+        # A program whose output nobody takes would wait for ever, so that every line is read, wherever it goes.
+        with contextlib.suppress(Exception):
+            sys.stderr.write(line)
 
 
 class Server:
     """A server of a store on this machine, for as long as it is open: `with seese3.serve("store") as server`.
 
-    Without `with`, it runs until `stop`, or until Python ends. A Python that is killed leaves it behind.
+    Without `with`, it runs until `stop`, or until Python ends. A Python that a signal ends leaves it behind.
     """
 
     def __init__(self, process: subprocess.Popen[str], address: str, log: deque[str]) -> None:
@@ -144,42 +154,65 @@ def serve(store: str | Path, *arguments: object, listen: str = "127.0.0.1:0") ->
     More `arguments` are those of `seese3 serve`, for instance "--encoder", "model.onnx", or "--writable".
     """
     words = [str(argument) for argument in arguments]
+    if "--quiet" in words:
+        raise ValueError("--quiet: a server that says nothing does not say where it listens")
     if not any(word.split("=")[0] == "--metrics-listen" for word in words):
         # This port says when the store is loaded, whether the other one asks for TLS and tokens or not.
         words += ["--metrics-listen", "127.0.0.1:0"]
     command = ["serve", "--store", str(store), "--listen", listen, *words]
     process = subprocess.Popen(
-        [program(), *command], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [program(), *command],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        encoding="utf-8",
+        errors="backslashreplace",
     )
     log: deque[str] = deque(maxlen=KEPT_LINES)
+    said: queue.Queue[str | None] = queue.Queue()
     server = Server(process, "", log)
+    last = time.monotonic() + LOADING_S
     try:
-        server.address = _address(process, log, "listening on ")
-        operations = _address(process, log, "metrics on ")
-        threading.Thread(target=log.extend, args=(process.stdout,), daemon=True).start()
-        _wait_until_ready(process, operations)
+        threading.Thread(target=_listen, args=(process, log, said), daemon=True).start()
+        server.address = _address(said, "listening on ", last)
+        operations = _address(said, "metrics on ", last)
+        _wait_until_ready(process, operations, last)
+        if process.poll() is not None or not server.address:
+            raise CommandError(command, process.wait(), server.log)
     except BaseException:
         server.stop()
         raise
-    if process.returncode is not None or not server.address:
-        raise CommandError(command, process.wait(), server.log)
     return server
 
 
-def _address(process: subprocess.Popen[str], log: deque[str], label: str) -> str:
-    """The rest of the first line that begins with the label; "" if the program ended before it."""
+def _listen(process: subprocess.Popen[str], log: deque[str], said: queue.Queue[str | None]) -> None:
+    """Takes all that a server says, until it ends: one that nobody listens to would wait for ever."""
     assert process.stdout is not None
-    for line in process.stdout:
-        log.append(line)
+    with process.stdout:
+        for line in process.stdout:
+            log.append(line)
+            said.put(line)
+    said.put(None)
+
+
+def _address(said: queue.Queue[str | None], label: str, last: float) -> str:
+    """The rest of the first line that begins with the label; "" if the program ended before it."""
+    while True:
+        try:
+            line = said.get(timeout=max(0.0, last - time.monotonic()))
+        except queue.Empty:
+            raise SeeseError(f"the server did not say {label.strip()!r} within {LOADING_S:g} s") from None
+        if line is None:
+            # For whoever asks for the next label.
+            said.put(None)
+            return ""
         if line.startswith(label):
             return line.removeprefix(label).strip()
-    return ""
 
 
-def _wait_until_ready(process: subprocess.Popen[str], operations: str) -> None:
+def _wait_until_ready(process: subprocess.Popen[str], operations: str, last: float) -> None:
     # A proxy of the environment has nothing to do with this machine's own ports.
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    last = time.monotonic() + LOADING_S
     while operations and process.poll() is None:
         if time.monotonic() > last:
             raise SeeseError(f"the server did not load its store within {LOADING_S:g} s")
@@ -189,4 +222,3 @@ def _wait_until_ready(process: subprocess.Popen[str], operations: str) -> None:
         except OSError:
             # Refused while it starts, and answered by 503 while it loads.
             time.sleep(0.02)
-    process.wait()

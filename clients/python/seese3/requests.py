@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from .answers import Camera, FeatureSource
-from .geometry import wire_pose, wire_twist, wire_vector
+from .geometry import real, wire_pose, wire_twist, wire_vector
 from .v1 import catalog_pb2, geometry_pb2, navigation_pb2, odometry_pb2
 from .views import View, wire_view
 
-# About so many bytes of frames go into one message of an upload.
+# The approximate size of one message of an upload, bytes.
 UPLOAD_BYTES = 1 << 20
 
 Bytes: TypeAlias = "bytes | Path"
@@ -31,6 +31,25 @@ def enum_value(enum: Any, prefix: str, word: str | None, argument: str) -> int:
     if word not in words:
         raise ValueError(f"{argument}: {word!r} is none of {', '.join(words)}")
     return words[word]
+
+
+def count(number: int | None, argument: str) -> Any:
+    """A number that is counted from 0: a frame's row, steps, frames."""
+    if number is not None and not 0 <= number < 1 << 32:
+        raise ValueError(f"{argument}: {number} is not a number from 0 to 2³² - 1")
+    return number
+
+
+def names(given: Sequence[str] | str) -> Sequence[str]:
+    """Names, of which one may be given alone."""
+    return [given] if isinstance(given, str) else given
+
+
+def wire_views(views: Sequence[View]) -> list[geometry_pb2.View]:
+    """Views on the wire. One view alone is refused: the bytes of an image are a sequence too, of numbers."""
+    if isinstance(views, (bytes, str, Path)):
+        raise TypeError(f"views: is a sequence of views, not {type(views).__name__}; put one into a list")
+    return [wire_view(view) for view in views]
 
 
 def mode(word: str | None) -> Any:
@@ -56,11 +75,14 @@ def displacement(
     if (to is not None) + (twist is not None) + (pose is not None) != 1:
         raise ValueError("give exactly one of to (a frame's row), twist and pose")
     if to is not None:
-        return navigation_pb2.Displacement(target_frame_id=to)
+        return navigation_pb2.Displacement(target_frame_id=count(to, "to"))
     if pose is not None:
         return navigation_pb2.Displacement(target_pose=wire_pose(pose))
 
-    twists = np.asarray(twist, dtype=np.float64)
+    assert twist is not None
+    twists = real(twist, "twist")
+    if twists.ndim not in (1, 2):
+        raise ValueError(f"twist: is (6,), or several (n, 6), not {twists.shape}")
     if twists.ndim == 1:
         return navigation_pb2.Displacement(twist=wire_twist(twists))
     return navigation_pb2.Displacement(twists=navigation_pb2.TwistList(twists=[wire_twist(row) for row in twists]))
@@ -91,13 +113,13 @@ class Question:
             source=wire_view(self.source),
             source_pose=None if self.source_pose is None else wire_pose(self.source_pose),
             displacement=displacement(self.to, self.twist, self.pose),
-            steps=self.steps,
+            steps=count(self.steps, "steps"),
             mode=mode(self.mode),
             reading=enum_value(navigation_pb2.Reading, "READING_", self.reading, "reading"),  # type: ignore[arg-type]
             navigator=self.navigator,
-            top_k=self.top_k,
+            top_k=count(self.top_k, "top_k"),
             exclude_source=self.exclude_source,
-            exclude_radius=self.exclude_radius,
+            exclude_radius=count(self.exclude_radius, "exclude_radius"),
             thresholds=self.thresholds,
         )
 
@@ -133,7 +155,7 @@ class TrackConfig:
     """What a tracking stream is to do. What is left out is chosen by the server."""
 
     room: str = ""
-    rooms: Sequence[str] = ()
+    rooms: Sequence[str] | str = ()
     adapter: str = ""
     initial_pose: InitialPose | None = None
     keyframe_displacement: float | None = None
@@ -164,7 +186,7 @@ class TrackConfig:
         pressure = odometry_pb2.BACK_PRESSURE_NEWEST if self.newest_only else odometry_pb2.BACK_PRESSURE_UNSPECIFIED
         return odometry_pb2.TrackConfig(
             room=self.room,
-            rooms=self.rooms,
+            rooms=names(self.rooms),
             adapter=self.adapter,
             initial_pose=self.initial_pose.message() if self.initial_pose else None,
             keyframes=keyframes,
@@ -241,6 +263,21 @@ class Prediction:
     frame: int | None = None
     last_step_frame: int | None = None
 
+    def __post_init__(self) -> None:
+        if (self.latent is None) == (self.frame is None):
+            raise ValueError("a prediction is exactly one of latent and frame")
+
+
+def integers(values: Any, argument: str, within: range) -> None:
+    """Refuses what is no list of whole numbers within a range."""
+    if values is None:
+        return
+    for row, value in enumerate(values):
+        if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or int(value) not in within:
+            raise ValueError(
+                f"{argument}: row {row} is {value!r}, and no whole number from {within.start} to {within.stop - 1}"
+            )
+
 
 def new_id() -> str:
     """A request id, by which a change that is sent again is known as the same one."""
@@ -263,7 +300,7 @@ class Upload:
     sequences: Sequence[int] | npt.NDArray[np.integer] | None = None
 
     def __post_init__(self) -> None:
-        poses = np.asarray(self.poses, dtype="<f8")
+        poses = real(self.poses, "poses").astype("<f8")
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) == 0:
             raise ValueError(f"poses: are (n, 4, 4) with at least one frame, not {poses.shape}")
         counts = {"images": self.images, "names": self.names}
@@ -271,6 +308,16 @@ class Upload:
         for argument, values in counts.items():
             if values is not None and len(values) not in (0, len(poses)):
                 raise ValueError(f"{argument}: has {len(values)} entries, there are {len(poses)} poses")
+        integers(self.timestamps_ns, "timestamps_ns", range(-(1 << 63), 1 << 63))
+        integers(self.sequences, "sequences", range(1 << 32))
+        for row, name in enumerate(self.names):
+            if not isinstance(name, str):
+                raise ValueError(f"names: row {row} is {name!r}, and no text")
+        for row, image in enumerate(self.images):
+            if not isinstance(image, (bytes, Path)):
+                raise ValueError(f"images: row {row} is {image!r}, and neither bytes nor a pathlib.Path")
+            if isinstance(image, Path) and not image.is_file():
+                raise ValueError(f"images: row {row}, {image}, is no file")
         for source, rows in self.features:
             if np.asarray(rows).shape != (len(poses), source.dim):
                 shape = np.asarray(rows).shape

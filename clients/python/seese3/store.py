@@ -17,8 +17,9 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from functools import cached_property
 from pathlib import Path
@@ -26,25 +27,34 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from .answers import Camera, FeatureSource, Revision
 from .errors import DamagedError, SeeseError
-from .geometry import Array
+from .geometry import Array, real
 
 SCHEMA = 1
 # Rotations that are further from SO(3) are taken for a mistake, as by `seese3 import`.
 WORST_ROTATION = 1e-2
+# The longest distance of a camera from its world's origin, metres: that of the program.
+LONGEST_M = 1e6
+LICENCE_BYTES = 10_000
 # Adapters keep some features with what they give for them, by which a reader checks that it computes the same.
 GOLDEN_ROWS = 8
 GOLDEN_TOLERANCE = 1e-6
 WEIGHTS = ("phi.0.weight", "phi.0.bias", "phi.1.weight", "phi.1.bias", "phi.3.weight", "phi.3.bias", "W.weight")
+SPLITS = ("time", "blocks", "pairs", "whole", "dataset", "fold1", "fold2", "fold3", "fold4", "fold5")
+NUMBER = re.compile("[0-9]{1,18}")
 PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 @dataclass(frozen=True, eq=False)
 class StoredRoom:
-    """A room: poses world_from_camera (n, 4, 4), metres, and features (n, d) by the name of their source."""
+    """A room: poses world_from_camera (n, 4, 4), metres, and features (n, d) by the name of their source.
+
+    `images` are the paths of image files; those of a `.sens` recording are its path and the place in it.
+    """
 
     revision: Revision
     poses: Array
@@ -107,6 +117,17 @@ def _embed(weights: Mapping[str, Array], features: Array) -> Array:
     return latents
 
 
+@contextmanager
+def _damaged(what: str) -> Iterator[None]:
+    """Turns whatever goes wrong with content that is not as the program writes it into a `DamagedError`."""
+    try:
+        yield
+    except SeeseError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, SafetensorError, TypeError, ValueError) as error:
+        raise DamagedError(f"{what} has content that is not valid ({type(error).__name__}: {error})") from error
+
+
 class Store:
     """A store in a folder. Writing makes the folder if it is not there; reading needs it."""
 
@@ -128,42 +149,47 @@ class Store:
 
     def room(self, name: str, revision: int | None = None) -> StoredRoom:
         """A room with all its features: the given revision, or the one that the name alone means."""
+        _check_name("room", name)
         body = self._body("rooms", name, revision)
-        frames = load(self._object("rooms", name, body["frames"]))
-        features, sources = {}, {}
-        for entry in body["features"]:
-            source = _source(entry["source"])
-            features[source.name] = load(self._object("rooms", name, entry["object"]))["features"]
-            sources[source.name] = source
+        with _damaged(f"room {name!r}"):
+            frames = load(self._object("rooms", name, body["frames"]))
+            features, sources = {}, {}
+            for entry in body["features"]:
+                source = _source(entry["source"])
+                features[source.name] = load(self._object("rooms", name, entry["object"]))["features"]
+                sources[source.name] = source
 
-        root = Path(body["provenance"].get("images_root", ""))
-        images = self._list(name, body.get("images"))
-        return StoredRoom(
-            revision=Revision(name, body["revision"]),
-            poses=frames["world_from_camera"],
-            features=features,
-            sources=sources,
-            names=self._list(name, body["frame_names"]),
-            images=None if images is None else [root / image for image in images],
-            timestamps_ns=frames.get("timestamps_ns"),
-            sequences=frames.get("sequences"),
-            manifest=body,
-        )
+            root = Path(body["provenance"].get("images_root", ""))
+            images = self._list(name, body.get("images"))
+            return StoredRoom(
+                revision=Revision(name, body["revision"]),
+                poses=frames["world_from_camera"],
+                features=features,
+                sources=sources,
+                names=self._list(name, body["frame_names"]),
+                images=None if images is None else [root / image for image in images],
+                timestamps_ns=frames.get("timestamps_ns"),
+                sequences=frames.get("sequences"),
+                manifest=body,
+            )
 
     def adapter(self, name: str, revision: int | None = None) -> StoredAdapter:
         """An adapter. One of a single chart is checked: its golden features have to give its golden latents."""
+        _check_name("adapter", name)
         body = self._body("adapters", name, revision)
-        tensors = load(self._object("adapters", name, body["weights"]))
-        adapter = StoredAdapter(Revision(name, body["revision"]), _source(body["source"]), tensors, body)
-        if body["training"].get("charts", 1) == 1:
-            expected = tensors["golden.latents"]
-            difference = np.abs(adapter.embed(tensors["golden.features"]) - expected)
-            if (difference > GOLDEN_TOLERANCE * np.maximum(1.0, np.abs(expected))).any():
-                raise DamagedError(f"adapter {name!r}: its golden features do not give its golden latents")
-        return adapter
+        with _damaged(f"adapter {name!r}"):
+            tensors = load(self._object("adapters", name, body["weights"]))
+            adapter = StoredAdapter(Revision(name, body["revision"]), _source(body["source"]), tensors, body)
+            if body["training"].get("charts", 1) == 1:
+                expected = tensors["golden.latents"]
+                difference = np.abs(adapter.embed(tensors["golden.features"]) - expected)
+                if not (difference <= GOLDEN_TOLERANCE * np.maximum(1.0, np.abs(expected))).all():
+                    raise DamagedError(f"adapter {name!r}: its golden features do not give its golden latents")
+            return adapter
 
     def adapter_files(self, name: str, revision: int | None = None) -> tuple[bytes, bytes]:
         """The manifest and the weights of an adapter, as `Client.publish_adapter` takes them."""
+        _check_name("adapter", name)
         body = self._body("adapters", name, revision)
         manifest = self._manifest("adapters", name, body["revision"]).read_bytes()
         return manifest, self._object("adapters", name, body["weights"])
@@ -178,68 +204,79 @@ class Store:
         *,
         timestamps_ns: npt.ArrayLike | None = None,
         sequences: npt.ArrayLike | None = None,
-        names: list[str] | None = None,
+        names: Sequence[str] | None = None,
         camera: Camera | None = None,
-        format: str = "numpy",
+        format: str = "",
         licence: str = "",
     ) -> Revision:
         """Publishes a room: poses world_from_camera (n, 4, 4) in metres, and features (n, d) by name or source.
 
         Rotations are projected onto SO(3). The newest revision is kept beside the new one; if it has the same poses,
-        what is not given here (features of other names, times, names, images) is carried over. The poses are not
-        compared with images: `seese3 check room` does that where the room has some.
+        what is not given here (features of other names, times, names, images, licence) is carried over. The poses are
+        not compared with images: `seese3 check room` does that where the room has some.
         """
         _check_name("room", name)
         matrices, deviation = _checked_poses(poses)
         columns: dict[str, npt.NDArray[Any]] = {"world_from_camera": matrices}
-        for column, values in (("timestamps_ns", timestamps_ns), ("sequences", sequences)):
-            if values is not None:
-                columns[column] = _column(values, column, len(matrices))
-        if names is not None and len(names) != len(matrices):
-            raise ValueError(f"names: has {len(names)} entries, there are {len(matrices)} poses")
+        if timestamps_ns is not None:
+            columns["timestamps_ns"] = _column(
+                timestamps_ns, "timestamps_ns", len(matrices), range(-(1 << 63), 1 << 63)
+            )
+        if sequences is not None:
+            columns["sequences"] = _column(sequences, "sequences", len(matrices), range(1 << 32))
+        listed = _checked_names(names, len(matrices))
         sets = [_checked_features(key, values, len(matrices)) for key, values in features.items()]
+        if len({source.name for source, _ in sets}) < len(sets):
+            raise ValueError("features: two sets have the same name")
+        for argument, text in (("format", format), ("licence", licence)):
+            if not isinstance(text, str) or len(text.encode()) > LICENCE_BYTES:
+                raise ValueError(f"{argument}: is a text of at most {LICENCE_BYTES} bytes, not {text!r}")
 
-        newest = self._newest_of_same_poses(name, matrices)
+        new = _NewRoom(matrices, deviation, columns, listed, sets, camera, format, licence)
+        return self._publish("rooms", name, lambda newest: self._room_body(name, new, newest))
+
+    def _room_body(self, name: str, new: _NewRoom, newest: dict[str, Any] | None) -> dict[str, Any]:
+        """The manifest of a room, with what the newest revision has and is not given, if it has the same poses."""
+        columns = new.columns
         if newest is not None:
             known = load(self._object("rooms", name, newest["frames"]))
-            columns = {**known, **columns, "world_from_camera": known["world_from_camera"]}
+            stored = known["world_from_camera"]
+            if stored.shape == new.poses.shape and np.abs(stored - new.poses).max() < 1e-12:
+                columns = {**known, **columns, "world_from_camera": stored}
+            else:
+                newest = None
 
-        entries = {
-            source.name: {
-                "source": asdict(source),
-                "object": self._write(
-                    "rooms", name, f"features-{source.name}", "safetensors", save({"features": rows})
-                ),
-            }
-            for source, rows in sets
-        }
+        entries = {}
+        for source, rows in new.features:
+            content = _safetensors({"features": rows})
+            stored_as = self._write("rooms", name, f"features-{source.name}", "safetensors", content)
+            entries[source.name] = {"source": asdict(source), "object": stored_as}
         for entry in newest["features"] if newest else []:
             entries.setdefault(entry["source"]["name"], entry)
 
         provenance: dict[str, Any] = {
-            "format": format,
-            "licence": licence,
+            "format": new.format or (newest["provenance"]["format"] if newest else "numpy"),
+            "licence": new.licence or (newest["provenance"].get("licence", "") if newest else ""),
             "images_root": newest["provenance"].get("images_root", "") if newest else "",
-            "worst_rotation_deviation": deviation,
+            "worst_rotation_deviation": new.worst_rotation_deviation,
         }
-        if camera is not None:
-            provenance["camera"] = _stored_camera(camera)
+        if new.camera is not None:
+            provenance["camera"] = _stored_camera(new.camera)
         elif newest and "camera" in newest["provenance"]:
             provenance["camera"] = newest["provenance"]["camera"]
 
-        body = {
+        return {
             "schema": SCHEMA,
             "room": name,
             "revision": 0,
             "created": "",
-            "frame_count": len(matrices),
-            "frames": self._write("rooms", name, "frames", "safetensors", save(columns)),
-            "frame_names": self._write_list(name, "frame-names", names, newest),
+            "frame_count": len(new.poses),
+            "frames": self._write("rooms", name, "frames", "safetensors", _safetensors(columns)),
+            "frame_names": self._write_list(name, "frame-names", new.names, newest),
             "images": newest.get("images") if newest else None,
             "features": [entries[key] for key in sorted(entries)],
             "provenance": provenance,
         }
-        return self._publish("rooms", name, body)
 
     def write_adapter(
         self,
@@ -269,21 +306,14 @@ class Store:
         It has no scores and no error model: a server navigates with it, and does not track.
         """
         _check_name("adapter", name)
-        tensors = {key: np.ascontiguousarray(weights[key], dtype=np.float32) for key in WEIGHTS if key in weights}
-        if missing := [key for key in WEIGHTS if key not in weights]:
-            raise ValueError(f"weights: lack {', '.join(missing)}")
-        hidden, dim = tensors["phi.0.weight"].shape
-        latent = tensors["phi.3.weight"].shape[0]
-        shapes = ((hidden, dim), (hidden,), (hidden,), (hidden,), (latent, hidden), (latent,), (6, latent))
-        for key, shape in zip(WEIGHTS, shapes, strict=True):
-            if tensors[key].shape != shape or not np.isfinite(tensors[key]).all():
-                raise ValueError(f"weights: {key!r} is {shape} of finite numbers, not {tensors[key].shape}")
-        if source.dim != dim:
-            raise ValueError(f"source: has {source.dim} columns, the weights take {dim}")
+        _check_training(split, stride, epochs, seed, preset, rooms)
+        tensors = _checked_weights(weights, source)
+        hidden, latent = tensors["phi.0.weight"].shape[0], tensors["phi.3.weight"].shape[0]
 
-        mean, deviation = (np.array(values, dtype=np.float64) for values in (target_mean, target_deviation))
-        if mean.shape != (6,) or deviation.shape != (6,) or not (deviation > 0).all() or not np.isfinite(mean).all():
-            raise ValueError("target_mean and target_deviation: are six numbers each, the deviations above 0")
+        mean, deviation = real(target_mean, "target_mean"), real(target_deviation, "target_deviation")
+        is_finite = np.isfinite(mean).all() and np.isfinite(deviation).all()
+        if mean.shape != (6,) or deviation.shape != (6,) or not is_finite or not (deviation > 0).all():
+            raise ValueError("target_mean and target_deviation: are six finite numbers each, the deviations above 0")
 
         rows = _checked_features(source, features, None)[1]
         golden = np.ascontiguousarray(rows[:: -(-len(rows) // GOLDEN_ROWS)])
@@ -310,16 +340,16 @@ class Store:
         training = {
             "preset": preset,
             "split": split,
-            "stride": stride,
-            "rooms": [[room, revision] for room, revision in rooms.items()],
-            "epochs": epochs,
+            "stride": int(stride),
+            "rooms": [[room, int(revision)] for room, revision in rooms.items()],
+            "epochs": int(epochs),
             "batch": 0,
             "learning_rate": 0.0,
             "weight_decay": 0.0,
             "clip_norm": 0.0,
             "hidden": hidden,
             "latent": latent,
-            "seed": seed,
+            "seed": int(seed),
             "pair_count": 0,
             "test": unknown,
             "train": unknown,
@@ -331,12 +361,12 @@ class Store:
             "revision": 0,
             "created": "",
             "source": asdict(source),
-            "weights": self._write("adapters", name, "weights", "safetensors", save(content)),
+            "weights": self._write("adapters", name, "weights", "safetensors", _safetensors(content)),
             "twist_frame": "body",
             "deviation_ddof": 0,
             "training": training,
         }
-        return self._publish("adapters", name, body)
+        return self._publish("adapters", name, lambda newest: body)
 
     # Files.
 
@@ -353,7 +383,7 @@ class Store:
         """The revisions that are there, and the highest number that was ever given."""
         present, highest = [], 0
         for file in (self.folder / kind / name / "revisions").glob("*"):
-            number = int(file.stem) if file.stem.isdigit() else 0
+            number = int(file.stem) if NUMBER.fullmatch(file.stem) else 0
             if number and file.name in (f"{number:06}.json", f"{number:06}.gone"):
                 highest = max(highest, number)
                 if file.suffix == ".json":
@@ -370,19 +400,30 @@ class Store:
             revision = self._defaults().get(f"{what}_revisions", {}).get(name, present[-1])
         if revision not in present:
             raise SeeseError(f"{what} {name!r} has no revision {revision}; it has {present}")
-        return _read_manifest(self._manifest(kind, name, revision))
+        path = self._manifest(kind, name, revision)
+        manifest = _read_manifest(path)
+        if (manifest.get(what), manifest.get("revision")) != (name, revision):
+            raise DamagedError(f"{path} is the manifest of another {what} or revision")
+        return manifest
 
     def _defaults(self) -> dict[str, Any]:
-        files = sorted((self.folder / "defaults").glob("[0-9]*.json"), key=lambda file: int(file.stem))
+        files = [file for file in (self.folder / "defaults").glob("*.json") if NUMBER.fullmatch(file.stem)]
+        files.sort(key=lambda file: int(file.stem))
         defaults: dict[str, Any] = _read_manifest(files[-1])["defaults"] if files else {}
         return defaults
 
     def _object(self, kind: str, name: str, reference: dict[str, Any]) -> bytes:
         path = self.folder / kind / name / "objects" / reference["file"]
+        if path.name != reference["file"]:
+            raise DamagedError(
+                f"the manifest of {name!r} names the file {reference['file']!r}, which is none of its own"
+            )
         try:
             content: bytes = path.read_bytes()
         except FileNotFoundError:
             raise DamagedError(f"{path} is missing; restore it, or publish again") from None
+        except IsADirectoryError:
+            raise DamagedError(f"{path} is a folder; restore it, or publish again") from None
         if len(content) != reference["bytes"] or hashlib.sha256(content).hexdigest() != reference["sha256"]:
             raise DamagedError(f"{path} is truncated or altered: it has another checksum than its manifest states")
         return content
@@ -392,15 +433,6 @@ class Store:
             return None
         names: list[str] = json.loads(self._object("rooms", name, reference))
         return names
-
-    def _newest_of_same_poses(self, name: str, poses: Array) -> dict[str, Any] | None:
-        present = self._revisions("rooms", name)[0]
-        if not present:
-            return None
-        body = self._body("rooms", name, present[-1])
-        stored = load(self._object("rooms", name, body["frames"]))["world_from_camera"]
-        same = stored.shape == poses.shape and np.abs(stored - poses).max() < 1e-12
-        return body if same else None
 
     def _write_list(
         self, name: str, stem: str, names: list[str] | None, newest: dict[str, Any] | None
@@ -419,14 +451,18 @@ class Store:
         os.replace(_temporary(folder, content), folder / file)
         return {"file": file, "sha256": sha256, "bytes": len(content)}
 
-    def _publish(self, kind: str, name: str, body: dict[str, Any]) -> Revision:
-        """Writes the manifest under the next free number, or returns the newest revision if it says the same."""
+    def _publish(self, kind: str, name: str, body_after: Callable[[dict[str, Any] | None], dict[str, Any]]) -> Revision:
+        """Writes a manifest under the next free number, or returns the newest revision if it says the same.
+
+        `body_after` makes the manifest from that of the newest revision. It is asked again if somebody else published
+        one meanwhile, so that nothing that they added is lost.
+        """
         while True:
             present, highest = self._revisions(kind, name)
-            if present:
-                newest = _read_manifest(self._manifest(kind, name, present[-1]))
-                if {**newest, "created": "", "revision": 0} == _as_written(body):
-                    return Revision(name, present[-1])
+            newest = _read_manifest(self._manifest(kind, name, present[-1])) if present else None
+            body = body_after(newest)
+            if newest is not None and {**newest, "created": "", "revision": 0} == _as_written(body):
+                return Revision(name, present[-1])
 
             revision = highest + 1
             dated = {**body, "revision": revision, "created": datetime.now(timezone.utc).isoformat()}
@@ -447,6 +483,26 @@ class Store:
                 os.unlink(temporary)
 
 
+@dataclass(frozen=True, eq=False)
+class _NewRoom:
+    """What `write_room` was given, checked."""
+
+    poses: Array
+    worst_rotation_deviation: float
+    columns: dict[str, npt.NDArray[Any]]
+    names: list[str] | None
+    features: list[tuple[FeatureSource, npt.NDArray[np.float32]]]
+    camera: Camera | None
+    format: str
+    licence: str
+
+
+def _safetensors(tensors: Mapping[str, npt.NDArray[Any]]) -> bytes:
+    """Tensors as a file. The library writes the memory of an array as it lies, whatever its strides are."""
+    content: bytes = save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+    return content
+
+
 def _as_written(body: dict[str, Any]) -> Any:
     """The body as it reads when it was written as JSON."""
     return json.loads(json.dumps(body))
@@ -455,11 +511,15 @@ def _as_written(body: dict[str, Any]) -> Any:
 def _temporary(folder: Path, content: bytes) -> str:
     """A file in `folder` with this content, on the disk."""
     descriptor, path = tempfile.mkstemp(dir=folder, prefix=".", suffix=".tmp")
-    with os.fdopen(descriptor, "wb") as file:
-        os.fchmod(descriptor, 0o644)
-        file.write(content)
-        file.flush()
-        os.fsync(descriptor)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            os.fchmod(descriptor, 0o644)
+            file.write(content)
+            file.flush()
+            os.fsync(descriptor)
+    except BaseException:
+        os.unlink(path)
+        raise
     return path
 
 
@@ -471,14 +531,13 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         stated, body = envelope["sha256"], envelope["body"]
         start = text.index("{", text.index('"body"'))
         _, end = json.JSONDecoder().raw_decode(text, start)
-    except FileNotFoundError:
-        raise
-    except (ValueError, KeyError, TypeError) as error:
+        schema = body["schema"]
+    except (ValueError, KeyError, TypeError, IsADirectoryError) as error:
         raise DamagedError(f"{path} is not a valid manifest ({error}): it was truncated or altered") from None
     if hashlib.sha256(text[start:end].encode()).hexdigest() != stated:
         raise DamagedError(f"{path} does not have the checksum that it states: it was altered")
-    if body["schema"] > SCHEMA:
-        raise SeeseError(f"{path} was written by a newer version (schema {body['schema']}); update this package")
+    if not isinstance(schema, int) or schema > SCHEMA:
+        raise SeeseError(f"{path} was written by a newer version (schema {schema}); update this package")
     result: dict[str, Any] = body
     return result
 
@@ -492,25 +551,29 @@ def _stored_camera(camera: Camera) -> dict[str, Any]:
     x = camera.width / 2 if camera.centre_x is None else camera.centre_x
     y = camera.height / 2 if camera.centre_y is None else camera.centre_y
     return {
-        "focal": camera.focal / camera.width,
-        "height": camera.height / camera.width,
-        "centre": [x / camera.width, y / camera.width],
+        "focal": float(camera.focal / camera.width),
+        "height": float(camera.height / camera.width),
+        "centre": [float(x / camera.width), float(y / camera.width)],
     }
 
 
 def _check_name(what: str, name: str) -> None:
-    if not PLAIN_NAME.fullmatch(name):
-        raise ValueError(f"{name!r} cannot name a {what}: use 1 to 100 letters, digits, '.', '-' or '_'")
+    if not isinstance(name, str) or not PLAIN_NAME.fullmatch(name):
+        raise ValueError(f"{name!r} cannot be the name of a {what}: use 1 to 100 letters, digits, '.', '-' or '_'")
 
 
 def _checked_poses(poses: npt.ArrayLike) -> tuple[Array, float]:
     """The poses with their rotations projected onto SO(3), and how far the worst was from it."""
-    matrices = np.array(poses, dtype=np.float64)
+    matrices = real(poses, "poses")
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4) or len(matrices) == 0:
         raise ValueError(f"poses: are (n, 4, 4) with at least one frame, not {matrices.shape}")
     if not np.isfinite(matrices).all():
         row = int(np.argwhere(~np.isfinite(matrices).all(axis=(1, 2)))[0, 0])
         raise ValueError(f"poses: row {row} has a number that is not finite")
+    distances = np.linalg.norm(matrices[:, :3, 3], axis=1)
+    if distances.max() > LONGEST_M:
+        row = int(distances.argmax())
+        raise ValueError(f"poses: row {row} is {distances[row]:.1e} m from the origin; are these metres?")
     if np.abs(matrices[:, 3] - (0, 0, 0, 1)).max() > 1e-6:
         raise ValueError("poses: the last row of each has to be 0, 0, 0, 1; are they transposed?")
 
@@ -529,17 +592,76 @@ def _checked_poses(poses: npt.ArrayLike) -> tuple[Array, float]:
     return matrices, float(deviations[worst])
 
 
-def _column(values: npt.ArrayLike, name: str, count: int) -> npt.NDArray[np.int64]:
+def _column(values: npt.ArrayLike, name: str, count: int, within: range) -> npt.NDArray[np.int64]:
     column = np.asarray(values)
     if column.shape != (count,) or not np.issubdtype(column.dtype, np.integer):
         raise ValueError(f"{name}: is ({count},) of integers, not {column.dtype} of shape {column.shape}")
+    if int(column.min()) not in within or int(column.max()) not in within:
+        raise ValueError(f"{name}: has a number that is not from {within.start} to {within.stop - 1}")
     return column.astype(np.int64)
+
+
+def _checked_names(names: Sequence[str] | None, count: int) -> list[str] | None:
+    if names is None:
+        return None
+    if isinstance(names, str) or len(names) != count:
+        raise ValueError(f"names: is a list of {count} names, one for each pose, not {names!r:.100}")
+    listed = list(names)
+    for row, name in enumerate(listed):
+        if not isinstance(name, str):
+            raise ValueError(f"names: row {row} is {name!r}, and no text")
+    return [str(name) for name in listed]
+
+
+def _check_training(split: str, stride: int, epochs: int, seed: int, preset: str, rooms: Mapping[str, int]) -> None:
+    """What a manifest states about a training, as the program reads it."""
+    if split not in SPLITS:
+        raise ValueError(f"split: {split!r} is none of {', '.join(SPLITS)}")
+    for argument, value, within in (
+        ("stride", stride, range(1, 1 << 32)),
+        ("epochs", epochs, range(1 << 32)),
+        ("seed", seed, range(1 << 64)),
+    ):
+        if not isinstance(value, (int, np.integer)) or int(value) not in within:
+            raise ValueError(f"{argument}: {value!r} is no whole number from {within.start} to {within.stop - 1}")
+    _check_name("preset", preset)
+    for room, revision in rooms.items():
+        _check_name("room", room)
+        if not isinstance(revision, (int, np.integer)) or revision < 1:
+            raise ValueError(f"rooms: {room!r} has the revision {revision!r}, which is no number from 1 on")
+
+
+def _checked_weights(
+    weights: Mapping[str, npt.NDArray[np.floating]], source: FeatureSource
+) -> dict[str, npt.NDArray[np.float32]]:
+    """The tensors of an adapter, as the program reads them."""
+    if missing := [key for key in WEIGHTS if key not in weights]:
+        raise ValueError(f"weights: lack {', '.join(missing)}")
+    if unknown := [key for key in weights if key not in WEIGHTS]:
+        raise ValueError(f"weights: {', '.join(unknown)} are no tensors of an adapter of one chart")
+
+    tensors = {key: real(weights[key], f"weights: {key!r}").astype(np.float32) for key in WEIGHTS}
+    if tensors["phi.0.weight"].ndim != 2 or tensors["phi.3.weight"].ndim != 2:
+        raise ValueError("weights: 'phi.0.weight' is (h, d) and 'phi.3.weight' is (k, h)")
+    hidden, dim = tensors["phi.0.weight"].shape
+    latent = tensors["phi.3.weight"].shape[0]
+    shapes = ((hidden, dim), (hidden,), (hidden,), (hidden,), (latent, hidden), (latent,), (6, latent))
+    for key, shape in zip(WEIGHTS, shapes, strict=True):
+        if tensors[key].shape != shape:
+            raise ValueError(f"weights: {key!r} is {shape}, not {tensors[key].shape}")
+        if not np.isfinite(tensors[key]).all():
+            raise ValueError(f"weights: {key!r} has a number that is not finite")
+    if source.dim != dim:
+        raise ValueError(f"source: has {source.dim} columns, the weights take {dim}")
+    if np.linalg.matrix_rank(tensors["W.weight"]) < 6:
+        raise ValueError("weights: 'W.weight' has a rank below 6: some motions would be read as none")
+    return tensors
 
 
 def _checked_features(
     key: str | FeatureSource, values: npt.NDArray[np.floating], count: int | None
 ) -> tuple[FeatureSource, npt.NDArray[np.float32]]:
-    rows = np.ascontiguousarray(values, dtype=np.float32)
+    rows = real(values, "features").astype(np.float32)
     name = key if isinstance(key, str) else key.name
     _check_name("set of features", name)
     if rows.ndim != 2 or rows.size == 0 or count not in (None, len(rows)):
@@ -547,7 +669,17 @@ def _checked_features(
     if not np.isfinite(rows).all():
         row = int(np.argwhere(~np.isfinite(rows).all(axis=1))[0, 0])
         raise ValueError(f"features: {name!r} has a number in row {row} that is not finite")
-    source = FeatureSource(name, rows.shape[1]) if isinstance(key, str) else key
+    source = FeatureSource(name, rows.shape[1]) if isinstance(key, str) else _checked_source(key)
     if source.dim != rows.shape[1]:
         raise ValueError(f"features: {name!r} has {rows.shape[1]} columns, its source says {source.dim}")
     return source, rows
+
+
+def _checked_source(source: FeatureSource) -> FeatureSource:
+    texts = {key: value for key, value in asdict(source).items() if key != "dim"}
+    for key, value in texts.items():
+        if not isinstance(value, str):
+            raise ValueError(f"features: {key} of the source {source.name!r} is {value!r}, and no text")
+    if not isinstance(source.dim, (int, np.integer)) or source.dim < 1:
+        raise ValueError(f"features: the source {source.name!r} has {source.dim!r} columns")
+    return replace(source, dim=int(source.dim))

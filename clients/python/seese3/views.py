@@ -44,6 +44,8 @@ def wire_view(view: View) -> pb.View:
     if isinstance(view, (bool, np.bool_)):
         raise TypeError("a view is no truth value: give a frame's row, a feature, a latent or an image")
     if isinstance(view, (int, np.integer)):
+        if not 0 <= view < 1 << 32:
+            raise ValueError(f"a view that is a number is a frame's row, from 0 to 2³² - 1, not {view}")
         return pb.View(frame_id=int(view))
     if isinstance(view, bytes):
         return pb.View(image=view)

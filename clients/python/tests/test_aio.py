@@ -64,6 +64,7 @@ def test_a_step_that_is_given_up_did_not_happen(drawn: Path) -> None:
                     with pytest.raises(asyncio.TimeoutError):
                         await asyncio.wait_for(track.step(feature, row * 33_000_000), 0.2)
                     server._process.send_signal(signal.SIGCONT)
+                    assert track.last_sequence == given_up, "its number is not used up"
                 update = await track.step(feature, row * 33_000_000)
                 assert isinstance(update, seese3.TrackUpdate)
                 poses.append(update.odom_from_camera)

@@ -172,6 +172,7 @@ def test_changes_of_the_catalog(store: Path) -> None:
     first, rest = slice(0, 80), slice(80, None)
     with seese3.serve(store, "--writable") as server, server.client(deadline_s=60) as client:
         upload = seese3.Upload(room.poses[first], [(source, rows[first])])
+        assert client.create_room("copy", upload, validate_only=True).revision is None
         made = client.create_room("copy", upload)
         assert made.created and made.served and client.room("copy").frame_count == 80
         assert not client.create_room("copy", upload).created
@@ -184,11 +185,17 @@ def test_changes_of_the_catalog(store: Path) -> None:
         assert client.publish_adapter("again", manifest, weights).served
         assert "again" in [adapter.name for adapter in client.adapters()]
 
+        # What is chosen can be taken back, and names are those that other methods take.
+        client.set_default(room=ROOM, adapter="again")
+        assert client.unset_default(room=ROOM) == []
+
         done: list[int] = []
         fitted = client.refit_room("copy", features=FEATURES, on_progress=lambda n, _: done.append(n))
         assert fitted.created and done
         defaults = client.set_default(room="copy", adapter="again")
-        assert [(one.name, one.adapter) for one in defaults] == [("rooms/copy", "adapters/again")]
+        assert [(one.name, one.adapter) for one in defaults] == [("copy", "again")]
+        assert "adapter" in [one.kind for one in client.set_default(adapter="again", revision=1)]
+        client.unset_default(adapter="again")
         assert client.room("copy").adapters[0] == "again"
         assert client.set_default(room="copy", revision=1) and client.room("copy").frame_count == 80
         assert client.roll_back_default() and client.room("copy").frame_count == 120
@@ -207,8 +214,18 @@ def test_unfit_uploads_are_refused_before_they_are_sent() -> None:
         seese3.Upload(np.eye(4))
     with pytest.raises(ValueError, match=r"'mine' is \(2, 3\)"):
         seese3.Upload(np.tile(np.eye(4), (2, 1, 1)), [(source, np.zeros((3, 3)))])
-    with pytest.raises(ValueError, match="names: has 1"):
-        seese3.Upload(np.tile(np.eye(4), (2, 1, 1)), names=["one"])
+    two = np.tile(np.eye(4), (2, 1, 1))
+    for argument, values, problem in (
+        ("names", ["one"], "names: has 1"),
+        ("names", ["one", 2], "names: row 1"),
+        ("timestamps_ns", [0, 1.5], "timestamps_ns: row 1"),
+        ("timestamps_ns", [0, 2**63], "timestamps_ns: row 1"),
+        ("sequences", [0, -1], "sequences: row 1"),
+        ("images", [b"", "x.jpg"], "images: row 1"),
+        ("images", [b"", Path("/nowhere.jpg")], "is no file"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            seese3.Upload(two, **{argument: values})
 
 
 def test_tokens_and_tls(drawn: Path, tmp_path: Path) -> None:
@@ -246,3 +263,45 @@ def test_a_command_that_fails_says_why(tmp_path: Path) -> None:
     assert error.value.returncode == 1
     with pytest.raises(seese3.CommandError, match="does not exist"):
         seese3.serve(tmp_path / "none")
+
+
+def test_arguments_that_are_none_are_refused_by_their_names(client: seese3.Client) -> None:
+    for ask, problem in (
+        (lambda: client.navigate(ROOM, -1, to=2), "frame's row"),
+        (lambda: client.navigate(ROOM, 1, to=-2), "to: -2"),
+        (lambda: client.navigate(ROOM, 1, to=2, steps=-1), "steps: -1"),
+        (lambda: client.navigate(ROOM, 1, twist=0), "twist: is"),
+        (lambda: client.navigate(ROOM, 1, twist=np.zeros(6, complex)), "complex"),
+        (lambda: client.navigate_batch(ROOM, [seese3.Question(1, to=2), seese3.Question(1)]), r"questions\[1\]"),
+        (lambda: client.localize(1, rooms=ROOM, deadline_s=float("nan")), "deadline_s"),
+        (lambda: client.track(resume_token=b"x"), "last_sequence"),
+        (lambda: client.set_default(revision=3), "room and adapter"),
+        (lambda: seese3.Prediction(1, 2), "exactly one"),
+        (lambda: seese3.Camera(640, 480, float("inf")), "focal length"),
+        (lambda: seese3.Client("127.0.0.1:99999"), "no server address"),
+        (lambda: seese3.Client("127.0.0.1:1", token="a\nb"), "token"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            ask()
+    with pytest.raises(TypeError, match="views: is a sequence"):
+        client.encode(b"an image")
+
+    # For ever, and not a deadline that has passed.
+    assert client.localize(1, rooms=ROOM, deadline_s=float("inf")).places[0].frame.id == 1
+    client.close()
+    with pytest.raises(seese3.SeeseError, match="closed"):
+        client.rooms()
+
+
+def test_a_program_that_says_strange_things_is_heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "program"
+    program.write_text("#!/bin/sh\nhead -c 200000 /dev/urandom >&2\necho done\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("SEESE3", str(program))
+    assert seese3.run("anything") == "done\n"
+
+    # A server that never says where it listens is given up.
+    program.write_text("#!/bin/sh\nsleep 60\n")
+    monkeypatch.setattr(seese3.program, "LOADING_S", 0.3)
+    with pytest.raises(seese3.SeeseError, match="did not say"):
+        seese3.serve(tmp_path)

@@ -1,5 +1,6 @@
 """Stores without a server. What is written here the program reads, and the other way round."""
 
+import hashlib
 import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -113,13 +114,116 @@ def test_unfit_rooms_are_refused_and_leave_nothing(tmp_path: Path) -> None:
         (broken, {"a": rows}, "row 2"),
         (good, {"a": rows[:3]}, "features: 'a' is"),
         (good, {"a": rows * np.nan}, "row 0"),
-        (good, {"../a": rows}, "cannot name"),
+        (good, {"../a": rows}, "cannot be the name"),
+        (good, {"a": rows, seese3.FeatureSource("a", 3): rows}, "same name"),
+        (good + 2e6 * np.eye(4)[:, [1, 2, 3, 0]], {"a": rows}, "from the origin"),
     ):
         with pytest.raises(ValueError, match=problem):
             store.write_room("hall", wrong, features)
-    with pytest.raises(ValueError, match="cannot name"):
+    for columns, problem in (
+        ({"timestamps_ns": np.full(4, 2**63, np.uint64)}, "timestamps_ns"),
+        ({"sequences": [-1] * 4}, "sequences"),
+        ({"names": ["a", "b", "c", 4]}, "names: row 3"),
+        ({"names": "abcd"}, "names: is a list"),
+        ({"licence": float("nan")}, "licence"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            store.write_room("hall", good, {"a": rows}, **columns)
+    with pytest.raises(ValueError, match="cannot be the name"):
         store.write_room("../hall", good, {"a": rows})
     assert not store.folder.exists()
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 0, 2)])
+def test_arrays_are_stored_whatever_their_memory_looks_like(tmp_path: Path, order: tuple[int, int, int]) -> None:
+    """Oracle: the program's own export. A transposed view has the numbers of its array in another order in memory."""
+    stated, rows = poses(5), RANDOM.normal(size=(5, 3)).astype(np.float32)
+    strided = np.ascontiguousarray(stated.transpose(order)).transpose(np.argsort(order))
+    np.testing.assert_array_equal(strided, stated)
+
+    store = seese3.Store(tmp_path / "store")
+    store.write_room("hall", strided, {"a": np.asfortranarray(rows)[::-1][::-1]}, timestamps_ns=np.arange(10)[::2])
+    seese3.run("export", "numpy", "--store", store.folder, "--room", "hall", "--out", tmp_path / "out")
+    np.testing.assert_allclose(np.load(tmp_path / "out/poses.npy"), stated, atol=1e-12)
+    np.testing.assert_array_equal(np.load(tmp_path / "out/features_a.npy"), rows)
+    np.testing.assert_array_equal(store.room("hall").timestamps_ns, [0, 2, 4, 6, 8])
+
+
+def test_writers_at_once_lose_nothing_of_each_other(tmp_path: Path) -> None:
+    store, stated = seese3.Store(tmp_path), poses(3)
+    sets = [f"x{number}" for number in range(12)]
+    with ThreadPoolExecutor(6) as pool:
+        list(pool.map(lambda name: store.write_room("hall", stated, {name: np.ones((3, 2))}), sets))
+    assert sorted(store.room("hall").features) == sorted(sets)
+    seese3.run("store", "verify", "--store", store.folder)
+
+
+def test_a_licence_is_kept_by_those_who_add_features(tmp_path: Path) -> None:
+    store, stated = seese3.Store(tmp_path), poses(3)
+    store.write_room("hall", stated, {"a": np.ones((3, 2))}, licence="CC BY 4.0", format="mine")
+    store.write_room("hall", stated, {"b": np.ones((3, 2))})
+    provenance = store.room("hall").manifest["provenance"]
+    assert (provenance["licence"], provenance["format"]) == ("CC BY 4.0", "mine")
+
+
+def test_unfit_adapters_are_refused_and_leave_nothing(tmp_path: Path) -> None:
+    store = seese3.Store(tmp_path / "store")
+    source = seese3.FeatureSource("mine", 6)
+    shapes = [(8, 6), (8,), (8,), (8,), (7, 8), (7,), (6, 7)]
+    good = {name: RANDOM.normal(size=shape) for name, shape in zip(seese3.store.WEIGHTS, shapes, strict=True)}
+    told = {
+        "source": source,
+        "features": np.ones((3, 6)),
+        "rooms": {"hall": 1},
+        "stride": 5,
+        "epochs": 1,
+        "target_mean": np.zeros(6),
+        "target_deviation": np.ones(6),
+    }
+    for weights, changes, problem in (
+        (good, {"split": "block"}, "split"),
+        (good, {"stride": 0}, "stride"),
+        (good, {"stride": 1.5}, "stride"),
+        (good, {"seed": -1}, "seed"),
+        (good, {"rooms": {"hall": "x"}}, "rooms"),
+        (good, {"target_deviation": np.full(6, np.inf)}, "finite"),
+        ({**good, "W.weight": np.zeros((6, 7))}, {}, "rank"),
+        ({**good, "W.weight": np.full((6, 7), np.nan)}, {}, "finite"),
+        ({**good, "phi.0.weight": np.ones(8)}, {}, "phi.0.weight"),
+        ({**good, "foo": np.ones(3)}, {}, "foo"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            store.write_adapter("mine", weights, **{**told, **changes})
+    assert not store.folder.exists()
+
+
+def test_a_manifest_names_files_of_its_own_alone(tmp_path: Path) -> None:
+    """A manifest with a right checksum, made by hand: what it says is not believed for that."""
+    store = seese3.Store(tmp_path / "store")
+    store.write_room("hall", poses(3), {"a": np.ones((3, 2))}, names=["u", "v", "w"])
+    (tmp_path / "outside.json").write_text('["x", "y", "z"]')
+    manifest = store.folder / "rooms/hall/revisions/000001.json"
+    body = json.loads(manifest.read_text())["body"]
+    content = (tmp_path / "outside.json").read_bytes()
+    for changes, problem in (
+        (
+            {
+                "frame_names": {
+                    "file": "../../../../outside.json",
+                    "sha256": hashlib.sha256(content).hexdigest(),
+                    "bytes": len(content),
+                }
+            },
+            "none of its own",
+        ),
+        ({"room": "other"}, "another room"),
+        ({"features": [{"source": 3}]}, "not valid"),
+    ):
+        text = json.dumps({**body, **changes})
+        sha256 = hashlib.sha256(text.encode()).hexdigest()
+        manifest.write_text(f'{{"sha256": "{sha256}", "body": {text}}}')
+        with pytest.raises(seese3.DamagedError, match=problem):
+            store.room("hall")
 
 
 def test_of_many_writers_each_gets_a_number_of_its_own(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -122,8 +123,17 @@ def test_a_recording_is_followed_ahead_of_its_answers(drawn: Path, tmp_path: Pat
     # 17 frames had been sent; nobody asked for the answers to 16 of them, and the stream knows them all the same.
     assert after[0].sequence == 18
 
-    with pytest.raises(ValueError, match="ahead"), server.client() as client:
-        list(client.track(config).follow(iter(frames), ahead=-1))
+
+def test_newer_frames_that_take_the_place_of_older_ones_are_counted(client: seese3.Client, drawn: Path) -> None:
+    """One refusal stands for all frames that were superseded: whoever waits for an answer to each waits for ever."""
+    rows = seese3.Store(drawn).room(ROOM).features[FEATURES]
+    frames = [(row * PERIOD_NS, feature) for row, feature in enumerate(rows)]
+    with client.track(seese3.TrackConfig(room=ROOM, newest_only=True)) as track:
+        answers = list(track.follow(iter(frames), ahead=64))
+        assert track.start is not None and track.start.adapter.name == "robot"
+    refused = sum(one.frames for one in answers if isinstance(one, seese3.TrackRefusal))
+    assert refused + sum(isinstance(one, seese3.TrackUpdate) for one in answers) == len(frames)
+    assert answers[-1].sequence == len(frames)
 
 
 def test_a_token_carries_a_stream_to_another_client(server: seese3.Server, drawn: Path) -> None:
@@ -146,6 +156,14 @@ def test_what_a_stream_refuses(client: seese3.Client) -> None:
         client.track(seese3.TrackConfig(room=ROOM, token_every=0))
     with pytest.raises(ValueError, match="exactly one"):
         client.track()
+    with pytest.raises(ValueError, match="ahead"), client.track(seese3.TrackConfig(room=ROOM)) as track:
+        list(track.follow(iter([]), ahead=-1))
+    # A stream that is refused leaves no thread behind.
+    threads = threading.active_count()
+    for _ in range(5):
+        with pytest.raises(seese3.NotFoundError), client.track(seese3.TrackConfig(room="nowhere")):
+            pass
+    assert threading.active_count() <= threads + 1
     with client.track(seese3.TrackConfig(room=ROOM)) as track:
         refused = track.step(np.zeros(3), 0)
         assert isinstance(refused, seese3.TrackRefusal) and refused.reason == "view"

@@ -21,14 +21,21 @@ pub struct BagPath {
     /// there is only one
     #[arg(long, value_name = "TOPIC", conflicts_with = "world_frame")]
     pose_topic: Option<String>,
-    /// Take the poses from /tf instead: those of the images' frame in this one, such as map
+    /// Take the camera's poses from /tf: its pose in this frame, such as map
     #[arg(long, value_name = "FRAME")]
     world_frame: Option<String>,
-    /// The camera on what the poses are of, x,y,z,qx,qy,qz,qw in metres, where the transforms do not
-    /// tell it
-    #[arg(long, value_delimiter = ',', allow_hyphen_values = true, num_args = 1)]
+    /// The camera's pose (optical axes) in the frame whose poses are read, such as base_link:
+    /// x,y,z,qx,qy,qz,qw in metres; needed where /tf does not have it
+    #[arg(
+        long,
+        value_delimiter = ',',
+        allow_hyphen_values = true,
+        num_args = 1,
+        conflicts_with = "world_frame"
+    )]
     base_from_camera: Option<Vec<f64>>,
-    /// The folder for the images, which the room refers to; NAME-images beside the bag if omitted
+    /// The folder for the images, which the room refers to, a folder in it for each topic; BAG-images
+    /// beside the bag if omitted. A file that is there is never replaced
     #[arg(long, value_name = "DIR")]
     images_to: Option<PathBuf>,
     #[command(flatten)]
@@ -52,10 +59,13 @@ impl BagPath {
         };
 
         let read = |reader: &mut Reader<'_>| datasets::read_bag(&self.path, &bag, reader);
-        let recording = self.to.read(read)?;
+        let (recording, images) = self.to.read(read)?;
         self.to
             .publish("bag", &self.path, recording, self.poses.direction)
-            .await
+            .await?;
+
+        images.keep();
+        Ok(())
     }
 }
 
@@ -82,7 +92,7 @@ fn mounting(numbers: &[f64]) -> anyhow::Result<Pose> {
     ))
 }
 
-/// The folder NAME-images beside a bag, which is a folder NAME or a file NAME.mcap or NAME.db3.
+/// The folder BAG-images beside a bag, which is a folder BAG or a file BAG.mcap or BAG.db3.
 fn images_beside(bag: &Path) -> PathBuf {
     // A path such as `.` only has a name once it is resolved.
     let path = bag.canonicalize().unwrap_or_else(|_| bag.to_owned());

@@ -11,7 +11,7 @@ use crate::cli::camera::CameraOption;
 use crate::cli::encode::same_poses;
 use crate::cli::output::{JsonOutput, say};
 use crate::cli::pose_options::{DirectionName, PoseOptions};
-use crate::cli::pose_report::PoseReport;
+use crate::cli::pose_report::{PoseReport, PosesFrom};
 use crate::cli::progress::bar;
 use crate::datasets::{self, Reader, Recording, Unusable};
 use crate::store::{Store, check_features};
@@ -30,8 +30,8 @@ pub struct Destination {
     #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
     /// Fail and publish nothing if a frame is unusable, instead of dropping it, and if the poses are
-    /// wrong for certain (contradicted by the images, all the same, identities where tracking was
-    /// lost, in another unit), instead of warning
+    /// wrong (contradicted by the images, all the same, identities where tracking was lost, steps that
+    /// no camera makes in metres, times that do not rise), instead of warning
     #[arg(long)]
     strict: bool,
     /// Publish a new revision even if the store has a room of this name with other frames; the
@@ -83,12 +83,19 @@ impl Destination {
         );
     }
 
+    /// Finds out before the work whether its results can be written.
+    pub fn begin(&self) -> anyhow::Result<()> {
+        self.json.begin()
+    }
+
     /// Reads a recording with a progress bar, dropping or refusing unusable frames as --strict
     /// says.
-    pub fn read(
+    pub fn read<T>(
         &self,
-        read: impl FnOnce(&mut Reader<'_>) -> Result<Recording, datasets::Error>,
-    ) -> anyhow::Result<Recording> {
+        read: impl FnOnce(&mut Reader<'_>) -> Result<T, datasets::Error>,
+    ) -> anyhow::Result<T> {
+        self.begin()?;
+
         let progress = bar(0, "reading");
 
         let unusable = if self.strict {
@@ -222,7 +229,6 @@ impl Destination {
         mut recording: Recording,
         direction: DirectionName,
     ) -> anyhow::Result<()> {
-        self.json.begin()?;
         let read_count = recording.frames.poses.len();
 
         self.read_features(&mut recording)?;
@@ -253,7 +259,9 @@ impl Destination {
         self.say_read(&room, &features, &recording, read_count);
         let mut report = PoseReport::of_path(&room);
         if !self.skip_pose_check && !room.images().is_empty() {
-            report.look_at_images(&room, Path::new(&recording.images_root), &stated, read_as);
+            let root = Path::new(&recording.images_root);
+            let from = PosesFrom::Recording(read_as);
+            report.look_at_images(&room, root, &stated, from);
         }
         report.say();
         if format == "colmap" && self.read_as.has_no_scale() {
@@ -263,6 +271,12 @@ impl Destination {
             );
         }
 
+        if self.strict && report.has_unreadable_images() {
+            bail!(
+                "images of room '{}' cannot be read, see the warnings; nothing was published (--strict)",
+                room.id()
+            );
+        }
         if self.strict && report.is_wrong() {
             bail!(
                 "the poses of room '{}' are wrong, see the warnings; nothing was published (--strict)",

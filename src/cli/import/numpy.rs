@@ -43,6 +43,7 @@ impl std::str::FromStr for PosesOption {
 
 impl Numpy {
     pub async fn import(self) -> anyhow::Result<()> {
+        self.to.begin()?;
         let mut file = None;
         let mut direction = DirectionName::WorldFromCamera;
         for given in self.poses {

@@ -36,7 +36,7 @@ pub fn say_frames(room: &Room) {
     let gaps = room
         .frame_numbers()
         .windows(2)
-        .filter(|pair| pair[1] > pair[0] + 1)
+        .filter(|pair| pair[1].saturating_sub(pair[0]) > 1)
         .count();
 
     if gaps > 0 {

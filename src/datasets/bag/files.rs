@@ -84,7 +84,15 @@ fn files_of(bag: &Path) -> Result<Vec<PathBuf>, Error> {
     if names.is_empty() {
         return Err(Error::Malformed {
             file: bag.to_owned(),
-            problem: "has no .mcap and no .db3 files: it is no bag of ROS 2".to_owned(),
+            problem: "has no .mcap and no .db3 files: it is not a bag of ROS 2".to_owned(),
+        });
+    }
+    let has = |ending: &str| names.iter().any(|name| name.ends_with(ending));
+    if has(".mcap") && has(".db3") {
+        return Err(Error::Malformed {
+            file: bag.to_owned(),
+            problem: "has .mcap and .db3 files, which may be the same recording twice: name one of the files"
+                .to_owned(),
         });
     }
 
@@ -102,6 +110,13 @@ fn form_of(file: &Path) -> Result<Form, Error> {
         file: file.to_owned(),
         cause,
     };
+    // Opening a pipe would wait for someone to write into it.
+    if !std::fs::metadata(file).map_err(io)?.is_file() {
+        return Err(Error::Malformed {
+            file: file.to_owned(),
+            problem: "is not a regular file".to_owned(),
+        });
+    }
     let mut first = Vec::new();
     let opened = File::open(file).map_err(io)?;
     opened.take(16).read_to_end(&mut first).map_err(io)?;

@@ -6,11 +6,15 @@ use std::io::Read;
 use std::path::Path;
 
 use mcap::records::{Channel, Record, SchemaHeader};
-use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader};
+use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
 use super::files::{Message, Topic};
 use super::messages::Kind;
 use crate::datasets::Error;
+
+/// Records, and chunks of them when they are unpacked, are at most as long as their file, and may have this
+/// length at least and at most, bytes: what states a greater one is damaged.
+const LONGEST_RECORD: std::ops::Range<usize> = 1 << 28..1 << 30;
 
 /// Calls `take` with every message that is understood, and returns all topics.
 pub fn each_message(
@@ -25,10 +29,18 @@ pub fn each_message(
         file: file.to_owned(),
         problem,
     };
-    let damaged = |error: mcap::McapError| malformed(format!("is no whole MCAP file: {error}"));
+    let damaged =
+        |error: mcap::McapError| malformed(format!("is a truncated or damaged MCAP file: {error}"));
 
     let mut source = File::open(file).map_err(io)?;
-    let mut reader = LinearReader::new();
+    let length = source.metadata().map_err(io)?.len();
+    let length = usize::try_from(length).unwrap_or(usize::MAX);
+    // Checked before its messages are used: a chunk whose bits were flipped reads as other poses.
+    let options = LinearReaderOptions::default()
+        .with_prevalidate_chunk_crcs(true)
+        .with_validate_data_section_crc(true)
+        .with_record_length_limit(length.clamp(LONGEST_RECORD.start, LONGEST_RECORD.end));
+    let mut reader = LinearReader::new_with_options(options);
     let mut schemas = BTreeMap::new();
     let mut topics: BTreeMap<u16, Topic> = BTreeMap::new();
 

@@ -71,6 +71,14 @@ impl Kind {
         )
     }
 
+    /// Whether its messages are transforms between frames that both have names.
+    pub fn is_transforms(&self) -> bool {
+        matches!(
+            self,
+            Self::RosTransforms | Self::FoxgloveTransform | Self::FoxgloveTransforms
+        )
+    }
+
     /// Whether its messages say where something is, one pose each.
     pub fn is_pose(&self) -> bool {
         matches!(
@@ -84,19 +92,10 @@ impl Kind {
     }
 }
 
-/// What a message says.
-#[derive(Debug)]
-pub enum Located {
-    Image(Image),
-    /// One pose of a pose topic, or several transforms.
-    Poses(Vec<StampedPose>),
-}
-
+/// An image and when it was taken.
 #[derive(Debug)]
 pub struct Image {
     pub time_ns: i64,
-    /// The frame of the camera.
-    pub frame: String,
     pub picture: Picture,
 }
 
@@ -145,48 +144,59 @@ impl Picture {
     }
 }
 
-/// What a message says. The time of recording stands for a stamp of zero. The error says what is wrong
-/// with which topic.
-pub fn decode(message: &Message<'_>) -> Result<Located, String> {
-    let Message {
-        topic,
-        kind,
-        log_time_ns,
-        data,
-    } = *message;
-
-    // A message of CDR begins with a zero.
-    if data.starts_with(ZSTD) {
-        return Err(format!(
-            "topic {topic}: messages are compressed one by one; `ros2 bag convert` the bag without \
-             compression_mode"
-        ));
-    }
-    decode_data(kind, data, log_time_ns).map_err(|problem| format!("topic {topic}: {problem}"))
+/// The poses that a message states, none if it is an image. The time of recording stands for a stamp of
+/// zero. The error says what is wrong.
+pub fn poses_of(message: &Message<'_>) -> Result<Vec<StampedPose>, String> {
+    decode_poses(message.kind, uncompressed(message)?, message.log_time_ns)
 }
 
-fn decode_data(kind: Kind, data: &[u8], log_time: i64) -> Result<Located, String> {
-    let image = |time_ns: i64, frame: String, picture: Picture| {
-        Located::Image(Image {
-            time_ns: if time_ns == 0 { log_time } else { time_ns },
-            frame,
+/// The frame of the camera that an image is of; empty if the message does not state one.
+pub fn camera_frame_of(message: &Message<'_>) -> Result<String, String> {
+    let data = uncompressed(message)?;
+    match message.kind {
+        // Every message with a header begins with it: the pixels need not be read.
+        Kind::RosCompressedImage | Kind::RosImage => Ok(cdr::<RosHeader>(data)?.frame_id),
+        Kind::FoxgloveCompressedImage => {
+            let image: foxglove::messages::CompressedImage = protobuf(data)?;
+            Ok(image.frame_id)
+        }
+        _ => Ok(String::new()),
+    }
+}
+
+/// The bytes of a message, which begin with a zero in CDR.
+fn uncompressed<'a>(message: &Message<'a>) -> Result<&'a [u8], String> {
+    if message.data.starts_with(ZSTD) {
+        return Err(
+            "messages are compressed one by one; `ros2 bag convert` the bag without compression_mode"
+                .to_owned(),
+        );
+    }
+    Ok(message.data)
+}
+
+/// The image that a message is; none if it is something else.
+pub fn image_of(message: &Message<'_>) -> Result<Option<Image>, String> {
+    let data = uncompressed(message)?;
+    let image = |time_ns: i64, picture: Picture| {
+        Some(Image {
+            time_ns: stamp_or(time_ns, message.log_time_ns),
             picture,
         })
     };
 
-    Ok(match kind {
+    Ok(match message.kind {
         Kind::RosCompressedImage => {
             let message: RosCompressedImage = cdr(data)?;
             let picture = Picture::Compressed {
                 format: message.format,
                 bytes: message.data,
             };
-            image(message.header.time_ns(), message.header.frame_id, picture)
+            image(message.header.time_ns(), picture)
         }
         Kind::RosImage => {
             let message: RosImage = cdr(data)?;
-            let (time, frame) = (message.header.time_ns(), message.header.frame_id.clone());
-            image(time, frame, Picture::Raw(message))
+            image(message.header.time_ns(), Picture::Raw(message))
         }
         Kind::FoxgloveCompressedImage => {
             let message: foxglove::messages::CompressedImage = protobuf(data)?;
@@ -194,15 +204,20 @@ fn decode_data(kind: Kind, data: &[u8], log_time: i64) -> Result<Located, String
                 format: message.format,
                 bytes: message.data.to_vec(),
             };
-            image(foxglove_time(message.timestamp), message.frame_id, picture)
+            image(foxglove_time(message.timestamp), picture)
         }
-        _ => Located::Poses(decode_poses(kind, data, log_time)?),
+        _ => None,
     })
+}
+
+/// The stamp of a message, or when it was recorded if it has none.
+fn stamp_or(stamp_ns: i64, log_time_ns: i64) -> i64 {
+    if stamp_ns == 0 { log_time_ns } else { stamp_ns }
 }
 
 fn decode_poses(kind: Kind, data: &[u8], log_time: i64) -> Result<Vec<StampedPose>, String> {
     let stamped = |time_ns: i64, parent: String, child: String, pose: Pose| StampedPose {
-        time_ns: if time_ns == 0 { log_time } else { time_ns },
+        time_ns: stamp_or(time_ns, log_time),
         parent,
         child,
         pose,
@@ -275,7 +290,8 @@ fn decode_poses(kind: Kind, data: &[u8], log_time: i64) -> Result<Vec<StampedPos
 
 /// A message of ROS 2. The first four bytes say in which order the bytes of numbers are.
 fn cdr<T: DeserializeOwned>(data: &[u8]) -> Result<T, String> {
-    let wrong = |error: cdr_encoding::Error| format!("a message is not whole: {error}");
+    let wrong =
+        |error: cdr_encoding::Error| format!("the message is truncated or malformed: {error}");
     match data {
         [_, order, _, _, rest @ ..] if order % 2 == 1 => {
             cdr_encoding::from_bytes::<T, LittleEndian>(rest)
@@ -285,12 +301,12 @@ fn cdr<T: DeserializeOwned>(data: &[u8]) -> Result<T, String> {
         [_, _, _, _, rest @ ..] => cdr_encoding::from_bytes::<T, BigEndian>(rest)
             .map(|(message, _)| message)
             .map_err(wrong),
-        _ => Err("a message is not whole".to_owned()),
+        _ => Err("the message is truncated".to_owned()),
     }
 }
 
 fn protobuf<T: Decode>(data: &[u8]) -> Result<T, String> {
-    T::decode(data).map_err(|error| format!("a message is not whole: {error}"))
+    T::decode(data).map_err(|error| format!("the message is truncated or malformed: {error}"))
 }
 
 /// Nanoseconds since the epoch; 0 if there is no time.
@@ -311,7 +327,7 @@ fn foxglove_transform(
 ) -> Result<StampedPose, String> {
     let time_ns = foxglove_time(message.timestamp);
     Ok(StampedPose {
-        time_ns: if time_ns == 0 { log_time } else { time_ns },
+        time_ns: stamp_or(time_ns, log_time),
         pose: foxglove_parts(message.translation, message.rotation)?,
         parent: message.parent_frame_id,
         child: message.child_frame_id,
@@ -463,8 +479,8 @@ impl RosPose {
             && [x, y, z].iter().all(|n| n.is_finite()))
         {
             return Err(format!(
-                "a pose has the quaternion ({}, {}, {}, {}) and the position ({x}, {y}, {z}): no unit quaternion, or not \
-                 finite",
+                "a pose has the quaternion ({}, {}, {}, {}) and the position ({x}, {y}, {z}): the quaternion is not of \
+                 length 1, or a number is not finite",
                 q.x, q.y, q.z, q.w
             ));
         }

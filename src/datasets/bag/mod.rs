@@ -18,6 +18,7 @@ mod mcap_file;
 mod messages;
 mod poses;
 mod sqlite_file;
+mod written_images;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -25,32 +26,40 @@ use std::path::{Path, PathBuf};
 use super::collect::{About, Collected};
 use super::{DropReason, Error, Reader, Recording};
 use files::{Topic, each_message};
-use messages::{ImageFile, Kind, Located, Picture};
+use messages::{Image, Kind};
 use poses::Poses;
 use seese3_core::geometry::Pose;
+pub use written_images::WrittenImages;
 
-/// What of a bag is read. What is left out is chosen if there is only one.
+/// Which parts of a bag are read. A topic that is `None` is chosen if the bag has only one of its kind.
 #[derive(Debug, Clone, Default)]
 pub struct Bag {
     /// The topic of the images.
     pub image_topic: Option<String>,
-    /// The topic of the poses; without it, and with `world`, the transforms of /tf are used.
+    /// The topic of the poses; without it, and with `world`, the transforms of /tf are used. The world of
+    /// the room is the frame in which its poses are stated.
     pub pose_topic: Option<String>,
     /// The frame of /tf in which the camera's poses are wanted.
     pub world: Option<String>,
-    /// The camera on what the poses are of; identity if the poses are those of the camera. Without
-    /// it, /tf is asked.
+    /// The camera's pose in the frame whose poses the topic states, such as base_link. `None`: it is
+    /// looked up in /tf, or the poses are the camera's own if the topic names no frame.
     pub base_from_camera: Option<Pose>,
-    /// The folder for the images, made if it does not exist.
+    /// The folder for the images, made if it does not exist. Each topic has a folder in it.
     pub images: PathBuf,
 }
 
-/// Reads a bag: a folder as ROS 2 writes it, or one of its files.
+/// Reads a bag: a folder as ROS 2 writes it, or one of its files. The images are removed again unless
+/// they are kept, see [`WrittenImages`].
 ///
 /// # Errors
 /// [`Error`] if a file cannot be read or is damaged, a topic is not in it or has messages of another
-/// kind, several could be meant, no image has a pose, or an image cannot be written.
-pub fn read_bag(path: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recording, Error> {
+/// kind, several could be meant, no image has a pose, an image cannot be written or would replace
+/// another one, or if `reader` refuses unusable frames and there are some.
+pub fn read_bag(
+    path: &Path,
+    bag: &Bag,
+    reader: &mut Reader<'_>,
+) -> Result<(Recording, WrittenImages), Error> {
     let malformed = |problem: String| Error::Malformed {
         file: path.to_owned(),
         problem,
@@ -59,17 +68,19 @@ pub fn read_bag(path: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recor
     let Contents {
         topics,
         mut poses,
+        malformed_poses,
         mut images,
     } = contents(path)?;
 
-    let image_topic = chosen_topic(&topics, bag.image_topic.as_deref(), Kind::is_image, "image")
-        .map_err(&malformed)?;
+    let image_topic = chosen_topic(&topics, bag.image_topic.as_deref(), &IMAGES);
+    let image_topic = image_topic.map_err(&malformed)?;
     let (count, camera_frame) = images.remove(&image_topic).unwrap_or_default();
     let pose_topic = match (&bag.pose_topic, &bag.world) {
         (None, Some(_)) => None,
-        (given, _) => Some(
-            chosen_topic(&topics, given.as_deref(), Kind::is_pose, "pose").map_err(&malformed)?,
-        ),
+        (given, _) => {
+            let chosen = chosen_topic(&topics, given.as_deref(), &POSES);
+            Some(chosen.map_err(&malformed)?)
+        }
     };
 
     poses.sort();
@@ -80,15 +91,25 @@ pub fn read_bag(path: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recor
             &camera_frame,
             bag.base_from_camera,
         )
-        .map_err(&malformed)?;
-
-    let io = |cause| Error::Io {
-        file: bag.images.clone(),
-        cause,
-    };
-    std::fs::create_dir_all(&bag.images).map_err(io)?;
+        .map_err(|problem| {
+            // Nothing is known where all messages are malformed: what is wrong with the first one says why.
+            let of_topic = |message: &&MalformedPose| Some(&message.topic) == pose_topic.as_ref();
+            match malformed_poses.iter().find(of_topic) {
+                Some(first) => malformed(format!("{problem}; the first: {}", first.problem)),
+                None => malformed(problem),
+            }
+        })?;
 
     let mut collected = Collected::default();
+    for message in malformed_poses {
+        if message.is_transform || Some(&message.topic) == pose_topic.as_ref() {
+            let name = format!("message {} of {}", message.number, message.topic);
+            collected.drop_for(name, DropReason::MalformedMessage, message.problem);
+        }
+    }
+
+    let mut written = WrittenImages::in_folder(bag.images.join(folder_of(&image_topic)))?;
+    let mut frames = Vec::new();
     let mut done = 0;
     each_message(path, |message| {
         if message.topic != image_topic {
@@ -96,50 +117,107 @@ pub fn read_bag(path: &Path, bag: &Bag, reader: &mut Reader<'_>) -> Result<Recor
         }
         (reader.progress)(done, count);
         done += 1;
+        let number = format!("{done:06}");
 
-        let Located::Image(image) = messages::decode(message)? else {
+        let file = messages::image_of(message).and_then(|image| {
+            image
+                .map(|Image { time_ns, picture }| Ok((time_ns, picture.file()?)))
+                .transpose()
+        });
+        let (time_ns, file) = match file {
+            Ok(Some(found)) => found,
+            Ok(None) => return Ok(()),
+            Err(problem) => {
+                collected.drop_for(number, DropReason::MalformedMessage, problem);
+                return Ok(());
+            }
+        };
+        let Some(world_from_camera) = camera.at(time_ns) else {
+            collected.drop(number, DropReason::NoPoseWithinTolerance);
             return Ok(());
         };
-        let name = format!("{done:06}");
-        let Some(world_from_camera) = camera.at(image.time_ns) else {
-            collected.drop(name, DropReason::NoPoseWithinTolerance);
-            return Ok(());
-        };
 
-        let name = written(&bag.images, &name, &image.picture)?;
-        let about = About {
-            name: name.clone(),
-            image: Some(name),
-            timestamp_ns: Some(image.time_ns),
-            ..About::default()
-        };
-        collected.keep(about, world_from_camera);
+        let name = format!("{number}.{}", file.extension);
+        written.write(&name, &file.bytes)?;
+        frames.push((time_ns, name, world_from_camera));
         Ok(())
     })?;
 
-    collected.finish(&bag.images, reader)
+    // Messages may be recorded in another order than that in which their images were taken.
+    frames.sort_by_key(|(time_ns, ..)| *time_ns);
+    for (time_ns, name, world_from_camera) in frames {
+        let about = About {
+            name: name.clone(),
+            image: Some(name),
+            timestamp_ns: Some(time_ns),
+            ..About::default()
+        };
+        collected.keep(about, world_from_camera);
+    }
+
+    // What is missing is missing in the bag, and not in the folder of its images.
+    let of_bag = |error| match error {
+        Error::NoFrames { dropped, .. } => Error::NoFrames {
+            folder: path.to_owned(),
+            dropped,
+        },
+        Error::Strict { dropped, .. } => Error::Strict {
+            folder: path.to_owned(),
+            dropped,
+        },
+        other => other,
+    };
+    let recording = collected.finish(written.folder(), reader).map_err(of_bag)?;
+    Ok((recording, written))
 }
 
 /// What the first pass finds.
 struct Contents {
     topics: BTreeMap<String, Topic>,
     poses: Poses,
+    malformed_poses: Vec<MalformedPose>,
     /// By topic, the number of images and the frame of the camera.
     images: BTreeMap<String, (usize, String)>,
 }
 
+/// A message that should state poses, and states none.
+struct MalformedPose {
+    topic: String,
+    is_transform: bool,
+    /// Counted from 1, of the messages of its topic.
+    number: usize,
+    problem: String,
+}
+
 fn contents(path: &Path) -> Result<Contents, Error> {
     let mut poses = Poses::default();
-    let mut images = BTreeMap::new();
+    let mut malformed_poses = Vec::new();
+    let mut images: BTreeMap<String, (usize, String)> = BTreeMap::new();
+    let mut counts: BTreeMap<String, usize> = BTreeMap::new();
 
     let topics = each_message(path, |message| {
-        match messages::decode(message)? {
-            Located::Poses(found) => poses.add(message.topic, found),
-            Located::Image(image) => {
-                let topic = message.topic.to_owned();
-                let counted = images.entry(topic).or_insert((0, image.frame));
-                counted.0 += 1;
+        let topic = message.topic.to_owned();
+        if message.kind.is_image() {
+            let (count, frame) = images.entry(topic).or_default();
+            *count += 1;
+            // An image that cannot be read is named when it is written.
+            if frame.is_empty() {
+                *frame = messages::camera_frame_of(message).unwrap_or_default();
             }
+            return Ok(());
+        }
+
+        let number = counts.entry(topic.clone()).or_default();
+        *number += 1;
+        match messages::poses_of(message) {
+            Ok(found) if message.kind.is_transforms() => poses.add_transforms(&topic, found),
+            Ok(found) => poses.add_poses(&topic, found),
+            Err(problem) => malformed_poses.push(MalformedPose {
+                is_transform: message.kind.is_transforms(),
+                number: *number,
+                topic,
+                problem,
+            }),
         }
         Ok(())
     })?;
@@ -147,26 +225,62 @@ fn contents(path: &Path) -> Result<Contents, Error> {
     Ok(Contents {
         topics,
         poses,
+        malformed_poses,
         images,
     })
 }
+
+/// A topic as the name of a folder: /camera/image is camera-image.
+fn folder_of(topic: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '_';
+    let words = topic
+        .split(|c| !is_plain(c))
+        .filter(|word| !word.is_empty());
+    words.collect::<Vec<_>>().join("-")
+}
+
+/// What a topic is wanted for.
+struct Wanted {
+    /// In words, and as the option that names it.
+    what: &'static str,
+    is_of_kind: fn(&Kind) -> bool,
+    /// What to do if there is none.
+    else_do: &'static str,
+}
+
+const IMAGES: Wanted = Wanted {
+    what: "image",
+    is_of_kind: Kind::is_image,
+    else_do: "ROS 2's sensor_msgs/msg/Image and CompressedImage and Foxglove's CompressedImage are read",
+};
+
+const POSES: Wanted = Wanted {
+    what: "pose",
+    is_of_kind: Kind::is_pose,
+    else_do: "ROS 2's PoseStamped, PoseWithCovarianceStamped and Odometry and Foxglove's PoseInFrame and \
+              Odometry are read; give --world-frame FRAME to take the camera's poses from /tf",
+};
 
 /// The topic that is named, or the only one of its kind.
 fn chosen_topic(
     topics: &BTreeMap<String, Topic>,
     named: Option<&str>,
-    is_of_kind: impl Fn(&Kind) -> bool,
-    what: &str,
+    wanted: &Wanted,
 ) -> Result<String, String> {
+    let Wanted {
+        what,
+        is_of_kind,
+        else_do,
+    } = wanted;
     let of_kind = topics
         .values()
-        .filter(|topic| topic.kind.as_ref().is_some_and(&is_of_kind));
+        .filter(|topic| topic.kind.as_ref().is_some_and(is_of_kind));
     let names: Vec<&str> = of_kind.map(|topic| topic.name.as_str()).collect();
 
     match (named, names.as_slice()) {
         (Some(named), _) if names.contains(&named) => Ok(named.to_owned()),
         (Some(named), []) => Err(format!(
-            "has no topic of {what}s, and so not {named}; {}",
+            "has no {what} topic {named}, nor any other {what} topic; {}",
             all_of(topics)
         )),
         (Some(named), _) => Err(format!(
@@ -175,8 +289,7 @@ fn chosen_topic(
         )),
         (None, [only]) => Ok((*only).to_owned()),
         (None, []) => Err(format!(
-            "has no topic of {what}s that is understood: ROS 2's sensor_msgs, geometry_msgs, nav_msgs and tf2_msgs, and \
-             Foxglove's in Protobuf are; {}",
+            "has no {what} topic: {else_do}; {}",
             all_of(topics)
         )),
         (None, _) => Err(format!(
@@ -196,14 +309,4 @@ fn all_of(topics: &BTreeMap<String, Topic>) -> String {
         [] => "it has no topics".to_owned(),
         words => format!("its topics are {}", words.join(", ")),
     }
-}
-
-/// Writes an image to a file of the folder, and returns the file's name.
-fn written(folder: &Path, stem: &str, picture: &Picture) -> Result<String, String> {
-    let ImageFile { extension, bytes } = picture.file()?;
-    let name = format!("{stem}.{extension}");
-    let path = folder.join(&name);
-    std::fs::write(&path, bytes)
-        .map_err(|error| format!("{} cannot be written: {error}", path.display()))?;
-    Ok(name)
 }

@@ -15,10 +15,11 @@ type Track = Vec<(i64, Pose)>;
 /// Everything that a bag says of poses.
 #[derive(Default)]
 pub struct Poses {
-    /// By topic: of what frame in what other, and where.
+    /// By topic of poses: the frame whose poses it has, and the poses.
     topics: BTreeMap<String, PoseTopic>,
-    /// `parent_from_child`, by the names of both.
-    transforms: BTreeMap<(String, String), Track>,
+    /// `parent_from_child`, by the names of both, of topics of transforms alone: other topics may state
+    /// the same two frames and mean another estimate.
+    transforms: BTreeMap<(String, String), Transform>,
 }
 
 #[derive(Default)]
@@ -27,34 +28,38 @@ struct PoseTopic {
     track: Track,
 }
 
+#[derive(Default)]
+struct Transform {
+    track: Track,
+    /// Whether it was said on /tf_static, and holds for ever.
+    is_static: bool,
+}
+
 impl Poses {
-    /// Adds what a message said.
-    pub fn add(&mut self, topic: &str, said: Vec<StampedPose>) {
-        for StampedPose {
-            time_ns,
-            parent,
-            child,
-            pose,
-        } in said
-        {
-            // Transforms name both of their frames, wherever they are said.
-            if !child.is_empty() && !parent.is_empty() {
-                let edge = (plain(&parent), plain(&child));
-                self.transforms
-                    .entry(edge)
-                    .or_default()
-                    .push((time_ns, pose));
-            }
-            let of_topic = self.topics.entry(topic.to_owned()).or_default();
-            of_topic.child = plain(&child);
-            of_topic.track.push((time_ns, pose));
+    /// Adds what a message of a topic of poses said.
+    pub fn add_poses(&mut self, topic: &str, poses: Vec<StampedPose>) {
+        let of_topic = self.topics.entry(topic.to_owned()).or_default();
+        for stated in poses {
+            of_topic.child = without_slash(&stated.child);
+            of_topic.track.push((stated.time_ns, stated.pose));
+        }
+    }
+
+    /// Adds what a message of a topic of transforms said.
+    pub fn add_transforms(&mut self, topic: &str, transforms: Vec<StampedPose>) {
+        for stated in transforms {
+            let edge = (without_slash(&stated.parent), without_slash(&stated.child));
+            let transform = self.transforms.entry(edge).or_default();
+            transform.track.push((stated.time_ns, stated.pose));
+            transform.is_static |= topic.ends_with("tf_static");
         }
     }
 
     /// Brings everything into the order of time. Called once, after the last message.
     pub fn sort(&mut self) {
-        let tracks = self.topics.values_mut().map(|topic| &mut topic.track);
-        for track in tracks.chain(self.transforms.values_mut()) {
+        let of_topics = self.topics.values_mut().map(|topic| &mut topic.track);
+        let of_transforms = self.transforms.values_mut().map(|one| &mut one.track);
+        for track in of_topics.chain(of_transforms) {
             track.sort_by_key(|(time, _)| *time);
         }
     }
@@ -68,9 +73,9 @@ impl Poses {
         camera_frame: &str,
         base_from_camera: Option<Pose>,
     ) -> Result<Path<'_>, String> {
-        let camera = plain(camera_frame);
+        let camera = without_slash(camera_frame);
         let Some(topic) = pose_topic else {
-            let world = plain(world.unwrap_or_default());
+            let world = without_slash(world.unwrap_or_default());
             let chain = self.chain(&world, &camera)?;
             return Ok(Path {
                 chain,
@@ -81,10 +86,11 @@ impl Poses {
         let found = self
             .topics
             .get(topic)
-            .ok_or_else(|| format!("topic {topic} has no messages"))?;
+            .ok_or_else(|| format!("topic {topic} has no message that states a pose"))?;
         let mut chain = vec![Edge {
             track: &found.track,
             is_reversed: false,
+            is_static: false,
         }];
 
         // A topic that does not say what its poses are of is taken to be of the camera.
@@ -112,7 +118,7 @@ impl Poses {
             if frame == to {
                 return Ok(reached.remove(to).unwrap_or_default());
             }
-            for ((parent, child), track) in &self.transforms {
+            for ((parent, child), transform) in &self.transforms {
                 let (next, is_reversed) = match frame {
                     _ if frame == parent => (child.as_str(), false),
                     _ if frame == child => (parent.as_str(), true),
@@ -120,7 +126,11 @@ impl Poses {
                 };
                 if !reached.contains_key(next) {
                     let mut way = reached[frame].clone();
-                    way.push(Edge { track, is_reversed });
+                    way.push(Edge {
+                        track: &transform.track,
+                        is_reversed,
+                        is_static: transform.is_static,
+                    });
                     reached.insert(next, way);
                     open.push_back(next);
                 }
@@ -145,7 +155,7 @@ impl Poses {
 }
 
 /// A frame's name as TF compares it.
-fn plain(frame: &str) -> String {
+fn without_slash(frame: &str) -> String {
     frame.trim_start_matches('/').to_owned()
 }
 
@@ -153,6 +163,7 @@ fn plain(frame: &str) -> String {
 struct Edge<'a> {
     track: &'a Track,
     is_reversed: bool,
+    is_static: bool,
 }
 
 /// Where a camera was, over time.
@@ -166,7 +177,11 @@ impl Path<'_> {
     pub fn at(&self, time_ns: i64) -> Option<Pose> {
         let mut pose = Pose::identity();
         for edge in &self.chain {
-            let step = between(edge.track, time_ns)?;
+            let step = if edge.is_static {
+                last_before(edge.track, time_ns)?
+            } else {
+                between(edge.track, time_ns)?
+            };
             pose *= if edge.is_reversed {
                 step.inverse()
             } else {
@@ -177,13 +192,15 @@ impl Path<'_> {
     }
 }
 
-/// The pose at a time, between those before and after. A track of one pose holds for ever, as those
-/// of /tf_static do.
-fn between(track: &Track, time_ns: i64) -> Option<Pose> {
-    if let [(_, only)] = track.as_slice() {
-        return Some(*only);
-    }
+/// The pose that was said last, as of a static transform: the first one also holds before it was said.
+fn last_before(track: &Track, time_ns: i64) -> Option<Pose> {
+    let after = track.partition_point(|(time, _)| *time <= time_ns);
+    let (_, pose) = track.get(after.saturating_sub(1))?;
+    Some(*pose)
+}
 
+/// The pose at a time, between those before and after.
+fn between(track: &Track, time_ns: i64) -> Option<Pose> {
     let after = track.partition_point(|(time, _)| *time < time_ns);
     let (next_time, next) = track.get(after)?;
     if *next_time == time_ns {
@@ -224,22 +241,24 @@ mod tests {
         path.at(time_ns).map(|pose| pose.translation.x)
     }
 
-    /// By hand: the base moves 1 m in .4 s, and the camera stands .5 m before it. TF names the base's
-    /// parent, so that the chain is walked backwards once.
+    /// By hand: the base moves 1 m in .4 s, and the camera stands .5 m before it. The map is a child
+    /// of odom, so that this transform is inverted.
     #[test]
     fn transforms_are_chained_and_interpolated() {
         let mut poses = Poses::default();
-        poses.add(
+        poses.add_transforms(
             "/tf",
             vec![
                 said(0, "odom", "base", 0.0),
                 said(400_000_000, "odom", "base", 1.0),
             ],
         );
-        poses.add(
+        // Broadcasters of static transforms say theirs again whenever they have a new one.
+        poses.add_transforms(
             "/tf_static",
             vec![
                 said(0, "base", "camera", 0.5),
+                said(200_000_000, "base", "camera", 0.5),
                 said(0, "odom", "/map", -10.0),
             ],
         );
@@ -261,7 +280,7 @@ mod tests {
     fn an_odometry_of_the_base_needs_to_know_where_the_camera_is() {
         let mut poses = Poses::default();
         let track = vec![said(0, "odom", "base", 2.0), said(100, "odom", "base", 3.0)];
-        poses.add("/odom", track);
+        poses.add_poses("/odom", track);
         poses.sort();
 
         let problem = poses
@@ -277,12 +296,29 @@ mod tests {
         assert_eq!(x_at(&path, 50), Some(2.75));
     }
 
+    /// Two estimates of the same frames, of which /tf has one: transforms are those of /tf alone.
+    #[test]
+    fn an_odometry_is_no_transform() {
+        let mut poses = Poses::default();
+        poses.add_poses("/wheel/odom", vec![said(50, "odom", "base", 9.0)]);
+        let of_tf = vec![said(0, "odom", "base", 1.0), said(100, "odom", "base", 2.0)];
+        poses.add_transforms("/tf", of_tf);
+        poses.sort();
+
+        let path = poses.path(None, Some("odom"), "base", None).unwrap();
+        assert_eq!(x_at(&path, 50), Some(1.5));
+        // One pose of a topic is that of its own time.
+        let path = poses.path(Some("/wheel/odom"), None, "base", None).unwrap();
+        assert_eq!(x_at(&path, 50), Some(9.0));
+        assert_eq!(x_at(&path, 51), None);
+    }
+
     /// Half a second without poses: the camera may have been anywhere.
     #[test]
     fn no_pose_is_made_up_over_a_gap() {
         let mut poses = Poses::default();
         let later = LONGEST_GAP_NS + 1;
-        poses.add(
+        poses.add_poses(
             "/pose",
             vec![said(0, "map", "", 0.0), said(later, "map", "", 1.0)],
         );

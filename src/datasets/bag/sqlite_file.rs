@@ -23,14 +23,19 @@ pub fn each_message(
         file: file.to_owned(),
         problem,
     };
-    let damaged = |error: rusqlite::Error| malformed(format!("is no whole bag: {error}"));
+    let damaged = |error: rusqlite::Error| malformed(format!("is a damaged .db3 bag: {error}"));
 
+    // A name such as `file:a.db3` is a name here, and not a URI.
+    let path = file.canonicalize().map_err(|cause| Error::Io {
+        file: file.to_owned(),
+        cause,
+    })?;
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-    let database = Connection::open_with_flags(file, flags).map_err(damaged)?;
+    let database = Connection::open_with_flags(path, flags).map_err(damaged)?;
     for table in ["topics", "messages"] {
         if !has_table(&database, table).map_err(damaged)? {
             return Err(malformed(format!(
-                "is a database without the table '{table}': it is no bag of ROS 2"
+                "is a database without the table '{table}': it is not a bag of ROS 2"
             )));
         }
     }

@@ -3,7 +3,7 @@
 use super::ObservedPair;
 use crate::geometry::Pose;
 
-/// Translations that explain less than this share of the motion tell no depth.
+/// The depth is told only where translations explain at least this share of the motion.
 const TELLS_DEPTH: f64 = 0.03;
 /// Pairs whose motion is off by more than this, image widths and radians together, count for less and
 /// less in a fit: their alignment went wrong, or something near to the camera fills the image.
@@ -14,7 +14,7 @@ const ROUNDS: usize = 8;
 /// What the images tell of the camera and of the scene, if the poses are right.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Seen {
-    /// The focal length, image widths; about 0.8 for a phone or a webcam.
+    /// The focal length, image widths; about 0.8 for a phone or a webcam; 0 if the camera does not turn.
     pub focal: f64,
     /// How far away the things in view are, in the unit of the translations; none if the camera
     /// moves too little, or along a line that tells nothing.
@@ -25,8 +25,8 @@ pub struct Seen {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Follows {
     /// The share of the motion that is explained, 0 to 1: shifts in image widths, turns in radians
-    /// and growths, taken together. A pair of which nothing is explained counts as 0, however wrong
-    /// it is.
+    /// and growths, taken together. A pair whose residual is larger than its motion counts as 0, and
+    /// not as less.
     pub explained: f64,
     /// The same without the translations.
     pub explained_by_rotations: f64,
@@ -34,7 +34,8 @@ pub struct Follows {
     pub seen: Seen,
 }
 
-/// What one stated motion says of one observed number: the two causes that it may have.
+/// What one observed number would be by a stated rotation and by a stated translation, each times a
+/// factor: the regressors of the fit.
 #[derive(Clone, Copy, Default)]
 struct Causes {
     by_rotation: f64,
@@ -77,8 +78,8 @@ pub(super) fn follows(motions: &[Pose], observed: &[ObservedPair]) -> Follows {
 
     // Where translations explain little, the depth would be a quotient of noise.
     let of_shifts = factors[KIND[0]];
-    let tells_depth =
-        of_shifts.translation > 0.0 && explained - explained_by_rotations >= TELLS_DEPTH;
+    let has_both = of_shifts.rotation > 0.0 && of_shifts.translation > 0.0;
+    let tells_depth = has_both && explained - explained_by_rotations >= TELLS_DEPTH;
     Follows {
         explained,
         explained_by_rotations,
@@ -87,6 +88,15 @@ pub(super) fn follows(motions: &[Pose], observed: &[ObservedPair]) -> Follows {
             depth: tells_depth.then(|| of_shifts.rotation / of_shifts.translation),
         },
     }
+}
+
+/// What of each pair's motion is not explained, image widths and radians together.
+pub(super) fn unexplained(motions: &[Pose], observed: &[ObservedPair]) -> Vec<f64> {
+    let pairs = motions.iter().zip(observed);
+    let pairs: Vec<Pair> = pairs.map(|(motion, pair)| pair_of(motion, pair)).collect();
+    let (_, factors) = fit(&pairs);
+
+    pairs.iter().map(|pair| off(pair, &factors)).collect()
 }
 
 fn pair_of(motion: &Pose, pair: &ObservedPair) -> Pair {

@@ -21,25 +21,28 @@
 //! | `convention` | the conventions and how each is read |
 //! | `translations` | ways in which translations alone can be wrong |
 //! | `follows` | how well poses explain the motion of images |
+//! | `evidence` | whether a small difference shows throughout a recording |
 //! | `path` | what the poses alone tell: extents, steps, jumps |
 //!
 //! Not a method of the paper. The limits were chosen on a real recording and eighteen drawn rooms;
 //! docs/rooms-and-encoders.md reports them on rooms that were drawn afterwards.
 
 mod convention;
+mod evidence;
 mod follows;
 mod path;
 mod translations;
 
 pub use convention::{Axes, Convention, Direction, QuaternionOrder};
 pub use follows::{Follows, Seen};
-pub use path::{PathFacts, PathWarning};
+pub use path::{PathFacts, PathWarning, is_identity};
 pub use translations::Translations;
 
 use crate::geometry::Pose;
 use crate::image_motion::ImageMotion;
 use crate::room::{FrameId, Room};
-use follows::follows;
+use evidence::Residuals;
+use follows::{follows, unexplained};
 
 /// Pairs of frames that are looked at.
 const PAIRS: usize = 100;
@@ -61,8 +64,12 @@ const AGREES: f64 = 0.6;
 const EXPLAINS: f64 = 0.6;
 /// and by this much more than the stated one.
 const BETTER_BY: f64 = 0.15;
-/// Other translations are named where they explain by this much more than the stated ones.
+/// Other translations are named where they explain by this much more than the stated ones,
 const TRANSLATIONS_BETTER_BY: f64 = 0.05;
+/// or by this much, if it shows throughout the recording.
+const TRANSLATIONS_THROUGHOUT_BETTER_BY: f64 = 0.015;
+/// Transposed rotations are named where they explain by this much more than every convention.
+const ROTATIONS_BETTER_BY: f64 = 0.1;
 /// Poses of other frames are named where they explain by this much more than those of the same.
 const ROWS_BETTER_BY: f64 = 0.05;
 /// Poses are looked for so many rows away from their images.
@@ -95,6 +102,18 @@ pub enum Verdict {
         /// The likely ones, the best first.
         likely: Vec<Convention>,
         /// How much of the motion the best of them explains, 0 to 1.
+        explained: f64,
+    },
+    /// The images are mirrored: left and right are exchanged.
+    MirroredImages {
+        /// In which conventions the poses then explain the motion, the best first.
+        likely: Vec<Convention>,
+        /// How much of the motion the best of them explains, 0 to 1.
+        explained: f64,
+    },
+    /// The translations are right, and the rotations are those of the inverse.
+    TransposedRotations {
+        /// How much of the motion is explained with rotations turned round, 0 to 1.
         explained: f64,
     },
     /// The rotations are right, and the translations do not go with them.
@@ -143,7 +162,7 @@ pub struct PoseCheck {
 /// Pairs of frames to look at, spread over the recording.
 pub fn pairs_to_look_at(room: &Room) -> Vec<(FrameId, FrameId)> {
     let frame_count = room.frame_count() as u32;
-    let every = (room.frame_count() / PAIRS).max(1);
+    let every = room.frame_count().div_ceil(PAIRS);
 
     let starts = (0..frame_count).step_by(every).map(FrameId);
     let pairs = starts.filter_map(|first| Some((first, turned_since(room, first)?)));
@@ -208,44 +227,113 @@ fn verdict(
     observed: &[ObservedPair],
     stated: &Follows,
 ) -> Verdict {
-    let all = Convention::all();
-    let explained = |convention: &Convention| {
-        let motions = motions(poses, *convention, observed);
-        follows(&motions, observed).explained
-    };
-    let readings: Vec<f64> = all.iter().map(explained).collect();
-    let best = readings.iter().copied().fold(0.0, f64::max);
+    let conventions = Likely::of(poses, observed);
+    let best = conventions.explained;
+    let (translations, with_translations) = best_translations(poses, read_as, observed);
 
-    if best >= EXPLAINS && best - stated.explained >= BETTER_BY {
-        let readings = readings.iter().zip(&all);
-        let mut likely: Vec<(f64, Convention)> = readings
-            .filter(|(explained, _)| best - *explained <= AS_GOOD)
-            .map(|(explained, convention)| (*explained, *convention))
-            .collect();
-        likely.sort_by(|a, b| b.0.total_cmp(&a.0));
-
-        let likely = likely.into_iter().map(|(_, convention)| convention);
+    if let Some(mistake) = rarer_mistake(poses, read_as, observed, best.max(with_translations)) {
+        return mistake;
+    }
+    if best >= EXPLAINS
+        && best - stated.explained >= BETTER_BY
+        && best + AS_GOOD >= with_translations
+    {
         return Verdict::OtherConvention {
-            likely: likely.collect(),
+            likely: conventions.likely,
             explained: best,
         };
     }
     if let Some(shifted) = best_shift(poses, read_as, observed) {
         return shifted;
     }
-    if best < UNRELATED {
+    if best.max(with_translations) < UNRELATED {
         return Verdict::Unrelated { explained: best };
     }
 
-    let (likely, explained) = best_translations(poses, read_as, observed);
-    if explained >= EXPLAINS && explained - stated.explained >= TRANSLATIONS_BETTER_BY {
-        return Verdict::OtherTranslations { likely, explained };
+    let gain = with_translations - stated.explained;
+    let is_throughout = || {
+        let other = motions_with(translations, poses, read_as, observed);
+        let residuals = Residuals {
+            stated: unexplained(&motions(poses, read_as, observed), observed),
+            other: unexplained(&other, observed),
+        };
+        residuals.is_other_better_throughout()
+    };
+    if with_translations >= EXPLAINS
+        && (gain >= TRANSLATIONS_BETTER_BY
+            || (gain >= TRANSLATIONS_THROUGHOUT_BETTER_BY && is_throughout()))
+    {
+        return Verdict::OtherTranslations {
+            likely: translations,
+            explained: with_translations,
+        };
     }
     if stated.explained >= AGREES {
         Verdict::Agrees(stated.seen)
     } else {
         Verdict::Unclear { explained: best }
     }
+}
+
+/// The conventions that explain most, and how much that is.
+struct Likely {
+    /// The best first; those after it explain hardly less.
+    likely: Vec<Convention>,
+    /// What the best one explains, 0 to 1.
+    explained: f64,
+}
+
+impl Likely {
+    fn of(poses: &[Pose], observed: &[ObservedPair]) -> Self {
+        let explained = |convention: Convention| {
+            let motions = motions(poses, convention, observed);
+            (follows(&motions, observed).explained, convention)
+        };
+        let mut readings: Vec<(f64, Convention)> =
+            Convention::all().into_iter().map(explained).collect();
+        readings.sort_by(|a, b| b.0.total_cmp(&a.0));
+
+        let best = readings[0].0;
+        readings.retain(|(explained, _)| best - explained <= AS_GOOD);
+        Self {
+            likely: readings.into_iter().map(|(_, likely)| likely).collect(),
+            explained: best,
+        }
+    }
+}
+
+/// The verdict that images are mirrored or rotations transposed, if that explains much more than
+/// anything more usual, of which the best explains `usual`.
+fn rarer_mistake(
+    poses: &[Pose],
+    read_as: Convention,
+    observed: &[ObservedPair],
+    usual: f64,
+) -> Option<Verdict> {
+    let mirrored = Likely::of(poses, &mirrored(observed));
+    if mirrored.explained >= EXPLAINS && mirrored.explained - usual >= BETTER_BY {
+        return Some(Verdict::MirroredImages {
+            likely: mirrored.likely,
+            explained: mirrored.explained,
+        });
+    }
+
+    let transposed = |pose: &Pose| Pose::from_parts(pose.translation, pose.rotation.inverse());
+    let transposed: Vec<Pose> = poses.iter().map(transposed).collect();
+    let explained = follows(&motions(&transposed, read_as, observed), observed).explained;
+    (explained >= EXPLAINS && explained - usual >= ROTATIONS_BETTER_BY)
+        .then_some(Verdict::TransposedRotations { explained })
+}
+
+/// How the images would have moved with left and right exchanged.
+fn mirrored(observed: &[ObservedPair]) -> Vec<ObservedPair> {
+    let mirrored = |pair: &ObservedPair| {
+        let mut pair = *pair;
+        pair.motion.shift.x = -pair.motion.shift.x;
+        pair.motion.turn = -pair.motion.turn;
+        pair
+    };
+    observed.iter().map(mirrored).collect()
 }
 
 /// The verdict that poses are those of other rows, if they are.
@@ -291,29 +379,39 @@ fn best_shift(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) ->
     })
 }
 
-/// The translations that explain most beside the stated rotations, and how much that is.
+/// The translations that explain most beside the stated rotations, and how much that is. Of those that
+/// explain the same, the first: the stated ones.
 fn best_translations(
     poses: &[Pose],
     read_as: Convention,
     observed: &[ObservedPair],
 ) -> (Translations, f64) {
-    let read: Vec<Pose> = poses
-        .iter()
-        .map(|pose| read_as.to_world_from_camera(pose))
-        .collect();
-
     let mut best = (Translations::STATED, 0.0);
     for translations in Translations::all() {
-        let meant = |frame: FrameId| translations.meant(&read[frame.row()]);
-        let motions = observed
-            .iter()
-            .map(|pair| meant(pair.first).inverse() * meant(pair.second));
-        let explained = follows(&motions.collect::<Vec<_>>(), observed).explained;
+        let motions = motions_with(translations, poses, read_as, observed);
+        let explained = follows(&motions, observed).explained;
         if explained > best.1 {
             best = (translations, explained);
         }
     }
     best
+}
+
+/// The camera motions of the pairs, if translations were written down in another way.
+fn motions_with(
+    translations: Translations,
+    poses: &[Pose],
+    read_as: Convention,
+    observed: &[ObservedPair],
+) -> Vec<Pose> {
+    let meant = |frame: FrameId| {
+        let read = read_as.to_world_from_camera(&poses[frame.row()]);
+        translations.meant(&read)
+    };
+    observed
+        .iter()
+        .map(|pair| meant(pair.first).inverse() * meant(pair.second))
+        .collect()
 }
 
 /// The stated camera motions of the pairs, if poses are read in a convention.

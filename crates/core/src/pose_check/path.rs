@@ -6,14 +6,13 @@ use crate::geometry::Pose;
 use crate::room::{FrameId, Room};
 use crate::statistics::{median, quantile};
 
-/// A step is a jump if it is so many times as long as the long steps of the recording, the
-/// twentieth part of them.
+/// A step is a jump if it is longer than so many times the 95th percentile of all steps.
 const JUMP: f64 = 10.0;
 /// Jumps are looked for in recordings of at least so many steps.
 const FEWEST_STEPS: usize = 40;
-/// Cameras that are faster than this on the whole are not, m/s: the unit of length is another one.
+/// A median speed above this, m/s, is none of a camera: the unit of length is another one.
 const FASTEST_M_S: f64 = 50.0;
-/// Where no times are known: steps that are longer than this on the whole, metres.
+/// The same where no times are known: a median step above this, metres.
 const LONGEST_STEP_M: f64 = 10.0;
 
 /// What the poses of a recording say about its camera's path.
@@ -25,11 +24,11 @@ pub struct PathFacts {
     pub length_m: f64,
     /// The median distance between consecutive frames, metres.
     pub median_step_m: f64,
-    /// The largest, and the frame that it leads to.
+    /// The largest of these distances, and the later of its two frames.
     pub largest_step_m: (f64, FrameId),
     /// The median rotation between consecutive frames, radians.
     pub median_step_rad: f64,
-    /// The largest, and the frame that it leads to.
+    /// The largest of these rotations, and the later of its two frames.
     pub largest_step_rad: (f64, FrameId),
     /// Frames per second, from the median of the times between consecutive frames; none if times are
     /// not known.
@@ -45,7 +44,7 @@ pub enum PathWarning {
     NeverMoves,
     /// All positions are the same, and the camera turns.
     OnlyTurns,
-    /// Poses are exactly the identity, after others that are not.
+    /// Poses are exactly the identity, or it read along other axes, after others that are not.
     Identities {
         /// How many.
         count: usize,
@@ -128,6 +127,15 @@ fn steps(room: &Room) -> Vec<Step> {
     joined.map(step).collect()
 }
 
+/// Whether this is a pose that recorders write when tracking is lost: the identity, read in any
+/// convention of axes.
+pub fn is_identity(pose: &Pose) -> bool {
+    let rotation = pose.rotation.to_rotation_matrix();
+    let is_along_axis = |number: &f64| number.abs() < 1e-9 || (number.abs() - 1.0).abs() < 1e-9;
+
+    pose.translation.vector == Vector3::zeros() && rotation.matrix().iter().all(is_along_axis)
+}
+
 fn warnings(room: &Room, steps: &[Step]) -> Vec<PathWarning> {
     let poses = room.poses();
     if poses.len() > 1 && poses.iter().all(|pose| pose == &poses[0]) {
@@ -139,7 +147,6 @@ fn warnings(room: &Room, steps: &[Step]) -> Vec<PathWarning> {
         warnings.push(PathWarning::OnlyTurns);
     }
 
-    let is_identity = |pose: &Pose| *pose == Pose::identity();
     let moved = poses
         .iter()
         .position(|pose| !is_identity(pose))

@@ -76,7 +76,10 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
 /// pairs are too few to tell. `None` if there is nothing of the kind.
 pub fn training_remark(runs: &[TrainingRun]) -> Option<String> {
     let test_count = runs.first()?.record.test.n;
-    if (1..FEWEST_TEST_PAIRS).contains(&test_count) {
+    if test_count == 0 {
+        return None;
+    }
+    if test_count < FEWEST_TEST_PAIRS {
         return Some(format!(
             "{test_count} test pairs are too few to tell how good the adapter is"
         ));
