@@ -13,7 +13,7 @@ use serde::Serialize;
 /// Whether lines for people are left out. It belongs to the process, as standard output does.
 static IS_SILENT: AtomicBool = AtomicBool::new(false);
 
-/// Why the first write to standard output that failed did so.
+/// The first error of a write to standard output.
 static PRINT_PROBLEM: OnceLock<String> = OnceLock::new();
 
 /// The path that stands for standard output.
@@ -29,7 +29,7 @@ pub struct JsonOutput {
 }
 
 impl JsonOutput {
-    /// Of a value of `--json` that was read by itself.
+    /// For a command that declares its own `--json` option.
     #[cfg(feature = "lab")]
     pub fn to(json: Option<PathBuf>) -> Self {
         Self { json }
@@ -96,6 +96,13 @@ impl JsonLines {
         let mut line = serde_json::to_vec(record)?;
         line.push(b'\n');
         let written = self.to.write_all(&line).and_then(|()| self.to.flush());
+
+        // A closed pipe (`seese3 track --json - | head`) is no error here either.
+        if let Err(error) = &written
+            && error.kind() == std::io::ErrorKind::BrokenPipe
+        {
+            return Ok(());
+        }
         written.with_context(|| format!("{} cannot be written", self.path.display()))
     }
 }

@@ -86,11 +86,7 @@ pub fn read_seven_scenes(
         }
     }
 
-    // Frame numbers form a column: if one frame has none, all go without.
-    if frames.iter().any(|about| about.number.is_none()) {
-        frames.iter_mut().for_each(|about| about.number = None);
-    }
-
+    all_or_none_numbered(&mut frames);
     let count = frames.len();
     let mut collected = Collected::default();
     for (done, about) in frames.into_iter().enumerate() {
@@ -125,6 +121,13 @@ pub fn read_seven_scenes(
     }
 
     Ok(recording)
+}
+
+/// Frame numbers form a column: if one frame has none, all go without.
+fn all_or_none_numbered(frames: &mut [About]) {
+    if frames.iter().any(|about| about.number.is_none()) {
+        frames.iter_mut().for_each(|about| about.number = None);
+    }
 }
 
 /// The stem of the frame that a colour image belongs to; `None` for any other file. The extension may

@@ -232,10 +232,15 @@ fn other_mistakes_are_named() {
         .map(|pair| {
             let mut pair = *pair;
             pair.motion.shift *= 1e-3;
+            pair.motion.turn *= 1e-3;
             pair
         })
         .collect();
-    assert_eq!(nothing(&still), Verdict::TooLittleMotion);
+    let standing = vec![truth[7]; truth.len()];
+    let of_standing = check(&standing, usual, &still).verdict;
+    assert_eq!(of_standing, Verdict::TooLittleMotion);
+    // The same images, of poses that turn by several degrees from one to the next.
+    assert_eq!(nothing(&still), Verdict::Unrelated { explained: 0.0 });
 }
 
 /// Oracle: the exchange that was made. The camera moves two metres along x, and half a metre along

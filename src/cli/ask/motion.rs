@@ -55,26 +55,32 @@ pub struct Motion {
 }
 
 impl Motion {
-    pub async fn run(self) -> anyhow::Result<()> {
-        self.json.begin()?;
-
+    /// The two views.
+    fn views(&self) -> anyhow::Result<(pb::View, pb::View)> {
         // Both views come from one kind of input: frames of a room, rows of a feature file, or
         // image files.
         let frames = match self.from.zip(self.to) {
             Some((from, to)) => Some(vec![from, to]),
-            None => self.frames,
+            None => self.frames.clone(),
         };
-        let (first, second) = match (frames.as_deref(), &self.feature, self.rows.as_deref()) {
-            (Some(&[a, b]), _, _) => (frame_view(a), frame_view(b)),
-            (None, Some(file), Some(&[a, b])) => (feature_view(file, a)?, feature_view(file, b)?),
+        match (frames.as_deref(), &self.feature, self.rows.as_deref()) {
+            (Some(&[a, b]), _, _) => Ok((frame_view(a), frame_view(b))),
+            (None, Some(file), Some(&[a, b])) => {
+                Ok((feature_view(file, a)?, feature_view(file, b)?))
+            }
             _ => match self.images.as_deref() {
-                Some([a, b]) => (image_view(a)?, image_view(b)?),
+                Some([a, b]) => Ok((image_view(a)?, image_view(b)?)),
                 _ => {
                     bail!("--from A --to B, --feature FILE --rows A,B or --images A,B is required")
                 }
             },
-        };
+        }
+    }
 
+    pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+
+        let (first, second) = self.views()?;
         let camera = self.camera.map(|CameraOption(camera)| pb::Pinhole {
             width: camera.width,
             height: camera.height,

@@ -60,17 +60,17 @@ pub struct Destination {
 impl Destination {
     /// Refuses to replace a room of the same name by one with other frames, unless --replace was
     /// given.
-    async fn check_same(&self, store: &Store, room: Room) -> anyhow::Result<Room> {
+    async fn refuse_other_frames(&self, store: &Store, room: &Room) -> anyhow::Result<()> {
         let before = match store.load_room(room.id().as_str(), None).await {
             Ok(before) => before.room,
-            Err(crate::store::Error::Unknown { .. }) => return Ok(room),
+            Err(crate::store::Error::Unknown { .. }) => return Ok(()),
             Err(error) => return Err(error.into()),
         };
 
         // Features belong to frames: new frames would silently lose the features that were
         // computed for the old ones.
-        if self.replace || same_poses(&before, &room) {
-            return Ok(with_known_camera(room, &before)?);
+        if self.replace || same_poses(&before, room) {
+            return Ok(());
         }
 
         bail!(
@@ -185,7 +185,7 @@ impl Destination {
         say_frames(room);
         let deviation = recording.worst_rotation_deviation;
         say(format_args!(
-            "rotations: at most {deviation:.1e} off SO(3), projected"
+            "rotations: R Rᵀ differs from the identity by at most {deviation:.1e}; projected onto SO(3)"
         ));
 
         for set in features {
@@ -254,7 +254,7 @@ impl Destination {
         // was.
         check_features(&room, &features)?;
         let store = Store::create(&self.store)?;
-        let room = self.check_same(&store, room).await?;
+        self.refuse_other_frames(&store, &room).await?;
 
         self.say_read(&room, &features, &recording, read_count);
         let mut report = PoseReport::of_path(&room);
@@ -343,15 +343,4 @@ fn read_features(given: &str) -> anyhow::Result<Features> {
     let dim = rows.ncols();
 
     Features::new(FeatureSource::imported(name, dim), rows).with_context(|| file.to_owned())
-}
-
-/// A room with the camera that an earlier import stated, if this one states none.
-fn with_known_camera(room: Room, before: &Room) -> Result<Room, seese3_core::room::Error> {
-    let stated = room.provenance().camera;
-    let provenance = Provenance {
-        camera: stated.or(before.provenance().camera),
-        ..room.provenance().clone()
-    };
-
-    Room::new(room.id().clone(), room.frames().clone(), provenance)
 }

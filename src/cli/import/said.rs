@@ -1,21 +1,23 @@
 //! What is printed about the frames of a recording.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::cli::output::say;
 use crate::datasets::Dropped;
 use seese3_core::room::Room;
 
 /// The number of dropped frames that are listed one by one; beyond that they are only counted.
-const NAMED: usize = 20;
+const MOST_LISTED: usize = 20;
 
 /// Prints the facts about the frames that limit their use: sequences, the recording's own split,
 /// gaps in the numbering, and images.
 pub fn say_frames(room: &Room) {
     let timeline = room.timeline();
-    if let Some(most) = timeline.sequences.iter().max() {
+    let sequences: BTreeSet<u32> = timeline.sequences.iter().copied().collect();
+    if !sequences.is_empty() {
         say(format_args!(
-            "sequences: up to number {most}; a pair of frames never spans two of them"
+            "sequences: {}; a pair of frames never spans two of them",
+            sequences.len()
         ));
     }
 
@@ -53,11 +55,11 @@ pub fn say_frames(room: &Room) {
 
 /// Prints which frames were left out, and why.
 pub fn say_dropped(dropped: &[Dropped]) {
-    for frame in dropped.iter().take(NAMED) {
+    for frame in dropped.iter().take(MOST_LISTED) {
         say(format_args!("dropped {frame}"));
     }
 
-    // A long list is cut after the first NAMED frames; the counts by reason cover all of them.
+    // A long list is cut after the first MOST_LISTED frames; the counts by reason cover all of them.
     let mut counts = BTreeMap::new();
     for frame in dropped {
         *counts.entry(frame.reason).or_insert(0) += 1;

@@ -25,8 +25,8 @@ use std::path::{Path, PathBuf};
 
 use super::collect::{About, Collected};
 use super::{DropReason, Error, Reader, Recording};
-use files::{Topic, each_message};
-use messages::{Image, Kind};
+use files::{Message, Topic, each_message};
+use messages::{Image, ImageFile, Kind};
 use poses::Poses;
 use seese3_core::geometry::Pose;
 pub use written_images::WrittenImages;
@@ -60,17 +60,14 @@ pub fn read_bag(
     bag: &Bag,
     reader: &mut Reader<'_>,
 ) -> Result<(Recording, WrittenImages), Error> {
-    let malformed = |problem: String| Error::Malformed {
-        file: path.to_owned(),
-        problem,
-    };
-
+    let malformed = |problem: String| malformed(path, problem);
     let Contents {
         topics,
         mut poses,
         malformed_poses,
         mut images,
     } = contents(path)?;
+    poses.sort();
 
     let image_topic = chosen_topic(&topics, bag.image_topic.as_deref(), &IMAGES);
     let image_topic = image_topic.map_err(&malformed)?;
@@ -82,27 +79,27 @@ pub fn read_bag(
             Some(chosen.map_err(&malformed)?)
         }
     };
+    let is_of_pose_topic = |message: &MalformedPose| Some(&message.topic) == pose_topic.as_ref();
 
-    poses.sort();
-    let camera = poses
-        .path(
-            pose_topic.as_deref(),
-            bag.world.as_deref(),
-            &camera_frame,
-            bag.base_from_camera,
-        )
-        .map_err(|problem| {
-            // Nothing is known where all messages are malformed: what is wrong with the first one says why.
-            let of_topic = |message: &&MalformedPose| Some(&message.topic) == pose_topic.as_ref();
-            match malformed_poses.iter().find(of_topic) {
-                Some(first) => malformed(format!("{problem}; the first: {}", first.problem)),
-                None => malformed(problem),
-            }
-        })?;
+    let camera = poses.path(
+        pose_topic.as_deref(),
+        bag.world.as_deref(),
+        &camera_frame,
+        bag.base_from_camera,
+    );
+    let camera = camera.map_err(|problem| {
+        // Nothing is known where all messages are malformed: what is wrong with the first one says why.
+        let first = malformed_poses
+            .iter()
+            .find(|message| is_of_pose_topic(message));
+        malformed(first.map_or(problem.clone(), |first| {
+            format!("{problem}; the first: {}", first.problem)
+        }))
+    })?;
 
     let mut collected = Collected::default();
     for message in malformed_poses {
-        if message.is_transform || Some(&message.topic) == pose_topic.as_ref() {
+        if message.is_transform || is_of_pose_topic(&message) {
             let name = format!("message {} of {}", message.number, message.topic);
             collected.drop_for(name, DropReason::MalformedMessage, message.problem);
         }
@@ -119,12 +116,7 @@ pub fn read_bag(
         done += 1;
         let number = format!("{done:06}");
 
-        let file = messages::image_of(message).and_then(|image| {
-            image
-                .map(|Image { time_ns, picture }| Ok((time_ns, picture.file()?)))
-                .transpose()
-        });
-        let (time_ns, file) = match file {
+        let (time_ns, file) = match image_file(message) {
             Ok(Some(found)) => found,
             Ok(None) => return Ok(()),
             Err(problem) => {
@@ -143,7 +135,26 @@ pub fn read_bag(
         Ok(())
     })?;
 
-    // Messages may be recorded in another order than that in which their images were taken.
+    let recording = in_order(collected, frames, written.folder(), reader);
+    Ok((recording.map_err(|error| of_bag(error, path))?, written))
+}
+
+/// The image of a message as a file, and when it was taken, nanoseconds; none if it is no image.
+fn image_file(message: &Message<'_>) -> Result<Option<(i64, ImageFile)>, String> {
+    let Some(Image { time_ns, picture }) = messages::image_of(message)? else {
+        return Ok(None);
+    };
+    Ok(Some((time_ns, picture.file()?)))
+}
+
+/// The recording of frames, each when it was taken, its image and `world_from_camera`. Messages may be
+/// recorded in another order than that in which their images were taken.
+fn in_order(
+    mut collected: Collected,
+    mut frames: Vec<(i64, String, Pose)>,
+    folder: &Path,
+    reader: &Reader<'_>,
+) -> Result<Recording, Error> {
     frames.sort_by_key(|(time_ns, ..)| *time_ns);
     for (time_ns, name, world_from_camera) in frames {
         let about = About {
@@ -155,8 +166,19 @@ pub fn read_bag(
         collected.keep(about, world_from_camera);
     }
 
-    // What is missing is missing in the bag, and not in the folder of its images.
-    let of_bag = |error| match error {
+    collected.finish(folder, reader)
+}
+
+fn malformed(path: &Path, problem: String) -> Error {
+    Error::Malformed {
+        file: path.to_owned(),
+        problem,
+    }
+}
+
+/// What is missing is missing in the bag, and not in the folder of its images.
+fn of_bag(error: Error, path: &Path) -> Error {
+    match error {
         Error::NoFrames { dropped, .. } => Error::NoFrames {
             folder: path.to_owned(),
             dropped,
@@ -166,9 +188,7 @@ pub fn read_bag(
             dropped,
         },
         other => other,
-    };
-    let recording = collected.finish(written.folder(), reader).map_err(of_bag)?;
-    Ok((recording, written))
+    }
 }
 
 /// What the first pass finds.

@@ -68,15 +68,20 @@ const BETTER_BY: f64 = 0.15;
 const TRANSLATIONS_BETTER_BY: f64 = 0.05;
 /// or by this much, if it shows throughout the recording.
 const TRANSLATIONS_THROUGHOUT_BETTER_BY: f64 = 0.015;
-/// Transposed rotations are named where they explain by this much more than every convention.
-const ROTATIONS_BETTER_BY: f64 = 0.1;
+/// Other translations have to explain this share at least: of 49, one explains much by chance.
+const TRANSLATIONS_EXPLAIN: f64 = 0.7;
+/// Mirrored images and transposed rotations are named where they explain by this much more than every
+/// convention and every way to write translations.
+const RARER_BETTER_BY: f64 = 0.07;
+/// Where poses turn by this on average, radians, images that stand still are not theirs.
+const SURE_TURN_RAD: f64 = 0.03;
 /// Poses of other frames are named where they explain by this much more than those of the same.
-const ROWS_BETTER_BY: f64 = 0.05;
+const ROWS_BETTER_BY: f64 = 0.02;
 /// Poses are looked for so many rows away from their images.
 const FURTHEST_SHIFT: i64 = 60;
 /// Conventions within this of the best one may be meant as well.
 const AS_GOOD: f64 = 0.03;
-/// Poses that explain less than this in every convention are not those of the images.
+/// Poses that explain less than this, and nothing usual that explains enough, are not those of the images.
 const UNRELATED: f64 = 0.4;
 
 /// Two frames of a recording and how the image moved between them.
@@ -208,9 +213,17 @@ pub fn check(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) -> 
         return nothing(Verdict::TooFewPairs);
     }
 
-    let shifts = observed.iter().map(|pair| pair.motion.shift.norm());
-    if shifts.sum::<f64>() / (pair_count as f64) < LEAST_MOTION {
-        return nothing(Verdict::TooLittleMotion);
+    let mean = |numbers: &mut dyn Iterator<Item = f64>| numbers.sum::<f64>() / pair_count as f64;
+    let shift = mean(&mut observed.iter().map(|pair| pair.motion.shift.norm()));
+    let turn = mean(&mut observed.iter().map(|pair| pair.motion.turn.abs()));
+    if shift < LEAST_MOTION {
+        let stated = motions(poses, read_as, &observed);
+        let stated_turn = mean(&mut stated.iter().map(|motion| motion.rotation.angle()));
+        return nothing(if stated_turn >= SURE_TURN_RAD && turn < LEAST_MOTION {
+            Verdict::Unrelated { explained: 0.0 }
+        } else {
+            Verdict::TooLittleMotion
+        });
     }
 
     let stated = follows(&motions(poses, read_as, &observed), &observed);
@@ -246,10 +259,6 @@ fn verdict(
     if let Some(shifted) = best_shift(poses, read_as, observed) {
         return shifted;
     }
-    if best.max(with_translations) < UNRELATED {
-        return Verdict::Unrelated { explained: best };
-    }
-
     let gain = with_translations - stated.explained;
     let is_throughout = || {
         let other = motions_with(translations, poses, read_as, observed);
@@ -259,7 +268,7 @@ fn verdict(
         };
         residuals.is_other_better_throughout()
     };
-    if with_translations >= EXPLAINS
+    if with_translations >= TRANSLATIONS_EXPLAIN
         && (gain >= TRANSLATIONS_BETTER_BY
             || (gain >= TRANSLATIONS_THROUGHOUT_BETTER_BY && is_throughout()))
     {
@@ -270,6 +279,8 @@ fn verdict(
     }
     if stated.explained >= AGREES {
         Verdict::Agrees(stated.seen)
+    } else if stated.explained < UNRELATED {
+        Verdict::Unrelated { explained: best }
     } else {
         Verdict::Unclear { explained: best }
     }
@@ -310,19 +321,23 @@ fn rarer_mistake(
     observed: &[ObservedPair],
     usual: f64,
 ) -> Option<Verdict> {
-    let mirrored = Likely::of(poses, &mirrored(observed));
-    if mirrored.explained >= EXPLAINS && mirrored.explained - usual >= BETTER_BY {
-        return Some(Verdict::MirroredImages {
-            likely: mirrored.likely,
-            explained: mirrored.explained,
-        });
-    }
-
     let transposed = |pose: &Pose| Pose::from_parts(pose.translation, pose.rotation.inverse());
     let transposed: Vec<Pose> = poses.iter().map(transposed).collect();
-    let explained = follows(&motions(&transposed, read_as, observed), observed).explained;
-    (explained >= EXPLAINS && explained - usual >= ROTATIONS_BETTER_BY)
-        .then_some(Verdict::TransposedRotations { explained })
+    let transposed = follows(&motions(&transposed, read_as, observed), observed).explained;
+    let mirrored = Likely::of(poses, &mirrored(observed));
+
+    let explained = transposed.max(mirrored.explained);
+    if explained < EXPLAINS || explained - usual < RARER_BETTER_BY {
+        return None;
+    }
+    Some(if transposed >= mirrored.explained {
+        Verdict::TransposedRotations { explained }
+    } else {
+        Verdict::MirroredImages {
+            likely: mirrored.likely,
+            explained,
+        }
+    })
 }
 
 /// How the images would have moved with left and right exchanged.
