@@ -350,7 +350,9 @@ mod tests {
                 .as_bytes(),
             )
         };
-        let clip = of("CLIPImageProcessor", ", \"do_rescale\": false").unwrap();
+        let uncropped = ", \"do_rescale\": false, \"do_center_crop\": false";
+        let clip = of("CLIPImageProcessor", uncropped).unwrap();
+        assert_eq!(clip.crop, None);
         assert_eq!(clip.resize, Resize::Shortest(224));
         assert_eq!(
             (clip.divisor, clip.mean, clip.deviation),
@@ -368,6 +370,11 @@ mod tests {
             let problem = result.unwrap_err();
             assert!(problem.contains(field), "{field}: {problem}");
         };
+        // CLIP's processor crops unless it is told not to, and older files name it otherwise.
+        let older = "{\"feature_extractor_type\": \"CLIPFeatureExtractor\", \"size\": 224, \"crop_size\": 224, \
+                     \"resample\": 3, \"do_normalize\": false}";
+        assert_eq!(parse(older.as_bytes()).unwrap().crop, Some((224, 224)));
+        named(of("CLIPImageProcessor", ""), "crop_size");
         named(of("OwnProcessor", ""), "shorter edge or both");
         named(of("ConvNextImageProcessor", ""), "ConvNext");
         for step in [

@@ -470,7 +470,7 @@ fn what_is_no_bag_of_ros_2_is_said() {
                 "UPDATE topics SET type = 'std_msgs/msg/String' WHERE name = '/odom'",
                 None,
             ),
-            "no topic of poses that is understood",
+            "has no pose topic: ROS 2's PoseStamped",
         ),
         (
             changed(

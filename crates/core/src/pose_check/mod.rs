@@ -62,8 +62,10 @@ const LEAST_MOTION: f64 = 0.005;
 const AGREES: f64 = 0.6;
 /// Another convention is named where it explains this share at least,
 const EXPLAINS: f64 = 0.6;
-/// and by this much more than the stated one.
+/// and by this much more than the stated one,
 const BETTER_BY: f64 = 0.15;
+/// or by this much, if it shows throughout the recording.
+const THROUGHOUT_BETTER_BY: f64 = 0.05;
 /// Other translations are named where they explain by this much more than the stated ones,
 const TRANSLATIONS_BETTER_BY: f64 = 0.05;
 /// or by this much, if it shows throughout the recording.
@@ -75,8 +77,10 @@ const TRANSLATIONS_EXPLAIN: f64 = 0.7;
 const RARER_BETTER_BY: f64 = 0.07;
 /// Where poses turn by this on average, radians, images that stand still are not theirs.
 const SURE_TURN_RAD: f64 = 0.03;
-/// Poses of other frames are named where they explain by this much more than those of the same.
+/// Poses of other frames are named where they explain by this much more than those of the same,
 const ROWS_BETTER_BY: f64 = 0.02;
+/// and this share at least: of 121 places to look for them, one explains much by chance.
+const ROWS_EXPLAIN: f64 = 0.75;
 /// Poses are looked for so many rows away from their images.
 const FURTHEST_SHIFT: i64 = 60;
 /// Conventions within this of the best one may be meant as well.
@@ -247,36 +251,43 @@ fn verdict(
     if let Some(mistake) = rarer_mistake(poses, read_as, observed, best.max(with_translations)) {
         return mistake;
     }
-    if best >= EXPLAINS
-        && best - stated.explained >= BETTER_BY
-        && best + AS_GOOD >= with_translations
-    {
+    let of_stated = motions(poses, read_as, observed);
+    let is_throughout = |other: &[Pose]| {
+        let residuals = Residuals {
+            stated: unexplained(&of_stated, observed),
+            other: unexplained(other, observed),
+        };
+        residuals.is_other_better_throughout()
+    };
+
+    let gain = best - stated.explained;
+    let is_better = gain >= BETTER_BY
+        || (gain >= THROUGHOUT_BETTER_BY
+            && is_throughout(&motions(poses, conventions.likely[0], observed)));
+    if best >= EXPLAINS && best + AS_GOOD >= with_translations && is_better {
         return Verdict::OtherConvention {
             likely: conventions.likely,
             explained: best,
         };
     }
-    if let Some(shifted) = best_shift(poses, read_as, observed) {
-        return shifted;
-    }
+
+    // Where other rows and other translations both would explain it, the better ones are meant.
+    let shifted = best_shift(poses, read_as, observed);
+    let by_shift = shifted.map_or(0.0, |shift| shift.explained);
     let gain = with_translations - stated.explained;
-    let is_throughout = || {
-        let other = motions_with(translations, poses, read_as, observed);
-        let residuals = Residuals {
-            stated: unexplained(&motions(poses, read_as, observed), observed),
-            other: unexplained(&other, observed),
-        };
-        residuals.is_other_better_throughout()
-    };
-    if with_translations >= TRANSLATIONS_EXPLAIN
-        && (gain >= TRANSLATIONS_BETTER_BY
-            || (gain >= TRANSLATIONS_THROUGHOUT_BETTER_BY && is_throughout()))
-    {
+    let is_better = gain >= TRANSLATIONS_BETTER_BY
+        || (gain >= TRANSLATIONS_THROUGHOUT_BETTER_BY
+            && is_throughout(&motions_with(translations, poses, read_as, observed)));
+    if with_translations >= TRANSLATIONS_EXPLAIN && with_translations >= by_shift && is_better {
         return Verdict::OtherTranslations {
             likely: translations,
             explained: with_translations,
         };
     }
+    if let Some(Shift { rows, explained }) = shifted {
+        return Verdict::OtherRows { rows, explained };
+    }
+
     if stated.explained >= AGREES {
         Verdict::Agrees(stated.seen)
     } else if stated.explained < UNRELATED {
@@ -351,9 +362,19 @@ fn mirrored(observed: &[ObservedPair]) -> Vec<ObservedPair> {
     observed.iter().map(mirrored).collect()
 }
 
-/// The verdict that poses are those of other rows, if they are.
-fn best_shift(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) -> Option<Verdict> {
-    let mut best = (0, 0.0);
+/// Poses that are those of images so many rows later, and how much they explain then.
+#[derive(Debug, Clone, Copy)]
+struct Shift {
+    rows: i64,
+    explained: f64,
+}
+
+/// The rows by which poses are shifted, if they are.
+fn best_shift(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) -> Option<Shift> {
+    let mut best = Shift {
+        rows: 0,
+        explained: 0.0,
+    };
     for rows in -FURTHEST_SHIFT..=FURTHEST_SHIFT {
         // The pose of an image stands so many rows before it.
         let shifted = |frame: FrameId| {
@@ -383,15 +404,12 @@ fn best_shift(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) ->
         let there: Vec<ObservedPair> = there.collect();
         let explained = follows(&motions(poses, read_as, &moved), &moved).explained;
         let stated = follows(&motions(poses, read_as, &there), &there).explained;
-        if explained - stated >= ROWS_BETTER_BY && explained > best.1 {
-            best = (rows, explained);
+        if explained - stated >= ROWS_BETTER_BY && explained > best.explained {
+            best = Shift { rows, explained };
         }
     }
 
-    (best.1 >= EXPLAINS).then_some(Verdict::OtherRows {
-        rows: best.0,
-        explained: best.1,
-    })
+    (best.explained >= ROWS_EXPLAIN).then_some(best)
 }
 
 /// The translations that explain most beside the stated rotations, and how much that is. Of those that
