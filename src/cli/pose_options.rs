@@ -41,10 +41,11 @@ pub struct DirectionOption {
 }
 
 /// The two transforms that a pose can be, by their names on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 #[value(rename_all = "snake_case")]
 pub enum DirectionName {
     /// From the camera to the world: the translation is the camera's position
+    #[default]
     WorldFromCamera,
     /// From the world to the camera: the inverse
     CameraFromWorld,

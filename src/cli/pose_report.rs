@@ -12,8 +12,8 @@ use crate::encoder::{image_size, read_image};
 use seese3_core::geometry::{Pinhole, Pose};
 use seese3_core::image_motion::{SmallImage, align};
 use seese3_core::pose_check::{
-    Convention, ObservedPair, PathFacts, PathWarning, PoseCheck, Seen, Translations, Verdict,
-    check, is_identity, pairs_to_look_at,
+    Convention, ObservedPair, PathFacts, PathWarning, PoseCheck, SceneEstimate, Translations,
+    Verdict, check, is_identity, pairs_to_look_at,
 };
 use seese3_core::room::{FrameId, Room};
 
@@ -419,7 +419,7 @@ fn translations_in_words(translations: Translations) -> String {
     }
 }
 
-fn seen_warnings(seen: Seen, camera: Option<Pinhole>) -> Vec<String> {
+fn seen_warnings(seen: SceneEstimate, camera: Option<Pinhole>) -> Vec<String> {
     let mut warnings = Vec::new();
     if let Some(depth) = seen.depth.filter(|depth| !USUAL_DEPTH_M.contains(depth)) {
         let unit = match depth {

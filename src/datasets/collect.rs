@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use nalgebra::{Matrix4, UnitQuaternion};
+use nalgebra::{Matrix4, Quaternion, UnitQuaternion};
 
 use super::{DropReason, Dropped, Error, MAX_ROTATION_DEVIATION, Reader, Recording, Unusable};
 use seese3_core::geometry::{Pose, nearest_rotation};
@@ -65,6 +65,26 @@ pub fn pose_of_matrix(matrix: &Matrix4<f64>) -> Result<(Pose, f64), String> {
         MatrixPose::NotARotation => Err("has no rotation: its matrix is singular".to_owned()),
         MatrixPose::NotHomogeneous => Err(LAST_ROW_PROBLEM.to_owned()),
     }
+}
+
+/// How far the length of a quaternion may be from 1.
+const NORM_TOLERANCE: f64 = 1e-2;
+
+/// A pose from a position, metres, and a quaternion whose length is 1 up to rounding.
+///
+/// # Errors
+/// What is wrong with the numbers, in words.
+pub fn pose_of_quaternion(position: [f64; 3], quaternion: Quaternion<f64>) -> Result<Pose, String> {
+    let is_unit = (quaternion.norm() - 1.0).abs() <= NORM_TOLERANCE;
+    if !is_unit || !position.iter().all(|number| number.is_finite()) {
+        return Err(format!(
+            "the quaternion has norm {}, or the position is not finite",
+            quaternion.norm()
+        ));
+    }
+
+    let rotation = UnitQuaternion::from_quaternion(quaternion);
+    Ok(Pose::from_parts(position.into(), rotation))
 }
 
 /// Checks that every column of the frames is empty or as long as the poses, so that it can be

@@ -8,9 +8,9 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use nalgebra::Quaternion;
 
-use super::collect::{About, Collected};
+use super::collect::{About, Collected, pose_of_quaternion};
 use super::natural::sort_naturally;
 use super::text::number;
 use super::{DropReason, Error, Reader, Recording, read_bytes, read_text};
@@ -20,8 +20,6 @@ use seese3_core::geometry::{Pinhole, PixelCamera, Pose};
 const MODELS: [&str; 4] = ["", "sparse/0", "sparse", "0"];
 /// Folders in which images lie, from the folder of the model.
 const IMAGES: [&str; 4] = ["images", "../images", "../../images", "."];
-/// How far the norm of a quaternion may be from 1.
-const NORM_TOLERANCE: f64 = 1e-2;
 /// Bytes of a point of an image in `images.bin`: two coordinates and the number of a point in space.
 const POINT_BYTES: u64 = 24;
 
@@ -233,19 +231,11 @@ impl Model {
 
 fn pose(file: &Path, what: &str, numbers: [f64; 7]) -> Result<Pose, Error> {
     let [w, x, y, z, tx, ty, tz] = numbers;
-    let quaternion = Quaternion::new(w, x, y, z);
-    let is_rotation = (quaternion.norm() - 1.0).abs() <= NORM_TOLERANCE;
-    if is_rotation && [tx, ty, tz].iter().all(|x| x.is_finite()) {
-        let rotation = UnitQuaternion::from_quaternion(quaternion);
-        return Ok(Pose::from_parts(Translation3::new(tx, ty, tz), rotation));
-    }
-
-    Err(Error::Malformed {
-        file: file.to_owned(),
-        problem: format!(
-            "{what}: its quaternion has norm {}, or its translation is not finite",
-            quaternion.norm()
-        ),
+    pose_of_quaternion([tx, ty, tz], Quaternion::new(w, x, y, z)).map_err(|problem| {
+        Error::Malformed {
+            file: file.to_owned(),
+            problem: format!("{what}: {problem}"),
+        }
     })
 }
 

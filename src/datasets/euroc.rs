@@ -7,17 +7,15 @@
 
 use std::path::Path;
 
-use nalgebra::{Matrix4, Quaternion, Translation3, UnitQuaternion};
+use nalgebra::{Matrix4, Quaternion};
 
-use super::collect::{About, Collected, pose_of_matrix};
+use super::collect::{About, Collected, pose_of_matrix, pose_of_quaternion};
 use super::text::number;
 use super::{DropReason, Error, Reader, Recording, read_text};
 use seese3_core::geometry::{Pinhole, PixelCamera, Pose};
 
 /// The longest time between an image and its pose, nanoseconds.
 const MAX_DIFFERENCE_NS: u64 = 10_000_000;
-/// How far the norm of a quaternion in the file may be from 1.
-const NORM_TOLERANCE: f64 = 1e-2;
 
 /// Reads a sequence's folder, with or without `mav0`. `camera` is the camera's folder, such as `cam0`.
 ///
@@ -128,21 +126,8 @@ fn read_ground_truth(file: &Path) -> Result<Vec<(i64, Pose)>, Error> {
             *value = number(file, line, word)?;
         }
         let [x, y, z, qw, qx, qy, qz] = numbers;
-        let quaternion = Quaternion::new(qw, qx, qy, qz);
-        let is_rotation = (quaternion.norm() - 1.0).abs() <= NORM_TOLERANCE;
-        if !is_rotation || !numbers.iter().all(|x| x.is_finite()) {
-            return Err(wrong(
-                file,
-                line,
-                format!(
-                    "has a quaternion of norm {}, or a number that is not finite",
-                    quaternion.norm()
-                ),
-            ));
-        }
-
-        let rotation = UnitQuaternion::from_quaternion(quaternion);
-        let pose = Pose::from_parts(Translation3::new(x, y, z), rotation);
+        let pose = pose_of_quaternion([x, y, z], Quaternion::new(qw, qx, qy, qz))
+            .map_err(|problem| wrong(file, line, problem))?;
         poses.push((time(file, line, &columns[0])?, pose));
     }
 

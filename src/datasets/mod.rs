@@ -25,7 +25,7 @@ mod twelve_scenes;
 pub use arkitscenes::read_arkitscenes;
 pub use bag::{Bag, WrittenImages, read_bag};
 pub use bundle::{read_bundle, read_numpy, write_numpy};
-pub use collect::pose_of_matrix;
+pub use collect::{pose_of_matrix, pose_of_quaternion};
 pub use colmap::read_colmap;
 pub use euroc::read_euroc;
 pub use folder::read_folder;

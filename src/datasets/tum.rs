@@ -7,9 +7,9 @@
 
 use std::path::Path;
 
-use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use nalgebra::Quaternion;
 
-use super::collect::{About, Collected};
+use super::collect::{About, Collected, pose_of_quaternion};
 use super::text::{data_lines, finite_row, nanoseconds, spaced, wrong};
 use super::{DropReason, Error, Reader, Recording, read_text};
 use seese3_core::geometry::Pose;
@@ -17,8 +17,6 @@ use seese3_core::trajectory::Trajectory;
 
 /// The longest time between an image and its pose, nanoseconds.
 const MAX_DIFFERENCE_NS: u64 = 10_000_000;
-/// How far the norm of a quaternion in the file may be from 1.
-const NORM_TOLERANCE: f64 = 1e-2;
 
 /// Reads the folder of one sequence.
 ///
@@ -93,21 +91,9 @@ fn read_trajectory(file: &Path) -> Result<Vec<(i64, Pose)>, Error> {
         let time = time(file, line, row)?;
 
         // The file writes the scalar part last; nalgebra takes it first.
-        let quaternion = Quaternion::new(qw, qx, qy, qz);
-        let norm = quaternion.norm();
-
-        // A small deviation is rounding and is normalised away below. A large one suggests that the
-        // columns are in another order.
-        if (norm - 1.0).abs() > NORM_TOLERANCE {
-            return Err(wrong(
-                file,
-                line,
-                format!("the quaternion has norm {norm}, a rotation has 1"),
-            ));
-        }
-
-        let rotation = UnitQuaternion::from_quaternion(quaternion);
-        poses.push((time, Pose::from_parts(Translation3::new(x, y, z), rotation)));
+        let pose = pose_of_quaternion([x, y, z], Quaternion::new(qw, qx, qy, qz))
+            .map_err(|problem| wrong(file, line, problem))?;
+        poses.push((time, pose));
     }
 
     poses.sort_by_key(|(time, _)| *time);

@@ -67,10 +67,22 @@ fn answer(
     // Thresholds are checked whoever reads the motion.
     convert::thresholds(request.thresholds.clone())?;
 
-    match by_two_views(snapshot, &request, cancel)? {
-        Some(answer) => Ok(answer),
-        None => by_adapter(snapshot, request, cancel),
+    if let Some(answer) = by_two_views(snapshot, &request, cancel)? {
+        return Ok(answer);
     }
+
+    // Whoever sends two images to a server that compares images may have forgotten their camera.
+    let lacks_camera = snapshot.two_views().is_some()
+        && request.adapter.is_empty()
+        && image(request.first.as_ref()).is_some()
+        && image(request.second.as_ref()).is_some();
+    by_adapter(snapshot, request, cancel).map_err(|error| match error {
+        Error::Precondition(problem) if lacks_camera => Error::Precondition(format!(
+            "{problem}; or give `camera`, or a room whose camera is known: this server then compares the images \
+             themselves"
+        )),
+        other => other,
+    })
 }
 
 /// The motion that an adapter reads from two latents.

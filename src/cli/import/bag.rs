@@ -77,19 +77,8 @@ fn mounting(numbers: &[f64]) -> anyhow::Result<Pose> {
             numbers.len()
         );
     };
-    let quaternion = nalgebra::Quaternion::new(qw, qx, qy, qz);
-    let is_unit = (quaternion.norm() - 1.0).abs() < 1e-2;
-    if !(is_unit && [x, y, z].iter().all(|number| number.is_finite())) {
-        bail!(
-            "--base-from-camera: the last four numbers are no unit quaternion, or a number is not finite"
-        );
-    }
-
-    let rotation = nalgebra::UnitQuaternion::from_quaternion(quaternion);
-    Ok(Pose::from_parts(
-        nalgebra::Translation3::new(x, y, z),
-        rotation,
-    ))
+    datasets::pose_of_quaternion([x, y, z], nalgebra::Quaternion::new(qw, qx, qy, qz))
+        .map_err(|problem| anyhow::anyhow!("--base-from-camera: {problem}"))
 }
 
 /// The folder BAG-images beside a bag, which is a folder BAG or a file BAG.mcap or BAG.db3.

@@ -45,10 +45,13 @@ impl Numpy {
     pub async fn import(self) -> anyhow::Result<()> {
         self.to.begin()?;
         let mut file = None;
-        let mut direction = DirectionName::WorldFromCamera;
+        let mut direction = None;
         for given in self.poses {
             match given {
-                PosesOption::Direction(given) => direction = given,
+                PosesOption::Direction(given) if direction.is_none() => direction = Some(given),
+                PosesOption::Direction(_) => {
+                    bail!("--poses: which transform the poses are was said twice")
+                }
                 PosesOption::File(given) if file.is_none() => file = Some(given),
                 PosesOption::File(given) => bail!(
                     "--poses: {} is a second file, and neither world_from_camera nor camera_from_world",
@@ -90,6 +93,8 @@ impl Numpy {
         }
 
         let path = self.path.as_deref().unwrap_or(Path::new(""));
-        self.to.publish("numpy", path, recording, direction).await
+        self.to
+            .publish("numpy", path, recording, direction.unwrap_or_default())
+            .await
     }
 }

@@ -5,15 +5,13 @@ use std::io::Cursor;
 use byteorder::{BigEndian, LittleEndian};
 use foxglove::Decode;
 use image::{ColorType, ExtendedColorType, ImageEncoder};
-use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use nalgebra::Quaternion;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
 use super::files::{Message, ZSTD};
+use crate::datasets::pose_of_quaternion;
 use seese3_core::geometry::Pose;
-
-/// How far the norm of a quaternion may be from 1.
-const NORM_TOLERANCE: f64 = 1e-2;
 
 /// A kind of message that is understood.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -474,20 +472,7 @@ impl RosPose {
     fn pose(&self) -> Result<Pose, String> {
         let RosVector { x, y, z } = self.position;
         let q = self.orientation;
-        let quaternion = Quaternion::new(q.w, q.x, q.y, q.z);
-        if !((quaternion.norm() - 1.0).abs() < NORM_TOLERANCE
-            && [x, y, z].iter().all(|n| n.is_finite()))
-        {
-            return Err(format!(
-                "a pose has the quaternion ({}, {}, {}, {}) and the position ({x}, {y}, {z}): the quaternion is not of \
-                 length 1, or a number is not finite",
-                q.x, q.y, q.z, q.w
-            ));
-        }
-        Ok(Pose::from_parts(
-            Translation3::new(x, y, z),
-            UnitQuaternion::from_quaternion(quaternion),
-        ))
+        pose_of_quaternion([x, y, z], Quaternion::new(q.w, q.x, q.y, q.z))
     }
 }
 

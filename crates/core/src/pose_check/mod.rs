@@ -20,7 +20,7 @@
 //! | --- | --- |
 //! | `convention` | the conventions and how each is read |
 //! | `translations` | ways in which translations alone can be wrong |
-//! | `follows` | how well poses explain the motion of images |
+//! | `motion_fit` | how well poses explain the motion of images |
 //! | `evidence` | whether a small difference shows throughout a recording |
 //! | `path` | what the poses alone tell: extents, steps, jumps |
 //!
@@ -29,12 +29,12 @@
 
 mod convention;
 mod evidence;
-mod follows;
+mod motion_fit;
 mod path;
 mod translations;
 
 pub use convention::{Axes, Convention, Direction, QuaternionOrder};
-pub use follows::{Follows, Seen};
+pub use motion_fit::SceneEstimate;
 pub use path::{PathFacts, PathWarning, is_identity};
 pub use translations::Translations;
 
@@ -42,7 +42,7 @@ use crate::geometry::Pose;
 use crate::image_motion::ImageMotion;
 use crate::room::{FrameId, Room};
 use evidence::Residuals;
-use follows::{follows, unexplained};
+use motion_fit::{MotionFit, fit_motions, unexplained};
 
 /// Pairs of frames that are looked at.
 const PAIRS: usize = 100;
@@ -105,7 +105,7 @@ pub struct ObservedPair {
 #[derive(Debug, Clone, PartialEq)]
 pub enum Verdict {
     /// The poses can be those of the images.
-    Agrees(Seen),
+    Agrees(SceneEstimate),
     /// The poses are written in another convention.
     OtherConvention {
         /// The likely ones, the best first.
@@ -230,7 +230,7 @@ pub fn check(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) -> 
         });
     }
 
-    let stated = follows(&motions(poses, read_as, &observed), &observed);
+    let stated = fit_motions(&motions(poses, read_as, &observed), &observed);
     PoseCheck {
         verdict: verdict(poses, read_as, &observed, &stated),
         explained: stated.explained,
@@ -242,7 +242,7 @@ fn verdict(
     poses: &[Pose],
     read_as: Convention,
     observed: &[ObservedPair],
-    stated: &Follows,
+    stated: &MotionFit,
 ) -> Verdict {
     let conventions = Likely::of(poses, observed);
     let best = conventions.explained;
@@ -309,7 +309,7 @@ impl Likely {
     fn of(poses: &[Pose], observed: &[ObservedPair]) -> Self {
         let explained = |convention: Convention| {
             let motions = motions(poses, convention, observed);
-            (follows(&motions, observed).explained, convention)
+            (fit_motions(&motions, observed).explained, convention)
         };
         let mut readings: Vec<(f64, Convention)> =
             Convention::all().into_iter().map(explained).collect();
@@ -334,7 +334,7 @@ fn rarer_mistake(
 ) -> Option<Verdict> {
     let transposed = |pose: &Pose| Pose::from_parts(pose.translation, pose.rotation.inverse());
     let transposed: Vec<Pose> = poses.iter().map(transposed).collect();
-    let transposed = follows(&motions(&transposed, read_as, observed), observed).explained;
+    let transposed = fit_motions(&motions(&transposed, read_as, observed), observed).explained;
     let mirrored = Likely::of(poses, &mirrored(observed));
 
     let explained = transposed.max(mirrored.explained);
@@ -402,8 +402,8 @@ fn best_shift(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) ->
             ..*pair
         });
         let there: Vec<ObservedPair> = there.collect();
-        let explained = follows(&motions(poses, read_as, &moved), &moved).explained;
-        let stated = follows(&motions(poses, read_as, &there), &there).explained;
+        let explained = fit_motions(&motions(poses, read_as, &moved), &moved).explained;
+        let stated = fit_motions(&motions(poses, read_as, &there), &there).explained;
         if explained - stated >= ROWS_BETTER_BY && explained > best.explained {
             best = Shift { rows, explained };
         }
@@ -422,7 +422,7 @@ fn best_translations(
     let mut best = (Translations::STATED, 0.0);
     for translations in Translations::all() {
         let motions = motions_with(translations, poses, read_as, observed);
-        let explained = follows(&motions, observed).explained;
+        let explained = fit_motions(&motions, observed).explained;
         if explained > best.1 {
             best = (translations, explained);
         }

@@ -13,7 +13,7 @@ const ROUNDS: usize = 8;
 
 /// What the images tell of the camera and of the scene, if the poses are right.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Seen {
+pub struct SceneEstimate {
     /// The focal length, image widths; about 0.8 for a phone or a webcam; 0 if the camera does not turn.
     pub focal: f64,
     /// How far away the things in view are, in the unit of the translations; none if the camera
@@ -23,15 +23,13 @@ pub struct Seen {
 
 /// How much of the motion of images a list of camera motions explains.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Follows {
+pub(super) struct MotionFit {
     /// The share of the motion that is explained, 0 to 1: shifts in image widths, turns in radians
     /// and growths, taken together. A pair whose residual is larger than its motion counts as 0, and
     /// not as less.
     pub explained: f64,
-    /// The same without the translations.
-    pub explained_by_rotations: f64,
     /// The focal length and the depth that fit best.
-    pub seen: Seen,
+    pub seen: SceneEstimate,
 }
 
 /// What one observed number would be by a stated rotation and by a stated translation, each times a
@@ -59,7 +57,7 @@ struct Factors {
 const KIND: [usize; 4] = [0, 0, 1, 2];
 
 /// Fits camera motions, `first_from_second` in the first camera's axes, to the motions of images.
-pub(super) fn follows(motions: &[Pose], observed: &[ObservedPair]) -> Follows {
+pub(super) fn fit_motions(motions: &[Pose], observed: &[ObservedPair]) -> MotionFit {
     let pairs: Vec<Pair> = motions
         .iter()
         .zip(observed)
@@ -80,10 +78,9 @@ pub(super) fn follows(motions: &[Pose], observed: &[ObservedPair]) -> Follows {
     let of_shifts = factors[KIND[0]];
     let has_both = of_shifts.rotation > 0.0 && of_shifts.translation > 0.0;
     let tells_depth = has_both && explained - explained_by_rotations >= TELLS_DEPTH;
-    Follows {
+    MotionFit {
         explained,
-        explained_by_rotations,
-        seen: Seen {
+        seen: SceneEstimate {
             focal: of_shifts.rotation,
             depth: tells_depth.then(|| of_shifts.rotation / of_shifts.translation),
         },
@@ -96,7 +93,7 @@ pub(super) fn unexplained(motions: &[Pose], observed: &[ObservedPair]) -> Vec<f6
     let pairs: Vec<Pair> = pairs.map(|(motion, pair)| pair_of(motion, pair)).collect();
     let (_, factors) = fit(&pairs);
 
-    pairs.iter().map(|pair| off(pair, &factors)).collect()
+    pairs.iter().map(|pair| residual(pair, &factors)).collect()
 }
 
 fn pair_of(motion: &Pose, pair: &ObservedPair) -> Pair {
@@ -126,7 +123,7 @@ fn fit(pairs: &[Pair]) -> (f64, [Factors; 3]) {
     for _ in 0..ROUNDS {
         factors = std::array::from_fn(|kind| factors_of(kind, pairs, &weights));
         for (weight, pair) in weights.iter_mut().zip(pairs) {
-            *weight = (1.0 + (off(pair, &factors) / ROBUST_MOTION).powi(2)).recip();
+            *weight = (1.0 + (residual(pair, &factors) / ROBUST_MOTION).powi(2)).recip();
         }
     }
 
@@ -136,7 +133,7 @@ fn fit(pairs: &[Pair]) -> (f64, [Factors; 3]) {
         let motion = pair.observed.iter().map(|number| number * number);
         let motion = motion.sum::<f64>().sqrt();
         if motion > 0.0 {
-            explained += motion * (1.0 - (off(pair, &factors) / motion).powi(2)).max(0.0);
+            explained += motion * (1.0 - (residual(pair, &factors) / motion).powi(2)).max(0.0);
             total += motion;
         }
     }
@@ -145,7 +142,7 @@ fn fit(pairs: &[Pair]) -> (f64, [Factors; 3]) {
 }
 
 /// How far a pair's motion is from the predicted one.
-fn off(pair: &Pair, factors: &[Factors; 3]) -> f64 {
+fn residual(pair: &Pair, factors: &[Factors; 3]) -> f64 {
     let numbers = pair.observed.iter().zip(&pair.causes).zip(KIND);
     let squares = numbers.map(|((observed, causes), kind)| {
         let Factors {
