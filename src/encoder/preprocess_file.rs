@@ -53,14 +53,14 @@ struct TransformersConfig {
     others: BTreeMap<String, serde_json::Value>,
 }
 
-/// What processors do to images beside what is read here, where a file says `true`. Conversion to three
-/// channels is done with every image.
+/// Steps of processors that are not supported, beside those whose names begin with `do_`.
 const OTHER_STEPS: [&str; 4] = [
     "rescale_offset",
     "include_top",
     "offset",
     "keep_aspect_ratio",
 ];
+/// Conversion to three channels, which is done with every image.
 const HARMLESS_STEPS: [&str; 1] = ["do_convert_rgb"];
 
 /// A size as transformers write it: older files have one number for both edges.

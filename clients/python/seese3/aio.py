@@ -570,14 +570,16 @@ class AsyncClient:
         answer = await self._ask(self._catalog.SetDefault, request, deadline_s)
         return [Default.of(default) for default in answer.defaults]
 
-    async def unset_default(self, *, room: str = "", adapter: str = "", request_id: str = "") -> list[Default]:
+    async def unset_default(
+        self, *, room: str = "", adapter: str = "", request_id: str = "", deadline_s: float | None = None
+    ) -> list[Default]:
         """Chooses nothing for a room or an adapter any more: its name means its newest revision again."""
         if bool(room) == bool(adapter):
             raise ValueError("give exactly one of room and adapter")
         request = catalog_pb2.SetDefaultRequest(
             name=f"rooms/{room}" if room else f"adapters/{adapter}", request_id=request_id or requests.new_id()
         )
-        answer = await self._ask(self._catalog.SetDefault, request, None)
+        answer = await self._ask(self._catalog.SetDefault, request, deadline_s)
         return [Default.of(default) for default in answer.defaults]
 
     async def roll_back_default(self, *, request_id: str = "", deadline_s: float | None = None) -> list[Default]:

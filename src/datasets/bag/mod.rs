@@ -92,9 +92,10 @@ pub fn read_bag(
         let first = malformed_poses
             .iter()
             .find(|message| is_of_pose_topic(message));
-        malformed(first.map_or(problem.clone(), |first| {
-            format!("{problem}; the first: {}", first.problem)
-        }))
+        malformed(match first {
+            Some(first) => format!("{problem}; the first: {}", first.problem),
+            None => problem,
+        })
     })?;
 
     let mut collected = Collected::default();

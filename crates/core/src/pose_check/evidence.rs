@@ -1,7 +1,8 @@
-//! Whether one way to read poses explains the motion of images better than another throughout a recording.
+//! Whether one way to read poses explains the motion of images better than another, throughout a
+//! recording.
 //!
-//! Where a camera hardly moves along an axis, to exchange it changes little of what is explained. But it changes it in
-//! every part of the recording in the same direction, which chance does not.
+//! Exchanging an axis along which the camera hardly moves changes little of what is explained. But it
+//! changes it in the same direction in every part of the recording, which chance does not.
 
 use crate::statistics::median;
 
@@ -12,8 +13,8 @@ const STANDARD_ERRORS: f64 = 3.0;
 /// Alignments are not more exact than this, image widths and radians together.
 const EXACT: f64 = 0.002;
 
-/// What two ways to read poses leave unexplained of the same pairs, in the order of the recording, image
-/// widths and radians together.
+/// What two ways to read poses leave unexplained of the same pairs, in the order of the recording,
+/// image widths and radians together.
 pub(super) struct Residuals {
     pub stated: Vec<f64>,
     pub other: Vec<f64>,

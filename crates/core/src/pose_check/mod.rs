@@ -24,7 +24,7 @@
 //! | `evidence` | whether a small difference shows throughout a recording |
 //! | `path` | what the poses alone tell: extents, steps, jumps |
 //!
-//! Not a method of the paper. The limits were chosen on a real recording and eighteen drawn rooms;
+//! Not a method of the paper. The limits were chosen on a real recording and on drawn rooms;
 //! docs/rooms-and-encoders.md reports them on rooms that were drawn afterwards.
 
 mod convention;
@@ -85,7 +85,7 @@ const ROWS_EXPLAIN: f64 = 0.75;
 const FURTHEST_SHIFT: i64 = 60;
 /// Conventions within this of the best one may be meant as well.
 const AS_GOOD: f64 = 0.03;
-/// Poses that explain less than this, and nothing usual that explains enough, are not those of the images.
+/// Poses that explain less than this are not those of the images, where no mistake explains enough.
 const UNRELATED: f64 = 0.4;
 
 /// Two frames of a recording and how the image moved between them.
