@@ -3,6 +3,7 @@
 check: test lean lint doc hygiene e2e
 
 test:
+    cargo test --workspace
     cargo test --workspace --features full
 
 # The tests that need the folder of large inputs, SEESE3_SHARED or ../shared.
@@ -12,9 +13,9 @@ large:
 # The long forms of what the tests show in short: a thousand reloads under load, ten thousand streams that say nothing,
 # half an hour of a steady load.
 soak:
-    SEESE3_RELOADS=1000 cargo test --release --test service swapped -- --nocapture
-    SEESE3_IDLE_STREAMS=10000 cargo test --release --test service idle_streams
-    SEESE3_SOAK_SECONDS=1800 cargo test --release --test service steady_load -- --nocapture
+    SEESE3_RELOADS=1000 cargo test --release -p seese3-server --test service swapped -- --nocapture
+    SEESE3_IDLE_STREAMS=10000 cargo test --release -p seese3-server --test service idle_streams
+    SEESE3_SOAK_SECONDS=1800 cargo test --release -p seese3-server --test service steady_load -- --nocapture
 
 # The same for publishers and servers that are killed: two hundred each.
 kills:
@@ -22,7 +23,7 @@ kills:
 
 # Every parser of outside bytes gets mutated files for ten minutes.
 fuzz:
-    SEESE3_FUZZ_SECONDS=600 cargo test --release --test library hostile:: -- --nocapture
+    SEESE3_FUZZ_SECONDS=600 cargo test --release -p seese3-fuzz --features full -- --nocapture
 
 # docs/api.md, from the protos.
 api:

@@ -16,14 +16,14 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use seese3::encoder::{
-    Encoder, Layer, ModelTask, OnBadImage, Runtime, RuntimeKind, Task, encode_room, read_image,
-    recipe,
-};
 use seese3_core::cancel::Cancellation;
 use seese3_core::image::RgbImage;
 use seese3_core::room::Timeline;
-use seese3_lab::studio::{Camera, SuiteRoom, render};
+use seese3_encoder::{
+    Encoder, Layer, ModelTask, OnBadImage, Runtime, RuntimeKind, Task, encode_room, read_image,
+    recipe,
+};
+use seese3_studio::{Camera, SuiteRoom, render};
 
 const FRAMES: usize = 64;
 const BATCH: usize = 8;

@@ -300,7 +300,7 @@ fn rpc(criterion: &mut Criterion) {
 }
 
 async fn serve(folder: &str) -> (Client, tonic::transport::Channel) {
-    let store = seese3::store::Store::create(folder).unwrap();
+    let store = seese3_store::Store::create(folder).unwrap();
     let (room, features) = room(1_000);
     store
         .publish_room(&room, std::slice::from_ref(&features))
@@ -330,10 +330,10 @@ async fn serve(folder: &str) -> (Client, tonic::transport::Channel) {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();
 
-    tokio::spawn(seese3::service::run(
+    tokio::spawn(seese3_server::run(
         listener,
         store,
-        seese3::service::Config::default(),
+        seese3_server::Config::default(),
         std::future::pending(),
     ));
 

@@ -16,20 +16,20 @@ use std::time::{Duration, Instant};
 
 use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
-use seese3::service::{Config, run};
-use seese3::store::Store;
 use seese3_client::Client;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::odometry_service_server::{OdometryService, OdometryServiceServer};
 use seese3_client::proto::v1::track_request::Message;
 use seese3_client::proto::v1::track_response::Answer;
 use seese3_core::adapter::{Adapter, Preset};
-use seese3_core::calibration::calibrate;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{Pose, Twist, exp};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
+use seese3_robot::calibration::calibrate;
+use seese3_server::{Config, run};
+use seese3_store::Store;
 use tokio::net::TcpListener;
 use tokio_stream::{Stream, StreamExt, wrappers::ReceiverStream};
 

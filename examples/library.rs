@@ -7,7 +7,6 @@
 
 use std::sync::Arc;
 
-use seese3::encoder::{BUILTIN_DIM, builtin_source, encode_builtin};
 use seese3_core::adapter::{Preset, Reading};
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::Features;
@@ -19,14 +18,15 @@ use seese3_core::ndarray::Array2;
 use seese3_core::room::{FrameId, Frames, Provenance, Room, RoomId};
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
-use seese3_lab::studio::{Camera, Scene, camera_path, render};
+use seese3_encoder::{BUILTIN_DIM, builtin_source, encode_builtin};
+use seese3_studio::{Camera, Scene, camera_path, render};
 
 const FRAMES: usize = 200;
 const SEED: u64 = 7;
 const STRIDE: u32 = 10;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    // A recording: images with exact poses. One's own recordings come from `seese3::datasets`.
+    // A recording: images with exact poses. One's own recordings come from `seese3_data::datasets`.
     let scene = Scene::new(SEED);
     let poses = camera_path(&scene, FRAMES, SEED);
     let mut rows = Vec::with_capacity(FRAMES);

@@ -1,14 +1,63 @@
-//! The program: parses the command line, runs the command, and reports an error in one line.
+//! The program `seese3`: the command line, one file per command. Each reads its arguments, calls the
+//! crates and prints the results.
+
+mod camera;
+mod encoder;
+mod examples;
+mod log;
+mod named;
+mod output;
+mod pose_options;
+#[cfg(feature = "lab")]
+mod rooms;
+mod ask;
+mod encoders;
+mod export;
+mod manual;
+mod progress;
+#[cfg(feature = "lab")]
+mod protocol;
+mod serve;
+mod config;
+mod encode;
+mod fit;
+mod health;
+mod pose_report;
+#[cfg(feature = "lab")]
+mod probe;
+mod push;
+#[cfg(feature = "lab")]
+mod reproduce;
+mod store;
+#[cfg(feature = "lab")]
+mod sweep;
+#[cfg(feature = "lab")]
+mod theory;
+mod track;
+#[cfg(feature = "lab")]
+mod train;
+mod check;
+#[cfg(feature = "lab")]
+mod demo;
+#[cfg(feature = "lab")]
+mod evaluate;
+mod import;
+#[cfg(feature = "lab")]
+mod studio;
+#[cfg(feature = "lab")]
+mod cross_room;
 
 use std::io::Write;
 use std::process::ExitCode;
 use std::time::Duration;
 
+use clap::{Parser, Subcommand};
+
 /// How long blocking work that cannot be cancelled may delay the exit.
 const LAST_WORK: Duration = Duration::from_secs(1);
 
 fn main() -> ExitCode {
-    let cli = match seese3::cli::parse() {
+    let cli = match config::parse() {
         Ok(cli) => cli,
         Err(error) => {
             complain(&format_args!("{error:#}"));
@@ -24,7 +73,7 @@ fn main() -> ExitCode {
         }
     };
 
-    let result = runtime.block_on(seese3::cli::run(cli));
+    let result = runtime.block_on(run(cli));
 
     // Dropping the runtime would wait without limit for blocking tasks that are still running.
     runtime.shutdown_timeout(LAST_WORK);
@@ -42,4 +91,150 @@ fn main() -> ExitCode {
 /// `eprintln` would panic.
 fn complain(error: &dyn std::fmt::Display) {
     let _ = writeln!(std::io::stderr(), "error: {error}");
+}
+
+/// Latent navigation over gRPC: train on a room's images, serve the room, navigate in it
+#[derive(Debug, Parser)]
+#[command(version, about, propagate_version = true)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+    /// Print nothing but warnings and errors; files that options name are written
+    #[arg(short, long, global = true)]
+    quiet: bool,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    #[cfg(feature = "lab")]
+    /// Show the whole pipeline on a synthetic room: render, train, serve and navigate
+    Demo(demo::Demo),
+    /// Read a recording from disk and publish it as a room in a store
+    Import(import::Import),
+    /// Check a stored room: what its camera did, and whether its poses can be those of its images
+    Check(check::Check),
+    /// Write a stored room in a format that other programs read
+    Export(export::Export),
+    /// Encode a room's images as features
+    Encode(encode::Encode),
+    /// List the known encoder recipes, with their preprocessing and layers
+    Encoders(encoders::Encoders),
+    #[cfg(feature = "lab")]
+    /// Render a suite of synthetic rooms and encode their images
+    Studio(studio::Studio),
+    #[cfg(feature = "lab")]
+    /// Train an adapter on the features of one or more rooms and publish it
+    Train(train::Train),
+    /// Fit an adapter to one room, measure how far it may be believed there, and publish it
+    Fit(fit::Fit),
+    #[cfg(feature = "lab")]
+    /// Score navigators on held-out motions: Hit@ε with baselines and intervals
+    Evaluate(evaluate::Evaluate),
+    #[cfg(feature = "lab")]
+    /// Measure how much SE(3) structure features carry: M1 mutual k-NN, M2 intrinsic dimension, M3
+    /// ridge probe, M4 trained adapter
+    Probe(probe::Probe),
+    #[cfg(feature = "lab")]
+    /// Train on some rooms and navigate zero-shot in others: scores against Identity, by the number
+    /// of training rooms
+    CrossRoom(cross_room::CrossRoom),
+    #[cfg(feature = "lab")]
+    /// Compare many layers, adapter configurations or formulations in one run
+    Sweep(sweep::Sweep),
+    #[cfg(feature = "lab")]
+    /// Reproduce the paper's tables and figures on given rooms and write one report
+    Reproduce(reproduce::Reproduce),
+    #[cfg(feature = "lab")]
+    /// Check the paper's theorems numerically: the measured value against the bound
+    Theory(theory::Theory),
+    /// Answer over gRPC until SIGTERM or Ctrl-C
+    Serve(Box<serve::Serve>),
+    /// Look after a store: list, defaults, removal, garbage, verification
+    Store(store::StoreCommand),
+    /// Upload a room or an adapter of a store to a server that was started with --writable
+    Push(push::Push),
+    /// Check or print the settings of `serve`
+    Config(Box<config::Config>),
+    /// Ask a server for the frames that a camera motion leads to
+    Navigate(ask::Navigate),
+    /// Ask a server for the frames of its rooms that look most like a view
+    Localize(ask::Localize),
+    /// Ask a server in which room a camera is, and where in it, from some of its views; and how sure
+    /// that is
+    Relocalize(ask::Relocalize),
+    /// Ask a server for the camera motion between two views
+    Motion(ask::Motion),
+    /// Track a camera with a server, from a file of features or a folder of images
+    Track(track::Track),
+    /// List the rooms and adapters of a server
+    Catalog(ask::Catalog),
+    /// Exit successfully if a server is serving, for containers and supervisors
+    Health(health::Health),
+    /// Print the completions of a shell
+    Completions(manual::Completions),
+    /// Write the manual pages, one for each command
+    Man(manual::Man),
+}
+
+impl Cli {
+    fn remember(&mut self, matches: &clap::ArgMatches) {
+        if let Command::Config(config) = &mut self.command {
+            config.remember(matches);
+        }
+    }
+}
+
+/// Runs a command. Results go to standard output; a failure is returned as the error.
+///
+/// # Errors
+/// When the command fails: one line that says what went wrong and what to change.
+pub async fn run(cli: Cli) -> anyhow::Result<()> {
+    dispatch(cli).await?;
+    output::check_printed()
+}
+
+async fn dispatch(cli: Cli) -> anyhow::Result<()> {
+    if cli.quiet {
+        output::silence();
+    }
+
+    match cli.command {
+        Command::Import(arguments) => arguments.run().await,
+        Command::Check(arguments) => arguments.run().await,
+        Command::Export(arguments) => arguments.run().await,
+        Command::Encode(arguments) => arguments.run().await,
+        Command::Fit(arguments) => arguments.run().await,
+        Command::Encoders(arguments) => arguments.run(),
+        #[cfg(feature = "lab")]
+        Command::Studio(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
+        Command::Train(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
+        Command::Evaluate(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
+        Command::Demo(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
+        Command::Probe(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
+        Command::CrossRoom(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
+        Command::Sweep(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
+        Command::Reproduce(arguments) => arguments.run().await,
+        #[cfg(feature = "lab")]
+        Command::Theory(arguments) => arguments.run(),
+        Command::Serve(arguments) => arguments.run().await,
+        Command::Store(arguments) => arguments.run().await,
+        Command::Push(arguments) => arguments.run().await,
+        Command::Config(arguments) => arguments.run(),
+        Command::Navigate(arguments) => arguments.run().await,
+        Command::Localize(arguments) => arguments.run().await,
+        Command::Relocalize(arguments) => arguments.run().await,
+        Command::Motion(arguments) => arguments.run().await,
+        Command::Track(arguments) => arguments.run().await,
+        Command::Catalog(arguments) => arguments.run().await,
+        Command::Health(arguments) => arguments.run().await,
+        Command::Completions(arguments) => arguments.run(),
+        Command::Man(arguments) => arguments.run(),
+    }
 }

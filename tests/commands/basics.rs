@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
 
 use crate::program::{refuses, seese3, succeeds, text};
-use crate::support::golden;
+use seese3_testing::golden;
 
 /// Imports the oracle's room, and trains on it for a moment.
 pub fn imported(store: &str) {
@@ -81,7 +81,7 @@ fn import_train_and_evaluate_write_what_scripts_read() {
         "{printed}"
     );
 
-    let runs = crate::support::json(&train_json);
+    let runs = seese3_testing::json(&train_json);
     assert_eq!(runs["runs"].as_array().unwrap().len(), 2);
 
     for (seed, run) in runs["runs"].as_array().unwrap().iter().enumerate() {
@@ -101,12 +101,12 @@ fn import_train_and_evaluate_write_what_scripts_read() {
             );
         }
 
-        let parts = crate::support::number(&run["test"]["r2"]["translation"])
-            + crate::support::number(&run["test"]["r2"]["rotation"]);
+        let parts = seese3_testing::number(&run["test"]["r2"]["translation"])
+            + seese3_testing::number(&run["test"]["r2"]["rotation"]);
 
-        crate::support::near(
+        seese3_testing::near(
             "overall",
-            crate::support::number(&run["test"]["r2"]["overall"]),
+            seese3_testing::number(&run["test"]["r2"]["overall"]),
             parts / 2.0,
             1e-12,
         );
@@ -126,7 +126,7 @@ fn import_train_and_evaluate_write_what_scripts_read() {
 
     assert!(printed.contains("inverse-poincare-affine"), "{printed}");
 
-    let table = crate::support::json(&table_json);
+    let table = seese3_testing::json(&table_json);
     let names: Vec<&str> = table["navigators"]
         .as_array()
         .unwrap()
@@ -151,7 +151,7 @@ fn import_train_and_evaluate_write_what_scripts_read() {
         assert!(row["mse"].is_number() && row["r2"].is_number() && row["top1"].is_number());
 
         for epsilon in ["0.1", "0.2", "0.3", "0.5"] {
-            let hit = |key: &str| crate::support::number(&row["hit"][epsilon][key]);
+            let hit = |key: &str| seese3_testing::number(&row["hit"][epsilon][key]);
             assert!(hit("low") <= hit("rate") && hit("rate") <= hit("high"));
         }
     }
@@ -385,7 +385,7 @@ fn bad_input_gets_one_line() {
 
     let good = format!("f={}", text(&golden().join("rooms/synthetic/features.npy")));
     let nan = folder.path().join("nan.npy");
-    let mut rows = crate::support::features(&golden(), "synthetic");
+    let mut rows = seese3_testing::features(&golden(), "synthetic");
     rows[(4, 2)] = f32::NAN;
 
     ndarray_npy::write_npy(&nan, &rows).unwrap();

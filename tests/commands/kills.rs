@@ -10,7 +10,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::program::{seese3, succeeds, text};
-use crate::support::{features, golden};
+use seese3_testing::{features, golden};
 
 /// How often each is killed: SEESE3_KILLS, 8 if it is not set; `just kills` asks for 200.
 fn kills() -> u32 {

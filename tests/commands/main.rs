@@ -7,9 +7,6 @@
     reason = "a failed step is a failed run here, and a case may be long"
 )]
 
-#[path = "../support/mod.rs"]
-mod support;
-
 mod basics;
 #[cfg(target_os = "linux")]
 mod disks;

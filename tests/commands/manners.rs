@@ -119,7 +119,7 @@ fn tables_and_plots_are_what_their_names_say() {
     succeeds(&[&evaluate[..], &["--table", text(&tex)]].concat());
 
     // Oracle: the JSON of the same evaluation.
-    let record = crate::support::json(&json);
+    let record = seese3_testing::json(&json);
     let table = std::fs::read_to_string(csv).unwrap();
     let mut lines = table
         .lines()

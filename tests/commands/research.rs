@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use crate::program::{refuses, succeeds, text};
-use crate::support::{golden, json, near, number};
+use seese3_testing::{golden, json, near, number};
 
 /// A store with the oracle's two rooms, `a` and `b`.
 fn stored(folder: &Path) -> String {

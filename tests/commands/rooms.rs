@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use crate::program::{refuses, seese3, succeeds};
-use crate::support::{golden, json, npy};
 use ndarray::{Array2, Array3};
-use seese3::encoder::encode_png;
 use seese3_core::image::RgbImage;
+use seese3_encoder::encode_png;
+use seese3_testing::{golden, json, npy};
 
 fn path(folder: &Path, name: &str) -> String {
     folder.join(name).to_str().unwrap().to_owned()

@@ -1,4 +1,5 @@
-//! The computations of [seese3](https://docs.rs/seese3): latent navigation with Poincaré adapters.
+//! The paper SeeSE3 as computations: latent navigation with Poincaré adapters. Part of
+//! [seese3](https://docs.rs/seese3).
 //!
 //! An encoder turns an image into a feature z. A small trained network φ, the *Poincaré adapter*,
 //! turns features into latents in which camera motion is linear: ΔP ≈ W(φ(z₂) − φ(z₁)), with
@@ -68,24 +69,17 @@
 //! | [`matrices`] | between ndarray and nalgebra |
 //! | [`room`] | a recording: frames with poses, times and image names |
 //! | [`image`] | 8-bit RGB pictures |
-//! | [`image_motion`] | how an image moved between two views |
 //! | [`features`] | one row of encoder output per frame, and what made it |
 //! | [`index`] | nearest neighbours: the exact scan, HNSW |
 //! | [`ridge`] | ridge regression in closed form |
 //! | [`splits`] | which pairs of frames train and which test; which frames a map holds |
 //! | [`statistics`] | means, quantiles, rates, the bootstrap over rooms, coverage of covariances |
 //! | [`motion_scores`] | R² of predicted motions |
-//! | [`pose_check`] | whether poses can be those of a recording's images |
 //! | [`trajectory`] | paths against the true ones: association, alignment, APE, RPE |
 //! | [`adapter`] | features to latents, latents to motions and back; networks and their training |
 //! | [`training`] | from rooms to an adapter and its scores |
 //! | [`navigation`] | from a frame and a motion to the frames that follow |
 //! | [`localization`] | from a view to the frames that look like it |
-//! | [`tracking`] | a camera followed frame by frame, with covariances |
-//! | [`planning`] | a way from a view to a goal, over a room's frames |
-//! | [`calibration`] | how large an adapter's errors are in rooms that it did not learn from |
-//! | [`fitting`] | an adapter fitted to one mapped room, and single views located in it |
-//! | [`two_view`] | the motion between two views from where things are in both images |
 //! | [`eval`] | Hit@ε on held-out motions, and whether a score leaks |
 //!
 //! Nothing here reads files, the network, the clock or the environment; randomness enters as a
@@ -96,24 +90,17 @@ pub mod geometry;
 pub mod matrices;
 pub mod room;
 pub mod image;
-pub mod image_motion;
 pub mod features;
 pub mod index;
 pub mod ridge;
 pub mod splits;
 pub mod statistics;
 pub mod motion_scores;
-pub mod pose_check;
 pub mod trajectory;
 pub mod adapter;
 pub mod training;
 pub mod navigation;
 pub mod localization;
-pub mod tracking;
-pub mod planning;
-pub mod calibration;
-pub mod fitting;
-pub mod two_view;
 pub mod eval;
 
 /// Vectors and matrices of poses and twists.

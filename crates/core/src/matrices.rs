@@ -15,6 +15,53 @@ pub fn to_ndarray(matrix: &DMatrix<f64>) -> Array2<f64> {
     Array2::from_shape_fn(matrix.shape(), |at| matrix[at])
 }
 
+/// Serializes a symmetric matrix as its upper triangle, row by row, for `#[serde(with)]`.
+#[cfg(feature = "serde")]
+pub mod upper_triangle {
+    use nalgebra::SMatrix;
+    use serde::de::Error;
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+    fn entries<const N: usize>() -> impl Iterator<Item = (usize, usize)> {
+        (0..N).flat_map(|row| (row..N).map(move |column| (row, column)))
+    }
+
+    /// Writes N(N + 1)/2 numbers; the lower triangle is not read.
+    ///
+    /// # Errors
+    /// Those of the serializer.
+    pub fn serialize<S: Serializer, const N: usize>(
+        matrix: &SMatrix<f64, N, N>,
+        serializer: S,
+    ) -> Result<S::Ok, S::Error> {
+        let values: Vec<f64> = entries::<N>().map(|at| matrix[at]).collect();
+        values.serialize(serializer)
+    }
+
+    /// Reads N(N + 1)/2 numbers.
+    ///
+    /// # Errors
+    /// If the count differs, or those of the deserializer.
+    pub fn deserialize<'de, D: Deserializer<'de>, const N: usize>(
+        deserializer: D,
+    ) -> Result<SMatrix<f64, N, N>, D::Error> {
+        let values = Vec::<f64>::deserialize(deserializer)?;
+        if values.len() != N * (N + 1) / 2 {
+            return Err(D::Error::invalid_length(
+                values.len(),
+                &"N(N + 1)/2 numbers",
+            ));
+        }
+
+        let mut matrix = SMatrix::zeros();
+        for ((row, column), value) in entries::<N>().zip(values) {
+            matrix[(row, column)] = value;
+            matrix[(column, row)] = value;
+        }
+        Ok(matrix)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

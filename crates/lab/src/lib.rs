@@ -6,7 +6,6 @@
 //!
 //! | module | what |
 //! | --- | --- |
-//! | [`studio`] | procedural rooms, ray-cast: images with exact poses |
 //! | [`formulations`] | the paper's alternatives A to D to the adapter |
 //! | [`probes`] | M1 to M3: how much of SE(3) features hold; M4 is the training of an adapter |
 //! | [`theory`] | the paper's theorems as numeric checks |
@@ -16,7 +15,6 @@
 //!
 //! Nothing here reads or writes files; the program does.
 
-pub mod studio;
 pub mod formulations;
 pub mod probes;
 pub mod theory;

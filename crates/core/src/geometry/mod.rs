@@ -9,11 +9,15 @@
 //!   log(P₁⁻¹ P₂), v in metres, ω in radians with |ω| ≤ π.
 //! - v is the translation part of the logarithm, V(ω)⁻¹ t, not the translation t itself.
 
+mod given_pose;
 mod pinhole;
 mod pose_error;
 mod rotation;
 mod se3;
 
+pub use given_pose::{
+    GivenPoseError, MAX_ROTATION_DEVIATION, pose_from_matrix, pose_from_quaternion,
+};
 pub use pinhole::{Pinhole, PinholeError, PixelCamera};
 pub use pose_error::PoseError;
 pub use rotation::{NearestRotation, nearest_rotation};

@@ -12,6 +12,7 @@ const SERIES_ANGLE_RAD: f64 = 0.2;
 
 /// An element of se(3): a camera motion, in the body frame of the camera it starts from.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Twist {
     /// v, metres.
     pub linear: Vector3<f64>,

@@ -11,7 +11,7 @@ use std::collections::BTreeSet;
 use hnsw_rs::prelude::{DistL2, Hnsw};
 use ndarray::ArrayView2;
 
-use super::{ExactIndex, Exclusion, Index, Neighbour, by_distance_then_frame, distance};
+use super::{Audit, ExactIndex, Exclusion, Index, Neighbour, by_distance_then_frame, distance};
 use crate::room::FrameId;
 
 const MOST_LAYERS: usize = 16;
@@ -39,23 +39,6 @@ impl Default for HnswParameters {
             search_effort: 256,
         }
     }
-}
-
-/// How an [`HnswIndex`] compares with the exact scan.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Audit {
-    /// Points that no search of the graph reaches; they are scanned instead.
-    pub unreachable: usize,
-    /// Points in the index.
-    pub frame_count: usize,
-    /// Share of the exact `k` nearest frames that the index also returns, averaged over the
-    /// queries.
-    pub recall: f64,
-    /// How many neighbours were asked for.
-    pub k: usize,
-    /// How many queries were asked. Each is the midpoint of two latents half the room apart, off
-    /// the frames' path as wanted latents are.
-    pub queries: usize,
 }
 
 /// Latents in a navigable small-world graph. Building and searching are deterministic.

@@ -5,10 +5,12 @@
 //! are left.
 
 mod exact;
+#[cfg(feature = "hnsw")]
 mod hnsw;
 
 pub use exact::ExactIndex;
-pub use hnsw::{Audit, HnswIndex, HnswParameters};
+#[cfg(feature = "hnsw")]
+pub use hnsw::{HnswIndex, HnswParameters};
 
 use crate::room::FrameId;
 
@@ -19,6 +21,23 @@ pub struct Neighbour {
     pub frame: FrameId,
     /// L2 distance in latent units.
     pub distance: f64,
+}
+
+/// How an approximate index compares with the exact scan.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Audit {
+    /// Points that no search of the graph reaches; they are scanned instead.
+    pub unreachable: usize,
+    /// Points in the index.
+    pub frame_count: usize,
+    /// Share of the exact `k` nearest frames that the index also returns, averaged over the
+    /// queries.
+    pub recall: f64,
+    /// How many neighbours were asked for.
+    pub k: usize,
+    /// How many queries were asked. Each is the midpoint of two latents half the room apart, off
+    /// the frames' path as wanted latents are.
+    pub queries: usize,
 }
 
 /// Frames that must not be returned: all within `radius` rows of `centre`.
@@ -37,6 +56,7 @@ impl Exclusion {
     }
 
     /// The most frames that are left out.
+    #[cfg(feature = "hnsw")]
     fn most(&self) -> usize {
         (self.radius as usize).saturating_mul(2).saturating_add(1)
     }
@@ -68,7 +88,7 @@ fn by_distance_then_frame(a: &Neighbour, b: &Neighbour) -> std::cmp::Ordering {
 
 /// L2 distance. Columns are summed in four lanes, which a processor adds at the same time; the
 /// order is always the same, so that equal rows have equal distances.
-pub(crate) fn distance(a: &[f64], b: &[f64]) -> f64 {
+pub fn distance(a: &[f64], b: &[f64]) -> f64 {
     let ((a_lanes, a_rest), (b_lanes, b_rest)) = (a.as_chunks::<4>(), b.as_chunks::<4>());
 
     let mut sums = [0.0; 4];
@@ -85,7 +105,7 @@ pub(crate) fn distance(a: &[f64], b: &[f64]) -> f64 {
 
 /// The nearest of all neighbours that are offered, by distance and then by frame.
 #[derive(Debug)]
-pub(crate) struct Nearest {
+pub struct Nearest {
     count: usize,
     /// Always sorted and never longer than `count`, so that nothing has to be sorted at the end.
     best: Vec<Neighbour>,
@@ -100,6 +120,7 @@ impl Nearest {
         }
     }
 
+    /// Takes a neighbor if it is among the nearest so far.
     #[inline]
     pub fn offer(&mut self, found: Neighbour) {
         // Most are no better than the worst so far and are dropped here.
@@ -118,6 +139,7 @@ impl Nearest {
         self.best.truncate(self.count);
     }
 
+    /// The nearest that were offered, sorted.
     pub fn found(self) -> Vec<Neighbour> {
         self.best
     }

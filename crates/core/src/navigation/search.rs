@@ -4,7 +4,9 @@ use nalgebra::{DMatrix, SymmetricEigen};
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
 
 use crate::adapter::{Adapter, Error};
-use crate::index::{Audit, ExactIndex, Exclusion, HnswIndex, HnswParameters, Index, Neighbour};
+use crate::index::{Audit, ExactIndex, Exclusion, Index, Neighbour};
+#[cfg(feature = "hnsw")]
+use crate::index::{HnswIndex, HnswParameters};
 use crate::matrices::{to_nalgebra, to_ndarray};
 use crate::room::FrameId;
 
@@ -70,6 +72,7 @@ pub enum IndexKind {
     #[default]
     Exact,
     /// The approximate graph of `hnsw_rs`.
+    #[cfg(feature = "hnsw")]
     Hnsw(HnswParameters),
 }
 
@@ -240,22 +243,24 @@ impl Search {
         latents: ArrayView2<'_, f64>,
     ) -> Result<Self, Error> {
         let frames: Vec<FrameId> = (0..latents.nrows() as u32).map(FrameId).collect();
-        let IndexKind::Hnsw(parameters) = kind else {
-            return Self::exact(metric, adapter, latents, &frames);
-        };
+        match kind {
+            IndexKind::Exact => Self::exact(metric, adapter, latents, &frames),
+            #[cfg(feature = "hnsw")]
+            IndexKind::Hnsw(parameters) => {
+                let projection = Projection::new(metric, adapter, latents)?;
+                let index = HnswIndex::new(projection.rows(latents).view(), &frames, parameters);
 
-        let projection = Projection::new(metric, adapter, latents)?;
-        let index = HnswIndex::new(projection.rows(latents).view(), &frames, parameters);
+                // The recall of this very graph is measured on at most 200 queries, so that it can
+                // be reported.
+                let audit = Some(index.audit(10, frames.len().div_ceil(200)));
 
-        // The recall of this very graph is measured on at most 200 queries, so that it can be
-        // reported.
-        let audit = Some(index.audit(10, frames.len().div_ceil(200)));
-
-        Ok(Self {
-            projection,
-            index: Box::new(index),
-            audit,
-        })
+                Ok(Self {
+                    projection,
+                    index: Box::new(index),
+                    audit,
+                })
+            }
+        }
     }
 
     /// The `k` frames nearest to a latent.

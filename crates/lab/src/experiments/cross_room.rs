@@ -10,7 +10,6 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use seese3_core::adapter::{Adapter, TrainingRecord};
-use seese3_core::calibration::calibrate_retrieval;
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{Baselines, Protocol, Row, TestPairs, evaluate};
 use seese3_core::motion_scores::MotionScores;
@@ -18,6 +17,7 @@ use seese3_core::navigation::{IndexKind, Navigator, NavigatorKind};
 use seese3_core::room::RoomId;
 use seese3_core::statistics::{Rate, RoomMean, bootstrap_mean};
 use seese3_core::training::{RoomData, TrainingPlan, motions, predictions, train_adapter};
+use seese3_robot::calibration::calibrate_retrieval;
 
 use super::Error;
 

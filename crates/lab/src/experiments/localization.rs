@@ -3,12 +3,12 @@
 use std::sync::Arc;
 
 use seese3_core::adapter::{Adapter, EpochProgress};
-use seese3_core::fitting::{Fitted, Localizer, MotionReader, ReadingRules, Readings, fit};
 use seese3_core::geometry::{Pose, PoseError, exp, log};
 use seese3_core::room::FrameId;
 use seese3_core::splits::is_in_left_out_block;
 use seese3_core::statistics::{Coverage, RecordedMedian, coverage, median_of_recording, quantile};
 use seese3_core::training::RoomData;
+use seese3_robot::fitting::{Fitted, Localizer, MotionReader, ReadingRules, Readings, fit};
 
 use super::Error;
 

@@ -24,6 +24,7 @@ pub mod localization;
 pub mod motion;
 pub mod odometry;
 pub mod path_comparison;
+mod mapped_room;
 pub mod planning;
 pub mod probe;
 pub mod robustness;
@@ -31,10 +32,8 @@ pub mod seeds;
 mod simple_planners;
 pub mod tracking_scores;
 
-use seese3_core::{
-    adapter, calibration, eval, fitting, navigation, splits, tracking, training, trajectory,
-    two_view,
-};
+use seese3_core::{adapter, eval, navigation, splits, training, trajectory};
+use seese3_robot::{calibration, fitting, tracking, two_view};
 
 use crate::probes;
 

@@ -12,7 +12,7 @@ use seese3_core::room::Room;
 use seese3_core::splits::Pair;
 use seese3_core::statistics::{Coverage, coverage};
 use seese3_core::training::motions;
-use seese3_core::two_view;
+use seese3_robot::two_view;
 
 use super::Error;
 use super::localization::ErrorQuantiles;

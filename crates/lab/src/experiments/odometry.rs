@@ -11,17 +11,17 @@ use rayon::prelude::*;
 
 use seese3_core::adapter::Adapter;
 use seese3_core::cancel::Cancellation;
-use seese3_core::fitting::{RoomReader, fit};
 use seese3_core::geometry::{Pose, PoseError};
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
-use seese3_core::tracking::{
+use seese3_core::training::RoomData;
+use seese3_core::trajectory::{Relation, RpePairs, Statistics, Trajectory, ape, rpe};
+use seese3_robot::fitting::{RoomReader, fit};
+use seese3_robot::tracking::{
     InitialPose, Map, MapMatch, MapQuery, MotionSurprise, Replay, Segment, Status, Tracker,
     TrackerSettings, relocalize, replay, replay_streams,
 };
-use seese3_core::training::RoomData;
-use seese3_core::trajectory::{Relation, RpePairs, Statistics, Trajectory, ape, rpe};
 
 use super::tracking_scores::TrackingScores;
 use super::{Error, Within};
@@ -458,7 +458,7 @@ fn lost_frames(
 
         // The other room's frames are the last ones that were played.
         let updates = &replayed.updates[replayed.updates.len() - frames.len()..];
-        let is_lost = |update: &&seese3_core::tracking::Update| update.status == Status::Lost;
+        let is_lost = |update: &&seese3_robot::tracking::Update| update.status == Status::Lost;
         found.frames += updates.len();
         found.lost += updates.iter().filter(is_lost).count();
     }

@@ -12,49 +12,25 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ndarray::Array1;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use seese3_core::adapter::{Adapter, Reading};
 use seese3_core::cancel::Cancellation;
-use seese3_core::features::Features;
-use seese3_core::fitting::{RoomReader, fit};
 use seese3_core::geometry::{Pose, PoseError, body_twist};
-use seese3_core::navigation::{
-    self, IndexKind, Navigator, Outcome, Pursuit, Start, Stepper, pursue,
-};
-use seese3_core::planning::{
-    BelievedStart, Hops, KnownRoom, LEAST_ARRIVAL_PROBABILITY, Planned, Route, RouteBounds, plan,
-};
-use seese3_core::room::{FrameId, Room};
-use seese3_core::splits::HoldOut;
-use seese3_core::tracking::{Map, PoseReader};
+use seese3_core::navigation::{self, Outcome, Start, Stepper, pursue};
+use seese3_core::room::FrameId;
 use seese3_core::training::RoomData;
+use seese3_robot::planning::{BelievedStart, KnownRoom, Planned, plan};
+use seese3_robot::tracking::PoseReader;
 
+use super::Error;
+pub use super::mapped_room::{MappedRoom, PlannedWay, PlanningProtocol, PlanningQuestion};
 use super::simple_planners::{greedy, pose_graph, topological};
-use super::{Error, Within};
 
 /// Views of each other room that a room's planners are asked about.
 const OTHER_ROOM_VIEWS: usize = 5;
-
-/// What decides an evaluation besides the rooms and the adapter.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PlanningProtocol {
-    /// Which frames are mapped, and which views are asked about.
-    pub hold_out: HoldOut,
-    /// Questions in each room.
-    pub questions: usize,
-    /// The longest hop, ‖(v, ω)‖ with metres and radians mixed. None takes the adapter's own, which
-    /// ours and the pose graph exceed where there is no other way.
-    pub longest_hop: Option<f64>,
-    /// Of the questions.
-    pub seed: u64,
-    /// Whether an adapter is fitted to the mapped frames, from the given one's weights, and tells
-    /// ours where a view is.
-    pub is_fitted: bool,
-}
 
 /// A planner that is evaluated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -84,20 +60,6 @@ impl Planner {
         Self::Topological,
         Self::StandingStill,
     ];
-}
-
-/// What a planner answers.
-#[derive(Debug, Clone, PartialEq)]
-pub struct PlannedWay {
-    /// Where the planner believes the camera to be, `world_from_camera`.
-    pub start: Pose,
-    /// The poses to drive to, in order, `world_from_camera`.
-    pub poses: Vec<Pose>,
-    /// Whether the planner says that the goal is reached.
-    pub says_reached: bool,
-    /// How probable the planner thinks it that the robot ends within the tolerance, if it says
-    /// that.
-    pub probability: Option<f64>,
 }
 
 /// How a planner did.
@@ -136,199 +98,94 @@ pub struct RoomPlanning {
     pub scores: BTreeMap<Planner, PlannerScores>,
 }
 
-/// What planners know of a room.
-pub struct MappedRoom {
-    /// The mapped frames as a room of their own.
-    pub navigator: Arc<Navigator>,
-    /// The same features, row by frame.
-    pub features: Features,
-    /// None if the adapter is not calibrated.
-    map: Option<Map>,
-    /// Of the adapter that was fitted to the mapped frames, if one was.
-    reader: Option<RoomReader>,
-    pursuit: Pursuit,
-    bounds: RouteBounds,
-}
-
-/// A question to the planners.
-pub struct PlanningQuestion {
-    /// What the camera sees, shape (d,).
-    pub feature: Vec<f32>,
-    /// The same under the adapter, shape (k,).
-    pub latent: Array1<f64>,
-    /// The goal, a frame of the mapped room.
-    pub goal: FrameId,
-}
-
-impl MappedRoom {
-    fn new(
-        data: &RoomData<'_>,
-        adapter: &Arc<Adapter>,
-        protocol: &PlanningProtocol,
-    ) -> Result<Self, Error> {
-        let what = || format!("room '{}'", data.room.id());
-        let rows = rows(&protocol.hold_out.mapped(data.room.frame_count()));
-        let frames = data.room.frames().select(&rows);
-        let room = Room::new(
-            data.room.id().clone(),
-            frames,
-            data.room.provenance().clone(),
-        );
-        let room = Arc::new(room.map_err(|problem| Error::Input(problem.to_string()))?);
-        let features = data.features.select(&rows);
-
-        let navigator = Navigator::new(room, &features, adapter.clone(), IndexKind::Exact);
-        let navigator = Arc::new(navigator.within(what)?);
-        let map = match adapter.error_model() {
-            Some(_) => {
-                let mapped = all_frames(&navigator);
-                let map = Map::new(navigator.clone(), &mapped).within(what)?;
-                Some(map.with_features(features.rows(), &mapped))
-            }
-            None => None,
-        };
-
-        let reader = if protocol.is_fitted {
-            let data = RoomData {
-                room: navigator.room(),
-                revision: data.revision,
-                features: &features,
-            };
-            let mapped = all_frames(&navigator);
-            let fitted = fit(&data, &mapped, Some(adapter), 0, &|_| ()).within(what)?;
-            let reader = RoomReader::new(&data, &mapped, Some(adapter.clone()), &fitted);
-            Some(reader.within(what)?)
-        } else {
-            None
-        };
-
-        let own = Pursuit::of(&navigator);
-        Ok(Self {
-            pursuit: Pursuit {
-                step: protocol.longest_hop.unwrap_or(own.step),
-                ..own
-            },
-            bounds: RouteBounds {
-                hops: protocol
-                    .longest_hop
-                    .map_or(Hops::Preferably(own.step), Hops::AtMost),
-                tolerance_m: own.tolerance_m,
-                tolerance_rad: own.tolerance_rad,
-                least_arrival_probability: LEAST_ARRIVAL_PROBABILITY,
-            },
-            navigator,
-            features,
-            map,
-            reader,
-        })
-    }
-
-    /// The poses of the mapped frames, `world_from_camera`.
-    pub fn poses(&self) -> &[Pose] {
-        self.navigator.room().poses()
-    }
-
-    /// What is asked of a way.
-    pub fn pursuit(&self) -> &Pursuit {
-        &self.pursuit
-    }
-
-    /// What is asked of a route.
-    pub fn bounds(&self) -> RouteBounds {
-        self.bounds
-    }
-
-    fn answer(&self, planner: Planner, question: &PlanningQuestion) -> Result<PlannedWay, Error> {
-        match planner {
-            Planner::Ours => self.ours(question),
-            Planner::Latent => self.latent(question),
-            Planner::Greedy => Ok(greedy(self, question)),
-            Planner::PoseGraph => Ok(pose_graph(self, question)),
-            Planner::Topological => Ok(topological(self, question)),
-            Planner::StandingStill => Ok(PlannedWay {
-                start: Pose::identity(),
-                poses: Vec::new(),
-                says_reached: true,
-                probability: None,
-            }),
-        }
-    }
-
-    fn ours(&self, question: &PlanningQuestion) -> Result<PlannedWay, Error> {
-        let known = KnownRoom {
-            navigator: &self.navigator,
-            map: self.map.as_ref(),
-            reader: self.reader.as_ref().map(|reader| reader as &dyn PoseReader),
-        };
-        let feature = Some(question.feature.as_slice());
-        let start = BelievedStart::seen(known, question.latent.view(), feature);
-        let goal = self.poses()[question.goal.row()];
-        let planned = plan(
-            &self.navigator,
-            &start,
-            &goal,
-            self.bounds,
-            &Cancellation::default(),
-        );
-
-        let nothing = PlannedWay {
-            start: start.pose,
+fn answer(
+    room: &MappedRoom,
+    planner: Planner,
+    question: &PlanningQuestion,
+) -> Result<PlannedWay, Error> {
+    match planner {
+        Planner::Ours => ours(room, question),
+        Planner::Latent => latent(room, question),
+        Planner::Greedy => Ok(greedy(room, question)),
+        Planner::PoseGraph => Ok(pose_graph(room, question)),
+        Planner::Topological => Ok(topological(room, question)),
+        Planner::StandingStill => Ok(PlannedWay {
+            start: Pose::identity(),
             poses: Vec::new(),
-            says_reached: false,
+            says_reached: true,
             probability: None,
-        };
-        Ok(match planned.map_err(navigation::Error::from)? {
-            Planned::Way {
-                route,
-                arrival_probability,
-            } => PlannedWay {
-                poses: self.poses_of(&route),
-                says_reached: true,
-                probability: arrival_probability,
-                ..nothing
-            },
-            Planned::StartUnknown(_) | Planned::NoRoute(_) => nothing,
-        })
+        }),
     }
+}
 
-    /// The poses of a route's frames.
-    pub fn poses_of(&self, route: &Route) -> Vec<Pose> {
-        let pose = |frame: &FrameId| self.poses()[frame.row()];
-        route.frames.iter().map(pose).collect()
-    }
+fn ours(room: &MappedRoom, question: &PlanningQuestion) -> Result<PlannedWay, Error> {
+    let known = KnownRoom {
+        navigator: &room.navigator,
+        map: room.map.as_ref(),
+        reader: room.reader.as_ref().map(|reader| reader as &dyn PoseReader),
+    };
+    let feature = Some(question.feature.as_slice());
+    let start = BelievedStart::seen(known, question.latent.view(), feature);
+    let goal = room.poses()[question.goal.row()];
+    let planned = plan(
+        &room.navigator,
+        &start,
+        &goal,
+        room.bounds,
+        &Cancellation::default(),
+    );
 
-    fn latent(&self, question: &PlanningQuestion) -> Result<PlannedWay, Error> {
-        let pose = self.navigator.nearest(question.latent.view(), 1)[0].pose;
-        let start = Start {
-            latent: question.latent.clone(),
-            frame: None,
-            pose: Some(pose),
-        };
+    let nothing = PlannedWay {
+        start: start.pose,
+        poses: Vec::new(),
+        says_reached: false,
+        probability: None,
+    };
+    Ok(match planned.map_err(navigation::Error::from)? {
+        Planned::Way {
+            route,
+            arrival_probability,
+        } => PlannedWay {
+            poses: room.poses_of(&route),
+            says_reached: true,
+            probability: arrival_probability,
+            ..nothing
+        },
+        Planned::StartUnknown(_) | Planned::NoRoute(_) => nothing,
+    })
+}
 
-        let mut poses: Vec<Pose> = Vec::new();
-        let outcome = pursue(
-            &self.navigator,
-            &Stepper::InversePoincare(Reading::Homogeneous),
-            start,
-            &self.poses()[question.goal.row()],
-            self.pursuit,
-            &Cancellation::default(),
-            &mut |feedback| {
-                // An attempt that found no frame repeats the last one.
-                let at = feedback.frame.map(|frame| frame.pose);
-                if let Some(at) = at.filter(|at| poses.last() != Some(at)) {
-                    poses.push(at);
-                }
-            },
-        )?;
+fn latent(room: &MappedRoom, question: &PlanningQuestion) -> Result<PlannedWay, Error> {
+    let pose = room.navigator.nearest(question.latent.view(), 1)[0].pose;
+    let start = Start {
+        latent: question.latent.clone(),
+        frame: None,
+        pose: Some(pose),
+    };
 
-        Ok(PlannedWay {
-            start: pose,
-            poses,
-            says_reached: outcome == Outcome::Reached,
-            probability: None,
-        })
-    }
+    let mut poses: Vec<Pose> = Vec::new();
+    let outcome = pursue(
+        &room.navigator,
+        &Stepper::InversePoincare(Reading::Homogeneous),
+        start,
+        &room.poses()[question.goal.row()],
+        room.pursuit,
+        &Cancellation::default(),
+        &mut |feedback| {
+            // An attempt that found no frame repeats the last one.
+            let at = feedback.frame.map(|frame| frame.pose);
+            if let Some(at) = at.filter(|at| poses.last() != Some(at)) {
+                poses.push(at);
+            }
+        },
+    )?;
+
+    Ok(PlannedWay {
+        start: pose,
+        poses,
+        says_reached: outcome == Outcome::Reached,
+        probability: None,
+    })
 }
 
 /// Asks every planner in every room; `done` hears of each room.
@@ -354,7 +211,7 @@ pub fn evaluate(
             let question = question(data, adapter, frame, goal)?;
             let truth = &data.room.poses()[frame.row()];
             for planner in Planner::ALL {
-                let way = mapped.answer(planner, &question)?;
+                let way = answer(&mapped, planner, &question)?;
                 scores
                     .entry(planner)
                     .or_default()
@@ -371,7 +228,7 @@ pub fn evaluate(
                 let goal = mapped.any_frame(&mut random);
                 let question = question(other, adapter, frame, goal)?;
                 for planner in Planner::ALL {
-                    let says_reached = mapped.answer(planner, &question)?.says_reached;
+                    let says_reached = answer(&mapped, planner, &question)?.says_reached;
                     let scores = scores.entry(planner).or_default();
                     scores.other_questions += 1;
                     scores.other_says_reached += usize::from(says_reached);
@@ -450,14 +307,4 @@ impl PlannerScores {
             other_says_reached: sum.other_says_reached + room.other_says_reached,
         })
     }
-}
-
-fn all_frames(navigator: &Navigator) -> Vec<FrameId> {
-    (0..navigator.room().frame_count() as u32)
-        .map(FrameId)
-        .collect()
-}
-
-fn rows(frames: &[FrameId]) -> Vec<usize> {
-    frames.iter().map(|frame| frame.row()).collect()
 }

@@ -7,10 +7,10 @@ use ndarray::{Array1, ArrayView1, Axis};
 
 use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::{Pose, PoseError, body_twist};
-use seese3_core::planning::PoseGraph;
 use seese3_core::room::FrameId;
+use seese3_robot::planning::PoseGraph;
 
-use super::planning::{MappedRoom, PlannedWay, PlanningQuestion};
+use super::mapped_room::{MappedRoom, PlannedWay, PlanningQuestion};
 
 /// Frames that look most like a frame, to which the topological graph joins it.
 const LOOK_ALIKE: usize = 10;

@@ -6,7 +6,7 @@ use super::table::aligned;
 use crate::experiments::odometry::{LostFrames, PathErrors, Relocalisation, RoomOdometry};
 use crate::experiments::tracking_scores::{AnswerErrors, TrackingScores, VelocityErrors};
 use seese3_core::statistics::{Rate, coverage, mean, median, root_mean_square};
-use seese3_core::tracking::MotionSurprise;
+use seese3_robot::tracking::MotionSurprise;
 
 /// Groups of about equal size into which the coverage table divides motions by their length.
 const STRATA: usize = 4;

@@ -4,8 +4,8 @@ use nalgebra::{DMatrix, DVector, Vector6};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use crate::studio::{Camera, Scene, SuiteRoom, render};
 use seese3_core::geometry::{Pose, Twist, exp};
+use seese3_studio::{Camera, Scene, SuiteRoom, render};
 
 /// Step of the central differences for constructed maps, metres and radians.
 const STEP: f64 = 1e-4;

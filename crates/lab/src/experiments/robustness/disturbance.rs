@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use seese3_core::geometry::Pose;
 use seese3_core::image::RgbImage;
 use seese3_core::statistics::normal_deviates;
-use seese3_core::tracking::MeasuredGravity;
+use seese3_robot::tracking::MeasuredGravity;
 
 /// The width in pixels for which blurs are stated; in other images they are as large a part.
 const STATED_WIDTH: f64 = 640.0;

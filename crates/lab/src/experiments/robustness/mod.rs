@@ -12,7 +12,7 @@ use ndarray::ArrayView2;
 use seese3_core::geometry::Pose;
 use seese3_core::room::FrameId;
 use seese3_core::splits::HoldOut;
-use seese3_core::tracking::{
+use seese3_robot::tracking::{
     InitialPose, Observation, Played, Replay, Status, joined, period_ns, replay_frames,
 };
 

@@ -1,0 +1,118 @@
+//! The files of a bag, whichever way it is stored: the messages of all of them, in the order written.
+//!
+//! ROS 2 writes a bag as a folder, of one file or of several that follow each other, `NAME_0.mcap`,
+//! `NAME_1.mcap`; until Iron the files were databases of SQLite, `.db3`. What a file is stands in its
+//! first bytes, whatever its name.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use super::message::{Message, Topic, ZSTD};
+use super::{mcap_file, sqlite_file};
+use crate::datasets::Error;
+use crate::datasets::natural::sort_naturally;
+
+/// The first bytes of an MCAP file.
+const MCAP: &[u8] = b"\x89MCAP0\r\n";
+/// The first bytes of a database of SQLite.
+const SQLITE: &[u8] = b"SQLite format 3\0";
+/// The endings of the files of a bag's folder; beside them it has a description.
+const ENDINGS: [&str; 3] = [".mcap", ".db3", ".zstd"];
+
+/// Calls `take` with every message that is understood, and returns all topics by their names. What
+/// `take` refuses is an error of the file that has the message.
+///
+/// # Errors
+/// [`Error`] if the bag cannot be read, or is not of a form that is understood.
+pub fn each_message(
+    bag: &Path,
+    mut take: impl FnMut(&Message<'_>) -> Result<(), String>,
+) -> Result<BTreeMap<String, Topic>, Error> {
+    let mut topics = BTreeMap::new();
+    for file in files_of(bag)? {
+        let of_file = match form_of(&file)? {
+            Form::Mcap => mcap_file::each_message(&file, &mut take)?,
+            Form::Sqlite => sqlite_file::each_message(&file, &mut take)?,
+        };
+        topics.extend(of_file.into_iter().map(|topic| (topic.name.clone(), topic)));
+    }
+
+    Ok(topics)
+}
+
+/// The files of a bag in the order in which they were written.
+fn files_of(bag: &Path) -> Result<Vec<PathBuf>, Error> {
+    if !bag.is_dir() {
+        return Ok(vec![bag.to_owned()]);
+    }
+
+    let io = |cause| Error::Io {
+        file: bag.to_owned(),
+        cause,
+    };
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(bag).map_err(io)? {
+        let name = entry.map_err(io)?.file_name();
+        let name = name.to_string_lossy().into_owned();
+        if ENDINGS.iter().any(|ending| name.ends_with(ending)) {
+            names.push(name);
+        }
+    }
+    if names.is_empty() {
+        return Err(Error::Malformed {
+            file: bag.to_owned(),
+            problem: "has no .mcap and no .db3 files: it is not a bag of ROS 2".to_owned(),
+        });
+    }
+    let has = |ending: &str| names.iter().any(|name| name.ends_with(ending));
+    if has(".mcap") && has(".db3") {
+        return Err(Error::Malformed {
+            file: bag.to_owned(),
+            problem: "has .mcap and .db3 files, which may be the same recording twice: name one of the files"
+                .to_owned(),
+        });
+    }
+
+    sort_naturally(&mut names, |name| name);
+    Ok(names.iter().map(|name| bag.join(name)).collect())
+}
+
+enum Form {
+    Mcap,
+    Sqlite,
+}
+
+fn form_of(file: &Path) -> Result<Form, Error> {
+    let io = |cause| Error::Io {
+        file: file.to_owned(),
+        cause,
+    };
+    // Opening a pipe would wait for someone to write into it.
+    if !std::fs::metadata(file).map_err(io)?.is_file() {
+        return Err(Error::Malformed {
+            file: file.to_owned(),
+            problem: "is not a regular file".to_owned(),
+        });
+    }
+    let mut first = Vec::new();
+    let opened = File::open(file).map_err(io)?;
+    opened.take(16).read_to_end(&mut first).map_err(io)?;
+
+    let problem = match first.as_slice() {
+        bytes if bytes.starts_with(MCAP) => return Ok(Form::Mcap),
+        bytes if bytes.starts_with(SQLITE) => return Ok(Form::Sqlite),
+        bytes if bytes.starts_with(ZSTD) => {
+            "is compressed as a whole: unpack it with `zstd -d`, or `ros2 bag convert` the bag"
+        }
+        bytes if bytes.starts_with(b"#ROSBAG") => {
+            "is a bag of ROS 1: `rosbags-convert` makes one of ROS 2 of it"
+        }
+        _ => "is neither an MCAP file nor a .db3 of ROS 2",
+    };
+    Err(Error::Malformed {
+        file: file.to_owned(),
+        problem: problem.to_owned(),
+    })
+}

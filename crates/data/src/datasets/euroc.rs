@@ -1,0 +1,210 @@
+//! EuRoC MAV: `mav0/cam0/{data.csv,sensor.yaml,data/*.png}` and
+//! `mav0/state_groundtruth_estimate0/data.csv`.
+//!
+//! The ground truth is the pose of the body, the IMU, with the scalar of quaternions first; the camera
+//! stands on the body as `T_BS` of its `sensor.yaml` says. Images take the ground truth nearest in
+//! time.
+
+use std::path::Path;
+
+use nalgebra::{Matrix4, Quaternion};
+
+use super::collect::{About, Collected};
+use super::text::number;
+use super::{DropReason, Error, Reader, Recording, read_text};
+use seese3_core::geometry::{Pinhole, PixelCamera, Pose, pose_from_matrix, pose_from_quaternion};
+
+/// The longest time between an image and its pose, nanoseconds.
+const MAX_DIFFERENCE_NS: u64 = 10_000_000;
+
+/// Reads a sequence's folder, with or without `mav0`. `camera` is the camera's folder, such as `cam0`.
+///
+/// # Errors
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
+/// refuses unusable frames and there are some.
+pub fn read_euroc(
+    folder: &Path,
+    camera: &str,
+    reader: &mut Reader<'_>,
+) -> Result<Recording, Error> {
+    let inner = folder.join("mav0");
+    let folder = if inner.is_dir() {
+        inner
+    } else {
+        folder.to_owned()
+    };
+    let camera_folder = folder.join(camera);
+
+    let poses = read_ground_truth(&folder.join("state_groundtruth_estimate0/data.csv"))?;
+    let sensor = read_sensor(&camera_folder.join("sensor.yaml"))?;
+    let images = read_images(&camera_folder.join("data.csv"))?;
+
+    let mut collected = Collected::default();
+    for (done, (timestamp_ns, name)) in images.iter().enumerate() {
+        (reader.progress)(done, images.len());
+        let image = format!("data/{name}");
+        if !camera_folder.join(&image).is_file() {
+            let looked_for = camera_folder.join(&image).display().to_string();
+            collected.drop_without(looked_for, name.clone(), DropReason::MissingImage);
+            continue;
+        }
+
+        let nearest = poses
+            .iter()
+            .min_by_key(|(time, _)| time.abs_diff(*timestamp_ns))
+            .filter(|(time, _)| time.abs_diff(*timestamp_ns) <= MAX_DIFFERENCE_NS);
+        let Some((_, world_from_body)) = nearest else {
+            collected.drop(name.clone(), DropReason::NoPoseWithinTolerance);
+            continue;
+        };
+
+        let about = About {
+            name: name.clone(),
+            image: Some(image),
+            timestamp_ns: Some(*timestamp_ns),
+            ..About::default()
+        };
+        collected.keep(about, world_from_body * sensor.body_from_camera);
+    }
+
+    let mut recording = collected.finish(&camera_folder, reader)?;
+    recording.stated.camera = sensor.camera;
+    Ok(recording)
+}
+
+/// The rows of a table: the line's number and its columns. Lines that begin with # are skipped.
+fn rows(file: &Path, text: &str) -> Result<Vec<(usize, Vec<String>)>, Error> {
+    let lines = (1..).zip(text.lines());
+    let says = lines.filter(|(_, row)| !row.trim().is_empty() && !row.starts_with('#'));
+    let columns = |(line, row): (usize, &str)| {
+        let columns = row.split(',').map(|word| word.trim().to_owned());
+        (line, columns.collect::<Vec<_>>())
+    };
+    let rows: Vec<_> = says.map(columns).collect();
+
+    match rows.iter().find(|(_, columns)| columns.len() < 2) {
+        None => Ok(rows),
+        Some((line, _)) => Err(wrong(
+            file,
+            *line,
+            "has no columns separated by commas".to_owned(),
+        )),
+    }
+}
+
+fn wrong(file: &Path, line: usize, problem: String) -> Error {
+    Error::Line {
+        file: file.to_owned(),
+        line,
+        problem,
+    }
+}
+
+fn time(file: &Path, line: usize, word: &str) -> Result<i64, Error> {
+    word.parse()
+        .map_err(|_| wrong(file, line, format!("'{word}' is not a time in nanoseconds")))
+}
+
+/// Times, nanoseconds, and poses of the body, `world_from_body`.
+fn read_ground_truth(file: &Path) -> Result<Vec<(i64, Pose)>, Error> {
+    let text = read_text(file)?;
+    let mut poses = Vec::new();
+    for (line, columns) in rows(file, &text)? {
+        if columns.len() < 8 {
+            return Err(wrong(
+                file,
+                line,
+                format!(
+                    "has {} columns, expected time, position and quaternion",
+                    columns.len()
+                ),
+            ));
+        }
+
+        let mut numbers = [0.0; 7];
+        for (value, word) in numbers.iter_mut().zip(&columns[1..8]) {
+            *value = number(file, line, word)?;
+        }
+        let [x, y, z, qw, qx, qy, qz] = numbers;
+        let pose = pose_from_quaternion([x, y, z], Quaternion::new(qw, qx, qy, qz))
+            .map_err(|error| wrong(file, line, error.to_string()))?;
+        poses.push((time(file, line, &columns[0])?, pose));
+    }
+
+    Ok(poses)
+}
+
+/// Times, nanoseconds, and names of images, in the order of time.
+fn read_images(file: &Path) -> Result<Vec<(i64, String)>, Error> {
+    let text = read_text(file)?;
+    let mut images = Vec::new();
+    for (line, columns) in rows(file, &text)? {
+        images.push((time(file, line, &columns[0])?, columns[1].clone()));
+    }
+
+    images.sort();
+    Ok(images)
+}
+
+/// What is known of a camera.
+struct Sensor {
+    body_from_camera: Pose,
+    camera: Option<Pinhole>,
+}
+
+fn read_sensor(file: &Path) -> Result<Sensor, Error> {
+    let text = read_text(file)?;
+    let malformed = |problem: String| Error::Malformed {
+        file: file.to_owned(),
+        problem,
+    };
+
+    let mounting = list(&text, "T_BS:").and_then(|numbers| <[f64; 16]>::try_from(numbers).ok());
+    let mounting = mounting.ok_or_else(|| {
+        malformed("has no T_BS with sixteen numbers, the camera's pose on the body".to_owned())
+    })?;
+    let (body_from_camera, _) = pose_from_matrix(&Matrix4::from_row_slice(&mounting))
+        .map_err(|error| malformed(error.to_string()))?;
+
+    let numbers = list(&text, "resolution:").zip(list(&text, "intrinsics:"));
+    let camera = numbers.and_then(|(size, intrinsics)| {
+        let [width, height] = <[f64; 2]>::try_from(size).ok()?;
+        let [focal, _, x, y] = <[f64; 4]>::try_from(intrinsics).ok()?;
+        let centre = Some([x, y].into());
+        Pinhole::new(PixelCamera {
+            width,
+            height,
+            focal,
+            centre,
+        })
+        .ok()
+    });
+    Ok(Sensor {
+        body_from_camera,
+        camera,
+    })
+}
+
+/// The numbers between the first brackets after a key, in the one form of YAML that these files have.
+fn list(text: &str, key: &str) -> Option<Vec<f64>> {
+    let after = &text[text.find(key)? + key.len()..];
+    let inside = after.split_once('[')?.1.split_once(']')?.0;
+    inside
+        .split(',')
+        .map(|word| word.trim().parse().ok())
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: by hand, in the form of the published files.
+    #[test]
+    fn lists_are_found_by_their_keys() {
+        let yaml = "sensor_type: camera\nT_BS:\n  cols: 4\n  data: [0.0, -1.0,\n         2.5]\nresolution: [752, 480]\n";
+        assert_eq!(list(yaml, "T_BS:"), Some(vec![0.0, -1.0, 2.5]));
+        assert_eq!(list(yaml, "resolution:"), Some(vec![752.0, 480.0]));
+        assert_eq!(list(yaml, "intrinsics:"), None);
+    }
+}

@@ -1,0 +1,9 @@
+//! Paths and streams as other programs read them: TUM, KITTI, MCAP.
+
+#[cfg(feature = "bags")]
+mod recording;
+mod trajectory;
+
+#[cfg(feature = "bags")]
+pub use recording::{McapRecording, RecordedOdometry};
+pub use trajectory::{kitti_trajectory, tum_trajectory};

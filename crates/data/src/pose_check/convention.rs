@@ -1,0 +1,179 @@
+//! The conventions in which poses are written down, and how each is read.
+
+use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion};
+
+use seese3_core::geometry::Pose;
+
+/// Which way the axes of a camera point.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Axes {
+    /// x right, y down, z forward: OpenCV, COLMAP, ROS optical frames, and this project.
+    #[default]
+    OpenCv,
+    /// x right, y up, z backward: OpenGL, Blender, NeRF, ARKit.
+    OpenGl,
+    /// x forward, y left, z up: the bodies of robots in ROS.
+    Ros,
+}
+
+/// Which transform a pose is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Direction {
+    /// From coordinates of the camera to those of the world; its translation is the camera's place.
+    #[default]
+    WorldFromCamera,
+    /// From coordinates of the world to those of the camera: the inverse, as COLMAP writes it.
+    CameraFromWorld,
+}
+
+/// In which order a quaternion's numbers stand.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum QuaternionOrder {
+    /// As the format says.
+    #[default]
+    Stated,
+    /// (w, x, y, z) in a place where (x, y, z, w) is read.
+    ScalarFirst,
+}
+
+/// A way in which poses can be written down.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Convention {
+    /// The camera's axes.
+    pub axes: Axes,
+    /// Which transform.
+    pub direction: Direction,
+    /// By how many quarter turns the images are turned clockwise against the camera that the poses
+    /// are of, 0 to 3.
+    pub image_quarter_turns: u8,
+    /// The order of quaternions.
+    pub quaternions: QuaternionOrder,
+}
+
+impl Convention {
+    /// `world_from_camera` with axes x right, y down, z forward in the image, from a pose that is
+    /// stated in this convention.
+    pub fn to_world_from_camera(self, stated: &Pose) -> Pose {
+        let mut pose = *stated;
+        if self.quaternions == QuaternionOrder::ScalarFirst {
+            // What was read as (x, y, z, w) is (w, x, y, z).
+            let read = pose.rotation.quaternion();
+            let meant = Quaternion::new(read.i, read.j, read.k, read.w);
+            pose.rotation = UnitQuaternion::from_quaternion(meant);
+        }
+        if self.direction == Direction::CameraFromWorld {
+            pose = pose.inverse();
+        }
+
+        pose * stated_from_optical(self.axes) * camera_from_turned_image(self.image_quarter_turns)
+    }
+
+    /// Every convention that a mistake may be, the one of this project first and the common ones
+    /// before the rare ones.
+    pub fn all() -> Vec<Self> {
+        let mut all = Vec::new();
+        for image_quarter_turns in 0..4 {
+            for axes in [Axes::OpenCv, Axes::OpenGl, Axes::Ros] {
+                for direction in [Direction::WorldFromCamera, Direction::CameraFromWorld] {
+                    all.push(Self {
+                        axes,
+                        direction,
+                        image_quarter_turns,
+                        quaternions: QuaternionOrder::Stated,
+                    });
+                }
+            }
+        }
+
+        for direction in [Direction::WorldFromCamera, Direction::CameraFromWorld] {
+            all.push(Self {
+                direction,
+                quaternions: QuaternionOrder::ScalarFirst,
+                ..Self::default()
+            });
+        }
+        all
+    }
+}
+
+fn rotation(rows: [[f64; 3]; 3]) -> UnitQuaternion<f64> {
+    let matrix = Matrix3::from_fn(|row, column| rows[row][column]);
+    UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(matrix))
+}
+
+/// Takes coordinates along x right, y down, z forward to those along the stated axes.
+fn stated_from_optical(axes: Axes) -> UnitQuaternion<f64> {
+    match axes {
+        Axes::OpenCv => UnitQuaternion::identity(),
+        Axes::OpenGl => rotation([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]),
+        Axes::Ros => rotation([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+    }
+}
+
+/// Takes coordinates in a turned image's axes to those of the camera that is not turned.
+fn camera_from_turned_image(quarter_turns: u8) -> UnitQuaternion<f64> {
+    // What points right in the image that was turned clockwise pointed up before.
+    let angle = -std::f64::consts::FRAC_PI_2 * f64::from(quarter_turns);
+    UnitQuaternion::from_axis_angle(&nalgebra::Vector3::z_axis(), angle)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Point3, Translation3, Vector3};
+
+    /// Oracle: by hand. A camera at (1, 2, 3) looks along the world's x axis, with the world's z
+    /// axis up in its image: right in its image is −y, down is −z.
+    #[test]
+    fn each_convention_is_read() {
+        let optical = rotation([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]);
+        let pose = Pose::from_parts(Translation3::new(1.0, 2.0, 3.0), optical);
+        let seen = pose * Point3::new(0.0, 0.0, 5.0);
+        assert!((seen - Point3::new(6.0, 2.0, 3.0)).norm() < 1e-12);
+
+        // A robot whose body looks along x of the world stands as the world does.
+        let body = Pose::from_parts(pose.translation, UnitQuaternion::identity());
+        // In OpenGL's axes the camera looks along its −z, and its y is up: the world's z.
+        let gl = rotation([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
+        let gl = Pose::from_parts(pose.translation, gl);
+
+        let of = |axes, direction| Convention {
+            axes,
+            direction,
+            ..Convention::default()
+        };
+        let cases = [
+            (Axes::OpenCv, Direction::WorldFromCamera, pose),
+            (Axes::OpenCv, Direction::CameraFromWorld, pose.inverse()),
+            (Axes::Ros, Direction::WorldFromCamera, body),
+            (Axes::OpenGl, Direction::WorldFromCamera, gl),
+            (Axes::OpenGl, Direction::CameraFromWorld, gl.inverse()),
+        ];
+        for (axes, direction, stated) in cases {
+            let found = of(axes, direction).to_world_from_camera(&stated);
+            let off = (found.to_homogeneous() - pose.to_homogeneous()).norm();
+            assert!(off < 1e-12, "{axes:?} {direction:?}");
+        }
+
+        // An image that was turned clockwise by a quarter: what was up, the world's z, is right now.
+        let turned = Convention {
+            image_quarter_turns: 1,
+            ..Convention::default()
+        };
+        let right = turned.to_world_from_camera(&pose).rotation * Vector3::x();
+        assert!((right - Vector3::z()).norm() < 1e-12);
+
+        // A file's (w, x, y, z) = (.5, .5, −.5, .5) read as (x, y, z, w).
+        let mixed = Pose::from_parts(
+            pose.translation,
+            UnitQuaternion::from_quaternion(Quaternion::new(0.5, 0.5, 0.5, -0.5)),
+        );
+        let convention = Convention {
+            quaternions: QuaternionOrder::ScalarFirst,
+            ..Convention::default()
+        };
+        let found = convention.to_world_from_camera(&mixed).rotation;
+        let meant = UnitQuaternion::from_quaternion(Quaternion::new(0.5, 0.5, -0.5, 0.5));
+        assert!(found.angle_to(&meant) < 1e-12);
+    }
+}

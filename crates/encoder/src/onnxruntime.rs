@@ -1,0 +1,173 @@
+//! Models in onnxruntime, whose shared library is loaded when the first model is opened.
+
+use std::path::Path;
+use std::sync::{Mutex, OnceLock, PoisonError};
+
+use ndarray::{ArrayD, Axis, Slice};
+use ort::environment::Environment;
+use ort::session::Session;
+use ort::value::TensorRef;
+
+use super::model_file::ModelFile;
+use super::runtime::{Runner, Runtime};
+use super::{Error, RuntimeKind};
+
+const NAME: &str = "onnxruntime";
+/// The setting of a session that names the folder of weights in files of their own.
+const WEIGHTS_FOLDER: &str = "session.model_external_initializers_file_folder_path";
+
+/// The loaded library, or why it could not be loaded. It is loaded once per process.
+static LOADED: OnceLock<Result<Environment, String>> = OnceLock::new();
+
+pub(super) struct OnnxRuntime {
+    session: Mutex<Session>,
+    /// The outputs that were asked for, in that order.
+    names: Vec<String>,
+    /// Whether the model takes one clip in a run, and not as many as come.
+    is_of_one: bool,
+}
+
+impl OnnxRuntime {
+    pub fn open(
+        file: &Path,
+        model: &ModelFile,
+        names: &[String],
+        shape: &[Option<usize>],
+        runtime: &Runtime,
+    ) -> Result<Self, Error> {
+        let wrong = |problem: String| Error::Model {
+            file: file.to_owned(),
+            problem,
+        };
+
+        let environment = environment(runtime.library.as_deref())?;
+        let builder = Session::builder(environment).map_err(|error| failed(&error))?;
+        let mut builder = builder
+            .with_intra_threads(runtime.threads)
+            .map_err(|error| failed(&error))?;
+
+        // A copy in memory finds the files of its weights by the folder of the model.
+        let folder = file
+            .parent()
+            .filter(|folder| !folder.as_os_str().is_empty());
+        let folder = folder.unwrap_or(Path::new(".")).to_string_lossy();
+        builder = builder
+            .with_config_entry(WEIGHTS_FOLDER, folder)
+            .map_err(|error| failed(&error))?;
+
+        // onnxruntime returns declared outputs only. For an inner value,
+        // the model is opened from a copy in memory that declares it.
+        let session = if names.iter().all(|name| model.outputs.contains(name)) {
+            builder.commit_from_file(file)
+        } else {
+            builder.commit_from_memory(&model.with_outputs(names))
+        };
+
+        let session =
+            session.map_err(|error| wrong(format!("cannot be run by {NAME}: {error}")))?;
+        let is_of_one = shape.first().copied().flatten().is_some();
+
+        Ok(Self {
+            session: Mutex::new(session),
+            names: names.to_vec(),
+            is_of_one,
+        })
+    }
+
+    fn batch(&self, input: ndarray::ArrayViewD<'_, f32>) -> Result<Vec<ArrayD<f32>>, Error> {
+        let input = input.as_standard_layout();
+        let tensor = TensorRef::from_array_view(&input).map_err(|error| failed(&error))?;
+
+        // A poisoned lock is no reason to stop: a run does not change the session.
+        let mut session = self.session.lock().unwrap_or_else(PoisonError::into_inner);
+        let outputs = session
+            .run(ort::inputs![tensor])
+            .map_err(|error| failed(&error))?;
+
+        let array = |name: &String| {
+            let missing = || Error::Runtime {
+                runtime: NAME,
+                problem: format!("gave no output '{name}'"),
+            };
+            let output = outputs.get(name).ok_or_else(missing)?;
+
+            Ok(output
+                .try_extract_array::<f32>()
+                .map_err(|error| failed(&error))?
+                .to_owned())
+        };
+
+        self.names.iter().map(array).collect()
+    }
+}
+
+impl Runner for OnnxRuntime {
+    fn run(&self, input: ArrayD<f32>) -> Result<Vec<ArrayD<f32>>, Error> {
+        // The whole batch is one run, unless the model takes one clip at a time.
+        if !self.is_of_one || input.shape()[0] == 1 {
+            return self.batch(input.view());
+        }
+
+        // A model that was exported with a batch size of 1 is run once for each clip.
+        let clips = 0..input.shape()[0];
+        let each: Vec<_> = clips
+            .map(|clip| self.batch(input.slice_axis(Axis(0), Slice::from(clip..clip + 1))))
+            .collect::<Result<_, _>>()?;
+
+        let joined = |output: usize| {
+            let parts: Vec<_> = each
+                .iter()
+                .map(|outputs: &Vec<ArrayD<f32>>| outputs[output].view())
+                .collect();
+            ndarray::concatenate(Axis(0), &parts).map_err(|error| Error::Runtime {
+                runtime: NAME,
+                problem: error.to_string(),
+            })
+        };
+
+        (0..self.names.len()).map(joined).collect()
+    }
+}
+
+fn environment(library: Option<&Path>) -> Result<&'static Environment, Error> {
+    let help = "`pip install onnxruntime` brings the library, onnxruntime/capi/libonnxruntime.so.*; name it with \
+                --onnxruntime FILE or ORT_DYLIB_PATH";
+
+    let failed = |problem: String| Error::Runtime {
+        runtime: RuntimeKind::OnnxRuntime.name(),
+        problem,
+    };
+    let library =
+        library.ok_or_else(|| failed(format!("its shared library was not named; {help}")))?;
+
+    if !library.is_file() {
+        return Err(failed(format!(
+            "{} is not a file; {help}",
+            library.display()
+        )));
+    }
+
+    let load = || {
+        let builder = ort::init_from(library).map_err(|error| error.to_string())?;
+        builder
+            .with_name("seese3")
+            .with_telemetry(false)
+            .build()
+            .map_err(|error| error.to_string())
+    };
+
+    // Later calls get the result of the first one, even if they name another library.
+    LOADED.get_or_init(load).as_ref().map_err(|problem| {
+        failed(format!(
+            "{} cannot be loaded: {problem}; {help}",
+            library.display()
+        ))
+    })
+}
+
+fn failed<T: std::fmt::Display>(error: &T) -> Error {
+    Error::Runtime {
+        runtime: NAME,
+        problem: error.to_string(),
+    }
+}

@@ -1,0 +1,130 @@
+//! Encoder recipes: how images are prepared for well-known encoders, and which of their layers are
+//! used. The recipes themselves are data, in `recipes.toml`.
+
+use std::sync::LazyLock;
+
+use serde::Deserialize;
+
+use super::preparation::size;
+use super::{Error, Preparation};
+
+/// How to use a well-known encoder, whose model the user has to bring.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EncoderRecipe {
+    /// The value of `--recipe` that chooses it.
+    pub name: String,
+    /// The model in one line.
+    pub about: String,
+    /// How its images are prepared.
+    pub preparation: Preparation,
+    /// The number of images in a clip.
+    pub window: usize,
+    /// The layers that can be used, by the names that the export gives them.
+    pub layers: String,
+    /// Where the numbering of layers starts, `0` or `1`, or `name` where layers have names.
+    pub base: String,
+    /// Whether the encoder's final normalisation layer is included in the outputs: `final` or `none`
+    ///
+    pub norm: String,
+    /// The number of tokens before the patches.
+    pub prefix_tokens: usize,
+    /// How the output of a layer is reduced to one row, unless `--pool` says otherwise.
+    pub pooling: String,
+    /// What the paper says about its use.
+    pub paper: String,
+    /// Whether it was run for this project, and where the numbers of the recipe come from.
+    pub checked: String,
+    /// Python code that exports it to an ONNX file.
+    pub export: String,
+}
+
+/// All recipes.
+pub static RECIPES: LazyLock<Vec<EncoderRecipe>> = LazyLock::new(|| {
+    #[expect(
+        clippy::expect_used,
+        reason = "the text is compiled in, and a test reads it"
+    )]
+    parse(include_str!("recipes.toml")).expect("recipes.toml is well formed")
+});
+
+/// The recipe of that name.
+pub fn recipe(name: &str) -> Option<&'static EncoderRecipe> {
+    RECIPES.iter().find(|recipe| recipe.name == name)
+}
+
+fn parse(text: &str) -> Result<Vec<EncoderRecipe>, toml::de::Error> {
+    #[derive(Deserialize)]
+    struct File {
+        recipe: Vec<EncoderRecipe>,
+    }
+
+    Ok(toml::from_str::<File>(text)?.recipe)
+}
+
+/// A preparation in the words of the command line's options.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct PreparationEntry {
+    resize: String,
+    filter: String,
+    crop: Option<String>,
+    divisor: f32,
+    mean: [f32; 3],
+    std: [f32; 3],
+}
+
+impl TryFrom<PreparationEntry> for Preparation {
+    type Error = Error;
+
+    fn try_from(entry: PreparationEntry) -> Result<Self, Error> {
+        Ok(Self {
+            resize: entry.resize.parse()?,
+            filter: entry.filter.parse()?,
+            crop: entry.crop.map(|crop| size("crop", &crop)).transpose()?,
+            divisor: entry.divisor,
+            mean: entry.mean,
+            deviation: entry.std,
+        })
+    }
+}
+
+impl<'de> Deserialize<'de> for Preparation {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        PreparationEntry::deserialize(deserializer)?
+            .try_into()
+            .map_err(serde::de::Error::custom)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Pooling;
+
+    /// Oracle: what it takes to open a model: every value of a recipe can be parsed, and the size
+    /// of its images is fixed.
+    #[test]
+    fn every_recipe_can_be_followed() {
+        for recipe in RECIPES.iter() {
+            assert!(recipe.pooling.parse::<Pooling>().is_ok(), "{}", recipe.name);
+
+            assert!(
+                recipe.preparation.size().is_some() && recipe.preparation.check().is_ok(),
+                "{}",
+                recipe.name
+            );
+
+            assert!(
+                matches!(recipe.base.as_str(), "0" | "1" | "name")
+                    && matches!(recipe.norm.as_str(), "none" | "final")
+            );
+
+            let text = recipe.preparation.describe(recipe.window);
+            assert_eq!(
+                Preparation::parse(&text).unwrap(),
+                (recipe.preparation.clone(), recipe.window)
+            );
+        }
+    }
+}

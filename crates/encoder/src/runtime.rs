@@ -1,0 +1,51 @@
+//! The libraries that can run a model, and what each of them implements.
+
+use std::path::PathBuf;
+
+use ndarray::ArrayD;
+
+use super::Error;
+
+/// The library that runs a model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RuntimeKind {
+    /// Written in Rust and compiled in; needs no library on the system.
+    Tract,
+    /// The shared library onnxruntime, loaded when the first model is opened; faster.
+    OnnxRuntime,
+}
+
+impl RuntimeKind {
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Tract => "tract",
+            Self::OnnxRuntime => "onnxruntime",
+        }
+    }
+
+    /// Whether this program was built with it.
+    pub fn is_built(self) -> bool {
+        match self {
+            Self::Tract => cfg!(feature = "onnx"),
+            Self::OnnxRuntime => cfg!(feature = "onnxruntime"),
+        }
+    }
+}
+
+/// How a model is run.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Runtime {
+    /// The library that runs it.
+    pub kind: RuntimeKind,
+    /// The number of threads, for a library that keeps threads of its own.
+    pub threads: usize,
+    /// The path of onnxruntime's shared library.
+    pub library: Option<PathBuf>,
+}
+
+/// A model that is ready to run.
+pub(super) trait Runner: Send + Sync {
+    /// The outputs of the layers that were asked for, clips along the first axis of each.
+    fn run(&self, input: ArrayD<f32>) -> Result<Vec<ArrayD<f32>>, Error>;
+}

@@ -1,0 +1,10 @@
+//! Encoders against PyTorch, onnxruntime and Pillow.
+#![allow(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::too_many_lines,
+    reason = "a failed step is a failed run here, and a case may be long"
+)]
+
+mod encoders;

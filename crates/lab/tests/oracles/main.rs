@@ -1,0 +1,13 @@
+//! Probes, formulations and planning against other libraries, and the real kitchen.
+#![allow(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::too_many_lines,
+    reason = "a failed step is a failed run here, and a case may be long"
+)]
+
+mod formulations;
+mod kitchen;
+mod planning;
+mod probes;

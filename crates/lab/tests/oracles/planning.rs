@@ -1,0 +1,124 @@
+//! Ways to a goal, and streams of disturbed cameras, in made-up places.
+
+use std::sync::Arc;
+
+use ndarray::Axis;
+use seese3_core::adapter::Adapter;
+use seese3_core::features::Features;
+use seese3_core::room::Room;
+use seese3_core::splits::HoldOut;
+use seese3_core::training::RoomData;
+use seese3_lab::experiments::odometry::{self, OdometryProtocol, TrackedRoom, trackers};
+use seese3_lab::experiments::planning::{self, Planner, PlannerScores, PlanningProtocol};
+use seese3_lab::experiments::robustness::{self, Disturbance, DisturbedTracking, DisturbedViews};
+use seese3_robot::tracking::TrackerSettings;
+
+use seese3_testing::world::{calibrated, served};
+
+fn data<'a>(room: &'a Room, features: &'a Features) -> RoomData<'a> {
+    RoomData {
+        room,
+        revision: 1,
+        features,
+    }
+}
+
+/// Oracle: the definitions of the simple planners. A pose graph takes any view for its room; a robot
+/// that stands still says that it is there and mostly is not. Ours refuses some views of other rooms,
+/// and no planner is there more often.
+#[test]
+fn planners_say_what_they_know() {
+    let adapter = Arc::new(calibrated().0);
+    let rooms = [served("hall"), served("attic")];
+    let rooms: Vec<RoomData<'_>> = rooms
+        .iter()
+        .map(|(room, features)| data(room, features))
+        .collect();
+    let protocol = PlanningProtocol {
+        hold_out: HoldOut::Interleaved,
+        questions: 60,
+        longest_hop: None,
+        seed: 5,
+        is_fitted: false,
+    };
+
+    let found = planning::evaluate(&rooms, &adapter, &protocol, &|| ()).unwrap();
+    let of = |planner: Planner| PlannerScores::sum(found.iter().map(|room| &room.scores[&planner]));
+    let ours = of(Planner::Ours);
+    let graph = of(Planner::PoseGraph);
+    let still = of(Planner::StandingStill);
+
+    assert_eq!(ours.questions, 120);
+    assert!(ours.truly_there >= 114, "{ours:?}");
+    assert!(ours.truly_there <= ours.says_reached);
+    assert!(
+        ours.other_says_reached < graph.other_says_reached,
+        "{ours:?}"
+    );
+    assert_eq!(graph.other_says_reached, graph.other_questions);
+    assert_eq!(still.says_reached, 120);
+    assert!(still.truly_there < 60 && still.steps == 0, "{still:?}");
+    for planner in Planner::ALL {
+        assert!(of(planner).truly_there <= ours.truly_there, "{planner:?}");
+    }
+}
+
+fn disturbed(
+    room: &TrackedRoom<'_>,
+    disturbance: Disturbance,
+    is_blank: bool,
+) -> DisturbedTracking {
+    let tracked = HoldOut::Interleaved.tracked(room.room().frame_count());
+    let rows: Vec<usize> = tracked.iter().map(|frame| frame.row()).collect();
+    let features = room.features().select(Axis(0), &rows);
+    let views = DisturbedViews {
+        features: features.view(),
+        is_blank: &vec![is_blank; rows.len()],
+    };
+
+    robustness::evaluate(room, HoldOut::Interleaved, disturbance, views).unwrap()
+}
+
+fn tracked<'a>(room: &'a (Room, Features), adapter: &Arc<Adapter>) -> Vec<TrackedRoom<'a>> {
+    let protocol = OdometryProtocol {
+        hold_out: HoldOut::Interleaved,
+        settings: TrackerSettings::of(adapter),
+        is_fitted: false,
+    };
+    trackers(&[data(&room.0, &room.1)], adapter, &protocol).unwrap()
+}
+
+/// Oracle: the replay that `evaluate odometry` makes of the same frames.
+#[test]
+fn an_undisturbed_camera_is_tracked_as_ever() {
+    let adapter = Arc::new(calibrated().0);
+    let hall = served("hall");
+    let rooms = tracked(&hall, &adapter);
+
+    let ever = odometry::evaluate(&rooms, HoldOut::Interleaved, &|_, _| ()).unwrap();
+    let plain = disturbed(&rooms[0], Disturbance::None, false);
+    assert_eq!(plain.scores, ever[0].scores);
+    assert_eq!(plain.statuses, ever[0].statuses);
+    assert_eq!(plain.noticed_after, None);
+}
+
+/// Oracle: the rules: a blank image is noticed at once, a frozen camera at the sixth image that is the
+/// same. A camera that takes every fourth frame answers a fourth of them.
+#[test]
+fn a_disturbance_is_scored_while_it_is_there() {
+    let adapter = Arc::new(calibrated().0);
+    let hall = served("hall");
+    let rooms = tracked(&hall, &adapter);
+    let tracked = HoldOut::Interleaved.tracked(hall.0.frame_count()).len();
+
+    let black = disturbed(&rooms[0], Disturbance::Blank { brightness: 0 }, true);
+    assert_eq!(black.noticed_after, Some(1));
+    assert_eq!(black.frames, (tracked / 3).min(60));
+
+    let frozen = disturbed(&rooms[0], Disturbance::Frozen, false);
+    assert_eq!(frozen.noticed_after, Some(6));
+
+    let plain = disturbed(&rooms[0], Disturbance::None, false);
+    let slow = disturbed(&rooms[0], Disturbance::Rate { every: 4 }, false);
+    assert_eq!(slow.frames, plain.frames.div_ceil(4));
+}

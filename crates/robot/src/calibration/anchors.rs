@@ -1,0 +1,111 @@
+//! Errors of poses that are read from a matching frame, by how far the match is.
+
+use nalgebra::Vector6;
+use ndarray::Array2;
+
+use super::Error;
+use super::embedded_room::EmbeddedRoom;
+use super::motions::share_to_believe;
+use super::robust_covariance;
+use seese3_core::adapter::{Adapter, ErrorTable, Stratum};
+use seese3_core::geometry::{Twist, body_twist, exp};
+use seese3_core::index::{ExactIndex, Exclusion, Index};
+use seese3_core::room::FrameId;
+use seese3_core::statistics::median;
+
+/// Frames to each side of a query that are left out of the map, one round each, so that matches of
+/// every distance occur.
+const LEFT_OUT_RADII: [u32; 10] = [0, 1, 2, 4, 6, 8, 10, 15, 20, 30];
+/// Strata of about as many matches each, by distance.
+const STRATA: usize = 8;
+/// A covariance of six components needs more errors than that.
+const FEWEST_ERRORS: usize = 6;
+
+/// One match: its distance, and the motion from the matching frame to the query.
+struct Match {
+    /// In standard deviations of frame noise.
+    distance: f64,
+    /// The motion that the adapter reads.
+    read: Vector6<f64>,
+    /// The true motion.
+    truth: Vector6<f64>,
+}
+
+/// The errors of poses read from matches, in strata by distance; `whitened` are the rooms' whitened
+/// latents, row by frame.
+pub fn anchor_errors(
+    adapter: &Adapter,
+    rooms: &[EmbeddedRoom<'_>],
+    whitened: &[Array2<f64>],
+) -> Result<ErrorTable, Error> {
+    let mut matches = Vec::new();
+    for (room, whitened) in rooms.iter().zip(whitened) {
+        add_matches(adapter, room, whitened, &mut matches);
+    }
+    matches.sort_by(|a, b| a.distance.total_cmp(&b.distance));
+
+    // Components are compared in deviations of the trained motions, so that metres do not drown
+    // radians.
+    let scale = adapter.scale().deviation;
+
+    let mut strata: Vec<Stratum> = Vec::new();
+    for part in matches.chunks(matches.len().div_ceil(STRATA).max(1)) {
+        let distances: Vec<f64> = part.iter().map(|found| found.distance).collect();
+        let at = median(&distances);
+        let gain = share_to_believe(part.iter().map(|found| (&found.truth, &found.read)), &scale);
+        let residuals: Vec<Vector6<f64>> = part.iter().map(|found| found.residual(gain)).collect();
+
+        // Repeated images are at no distance at all: their stratum is left out, so that distances
+        // rise from stratum to stratum.
+        let previous = strata.last().map_or(0.0, |last| last.at);
+        if at > previous && residuals.len() > FEWEST_ERRORS {
+            strata.push(Stratum {
+                at,
+                gain,
+                covariance: robust_covariance(&residuals)?,
+            });
+        }
+    }
+
+    Ok(ErrorTable::new(strata)?)
+}
+
+/// Matches every frame of a room with the rest of the room, once for each radius left out.
+fn add_matches(
+    adapter: &Adapter,
+    room: &EmbeddedRoom<'_>,
+    whitened: &Array2<f64>,
+    matches: &mut Vec<Match>,
+) {
+    let frames: Vec<FrameId> = (0..whitened.nrows() as u32).map(FrameId).collect();
+    let index = ExactIndex::new(whitened.view(), &frames);
+
+    for radius in LEFT_OUT_RADII {
+        for &centre in &frames {
+            let row = centre.row();
+            let query = whitened.row(row).to_vec();
+            let nearest = index.nearest(&query, 1, Some(Exclusion { centre, radius }));
+            let Some(best) = nearest.first() else {
+                continue;
+            };
+
+            let at = best.frame.row();
+            matches.push(Match {
+                distance: best.distance,
+                read: adapter
+                    .motion_without_mean(room.latents.row(at), room.latents.row(row))
+                    .to_vector(),
+                truth: body_twist(&room.poses[at], &room.poses[row]).to_vector(),
+            });
+        }
+    }
+}
+
+impl Match {
+    /// The error of the pose that is read with a gain, in its body frame.
+    fn residual(&self, gain: f64) -> Vector6<f64> {
+        let found = exp(&Twist::from_vector(&(self.read * gain)));
+        let truth = exp(&Twist::from_vector(&self.truth));
+        body_twist(&found, &truth).to_vector()
+    }
+}

@@ -1,0 +1,134 @@
+//! How far frames of a room and of other rooms are from its map: the limits that tell them apart.
+
+use ndarray::{Array2, ArrayView1};
+
+use super::Error;
+use seese3_core::adapter::{self, JUMP_WINDOW, TEMPORAL_NEIGHBOURS};
+use seese3_core::index::{ExactIndex, Exclusion, Index};
+use seese3_core::room::FrameId;
+use seese3_core::splits::is_in_left_out_block;
+use seese3_core::statistics::{median, quantile};
+
+/// Every so many frames of another room are matched with a room.
+const OTHER_ROOM_STEP: usize = 4;
+/// The out-of-distribution limit lies between the distance that this share of a room's own frames
+/// is below …
+const OWN_SHARE: f64 = 0.97;
+/// … and the distance that this share of other rooms' frames is below.
+const OTHERS_SHARE: f64 = 0.02;
+/// The share of other rooms' frames below the limit of certain matches.
+const OTHERS_SHARE_CERTAIN: f64 = 0.0003;
+/// A jump lies between the distance that this share of a room's own successive views is below …
+const OWN_JUMP_SHARE: f64 = 0.999;
+/// … and the distance that this share of views cut from one room to another is below.
+const OTHERS_JUMP_SHARE: f64 = 0.01;
+
+/// Distances of matches, divided by the room's typical distance.
+pub struct MatchLimits {
+    /// Above it a view shows another place.
+    pub out_of_distribution: f64,
+    /// Below it a view certainly shows this room.
+    pub certain: f64,
+}
+
+/// The limits of matches, from the rooms' whitened latents. A room's own frames are those of the
+/// blocks that its map leaves out, so that they are as far from the map as unmapped places are. The
+/// out-of-distribution limit is the geometric mean of a high quantile of own distances and a low
+/// one of other rooms' distances.
+pub fn match_limits(rooms: &[Array2<f64>]) -> Result<MatchLimits, Error> {
+    let mut own = Vec::new();
+    let mut others = Vec::new();
+
+    for (place, room) in rooms.iter().enumerate() {
+        let is_unmapped = |row: usize| is_in_left_out_block(row, room.nrows());
+        let mapped: Vec<FrameId> = (0..room.nrows())
+            .filter(|&row| !is_unmapped(row))
+            .map(|row| FrameId(row as u32))
+            .collect();
+        let index = ExactIndex::new(room.view(), &mapped);
+
+        let typical = typical_distance(&index, room, &mapped);
+        let relative_distance = |row: ArrayView1<'_, f64>| {
+            Some(index.nearest(&row.to_vec(), 1, None).first()?.distance / typical)
+        };
+
+        let unmapped = (0..room.nrows()).filter(|&row| is_unmapped(row));
+        own.extend(unmapped.filter_map(|row| relative_distance(room.row(row))));
+
+        for other in other_rooms(rooms, place) {
+            let frames = other.outer_iter().step_by(OTHER_ROOM_STEP);
+            others.extend(frames.filter_map(relative_distance));
+        }
+    }
+
+    let far_own = known(quantile(&own, OWN_SHARE))?;
+    let near_others = known(quantile(&others, OTHERS_SHARE))?;
+    Ok(MatchLimits {
+        out_of_distribution: (far_own * near_others).sqrt(),
+        certain: known(quantile(&others, OTHERS_SHARE_CERTAIN))?,
+    })
+}
+
+/// The limit of jumps, in standard deviations of frame noise: a view farther than this from all of
+/// the last frames has jumped. It lies between what a moving camera does and what a cut to another
+/// room does.
+pub fn jump_distance(rooms: &[Array2<f64>]) -> Result<f64, Error> {
+    let mut own = Vec::new();
+    let mut others = Vec::new();
+
+    for (place, room) in rooms.iter().enumerate() {
+        let successive = JUMP_WINDOW..room.nrows();
+        own.extend(successive.map(|row| nearest_before(room.row(row), room, row)));
+
+        // Cuts from the middle and the end of this room to the beginning and the middle of others.
+        for other in other_rooms(rooms, place) {
+            for before in [room.nrows() / 2, room.nrows()] {
+                let cuts = [0, other.nrows() / 2];
+                others.extend(cuts.map(|row| nearest_before(other.row(row), room, before)));
+            }
+        }
+    }
+
+    let longest_own = known(quantile(&own, OWN_JUMP_SHARE))?;
+    let shortest_cut = known(quantile(&others, OTHERS_JUMP_SHARE))?;
+    Ok((longest_own * shortest_cut).sqrt())
+}
+
+/// The median distance from a mapped frame to the nearest other one that is not its neighbour in
+/// time.
+fn typical_distance(index: &ExactIndex, room: &Array2<f64>, mapped: &[FrameId]) -> f64 {
+    let distances: Vec<f64> = mapped
+        .iter()
+        .filter_map(|&centre| {
+            let exclusion = Exclusion {
+                centre,
+                radius: TEMPORAL_NEIGHBOURS,
+            };
+            let query = room.row(centre.row()).to_vec();
+            Some(index.nearest(&query, 1, Some(exclusion)).first()?.distance)
+        })
+        .collect();
+
+    median(&distances)
+}
+
+/// The distance of a view from the nearest of the frames before `before` in a room.
+fn nearest_before(view: ArrayView1<'_, f64>, room: &Array2<f64>, before: usize) -> f64 {
+    let distance = |row: usize| (&view - &room.row(row)).mapv(|x| x * x).sum().sqrt();
+    (before.saturating_sub(JUMP_WINDOW)..before)
+        .map(distance)
+        .fold(f64::INFINITY, f64::min)
+}
+
+fn other_rooms(rooms: &[Array2<f64>], place: usize) -> impl Iterator<Item = &Array2<f64>> {
+    rooms
+        .iter()
+        .enumerate()
+        .filter(move |(other, _)| *other != place)
+        .map(|(_, room)| room)
+}
+
+/// Refuses a quantile of nothing: the rooms were too short.
+fn known(quantile: Option<f64>) -> Result<f64, Error> {
+    quantile.ok_or_else(|| adapter::Error::NoPairs.into())
+}

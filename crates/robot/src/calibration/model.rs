@@ -1,0 +1,104 @@
+//! The statistics of a tracker's error model, but for the factor of map poses.
+
+use ndarray::{Array2, s};
+
+use super::anchors::anchor_errors;
+use super::embedded_room::EmbeddedRoom;
+use super::limits::{jump_distance, match_limits};
+use super::motions::{RoomPair, fibonacci_strides, motion_errors, second_moment};
+use super::{Error, FEWEST_ROOMS_TO_TRACK};
+use crate::tracking::frame_period_s;
+use seese3_core::adapter::{Adapter, ErrorStatistics, TrainingRecord, Whitener};
+use seese3_core::splits::Split;
+use seese3_core::statistics::mean;
+use seese3_core::training::RoomData;
+
+/// Measures an adapter's errors in two or more rooms. The factor of map poses is left at 1.
+///
+/// # Errors
+/// [`Error::FewRooms`], or [`Error::Adapter`] when the rooms are too short or their errors make no
+/// sound covariance.
+pub fn measure(
+    adapter: &Adapter,
+    record: &TrainingRecord,
+    rooms: &[RoomData<'_>],
+) -> Result<ErrorStatistics, Error> {
+    if rooms.len() < FEWEST_ROOMS_TO_TRACK {
+        return Err(Error::FewRooms {
+            least: FEWEST_ROOMS_TO_TRACK,
+            given: rooms.len(),
+        });
+    }
+
+    let embedded = embed(adapter, rooms)?;
+    let strides = fibonacci_strides(&record.pairs);
+
+    // Two successive frames each carry the noise of one latent, so half the second moment of their
+    // difference is that of one.
+    let frame_noise = second_moment(&embedded, &pairs_at(rooms, 1))? * 0.5;
+    let measured_pairs: Vec<RoomPair> = strides
+        .iter()
+        .flat_map(|&stride| pairs_at(rooms, stride))
+        .collect();
+    let motion_spread = second_moment(&embedded, &measured_pairs)?;
+
+    let spread_whitener = Whitener::new(motion_spread.view())?;
+    let pairs_by_stride: Vec<(u32, Vec<RoomPair>)> = strides
+        .iter()
+        .map(|&stride| (stride, pairs_at(rooms, stride)))
+        .collect();
+    let motion_errors = motion_errors(adapter, &embedded, &pairs_by_stride, &spread_whitener)?;
+
+    // Everything about matches is measured in standard deviations of frame noise.
+    let noise_whitener = Whitener::new(frame_noise.view())?;
+    let whitened: Vec<Array2<f64>> = embedded
+        .iter()
+        .map(|room| noise_whitener.whitened(room.coordinates.view()))
+        .collect();
+    let anchor_errors = anchor_errors(adapter, &embedded, &whitened)?;
+    let limits = match_limits(&whitened)?;
+
+    let periods: Vec<f64> = rooms.iter().map(|data| frame_period_s(data.room)).collect();
+
+    Ok(ErrorStatistics {
+        frame_period_s: mean(&periods),
+        frame_noise,
+        motion_spread,
+        motion_errors,
+        anchor_errors,
+        out_of_distribution_ratio: limits.out_of_distribution,
+        certain_match_ratio: limits.certain,
+        jump_distance: jump_distance(&whitened)?,
+        map_pose_factor: 1.0,
+    })
+}
+
+fn embed<'a>(adapter: &Adapter, rooms: &'a [RoomData<'_>]) -> Result<Vec<EmbeddedRoom<'a>>, Error> {
+    let mut embedded = Vec::with_capacity(rooms.len());
+    for data in rooms {
+        let latents = adapter.embed(data.features.rows())?;
+        let coordinates = latents
+            .slice(s![.., ..adapter.coordinate_count()])
+            .to_owned();
+        embedded.push(EmbeddedRoom {
+            poses: data.room.poses(),
+            latents,
+            coordinates,
+        });
+    }
+
+    Ok(embedded)
+}
+
+/// Every pair of every room at a stride; rooms that are too short have none.
+fn pairs_at(rooms: &[RoomData<'_>], stride: u32) -> Vec<RoomPair> {
+    let mut all = Vec::new();
+    for (room, data) in rooms.iter().enumerate() {
+        let pairs = Split::Whole
+            .train_pairs(data.room.timeline(), stride)
+            .unwrap_or_default();
+        all.extend(pairs.into_iter().map(|pair| RoomPair { room, pair }));
+    }
+
+    all
+}

@@ -1,0 +1,217 @@
+//! Fits an adapter to the mapped frames of one room, and measures how far it may be believed.
+
+use std::sync::Arc;
+
+use super::folds::{Fold, folds};
+use super::localizer::Localizer;
+use super::pairs::{PAIRS, longest_rows, pairs};
+use super::rules::{ReadingRules, Trial};
+use super::{Error, check_mapped};
+use seese3_core::adapter::{
+    self, Adapter, EpochProgress, PairPlan, Samples, TrainConfig, TrainingRecord, train,
+    train_further,
+};
+use seese3_core::geometry::{Twist, body_twist};
+use seese3_core::motion_scores::{MotionScores, constant_r2};
+use seese3_core::room::FrameId;
+use seese3_core::splits::{Split, StrideRange};
+use seese3_core::training::{RoomData, check_rooms};
+
+/// The fewest mapped frames that an adapter is fitted to.
+pub const FEWEST_MAPPED_FRAMES: usize = 20;
+/// What the record of a fitted adapter names as its preset.
+pub const FITTED_PRESET: &str = "fitted";
+/// Passes over the pairs, about 590 steps in all.
+const EPOCHS: usize = 10;
+
+/// Epochs of a fit in all: of the adapter itself, and of one for each of the four folds.
+pub const FITTING_EPOCHS: u64 = 5 * EPOCHS as u64;
+
+/// An adapter that was fitted to a room, and how far it may be believed there.
+#[derive(Debug, Clone)]
+pub struct Fitted {
+    /// The adapter.
+    pub adapter: Arc<Adapter>,
+    /// What was measured on mapped frames that were left out.
+    pub rules: ReadingRules,
+    /// How it was trained.
+    pub record: TrainingRecord,
+}
+
+/// Fits an adapter to the mapped frames of a room, in rising order. It goes on from the weights of
+/// `base`, an adapter of other rooms, if that has one chart, and begins anew otherwise; `base` also
+/// stays a reader of its own, see [`ReadingRules`]. `progress` hears of every epoch of every
+/// training, of which there are five.
+///
+/// # Errors
+/// [`Error::FewFrames`] or [`Error::MappedFrames`] for the mapped frames, [`Error::Training`] when
+/// features and room do not fit together, [`Error::Adapter`] when `base` is for other features or
+/// training fails, among others because the camera does not move, [`Error::AllAlike`] when the
+/// mapped frames cannot be told apart.
+pub fn fit(
+    data: &RoomData<'_>,
+    mapped: &[FrameId],
+    base: Option<&Arc<Adapter>>,
+    seed: u64,
+    progress: &(dyn Fn(EpochProgress) + Sync),
+) -> Result<Fitted, Error> {
+    check_rooms(std::slice::from_ref(data))?;
+    check_mapped(data.room, mapped, FEWEST_MAPPED_FRAMES)?;
+    if let Some(base) = base {
+        base.check_source(data.features.source())?;
+    }
+
+    // The adapter itself and those without some of the frames are independent: all cores train.
+    let folds = folds(mapped);
+    let tried = |fold: &Fold| trials(data, fold, base, seed, progress);
+    let (trained, tried) = std::thread::scope(|scope| {
+        let tried: Vec<_> = folds
+            .iter()
+            .map(|fold| scope.spawn(|| tried(fold)))
+            .collect();
+        let trained = trained(data, mapped, base, seed, progress);
+
+        let tried: Vec<_> = tried
+            .into_iter()
+            .map(|thread| {
+                thread
+                    .join()
+                    .unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+            })
+            .collect();
+        (trained, tried)
+    });
+
+    let mut trials = Vec::new();
+    for tried in tried {
+        trials.extend(tried?);
+    }
+
+    let (adapter, samples) = trained?;
+    let record = record(data, mapped, &adapter, &samples, seed)?;
+    Ok(Fitted {
+        adapter: Arc::new(adapter),
+        rules: ReadingRules::measured(trials)?,
+        record,
+    })
+}
+
+/// The settings of the training: more steps of a wider network than for many rooms, since a view is
+/// to be told from its neighbours, and noise, since the frames are few.
+fn config(seed: u64) -> TrainConfig {
+    TrainConfig {
+        epochs: EPOCHS,
+        learning_rate: 3e-3,
+        hidden: 128,
+        standardise: true,
+        noise: 0.5,
+        average: 0.99,
+        through_zero: true,
+        seed,
+        ..TrainConfig::default()
+    }
+}
+
+/// An adapter trained on these frames, and its samples.
+fn trained(
+    data: &RoomData<'_>,
+    mapped: &[FrameId],
+    base: Option<&Arc<Adapter>>,
+    seed: u64,
+    progress: &(dyn Fn(EpochProgress) + Sync),
+) -> Result<(Adapter, Samples<f32>), Error> {
+    let samples = Samples::new(
+        data.features.rows(),
+        data.room.poses().to_vec(),
+        pairs(data.room, mapped, seed),
+    )?;
+
+    let config = config(seed);
+    let mut progress = |epoch| progress(epoch);
+    let base = base.filter(|base| base.network().chart_count() == 1);
+    let (network, samples) = match base {
+        Some(base) => {
+            let samples = samples.with_scale(base.scale().clone())?;
+            let network = train_further(&samples, base.network(), &config, &mut progress)?;
+            (network, samples)
+        }
+        None => {
+            let samples = samples.through_zero()?;
+            (train(&samples, &config, &mut progress)?, samples)
+        }
+    };
+
+    let source = data.features.source().clone();
+    let adapter = Adapter::new(source, network, samples.scale().clone())?;
+    Ok((adapter, samples))
+}
+
+/// Locates the frames that a fold leaves out, with an adapter that did not learn from them.
+fn trials(
+    data: &RoomData<'_>,
+    fold: &Fold,
+    base: Option<&Arc<Adapter>>,
+    seed: u64,
+    progress: &(dyn Fn(EpochProgress) + Sync),
+) -> Result<Vec<Trial>, Error> {
+    let (adapter, _) = trained(data, &fold.mapped, base, seed, progress)?;
+    let localizer = Localizer::new(data, &fold.mapped, base.cloned(), Some(Arc::new(adapter)))?;
+
+    fold.left_out
+        .iter()
+        .map(|frame| {
+            let feature = data.features.rows().row(frame.row()).to_vec();
+            let readings = localizer.read(&feature)?;
+            let mapped_pose = localizer.pose(readings.nearest.frame);
+            let truth = body_twist(mapped_pose, &data.room.poses()[frame.row()]);
+            Ok(Trial {
+                readings,
+                truth,
+                is_interleaved: fold.is_interleaved,
+            })
+        })
+        .collect()
+}
+
+fn record(
+    data: &RoomData<'_>,
+    mapped: &[FrameId],
+    adapter: &Adapter,
+    samples: &Samples<f32>,
+    seed: u64,
+) -> Result<TrainingRecord, adapter::Error> {
+    let longest = longest_rows(mapped);
+    let latents = adapter.embed(samples.features())?;
+    let predicted: Vec<Twist> = (0..samples.pair_count())
+        .map(|pair| {
+            let [from, to] = samples.pair(pair);
+            adapter.motion(latents.row(from), latents.row(to))
+        })
+        .collect();
+
+    // Nothing is held out of the adapter itself, so that there are no test scores.
+    let untested = MotionScores::of(&[], &[]);
+    let truth = samples.twists();
+    Ok(TrainingRecord {
+        preset: FITTED_PRESET.to_owned(),
+        split: Split::Whole,
+        stride: longest,
+        pairs: PairPlan::Range(StrideRange {
+            low: 1,
+            high: longest,
+            count: PAIRS,
+        }),
+        rooms: vec![(data.room.id().clone(), data.revision)],
+        calibrated_on: Vec::new(),
+        config: TrainConfig {
+            hidden: adapter.network().charts()[0].phi.hidden_dim(),
+            latent: adapter.coordinate_count(),
+            ..config(seed)
+        },
+        pair_count: samples.pair_count(),
+        room_tests: vec![untested],
+        test: untested,
+        train: MotionScores::of(truth, &predicted),
+        train_mean_r2: constant_r2(truth, &samples.scale().mean),
+    })
+}

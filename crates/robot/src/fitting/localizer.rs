@@ -1,0 +1,245 @@
+//! Where the camera of a single view is in a mapped room.
+
+use std::sync::Arc;
+
+use ndarray::{Array1, Array2, ArrayView2};
+
+use super::readings::{PartRule, Readings};
+use super::rules::ReadingRules;
+use super::{Error, check_mapped};
+use crate::tracking::Belief;
+use seese3_core::adapter::{self, Adapter, column_scale};
+use seese3_core::geometry::{Pose, Twist, body_twist, exp};
+use seese3_core::index::{ExactIndex, Index, Neighbour};
+use seese3_core::room::FrameId;
+use seese3_core::statistics::median;
+use seese3_core::training::RoomData;
+
+/// Locates views by the mapped frame that they resemble most and the motion from it.
+pub struct Localizer {
+    poses: Vec<Pose>,
+    standardisation: Standardisation,
+    index: ExactIndex,
+    zero_shot: Option<Embedded>,
+    fitted: Option<Embedded>,
+}
+
+/// How many mapped frames a view is read from, to see whether they agree.
+const WITNESSES: usize = 4;
+
+/// Where a view's camera is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LocatedView {
+    /// The mapped frame that the view resembles most; its distance is in deviations of a feature
+    /// column.
+    pub nearest: Neighbour,
+    /// `world_from_camera`, with the covariance of its error in its body frame.
+    pub pose: Belief,
+    /// What told the translation from that frame.
+    pub translation: PartRule,
+    /// What told the rotation from that frame.
+    pub rotation: PartRule,
+}
+
+/// Features in units in which their distances compare between rooms.
+struct Standardisation {
+    mean: Array1<f64>,
+    /// The columns' deviations times √d, so that a distance is the root mean square over columns.
+    scale: Array1<f64>,
+}
+
+impl Standardisation {
+    fn of(rows: ArrayView2<'_, f64>) -> Self {
+        let (mean, deviation) = column_scale(rows);
+        let scale = deviation * (rows.ncols() as f64).sqrt();
+        Self { mean, scale }
+    }
+
+    fn rows(&self, rows: ArrayView2<'_, f64>) -> Array2<f64> {
+        (&rows - &self.mean) / &self.scale
+    }
+}
+
+/// An adapter and the latents of the room's frames under it.
+struct Embedded {
+    adapter: Arc<Adapter>,
+    latents: Array2<f64>,
+}
+
+impl Embedded {
+    fn new(adapter: Arc<Adapter>, data: &RoomData<'_>) -> Result<Self, adapter::Error> {
+        adapter.check_source(data.features.source())?;
+        let latents = adapter.embed(data.features.rows())?;
+        Ok(Self { adapter, latents })
+    }
+
+    /// The motion from a frame to a view. A half turn has no unique logarithm, and no camera makes
+    /// one between two frames that look alike: nothing was read.
+    fn motion(&self, from: FrameId, feature: &[f32]) -> Result<Twist, adapter::Error> {
+        let latent = self.adapter.embed_one(feature)?;
+        let motion = self
+            .adapter
+            .motion_without_mean(self.latents.row(from.row()), latent.view());
+
+        Ok(if motion.is_unique_logarithm() {
+            motion
+        } else {
+            Twist::default()
+        })
+    }
+}
+
+impl Localizer {
+    /// A localizer over the mapped frames of a room, in rising order. `zero_shot` is an adapter
+    /// that learned from other rooms, `fitted` one that was fitted to these frames.
+    ///
+    /// # Errors
+    /// [`Error::MappedFrames`] or [`Error::FewFrames`] when there is no mapped frame or one does not
+    /// exist, [`Error::Adapter`] when the features are not those of an adapter.
+    pub fn new(
+        data: &RoomData<'_>,
+        mapped: &[FrameId],
+        zero_shot: Option<Arc<Adapter>>,
+        fitted: Option<Arc<Adapter>>,
+    ) -> Result<Self, Error> {
+        check_mapped(data.room, mapped, 1)?;
+        let rows = data.features.rows().mapv(f64::from);
+        let known: Vec<usize> = mapped.iter().map(|frame| frame.row()).collect();
+        let standardisation = Standardisation::of(rows.select(ndarray::Axis(0), &known).view());
+        let standardised = standardisation.rows(rows.view());
+
+        let embedded = |adapter: Option<Arc<Adapter>>| {
+            adapter
+                .map(|adapter| Embedded::new(adapter, data))
+                .transpose()
+        };
+
+        Ok(Self {
+            poses: data.room.poses().to_vec(),
+            index: ExactIndex::new(standardised.view(), mapped),
+            standardisation,
+            zero_shot: embedded(zero_shot)?,
+            fitted: embedded(fitted)?,
+        })
+    }
+
+    /// About how much memory it holds, bytes, besides the adapters.
+    pub fn memory_bytes(&self) -> usize {
+        let embedded = self.zero_shot.iter().chain(&self.fitted);
+        let latents: usize = embedded.map(|embedded| embedded.latents.len()).sum();
+
+        size_of_val(self.poses.as_slice()) + latents * size_of::<f64>() + self.index.memory_bytes()
+    }
+
+    /// What the readers say of a view, given by its raw feature of shape (d,).
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] when the feature has another width or a number that is not finite.
+    pub fn read(&self, feature: &[f32]) -> Result<Readings, Error> {
+        let expected = self.standardisation.mean.len();
+        if feature.len() != expected {
+            let actual = feature.len();
+            return Err(adapter::Error::FeatureDim { expected, actual }.into());
+        }
+        if let Some(position) = feature.iter().position(|x| !x.is_finite()) {
+            return Err(adapter::Error::NotFinite {
+                what: "feature",
+                position,
+                value: f64::from(feature[position]),
+            }
+            .into());
+        }
+
+        let row = Array2::from_shape_fn((1, expected), |(_, column)| f64::from(feature[column]));
+        let query = self.standardisation.rows(row.view()).row(0).to_vec();
+        let witnesses = self.index.nearest(&query, WITNESSES, None);
+        let nearest = witnesses[0];
+
+        let zero_shot = self.motion_by(&self.zero_shot, nearest.frame, feature)?;
+        let fitted = self.motion_by(&self.fitted, nearest.frame, feature)?;
+
+        Ok(Readings {
+            nearest,
+            distance: nearest.distance,
+            zero_shot,
+            fitted,
+            disagreement: self.disagreement(&witnesses, feature)?,
+        })
+    }
+
+    fn motion_by(
+        &self,
+        reader: &Option<Embedded>,
+        from: FrameId,
+        feature: &[f32],
+    ) -> Result<Option<Twist>, Error> {
+        let motion = reader
+            .as_ref()
+            .map(|embedded| embedded.motion(from, feature));
+        Ok(motion.transpose()?)
+    }
+
+    /// How far the poses of a view that are read from other frames are from the one that is read
+    /// from the first.
+    fn disagreement(&self, witnesses: &[Neighbour], feature: &[f32]) -> Result<f64, Error> {
+        let best_informed = if self.fitted.is_some() {
+            &self.fitted
+        } else {
+            &self.zero_shot
+        };
+
+        let mut poses = Vec::with_capacity(witnesses.len());
+        for witness in witnesses {
+            let motion = self.motion_by(best_informed, witness.frame, feature)?;
+            poses.push(self.pose(witness.frame) * exp(&motion.unwrap_or_default()));
+        }
+
+        let apart: Vec<f64> = poses[1..]
+            .iter()
+            .map(|pose| body_twist(&poses[0], pose).norm())
+            .collect();
+        Ok(if apart.is_empty() {
+            0.0
+        } else {
+            median(&apart)
+        })
+    }
+
+    /// The adapters that read motions here: that of other rooms, and the fitted one.
+    pub fn adapters(&self) -> impl Iterator<Item = &Arc<Adapter>> {
+        let readers = [&self.zero_shot, &self.fitted];
+        readers
+            .into_iter()
+            .flatten()
+            .map(|embedded| &embedded.adapter)
+    }
+
+    /// The pose of a mapped frame, `world_from_camera`.
+    pub fn pose(&self, frame: FrameId) -> &Pose {
+        &self.poses[frame.row()]
+    }
+
+    /// Where the camera of a view is, by the rules that were measured for this map.
+    ///
+    /// # Errors
+    /// As [`Localizer::read`].
+    pub fn locate(&self, feature: &[f32], rules: &ReadingRules) -> Result<LocatedView, Error> {
+        Ok(self.located(&self.read(feature)?, rules))
+    }
+
+    /// Where the camera of a view is, from what the readers say of it.
+    pub fn located(&self, readings: &Readings, rules: &ReadingRules) -> LocatedView {
+        let rule = rules.at(readings.distance);
+        let motion = readings.combined(rule.translation, rule.rotation);
+
+        LocatedView {
+            nearest: readings.nearest,
+            pose: Belief {
+                pose: self.pose(readings.nearest.frame) * exp(&motion),
+                covariance: rule.covariance_at(readings.distance, readings.disagreement),
+            },
+            translation: rule.translation,
+            rotation: rule.rotation,
+        }
+    }
+}

@@ -1,0 +1,326 @@
+//! Which reader of motions to believe, and how far, by the distance of a view from the map.
+
+use nalgebra::{Matrix6, Vector3, Vector6};
+
+use super::Error;
+use super::readings::{MotionReader, PartRule, Readings};
+use crate::calibration::robust_covariance;
+use seese3_core::geometry::{Pose, Twist, body_twist, exp};
+use seese3_core::statistics::{Rate, median};
+
+/// The fewest matches that one rule is made from.
+const FEWEST_MATCHES: usize = 25;
+/// The largest number of rules.
+const MOST_RULES: usize = 8;
+/// An error, metres or radians, that is assumed once in every direction.
+const LEAST_ERROR: f64 = 1e-3;
+/// Gains that are tried: tenths.
+const GAINS: usize = 10;
+
+/// What holds for views up to a distance from the map.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReadingRule {
+    /// The largest distance that the rule was made for, in deviations of a feature column.
+    pub up_to: f64,
+    /// What tells the translation.
+    pub translation: PartRule,
+    /// What tells the rotation.
+    pub rotation: PartRule,
+    /// The covariance of the located pose's error in its body frame, on (v, ω), metres and radians,
+    /// over u² + u₀²: the squares of the [`Readings::disagreement`] and of `least_disagreement`.
+    pub covariance: Matrix6<f64>,
+    /// u₀: a quarter of the median disagreement of the trials, so that errors are not taken for
+    /// zero where readings happen to agree.
+    pub least_disagreement: f64,
+}
+
+impl ReadingRule {
+    /// The covariance of the error of a pose that was located at a distance from the map, by
+    /// readings that disagree so far. Beyond the distance that the rule was made for, errors are
+    /// taken to grow with it.
+    pub fn covariance_at(&self, distance: f64, disagreement: f64) -> Matrix6<f64> {
+        let beyond = (distance / self.up_to).max(1.0);
+        self.covariance * (self.squared_size(disagreement) * beyond * beyond)
+    }
+
+    fn squared_size(&self, disagreement: f64) -> f64 {
+        disagreement * disagreement + self.least_disagreement * self.least_disagreement
+    }
+}
+
+/// Rules by rising distance; the last one also holds beyond its own.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReadingRules(Vec<ReadingRule>);
+
+/// What the readers said of a view whose true place is known.
+pub struct Trial {
+    /// What they said.
+    pub readings: Readings,
+    /// The true motion from the mapped frame to the view.
+    pub truth: Twist,
+    /// Whether the view lies between two mapped frames of one path.
+    pub is_interleaved: bool,
+}
+
+impl ReadingRules {
+    /// Checks rules that were stored.
+    ///
+    /// # Errors
+    /// [`Error::Rules`], which says what is wrong.
+    pub fn new(rules: Vec<ReadingRule>) -> Result<Self, Error> {
+        let unsound = |what| Err(Error::Rules { what });
+        if rules.is_empty() {
+            return unsound("there is none");
+        }
+        if !rules.is_sorted_by(|a, b| a.up_to < b.up_to)
+            || rules
+                .iter()
+                .any(|rule| rule.up_to.is_nan() || rule.up_to < 0.0)
+        {
+            return unsound("their distances do not rise");
+        }
+
+        for rule in &rules {
+            for part in [rule.translation, rule.rotation] {
+                let is_none = part.reader == MotionReader::NearestFrame;
+                if !(0.0..=1.0).contains(&part.gain) || is_none != (part.gain == 0.0) {
+                    return unsound("a gain is out of range");
+                }
+            }
+
+            if rule.covariance.cholesky().is_none() {
+                return unsound("a covariance is not positive definite");
+            }
+            if !(rule.least_disagreement.is_finite() && rule.least_disagreement > 0.0) {
+                return unsound("a disagreement is not positive");
+            }
+        }
+
+        Ok(Self(rules))
+    }
+
+    /// The rules, by rising distance.
+    pub fn rules(&self) -> &[ReadingRule] {
+        &self.0
+    }
+
+    /// The rule for a view at a distance from the map.
+    pub fn at(&self, distance: f64) -> &ReadingRule {
+        let next = self.0.partition_point(|rule| rule.up_to < distance);
+        &self.0[next.min(self.0.len() - 1)]
+    }
+
+    /// The rules that trials speak for.
+    ///
+    /// A reader is believed only where it comes nearer to the truth than the mapped frame itself in
+    /// more than half of the trials, and surely so (Wilson's lower bound).
+    ///
+    /// Between two mapped frames of one path a view is located better than anywhere else at the
+    /// same distance. Covariances are therefore those of the other trials, wherever these are
+    /// enough.
+    ///
+    /// # Errors
+    /// [`Error::AllAlike`] when no trial is at a distance, [`Error::Adapter`] when the errors make no
+    /// covariance.
+    pub(super) fn measured(mut trials: Vec<Trial>) -> Result<Self, Error> {
+        // Between repeated images there is nothing to read.
+        trials.retain(|trial| trial.readings.distance > 0.0);
+        if trials.is_empty() {
+            return Err(Error::AllAlike);
+        }
+        trials.sort_by(|a, b| a.readings.distance.total_cmp(&b.readings.distance));
+
+        let count = (trials.len() / FEWEST_MATCHES).clamp(1, MOST_RULES);
+        let mut rules: Vec<ReadingRule> = Vec::new();
+
+        for part in trials.chunks(trials.len().div_ceil(count).max(1)) {
+            let translation = best_reader(part, |twist| twist.linear);
+            let rotation = best_reader(part, |twist| twist.angular);
+
+            let mut rule = ReadingRule {
+                up_to: part[part.len() - 1].readings.distance,
+                translation,
+                rotation,
+                covariance: Matrix6::identity(),
+                least_disagreement: least_disagreement(part),
+            };
+
+            let elsewhere: Vec<&Trial> =
+                part.iter().filter(|trial| !trial.is_interleaved).collect();
+            let judging = if elsewhere.len() >= FEWEST_MATCHES {
+                elsewhere
+            } else {
+                part.iter().collect()
+            };
+
+            // A view between mapped frames is located better than one beyond them, also where their
+            // features are as far: errors are measured in the size that the disagreement of
+            // readings lets expect.
+            let mut residuals: Vec<Vector6<f64>> = judging
+                .into_iter()
+                .map(|trial| {
+                    let size = rule.squared_size(trial.readings.disagreement).sqrt();
+                    residual(trial, translation, rotation) / size
+                })
+                .collect();
+
+            // A robot on wheels has no error in some directions; a covariance needs one in each.
+            let size = rule.squared_size(rule.least_disagreement).sqrt();
+            residuals.extend((0..6).map(|axis| Vector6::ith(axis, LEAST_ERROR / size)));
+            rule.covariance = robust_covariance(&residuals)?;
+
+            // Trials at one distance may fall into two parts: the later one is as good.
+            match rules.last_mut() {
+                Some(last) if last.up_to >= rule.up_to => *last = rule,
+                _ => rules.push(rule),
+            }
+        }
+
+        Self::new(rules)
+    }
+}
+
+/// A quarter of the median disagreement; above zero.
+fn least_disagreement(trials: &[Trial]) -> f64 {
+    let found: Vec<f64> = trials
+        .iter()
+        .map(|trial| trial.readings.disagreement)
+        .collect();
+    (0.25 * median(&found)).max(f64::MIN_POSITIVE.sqrt())
+}
+
+/// The reader and the gain with the smallest median error of one part of the motion.
+fn best_reader(trials: &[Trial], part: fn(&Twist) -> Vector3<f64>) -> PartRule {
+    let unread: Vec<f64> = trials
+        .iter()
+        .map(|trial| part(&trial.truth).norm())
+        .collect();
+    let mut best = PartRule::NONE;
+    let mut least = median(&unread);
+
+    for reader in [MotionReader::ZeroShot, MotionReader::Fitted] {
+        for tenth in 1..=GAINS {
+            let gain = tenth as f64 / GAINS as f64;
+            let errors: Option<Vec<f64>> = trials
+                .iter()
+                .map(|trial| {
+                    let read = trial.readings.by(reader)?;
+                    Some((part(&trial.truth) - part(&read) * gain).norm())
+                })
+                .collect();
+
+            let Some(errors) = errors else {
+                continue;
+            };
+            let nearer = errors
+                .iter()
+                .zip(&unread)
+                .filter(|(read, unread)| read < unread);
+            let is_sure = Rate::of(nearer.count(), trials.len()).low > 0.5;
+            if is_sure && median(&errors) < least {
+                least = median(&errors);
+                best = PartRule { reader, gain };
+            }
+        }
+    }
+
+    best
+}
+
+/// The error of the located pose, in its body frame.
+fn residual(trial: &Trial, translation: PartRule, rotation: PartRule) -> Vector6<f64> {
+    let located = exp(&trial.readings.combined(translation, rotation));
+    let truth: Pose = exp(&trial.truth);
+    body_twist(&located, &truth).to_vector()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use seese3_core::index::Neighbour;
+    use seese3_core::room::FrameId;
+
+    /// Trials in which the fitted reader is right near the map and misleads far from it.
+    fn trials(count: usize) -> Vec<Trial> {
+        let mut random = <rand_chacha::ChaCha8Rng as rand::SeedableRng>::seed_from_u64(1);
+        (0..count)
+            .map(|at| {
+                let distance = 0.1 + at as f64 / count as f64;
+                let noise: Vec<f64> =
+                    seese3_core::statistics::normal_deviates(&mut random, 12).collect();
+                let truth =
+                    Twist::from_vector(&Vector6::from_iterator(noise[..6].iter().map(|x| 0.1 * x)));
+                let wrong =
+                    Twist::from_vector(&Vector6::from_iterator(noise[6..].iter().map(|x| 0.1 * x)));
+                let (of_truth, of_error) = if distance < 0.6 {
+                    (1.0, 0.1)
+                } else {
+                    (0.0, 1.0)
+                };
+
+                Trial {
+                    readings: Readings {
+                        nearest: Neighbour {
+                            frame: FrameId(0),
+                            distance,
+                        },
+                        distance,
+                        disagreement: 1.0,
+                        zero_shot: Some(wrong),
+                        fitted: Some(Twist::from_vector(
+                            &(truth.to_vector() * of_truth + wrong.to_vector() * of_error),
+                        )),
+                    },
+                    truth,
+                    is_interleaved: false,
+                }
+            })
+            .collect()
+    }
+
+    /// Oracle: the way the trials were made: right below a distance of .6, misleading above.
+    #[test]
+    fn a_reader_is_believed_where_it_is_right() {
+        let rules = ReadingRules::measured(trials(800)).unwrap();
+        assert_eq!(rules.rules().len(), 8);
+
+        for (distance, reader) in [
+            (0.05, MotionReader::Fitted),
+            (0.3, MotionReader::Fitted),
+            (0.9, MotionReader::NearestFrame),
+            (9.0, MotionReader::NearestFrame),
+        ] {
+            let rule = rules.at(distance);
+            assert_eq!(rule.translation.reader, reader, "{distance}");
+            assert_eq!(rule.rotation.reader, reader, "{distance}");
+        }
+
+        // What is read errs by a tenth of what is not; all trials disagree alike.
+        let near = rules.at(0.2).covariance_at(0.2, 1.0)[(0, 0)].sqrt();
+        let far = rules.at(1.0).covariance_at(1.0, 1.0)[(0, 0)].sqrt();
+        assert!(
+            (0.005..0.02).contains(&near) && (0.07..0.13).contains(&far),
+            "{near} {far}"
+        );
+    }
+
+    /// Oracle: the words of the error's documentation.
+    #[test]
+    fn rules_that_make_no_sense_are_refused() {
+        let rule = ReadingRules::measured(trials(100)).unwrap().rules()[0].clone();
+        let changed = |change: fn(&mut ReadingRule)| {
+            let mut rule = rule.clone();
+            change(&mut rule);
+            ReadingRules::new(vec![rule])
+        };
+
+        assert!(ReadingRules::new(vec![]).is_err());
+        assert!(ReadingRules::new(vec![rule.clone(), rule.clone()]).is_err());
+        assert!(changed(|rule| rule.up_to = f64::NAN).is_err());
+        assert!(changed(|rule| rule.rotation.gain = 1.5).is_err());
+        assert!(changed(|rule| rule.rotation.reader = MotionReader::NearestFrame).is_err());
+        assert!(changed(|rule| rule.covariance = Matrix6::zeros()).is_err());
+        assert!(changed(|rule| rule.least_disagreement = 0.0).is_err());
+        assert!(changed(|_| ()).is_ok());
+    }
+}

@@ -1,0 +1,321 @@
+//! Which way is down: what an accelerometer tells of a camera's tilt.
+//!
+//! A view says little of a camera's tilt: one that is rolled by ten degrees is most like the mapped
+//! views of a level camera at the same place. Gravity tells the tilt and nothing else: neither the
+//! heading nor the position.
+
+use nalgebra::{Cholesky, Matrix3, SMatrix, SVector, Unit, Vector3};
+
+use super::{Belief, MovingBelief, Observation, State};
+use seese3_core::geometry::{Pose, Twist, exp};
+
+/// 99 % of χ² with two degrees of freedom, those of a tilt.
+const GATE: f64 = 9.21;
+/// For how long the error of a measured direction is correlated, seconds: it is mostly that of a
+/// robot that speeds up or brakes.
+const MEMORY_S: f64 = 2.0;
+/// The largest multiple of the gate by which a contradiction is counted.
+const MOST_DOUBT: f64 = 1e6;
+
+/// The direction of gravity, as an accelerometer measures it in the camera's frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeasuredGravity {
+    /// In the room's world frame.
+    pub in_world: Unit<Vector3<f64>>,
+    /// In the camera's frame.
+    pub in_camera: Unit<Vector3<f64>>,
+    /// The standard deviation of the measured direction about each axis, radians, above 0.
+    pub deviation_rad: f64,
+}
+
+/// A measured direction as it counts beside those before it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct CountedGravity {
+    measured: MeasuredGravity,
+    /// The variance that its error has, radians².
+    variance: f64,
+    /// The larger variance with which it counts: those before it had about the same error.
+    counted_variance: f64,
+}
+
+/// How a pose is tilted against measured gravity.
+struct Tilt {
+    /// The rotation that would take the pose's own direction of gravity to the measured one, in the
+    /// camera's body frame, radians.
+    turn: Vector3<f64>,
+    /// Takes an error of rotation, in the camera's body frame, to its part across the vertical.
+    projection: Matrix3<f64>,
+}
+
+impl MeasuredGravity {
+    /// The direction that a frame brings, as it counts; the stream remembers when that was.
+    pub(super) fn after(self, state: &mut State, frame: &Observation) -> CountedGravity {
+        let seconds = state.gravity_ns.map_or(f64::INFINITY, |before| {
+            frame.time_ns.abs_diff(before) as f64 * 1e-9
+        });
+        state.gravity_ns = Some(frame.time_ns);
+        self.counted_after(seconds)
+    }
+
+    /// The direction as it counts some seconds after another. A row of measurements with the
+    /// correlation ρ from one to the next tells as much as independent ones of (1 + ρ)/(1 − ρ)
+    /// times the variance.
+    fn counted_after(self, seconds: f64) -> CountedGravity {
+        let correlation = (-seconds / MEMORY_S).exp();
+        let variance = self.deviation_rad.powi(2);
+        CountedGravity {
+            measured: self,
+            variance,
+            counted_variance: variance * (1.0 + correlation) / (1.0 - correlation),
+        }
+    }
+
+    fn tilt(&self, pose: &Pose) -> Tilt {
+        let expected = pose.rotation.inverse() * self.in_world.into_inner();
+        let measured = self.in_camera.into_inner();
+
+        // A camera that is turned by ω sees a direction h at h − ω × h: the turn is about measured ×
+        // expected. Where the two are opposite, any perpendicular axis will do.
+        let across = measured.cross(&expected);
+        let angle = across.norm().atan2(measured.dot(&expected));
+        let axis = across.try_normalize(1e-9).unwrap_or_else(|| {
+            let least = expected.iamin();
+            expected.cross(&Vector3::ith(least, 1.0)).normalize()
+        });
+
+        Tilt {
+            turn: axis * angle,
+            projection: Matrix3::identity() - expected * expected.transpose(),
+        }
+    }
+}
+
+impl Tilt {
+    /// The squared Mahalanobis length of the turn; infinite if the covariances are not positive
+    /// definite.
+    fn surprise(&self, of_rotation: &Matrix3<f64>, measured_variance: f64) -> f64 {
+        let sum = self.projection * of_rotation * self.projection.transpose()
+            + Matrix3::identity() * measured_variance;
+        Cholesky::new(sum).map_or(f64::INFINITY, |sum| self.turn.dot(&sum.solve(&self.turn)))
+    }
+
+    /// The step of an error whose rotation is at 3, 4 and 5, and its covariance after the tilt was
+    /// measured, in the body frame before the step; none if the covariances are not positive
+    /// definite. Heading and position are left alone: that they are correlated with the tilt comes
+    /// from views that are taken for one another, and does not hold for a camera that is mounted
+    /// askew.
+    fn update<const N: usize>(
+        &self,
+        covariance: &SMatrix<f64, N, N>,
+        measured_variance: f64,
+    ) -> Option<(SVector<f64, N>, SMatrix<f64, N, N>)> {
+        let noise = Matrix3::identity() * measured_variance;
+        let mut of_error = SMatrix::<f64, 3, N>::zeros();
+        of_error
+            .fixed_view_mut::<3, 3>(0, 3)
+            .copy_from(&self.projection);
+
+        let of_tilt = of_error * covariance * of_error.transpose();
+        let sum = Cholesky::new(of_tilt + noise)?;
+        let mut gain = SMatrix::<f64, N, 3>::zeros();
+        gain.fixed_view_mut::<3, 3>(3, 0)
+            .copy_from(&(of_tilt * sum.inverse()));
+
+        // Joseph's form, which holds for any gain: (I − K H) P (I − K H)ᵀ + K R Kᵀ.
+        let rest = SMatrix::<f64, N, N>::identity() - gain * of_error;
+        let joseph = rest * covariance * rest.transpose() + gain * noise * gain.transpose();
+        let symmetric = (joseph + joseph.transpose()) * 0.5;
+
+        Some((gain * self.turn, symmetric))
+    }
+}
+
+impl CountedGravity {
+    /// The tilt of a pose with this covariance of rotation, and the factor by which this measurement
+    /// counts for less: the more, the further beyond 99 % the two contradict one another. A robot
+    /// that brakes measures another direction, and so does one whose sensor is mounted otherwise
+    /// than it was told.
+    fn against(&self, pose: &Pose, of_rotation: &Matrix3<f64>) -> (Tilt, f64) {
+        let tilt = self.measured.tilt(pose);
+        let excess = tilt.surprise(of_rotation, self.variance) / GATE;
+        (tilt, excess.clamp(1.0, MOST_DOUBT).powi(2))
+    }
+
+    /// By how much it contradicts a pose, radians; none if it does not.
+    pub(super) fn contradicts(&self, pose: &Belief) -> Option<f64> {
+        let tilt = self.measured.tilt(&pose.pose);
+        let of_rotation = pose.covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        let is_surprise = tilt.surprise(&of_rotation, self.variance) > GATE;
+        is_surprise.then(|| tilt.turn.norm())
+    }
+}
+
+impl Belief {
+    /// The pose of a view, corrected by the gravity that was measured beside it: however many views
+    /// there are, each is turned at most to where gravity says.
+    #[must_use]
+    pub(super) fn levelled(&self, gravity: &CountedGravity) -> Self {
+        let of_rotation = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        let (tilt, factor) = gravity.against(&self.pose, &of_rotation);
+        match tilt.update(&self.covariance, gravity.variance * factor) {
+            Some((step, covariance)) => {
+                let step = exp(&Twist::from_vector(&step));
+                Self {
+                    covariance,
+                    ..*self
+                }
+                .of_attached(&step)
+            }
+            None => *self,
+        }
+    }
+}
+
+impl MovingBelief {
+    /// The belief when gravity was measured.
+    #[must_use]
+    pub(super) fn levelled(&self, gravity: &CountedGravity) -> Self {
+        let of_rotation = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        let (tilt, factor) = gravity.against(&self.pose, &of_rotation);
+        let variance = gravity.counted_variance * factor;
+        let Some((change, covariance)) = tilt.update(&self.covariance, variance) else {
+            return *self;
+        };
+
+        let step = change.fixed_rows::<6>(0).into_owned();
+        Self {
+            pose: self.pose * exp(&Twist::from_vector(&step)),
+            covariance,
+            ..*self
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector6;
+
+    use super::*;
+    use crate::tracking::MotionPrior;
+    use seese3_core::geometry::{Pose, log};
+
+    const DOWN: Vector3<f64> = Vector3::new(0.0, 1.0, 0.0);
+
+    /// What a camera at this pose measures exactly, in a world whose y axis points down.
+    fn gravity_at(pose: &Pose, deviation_rad: f64) -> MeasuredGravity {
+        let down = Unit::new_unchecked(DOWN);
+        MeasuredGravity {
+            in_world: down,
+            in_camera: pose.rotation.inverse() * down,
+            deviation_rad,
+        }
+    }
+
+    /// The same, as the first that a stream brings.
+    fn first_at(pose: &Pose, deviation_rad: f64) -> CountedGravity {
+        gravity_at(pose, deviation_rad).counted_after(f64::INFINITY)
+    }
+
+    fn turned(axis: Vector3<f64>, angle_rad: f64) -> Pose {
+        Pose::new(Vector3::new(1.0, 2.0, 3.0), axis * angle_rad)
+    }
+
+    /// Oracle: by hand. A camera that is believed to stand level is rolled by 10 degrees about its
+    /// optical axis: gravity, which is much surer, turns it so, about no other axis. Its tilt is
+    /// known afterwards; neither its position nor its heading are known better.
+    #[test]
+    fn gravity_tells_the_tilt_and_nothing_else() {
+        let level = turned(DOWN, 0.7);
+        let roll = Twist::from_vector(&Vector6::new(0., 0., 0., 0., 0., 10_f64.to_radians()));
+        let truth = level * exp(&roll);
+        let (right, down) = (Vector3::x(), truth.rotation.inverse() * DOWN);
+
+        let independent = Belief::known(level, 0.1, 0.2);
+        // Also where errors of roll went along with those of position and heading.
+        let mut together = independent;
+        for other in [0, 4] {
+            let covariance = &mut together.covariance;
+            covariance[(5, other)] = 0.6 * (covariance[(5, 5)] * covariance[(other, other)]).sqrt();
+            covariance[(other, 5)] = covariance[(5, other)];
+        }
+
+        for believed in [independent, together] {
+            assert!(believed.covariance.cholesky().is_some());
+            let found = believed.levelled(&first_at(&truth, 1e-6));
+            let error = log(&found.pose.inv_mul(&truth)).to_vector();
+            assert!(error.norm() < 1e-6, "{error}");
+
+            let part = |at: usize, axis: Vector3<f64>| {
+                let block = found.covariance.fixed_view::<3, 3>(at, at).into_owned();
+                (axis.transpose() * block * axis)[0]
+            };
+            let across = right.cross(&down).normalize();
+            for axis in [across, across.cross(&down)] {
+                assert!(part(3, axis) < 1e-9, "{}", part(3, axis));
+            }
+            assert!((part(3, down) - 0.04).abs() < 1e-6, "{}", part(3, down));
+            for axis in [right, down, across] {
+                assert!((part(0, axis) - 0.01).abs() < 1e-9, "{}", part(0, axis));
+            }
+        }
+    }
+
+    /// Oracle: by hand. A view that is sure to stand level to .005 rad and a gravity of .02 rad that
+    /// says .2 rad differ by .2² / (.005² + .02²) = 94.118 squared deviations, 10.219 times the 9.21
+    /// of χ²: gravity counts with 104.43 times its variance, .04177, and turns the view by the share
+    /// 25e-6 / .041797 of .2, which is .0001196 rad. And that is a contradiction of .2 rad, while one
+    /// of .02 rad is none.
+    #[test]
+    fn gravity_that_a_sure_view_contradicts_is_doubted() {
+        let view = Belief::known(turned(DOWN, -0.4), 0.005, 0.005);
+        let pitched = |angle: f64| {
+            let truth = view.pose
+                * exp(&Twist::from_vector(&Vector6::new(
+                    0., 0., 0., angle, 0., 0.,
+                )));
+            first_at(&truth, 0.02)
+        };
+
+        let found = view.levelled(&pitched(0.2));
+        let turn = log(&view.pose.inv_mul(&found.pose)).to_vector();
+        assert!((turn[3] - 1.196e-4).abs() < 1e-6, "{turn}");
+        assert!((pitched(0.2).contradicts(&view).unwrap() - 0.2).abs() < 1e-9);
+        assert!(pitched(0.02).contradicts(&view).is_none());
+    }
+
+    /// Oracle: the definition: where a camera is upside down it was turned by half, about an axis
+    /// across.
+    #[test]
+    fn upside_down_is_a_turn_by_half() {
+        let pose = turned(DOWN, 0.3);
+        let down = gravity_at(&pose, 0.01);
+        let up = MeasuredGravity {
+            in_camera: -down.in_camera,
+            ..down
+        };
+        let tilt = up.tilt(&pose);
+        assert!((tilt.turn.norm() - std::f64::consts::PI).abs() < 1e-9);
+        assert!(tilt.turn.dot(&down.in_camera).abs() < 1e-9);
+    }
+
+    /// Oracle: by hand. The first direction, as sure as what is believed, takes the camera half of
+    /// the way. One that comes a tenth of a second later, with the correlation e^(−1/20) = .951,
+    /// counts with 39.7 times the variance, and takes it 1/40.7 of the way.
+    #[test]
+    fn directions_in_a_row_count_as_few() {
+        let prior = MotionPrior::assumed();
+        let level = turned(DOWN, 0.0);
+        let truth = level * exp(&Twist::from_vector(&Vector6::new(0., 0., 0., 0., 0., 0.02)));
+        let believed = MovingBelief::at(Belief::known(level, 0.1, 0.02), &prior);
+
+        for (seconds, expected) in [(f64::INFINITY, 0.01), (0.1, 0.02 / 41.01)] {
+            let gravity = gravity_at(&truth, 0.02).counted_after(seconds);
+            let found = believed.levelled(&gravity);
+            let roll = log(&level.inv_mul(&found.pose)).to_vector()[5];
+            assert!(
+                (roll / expected - 1.0).abs() < 1e-3,
+                "{roll}, not {expected}"
+            );
+        }
+    }
+}

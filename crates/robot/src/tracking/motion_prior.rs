@@ -1,0 +1,337 @@
+//! How a camera moves when nothing is read of it: as the camera did that mapped the room.
+//!
+//! Its velocity is a random walk that is pulled back to zero (an Ornstein–Uhlenbeck process): over a
+//! short time the camera goes on as it did, over a long time it may have turned round, and is expected
+//! where it would have come to rest. Everything is a function of seconds, not of frames.
+
+use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
+
+use super::clock::seconds_between;
+use seese3_core::geometry::{Twist, body_twist};
+use seese3_core::room::{FrameId, Room};
+
+/// A covariance of a pose and a velocity.
+pub(super) type Matrix12 = SMatrix<f64, 12, 12>;
+
+/// Velocities are compared over about this time to see how long they last, seconds.
+const LAG_S: f64 = 0.2;
+/// Mapped frames further apart in time than this tell no velocity, seconds.
+const LONGEST_STEP_S: f64 = 0.25;
+/// With fewer velocities than this nothing is known of the room's camera.
+const FEWEST_VELOCITIES: usize = 20;
+/// A velocity lasts at least and at most this long, seconds.
+const DURATION_RANGE_S: (f64, f64) = (0.05, 5.0);
+/// The variances of a camera that hardly moved are not below these, (m/s)² and (rad/s)²: one
+/// centimetre and half a degree a second.
+const LEAST_VARIANCE: f64 = 1e-4;
+/// What is assumed of a camera of which too little is known: half a metre and half a radian a second
+/// along every axis, for half a second.
+const ASSUMED_VARIANCE: f64 = 0.25;
+const ASSUMED_DURATION_S: f64 = 0.5;
+
+/// The statistics of a camera's velocity in its body frame, on (v, ω).
+#[derive(Debug, Clone, PartialEq)]
+pub struct MotionPrior {
+    linear: Part,
+    angular: Part,
+}
+
+/// The velocity of translation, or that of rotation.
+#[derive(Debug, Clone, PartialEq)]
+struct Part {
+    /// Its second moment, m²/s² or rad²/s².
+    variance: Matrix3<f64>,
+    /// The time after which it is correlated by 1/e, seconds.
+    duration_s: f64,
+}
+
+/// What becomes of a velocity over a time.
+struct Decay {
+    /// The share of the velocity that is left.
+    left: f64,
+    /// The seconds that the camera goes on with the velocity it had.
+    reach_s: f64,
+    /// The variance of the way, its covariance with the velocity at the end, and the variance of that
+    /// velocity, for a velocity of unit variance.
+    way: f64,
+    way_velocity: f64,
+    velocity: f64,
+}
+
+/// What a prior says of the motion over a time.
+pub(super) struct Drift {
+    /// The motion that is expected.
+    pub motion: Twist,
+    /// The velocity that is expected at its end.
+    pub velocity: Twist,
+    /// The derivatives of motion and final velocity by the velocity at the beginning, as the factors
+    /// of identity for (v, ω).
+    pub reach_s: [f64; 2],
+    pub left: [f64; 2],
+    /// The covariance of (motion, final velocity) for a known velocity at the beginning.
+    pub noise: Matrix12,
+}
+
+impl MotionPrior {
+    /// The prior of the camera that took the mapped frames of a room, given in order.
+    pub fn of_path(room: &Room, mapped: &[FrameId]) -> Self {
+        let steps: Vec<Option<(f64, Twist)>> = mapped
+            .windows(2)
+            .map(|pair| velocity(room, pair[0], pair[1]))
+            .collect();
+        let known: Vec<&(f64, Twist)> = steps.iter().flatten().collect();
+        if known.len() < FEWEST_VELOCITIES {
+            return Self::assumed();
+        }
+
+        let period = known.iter().map(|(seconds, _)| seconds).sum::<f64>() / known.len() as f64;
+        let lag = ((LAG_S / period).round() as usize).max(1);
+        let part = |of: fn(&Twist) -> Vector3<f64>| Part {
+            variance: second_moment(known.iter().map(|(_, twist)| of(twist))),
+            duration_s: duration(&steps, lag, lag as f64 * period, of),
+        };
+
+        Self {
+            linear: part(|twist| twist.linear),
+            angular: part(|twist| twist.angular),
+        }
+    }
+
+    /// The prior of a camera of which nothing is known.
+    pub(super) fn assumed() -> Self {
+        let part = Part {
+            variance: Matrix3::identity() * ASSUMED_VARIANCE,
+            duration_s: ASSUMED_DURATION_S,
+        };
+        Self {
+            linear: part.clone(),
+            angular: part,
+        }
+    }
+
+    /// The covariance of the velocity of a camera that was not observed, on (v, ω).
+    pub fn velocity_covariance(&self) -> Matrix6<f64> {
+        let mut covariance = Matrix6::zeros();
+        for (part, at) in [(&self.linear, 0), (&self.angular, 3)] {
+            covariance
+                .fixed_view_mut::<3, 3>(at, at)
+                .copy_from(&part.variance);
+        }
+        covariance
+    }
+
+    /// What becomes of a camera with a velocity over a time, seconds.
+    pub(super) fn over(&self, velocity: &Twist, seconds: f64) -> Drift {
+        let parts = [&self.linear, &self.angular];
+        let decays = parts.map(|part| Decay::over(seconds, part.duration_s));
+
+        let mut noise = Matrix12::zeros();
+        for (at, (part, decay)) in parts.into_iter().zip(&decays).enumerate() {
+            let (way, speed) = (3 * at, 6 + 3 * at);
+            for (row, column, factor) in [
+                (way, way, decay.way),
+                (way, speed, decay.way_velocity),
+                (speed, way, decay.way_velocity),
+                (speed, speed, decay.velocity),
+            ] {
+                noise
+                    .fixed_view_mut::<3, 3>(row, column)
+                    .copy_from(&(part.variance * factor));
+            }
+        }
+
+        let [linear, angular] = &decays;
+        Drift {
+            motion: Twist {
+                linear: velocity.linear * linear.reach_s,
+                angular: velocity.angular * angular.reach_s,
+            },
+            velocity: Twist {
+                linear: velocity.linear * linear.left,
+                angular: velocity.angular * angular.left,
+            },
+            reach_s: [linear.reach_s, angular.reach_s],
+            left: [linear.left, angular.left],
+            noise,
+        }
+    }
+}
+
+impl Decay {
+    /// Source: the Ornstein–Uhlenbeck process integrated once; Gillespie, Phys. Rev. E 54, 2084
+    /// (1996), equations 2.9 and 2.10, with D replaced by the stationary variance.
+    fn over(seconds: f64, duration_s: f64) -> Self {
+        let ratio = seconds / duration_s;
+        let left = (-ratio).exp();
+        let square = duration_s * duration_s;
+
+        // The closed form of the way's variance cancels to third order where the time is short: its
+        // series is taken there.
+        let way = if ratio < 5e-3 {
+            ratio.powi(3) * (2.0 / 3.0 - ratio / 2.0 + 7.0 / 30.0 * ratio * ratio)
+        } else {
+            2.0 * ratio - 3.0 + 4.0 * left - left * left
+        };
+        Self {
+            left,
+            reach_s: duration_s * (1.0 - left),
+            way: square * way,
+            way_velocity: duration_s * (1.0 - left).powi(2),
+            velocity: 1.0 - left * left,
+        }
+    }
+}
+
+/// The time and the velocity between two mapped frames, if they follow one another.
+fn velocity(room: &Room, from: FrameId, to: FrameId) -> Option<(f64, Twist)> {
+    let seconds = seconds_between(room, from, to);
+    let follows = room.timeline().joins(from, to) && seconds > 0.0 && seconds <= LONGEST_STEP_S;
+
+    let motion = follows.then(|| body_twist(&room.poses()[from.row()], &room.poses()[to.row()]))?;
+    let is_known = motion.is_unique_logarithm();
+    is_known.then(|| (seconds, motion.scaled(seconds.recip())))
+}
+
+fn second_moment(velocities: impl Iterator<Item = Vector3<f64>>) -> Matrix3<f64> {
+    let mut sum = Matrix3::zeros();
+    let mut count = 0.0;
+    for velocity in velocities {
+        sum += velocity * velocity.transpose();
+        count += 1.0;
+    }
+    sum / count + Matrix3::identity() * LEAST_VARIANCE
+}
+
+/// How long a velocity lasts, from its correlation with the velocity `lag` steps later, which are
+/// `seconds` apart.
+fn duration(
+    steps: &[Option<(f64, Twist)>],
+    lag: usize,
+    seconds: f64,
+    of: fn(&Twist) -> Vector3<f64>,
+) -> f64 {
+    let mut product = 0.0;
+    let mut square = 0.0;
+    for (now, later) in steps.iter().zip(steps.iter().skip(lag)) {
+        if let (Some((_, now)), Some((_, later))) = (now, later) {
+            product += of(now).dot(&of(later));
+            square += 0.5 * (of(now).norm_squared() + of(later).norm_squared());
+        }
+    }
+
+    let (least, most) = DURATION_RANGE_S;
+    let correlation = product / square;
+    if correlation.is_nan() || correlation <= 0.0 {
+        return least;
+    }
+    if correlation >= 1.0 {
+        return most;
+    }
+    (-seconds / correlation.ln()).clamp(least, most)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+
+    use super::*;
+    use seese3_core::geometry::{Pose, exp};
+    use seese3_core::room::{Frames, Provenance, RoomId};
+    use seese3_core::statistics::normal_deviates;
+
+    /// Oracle: the definition of a Markov process: what is said of two times one after the other is
+    /// what is said of both together.
+    #[test]
+    fn two_times_are_one_longer_time() {
+        let duration_s = 0.7;
+        for (first, second) in [(0.1, 0.3), (2.0, 0.05), (1e-4, 2e-4)] {
+            let [a, b, both] =
+                [first, second, first + second].map(|time| Decay::over(time, duration_s));
+
+            // The way of the second part begins with the velocity at the end of the first.
+            let way = a.way
+                + 2.0 * b.reach_s * a.way_velocity
+                + b.reach_s * b.reach_s * a.velocity
+                + b.way;
+            let way_velocity = b.left * (a.way_velocity + b.reach_s * a.velocity) + b.way_velocity;
+            let velocity = b.left * b.left * a.velocity + b.velocity;
+
+            for (found, expected) in [
+                (way, both.way),
+                (way_velocity, both.way_velocity),
+                (velocity, both.velocity),
+                (a.reach_s + a.left * b.reach_s, both.reach_s),
+                (a.left * b.left, both.left),
+            ] {
+                assert!(
+                    (found - expected).abs() < 1e-6 * expected,
+                    "{found} {expected}"
+                );
+            }
+        }
+    }
+
+    /// Oracle: a drawn path of known statistics: 0.4 m/s along every axis for 0.8 s, and 0.3 rad/s for
+    /// 0.3 s, seen at 15 Hz.
+    #[test]
+    fn a_path_tells_how_its_camera_moves() {
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(5);
+        let period = 1.0 / 15.0;
+        let mut velocity = Twist::default();
+        let mut pose = Pose::identity();
+        let mut poses = Vec::new();
+
+        // Steps are a hundredth of what is seen, so that the velocity is the path's own.
+        let step = period / 100.0;
+        for number in 0..400_000 {
+            if number % 100 == 0 {
+                poses.push(pose);
+            }
+            let mut drawn = |deviation: f64, duration: f64, now: Vector3<f64>| {
+                let left = (-step / duration).exp();
+                let noise = deviation * (1.0 - left * left).sqrt();
+                now * left + Vector3::from_iterator(normal_deviates(&mut random, 3)) * noise
+            };
+            velocity.linear = drawn(0.4, 0.8, velocity.linear);
+            velocity.angular = drawn(0.3, 0.3, velocity.angular);
+            pose *= exp(&velocity.scaled(step));
+        }
+
+        let times = (0..poses.len() as i64).map(|row| row * (period * 1e9) as i64);
+        let frames = Frames {
+            timestamps_ns: times.collect(),
+            poses,
+            ..Frames::default()
+        };
+        let room = Room::new(RoomId::new("a").unwrap(), frames, Provenance::default()).unwrap();
+        let mapped: Vec<FrameId> = (0..room.frame_count() as u32).map(FrameId).collect();
+        let prior = MotionPrior::of_path(&room, &mapped);
+
+        for (part, deviation, duration) in [(&prior.linear, 0.4, 0.8), (&prior.angular, 0.3, 0.3)] {
+            let found = (part.variance.trace() / 3.0).sqrt();
+            assert!(
+                (found / deviation - 1.0).abs() < 0.1,
+                "{found} m/s, not {deviation}"
+            );
+            let found = part.duration_s;
+            assert!(
+                (found / duration - 1.0).abs() < 0.2,
+                "{found} s, not {duration}"
+            );
+        }
+
+        let few = MotionPrior::of_path(&room, &mapped[..10]);
+        assert_eq!(few, MotionPrior::assumed());
+    }
+
+    /// Oracle: the definition: a velocity that never changes lasts as long as any may.
+    #[test]
+    fn a_constant_velocity_lasts() {
+        let twist = Twist {
+            linear: Vector3::x() * 0.25,
+            angular: Vector3::zeros(),
+        };
+        let steps = vec![Some((0.5, twist)); 40];
+        assert_eq!(duration(&steps, 4, 0.2, |twist| twist.linear), 5.0);
+    }
+}

@@ -1,0 +1,343 @@
+//! Replays of recordings through a tracker, and how far its answers are from the true path.
+
+use ndarray::ArrayView2;
+
+use super::clock::{ASSUMED_PERIOD_S, seconds_between};
+use super::{Belief, Observation, State, Status, Tracker, Update};
+use seese3_core::geometry::{Pose, PoseError, body_twist, log};
+use seese3_core::room::{FrameId, Room};
+use seese3_core::trajectory::Trajectory;
+
+/// How surely a given initial pose is known: metres and radians, standard deviations by axis.
+const INITIAL_DEVIATION: f64 = 1e-3;
+/// A map pose within this distance of the truth, metres, counts as found.
+const FOUND_WITHIN_M: f64 = 0.5;
+/// A map pose within this angle of the truth, degrees, counts as found.
+const FOUND_WITHIN_DEG: f64 = 15.0;
+
+/// Some frames of a recording.
+#[derive(Debug, Clone)]
+pub struct Segment<'a> {
+    /// Latents of the whole recording under the tracker's adapter, row by frame, shape (n, k).
+    pub latents: ArrayView2<'a, f64>,
+    /// Raw features of the same frames, shape (n, d), if the streams are to bring them.
+    pub features: Option<ArrayView2<'a, f32>>,
+    /// Poses of the whole recording, `world_from_camera`, row by frame.
+    pub poses: &'a [Pose],
+    /// The frames to replay, in order.
+    pub frames: &'a [FrameId],
+}
+
+/// One frame of a stream to replay.
+#[derive(Debug, Clone)]
+pub struct Played {
+    /// What the tracker is given.
+    pub frame: Observation,
+    /// Where the camera truly is, `world_from_camera`.
+    pub truth: Pose,
+}
+
+/// What a tracker is told at the beginning of a stream.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum InitialPose {
+    /// The true pose, to a millimetre and a milliradian.
+    Given,
+    /// Nothing.
+    Unknown,
+}
+
+/// A replayed stream: the true path, and the tracker's answers along it.
+#[derive(Debug, Clone)]
+pub struct Replay {
+    /// The true path, one pose per answer.
+    pub truth: Trajectory,
+    /// The frames' numbers, with gaps where the recording's rows were left out.
+    pub sequences: Vec<u64>,
+    /// The tracker's answers, frame by frame.
+    pub updates: Vec<Update>,
+    /// The rows in which a stream begins, in order; the first is 0.
+    pub beginnings: Vec<usize>,
+}
+
+/// Replays segments one after the other, as if no frame lay between them. Frames of successive rows
+/// are `period_ns` nanoseconds apart.
+pub fn replay(
+    tracker: &Tracker,
+    segments: &[Segment<'_>],
+    period_ns: i64,
+    initial_pose: InitialPose,
+) -> Replay {
+    let mut frames = Vec::new();
+
+    let mut sequence: u64 = 0;
+    for segment in segments {
+        let mut previous: Option<FrameId> = None;
+        for &frame in segment.frames {
+            // Rows that were left out are missing numbers; between segments no number is missing.
+            sequence += previous.map_or(1, |before| u64::from(frame.0 - before.0));
+            previous = Some(frame);
+
+            let time_ns = sequence as i64 * period_ns;
+            frames.push(Played {
+                frame: Observation {
+                    feature: segment
+                        .features
+                        .map(|features| features.row(frame.row()).to_vec()),
+                    ..Observation::new(
+                        time_ns,
+                        sequence,
+                        segment.latents.row(frame.row()).to_owned(),
+                    )
+                },
+                truth: segment.poses[frame.row()],
+            });
+        }
+    }
+
+    replay_frames(tracker, &frames, initial_pose)
+}
+
+/// Replays a stream frame by frame.
+pub fn replay_frames(tracker: &Tracker, frames: &[Played], initial_pose: InitialPose) -> Replay {
+    let mut state = start(tracker, frames, initial_pose);
+    let mut found = Replay {
+        truth: Trajectory::default(),
+        sequences: Vec::new(),
+        updates: Vec::new(),
+        beginnings: vec![0],
+    };
+
+    for Played { frame, truth } in frames {
+        // A frame of another adapter, or out of order, is refused and left out.
+        if let Ok(update) = tracker.observe(&mut state, frame) {
+            found.truth.times_ns.push(frame.time_ns);
+            found.truth.poses.push(*truth);
+            found.sequences.push(frame.sequence);
+            found.updates.push(update);
+        }
+    }
+
+    found
+}
+
+/// Replays frames of a room, each of its sequences as a stream of its own. Times are those of the
+/// recording, or those of a camera with [`ASSUMED_PERIOD_S`] if it has none.
+pub fn replay_streams(
+    tracker: &Tracker,
+    segment: Segment<'_>,
+    room: &Room,
+    initial_pose: InitialPose,
+) -> Replay {
+    let same_sequence = |a: &FrameId, b: &FrameId| room.timeline().joins(*a, *b);
+    let streams = segment.frames.chunk_by(same_sequence).map(|frames| {
+        let stream = Segment {
+            frames,
+            ..segment.clone()
+        };
+        let period_ns = period_ns(room, frames);
+        (
+            replay(tracker, &[stream], period_ns, initial_pose),
+            period_ns,
+        )
+    });
+
+    joined(streams)
+}
+
+/// Several streams as one replay, each with the mean time from one frame of its camera to the next,
+/// nanoseconds.
+pub fn joined(streams: impl Iterator<Item = (Replay, i64)>) -> Replay {
+    let mut joined = Replay {
+        truth: Trajectory::default(),
+        sequences: Vec::new(),
+        updates: Vec::new(),
+        beginnings: Vec::new(),
+    };
+
+    for (replayed, period_ns) in streams {
+        // Numbers and times go on from stream to stream, so that each frame has its own.
+        let number = joined.sequences.last().map_or(0, |last| last + 1);
+        let time = joined
+            .truth
+            .times_ns
+            .last()
+            .map_or(0, |last| last + period_ns);
+        joined.beginnings.push(joined.updates.len());
+        joined.truth.poses.extend(replayed.truth.poses);
+        let times = replayed.truth.times_ns.into_iter();
+        joined.truth.times_ns.extend(times.map(|at| at + time));
+        let numbers = replayed.sequences.into_iter();
+        joined.sequences.extend(numbers.map(|at| at + number));
+        joined
+            .updates
+            .extend(replayed.updates.into_iter().map(|update| Update {
+                keyframe_sequence: update.keyframe_sequence + number,
+                ..update
+            }));
+    }
+
+    joined
+}
+
+/// The mean time from one row of a recording to the next, nanoseconds.
+pub fn period_ns(room: &Room, frames: &[FrameId]) -> i64 {
+    let assumed = (ASSUMED_PERIOD_S * 1e9).round() as i64;
+    let (Some(&first), Some(&last)) = (frames.first(), frames.last()) else {
+        return assumed;
+    };
+
+    let rows = f64::from(last.0 - first.0).max(1.0);
+    let period = seconds_between(room, first, last) / rows * 1e9;
+    if period >= 1.0 {
+        period.round() as i64
+    } else {
+        assumed
+    }
+}
+
+fn start(tracker: &Tracker, frames: &[Played], initial_pose: InitialPose) -> State {
+    let first = frames.first().map(|played| played.truth);
+
+    match (initial_pose, first) {
+        (InitialPose::Given, Some(pose)) => tracker.start(Some(Belief::known(
+            pose,
+            INITIAL_DEVIATION,
+            INITIAL_DEVIATION,
+        ))),
+        _ => tracker.start(None),
+    }
+}
+
+/// The map poses of a replay.
+#[derive(Debug, Clone)]
+pub struct MapPath {
+    /// `map_from_camera` of the frames for which a map pose was reported, LOST and RELOCALIZING
+    /// ones included.
+    pub path: Trajectory,
+    /// The rows of those frames in the replay.
+    pub rows: Vec<usize>,
+}
+
+/// The error of one read motion against its stated covariance.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MotionSurprise {
+    /// The length of the read motion, ‖(v, ω)‖, metres and radians mixed.
+    pub length: f64,
+    /// The squared Mahalanobis length of its error.
+    pub squared_error: f64,
+}
+
+impl Replay {
+    /// `map_from_camera` of the frames for which a map pose was reported, LOST and RELOCALIZING
+    /// ones included.
+    pub fn map_path(&self) -> MapPath {
+        let mut path = Trajectory::default();
+        let mut rows = Vec::new();
+        for (row, update) in self.updates.iter().enumerate() {
+            if let Some(map_pose) = &update.map_pose {
+                path.times_ns.push(self.truth.times_ns[row]);
+                path.poses.push(map_pose.pose);
+                rows.push(row);
+            }
+        }
+
+        MapPath { path, rows }
+    }
+
+    /// `odom_from_camera`, moved so that each stream begins at its true first pose.
+    pub fn odom_path(&self) -> Trajectory {
+        let updates = self.updates.iter().enumerate();
+        let poses = updates.map(|(row, update)| self.first_pose(row) * update.odom.pose);
+
+        Trajectory {
+            times_ns: self.truth.times_ns.clone(),
+            poses: poses.collect(),
+        }
+    }
+
+    /// The true first pose of the stream that a row belongs to.
+    pub fn first_pose(&self, row: usize) -> Pose {
+        let streams = self
+            .beginnings
+            .partition_point(|&beginning| beginning <= row);
+        let beginning = self.beginnings[streams.max(1) - 1];
+        self.truth.poses[beginning]
+    }
+
+    /// The squared Mahalanobis lengths of the errors of all map poses.
+    pub fn map_pose_surprises(&self) -> Vec<f64> {
+        self.map_pose_surprises_where(|_| true)
+    }
+
+    /// The squared Mahalanobis lengths of the errors of the map poses in rows that `keep` accepts.
+    pub fn map_pose_surprises_where(&self, keep: impl Fn(usize) -> bool) -> Vec<f64> {
+        let mut surprises = Vec::new();
+        for (row, (update, truth)) in self.updates.iter().zip(&self.truth.poses).enumerate() {
+            if keep(row)
+                && let Some(map_pose) = &update.map_pose
+            {
+                let error = log(&map_pose.pose.inv_mul(truth)).to_vector();
+                surprises.extend(squared_mahalanobis(&error, &map_pose.covariance));
+            }
+        }
+
+        surprises
+    }
+
+    /// The errors of all motions but those of exactly zero, each from its keyframe.
+    pub fn motion_surprises(&self) -> Vec<MotionSurprise> {
+        let mut surprises = Vec::new();
+        for (update, truth) in self.updates.iter().zip(&self.truth.poses) {
+            let Ok(keyframe) = self.sequences.binary_search(&update.keyframe_sequence) else {
+                continue;
+            };
+
+            // A motion of exactly zero was not read: the stream's first frame, or a half turn.
+            // Motions over a jump are counted, with the covariance of a motion that was not seen.
+            let length = update.motion.norm();
+            if length > 0.0 {
+                let true_motion = body_twist(&self.truth.poses[keyframe], truth);
+                let error = true_motion.to_vector() - update.motion.to_vector();
+                let squared_error = squared_mahalanobis(&error, &update.motion_covariance);
+                surprises.extend(squared_error.map(|squared_error| MotionSurprise {
+                    length,
+                    squared_error,
+                }));
+            }
+        }
+
+        surprises
+    }
+
+    /// The share of frames that were answered with a status.
+    pub fn share(&self, status: Status) -> f64 {
+        let has_status = |update: &&Update| update.status == status;
+        self.updates.iter().filter(has_status).count() as f64 / self.updates.len() as f64
+    }
+
+    /// How many frames it took until the tracker was TRACKING within half a metre and 15 degrees of
+    /// the truth; none if it never was.
+    pub fn frames_to_relocalise(&self) -> Option<usize> {
+        let is_found = |(update, truth): (&Update, &Pose)| {
+            let Some(map_pose) = &update.map_pose else {
+                return false;
+            };
+            let error = PoseError::between(&map_pose.pose, truth);
+
+            update.status == Status::Tracking
+                && error.translation_m <= FOUND_WITHIN_M
+                && error.rotation_rad <= FOUND_WITHIN_DEG.to_radians()
+        };
+
+        let mut answers = self.updates.iter().zip(&self.truth.poses);
+        answers.position(is_found).map(|row| row + 1)
+    }
+}
+
+/// eᵀ Σ⁻¹ e; none if Σ is not positive definite.
+fn squared_mahalanobis(
+    error: &nalgebra::Vector6<f64>,
+    covariance: &nalgebra::Matrix6<f64>,
+) -> Option<f64> {
+    Some(error.dot(&covariance.cholesky()?.solve(error)))
+}

@@ -1,0 +1,355 @@
+//! Tracking a camera frame by frame: dead reckoning from keyframes, corrected by mapped frames that
+//! look alike.
+//!
+//! Start reading at [`Tracker::observe`], which hands a frame to `step`, the whole algorithm in six
+//! paragraphs. Its third one is in `dead_reckoning.rs`, the fourth in `anchoring.rs`.
+//!
+//! - A tracker keeps nothing: all that it knows of a stream is its [`State`], and the same state
+//!   and frame give the same answer to the bit.
+//! - A robot may have several cameras: what they see at the same time is in `rig.rs`.
+//! - `odom_from_camera` is continuous: motions are composed and never corrected. `map_from_camera`
+//!   is corrected and may jump.
+//! - The map pose is kept twice. The *believed* pose is the filter's own, with the covariance that
+//!   the filter computes; anchors are compared with it. The *reported* pose is what clients are
+//!   told, with the covariance that its errors were measured to have. While both exist they are the
+//!   same pose and differ in covariance alone; where health is lost only the reported one remains.
+
+use nalgebra::Matrix6;
+
+use super::dead_reckoning::{MotionReading, Poses, Prediction};
+use super::gravity::CountedGravity;
+use super::health::{Continuity, FrameEvidence, TrackingHealth};
+use super::rig::MatchedView;
+use super::sight::{Sight, UNCHANGED_DISTANCE, distance};
+use super::state::{Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
+use super::tracker::Tracker;
+use super::{Belief, MovingBelief};
+use seese3_core::adapter::JUMP_WINDOW;
+
+/// After a longer pause than this, in frames of the calibration rooms, a jump could not be noticed:
+/// half a second at 30 Hz.
+const LONGEST_GAP: u64 = 15;
+
+impl Tracker {
+    /// The state of a stream before its first frame: in the only map, or in one that is to be
+    /// found. `initial_pose` is `world_from_camera` of the first frame, if it is known.
+    pub fn start(&self, initial_pose: Option<Belief>) -> State {
+        let health = if initial_pose.is_some() {
+            TrackingHealth::confirmed()
+        } else {
+            TrackingHealth::NotStarted
+        };
+
+        State {
+            room: (self.maps.len() == 1).then_some(0),
+            health,
+            initial_pose,
+            ..State::default()
+        }
+    }
+
+    /// Sets where a stream's camera is, `world_from_camera`; `odom` continues as it was.
+    pub fn set_pose(&self, state: &mut State, pose: Belief) {
+        state.health = TrackingHealth::confirmed();
+        state.candidate = None;
+        state.frames_off_map = 0;
+
+        match &state.last {
+            // The pose is that of the last frame, which becomes the keyframe.
+            Some(last) => {
+                state.keyframe = Some(Keyframe {
+                    time_ns: last.time_ns,
+                    sequence: last.sequence,
+                    latent: last.latent.clone(),
+                    odom: MovingBelief::at(last.odom, self.prior(state.room)),
+                    reported_pose: Some(pose),
+                });
+                state.place = Some(Place {
+                    time_ns: last.time_ns,
+                    latent: Some(last.latent.clone()),
+                    belief: MovingBelief::at(pose, self.prior(state.room)),
+                    lasting: Matrix6::zeros(),
+                });
+                state.measured = state.measured.begun(last.time_ns);
+            }
+            None => state.initial_pose = Some(pose),
+        }
+    }
+
+    /// Takes one frame. The state changes only if the frame is accepted.
+    ///
+    /// # Errors
+    /// [`Refusal`] for a frame that is late or a duplicate, or whose latent does not fit the
+    /// adapter.
+    pub fn observe(&self, state: &mut State, frame: &Observation) -> Result<Update, Refusal> {
+        if let Some(last) = &state.last {
+            if frame.sequence <= last.sequence {
+                return Err(Refusal::Duplicate {
+                    sequence: frame.sequence,
+                    last: last.sequence,
+                });
+            }
+
+            if frame.time_ns <= last.time_ns {
+                return Err(Refusal::Late {
+                    time_ns: frame.time_ns,
+                    last_ns: last.time_ns,
+                });
+            }
+        }
+
+        let others = frame.other_views.iter().map(|other| &other.latent);
+        for latent in others.chain([&frame.latent]) {
+            self.adapter()
+                .check_latent(latent.as_slice().unwrap_or_default())?;
+        }
+
+        Ok(self.step(state, frame))
+    }
+
+    fn step(&self, state: &mut State, frame: &Observation) -> Update {
+        // 1. What the frame looks like: whether the view follows from the views before, and the view
+        //    of the robot's cameras that looks most like a map, with the mapped frame nearest to it.
+        let continuity = self.record_view(state, frame);
+        let sight = Sight::of(frame.is_blank, state.unchanged_frames);
+        let seen = self.look(state, frame);
+        let matches_room = seen.leading.matches_room();
+
+        // 2. What that says of the stream's health. The own view may jump, as when something covers
+        //    the lens and goes, while another camera certainly sees the room.
+        state.health = state.health.after(FrameEvidence {
+            matches_room,
+            matches_certainly: matches_room && seen.leading.matched.is_certain,
+            continuity: match continuity {
+                Continuity::Jump if seen.is_seen_by_other => Continuity::Continuous,
+                continuity => continuity,
+            },
+        });
+        state.frames_off_map = if matches_room {
+            0
+        } else {
+            state.frames_off_map.saturating_add(1)
+        };
+
+        // 3. Dead reckoning: the motion since the keyframe carries every pose forward.
+        let reading = match sight {
+            Sight::Clear => MotionReading::of(continuity, seen.own_matches_room),
+            Sight::Nothing | Sight::Unchanged => MotionReading::Unseen,
+        };
+        let prediction = self.predict(state, frame, reading);
+        let mut poses = prediction.poses;
+        if state.health.is_lost() {
+            self.stop_believing(state, &mut poses);
+        }
+
+        let gravity = frame.gravity.map(|measured| measured.after(state, frame));
+        if let (Some(believed), Some(gravity)) = (&mut poses.map_pose, &gravity) {
+            *believed = believed.levelled(gravity);
+        }
+
+        // 4. Correction: the mapped frames that look alike are tried as an anchor.
+        let correction = self.correct_by_views(state, &mut poses, frame, &seen, gravity.as_ref());
+        if let Some(believed) = &poses.map_pose {
+            poses.reported_pose = Some(self.reported(believed, &poses.lasting));
+        }
+
+        // 5. What is remembered for the next frame.
+        let keyframe_sequence = state
+            .keyframe
+            .as_ref()
+            .map_or(frame.sequence, |keyframe| keyframe.sequence);
+        let believed = poses.map_pose.as_ref().unwrap_or(&poses.odom);
+        let velocity = state.last.as_ref().map(|_| believed.velocity);
+
+        // Motions cannot be read from a blank image.
+        let shows = sight != Sight::Nothing || state.keyframe.is_none();
+        let is_keyframe = shows && self.is_keyframe_due(state, frame.time_ns, &prediction);
+        let is_corrected = state.corrected_ns == Some(frame.time_ns);
+        let is_place = is_corrected || (shows && self.is_place_old(state, frame.time_ns));
+        remember(state, frame, &poses, is_keyframe, is_place);
+        state.measured = state.measured.after(frame, is_keyframe, is_place);
+
+        // 6. The answer. The status judges the reported pose, but only while the filter still
+        //    believes one.
+        let judged_pose = poses.map_pose.and(poses.reported_pose);
+
+        let best = &seen.leading;
+        let contradiction = gravity.and_then(|gravity| contradiction(&gravity, best, &poses));
+        let (status, reason) = self.status(state, judged_pose.as_ref(), best, contradiction);
+
+        Update {
+            motion: prediction.motion,
+            motion_covariance: prediction.covariance,
+            keyframe_sequence,
+            is_keyframe,
+            odom: poses.odom.place(),
+            map_pose: poses.reported_pose,
+            velocity,
+            status,
+            reason,
+            out_of_distribution: best.matched.out_of_distribution,
+            room: state.room,
+            best_match: (best.room, best.matched.nearest[0]),
+            best_camera: best.other.map(|other| other.camera),
+            match_used: correction.is_applied,
+            surprise: correction.surprise,
+            candidate: state.candidate.clone(),
+        }
+    }
+
+    /// Adds the frame's view to the recent ones, and says how it follows from them. A blank view is
+    /// none: it neither follows nor jumps.
+    fn record_view(&self, state: &mut State, frame: &Observation) -> Continuity {
+        if frame.is_blank {
+            return Continuity::Continuous;
+        }
+
+        let whitened = self.whitened(frame.latent.view());
+        let nearest = state
+            .recent
+            .iter()
+            .map(|other| distance(other, &whitened))
+            .fold(f64::INFINITY, f64::min);
+
+        let is_unchanged = state
+            .recent
+            .last()
+            .is_some_and(|last| distance(last, &whitened) <= UNCHANGED_DISTANCE);
+        state.unchanged_frames = if is_unchanged {
+            state.unchanged_frames.saturating_add(1)
+        } else {
+            0
+        };
+
+        // How far the views of a moving camera lie apart grows slowly with the time from one to the
+        // other, about as its cube root.
+        let periods = state
+            .last
+            .as_ref()
+            .map_or(1, |last| self.frames_between(last.time_ns, frame.time_ns));
+        let jump = self.error_model.statistics().jump_distance;
+        let limit = jump * (periods as f64).cbrt();
+
+        // A camera that was covered or frozen meanwhile may have been moved like one that was silent.
+        let unseen = state
+            .seen_ns
+            .map_or(1, |seen_ns| self.frames_between(seen_ns, frame.time_ns));
+        if !is_unchanged {
+            state.seen_ns = Some(frame.time_ns);
+        }
+
+        let missing = frames_since_last(state, frame) > JUMP_WINDOW as u64;
+        let is_unseen = unseen > LONGEST_GAP && nearest > jump;
+        let continuity = if missing || periods > LONGEST_GAP || is_unseen {
+            Continuity::Gap
+        } else if !state.recent.is_empty() && nearest > limit {
+            Continuity::Jump
+        } else {
+            Continuity::Continuous
+        };
+
+        // A gap comes first: after one even a near view may hide a jump. After either, the views
+        // before say nothing of those that follow.
+        if continuity != Continuity::Continuous {
+            state.recent.clear();
+        } else if state.recent.len() == JUMP_WINDOW {
+            state.recent.remove(0);
+        }
+        state.recent.push(whitened);
+
+        continuity
+    }
+
+    /// Stops believing the map pose of a lost stream. In a single room the last pose is still
+    /// reported, less and less surely, but anchors have to agree before it is believed again; with
+    /// several rooms even the room is open again.
+    fn stop_believing(&self, state: &mut State, poses: &mut Poses) {
+        poses.map_pose = None;
+        state.candidate = None;
+
+        if self.maps.len() > 1 {
+            poses.reported_pose = None;
+            state.room = None;
+        }
+    }
+
+    /// Whether the last place is so old that motions from it were not measured, or there is none.
+    fn is_place_old(&self, state: &State, time_ns: i64) -> bool {
+        let place = state.place.as_ref();
+        place.is_none_or(|place| self.is_old(place.time_ns, time_ns))
+    }
+
+    fn is_keyframe_due(&self, state: &State, time_ns: i64, prediction: &Prediction) -> bool {
+        let keyframe = state.keyframe.as_ref();
+        let is_old = keyframe.is_none_or(|keyframe| self.is_old(keyframe.time_ns, time_ns));
+
+        is_old
+            || state.health.is_lost()
+            || prediction.motion.norm() >= self.settings.keyframe_displacement
+    }
+
+    fn is_old(&self, from_ns: i64, to_ns: i64) -> bool {
+        self.frames_between(from_ns, to_ns) >= u64::from(self.settings.keyframe_frames)
+    }
+}
+
+/// Keeps the frame, takes it as the keyframe if one is due, and keeps where the camera is believed
+/// to be if that is new.
+fn remember(
+    state: &mut State,
+    frame: &Observation,
+    poses: &Poses,
+    is_keyframe: bool,
+    is_place: bool,
+) {
+    let latent = frame.latent.to_vec();
+
+    if is_keyframe {
+        state.keyframe = Some(Keyframe {
+            time_ns: frame.time_ns,
+            sequence: frame.sequence,
+            latent: latent.clone(),
+            odom: poses.odom,
+            reported_pose: poses.reported_pose,
+        });
+        state.initial_pose = None;
+    }
+
+    match &poses.map_pose {
+        Some(belief) if is_place => {
+            let sight = Sight::of(frame.is_blank, state.unchanged_frames);
+            state.place = Some(Place {
+                time_ns: frame.time_ns,
+                latent: (sight == Sight::Clear).then(|| latent.clone()),
+                belief: *belief,
+                lasting: poses.lasting,
+            });
+        }
+        Some(_) => {}
+        None => state.place = None,
+    }
+
+    state.last = Some(LastFrame {
+        time_ns: frame.time_ns,
+        sequence: frame.sequence,
+        latent,
+        odom: poses.odom.place(),
+    });
+}
+
+/// By how much measured gravity contradicts where a view that looks like the room was taken, or the
+/// pose that several views told, radians; none if it does not.
+fn contradiction(gravity: &CountedGravity, view: &MatchedView<'_>, poses: &Poses) -> Option<f64> {
+    let placed = view.matches_room().then(|| view.placed());
+    let by_view = placed.and_then(|placed| gravity.contradicts(&placed));
+    by_view.or_else(|| gravity.contradicts(poses.reported_pose.as_ref()?))
+}
+
+/// How many frames the camera took since the last accepted one, this one included: numbers that are
+/// missing are frames that are missing.
+fn frames_since_last(state: &State, frame: &Observation) -> u64 {
+    state
+        .last
+        .as_ref()
+        .map_or(1, |last| frame.sequence - last.sequence)
+}

@@ -1,0 +1,466 @@
+//! The motion that explains matches best, and how sure that is.
+//!
+//! A motion (R, t) is `first_from_second`: the second camera in the frame of the first; small steps
+//! (v, ω) follow it.
+
+use nalgebra::{
+    Cholesky, Matrix2x6, Matrix3, Matrix6, Rotation3, Translation3, UnitQuaternion, Vector2,
+    Vector3, Vector6,
+};
+
+use super::Match;
+use seese3_core::geometry::Pose;
+
+/// The prior of log ρ, ρ the inverse depth per metre, at a place (x, y) of the image plane: the
+/// factors of 1, x, y, x², xy and y².
+const LOG_INVERSE_DEPTH: [f64; 6] = [-0.9446, -0.1065, -0.0705, 0.4672, 0.0214, 0.2502];
+
+/// Standard deviations of log ρ about that prior: the one that explains the matches best is taken.
+const DEPTH_SPREADS: [f64; 2] = [0.15, 0.3];
+
+/// Degrees of freedom of the Student-t distribution of a match.
+const DEGREES_OF_FREEDOM: f64 = 4.0;
+
+/// Standard deviation of the rotation before anything is seen, radians.
+const ROTATION_PRIOR: f64 = 1.0;
+
+/// Translations that the search begins at, metres.
+const STARTS: [[f64; 3]; 5] = [
+    [0.0, 0.0, 0.0],
+    [0.2, 0.0, 0.0],
+    [-0.2, 0.0, 0.0],
+    [0.0, 0.0, 0.2],
+    [0.0, 0.0, -0.2],
+];
+
+/// The matches' deviations are first taken as larger, so that the search passes over small dips:
+/// factors, and the most steps with each.
+const ANNEALING: [(f64, usize); 2] = [(8.0, 4), (3.0, 4)];
+
+/// How many of the best ends of these searches are followed to the bottom, and the most steps.
+const FINISHED: usize = 2;
+const LAST_STEPS: usize = 12;
+
+/// The Cauchy scale of the first rotation: a match that is farther off counts little, radians.
+const FIRST_GUESS_SCALE: f64 = 0.05;
+
+/// Neighbouring matches err together: so many count as one.
+const DEPENDENCE: f64 = 300.0;
+
+/// Where the images leave the translation open it goes towards none: its spread before anything is
+/// seen, as a share of the translation found, and metres.
+const SHRINKAGE: (f64, f64) = (0.8, 0.02);
+
+/// The covariance beside what the matches say.
+mod spread {
+    /// Factor of the covariance of the matches.
+    pub const MATCHES: f64 = 0.47;
+    /// The length of the translation, as a share of it: the depths have a scale of their own.
+    pub const SCALE: f64 = 0.31;
+    /// Every component of the translation: as a share of it, and metres.
+    pub const SHARE: f64 = 0.10;
+    pub const METRES: f64 = 0.006;
+    /// Every component of the rotation: as a share of it, and radians.
+    pub const TURN_SHARE: f64 = 0.06;
+    pub const RADIANS: f64 = 0.004;
+    /// Factor of all.
+    pub const ALL: f64 = 1.165;
+}
+
+/// A motion, and what each match says of it.
+pub(super) struct Found<'a> {
+    matches: &'a [Match],
+    /// Factor of the matches' deviations.
+    factor: f64,
+    depth_spread: f64,
+    rotation: Rotation3<f64>,
+    translation: Vector3<f64>,
+    seen: Vec<Seen>,
+    /// Twice the negative logarithm of the posterior density.
+    cost: f64,
+}
+
+/// A match under a motion.
+#[derive(Clone, Copy)]
+struct Seen {
+    /// log ρ, beyond its prior mean.
+    excess: f64,
+    inverse_depth: f64,
+    /// The direction in the second camera, scaled to depth 1 in the first.
+    direction: Vector3<f64>,
+    /// The depth in the second camera, of depth 1 in the first; at least 0.05.
+    depth: f64,
+    /// Where it should be seen, and the match's point relative to that.
+    expected: Vector2<f64>,
+    residual: Vector2<f64>,
+    /// Derivative of `expected` by log ρ.
+    by_depth: Vector2<f64>,
+    /// The variance that the unknown depth gives to the point, relative to the match's own.
+    depth_share: f64,
+    /// Weight of the match, of (ν + 2) / ν at most.
+    weight: f64,
+}
+
+/// The most probable motion for the matches.
+pub(super) fn solve(matches: &[Match]) -> Found<'_> {
+    let rotation = rotation_alone(matches);
+    let unmoved = Guess {
+        rotation,
+        translation: Vector3::zeros(),
+        excess: vec![0.0; matches.len()],
+    };
+    let mut best = Found::at(matches, 1.0, DEPTH_SPREADS[0], unmoved.clone());
+
+    for depth_spread in DEPTH_SPREADS {
+        let mut ends: Vec<Found<'_>> = STARTS
+            .into_iter()
+            .map(|start| {
+                let mut guess = Guess {
+                    translation: Vector3::from(start),
+                    ..unmoved.clone()
+                };
+                for (factor, steps) in ANNEALING {
+                    let mut found = Found::at(matches, factor, depth_spread, guess);
+                    found.descend(steps);
+                    guess = found.guess();
+                }
+
+                Found::at(matches, 1.0, depth_spread, guess)
+            })
+            .collect();
+
+        ends.push(Found::at(matches, 1.0, depth_spread, best.guess()));
+        ends.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+        for mut end in ends.into_iter().take(FINISHED) {
+            end.descend(LAST_STEPS);
+            if end.cost < best.cost {
+                best = end;
+            }
+        }
+    }
+
+    best
+}
+
+/// A motion, and how far the logarithm of each match's inverse depth is from its prior mean.
+#[derive(Clone)]
+struct Guess {
+    rotation: Rotation3<f64>,
+    translation: Vector3<f64>,
+    excess: Vec<f64>,
+}
+
+/// The rotation between the directions of the matches, as if there were no translation: Wahba's
+/// problem, with Cauchy weights against what does not fit.
+fn rotation_alone(matches: &[Match]) -> Rotation3<f64> {
+    let ends: Vec<[Vector3<f64>; 2]> = matches
+        .iter()
+        .map(|matched| {
+            [
+                matched.direction.normalize(),
+                matched.point.push(1.0).normalize(),
+            ]
+        })
+        .collect();
+    let mut rotation = Rotation3::identity();
+    let mut weights = vec![1.0; matches.len()];
+
+    for _ in 0..15 {
+        let mut sum = Matrix3::zeros();
+        for ((matched, [first, second]), weight) in matches.iter().zip(&ends).zip(&weights) {
+            sum += first * second.transpose() * (weight / matched.deviation.powi(2));
+        }
+
+        // The orthogonal factor, with the weakest axis turned where it would be a mirror.
+        let svd = sum.svd(true, true);
+        let (Some(left), Some(right)) = (svd.u, svd.v_t) else {
+            return rotation;
+        };
+        let mirror = Vector3::new(1.0, 1.0, (left * right).determinant());
+        rotation = Rotation3::from_matrix_unchecked(left * Matrix3::from_diagonal(&mirror) * right);
+
+        for (weight, [first, second]) in weights.iter_mut().zip(&ends) {
+            let off = (first - rotation * second).norm_squared();
+            *weight = 1.0 / (1.0 + off / FIRST_GUESS_SCALE.powi(2));
+        }
+    }
+
+    rotation
+}
+
+impl<'a> Found<'a> {
+    /// The matches under a motion, each with the depth that suits it best, sought from the guess on.
+    fn at(matches: &'a [Match], factor: f64, depth_spread: f64, guess: Guess) -> Self {
+        let Guess {
+            rotation,
+            translation,
+            excess,
+        } = guess;
+        let shift = rotation.inverse() * translation;
+        let seen: Vec<Seen> = matches
+            .iter()
+            .zip(excess)
+            .map(|(matched, excess)| {
+                let direction = rotation.inverse() * matched.direction;
+                Seen::of(
+                    matched,
+                    direction,
+                    shift,
+                    matched.deviation * factor,
+                    depth_spread,
+                    excess,
+                )
+            })
+            .collect();
+
+        let mut cost = rotation.scaled_axis().norm_squared() / ROTATION_PRIOR.powi(2);
+        for (matched, seen) in matches.iter().zip(&seen) {
+            let distance = seen.distance(matched.deviation * factor, depth_spread);
+            cost += (DEGREES_OF_FREEDOM + 2.0) * (distance / DEGREES_OF_FREEDOM).ln_1p()
+                + seen.depth_share.ln_1p();
+        }
+
+        Self {
+            matches,
+            factor,
+            depth_spread,
+            rotation,
+            translation,
+            seen,
+            cost,
+        }
+    }
+
+    /// The motion and the depths, from which another search can go on.
+    fn guess(&self) -> Guess {
+        Guess {
+            rotation: self.rotation,
+            translation: self.translation,
+            excess: self.seen.iter().map(|seen| seen.excess).collect(),
+        }
+    }
+
+    /// Goes downhill by Levenberg–Marquardt steps.
+    fn descend(&mut self, steps: usize) {
+        let mut damping = 1e-4;
+        for _ in 0..steps {
+            let (information, depth_curvature, gradient) = self.normal_equations();
+            let curvature = information + depth_curvature;
+            let mut lower = None;
+
+            for _ in 0..6 {
+                let damped = curvature + Matrix6::from_diagonal(&(curvature.diagonal() * damping));
+                let Some(step) = Cholesky::new(damped).map(|factors| factors.solve(&gradient))
+                else {
+                    damping = f64::max(damping * 10.0, 1e-3);
+                    continue;
+                };
+
+                let tried = self.moved(&step);
+                if tried.cost < self.cost {
+                    damping = f64::max(damping / 10.0, 1e-7);
+                    lower = Some(tried);
+                    break;
+                }
+                damping = f64::max(damping * 10.0, 1e-3);
+            }
+
+            let Some(lower) = lower else { return };
+            let gain = self.cost - lower.cost;
+            *self = lower;
+            if gain < 1e-2 {
+                return;
+            }
+        }
+    }
+
+    /// The same matches under this motion followed by a small one, ordered (v, ω).
+    fn moved(&self, step: &Vector6<f64>) -> Self {
+        let linear = step.fixed_rows::<3>(0).into_owned();
+        let angular = step.fixed_rows::<3>(3).into_owned();
+        let guess = Guess {
+            rotation: self.rotation * Rotation3::new(angular),
+            translation: self.translation + self.rotation * linear,
+            ..self.guess()
+        };
+
+        Self::at(self.matches, self.factor, self.depth_spread, guess)
+    }
+
+    /// The matches' information on a small motion that follows, ordered (v, ω), with every depth
+    /// eliminated; what the variance by unknown depths adds to it; and the gradient downhill.
+    fn normal_equations(&self) -> (Matrix6<f64>, Matrix6<f64>, Vector6<f64>) {
+        let shift = self.rotation.inverse() * self.translation;
+        let mut information = Matrix6::zeros();
+        let mut gradient = Vector6::zeros();
+        let mut by_shift = Matrix3::zeros();
+
+        for (matched, seen) in self.matches.iter().zip(&self.seen) {
+            let variance = (matched.deviation * self.factor).powi(2);
+            let rows = seen.by_motion();
+
+            // The Schur complement of the depth.
+            let own = seen.by_depth.norm_squared() / variance + self.depth_spread.powi(-2);
+            let slope = seen.by_depth.dot(&seen.residual) / variance
+                - seen.excess / self.depth_spread.powi(2);
+            let mixed = rows.transpose() * seen.by_depth / variance;
+
+            information += seen.weight
+                * (rows.transpose() * rows / variance - mixed * mixed.transpose() / own);
+            gradient +=
+                seen.weight * (rows.transpose() * seen.residual / variance - mixed * (slope / own));
+
+            // The determinant of the variance, whose depth share is k |(I, −h) shift|².
+            let share = (seen.inverse_depth * self.depth_spread / seen.depth).powi(2)
+                / variance
+                / (1.0 + seen.depth_share);
+            let [x, y] = [seen.expected.x, seen.expected.y];
+            by_shift += share * Matrix3::new(1.0, 0.0, -x, 0.0, 1.0, -y, -x, -y, x * x + y * y);
+        }
+
+        let prior = ROTATION_PRIOR.powi(-2);
+        let turned = self.rotation.scaled_axis();
+        let pull = by_shift * shift;
+        let mut depth_curvature = Matrix6::zeros();
+        for row in 0..3 {
+            information[(3 + row, 3 + row)] += prior;
+            gradient[3 + row] -= turned[row] * prior;
+            gradient[row] -= pull[row];
+        }
+        depth_curvature
+            .fixed_view_mut::<3, 3>(0, 0)
+            .copy_from(&by_shift);
+
+        (information, depth_curvature, gradient)
+    }
+
+    /// How many matches agree with the motion: the sum of their weights, 0 to 1 each.
+    pub fn support(&self) -> f64 {
+        let most = (DEGREES_OF_FREEDOM + 2.0) / DEGREES_OF_FREEDOM;
+        self.seen.iter().map(|seen| seen.weight / most).sum()
+    }
+
+    /// The motion, drawn towards no translation where the matches leave it open, and the covariance
+    /// of ξ in true = motion · exp(ξ), ordered (v, ω). None if the matches are degenerate.
+    pub fn shrunk_with_covariance(&self) -> Option<(Pose, Matrix6<f64>)> {
+        let (share, metres) = SHRINKAGE;
+        let (information, ..) = self.normal_equations();
+        let shift = self.rotation.inverse() * self.translation;
+        let towards_none = 1.0 / (share.powi(2) * shift.norm_squared() + metres.powi(2));
+
+        let mut posterior = information / DEPENDENCE;
+        let mut pull = Vector6::zeros();
+        for row in 0..3 {
+            posterior[(row, row)] += towards_none;
+            pull[row] = -towards_none * shift[row];
+        }
+
+        let covariance = Cholesky::new(posterior)?.inverse();
+        let step = covariance * pull;
+        let drawn = self.moved(&step);
+        let shift = drawn.rotation.inverse() * drawn.translation;
+
+        let turned =
+            spread::RADIANS.powi(2) + (spread::TURN_SHARE * drawn.rotation.angle()).powi(2);
+        let even = spread::SHARE.powi(2) * shift.norm_squared() + spread::METRES.powi(2);
+        let mut spread = covariance * spread::MATCHES;
+        let along = shift * shift.transpose() * spread::SCALE.powi(2);
+        for row in 0..3 {
+            spread[(row, row)] += even;
+            spread[(3 + row, 3 + row)] += turned;
+            for column in 0..3 {
+                spread[(row, column)] += along[(row, column)];
+            }
+        }
+
+        let motion = Pose::from_parts(
+            Translation3::from(drawn.translation),
+            UnitQuaternion::from_rotation_matrix(&drawn.rotation),
+        );
+        Some((motion, spread * spread::ALL))
+    }
+}
+
+impl Seen {
+    /// A match whose direction in the second camera's axes is `turned`, seen from `shift` away in
+    /// these axes, with the depth that suits it best.
+    fn of(
+        matched: &Match,
+        turned: Vector3<f64>,
+        shift: Vector3<f64>,
+        deviation: f64,
+        depth_spread: f64,
+        excess: f64,
+    ) -> Self {
+        let prior = log_inverse_depth(matched.direction);
+        let at = |excess: f64| {
+            let inverse_depth = (prior + excess).exp();
+            let direction = turned - shift * inverse_depth;
+            let depth = direction.z.max(0.05);
+            let expected = direction.xy() / depth;
+            let by_depth = (shift.xy() - expected * shift.z) * (-inverse_depth / depth);
+
+            Self {
+                excess,
+                inverse_depth,
+                direction,
+                depth,
+                expected,
+                residual: matched.point - expected,
+                by_depth,
+                depth_share: by_depth.norm_squared() * (depth_spread / deviation).powi(2),
+                weight: 1.0,
+            }
+        };
+
+        // Two Newton steps towards the most probable depth.
+        let mut seen = at(excess);
+        for _ in 0..2 {
+            let slope = seen.by_depth.dot(&seen.residual) / deviation.powi(2)
+                - seen.excess / depth_spread.powi(2);
+            let curvature =
+                seen.by_depth.norm_squared() / deviation.powi(2) + depth_spread.powi(-2);
+            let step = (slope / curvature).clamp(-0.7, 0.7);
+            seen = at((seen.excess + step).clamp(-3.0 * depth_spread, 3.0 * depth_spread));
+        }
+
+        seen.weight = (DEGREES_OF_FREEDOM + 2.0)
+            / (DEGREES_OF_FREEDOM + seen.distance(deviation, depth_spread));
+        seen
+    }
+
+    /// The squared Mahalanobis distance of the point and of the depth from what is expected.
+    fn distance(&self, deviation: f64, depth_spread: f64) -> f64 {
+        self.residual.norm_squared() / deviation.powi(2) + (self.excess / depth_spread).powi(2)
+    }
+
+    /// Derivative of `expected` by a small motion that follows, ordered (v, ω).
+    fn by_motion(&self) -> Matrix2x6<f64> {
+        let mut rows = Matrix2x6::zeros();
+        for axis in 0..2 {
+            let mut by_direction = Vector3::zeros();
+            by_direction[axis] = 1.0 / self.depth;
+            by_direction[2] = -self.expected[axis] / self.depth;
+
+            let by_turn = by_direction.cross(&self.direction);
+            for column in 0..3 {
+                rows[(axis, column)] = -self.inverse_depth * by_direction[column];
+                rows[(axis, 3 + column)] = by_turn[column];
+            }
+        }
+
+        rows
+    }
+}
+
+/// The mean of log ρ in the direction of a point of the image plane.
+fn log_inverse_depth(direction: Vector3<f64>) -> f64 {
+    let [x, y] = [direction.x, direction.y];
+    let terms = [1.0, x, y, x * x, x * y, y * y];
+
+    LOG_INVERSE_DEPTH
+        .iter()
+        .zip(terms)
+        .map(|(factor, term)| factor * term)
+        .sum()
+}

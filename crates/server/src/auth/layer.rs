@@ -1,0 +1,239 @@
+//! The check of every request, before any of it is decoded.
+
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use http::{HeaderMap, Request, Response, header};
+use tokio::sync::OwnedSemaphorePermit;
+use tonic::Status;
+use tonic::body::Body;
+use tower::{Layer, Service};
+
+use super::super::Error;
+use super::super::connections::Peer;
+use super::super::holding_body::holding;
+use super::super::metrics::Metrics;
+use super::super::status::Full;
+use super::{Keyring, Principal, Verb};
+
+/// Which verb an RPC needs, by the beginning of its path.
+const VERBS: [(&str, Need); 9] = [
+    // Probes of containers and load balancers carry no token.
+    ("/grpc.health.v1.Health/", Need::Nothing),
+    ("/grpc.reflection.", Need::Verb(Verb::Catalog)),
+    ("/seese3.v1.NavigationService/", Need::Verb(Verb::Navigate)),
+    (
+        "/seese3.v1.LocalizationService/",
+        Need::Verb(Verb::Localize),
+    ),
+    ("/seese3.v1.OdometryService/", Need::Verb(Verb::Track)),
+    ("/seese3.v1.EvaluationService/", Need::Verb(Verb::Evaluate)),
+    ("/seese3.v1.CatalogService/List", Need::Verb(Verb::Catalog)),
+    ("/seese3.v1.CatalogService/Get", Need::Verb(Verb::Catalog)),
+    // Everything else in the catalog changes it.
+    ("/seese3.v1.CatalogService/", Need::Verb(Verb::Write)),
+];
+
+/// What a caller has to have for an RPC.
+#[derive(Debug, Clone, Copy)]
+enum Need {
+    Nothing,
+    Verb(Verb),
+}
+
+/// What is held until the answer to a request has ended.
+struct Admitted {
+    /// One of the places of its caller.
+    _place: OwnedSemaphorePermit,
+    /// What the caller of a signed token has open is counted as long as any of its principals
+    /// lives.
+    _principal: Arc<Principal>,
+}
+
+/// Wraps a service so that only known callers reach it, if there are credentials.
+#[derive(Debug, Clone)]
+pub struct AuthLayer {
+    /// None to let everybody pass.
+    pub keyring: Option<Arc<Keyring>>,
+    /// Counts what is refused because a caller has as many requests open as it may.
+    pub metrics: Metrics,
+}
+
+impl<S> Layer<S> for AuthLayer {
+    type Service = Auth<S>;
+
+    fn layer(&self, inner: S) -> Self::Service {
+        Auth {
+            inner,
+            layer: self.clone(),
+        }
+    }
+}
+
+/// A service that only known callers reach.
+#[derive(Debug, Clone)]
+pub struct Auth<S> {
+    inner: S,
+    layer: AuthLayer,
+}
+
+impl<S, B> Service<Request<B>> for Auth<S>
+where
+    S: Service<Request<B>, Response = Response<Body>>,
+    S::Future: Send + 'static,
+{
+    type Response = Response<Body>;
+    type Error = S::Error;
+    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, S::Error>> + Send>>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), S::Error>> {
+        self.inner.poll_ready(context)
+    }
+
+    fn call(&mut self, mut request: Request<B>) -> Self::Future {
+        let admitted = match self.layer.admit(&mut request) {
+            Ok(admitted) => admitted,
+            Err(error) => {
+                let refused = Status::from(error).into_http();
+                return Box::pin(async move { Ok(refused) });
+            }
+        };
+        let answer = self.inner.call(request);
+
+        Box::pin(async move {
+            let response = answer.await?;
+            Ok(match admitted {
+                None => response,
+                Some(admitted) => response.map(|body| holding(body, admitted)),
+            })
+        })
+    }
+}
+
+impl AuthLayer {
+    /// Checks a request and notes who it is from. None if nobody has to be known.
+    fn admit<B>(&self, request: &mut Request<B>) -> Result<Option<Admitted>, Error> {
+        let Some(keyring) = &self.keyring else {
+            return Ok(None);
+        };
+
+        let path = request.uri().path();
+        let need = VERBS
+            .iter()
+            .find(|(beginning, _)| path.starts_with(beginning));
+        let verb = match need {
+            Some((_, Need::Nothing)) => return Ok(None),
+            Some((_, Need::Verb(verb))) => Some(*verb),
+            // A path that nobody answers: known callers are told so, others learn nothing.
+            None => None,
+        };
+
+        let principal = caller(keyring, request)?;
+        tracing::Span::current().record("principal", principal.name());
+
+        if let Some(verb) = verb.filter(|&verb| !principal.may(verb)) {
+            return Err(Error::Forbidden { verb: verb.name() });
+        }
+
+        let full = Full::CallersRequests;
+        let place = principal.request_place().ok_or_else(|| {
+            self.metrics.shed(full);
+            Error::Full { what: full }
+        })?;
+        request.extensions_mut().insert(principal.clone());
+
+        Ok(Some(Admitted {
+            _place: place,
+            _principal: principal,
+        }))
+    }
+}
+
+/// Who a request is from. A token goes before a certificate: the certificate may be that of a
+/// gateway that many callers share.
+fn caller<B>(keyring: &Keyring, request: &Request<B>) -> Result<Arc<Principal>, Error> {
+    let credentials = keyring.current();
+
+    if let Some(token) = bearer(request.headers())? {
+        return credentials.by_token(token);
+    }
+
+    let peer = request.extensions().get::<Peer>();
+    let certificate = peer.and_then(|peer| peer.certificate);
+    certificate
+        .and_then(|certificate| credentials.by_certificate(&certificate))
+        .ok_or(Error::Unauthenticated {
+            problem: "a token is needed, as metadata `authorization: Bearer TOKEN`",
+        })
+}
+
+/// The bearer token of a request (RFC 6750, section 2.1), if it has any authorization.
+fn bearer(headers: &HeaderMap) -> Result<Option<&[u8]>, Error> {
+    let Some(given) = headers.get(header::AUTHORIZATION) else {
+        return Ok(None);
+    };
+
+    let malformed = Error::Unauthenticated {
+        problem: "the metadata `authorization` must be `Bearer TOKEN`",
+    };
+    let (scheme, token) = given
+        .as_bytes()
+        .split_at_checked(7)
+        .ok_or(malformed.clone())?;
+    if !scheme.eq_ignore_ascii_case(b"Bearer ") || token.is_empty() {
+        return Err(malformed);
+    }
+
+    Ok(Some(token))
+}
+
+#[cfg(all(test, feature = "jwt"))]
+mod tests {
+    use super::*;
+    use std::convert::Infallible;
+
+    /// Oracle: the limit of the file. A token's calls count until they are answered, also when
+    /// their requests are gone before.
+    #[tokio::test]
+    async fn calls_of_one_subject_are_bounded() {
+        let golden =
+            std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/jwt");
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("auth.toml");
+        std::fs::copy(golden.join("p256.pem"), folder.path().join("login.pem")).unwrap();
+        let issuer = "[[issuer]]\nissuer = \"https://login.example.org\"\naudience = \"seese3\"\n\
+                      public_keys = [\"login.pem\"]\nverbs = [\"navigate\"]\nrooms = [\"*\"]\nrequests = 2\n";
+        std::fs::write(&file, issuer).unwrap();
+        let tokens = std::fs::read(golden.join("tokens.json")).unwrap();
+        let tokens: serde_json::Value = serde_json::from_slice(&tokens).unwrap();
+        let token = tokens["good"]["ES256"].as_str().unwrap();
+
+        let layer = AuthLayer {
+            keyring: Some(Arc::new(Keyring::open(file).unwrap())),
+            metrics: Metrics::default(),
+        };
+        let mut service = layer.layer(tower::service_fn(|request: Request<()>| {
+            drop(request);
+            std::future::pending::<Result<Response<Body>, Infallible>>()
+        }));
+        let mut call = || {
+            let request = Request::builder()
+                .uri("/seese3.v1.NavigationService/Navigate")
+                .header(header::AUTHORIZATION, format!("Bearer {token}"));
+            service.call(request.body(()).unwrap())
+        };
+
+        let open = [call(), call()];
+        let soon = std::time::Duration::from_millis(500);
+        let refused = tokio::time::timeout(soon, call()).await;
+        let refused = refused.expect("it is refused at once").unwrap();
+        assert_eq!(refused.headers()["grpc-status"], "8");
+
+        // Once they are given up, there are places again.
+        drop(open);
+        let answered = tokio::time::timeout(soon, call()).await;
+        assert!(answered.is_err(), "it is admitted, and never answered");
+    }
+}

@@ -1,0 +1,121 @@
+//! Receiving an adapter.
+
+use std::sync::Arc;
+
+use prost::Message;
+use tonic::Streaming;
+
+use super::super::auth::Principal;
+use super::super::{Error, Handlers};
+use super::changes::{check_right, identity, named_whole, revision_to_wire};
+use super::room_upload::{expect_end, next};
+use seese3_client::proto::v1 as pb;
+use seese3_store::{Kind, Published};
+
+impl Handlers {
+    /// Receives an adapter and publishes it.
+    pub(super) async fn receive_adapter(
+        &self,
+        caller: Option<Arc<Principal>>,
+        mut messages: Streaming<pb::PublishAdapterRequest>,
+    ) -> Result<pb::PublishAdapterResponse, Error> {
+        use pb::publish_adapter_request::Message as Wire;
+
+        let changes = self.changes()?.clone();
+        let first = next(&mut messages, "adapter").await?.message;
+        let Some(Wire::Adapter(upload)) = first else {
+            return Err(Error::invalid(
+                "adapter",
+                "is required in the first message",
+            ));
+        };
+
+        let name = named_whole("name", &upload.name, Kind::Adapter);
+        let name = name.map_err(|error| error.within("adapter"))?;
+        check_right(caller.as_ref(), &name)?;
+
+        // The manifest says how much is coming, so that no more is ever held than that.
+        let size = seese3_store::stated_weights_size(&upload.manifest).map_err(unfit)?;
+        let size = usize::try_from(size).unwrap_or(usize::MAX);
+        let memory = changes.upload_memory(size)?;
+        let weights = weights(&mut messages, size).await?;
+
+        // Loading proves that the weights give their golden outputs on this machine.
+        let manifest = upload.manifest.clone();
+        let checked = tokio::task::spawn_blocking(move || {
+            seese3_store::check_adapter_files(&manifest, &weights).map(|_| weights)
+        });
+        let weights = checked.await.map_err(|_| Error::Internal)?.map_err(unfit)?;
+        if upload.validate_only {
+            return Ok(pb::PublishAdapterResponse::default());
+        }
+
+        let content = upload.encode_to_vec();
+        let identity = identity(
+            caller.as_ref(),
+            &upload.request_id,
+            "PublishAdapter",
+            &content,
+        );
+        let store = changes.store.clone();
+        let published_as = name.name.clone();
+        let change = async move {
+            // What was uploaded counts until it is in the store.
+            let _memory = memory;
+            store
+                .publish_adapter_files(&name.name, &upload.manifest, weights)
+                .await
+                .map_err(unfit)
+        };
+        let handlers = self.clone();
+        let answer = move |published: Published| {
+            let revision = revision_to_wire(&published_as, &published);
+            pb::PublishAdapterResponse {
+                served: handlers.serves(Kind::Adapter, &revision),
+                created: published.is_new,
+                revision: Some(revision),
+            }
+        };
+        changes.once(identity, change, answer).await
+    }
+}
+
+/// The weights, of which the manifest states the size.
+async fn weights(
+    messages: &mut Streaming<pb::PublishAdapterRequest>,
+    size: usize,
+) -> Result<Vec<u8>, Error> {
+    use pb::publish_adapter_request::Message as Wire;
+
+    let mut weights = Vec::new();
+    while weights.len() < size {
+        match next(messages, "weights").await?.message {
+            Some(Wire::Weights(part)) if part.len() <= size - weights.len() => {
+                weights.extend(part);
+            }
+            Some(Wire::Weights(_)) => {
+                let problem = format!("are longer than the {size} bytes that the manifest states");
+                return Err(Error::invalid("weights", problem));
+            }
+            _ => {
+                return Err(Error::invalid(
+                    "weights",
+                    "are required after the first message",
+                ));
+            }
+        }
+    }
+
+    expect_end(messages).await?;
+    Ok(weights)
+}
+
+/// What is wrong with an uploaded adapter is the caller's to mend.
+fn unfit(error: seese3_store::Error) -> Error {
+    match error {
+        seese3_store::Error::Damaged { .. } | seese3_store::Error::Schema { .. } => {
+            Error::invalid("adapter.manifest", error)
+        }
+        other => other.into(),
+    }
+}

@@ -1,0 +1,341 @@
+//! What every change of the catalog goes through: the caller's rights, the memory of what was
+//! answered, one change at a time, and a look at the store afterwards.
+
+use std::future::Future;
+use std::sync::Arc;
+
+use prost::Message;
+use sha2::{Digest, Sha256};
+use tokio::sync::{Mutex, OwnedSemaphorePermit, Semaphore};
+use tracing::Instrument;
+
+use super::super::auth::Principal;
+use super::super::metrics::Metrics;
+use super::super::reload::Looks;
+use super::super::snapshot::Snapshot;
+use super::super::status::Full;
+use super::super::{Config, Error, Handlers, Phase};
+use super::recent::{Identity, Recent};
+use seese3_client::proto::v1 as pb;
+use seese3_store::fit_stored_room;
+use seese3_store::{Kind, Published, ResourceName, Store};
+
+/// Uploads are counted in pieces of this many bytes.
+const PIECE: usize = 1_024;
+/// The largest number of changes that wait for their turn.
+const MOST_WAITING: usize = 64;
+
+/// What changes of the catalog share.
+pub struct Changes {
+    pub store: Store,
+    looks: Looks,
+    recent: Arc<Mutex<Recent>>,
+    /// Changes that may wait for their turn.
+    waiting: Arc<Semaphore>,
+    /// The pieces that uploads may hold in memory together.
+    upload_pieces: usize,
+    uploads: Arc<Semaphore>,
+    fits: Arc<Semaphore>,
+    metrics: Metrics,
+}
+
+impl Changes {
+    pub fn new(store: Store, looks: Looks, config: &Config) -> Self {
+        Self {
+            store,
+            looks,
+            recent: Arc::default(),
+            waiting: Arc::new(Semaphore::new(MOST_WAITING)),
+            upload_pieces: config.upload_bytes / PIECE,
+            uploads: Arc::new(Semaphore::new(config.upload_bytes / PIECE)),
+            // A fit takes all of the processor.
+            fits: Arc::new(Semaphore::new(1)),
+            metrics: config.metrics.clone(),
+        }
+    }
+
+    /// Makes a change, lets the server look at its store, and then makes the answer; unless the
+    /// same change was made already, whose answer is given again. Changes are made one after
+    /// another. One that was admitted is finished even if the caller goes away.
+    ///
+    /// # Errors
+    /// Those of the change; [`Error::Invalid`] if the request id belongs to another one,
+    /// [`Error::Full`] if too many changes wait.
+    pub async fn once<T: Send + 'static, A: Message + Default + 'static>(
+        self: &Arc<Self>,
+        identity: Identity,
+        change: impl Future<Output = Result<T, Error>> + Send + 'static,
+        answer: impl FnOnce(T) -> A + Send + 'static,
+    ) -> Result<A, Error> {
+        let waiting = self.waiting.clone().try_acquire_owned();
+        let waiting = waiting.map_err(|_| {
+            self.metrics.shed(Full::Changes);
+            Error::Full {
+                what: Full::Changes,
+            }
+        })?;
+
+        let changes = self.clone();
+        let made = tokio::spawn(
+            async move {
+                let _waiting = waiting;
+
+                // A change waits here for its turn, and holds no thread while it does.
+                let mut recent = changes.recent.lock().await;
+                if let Some(answer) = recent.answer(&identity)? {
+                    return A::decode(answer).map_err(|_| Error::Internal);
+                }
+
+                let made = on_blocking_thread(change).await??;
+                changes.looks.look().await;
+                let answer = answer(made);
+                recent.remember(identity, answer.encode_to_vec());
+                Ok(answer)
+            }
+            .in_current_span(),
+        );
+
+        made.await.unwrap_or_else(|error| {
+            tracing::error!(%error, "a change panicked");
+            Err(Error::Internal)
+        })
+    }
+
+    /// The answer to the same change, if it was made already.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if the request id belongs to another change.
+    pub async fn answered<A: Message + Default>(
+        &self,
+        identity: &Identity,
+    ) -> Result<Option<A>, Error> {
+        let mut recent = self.recent.lock().await;
+        let answer = recent.answer(identity)?;
+        let decoded = answer.map(A::decode).transpose();
+        decoded.map_err(|_| Error::Internal)
+    }
+
+    /// Memory for a part of an upload, to be held with it.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if it can never be held, [`Error::Full`] if the uploads in progress hold
+    /// as much as they may.
+    pub fn upload_memory(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Error> {
+        let pieces = bytes.div_ceil(PIECE);
+        if pieces > self.upload_pieces {
+            let problem =
+                "is larger than all uploads together may be; the operator sets --max-upload-bytes";
+            return Err(Error::invalid("message", problem));
+        }
+
+        let pieces = u32::try_from(pieces).unwrap_or(u32::MAX);
+        let memory = self.uploads.clone().try_acquire_many_owned(pieces);
+        memory.map_err(|_| {
+            self.metrics.shed(Full::Uploads);
+            Error::Full {
+                what: Full::Uploads,
+            }
+        })
+    }
+
+    /// The place of a fit.
+    pub fn fit_place(&self) -> Option<OwnedSemaphorePermit> {
+        self.fits.clone().try_acquire_owned().ok()
+    }
+}
+
+/// Runs work on a blocking thread: writing a store mixes files with hashing.
+pub async fn on_blocking_thread<T: Send + 'static>(
+    work: impl Future<Output = T> + Send + 'static,
+) -> Result<T, Error> {
+    let runtime = tokio::runtime::Handle::current();
+    let span = tracing::Span::current();
+    let done = tokio::task::spawn_blocking(move || span.in_scope(|| runtime.block_on(work)));
+
+    done.await.map_err(|error| {
+        tracing::error!(%error, "a change panicked");
+        Error::Internal
+    })
+}
+
+impl Handlers {
+    /// What changes go through.
+    ///
+    /// # Errors
+    /// [`Error::Precondition`] if this server takes no changes, [`Error::Loading`] if it is not
+    /// serving: what is changed then would not be served.
+    pub(super) fn changes(&self) -> Result<&Arc<Changes>, Error> {
+        if !matches!(&*self.phase.borrow(), Phase::Serving(_)) {
+            return Err(Error::Loading);
+        }
+
+        self.changes.as_ref().ok_or_else(|| {
+            Error::Precondition(
+                "this server takes no changes; start it with --writable, or change its store"
+                    .to_owned(),
+            )
+        })
+    }
+
+    /// Whether a room is answered with this revision of an adapter now.
+    pub(super) fn serves_in(&self, room: &str, adapter: &pb::Revision) -> bool {
+        match &*self.phase.borrow() {
+            Phase::Serving(snapshot) | Phase::Draining(snapshot) => {
+                let served = snapshot.rooms().get(room);
+                served.is_some_and(|room| {
+                    room.adapters().iter().any(|held| {
+                        (&held.name, held.revision) == (&adapter.name, adapter.revision)
+                    })
+                })
+            }
+            Phase::Loading | Phase::Stopping => false,
+        }
+    }
+
+    /// Whether requests are answered from this revision now.
+    pub(super) fn serves(&self, kind: Kind, published: &pb::Revision) -> bool {
+        let is_served = |snapshot: &Snapshot| match kind {
+            Kind::Room => snapshot
+                .rooms()
+                .get(&published.name)
+                .is_some_and(|room| room.summary.revision == published.revision),
+            Kind::Adapter => snapshot
+                .adapters()
+                .get(&published.name)
+                .is_some_and(|adapter| adapter.revision == published.revision),
+        };
+
+        match &*self.phase.borrow() {
+            Phase::Serving(snapshot) | Phase::Draining(snapshot) => is_served(snapshot),
+            Phase::Loading | Phase::Stopping => false,
+        }
+    }
+}
+
+/// The identity of a change. `method` tells it from others with the same content.
+pub fn identity(
+    caller: Option<&Arc<Principal>>,
+    request_id: &str,
+    method: &str,
+    content: &[u8],
+) -> Identity {
+    let mut digest = Sha256::new();
+    digest.update(method);
+    digest.update([0]);
+    digest.update(content);
+
+    Identity {
+        caller: caller.map_or_else(String::new, |caller| caller.name().to_owned()),
+        request_id: request_id.to_owned(),
+        content: digest.finalize().into(),
+    }
+}
+
+/// The room or adapter that a change names.
+///
+/// # Errors
+/// [`Error::Invalid`] if it is none of this kind.
+pub fn named(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error> {
+    let resource: ResourceName = text.parse().map_err(|error| Error::invalid(field, error))?;
+    if resource.kind != kind {
+        let problem = format!("names no {}; write {}/NAME", kind.name(), kind.collection());
+        return Err(Error::invalid(field, problem));
+    }
+
+    Ok(resource)
+}
+
+/// The same without a revision.
+///
+/// # Errors
+/// [`Error::Invalid`] if it is none of this kind, or a revision.
+pub fn named_whole(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error> {
+    let resource = named(field, text, kind)?;
+    if resource.revision.is_some() {
+        return Err(Error::invalid(field, "must be without a revision"));
+    }
+
+    Ok(resource)
+}
+
+/// Refuses a caller who may not change this. Adapters answer in every room, so only those who may
+/// see every room change them.
+///
+/// # Errors
+/// [`Error::OutOfScope`].
+pub fn check_right(caller: Option<&Arc<Principal>>, resource: &ResourceName) -> Result<(), Error> {
+    let Some(scope) = caller.map(|caller| caller.rooms()) else {
+        return Ok(());
+    };
+
+    match resource.kind {
+        Kind::Room if scope.contains(&resource.name) => Ok(()),
+        Kind::Room => Err(Error::OutOfScope { what: "this room" }),
+        Kind::Adapter if scope.is_all() => Ok(()),
+        Kind::Adapter => Err(Error::OutOfScope { what: "adapters" }),
+    }
+}
+
+/// A published revision on the wire.
+pub fn revision_to_wire(name: &str, published: &Published) -> pb::Revision {
+    pb::Revision {
+        name: name.to_owned(),
+        revision: published.revision,
+    }
+}
+
+impl From<seese3_store::Error> for Error {
+    fn from(error: seese3_store::Error) -> Self {
+        use seese3_store::Error as E;
+
+        match &error {
+            E::Unknown { kind, name, .. } => Self::NotStored {
+                field: (*kind).to_owned(),
+                name: name.clone(),
+            },
+            E::UnknownRevision {
+                kind,
+                name,
+                revision,
+                ..
+            } => Self::NotStored {
+                field: (*kind).to_owned(),
+                name: format!("{name}/revisions/{revision}"),
+            },
+            E::UnknownFeatures { .. } | E::WhichFeatures { .. } => Self::invalid("features", error),
+            E::InUse { .. } | E::NothingToTakeBack => Self::Precondition(error.to_string()),
+            E::Contended { name } => Self::Conflict {
+                name: name.clone(),
+                problem: "others changed it all the time; try again".to_owned(),
+            },
+            E::FeatureRows { .. } | E::DuplicateFeatures { .. } => Self::invalid("features", error),
+            E::Name { .. } => Self::invalid("name", error),
+            E::CannotAdd { .. } => Self::invalid("frames", error),
+            E::Absent { .. } => Self::Conflict {
+                name: "the store".to_owned(),
+                problem: "was changed by somebody else meanwhile; try again".to_owned(),
+            },
+            _ => {
+                tracing::error!(%error, "the store could not be changed");
+                Self::Precondition(
+                    "the store cannot be read or written, or is damaged where this belongs; the \
+                     server's log says why"
+                        .to_owned(),
+                )
+            }
+        }
+    }
+}
+
+impl From<fit_stored_room::Error> for Error {
+    fn from(error: fit_stored_room::Error) -> Self {
+        use fit_stored_room::Error as E;
+
+        match error {
+            E::Store(error) => error.into(),
+            E::Base { .. } => Self::invalid("base_adapter", error),
+            E::Name { .. } | E::Taken { .. } => Self::invalid("fitted_adapter", error),
+            E::Fitting(_) => Self::Precondition(error.to_string()),
+        }
+    }
+}

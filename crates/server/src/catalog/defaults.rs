@@ -1,0 +1,184 @@
+//! Choosing defaults and removing revisions.
+
+use std::sync::Arc;
+
+use prost::Message;
+
+use super::super::auth::{Principal, RoomScope};
+use super::super::{Error, Handlers};
+use super::changes::{check_right, identity, named, named_whole};
+use super::recent::Identity;
+use seese3_client::proto::v1 as pb;
+use seese3_store::{Choice, Defaults, Kind, ResourceName};
+
+impl Handlers {
+    pub(super) async fn set(
+        &self,
+        caller: Option<Arc<Principal>>,
+        request: pb::SetDefaultRequest,
+    ) -> Result<pb::SetDefaultResponse, Error> {
+        use pb::set_default_request::Default as Wire;
+
+        let content = request.encode_to_vec();
+        let identity = identity(caller.as_ref(), &request.request_id, "SetDefault", &content);
+
+        // Destructured with no `..`, so that a new field breaks the build here.
+        let pb::SetDefaultRequest {
+            name,
+            default,
+            request_id: _,
+            validate_only,
+        } = request;
+
+        let resource: ResourceName = name
+            .parse()
+            .map_err(|error| Error::invalid("name", error))?;
+        check_right(caller.as_ref(), &resource)?;
+        if resource.revision.is_some() {
+            let problem = "must not name a revision; give it as `revision`";
+            return Err(Error::invalid("name", problem));
+        }
+
+        let choice = match default {
+            None => Choice::Nothing(resource),
+            Some(Wire::Revision(revision)) => Choice::Revision(resource.at(revision)),
+            Some(Wire::Adapter(adapter)) => {
+                if resource.kind != Kind::Room {
+                    let problem = "is only for rooms";
+                    return Err(Error::invalid("adapter", problem));
+                }
+                Choice::Adapter {
+                    room: resource.name,
+                    adapter: named_whole("adapter", &adapter, Kind::Adapter)?.name,
+                }
+            }
+        };
+
+        let changes = self.changes()?.clone();
+        if validate_only {
+            changes.store.check_choice(&choice).await?;
+            let defaults = changes.store.defaults().await?;
+            let defaults = defaults_to_wire(&defaults, scope(caller.as_ref()));
+            return Ok(pb::SetDefaultResponse { defaults });
+        }
+
+        let store = changes.store.clone();
+        let change = async move { Ok(store.choose(&choice).await?) };
+        let answer = move |defaults: Defaults| pb::SetDefaultResponse {
+            defaults: defaults_to_wire(&defaults, scope(caller.as_ref())),
+        };
+        changes.once(identity, change, answer).await
+    }
+
+    pub(super) async fn roll_back(
+        &self,
+        caller: Option<Arc<Principal>>,
+        request: pb::RollBackDefaultRequest,
+    ) -> Result<pb::RollBackDefaultResponse, Error> {
+        // The last choice may be that of any room.
+        if scope(caller.as_ref()).is_some_and(|scope| !scope.is_all()) {
+            return Err(Error::OutOfScope {
+                what: "the defaults of all rooms",
+            });
+        }
+
+        let content = request.encode_to_vec();
+        let identity = identity(
+            caller.as_ref(),
+            &request.request_id,
+            "RollBackDefault",
+            &content,
+        );
+        let changes = self.changes()?.clone();
+        let store = changes.store.clone();
+        let change = async move { Ok(store.take_back_choice().await?) };
+        let answer = |defaults: Defaults| pb::RollBackDefaultResponse {
+            defaults: defaults_to_wire(&defaults, None),
+        };
+        changes.once(identity, change, answer).await
+    }
+
+    pub(super) async fn delete_room_named(
+        &self,
+        caller: Option<Arc<Principal>>,
+        request: pb::DeleteRoomRequest,
+    ) -> Result<pb::DeleteRoomResponse, Error> {
+        let content = request.encode_to_vec();
+        let identity = identity(caller.as_ref(), &request.request_id, "DeleteRoom", &content);
+        let resource = named("name", &request.name, Kind::Room)?;
+        check_right(caller.as_ref(), &resource)?;
+
+        let answer = |revisions| pb::DeleteRoomResponse { revisions };
+        self.delete(identity, resource, request.validate_only, answer)
+            .await
+    }
+
+    pub(super) async fn delete_adapter_named(
+        &self,
+        caller: Option<Arc<Principal>>,
+        request: pb::DeleteAdapterRequest,
+    ) -> Result<pb::DeleteAdapterResponse, Error> {
+        let content = request.encode_to_vec();
+        let identity = identity(
+            caller.as_ref(),
+            &request.request_id,
+            "DeleteAdapter",
+            &content,
+        );
+        let resource = named("name", &request.name, Kind::Adapter)?;
+        check_right(caller.as_ref(), &resource)?;
+
+        let answer = |revisions| pb::DeleteAdapterResponse { revisions };
+        self.delete(identity, resource, request.validate_only, answer)
+            .await
+    }
+
+    async fn delete<A: Message + Default + 'static>(
+        &self,
+        identity: Identity,
+        resource: ResourceName,
+        validate_only: bool,
+        answer: impl Fn(Vec<u64>) -> A + Send + 'static,
+    ) -> Result<A, Error> {
+        let changes = self.changes()?.clone();
+        if validate_only {
+            let removed = changes.store.check_removable(&resource).await?;
+            return Ok(answer(removed.revisions));
+        }
+
+        let store = changes.store.clone();
+        let change = async move { Ok(store.remove(&resource).await?.revisions) };
+        changes.once(identity, change, answer).await
+    }
+}
+
+fn scope(caller: Option<&Arc<Principal>>) -> Option<&RoomScope> {
+    caller.map(|caller| caller.rooms())
+}
+
+/// The defaults that a caller may see.
+fn defaults_to_wire(defaults: &Defaults, scope: Option<&RoomScope>) -> Vec<pb::Default> {
+    let is_seen = |resource: &ResourceName| match resource.kind {
+        Kind::Room => scope.is_none_or(|scope| scope.contains(&resource.name)),
+        Kind::Adapter => scope.is_none_or(RoomScope::is_all),
+    };
+
+    defaults
+        .chosen()
+        .into_iter()
+        .filter(is_seen)
+        .map(|resource| {
+            let adapter = match resource.kind {
+                Kind::Room => defaults.adapter(&resource.name),
+                Kind::Adapter => None,
+            };
+            pb::Default {
+                revision: defaults.revision(resource.kind, &resource.name),
+                adapter: adapter
+                    .map(|adapter| ResourceName::adapter(adapter).to_string())
+                    .unwrap_or_default(),
+                name: resource.to_string(),
+            }
+        })
+        .collect()
+}

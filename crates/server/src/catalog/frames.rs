@@ -1,0 +1,175 @@
+//! The frames of a room with their poses, and the pose graph that they make.
+
+use std::ops::RangeInclusive;
+use std::path::Path;
+
+use tonic::{Request, Response, Status};
+
+use super::super::convert;
+use super::super::snapshot::Snapshot;
+use super::super::workers::Lane;
+use super::super::{Error, Handlers};
+use super::page_length;
+use seese3_client::proto::v1 as pb;
+use seese3_core::cancel::Cancellation;
+use seese3_core::room::{FrameId, Room};
+use seese3_encoder::thumbnail;
+use seese3_robot::planning::PoseGraph;
+
+/// The most neighbours that a frame is given.
+const MOST_NEIGHBOURS: usize = 32;
+
+/// Widths of thumbnails, pixels.
+const THUMBNAIL_WIDTHS: RangeInclusive<u32> = 16..=512;
+/// A page ends once its thumbnails have so many bytes, so that it fits into the 4 MiB that clients
+/// of gRPC take if they are told nothing else.
+const THUMBNAILS_OF_A_PAGE: usize = 2 << 20;
+
+impl Handlers {
+    /// Answers a ListFrames request on a worker thread.
+    pub(super) async fn listed_frames(
+        &self,
+        request: Request<pb::ListFramesRequest>,
+    ) -> Result<Response<pb::ListFramesResponse>, Status> {
+        let with_thumbnails = request.get_ref().thumbnail_width.is_some();
+        if with_thumbnails && !self.config.thumbnails {
+            return Err(no_thumbnails("this server shows no images (--thumbnails)").into());
+        }
+
+        let lane = if with_thumbnails {
+            Lane::Images
+        } else {
+            Lane::Short
+        };
+        self.unary(request, |_| lane, answer).await
+    }
+}
+
+fn answer(
+    snapshot: &Snapshot,
+    request: pb::ListFramesRequest,
+    cancel: &Cancellation,
+) -> Result<pb::ListFramesResponse, Error> {
+    let pb::ListFramesRequest {
+        room,
+        page_size,
+        page_token,
+        neighbours_within,
+        thumbnail_width,
+    } = request;
+
+    if neighbours_within.is_some_and(|hop| !(hop.is_finite() && hop > 0.0)) {
+        return Err(Error::invalid(
+            "neighbours_within",
+            "must be finite and above 0",
+        ));
+    }
+    if thumbnail_width.is_some_and(|width| !THUMBNAIL_WIDTHS.contains(&width)) {
+        return Err(Error::invalid("thumbnail_width", "must be 16 to 512"));
+    }
+
+    let length = page_length(page_size)?;
+    let served = snapshot.navigator(&room, "")?;
+    let room = served.navigator.room();
+    let first = first_frame(&page_token, served.room_revision)?;
+    if thumbnail_width.is_some() && room.images().is_empty() {
+        return Err(no_thumbnails("the server has no images of this room"));
+    }
+
+    let frame_count = room.frame_count();
+    let all: Vec<FrameId> = (0..frame_count as u32).map(FrameId).collect();
+    let graph = PoseGraph::new(room.poses(), &all);
+    let last = first.saturating_add(length).min(frame_count);
+
+    let mut frames = Vec::new();
+    let mut picture_bytes = 0;
+    for &frame in all.get(first..last).unwrap_or_default() {
+        cancel.check()?;
+        if picture_bytes >= THUMBNAILS_OF_A_PAGE {
+            break;
+        }
+
+        let mut wire = frame_to_wire(room, frame);
+        if let Some(hop) = neighbours_within {
+            wire.neighbours = graph
+                .neighbours(frame, hop, MOST_NEIGHBOURS)
+                .iter()
+                .map(|(frame, motion)| pb::NeighbourFrame {
+                    frame_id: frame.0,
+                    motion: Some(convert::twist_to_wire(motion)),
+                })
+                .collect();
+        }
+        if let Some(width) = thumbnail_width {
+            wire.thumbnail = picture(room, frame, width);
+            picture_bytes += wire.thumbnail.len();
+        }
+        frames.push(wire);
+    }
+
+    let end = first.saturating_add(frames.len());
+    Ok(pb::ListFramesResponse {
+        room: Some(convert::room_revision(&served)),
+        frames,
+        next_page_token: if end < frame_count {
+            format!("{}.{end}", served.room_revision)
+        } else {
+            String::new()
+        },
+    })
+}
+
+/// The first frame of the page that a token stands for: the token is the room's revision and the frame,
+/// so that pages of two revisions are never put together.
+fn first_frame(token: &str, revision: u64) -> Result<usize, Error> {
+    if token.is_empty() {
+        return Ok(0);
+    }
+
+    let parts = token.split_once('.');
+    let numbers = parts.and_then(|(of, frame)| -> Option<(u64, usize)> {
+        Some((of.parse().ok()?, frame.parse().ok()?))
+    });
+    match numbers {
+        Some((of, frame)) if of == revision => Ok(frame),
+        Some(_) => Err(Error::Precondition(
+            "page_token: the room has changed since; start with the first page".to_owned(),
+        )),
+        None => Err(Error::invalid(
+            "page_token",
+            "is not a token of this service; start with the first page",
+        )),
+    }
+}
+
+fn frame_to_wire(room: &Room, frame: FrameId) -> pb::RoomFrame {
+    let row = frame.row();
+    pb::RoomFrame {
+        frame_id: frame.0,
+        pose: Some(convert::pose_to_wire(
+            &room.poses()[row],
+            room.id().as_str(),
+        )),
+        frame_name: room.frame_names().get(row).cloned().unwrap_or_default(),
+        timestamp_ns: room.timestamps_ns().get(row).copied(),
+        sequence: room.timeline().sequences.get(row).copied().unwrap_or(0),
+        neighbours: Vec::new(),
+        thumbnail: Vec::new(),
+    }
+}
+
+/// The thumbnail of a frame; empty if its image cannot be read.
+fn picture(room: &Room, frame: FrameId, width: u32) -> Vec<u8> {
+    let root = Path::new(&room.provenance().images_root);
+    let image = &room.images()[frame.row()];
+
+    thumbnail(root, image, width as usize).unwrap_or_else(|error| {
+        // The paths are the operator's affair and stay in the log.
+        tracing::warn!(room = %room.id(), frame = frame.0, %error, "no thumbnail");
+        Vec::new()
+    })
+}
+
+fn no_thumbnails(problem: &str) -> Error {
+    Error::Precondition(format!("thumbnail_width: {problem}; ask without it"))
+}

@@ -1,0 +1,351 @@
+//! CatalogService: lists the rooms and adapters that the server has, page by page, and changes
+//! them.
+//!
+//! | file | what |
+//! | --- | --- |
+//! | `changes` | what every change goes through: rights, one at a time, a look at the store afterwards |
+//! | `recent` | answers that are given again when a change is sent again |
+//! | `room_upload` | a room, frame by frame |
+//! | `adapter_upload` | an adapter |
+//! | `frames` | the frames of a room, for those who plan or draw themselves |
+//! | `refits` | an adapter fitted to a room here |
+//! | `defaults` | defaults and removals |
+
+mod adapter_upload;
+mod changes;
+mod defaults;
+mod frames;
+mod recent;
+mod refits;
+mod room_upload;
+
+pub use changes::Changes;
+
+use std::collections::BTreeMap;
+use std::ops::Bound;
+
+use tonic::{Request, Response, Status, Streaming};
+
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+
+use super::auth::RoomScope;
+use super::convert;
+use super::memory::respond;
+use super::snapshot::{ServedRoom, Snapshot};
+use super::{Error, Handlers, principal};
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::catalog_service_server::CatalogService;
+use seese3_core::geometry::Twist;
+use seese3_store::{RoomSummary, StoredAdapter};
+
+/// Entries of a page if the caller names no size, and the largest size of a page.
+const PAGE: usize = 100;
+const LARGEST_PAGE: usize = 1_000;
+
+#[tonic::async_trait]
+impl CatalogService for Handlers {
+    async fn list_rooms(
+        &self,
+        request: Request<pb::ListRoomsRequest>,
+    ) -> Result<Response<pb::ListRoomsResponse>, Status> {
+        let snapshot = self.snapshot(&request)?;
+        let pb::ListRoomsRequest {
+            page_size,
+            page_token,
+        } = request.into_inner();
+        let (page, next_page_token) = page(snapshot.rooms(), page_size, &page_token)?;
+        let rooms = page
+            .into_iter()
+            .map(|served| room(&snapshot, served))
+            .collect();
+
+        respond(pb::ListRoomsResponse {
+            rooms,
+            next_page_token,
+        })
+    }
+
+    async fn get_room(
+        &self,
+        request: Request<pb::GetRoomRequest>,
+    ) -> Result<Response<pb::GetRoomResponse>, Status> {
+        let snapshot = self.snapshot(&request)?;
+        let room = room(&snapshot, snapshot.room(&request.into_inner().room)?);
+        Ok(Response::new(pb::GetRoomResponse { room: Some(room) }))
+    }
+
+    async fn list_frames(
+        &self,
+        request: Request<pb::ListFramesRequest>,
+    ) -> Result<Response<pb::ListFramesResponse>, Status> {
+        self.listed_frames(request).await
+    }
+
+    async fn list_adapters(
+        &self,
+        request: Request<pb::ListAdaptersRequest>,
+    ) -> Result<Response<pb::ListAdaptersResponse>, Status> {
+        let scope = principal(&request).map(|caller| caller.rooms().clone());
+        let snapshot = self.snapshot(&request)?;
+        let pb::ListAdaptersRequest {
+            page_size,
+            page_token,
+        } = request.into_inner();
+        let (page, next_page_token) = page(snapshot.adapters(), page_size, &page_token)?;
+        let adapters = page
+            .into_iter()
+            .map(|stored| adapter(stored, scope.as_ref()))
+            .collect();
+
+        respond(pb::ListAdaptersResponse {
+            adapters,
+            next_page_token,
+        })
+    }
+
+    async fn get_adapter(
+        &self,
+        request: Request<pb::GetAdapterRequest>,
+    ) -> Result<Response<pb::GetAdapterResponse>, Status> {
+        let snapshot = self.snapshot(&request)?;
+        let scope = principal(&request).map(|caller| caller.rooms().clone());
+        let stored = snapshot.adapter(&request.into_inner().adapter)?;
+        let adapter = adapter(stored, scope.as_ref());
+
+        Ok(Response::new(pb::GetAdapterResponse {
+            adapter: Some(adapter),
+        }))
+    }
+
+    async fn create_room(
+        &self,
+        request: Request<Streaming<pb::CreateRoomRequest>>,
+    ) -> Result<Response<pb::CreateRoomResponse>, Status> {
+        let snapshot = self.snapshot(&request)?;
+        let caller = principal(&request).cloned();
+        let budget = self.workers.budget(request.metadata());
+
+        let received = self.receive_room(caller, snapshot, request.into_inner());
+        let answer = tokio::time::timeout(budget, received).await;
+        Ok(Response::new(answer.map_err(|_| Error::Deadline)??))
+    }
+
+    async fn publish_adapter(
+        &self,
+        request: Request<Streaming<pb::PublishAdapterRequest>>,
+    ) -> Result<Response<pb::PublishAdapterResponse>, Status> {
+        let caller = principal(&request).cloned();
+        let budget = self.workers.budget(request.metadata());
+
+        let received = self.receive_adapter(caller, request.into_inner());
+        let answer = tokio::time::timeout(budget, received).await;
+        Ok(Response::new(answer.map_err(|_| Error::Deadline)??))
+    }
+
+    type RefitRoomStream = ReceiverStream<Result<pb::RefitRoomResponse, Status>>;
+
+    async fn refit_room(
+        &self,
+        request: Request<pb::RefitRoomRequest>,
+    ) -> Result<Response<Self::RefitRoomStream>, Status> {
+        let caller = principal(&request).cloned();
+        let admitted = self.admit_refit(caller.as_ref(), request.into_inner())?;
+
+        let (events, heard) = mpsc::channel(16);
+        tokio::spawn(self.clone().run_refit(admitted, events));
+        Ok(Response::new(ReceiverStream::new(heard)))
+    }
+
+    async fn set_default(
+        &self,
+        request: Request<pb::SetDefaultRequest>,
+    ) -> Result<Response<pb::SetDefaultResponse>, Status> {
+        let caller = principal(&request).cloned();
+        Ok(Response::new(self.set(caller, request.into_inner()).await?))
+    }
+
+    async fn roll_back_default(
+        &self,
+        request: Request<pb::RollBackDefaultRequest>,
+    ) -> Result<Response<pb::RollBackDefaultResponse>, Status> {
+        let caller = principal(&request).cloned();
+        let answer = self.roll_back(caller, request.into_inner()).await?;
+        Ok(Response::new(answer))
+    }
+
+    async fn delete_room(
+        &self,
+        request: Request<pb::DeleteRoomRequest>,
+    ) -> Result<Response<pb::DeleteRoomResponse>, Status> {
+        let caller = principal(&request).cloned();
+        let answer = self.delete_room_named(caller, request.into_inner()).await?;
+        Ok(Response::new(answer))
+    }
+
+    async fn delete_adapter(
+        &self,
+        request: Request<pb::DeleteAdapterRequest>,
+    ) -> Result<Response<pb::DeleteAdapterResponse>, Status> {
+        let caller = principal(&request).cloned();
+        let answer = self
+            .delete_adapter_named(caller, request.into_inner())
+            .await?;
+        Ok(Response::new(answer))
+    }
+}
+
+/// The entries of a page that a caller asks for; 0 is the server's choice.
+fn page_length(size: i32) -> Result<usize, Error> {
+    match usize::try_from(size) {
+        Ok(0) => Ok(PAGE),
+        Ok(size) => Ok(size.min(LARGEST_PAGE)),
+        Err(_) => Err(Error::invalid(
+            "page_size",
+            format!("must not be negative, got {size}"),
+        )),
+    }
+}
+
+/// One page of the entries in order of name, and the token of the next page: the last name of this
+/// page, or empty if this page is the last.
+fn page<'a, T>(
+    all: &'a BTreeMap<String, T>,
+    size: i32,
+    token: &str,
+) -> Result<(Vec<&'a T>, String), Error> {
+    let size = page_length(size)?;
+
+    // The token is the last name that the caller has seen. It keeps its meaning when entries are
+    // added or removed, and the server stores nothing between pages.
+    let after = if token.is_empty() {
+        Bound::Unbounded
+    } else if seese3_core::room::is_plain_name(token) {
+        Bound::Excluded(token)
+    } else {
+        return Err(Error::invalid(
+            "page_token",
+            "is not a token of this service; start with the first page",
+        ));
+    };
+
+    // One entry is read beyond the page, only to learn whether another page follows.
+    let mut rest = all.range::<str, _>((after, Bound::Unbounded));
+    let page: Vec<(&String, &T)> = rest.by_ref().take(size).collect();
+    let next = match (rest.next(), page.last()) {
+        (Some(_), Some((name, _))) => (*name).clone(),
+        _ => String::new(),
+    };
+
+    Ok((page.into_iter().map(|(_, entry)| entry).collect(), next))
+}
+
+fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
+    let RoomSummary {
+        room,
+        revision,
+        created,
+        frame_count,
+        features,
+        provenance,
+    } = &served.summary;
+
+    pb::Room {
+        revision: Some(pb::Revision {
+            name: room.clone(),
+            revision: *revision,
+        }),
+        frame_count: *frame_count as u32,
+        adapters: snapshot
+            .adapters_of(served)
+            .iter()
+            .map(|adapter| adapter.name.clone())
+            .collect(),
+        features: features.iter().map(convert::source_to_wire).collect(),
+        format: provenance.format.clone(),
+        licence: provenance.licence.clone(),
+        worst_rotation_deviation: provenance.worst_rotation_deviation,
+        create_time: convert::time_to_wire(created),
+        camera: provenance.camera.as_ref().map(convert::pinhole_to_wire),
+    }
+}
+
+/// Rooms and their revisions, of those that the caller may see.
+fn revisions(
+    rooms: &[(seese3_core::room::RoomId, u64)],
+    scope: Option<&RoomScope>,
+) -> Vec<pb::Revision> {
+    rooms
+        .iter()
+        .filter(|(room, _)| scope.is_none_or(|scope| scope.contains(room.as_str())))
+        .map(|(room, revision)| pb::Revision {
+            name: room.to_string(),
+            revision: *revision,
+        })
+        .collect()
+}
+
+fn adapter(stored: &StoredAdapter, scope: Option<&RoomScope>) -> pb::Adapter {
+    let adapter = &stored.adapter;
+    let record = &stored.record;
+    let scale = adapter.scale();
+
+    pb::Adapter {
+        revision: Some(pb::Revision {
+            name: stored.name.clone(),
+            revision: stored.revision,
+        }),
+        source: Some(convert::source_to_wire(adapter.source())),
+        latent_dim: adapter.latent_dim() as u32,
+        training_rooms: revisions(&record.rooms, scope),
+        preset: record.preset.clone(),
+        split: record.split.name().to_owned(),
+        stride: record.stride,
+        seed: record.config.seed,
+        test: Some(convert::scores_to_wire(&record.test)),
+        train: Some(convert::scores_to_wire(&record.train)),
+        train_mean_r2: Some(record.train_mean_r2).filter(|r2| r2.is_finite()),
+        target_mean: Some(convert::twist_to_wire(&Twist::from_vector(&scale.mean))),
+        target_deviation: Some(convert::twist_to_wire(&Twist::from_vector(
+            &scale.deviation,
+        ))),
+        singular_values: adapter.inverse().singular_values().to_vec(),
+        create_time: convert::time_to_wire(&stored.created),
+        charts: adapter.network().chart_count() as u32,
+        loss: record.config.loss.name().to_owned(),
+        navigators: convert::navigator_names(adapter),
+        mixing: adapter.network().mixing().name().to_owned(),
+        calibration_rooms: revisions(&record.calibrated_on, scope),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: walking the pages gives every entry once, in order, whatever the size of a page.
+    #[test]
+    fn pages_cover_everything_once() {
+        let all: BTreeMap<String, usize> = (0..25).map(|i| (format!("{i:03}"), i)).collect();
+        for size in [1, 7, 24, 25, 26] {
+            let mut seen = Vec::new();
+            let mut token = String::new();
+            loop {
+                let (entries, next) = page(&all, size, &token).unwrap();
+                assert!(entries.len() <= size as usize);
+
+                seen.extend(entries.into_iter().copied());
+                if next.is_empty() {
+                    break;
+                }
+
+                token = next;
+            }
+
+            assert_eq!(seen, (0..25).collect::<Vec<_>>(), "pages of {size}");
+        }
+
+        assert!(page(&all, -1, "").is_err());
+        assert!(page(&all, 1, "no such").is_err());
+    }
+}

@@ -1,0 +1,538 @@
+//! Receiving a room, frame by frame.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use nalgebra::Matrix4;
+use ndarray::Array2;
+use prost::Message;
+use sha2::{Digest, Sha256};
+use tokio::sync::OwnedSemaphorePermit;
+use tonic::Streaming;
+
+use super::super::auth::Principal;
+use super::super::snapshot::Snapshot;
+use super::super::workers::Lane;
+use super::super::{Error, Handlers, convert};
+use super::changes::{check_right, identity, named_whole, on_blocking_thread, revision_to_wire};
+use seese3_client::proto::v1 as pb;
+use seese3_core::features::{FeatureSource, Features, MAX_COLUMNS, UNSPECIFIED};
+use seese3_core::geometry;
+use seese3_core::room::{Frames, Provenance, Room, RoomId, is_plain_name};
+use seese3_store::{Kind, OtherFeatures, Published, ResourceName};
+
+/// How long an upload may send nothing.
+const SILENCE: Duration = Duration::from_secs(30);
+/// The longest format and licence, characters.
+const LONGEST_WORDS: usize = 1_000;
+/// A pose on the wire: 16 numbers of 8 bytes.
+const POSE_BYTES: usize = 128;
+
+/// The next message of an upload.
+///
+/// # Errors
+/// [`Error::Invalid`] if none comes, [`Error::Deadline`] if the caller is silent for too long.
+pub async fn next<M>(messages: &mut Streaming<M>, field: &str) -> Result<M, Error> {
+    let message = tokio::time::timeout(SILENCE, messages.message()).await;
+    match message.map_err(|_| Error::Deadline)? {
+        Ok(Some(message)) => Ok(message),
+        Ok(None) => Err(Error::invalid(
+            field,
+            "is missing: the upload ended before it",
+        )),
+        // The caller went away, or sent what cannot be decoded.
+        Err(status) => Err(Error::Transport {
+            code: status.code(),
+            problem: status.message().to_owned(),
+        }),
+    }
+}
+
+/// Refuses messages behind the last one.
+///
+/// # Errors
+/// [`Error::Invalid`] if there is one, otherwise as [`next`].
+pub async fn expect_end<M>(messages: &mut Streaming<M>) -> Result<(), Error> {
+    match next(messages, "message").await {
+        // Nothing more is what is wanted here.
+        Err(Error::Invalid { .. }) => Ok(()),
+        Ok(_) => Err(Error::invalid("message", "comes after the last one")),
+        Err(error) => Err(error),
+    }
+}
+
+/// A room that is being received.
+struct Received {
+    name: ResourceName,
+    sources: Vec<FeatureSource>,
+    /// The adapter whose encoder makes the features from images.
+    encode_for: Option<String>,
+    frames: Frames,
+    /// The numbers of each source, row by row.
+    rows: Vec<Vec<f32>>,
+    worst_rotation_deviation: f64,
+    digest: Sha256,
+    /// What arrived beside the bytes that the caller's checksum covers.
+    other_columns: Sha256,
+    memory: Vec<OwnedSemaphorePermit>,
+}
+
+impl Handlers {
+    /// Receives a room and publishes it.
+    pub(super) async fn receive_room(
+        &self,
+        caller: Option<Arc<Principal>>,
+        snapshot: Arc<Snapshot>,
+        mut messages: Streaming<pb::CreateRoomRequest>,
+    ) -> Result<pb::CreateRoomResponse, Error> {
+        use pb::create_room_request::Message as Wire;
+
+        let changes = self.changes()?.clone();
+        let first = next(&mut messages, "room").await?.message;
+        let Some(Wire::Room(upload)) = first else {
+            return Err(Error::invalid("room", "is required in the first message"));
+        };
+        let mut received = begun(&upload, caller.as_ref(), &snapshot)?;
+        if upload.extend {
+            // The room is joined to the added frames in memory.
+            let known = changes
+                .store
+                .newest_room_summary(&received.name.name)
+                .await?;
+            let columns: usize = known.features.iter().map(|source| source.dim).sum();
+            let bytes = known.frame_count * (POSE_BYTES + 4 * columns);
+            received.memory.push(changes.upload_memory(2 * bytes)?);
+        }
+
+        let end = self
+            .receive_frames(&mut received, &snapshot, &mut messages)
+            .await?;
+        expect_end(&mut messages).await?;
+
+        let mut content = upload.encode_to_vec();
+        content.extend(received.other_columns.clone().finalize());
+        content.extend(&end.sha256);
+        let identity = identity(caller.as_ref(), &upload.request_id, "CreateRoom", &content);
+
+        let name = received.name.name.clone();
+        let memory = std::mem::take(&mut received.memory);
+        let (room, features) = finished(received, &upload, &end)?;
+        let others = if upload.drop_other_features {
+            OtherFeatures::LeftBehind
+        } else {
+            OtherFeatures::Required
+        };
+
+        let store = changes.store.clone();
+        if upload.validate_only {
+            if upload.extend {
+                let check = async move { store.extended_room(&room, &features, others).await };
+                on_blocking_thread(check).await??;
+            }
+            return Ok(pb::CreateRoomResponse::default());
+        }
+
+        let extend = upload.extend;
+        let change = async move {
+            // What was uploaded counts until it is in the store.
+            let _memory = memory;
+            let published = if extend {
+                store.extend_room(&room, &features, others).await
+            } else {
+                store.publish_room(&room, &features).await
+            };
+            Ok(published?)
+        };
+        let handlers = self.clone();
+        let answer = move |published: Published| {
+            let revision = revision_to_wire(&name, &published);
+            pb::CreateRoomResponse {
+                served: handlers.serves(Kind::Room, &revision),
+                created: published.is_new,
+                revision: Some(revision),
+            }
+        };
+        changes.once(identity, change, answer).await
+    }
+
+    /// Receives the frames of an upload up to the message that ends it.
+    async fn receive_frames(
+        &self,
+        received: &mut Received,
+        snapshot: &Arc<Snapshot>,
+        messages: &mut Streaming<pb::CreateRoomRequest>,
+    ) -> Result<pb::UploadEnd, Error> {
+        use pb::create_room_request::Message as Wire;
+
+        let changes = self.changes()?;
+        loop {
+            match next(messages, "end").await?.message {
+                Some(Wire::Frames(batch)) => {
+                    let arrived = changes.upload_memory(batch.encoded_len())?;
+                    let kept = changes.upload_memory(received.kept_bytes(&batch))?;
+                    received.memory.push(kept);
+                    self.take_batch(received, snapshot, batch)
+                        .await
+                        .map_err(|error| error.within("frames"))?;
+                    drop(arrived);
+                }
+                Some(Wire::End(end)) => return Ok(end),
+                Some(Wire::Room(_)) => {
+                    return Err(Error::invalid("room", "may only be sent once"));
+                }
+                None => {
+                    let problem = "one of room, frames and end is required in every message";
+                    return Err(Error::invalid("message", problem));
+                }
+            }
+        }
+    }
+
+    /// Adds a batch of frames.
+    async fn take_batch(
+        &self,
+        received: &mut Received,
+        snapshot: &Arc<Snapshot>,
+        batch: pb::FrameBatch,
+    ) -> Result<(), Error> {
+        // Destructured with no `..`, so that a new field breaks the build here.
+        let pb::FrameBatch {
+            poses,
+            features,
+            images,
+            timestamps_ns,
+            frame_names,
+            sequences,
+        } = batch;
+
+        let n = poses.len() / POSE_BYTES;
+        if poses.is_empty() || poses.len() % POSE_BYTES != 0 {
+            let problem = format!(
+                "has {} bytes; n frames have n times {POSE_BYTES}, as 4 by 4 numbers of 64 bits",
+                poses.len()
+            );
+            return Err(Error::invalid("poses", problem));
+        }
+
+        received.digest.update(&poses);
+        features
+            .iter()
+            .for_each(|rows| received.digest.update(rows));
+        images
+            .iter()
+            .for_each(|image| received.digest.update(image));
+
+        let before = received.frames.poses.len();
+        for (position, matrix) in poses.chunks_exact(POSE_BYTES).enumerate() {
+            let numbers = matrix.as_chunks::<8>().0.iter();
+            let matrix =
+                Matrix4::from_row_iterator(numbers.map(|bytes| f64::from_le_bytes(*bytes)));
+            let (pose, deviation) = geometry::pose_from_matrix(&matrix).map_err(|problem| {
+                let frame = before + position;
+                Error::invalid("poses", format!("the pose of frame {frame}: {problem}"))
+            })?;
+            received.worst_rotation_deviation = received.worst_rotation_deviation.max(deviation);
+            received.frames.poses.push(pose);
+        }
+
+        received.take_features(&features, n)?;
+        match &received.encode_for {
+            Some(adapter) => {
+                check_count("images", images.len(), n)?;
+                let rows = self.encoded(snapshot, adapter.clone(), images).await?;
+                received.rows[0].extend(rows);
+            }
+            None if images.is_empty() => {}
+            None => {
+                let problem = "must be empty: the upload has no encode_for";
+                return Err(Error::invalid("images", problem));
+            }
+        }
+
+        received.take_columns(before, n, timestamps_ns, frame_names, sequences)
+    }
+
+    /// The features of images, one after another, each on a thread of the images' lane.
+    async fn encoded(
+        &self,
+        snapshot: &Arc<Snapshot>,
+        adapter: String,
+        images: Vec<Vec<u8>>,
+    ) -> Result<Vec<f32>, Error> {
+        let mut rows = Vec::new();
+        for image in images {
+            let snapshot = snapshot.clone();
+            let adapter = adapter.clone();
+            let encode = move || {
+                let adapter = snapshot.adapter(&adapter)?;
+                snapshot.image_encoder(adapter)?.feature("images", &image)
+            };
+            rows.extend(self.workers.run_admitted(Lane::Images, encode).await??);
+        }
+
+        Ok(rows)
+    }
+}
+
+/// Checks what is going to be uploaded.
+fn begun(
+    upload: &pb::RoomUpload,
+    caller: Option<&Arc<Principal>>,
+    snapshot: &Snapshot,
+) -> Result<Received, Error> {
+    let within = |error: Error| error.within("room");
+    let name = named_whole("name", &upload.name, Kind::Room).map_err(within)?;
+    check_right(caller, &name)?;
+
+    for (field, words) in [("format", &upload.format), ("licence", &upload.licence)] {
+        if words.chars().count() > LONGEST_WORDS {
+            let problem = format!("is longer than {LONGEST_WORDS} characters");
+            return Err(within(Error::invalid(field, problem)));
+        }
+    }
+
+    check_extension(upload).map_err(within)?;
+
+    let (sources, encode_for) = match (upload.features.as_slice(), upload.encode_for.as_str()) {
+        ([], "") => {
+            let problem = "is required, or encode_for with images";
+            return Err(within(Error::invalid("features", problem)));
+        }
+        (given, "") => {
+            let sources = given.iter().map(source).collect::<Result<_, _>>();
+            (sources.map_err(within)?, None)
+        }
+        ([], adapter) => {
+            let adapter = named_whole("encode_for", adapter, Kind::Adapter).map_err(within)?;
+            let stored = snapshot.adapter(&adapter.name)?;
+            snapshot.image_encoder(stored)?;
+            (vec![stored.adapter.source().clone()], Some(adapter.name))
+        }
+        _ => {
+            let problem = "must be left out: the upload has features";
+            return Err(within(Error::invalid("encode_for", problem)));
+        }
+    };
+
+    Ok(Received {
+        name,
+        rows: vec![Vec::new(); sources.len()],
+        sources,
+        encode_for,
+        frames: Frames::default(),
+        worst_rotation_deviation: 0.0,
+        digest: Sha256::new(),
+        other_columns: Sha256::new(),
+        memory: Vec::new(),
+    })
+}
+
+/// Checks what only an extension of a room may or may not state.
+fn check_extension(upload: &pb::RoomUpload) -> Result<(), Error> {
+    if !upload.extend {
+        return match upload.drop_other_features {
+            true => Err(Error::invalid("drop_other_features", "needs extend")),
+            false => Ok(()),
+        };
+    }
+
+    for (field, words) in [("format", &upload.format), ("licence", &upload.licence)] {
+        if !words.is_empty() {
+            let problem = "must be left out: a room that is extended keeps its own";
+            return Err(Error::invalid(field, problem));
+        }
+    }
+    Ok(())
+}
+
+fn source(given: &pb::FeatureSource) -> Result<FeatureSource, Error> {
+    // Destructured with no `..`, so that a new field breaks the build here.
+    let pb::FeatureSource {
+        name,
+        encoder,
+        layer,
+        pooling,
+        preprocess,
+        dim,
+        base,
+        norm,
+    } = given.clone();
+    let dim = dim as usize;
+
+    if !is_plain_name(&name) {
+        let problem =
+            format!("{name:?} is not valid: use 1 to 100 letters, digits, '.', '-' or '_'");
+        return Err(Error::invalid("features.name", problem));
+    }
+    if !(1..=MAX_COLUMNS).contains(&dim) {
+        let problem = format!("must be 1 to {MAX_COLUMNS}, got {dim}");
+        return Err(Error::invalid("features.dim", problem));
+    }
+
+    let or_unspecified = |field: &str, given: String| {
+        if given.chars().count() > LONGEST_WORDS {
+            let problem = format!("is longer than {LONGEST_WORDS} characters");
+            return Err(Error::invalid(format!("features.{field}"), problem));
+        }
+        Ok(match given.as_str() {
+            "" => UNSPECIFIED.to_owned(),
+            _ => given,
+        })
+    };
+
+    Ok(FeatureSource {
+        name,
+        encoder: or_unspecified("encoder", encoder)?,
+        layer: or_unspecified("layer", layer)?,
+        base: or_unspecified("base", base)?,
+        norm: or_unspecified("norm", norm)?,
+        pooling: or_unspecified("pooling", pooling)?,
+        preprocess: or_unspecified("preprocess", preprocess)?,
+        dim,
+    })
+}
+
+impl Received {
+    /// What is kept of a batch, bytes: of images only their features.
+    fn kept_bytes(&self, batch: &pb::FrameBatch) -> usize {
+        let images: usize = batch.images.iter().map(Vec::len).sum();
+        let encoded = match self.encode_for {
+            Some(_) => batch.images.len() * 4 * self.sources[0].dim,
+            None => 0,
+        };
+        batch.encoded_len().saturating_sub(images) + encoded
+    }
+
+    /// Adds the features of `n` frames.
+    fn take_features(&mut self, features: &[Vec<u8>], n: usize) -> Result<(), Error> {
+        if self.encode_for.is_some() {
+            return match features {
+                [] => Ok(()),
+                _ => Err(Error::invalid(
+                    "features",
+                    "must be empty: the upload has encode_for",
+                )),
+            };
+        }
+
+        check_count("features", features.len(), self.sources.len())?;
+        for ((given, source), rows) in features.iter().zip(&self.sources).zip(&mut self.rows) {
+            let expected = n * source.dim * 4;
+            if given.len() != expected {
+                let problem = format!(
+                    "of '{}' have {} bytes; {n} frames of {} numbers of 32 bits have {expected}",
+                    source.name,
+                    given.len(),
+                    source.dim
+                );
+                return Err(Error::invalid("features", problem));
+            }
+
+            let numbers = given.as_chunks::<4>().0.iter();
+            rows.extend(numbers.map(|bytes| f32::from_le_bytes(*bytes)));
+        }
+
+        Ok(())
+    }
+
+    /// Adds the columns that a recording need not have. `before` frames were received before these.
+    fn take_columns(
+        &mut self,
+        before: usize,
+        n: usize,
+        timestamps_ns: Vec<i64>,
+        frame_names: Vec<String>,
+        sequences: Vec<u32>,
+    ) -> Result<(), Error> {
+        for (field, given, known) in [
+            (
+                "timestamps_ns",
+                timestamps_ns.len(),
+                self.frames.timestamps_ns.len(),
+            ),
+            ("frame_names", frame_names.len(), self.frames.names.len()),
+            ("sequences", sequences.len(), self.frames.sequences.len()),
+        ] {
+            // A column is there for all frames or for none.
+            let is_for_all = given == n && known == before;
+            let is_for_none = given == 0 && known == 0;
+            if !is_for_all && !is_for_none {
+                let problem =
+                    format!("has {given} entries for {n} frames; all batches have them or none");
+                return Err(Error::invalid(field, problem));
+            }
+        }
+
+        for timestamp in &timestamps_ns {
+            self.other_columns.update(timestamp.to_le_bytes());
+        }
+        for name in &frame_names {
+            self.other_columns.update((name.len() as u64).to_le_bytes());
+            self.other_columns.update(name);
+        }
+        for sequence in &sequences {
+            self.other_columns.update(sequence.to_le_bytes());
+        }
+
+        self.frames.timestamps_ns.extend(timestamps_ns);
+        self.frames.names.extend(frame_names);
+        self.frames.sequences.extend(sequences);
+        Ok(())
+    }
+}
+
+fn check_count(field: &str, given: usize, expected: usize) -> Result<(), Error> {
+    if given == expected {
+        return Ok(());
+    }
+    Err(Error::invalid(
+        field,
+        format!("has {given} entries, expected {expected}"),
+    ))
+}
+
+/// The room and its features, after everything was received.
+fn finished(
+    received: Received,
+    upload: &pb::RoomUpload,
+    end: &pb::UploadEnd,
+) -> Result<(Room, Vec<Features>), Error> {
+    let frame_count = received.frames.poses.len();
+    if frame_count != end.frame_count as usize {
+        let problem = format!("says {}, but {frame_count} frames arrived", end.frame_count);
+        return Err(Error::invalid("end.frame_count", problem));
+    }
+    if received.digest.finalize().as_slice() != end.sha256 {
+        let problem = "is not that of the bytes that arrived: poses, features and images of each \
+                       batch, in this order";
+        return Err(Error::invalid("end.sha256", problem));
+    }
+
+    let provenance = Provenance {
+        format: upload.format.clone(),
+        licence: upload.licence.clone(),
+        images_root: String::new(),
+        worst_rotation_deviation: received.worst_rotation_deviation,
+        camera: upload
+            .camera
+            .as_ref()
+            .map(convert::pinhole)
+            .transpose()
+            .map_err(|error| error.within("room"))?,
+    };
+    let unfit = |error: seese3_core::room::Error| Error::invalid("frames", error);
+    let id = RoomId::new(&received.name.name).map_err(unfit)?;
+    let room = Room::new(id, received.frames, provenance).map_err(unfit)?;
+
+    let features = received.sources.into_iter().zip(received.rows);
+    let features: Vec<Features> = features
+        .map(|(source, numbers)| {
+            let rows = Array2::from_shape_vec((frame_count, source.dim), numbers);
+            let rows = rows.map_err(|error| Error::invalid("frames.features", error))?;
+            Features::new(source, rows).map_err(|error| Error::invalid("frames.features", error))
+        })
+        .collect::<Result<_, Error>>()?;
+
+    seese3_store::check_features(&room, &features)?;
+    Ok((room, features))
+}

@@ -1,0 +1,408 @@
+//! Incoming requests, converted to domain queries. Every field is checked here, and an error names
+//! the field that is wrong.
+
+use seese3_client::convert::{self, ConvertError};
+
+use super::super::Error;
+use super::super::snapshot::Snapshot;
+use super::{CAMERA, world_frame};
+use seese3_client::proto::v1 as pb;
+use seese3_core::eval::{PredictedPair, Prediction, check_thresholds, default_thresholds};
+use seese3_core::geometry::{Pinhole, PixelCamera, Pose, Twist};
+use seese3_core::navigation::NavigatorKind;
+use seese3_core::navigation::{
+    Displacement, FitOn, MAX_TRANSLATION_M, Mode, Query, Reading, RetrievalMetric, Source,
+    SourceAt, StepKind,
+};
+use seese3_core::room::FrameId;
+use seese3_core::splits::{Pair, Split};
+use seese3_store::StoredAdapter;
+
+/// The largest number of navigators in one evaluation.
+const MAX_NAVIGATORS: usize = 100;
+
+pub fn twist(twist: pb::Twist) -> Result<Twist, Error> {
+    let convert::Twist { linear, angular } = convert::twist(&twist)?;
+    Ok(Twist { linear, angular })
+}
+
+impl From<ConvertError> for Error {
+    fn from(error: ConvertError) -> Self {
+        Self::invalid(error.field, error.problem)
+    }
+}
+
+/// A camera pose in the world frame of a room, `world_from_camera`.
+///
+/// # Errors
+/// [`Error::Invalid`] if a part is missing or not finite, the quaternion is not of unit norm, the
+/// position is too far from the origin, or the pose names other frames.
+pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
+    let pb::Pose {
+        parent_frame,
+        child_frame,
+        position,
+        orientation,
+    } = pose;
+
+    // Empty frame names stand for the room's world and the camera. Any other name would be a pose
+    // in a frame that this server cannot relate to the room.
+    let world = world_frame(room);
+    if !parent_frame.is_empty() && parent_frame != world {
+        return Err(Error::invalid(
+            "parent_frame",
+            format!("'{parent_frame}' is not the room's world, '{world}'"),
+        ));
+    }
+
+    if !child_frame.is_empty() && child_frame != CAMERA {
+        return Err(Error::invalid(
+            "child_frame",
+            format!("'{child_frame}' is not '{CAMERA}'"),
+        ));
+    }
+
+    let pose = convert::pose(&pb::Pose {
+        position,
+        orientation,
+        ..pb::Pose::default()
+    })?;
+    if pose.translation.vector.norm() > MAX_TRANSLATION_M {
+        return Err(Error::invalid(
+            "position",
+            format!("is over {MAX_TRANSLATION_M:e} m from the origin"),
+        ));
+    }
+
+    Ok(pose)
+}
+
+/// A camera as its calibration states it.
+///
+/// # Errors
+/// [`Error::Invalid`] if it is none.
+pub fn pinhole(camera: &pb::Pinhole) -> Result<Pinhole, Error> {
+    let pb::Pinhole {
+        width,
+        height,
+        focal,
+        centre_x,
+        centre_y,
+    } = *camera;
+    let middle = [width / 2.0, height / 2.0];
+    let centre = [centre_x.unwrap_or(middle[0]), centre_y.unwrap_or(middle[1])];
+
+    Pinhole::new(PixelCamera {
+        width,
+        height,
+        focal,
+        centre: Some(centre.into()),
+    })
+    .map_err(|problem| Error::invalid("camera", problem))
+}
+
+/// A view as the source of a query to `adapter`. An image is encoded here. `field` is the name of
+/// the view's field in its request.
+///
+/// # Errors
+/// [`Error::Invalid`] if the view is missing, or is a feature of another source or an image that
+/// cannot be decoded; [`Error::Precondition`] if the server has no encoder for images.
+pub fn source(
+    field: &str,
+    view: Option<pb::View>,
+    adapter: &StoredAdapter,
+    snapshot: &Snapshot,
+) -> Result<Source, Error> {
+    match view.and_then(|view| view.view) {
+        Some(pb::view::View::FrameId(frame)) => Ok(Source::Frame(FrameId(frame))),
+        Some(pb::view::View::Feature(pb::Feature {
+            values,
+            source_name,
+        })) => {
+            let own = &adapter.adapter.source().name;
+
+            // Features of different sources never compare, even where their width is the same. A
+            // caller that states the source is protected from mixing them up.
+            if !source_name.is_empty() && source_name != *own {
+                let problem =
+                    format!("'{source_name}' is not '{own}', which the adapter was trained on");
+                return Err(Error::invalid(
+                    format!("{field}.feature.source_name"),
+                    problem,
+                ));
+            }
+
+            Ok(Source::Feature(values))
+        }
+        Some(pb::view::View::Latent(pb::Latent { values })) => Ok(Source::Latent(values)),
+        Some(pb::view::View::Image(image)) => Ok(Source::Feature(
+            snapshot
+                .image_encoder(adapter)?
+                .feature(&format!("{field}.image"), &image)?,
+        )),
+        None => Err(Error::invalid(
+            field,
+            "is required: a frame_id, a feature, a latent or an image",
+        )),
+    }
+}
+
+fn displacement(displacement: Option<pb::Displacement>, room: &str) -> Result<Displacement, Error> {
+    use pb::displacement::Displacement as Wire;
+
+    let wire = displacement.and_then(|displacement| displacement.displacement);
+    match wire
+        .ok_or_else(|| Error::invalid("displacement", "is required: a twist, a target or twists"))?
+    {
+        Wire::Twist(given) => {
+            let given = twist(given).map_err(|error| error.within("displacement.twist"))?;
+            Ok(Displacement::Twists(vec![given]))
+        }
+        Wire::TargetFrameId(frame) => Ok(Displacement::TargetFrame(FrameId(frame))),
+        Wire::TargetPose(target) => {
+            let target =
+                pose(target, room).map_err(|error| error.within("displacement.target_pose"))?;
+            Ok(Displacement::TargetPose(target))
+        }
+        Wire::Twists(pb::TwistList { twists }) => {
+            let numbered = twists.into_iter().enumerate();
+
+            let each = |(position, given)| {
+                twist(given)
+                    .map_err(|error| error.within(&format!("displacement.twists[{position}]")))
+            };
+
+            Ok(Displacement::Twists(
+                numbered.map(each).collect::<Result<_, _>>()?,
+            ))
+        }
+    }
+}
+
+/// A navigation query, and the thresholds ε of Hit@ε for its errors.
+///
+/// # Errors
+/// [`Error::Invalid`], naming the field.
+pub fn query(
+    request: pb::NavigateRequest,
+    adapter: &StoredAdapter,
+    snapshot: &Snapshot,
+) -> Result<(Query, Vec<f64>), Error> {
+    // Destructured with no `..`, so that a new field breaks the build here.
+    let pb::NavigateRequest {
+        room,
+        adapter: _,
+        source: view,
+        source_pose,
+        displacement: wanted,
+        steps,
+        mode,
+        reading,
+        top_k,
+        exclude_source,
+        exclude_radius,
+        thresholds: given_thresholds,
+        navigator,
+    } = request;
+
+    let displacement = displacement(wanted, &room)?;
+    let thresholds = thresholds(given_thresholds)?;
+    let (step, metric) = step_of(&navigator, reading)?;
+
+    let mode = mode_of(mode)?;
+    let exclude_source = exclusion(exclude_source, exclude_radius)?;
+    let source_pose = source_pose
+        .map(|given| pose(given, &room).map_err(|error| error.within("source_pose")))
+        .transpose()?;
+
+    // Encoding an image is costly, so that every other field is checked before it.
+    let source = source("source", view, adapter, snapshot)?;
+    if source_pose.is_some() && matches!(source, Source::Frame(_)) {
+        return Err(Error::invalid(
+            "source_pose",
+            "must be left out for a frame: its pose is recorded in the room",
+        ));
+    }
+
+    let query = Query {
+        source: SourceAt {
+            source,
+            pose: source_pose,
+        },
+        displacement,
+        steps: steps.unwrap_or(1),
+        mode,
+        step,
+        metric,
+        fit_on: fit_on(adapter),
+        top_k: top_k.unwrap_or(1),
+        exclude_source,
+    };
+
+    Ok((query, thresholds))
+}
+
+/// How a motion becomes a latent step, and the metric of the search: as `name` says, or inverse
+/// Poincaré with the given reading if the name is empty.
+fn step_of(name: &str, reading: i32) -> Result<(StepKind, RetrievalMetric), Error> {
+    let given = reading_of(reading)?;
+    if name.is_empty() {
+        return Ok((StepKind::InversePoincare(given), RetrievalMetric::Full));
+    }
+
+    // The name of a navigator determines its reading, if it has one, so a reading beside it could
+    // only contradict.
+    if reading != pb::Reading::Unspecified as i32 {
+        return Err(Error::invalid(
+            "reading",
+            "must be left out with a navigator, which has its own",
+        ));
+    }
+
+    match navigator_named("navigator", name)? {
+        NavigatorKind::Step(step, metric) => Ok((step, metric)),
+        _ => Err(Error::invalid(
+            "navigator",
+            format!("'{name}' is a baseline of Evaluate; it makes no latent step"),
+        )),
+    }
+}
+
+/// The pairs of a room on which a ridge refit is fitted: those of the adapter's own split
+/// and stride. An adapter trained under `whole` held out no frames; then the time split is used.
+fn fit_on(adapter: &StoredAdapter) -> FitOn {
+    let split = match adapter.record.split {
+        Split::Whole => Split::Time,
+        split => split,
+    };
+    FitOn {
+        split,
+        stride: adapter.record.stride,
+    }
+}
+
+fn navigator_named(field: &str, name: &str) -> Result<NavigatorKind, Error> {
+    NavigatorKind::from_name(name).ok_or_else(|| {
+        let problem =
+            "is no navigator; adapters list theirs, and +row-space, +whitened, +motion or +calibrated may be added";
+        Error::invalid(field, format!("'{name}' {problem}"))
+    })
+}
+
+pub fn mode_of(mode: i32) -> Result<Mode, Error> {
+    match pb::Mode::try_from(mode) {
+        Ok(pb::Mode::Unspecified | pb::Mode::OpenLoop) => Ok(Mode::OpenLoop),
+        Ok(pb::Mode::Snap) => Ok(Mode::Snap),
+        Ok(pb::Mode::ClosedLoop) => Ok(Mode::ClosedLoop),
+        Err(_) => Err(Error::invalid(
+            "mode",
+            format!("{mode} is not known to this server"),
+        )),
+    }
+}
+
+fn reading_of(reading: i32) -> Result<Reading, Error> {
+    match pb::Reading::try_from(reading) {
+        Ok(pb::Reading::Unspecified | pb::Reading::Homogeneous) => Ok(Reading::Homogeneous),
+        Ok(pb::Reading::Affine) => Ok(Reading::Affine),
+        Ok(pb::Reading::Literal) => Ok(Reading::Literal),
+        Err(_) => Err(Error::invalid(
+            "reading",
+            format!("{reading} is not known to this server"),
+        )),
+    }
+}
+
+/// The exclusion radius: how many rows on each side of the source frame may not be retrieved,
+/// besides the frame itself. None if the source may be retrieved.
+pub fn exclusion(exclude_source: bool, exclude_radius: u32) -> Result<Option<u32>, Error> {
+    match (exclude_source, exclude_radius) {
+        (true, radius) => Ok(Some(radius)),
+        (false, 0) => Ok(None),
+        (false, _) => Err(Error::invalid(
+            "exclude_radius",
+            "means nothing without exclude_source",
+        )),
+    }
+}
+
+/// The given thresholds ε, or the paper's if there are none.
+pub fn thresholds(given: Vec<f64>) -> Result<Vec<f64>, Error> {
+    let thresholds = if given.is_empty() {
+        default_thresholds()
+    } else {
+        given
+    };
+    check_thresholds(&thresholds)?;
+
+    Ok(thresholds)
+}
+
+/// The split of this name; none if the name is empty.
+pub fn split(name: &str) -> Result<Option<Split>, Error> {
+    match Split::from_name(name) {
+        Some(split) => Ok(Some(split)),
+        None if name.is_empty() => Ok(None),
+        None => {
+            let known = Split::ALL.map(Split::name).join(", ");
+            Err(Error::invalid(
+                "split",
+                format!("'{name}' is none of {known}"),
+            ))
+        }
+    }
+}
+
+/// The navigators of an evaluation by name. An empty list stands for the adapter's own table.
+pub fn navigators(names: &[String]) -> Result<Vec<NavigatorKind>, Error> {
+    let twice = |(position, name): (usize, &String)| names[..position].contains(name);
+
+    if names.len() > MAX_NAVIGATORS {
+        return Err(Error::invalid(
+            "navigators",
+            format!("names more than {MAX_NAVIGATORS}"),
+        ));
+    }
+
+    if names.iter().enumerate().any(twice) {
+        return Err(Error::invalid("navigators", "names a navigator twice"));
+    }
+
+    names
+        .iter()
+        .map(|name| navigator_named("navigators", name))
+        .collect()
+}
+
+pub fn prediction(position: usize, given: pb::Prediction) -> Result<PredictedPair, Error> {
+    let pb::Prediction {
+        source_frame_id,
+        target_frame_id,
+        prediction,
+        last_step_frame_id,
+    } = given;
+
+    let prediction = match prediction {
+        Some(pb::prediction::Prediction::Latent(pb::Latent { values })) => {
+            Prediction::Latent(values)
+        }
+        Some(pb::prediction::Prediction::RetrievedFrameId(frame)) => {
+            Prediction::Frame(FrameId(frame))
+        }
+        None => {
+            return Err(Error::invalid(
+                format!("predictions[{position}]"),
+                "needs a latent or a retrieved_frame_id",
+            ));
+        }
+    };
+
+    Ok(PredictedPair {
+        pair: Pair {
+            source: FrameId(source_frame_id),
+            target: FrameId(target_frame_id),
+        },
+        prediction,
+        last_step_from: last_step_frame_id.map(FrameId),
+    })
+}

@@ -1,0 +1,69 @@
+//! OdometryService.Encode: views to latents, so that a robot sends twenty numbers a frame and no image.
+
+use tonic::{Request, Response, Status};
+
+use super::odometry::{EmbeddedView, ViewReader};
+use super::workers::Lane;
+use super::{Error, Handlers, Snapshot};
+use seese3_client::proto::v1 as pb;
+use seese3_core::cancel::Cancellation;
+
+/// The largest number of views in one request.
+const MAX_VIEWS: usize = 256;
+
+impl Handlers {
+    /// Answers an Encode request on a worker thread.
+    pub(super) async fn encoded_views(
+        &self,
+        request: Request<pb::EncodeRequest>,
+    ) -> Result<Response<pb::EncodeResponse>, Status> {
+        self.unary(request, |request| Lane::of(&request.views), answer)
+            .await
+    }
+}
+
+fn answer(
+    snapshot: &Snapshot,
+    request: pb::EncodeRequest,
+    cancel: &Cancellation,
+) -> Result<pb::EncodeResponse, Error> {
+    let pb::EncodeRequest {
+        adapter,
+        room,
+        views,
+        with_features,
+    } = request;
+
+    if views.is_empty() || views.len() > MAX_VIEWS {
+        return Err(Error::invalid(
+            "views",
+            format!("must be 1 to {MAX_VIEWS}, got {}", views.len()),
+        ));
+    }
+
+    let reader = ViewReader::of(snapshot, &room, &adapter)?;
+    let mut encoded = Vec::with_capacity(views.len());
+    for (position, view) in views.into_iter().enumerate() {
+        cancel.check()?;
+        let EmbeddedView { latent, feature } =
+            reader.embedded(&format!("views[{position}]"), Some(view))?;
+
+        encoded.push(pb::EncodedView {
+            latent: Some(pb::Latent {
+                values: latent.to_vec(),
+            }),
+            feature: feature.filter(|_| with_features).map(|values| pb::Feature {
+                values,
+                source_name: reader.stored.adapter.source().name.clone(),
+            }),
+        });
+    }
+
+    Ok(pb::EncodeResponse {
+        adapter: Some(pb::Revision {
+            name: reader.stored.name.clone(),
+            revision: reader.stored.revision,
+        }),
+        views: encoded,
+    })
+}

@@ -1,0 +1,465 @@
+//! What a server counts, in the format of Prometheus.
+//!
+//! Every name begins with `seese3_`. Labels come from closed sets: nothing that a caller sends
+//! becomes a label, so that no caller can make the answer grow.
+
+use std::collections::BTreeSet;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use prometheus_client::collector::Collector;
+use prometheus_client::encoding::{DescriptorEncoder, EncodeLabelSet, EncodeMetric};
+use prometheus_client::metrics::counter::{ConstCounter, Counter};
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::{ConstGauge, Gauge};
+use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
+use prometheus_client::metrics::info::Info;
+use prometheus_client::registry::{Registry, Unit};
+use prost::Message;
+use prost_types::FileDescriptorSet;
+
+use super::status::Full;
+use seese3_client::proto::v1::TrackStatus;
+
+/// The metrics of one server; clones count into the same numbers.
+#[derive(Debug, Clone)]
+pub struct Metrics(Arc<Inner>);
+
+#[derive(Debug)]
+struct Inner {
+    registry: Mutex<Registry>,
+    /// The paths of all RPCs: no other path becomes a label.
+    methods: BTreeSet<String>,
+    requests: Family<RequestLabels, Histogram>,
+    in_flight: Gauge,
+    frames: Family<FrameLabels, Histogram>,
+    encodings: Histogram,
+    retrieval_distance: Histogram,
+    refusals: Family<FullLabels, Counter>,
+    rooms: Gauge,
+    adapters: Gauge,
+    refused: Family<KindLabels, Gauge>,
+    reloads: Family<OutcomeLabels, Counter>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct RequestLabels {
+    method: String,
+    code: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct FrameLabels {
+    outcome: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct FullLabels {
+    full: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct KindLabels {
+    kind: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct OutcomeLabels {
+    outcome: &'static str,
+}
+
+/// How a look for changes of the store ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ReloadOutcome {
+    Changed,
+    Unchanged,
+    Failed,
+}
+
+impl ReloadOutcome {
+    const ALL: [Self; 3] = [Self::Changed, Self::Unchanged, Self::Failed];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Changed => "changed",
+            Self::Unchanged => "unchanged",
+            Self::Failed => "failed",
+        }
+    }
+}
+
+/// From a quarter of a millisecond to four minutes.
+fn request_seconds() -> Histogram {
+    Histogram::new(exponential_buckets(0.000_25, 2.0, 20))
+}
+
+/// From a tenth of a millisecond to three seconds: a camera sends a frame every 16 to 200 ms.
+fn frame_seconds() -> Histogram {
+    Histogram::new(exponential_buckets(0.000_1, 2.0, 16))
+}
+
+/// Distances between latents have no unit; those of neighbours lie between 0.01 and 10.
+fn latent_distance() -> Histogram {
+    Histogram::new(exponential_buckets(0.01, 2.0, 14))
+}
+
+impl Default for Metrics {
+    fn default() -> Self {
+        let mut registry = Registry::with_prefix("seese3");
+        let build = Info::new(vec![("version", env!("CARGO_PKG_VERSION"))]);
+        registry.register("build", "The program", build);
+
+        let metrics = Inner {
+            requests: Family::new_with_constructor(request_seconds),
+            in_flight: Gauge::default(),
+            frames: Family::new_with_constructor(frame_seconds),
+            encodings: request_seconds(),
+            retrieval_distance: latent_distance(),
+            refusals: Family::default(),
+            rooms: Gauge::default(),
+            adapters: Gauge::default(),
+            refused: Family::default(),
+            reloads: Family::default(),
+            registry: Mutex::default(),
+            methods: methods(&[
+                seese3_client::proto::FILE_DESCRIPTOR_SET,
+                tonic_health::pb::FILE_DESCRIPTOR_SET,
+                tonic_reflection::pb::v1::FILE_DESCRIPTOR_SET,
+                tonic_reflection::pb::v1alpha::FILE_DESCRIPTOR_SET,
+            ]),
+        };
+        metrics.describe(&mut registry);
+        metrics.begin_at_zero();
+
+        Self(Arc::new(Inner {
+            registry: Mutex::new(registry),
+            ..metrics
+        }))
+    }
+}
+
+impl Inner {
+    /// Makes the counts that alerts watch, so that the first event is seen as a change from zero.
+    fn begin_at_zero(&self) {
+        for full in Full::ALL {
+            let full = full.words();
+            drop(self.refusals.get_or_create(&FullLabels { full }));
+        }
+        for outcome in ReloadOutcome::ALL {
+            let outcome = outcome.name();
+            drop(self.reloads.get_or_create(&OutcomeLabels { outcome }));
+        }
+        for status in [
+            TrackStatus::Tracking,
+            TrackStatus::Degraded,
+            TrackStatus::Lost,
+            TrackStatus::Relocalizing,
+        ] {
+            let outcome = status.as_str_name();
+            drop(self.frames.get_or_create(&FrameLabels { outcome }));
+        }
+    }
+
+    /// Registers every metric under its name, with a sentence of help.
+    fn describe(&self, registry: &mut Registry) {
+        registry.register_with_unit(
+            "request",
+            "Time from a request's arrival to the end of its answer, streams included, by RPC and gRPC code",
+            Unit::Seconds,
+            self.requests.clone(),
+        );
+        registry.register(
+            "requests_in_flight",
+            "Requests and streams that are being answered",
+            self.in_flight.clone(),
+        );
+        registry.register_with_unit(
+            "track_frame",
+            "Time from a Track frame's arrival to its answer, by tracking status or refusal",
+            Unit::Seconds,
+            self.frames.clone(),
+        );
+        registry.register_with_unit(
+            "image_encoding",
+            "Time to encode one image",
+            Unit::Seconds,
+            self.encodings.clone(),
+        );
+        registry.register(
+            "retrieval_distance",
+            "Latent distance from what was searched for to the nearest frame that was found",
+            self.retrieval_distance.clone(),
+        );
+        registry.register(
+            "requests_shed",
+            "Requests refused because something was full, by what",
+            self.refusals.clone(),
+        );
+        registry.register("rooms", "Rooms that are served", self.rooms.clone());
+        registry.register(
+            "adapters",
+            "Adapters that are served",
+            self.adapters.clone(),
+        );
+        registry.register(
+            "refused",
+            "Newest revisions in the store that cannot be served: rooms, adapters, adapters in one of \
+             their rooms, and choices of defaults",
+            self.refused.clone(),
+        );
+        registry.register(
+            "reloads",
+            "Looks for changes of the store, by outcome: changed, unchanged or failed",
+            self.reloads.clone(),
+        );
+    }
+}
+
+/// What a snapshot serves and refuses.
+pub(super) struct ServedCounts {
+    pub rooms: usize,
+    pub adapters: usize,
+    /// Number of refused things by kind.
+    pub refused: [(&'static str, usize); 4],
+}
+
+impl Metrics {
+    /// The metrics as text, for a scrape.
+    pub fn text(&self) -> String {
+        let registry = self.0.registry.lock();
+        let registry = registry.unwrap_or_else(PoisonError::into_inner);
+
+        let mut text = String::new();
+        // Writing into a string cannot fail.
+        let _ = prometheus_client::encoding::text::encode(&mut text, &registry);
+        text
+    }
+
+    /// Adds a count that is kept elsewhere and read at every scrape.
+    pub fn count_elsewhere(
+        &self,
+        name: &'static str,
+        help: &'static str,
+        count: impl Fn() -> u64 + Send + Sync + 'static,
+    ) {
+        self.register(Elsewhere {
+            name,
+            help,
+            value: Box::new(count),
+            kind: Kind::Counter,
+        });
+    }
+
+    /// Adds a value that is kept elsewhere and read at every scrape; it may fall again.
+    pub(super) fn gauge_elsewhere(
+        &self,
+        name: &'static str,
+        help: &'static str,
+        value: impl Fn() -> u64 + Send + Sync + 'static,
+    ) {
+        self.register(Elsewhere {
+            name,
+            help,
+            value: Box::new(value),
+            kind: Kind::Gauge,
+        });
+    }
+
+    fn register(&self, collector: Elsewhere) {
+        let registry = self.0.registry.lock();
+        let mut registry = registry.unwrap_or_else(PoisonError::into_inner);
+        registry.register_collector(Box::new(collector));
+    }
+
+    /// A request or stream began.
+    pub(super) fn request_began(&self) {
+        self.0.in_flight.inc();
+    }
+
+    /// A request or stream ended.
+    pub(super) fn request_ended(&self, method: &str, code: tonic::Code, took: Duration) {
+        self.0.in_flight.dec();
+
+        let known = self.0.methods.get(method).map(String::as_str);
+        let labels = RequestLabels {
+            method: known.unwrap_or("unknown").to_owned(),
+            code: code_name(code),
+        };
+        let requests = self.0.requests.get_or_create(&labels);
+        requests.observe(took.as_secs_f64());
+    }
+
+    /// How many requests and streams are being answered.
+    pub(super) fn in_flight(&self) -> i64 {
+        self.0.in_flight.get()
+    }
+
+    /// A frame of a Track stream was answered.
+    pub(super) fn frame_answered(&self, outcome: &'static str, took: Duration) {
+        let frames = self.0.frames.get_or_create(&FrameLabels { outcome });
+        frames.observe(took.as_secs_f64());
+    }
+
+    /// An image was encoded.
+    pub(super) fn image_encoded(&self, took: Duration) {
+        self.0.encodings.observe(took.as_secs_f64());
+    }
+
+    /// A frame was retrieved at this distance between latents.
+    pub(super) fn retrieved(&self, distance: f64) {
+        self.0.retrieval_distance.observe(distance);
+    }
+
+    /// A request was refused because something was full.
+    pub(super) fn shed(&self, full: Full) {
+        let full = full.words();
+        self.0.refusals.get_or_create(&FullLabels { full }).inc();
+    }
+
+    /// A snapshot is served from now on.
+    pub(super) fn serving(&self, counts: ServedCounts) {
+        let count = |count: usize| i64::try_from(count).unwrap_or(i64::MAX);
+        self.0.rooms.set(count(counts.rooms));
+        self.0.adapters.set(count(counts.adapters));
+
+        for (kind, refused) in counts.refused {
+            let gauge = self.0.refused.get_or_create(&KindLabels { kind });
+            gauge.set(count(refused));
+        }
+    }
+
+    /// A look for changes of the store ended.
+    pub(super) fn reloaded(&self, outcome: ReloadOutcome) {
+        let outcome = outcome.name();
+        self.0
+            .reloads
+            .get_or_create(&OutcomeLabels { outcome })
+            .inc();
+    }
+}
+
+/// A count that is kept elsewhere.
+struct Elsewhere {
+    name: &'static str,
+    help: &'static str,
+    value: Box<dyn Fn() -> u64 + Send + Sync>,
+    kind: Kind,
+}
+
+/// Whether a value only grows.
+#[derive(Debug, Clone, Copy)]
+enum Kind {
+    Counter,
+    Gauge,
+}
+
+impl std::fmt::Debug for Elsewhere {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name)
+    }
+}
+
+impl Collector for Elsewhere {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), std::fmt::Error> {
+        let value = (self.value)();
+        match self.kind {
+            Kind::Counter => {
+                let counter = ConstCounter::new(value);
+                let kind = counter.metric_type();
+                counter.encode(encoder.encode_descriptor(self.name, self.help, None, kind)?)
+            }
+            Kind::Gauge => {
+                let gauge = ConstGauge::new(i64::try_from(value).unwrap_or(i64::MAX));
+                let kind = gauge.metric_type();
+                gauge.encode(encoder.encode_descriptor(self.name, self.help, None, kind)?)
+            }
+        }
+    }
+}
+
+/// The paths of the RPCs that descriptors describe.
+fn methods(descriptors: &[&[u8]]) -> BTreeSet<String> {
+    let mut paths = BTreeSet::new();
+    for bytes in descriptors {
+        // The descriptors are compiled in: one that cannot be read leaves its RPCs "unknown".
+        let Ok(set) = FileDescriptorSet::decode(*bytes) else {
+            continue;
+        };
+
+        for file in &set.file {
+            for service in &file.service {
+                for method in &service.method {
+                    paths.insert(format!(
+                        "/{}.{}/{}",
+                        file.package(),
+                        service.name(),
+                        method.name()
+                    ));
+                }
+            }
+        }
+    }
+
+    paths
+}
+
+/// The name of a code, as the gRPC specification writes it.
+fn code_name(code: tonic::Code) -> &'static str {
+    use tonic::Code;
+
+    match code {
+        Code::Ok => "OK",
+        Code::Cancelled => "CANCELLED",
+        Code::Unknown => "UNKNOWN",
+        Code::InvalidArgument => "INVALID_ARGUMENT",
+        Code::DeadlineExceeded => "DEADLINE_EXCEEDED",
+        Code::NotFound => "NOT_FOUND",
+        Code::AlreadyExists => "ALREADY_EXISTS",
+        Code::PermissionDenied => "PERMISSION_DENIED",
+        Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
+        Code::FailedPrecondition => "FAILED_PRECONDITION",
+        Code::Aborted => "ABORTED",
+        Code::OutOfRange => "OUT_OF_RANGE",
+        Code::Unimplemented => "UNIMPLEMENTED",
+        Code::Internal => "INTERNAL",
+        Code::Unavailable => "UNAVAILABLE",
+        Code::DataLoss => "DATA_LOSS",
+        Code::Unauthenticated => "UNAUTHENTICATED",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: Prometheus' text format: a counter ends in `_total`, a histogram has a bucket for
+    /// every bound, a count and a sum; an unknown path is no label.
+    #[test]
+    fn what_is_counted_is_in_the_text() {
+        let metrics = Metrics::default();
+        let took = Duration::from_millis(3);
+        for (method, code) in [
+            ("/seese3.v1.NavigationService/Navigate", tonic::Code::Ok),
+            ("/made/up", tonic::Code::Unauthenticated),
+        ] {
+            metrics.request_began();
+            metrics.request_ended(method, code, took);
+        }
+        metrics.shed(Full::ShortRequests);
+        metrics.count_elsewhere("log_lines_lost", "Lines", || 7);
+
+        let text = metrics.text();
+        for line in [
+            r#"seese3_request_seconds_count{method="/seese3.v1.NavigationService/Navigate",code="OK"} 1"#,
+            r#"seese3_request_seconds_bucket{le="0.004",method="/seese3.v1.NavigationService/Navigate",code="OK"} 1"#,
+            r#"seese3_request_seconds_bucket{le="0.002",method="/seese3.v1.NavigationService/Navigate",code="OK"} 0"#,
+            r#"seese3_request_seconds_count{method="unknown",code="UNAUTHENTICATED"} 1"#,
+            r#"seese3_requests_shed_total{full="short requests"} 1"#,
+            "seese3_requests_in_flight 0",
+            "seese3_log_lines_lost_total 7",
+        ] {
+            assert!(text.contains(line), "no {line} in\n{text}");
+        }
+        assert!(!text.contains("made/up"));
+    }
+}

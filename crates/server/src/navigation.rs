@@ -1,0 +1,170 @@
+//! NavigationService: Navigate and BatchNavigate. NavigateTo is in `navigate_to`.
+
+use tonic::{Request, Response, Status};
+
+use super::convert;
+use super::status::brief;
+use super::workers::Lane;
+use super::{Error, Handlers, Snapshot};
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::navigation_service_server::NavigationService;
+use seese3_core::cancel::Cancellation;
+use seese3_core::navigation::Limits;
+
+#[tonic::async_trait]
+impl NavigationService for Handlers {
+    async fn navigate(
+        &self,
+        request: Request<pb::NavigateRequest>,
+    ) -> Result<Response<pb::NavigateResponse>, Status> {
+        let limits = self.config.limits;
+        let response = self
+            .unary(
+                request,
+                |request| Lane::of(&request.source),
+                move |snapshot, request, cancel| navigate(snapshot, request, limits, cancel),
+            )
+            .await?;
+
+        let steps = response.get_ref().steps.iter();
+        for frame in steps.filter_map(|step| step.frames.first()) {
+            self.config.metrics.retrieved(frame.distance);
+        }
+
+        Ok(response)
+    }
+
+    type NavigateToStream = super::navigate_to::Events;
+
+    async fn navigate_to(
+        &self,
+        request: Request<pb::NavigateToRequest>,
+    ) -> Result<Response<Self::NavigateToStream>, Status> {
+        Ok(Response::new(self.begin_pursuit(request).await?))
+    }
+
+    async fn batch_navigate(
+        &self,
+        request: Request<pb::BatchNavigateRequest>,
+    ) -> Result<Response<pb::BatchNavigateResponse>, Status> {
+        let limits = self.config.limits;
+        let most = self.config.batch;
+        self.unary(request, batch_lane, move |snapshot, request, cancel| {
+            check_batch(&request.requests, most, limits)?;
+            answer_batch(snapshot, request, limits, cancel)
+        })
+        .await
+    }
+}
+
+/// The lane of a batch: that of images if any view is one.
+fn batch_lane(batch: &pb::BatchNavigateRequest) -> Lane {
+    let sources = batch
+        .requests
+        .iter()
+        .filter_map(|request| request.source.as_ref());
+    match Lane::of(sources) {
+        Lane::Images => Lane::Images,
+        Lane::Short | Lane::Long => Lane::Long,
+    }
+}
+
+fn check_batch(requests: &[pb::NavigateRequest], most: usize, limits: Limits) -> Result<(), Error> {
+    if requests.is_empty() || requests.len() > most {
+        return Err(Error::invalid(
+            "requests",
+            format!("needs 1 to {most}, got {}", requests.len()),
+        ));
+    }
+
+    // The limit on retrieved frames bounds the size of one answer, so in a batch it holds for all
+    // requests together.
+    let in_all = requests
+        .iter()
+        .map(hits_asked_for)
+        .fold(0, u64::saturating_add);
+
+    if in_all > limits.frames_in_answer {
+        let problem = format!(
+            "ask for {in_all} frames together, over the limit of {}",
+            limits.frames_in_answer
+        );
+        return Err(Error::invalid("requests", problem));
+    }
+    Ok(())
+}
+
+fn answer_batch(
+    snapshot: &Snapshot,
+    batch: pb::BatchNavigateRequest,
+    limits: Limits,
+    cancel: &Cancellation,
+) -> Result<pb::BatchNavigateResponse, Error> {
+    let mut results = Vec::with_capacity(batch.requests.len());
+    for request in batch.requests {
+        cancel.check()?;
+
+        let result = match navigate(snapshot, request, limits, cancel) {
+            Ok(response) => pb::batch_navigate_result::Result::Response(response),
+            // Cancellation ends the whole batch; any other error belongs to the one request that
+            // caused it.
+            Err(Error::Cancelled) => return Err(Error::Cancelled),
+            Err(error) => pb::batch_navigate_result::Result::Failure(pb::Failure {
+                code: error.code().into(),
+                message: brief(&error.to_string()),
+            }),
+        };
+        results.push(pb::BatchNavigateResult {
+            result: Some(result),
+        });
+    }
+
+    Ok(pb::BatchNavigateResponse { results })
+}
+
+/// How many frames a request asks for: motions times steps times frames. It only serves the sum over
+/// a batch; each request is checked in full when it is answered.
+fn hits_asked_for(request: &pb::NavigateRequest) -> u64 {
+    let motions = match request
+        .displacement
+        .as_ref()
+        .and_then(|given| given.displacement.as_ref())
+    {
+        Some(pb::displacement::Displacement::Twists(list)) => list.twists.len() as u64,
+        _ => 1,
+    };
+
+    let steps = u64::from(request.steps.unwrap_or(1)).saturating_mul(motions);
+    steps.saturating_mul(u64::from(request.top_k.unwrap_or(1)))
+}
+
+fn navigate(
+    snapshot: &Snapshot,
+    request: pb::NavigateRequest,
+    limits: Limits,
+    cancel: &Cancellation,
+) -> Result<pb::NavigateResponse, Error> {
+    let served = snapshot.navigator(&request.room, &request.adapter)?;
+    let (query, thresholds) = convert::query(request, &served.adapter, snapshot)?;
+    let answer = served.navigator.answer(&query, limits, cancel)?;
+
+    // The answer repeats what was chosen by default (mode, reading, navigator), so that a caller
+    // sees how its numbers came about. Without an audit the index is the exact scan.
+    let room = served.navigator.room();
+
+    Ok(pb::NavigateResponse {
+        room: Some(convert::room_revision(&served)),
+        adapter: Some(convert::adapter_revision(&served)),
+        steps: (1..)
+            .zip(&answer.steps)
+            .map(|(number, step)| convert::step_to_wire(number, step, room, &thresholds))
+            .collect(),
+        mode: convert::mode_to_wire(query.mode).into(),
+        reading: convert::reading_to_wire(query.step).into(),
+        navigator: convert::navigator_to_wire(&query),
+        displacement: answer
+            .displacement
+            .map(|twist| convert::twist_to_wire(&twist)),
+        exact: served.navigator.audit().is_none(),
+    })
+}

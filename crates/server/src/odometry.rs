@@ -1,0 +1,293 @@
+//! OdometryService: EstimateMotion, the motion between two views. Track is in `track`, Encode in
+//! `encoding`.
+
+use std::sync::Arc;
+
+use ndarray::Array1;
+use tonic::{Request, Response, Status};
+
+use super::convert;
+use super::snapshot::ServedNavigator;
+use super::status::view_error;
+use super::workers::Lane;
+use super::{Error, Handlers, Snapshot};
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::odometry_service_server::OdometryService;
+use seese3_core::cancel::Cancellation;
+use seese3_core::geometry::{body_twist, exp};
+use seese3_core::navigation::{Source, StepError};
+use seese3_core::room::FrameId;
+use seese3_robot::tracking::View;
+use seese3_store::StoredAdapter;
+
+#[tonic::async_trait]
+impl OdometryService for Handlers {
+    type TrackStream = super::track::Answers;
+
+    async fn track(
+        &self,
+        request: Request<tonic::Streaming<pb::TrackRequest>>,
+    ) -> Result<Response<Self::TrackStream>, Status> {
+        Ok(Response::new(self.follow(request).await?))
+    }
+
+    async fn estimate_motion(
+        &self,
+        request: Request<pb::EstimateMotionRequest>,
+    ) -> Result<Response<pb::EstimateMotionResponse>, Status> {
+        let lane = |request: &pb::EstimateMotionRequest| {
+            Lane::of(request.first.iter().chain(&request.second))
+        };
+        self.unary(request, lane, answer).await
+    }
+
+    async fn encode(
+        &self,
+        request: Request<pb::EncodeRequest>,
+    ) -> Result<Response<pb::EncodeResponse>, Status> {
+        self.encoded_views(request).await
+    }
+}
+
+fn answer(
+    snapshot: &Snapshot,
+    request: pb::EstimateMotionRequest,
+    cancel: &Cancellation,
+) -> Result<pb::EstimateMotionResponse, Error> {
+    // Thresholds are checked whoever reads the motion.
+    convert::thresholds(request.thresholds.clone())?;
+
+    if let Some(answer) = by_two_views(snapshot, &request, cancel)? {
+        return Ok(answer);
+    }
+
+    // Whoever sends two images to a server that compares images may have forgotten their camera.
+    let lacks_camera = snapshot.two_views().is_some()
+        && request.adapter.is_empty()
+        && image(request.first.as_ref()).is_some()
+        && image(request.second.as_ref()).is_some();
+    by_adapter(snapshot, request, cancel).map_err(|error| match error {
+        Error::Precondition(problem) if lacks_camera => Error::Precondition(format!(
+            "{problem}; or give `camera`, or a room whose camera is known: this server then compares the images \
+             themselves"
+        )),
+        other => other,
+    })
+}
+
+/// The motion that an adapter reads from two latents.
+fn by_adapter(
+    snapshot: &Snapshot,
+    request: pb::EstimateMotionRequest,
+    cancel: &Cancellation,
+) -> Result<pb::EstimateMotionResponse, Error> {
+    let pb::EstimateMotionRequest {
+        adapter,
+        room,
+        first,
+        second,
+        thresholds,
+        camera: _,
+    } = request;
+
+    let thresholds = convert::thresholds(thresholds)?;
+
+    let reader = ViewReader::of(snapshot, &room, &adapter)?;
+    let stored = reader.stored.clone();
+
+    // If both views are frames of the room, the true motion between them is recorded and is
+    // reported with the estimate.
+    let frame_of =
+        |given: &Option<pb::View>| match given.as_ref().and_then(|view| view.view.as_ref()) {
+            Some(pb::view::View::FrameId(frame)) => Some(FrameId(*frame)),
+            _ => None,
+        };
+    let frames = frame_of(&first).zip(frame_of(&second));
+
+    let latent = |field: &str, given| -> Result<Array1<f64>, Error> {
+        cancel.check()?;
+        Ok(reader.embedded(field, given)?.latent)
+    };
+
+    let first = latent("first", first)?;
+    let second = latent("second", second)?;
+    let twist = stored.adapter.motion(first.view(), second.view());
+
+    // `latent` has found both frames in the room, so their poses exist.
+    let truth = reader
+        .served
+        .as_ref()
+        .zip(frames)
+        .and_then(|(served, (first, second))| {
+            let poses = served.navigator.room().poses();
+            Some((poses.get(first.row())?, poses.get(second.row())?))
+        });
+
+    Ok(pb::EstimateMotionResponse {
+        true_motion: truth
+            .map(|(first, second)| convert::twist_to_wire(&body_twist(first, second))),
+        // The estimate as a pose: world_from_second = world_from_first · exp(motion).
+        error: truth.map(|(first, second)| {
+            convert::error_to_wire(
+                &StepError::of(first, &(first * exp(&twist)), second),
+                &thresholds,
+            )
+        }),
+        adapter: Some(pb::Revision {
+            name: stored.name.clone(),
+            revision: stored.revision,
+        }),
+        motion: Some(convert::twist_to_wire(&twist)),
+        reader: pb::MotionReader::Adapter.into(),
+        covariance: Vec::new(),
+    })
+}
+
+/// The answer of the two-view reader; none if the request names an adapter, this server has no
+/// reader, a view is not an image, or the camera is not known.
+fn by_two_views(
+    snapshot: &Snapshot,
+    request: &pb::EstimateMotionRequest,
+    cancel: &Cancellation,
+) -> Result<Option<pb::EstimateMotionResponse>, Error> {
+    // What is stated must hold, whoever reads the motion.
+    let stated = request.camera.as_ref().map(convert::pinhole).transpose()?;
+
+    let (Some(reader), Some(first), Some(second), "") = (
+        snapshot.two_views(),
+        image(request.first.as_ref()),
+        image(request.second.as_ref()),
+        request.adapter.as_str(),
+    ) else {
+        return Ok(None);
+    };
+
+    let of_room = if request.room.is_empty() {
+        None
+    } else {
+        snapshot.room(&request.room)?.summary.provenance.camera
+    };
+    let Some(camera) = stated.or(of_room) else {
+        if request.room.is_empty() && snapshot.adapters().is_empty() {
+            return Err(Error::invalid(
+                "camera",
+                "is required to compare two images: this server has no adapter to read them",
+            ));
+        }
+
+        return Ok(None);
+    };
+
+    let estimate = reader.read(first, second, &camera, cancel)?;
+    let reader = if estimate.is_estimated {
+        pb::MotionReader::TwoView
+    } else {
+        pb::MotionReader::None
+    };
+
+    Ok(Some(pb::EstimateMotionResponse {
+        adapter: None,
+        motion: Some(convert::twist_to_wire(&estimate.twist())),
+        true_motion: None,
+        error: None,
+        reader: reader.into(),
+        covariance: convert::matrix_to_wire(&estimate.covariance),
+    }))
+}
+
+fn image(view: Option<&pb::View>) -> Option<&[u8]> {
+    match view?.view.as_ref()? {
+        pb::view::View::Image(image) => Some(image),
+        _ => None,
+    }
+}
+
+/// Embeds views under one adapter, and knows the room that stored frames are of.
+pub(super) struct ViewReader<'a> {
+    snapshot: &'a Snapshot,
+    served: Option<Arc<ServedNavigator>>,
+    pub stored: Arc<StoredAdapter>,
+}
+
+/// A view under an adapter.
+pub(super) struct EmbeddedView {
+    /// Shape (k,).
+    pub latent: Array1<f64>,
+    /// Shape (d,); of a view that was sent as a feature or an image.
+    pub feature: Option<Vec<f32>>,
+}
+
+impl<'a> ViewReader<'a> {
+    /// A room is only needed to look up views that are frames; features, latents and images need no
+    /// more than the adapter.
+    pub fn of(snapshot: &'a Snapshot, room: &str, adapter: &str) -> Result<Self, Error> {
+        if room.is_empty() {
+            return Ok(Self {
+                snapshot,
+                served: None,
+                stored: adapter_without_room(snapshot, adapter)?.clone(),
+            });
+        }
+
+        let served = snapshot.navigator(room, adapter)?;
+        Ok(Self {
+            snapshot,
+            stored: served.adapter.clone(),
+            served: Some(served),
+        })
+    }
+
+    /// One view, by itself, so that an error names the view at fault.
+    pub fn embedded(&self, field: &str, view: Option<pb::View>) -> Result<EmbeddedView, Error> {
+        let adapter = &self.stored.adapter;
+        let source = convert::source(field, view, &self.stored, self.snapshot)?;
+        let latent = |view: View| {
+            view.latent(adapter)
+                .map_err(|error| view_error(&error).within(field))
+        };
+
+        match source {
+            Source::Feature(feature) => Ok(EmbeddedView {
+                latent: latent(View::Feature(feature.clone()))?,
+                feature: Some(feature),
+            }),
+            Source::Latent(values) => Ok(EmbeddedView {
+                latent: latent(View::Latent(values))?,
+                feature: None,
+            }),
+            Source::Frame(frame) => {
+                let served = self.served.as_ref().ok_or_else(|| {
+                    Error::invalid("room", format!("is required: {field} is a frame"))
+                })?;
+
+                let unknown = |_| Error::no_frame(&format!("{field}.frame_id"), frame);
+                served.navigator.room().pose(frame).map_err(unknown)?;
+                Ok(EmbeddedView {
+                    latent: served.navigator.latents().row(frame.row()).to_owned(),
+                    feature: None,
+                })
+            }
+        }
+    }
+}
+
+/// The adapter of a request that names no room: the one it names, or the only one.
+fn adapter_without_room<'a>(
+    snapshot: &'a Snapshot,
+    adapter: &str,
+) -> Result<&'a Arc<StoredAdapter>, Error> {
+    if !adapter.is_empty() {
+        return snapshot.adapter(adapter);
+    }
+
+    match snapshot.adapters().len() {
+        1 => snapshot.adapters().values().next().ok_or(Error::Internal),
+        count => {
+            let problem = format!(
+                "is required when no room is named: the server has {count} adapters; where it has a two-view model, a \
+                 camera does in its place, for two images"
+            );
+            Err(Error::invalid("adapter", problem))
+        }
+    }
+}

@@ -1,0 +1,325 @@
+//! LocalizationService.Relocalize: finds the room a camera is in, and its pose there, without any
+//! prior. Also chooses the rooms and maps for Track.
+
+use std::sync::Arc;
+
+use ndarray::Array1;
+use tonic::{Request, Response, Status};
+
+use super::convert;
+use super::localization::{located_by, rooms_under};
+use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
+use super::status::view_error;
+use super::workers::Lane;
+use super::{Error, Handlers};
+use seese3_client::proto::v1 as pb;
+use seese3_core::cancel::Cancellation;
+use seese3_core::navigation::{RetrievedFrame, Source};
+use seese3_robot::tracking::{self, Map, MapQuery, RoomMatch, View, relocalize};
+use seese3_store::StoredAdapter;
+
+/// Rooms in an answer if the request does not say how many.
+const ROOMS: u32 = 3;
+/// The largest number of views in one request.
+const MAX_VIEWS: usize = 256;
+
+impl Handlers {
+    /// Answers a Relocalize request on a worker thread.
+    pub(super) async fn relocalized(
+        &self,
+        request: Request<pb::RelocalizeRequest>,
+    ) -> Result<Response<pb::RelocalizeResponse>, Status> {
+        let most = self.config.limits.top_k;
+        self.unary(
+            request,
+            |request| Lane::of(&request.views),
+            move |snapshot, request, cancel| answer(snapshot, request, most, cancel),
+        )
+        .await
+    }
+}
+
+fn answer(
+    snapshot: &Snapshot,
+    request: pb::RelocalizeRequest,
+    most: u32,
+    cancel: &Cancellation,
+) -> Result<pb::RelocalizeResponse, Error> {
+    let pb::RelocalizeRequest {
+        rooms,
+        adapter,
+        views,
+        max_rooms,
+        top_k,
+    } = request;
+
+    let within = |field: &str, given: Option<u32>, plain: u32| match given.unwrap_or(plain) {
+        count if (1..=most).contains(&count) => Ok(count as usize),
+        count => Err(Error::invalid(
+            field,
+            format!("must be 1 to {most}, got {count}"),
+        )),
+    };
+
+    // All rooms are compared; `shown` only limits how many of them the answer lists.
+    let shown = within("max_rooms", max_rooms, ROOMS)?;
+    let top_k = within("top_k", top_k, 1)?;
+
+    if views.is_empty() || views.len() > MAX_VIEWS {
+        return Err(Error::invalid(
+            "views",
+            format!("must be 1 to {MAX_VIEWS}, got {}", views.len()),
+        ));
+    }
+
+    let served = rooms_to_track_in(snapshot, &rooms, &adapter)?;
+    let maps = maps(&served)?;
+    let stored = &served[0].adapter;
+    let views = embedded(views, stored, snapshot, cancel)?;
+    let queries: Vec<MapQuery<'_>> = views
+        .iter()
+        .map(|view| MapQuery {
+            latent: view.latent.view(),
+            feature: view.feature.as_deref(),
+        })
+        .collect();
+    let found = relocalize(&maps, &queries, top_k, cancel).map_err(|error| match error {
+        tracking::Error::Cancelled => Error::Cancelled,
+        _ => Error::Internal,
+    })?;
+
+    let newest = views.last().and_then(|view| view.feature.as_deref());
+    let shown = found.rooms.iter().take(shown);
+    let rooms = shown.map(|room| room_to_wire(room, &served, newest));
+
+    Ok(pb::RelocalizeResponse {
+        adapter: Some(convert::adapter_revision(&served[0])),
+        rooms: rooms.collect::<Result<_, _>>()?,
+        room_count: served.len() as u32,
+        margin: found.margin.is_finite().then_some(found.margin),
+        ambiguous: found.ambiguous,
+        reason: found.reason,
+    })
+}
+
+/// A view under the adapter.
+struct EmbeddedView {
+    latent: Array1<f64>,
+    /// Its raw feature, unless it came as a latent.
+    feature: Option<Vec<f32>>,
+}
+
+/// Embeds the views of a request one by one, with a check for cancellation before each, since an
+/// image may have to be encoded.
+fn embedded(
+    views: Vec<pb::View>,
+    stored: &StoredAdapter,
+    snapshot: &Snapshot,
+    cancel: &Cancellation,
+) -> Result<Vec<EmbeddedView>, Error> {
+    let mut embedded = Vec::with_capacity(views.len());
+    for (position, view) in views.into_iter().enumerate() {
+        cancel.check()?;
+        let field = format!("views[{position}]");
+
+        let view = match convert::source(&field, Some(view), stored, snapshot)? {
+            Source::Feature(feature) => View::Feature(feature),
+            Source::Latent(latent) => View::Latent(latent),
+            Source::Frame(_) => {
+                return Err(Error::invalid(
+                    format!("{field}.frame_id"),
+                    "is a stored frame; give a feature, a latent or an image of the camera",
+                ));
+            }
+        };
+
+        let latent = view
+            .latent(&stored.adapter)
+            .map_err(|error| view_error(&error).within(&field))?;
+        let feature = match view {
+            View::Feature(feature) => Some(feature),
+            View::Latent(_) => None,
+        };
+        embedded.push(EmbeddedView { latent, feature });
+    }
+
+    Ok(embedded)
+}
+
+/// The rooms to track or relocalise in, all under one adapter; at least one. If no adapter is
+/// named, only those that can track in these rooms are considered: the first of a single room, else
+/// the only one. Where all rooms are searched, those that are too small to track in are left out.
+///
+/// # Errors
+/// [`Error::Invalid`] on `adapter` if several can track; else as [`rooms_under`].
+pub fn rooms_to_track_in(
+    snapshot: &Snapshot,
+    rooms: &[String],
+    adapter: &str,
+) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+    let mut served = rooms_by_adapter(snapshot, rooms, adapter)?;
+    if rooms.is_empty() && served.iter().any(|served| served.map.is_some()) {
+        served.retain(|served| served.map.is_some());
+    }
+
+    Ok(served)
+}
+
+fn rooms_by_adapter(
+    snapshot: &Snapshot,
+    rooms: &[String],
+    adapter: &str,
+) -> Result<Vec<Arc<ServedNavigator>>, Error> {
+    if !adapter.is_empty() {
+        return rooms_under(snapshot, rooms, adapter);
+    }
+
+    let fitting = match rooms {
+        [] => adapters_that_track_anywhere(snapshot),
+        [room] => default_that_tracks(snapshot, room),
+        several => adapters_that_track_in_all(snapshot, several),
+    };
+
+    // If no adapter can track here, `rooms_under` still chooses one: `maps` then says what that
+    // adapter or room lacks.
+    match fitting.as_slice() {
+        [] => rooms_under(snapshot, rooms, ""),
+        [only] => rooms_under(snapshot, rooms, only),
+        several => {
+            let problem = format!(
+                "is required: {} adapters can track in these rooms ({})",
+                several.len(),
+                several.join(", ")
+            );
+            Err(Error::invalid("adapter", problem))
+        }
+    }
+}
+
+/// The names of the adapters that can track in a room, if it is large enough; its default first.
+fn adapters_that_track(snapshot: &Snapshot, room: &ServedRoom) -> Vec<String> {
+    let adapters = snapshot.adapters_of(room);
+    let tracks = |adapter: &&Arc<StoredAdapter>| adapter.adapter.error_model().is_some();
+
+    adapters
+        .iter()
+        .filter(tracks)
+        .map(|adapter| adapter.name.clone())
+        .collect()
+}
+
+/// Where no room is named, one room is enough: every adapter that can track in some room, by name.
+fn adapters_that_track_anywhere(snapshot: &Snapshot) -> Vec<String> {
+    let mut names: Vec<String> = snapshot
+        .rooms()
+        .values()
+        .flat_map(|room| adapters_that_track(snapshot, room))
+        .collect();
+    names.sort_unstable();
+    names.dedup();
+    names
+}
+
+/// In one room, its own default among the adapters that can track.
+fn default_that_tracks(snapshot: &Snapshot, room: &str) -> Vec<String> {
+    let mut names = snapshot
+        .rooms()
+        .get(room)
+        .map_or_else(Vec::new, |room| adapters_that_track(snapshot, room));
+    names.truncate(1);
+    names
+}
+
+/// Several named rooms need an adapter that can track in every one of them; they have no common
+/// order of preference, so the names are sorted.
+fn adapters_that_track_in_all(snapshot: &Snapshot, rooms: &[String]) -> Vec<String> {
+    let mut named = rooms.iter().filter_map(|room| snapshot.rooms().get(room));
+    let mut names = named
+        .next()
+        .map_or_else(Vec::new, |room| adapters_that_track(snapshot, room));
+    for room in named {
+        let here = adapters_that_track(snapshot, room);
+        names.retain(|name| here.contains(name));
+    }
+
+    names.sort_unstable();
+    names.dedup();
+    names
+}
+
+/// The maps of these rooms, which trackers and relocalisation match against.
+///
+/// # Errors
+/// [`Error::Precondition`] if a room has no map, because its adapter is not calibrated or because
+/// the room is too small. The message says which.
+pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
+    let map = |served: &Arc<ServedNavigator>| {
+        let name = &served.adapter.name;
+        let room = served.navigator.room().id();
+
+        served.map.clone().ok_or_else(|| {
+            Error::Precondition(match served.adapter.adapter.error_model() {
+                None => format!(
+                    "adapter '{name}' neither tracks nor relocalises: its errors were not measured in two or more rooms that \
+                     it did not learn from; train it with --calibrate-on"
+                ),
+                Some(_) => format!("room '{room}' has too few distinct frames to track in"),
+            })
+        })
+    };
+
+    served.iter().map(map).collect()
+}
+
+/// A room of the answer; `newest` is the feature of the newest view, if it has one.
+fn room_to_wire(
+    found: &RoomMatch,
+    served: &[Arc<ServedNavigator>],
+    newest: Option<&[f32]>,
+) -> Result<pb::RoomMatch, Error> {
+    let served = &served[found.map];
+    let room = served.navigator.room();
+
+    // An adapter that was fitted to the room reads it better than the one that tells rooms apart.
+    let located = match (served.room_reader(), newest) {
+        (Some(reader), Some(feature)) => Some(located_by(reader, feature, room.id())?),
+        _ => None,
+    };
+
+    // The distances of these frames are in standard deviations of frame noise, unlike those of
+    // Localize.
+    let retrieved = |neighbour: &seese3_core::index::Neighbour| {
+        let retrieved = RetrievedFrame {
+            neighbour: *neighbour,
+            pose: room.poses()[neighbour.frame.row()],
+        };
+        convert::retrieved_to_wire(&retrieved, room)
+    };
+
+    // It is believed where the views look like the room. Else the pose and covariance are those of
+    // the newest view, read from its nearest frame.
+    let believed = located
+        .as_ref()
+        .filter(|_| found.out_of_distribution <= 1.0);
+    let (pose, covariance) = match believed {
+        Some(located) => (located.pose.clone(), located.covariance.clone()),
+        None => {
+            let anchor = &found.last.anchor.belief;
+            let pose = convert::pose_to_wire(&anchor.pose, room.id().as_str());
+            (
+                Some(pose),
+                convert::matrix_to_wire(&anchor.ros_covariance()),
+            )
+        }
+    };
+
+    Ok(pb::RoomMatch {
+        room: Some(convert::room_revision(served)),
+        distance: found.distance,
+        out_of_distribution: found.out_of_distribution,
+        pose,
+        covariance,
+        frames: found.last.nearest.iter().map(retrieved).collect(),
+        located,
+    })
+}

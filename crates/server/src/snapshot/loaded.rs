@@ -1,0 +1,122 @@
+//! A room in memory: what answers in it are computed from.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use super::Refusal;
+use super::content::Content;
+use seese3_core::eval::TrainedOn;
+use seese3_core::features::FeatureSource;
+use seese3_core::navigation::Navigator;
+use seese3_robot::fitting::RoomReader;
+use seese3_robot::tracking::Map;
+use seese3_store::StoredAdapter;
+
+/// An adapter that fits a room by its features.
+#[derive(Clone)]
+pub struct Candidate {
+    /// The revision that is to serve the room.
+    pub adapter: Arc<StoredAdapter>,
+    /// The revision before, which goes on where the new one cannot serve the room.
+    pub earlier: Option<Arc<StoredAdapter>>,
+}
+
+/// What answers in a room are computed from.
+pub struct LoadedRoom {
+    /// One for each adapter that serves the room, in order of preference.
+    pub navigators: Vec<Arc<ServedNavigator>>,
+    /// Adapters that fit by their features and still cannot serve the room, by name.
+    pub refused: BTreeMap<String, Refusal>,
+}
+
+/// A room under one adapter that fits it.
+pub struct ServedNavigator {
+    /// Retrieves frames and plans motions in the latents of this adapter.
+    pub navigator: Arc<Navigator>,
+    /// The map for tracking and relocalisation; none if the adapter is not calibrated or the room
+    /// is too small.
+    pub map: Option<Arc<Map>>,
+    /// The adapter as it is stored, with its training record.
+    pub adapter: Arc<StoredAdapter>,
+    /// The identity of the adapter and the room's frames.
+    pub content: Content,
+    /// The room's revision.
+    pub room_revision: u64,
+    /// What the adapter has seen of this room.
+    pub trained_on: TrainedOn,
+    /// Locates single views, where the adapter was fitted to these very frames.
+    pub reader: Option<Arc<RoomReader>>,
+    /// The reader of an adapter that comes before this one, from which the map takes its anchors.
+    pub(super) tracking_reader: Option<Arc<RoomReader>>,
+}
+
+impl LoadedRoom {
+    /// The room under an adapter of this name.
+    pub fn under_any(&self, adapter: &str) -> Option<&Arc<ServedNavigator>> {
+        self.navigators
+            .iter()
+            .find(|served| served.adapter.name == adapter)
+    }
+
+    /// The room under this revision of an adapter, if trackers there take their anchors from
+    /// `tracking_reader`.
+    pub(super) fn under(
+        &self,
+        adapter: &StoredAdapter,
+        tracking_reader: Option<&Arc<RoomReader>>,
+    ) -> Option<&Arc<ServedNavigator>> {
+        let is_same_reader =
+            |served: &ServedNavigator| match (&served.tracking_reader, tracking_reader) {
+                (Some(before), Some(now)) => Arc::ptr_eq(before, now),
+                (None, None) => true,
+                _ => false,
+            };
+
+        self.navigators
+            .iter()
+            .find(|served| served.is_of(adapter) && is_same_reader(served))
+    }
+
+    /// About how much memory it holds, bytes.
+    pub(super) fn memory_bytes(&self) -> usize {
+        let room = self.navigators.first();
+        let room = room.map_or(0, |served| served.navigator.room().memory_bytes());
+        let navigators = self.navigators.iter();
+
+        room + navigators
+            .map(|served| served.memory_bytes())
+            .sum::<usize>()
+    }
+}
+
+impl ServedNavigator {
+    /// The reader of the adapter that was fitted to this room, if there is one for features of this
+    /// adapter's source; that of the newest of several.
+    pub fn room_reader(&self) -> Option<&RoomReader> {
+        let newest = self.tracking_reader.as_ref().or(self.reader.as_ref());
+        newest.map(Arc::as_ref)
+    }
+
+    fn is_of(&self, adapter: &StoredAdapter) -> bool {
+        self.adapter.name == adapter.name && self.adapter.revision == adapter.revision
+    }
+
+    fn memory_bytes(&self) -> usize {
+        let map = self.map.as_ref().map_or(0, |map| map.memory_bytes());
+        let reader = self.reader.as_ref();
+        let reader = reader.map_or(0, |reader| reader.localizer.memory_bytes());
+
+        self.navigator.memory_bytes() + map + reader
+    }
+}
+
+/// The reader of the first adapter for features of this source that has one.
+pub(super) fn reader_of<'a>(
+    navigators: &'a [Arc<ServedNavigator>],
+    source: &FeatureSource,
+) -> Option<&'a Arc<RoomReader>> {
+    navigators
+        .iter()
+        .filter(|served| served.adapter.adapter.source().is_like(source))
+        .find_map(|served| served.reader.as_ref())
+}

@@ -1,0 +1,535 @@
+//! Loading a store into a [`Snapshot`], once at the start and again whenever the store has changed.
+//!
+//! - What did not change is taken over from the snapshot before, so that a reload costs what
+//!   changed and no more.
+//! - A room or an adapter that cannot be loaded is refused by itself. If an older revision of it is
+//!   being served, that goes on; where rooms are not loaded ahead, as far as the manifest tells.
+//! - A revision that is damaged is not tried again, unless that is asked for. One that could not be
+//!   read is tried at every look.
+
+use std::collections::BTreeMap;
+use std::num::NonZero;
+use std::sync::Arc;
+
+use futures_util::StreamExt;
+use tokio::runtime::Handle;
+
+use super::super::image_encoder::{self, ImageEncoder, ImageEncoders};
+use super::super::metrics::Metrics;
+use super::super::two_views::TwoViewReader;
+use super::super::{Config, RunError};
+use super::cache::RoomCache;
+use super::loaded::Candidate;
+use super::room_loading::{Problem, RoomLoader, contained};
+use super::served::ServedRoom;
+use super::{Refusal, Snapshot};
+use seese3_core::features::FeatureSource;
+use seese3_core::room::RoomId;
+use seese3_store::{Defaults, Kind, RoomFit, StandingDefaults, Store, StoredAdapter};
+
+/// Whether revisions that were refused before are tried again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refused {
+    TryAgain,
+    LeaveOut,
+}
+
+/// Which rooms are in memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RoomMemory {
+    /// Whether every room is loaded, and thereby verified, before it is served. Else a room is
+    /// loaded when it is first asked for.
+    pub preload: bool,
+    /// About how many bytes the rooms in memory may hold together; none for no bound.
+    pub bytes: Option<usize>,
+}
+
+impl Default for RoomMemory {
+    fn default() -> Self {
+        Self {
+            preload: true,
+            bytes: None,
+        }
+    }
+}
+
+/// What became of a room.
+struct TriedRoom {
+    served: Option<Arc<ServedRoom>>,
+    /// Why its current revision is not what is served.
+    refusal: Option<Refusal>,
+}
+
+/// Loads the snapshots of one server.
+#[derive(Clone)]
+pub struct Loader {
+    store: Store,
+    rooms: Arc<RoomCache>,
+    memory: RoomMemory,
+    encoders: Option<ImageEncoders>,
+    two_views: Option<Arc<TwoViewReader>>,
+    metrics: Metrics,
+}
+
+impl Loader {
+    /// A loader of `store`, on a blocking thread. The models of the operator are read now.
+    ///
+    /// # Errors
+    /// [`RunError::Model`] or [`RunError::TwoView`] if a model cannot be used.
+    pub async fn open(store: Store, config: &Config) -> Result<Self, RunError> {
+        let Config {
+            index,
+            rooms: memory,
+            encoders,
+            metrics,
+            ..
+        } = config.clone();
+
+        blocking(move || {
+            if let Some(encoders) = &encoders {
+                image_encoder::check_models(&encoders.models)?;
+            }
+            let two_views = TwoViewReader::open(encoders.as_ref())?.map(Arc::new);
+
+            let loader = RoomLoader {
+                store: store.clone(),
+                index,
+            };
+            let rooms = Arc::new(RoomCache::new(loader, memory.bytes));
+            count_rooms(&rooms, &metrics);
+
+            Ok(Self {
+                store,
+                rooms,
+                memory,
+                encoders,
+                two_views,
+                metrics,
+            })
+        })
+        .await
+    }
+
+    /// Loads every room and adapter for the first time. A store without a room is refused unless
+    /// rooms can be added to it through this server.
+    ///
+    /// # Errors
+    /// [`RunError::Store`] if the store cannot be listed, [`RunError::NoRoom`] if it has no room,
+    /// [`RunError::NoneServed`] if none of its rooms can be served.
+    pub async fn first(&self, is_writable: bool) -> Result<Snapshot, RunError> {
+        let location = self.store.location().to_owned();
+        let snapshot = self
+            .load(Arc::new(Snapshot::default()), Refused::TryAgain)
+            .await?;
+
+        if !snapshot.rooms.is_empty() {
+            if let Some(encoders) = &self.encoders {
+                image_encoder::warn_of_unneeded(&encoders.models, &snapshot.adapters);
+            }
+            return Ok(snapshot);
+        }
+        match snapshot.refused.rooms.iter().next() {
+            None if is_writable => Ok(snapshot),
+            None => Err(RunError::NoRoom { location }),
+            Some((room, refusal)) => Err(RunError::NoneServed {
+                room: room.clone(),
+                reason: refusal.reason.clone(),
+            }),
+        }
+    }
+
+    /// Whether the store has rooms, or had some that were removed from it. One that has vanished,
+    /// for instance with its disk, has neither.
+    pub async fn remembers_rooms(&self) -> bool {
+        self.store.remembers(Kind::Room).await.unwrap_or(false)
+    }
+
+    /// Loads what differs from `before`, on a blocking thread.
+    ///
+    /// # Errors
+    /// [`RunError::Store`] if the store cannot be listed. Everything else is refused by itself.
+    pub async fn load(
+        &self,
+        before: Arc<Snapshot>,
+        refused: Refused,
+    ) -> Result<Snapshot, RunError> {
+        // Loading mixes reads with long computation (embedding, indexing). On an async thread it
+        // would hold up health checks and requests.
+        let loader = self.clone();
+        let runtime = Handle::current();
+        blocking(move || runtime.block_on(loader.load_now(&before, refused))).await
+    }
+
+    async fn load_now(
+        &self,
+        before: &Arc<Snapshot>,
+        refused: Refused,
+    ) -> Result<Snapshot, RunError> {
+        let mut loaded = Snapshot {
+            two_views: self.two_views.clone(),
+            ..Snapshot::default()
+        };
+
+        let defaults = self.defaults(&mut loaded, before).await?;
+        for (name, revision) in self.store.current_adapters(&defaults).await? {
+            self.add_adapter(&mut loaded, before, refused, name, revision)
+                .await;
+        }
+        self.add_image_encoders(&mut loaded, before, refused);
+
+        let rooms = self.store.current_rooms(&defaults).await?;
+        for (name, _) in &rooms {
+            let chosen = defaults.adapter(name).map(str::to_owned);
+            loaded
+                .default_adapters
+                .extend(chosen.map(|adapter| (name.clone(), adapter)));
+        }
+        self.add_rooms(&mut loaded, before, refused, rooms).await?;
+
+        Ok(loaded)
+    }
+
+    /// Adds rooms, each in its current revision. While no room is served, they are loaded on all
+    /// processors at the same time; later one after another, because requests are answered.
+    async fn add_rooms(
+        &self,
+        loaded: &mut Snapshot,
+        before: &Arc<Snapshot>,
+        refused: Refused,
+        rooms: Vec<(String, u64)>,
+    ) -> Result<(), RunError> {
+        let at_once = match before.rooms.is_empty() {
+            true => std::thread::available_parallelism().map_or(1, NonZero::get),
+            false => 1,
+        };
+        let adapters = Arc::new(loaded.adapters.clone());
+        let tried = rooms.into_iter().map(|(name, revision)| {
+            let (loader, before, adapters) = (self.clone(), before.clone(), adapters.clone());
+            let runtime = Handle::current();
+            blocking(move || {
+                let tried = loader.tried_room(&name, revision, &adapters, &before, refused);
+                let tried = runtime.block_on(tried);
+                Ok((name, tried))
+            })
+        });
+
+        let mut tried = futures_util::stream::iter(tried).buffered(at_once);
+        while let Some(tried) = tried.next().await {
+            let (name, TriedRoom { served, refusal }) = tried?;
+            loaded.rooms.extend(served.map(|room| (name.clone(), room)));
+            let refusals = &mut loaded.refused.rooms;
+            refusals.extend(refusal.map(|refusal| (name, refusal)));
+        }
+
+        Ok(())
+    }
+
+    /// The choices of an operator. If the file of the newest ones is damaged, those before it hold.
+    async fn defaults(
+        &self,
+        loaded: &mut Snapshot,
+        before: &Snapshot,
+    ) -> Result<Defaults, RunError> {
+        let StandingDefaults { defaults, refused } = self.store.standing_defaults().await?;
+
+        let reason = refused.map(|problem| problem.to_string());
+        if let Some(reason) = &reason
+            && before.refused.defaults.as_ref() != Some(reason)
+        {
+            tracing::error!(
+                reason,
+                "the newest choices of defaults cannot be read: older ones hold, or none; take the \
+                 last change back with `seese3 store default --back`"
+            );
+        }
+
+        loaded.refused.defaults = reason;
+        Ok(defaults)
+    }
+
+    /// Adds the current revision of an adapter; if it is refused, the one that was served before.
+    async fn add_adapter(
+        &self,
+        loaded: &mut Snapshot,
+        before: &Snapshot,
+        refused: Refused,
+        name: String,
+        revision: u64,
+    ) {
+        let known = before.adapters.get(&name);
+        if let Some(same) = known.filter(|known| known.revision == revision) {
+            loaded.adapters.insert(name, same.clone());
+            return;
+        }
+
+        let refusal = match kept(&before.refused.adapters, &name, revision, refused) {
+            Some(refusal) => refusal,
+            None => match self.adapter(&name, revision).await {
+                Ok(stored) => {
+                    loaded.adapters.insert(name, Arc::new(stored));
+                    return;
+                }
+                Err(problem) => {
+                    let refusal = Refusal::new(revision, &problem);
+                    log_refusal(
+                        "adapter",
+                        &name,
+                        before.refused.adapters.get(&name),
+                        &refusal,
+                    );
+                    refusal
+                }
+            },
+        };
+
+        if let Some(known) = known {
+            loaded.adapters.insert(name.clone(), known.clone());
+        }
+        loaded.refused.adapters.insert(name, refusal);
+    }
+
+    async fn adapter(&self, name: &str, revision: u64) -> Result<StoredAdapter, Problem> {
+        let load = async { Ok(self.store.load_adapter(name, Some(revision)).await?) };
+        contained(load).await
+    }
+
+    /// Adds the image encoders of all adapters. An adapter whose encoder cannot be used is served
+    /// without one: callers may still send features. One that failed before is tried again when
+    /// that is asked for.
+    fn add_image_encoders(&self, loaded: &mut Snapshot, before: &Snapshot, refused: Refused) {
+        let Some(encoders) = &self.encoders else {
+            return;
+        };
+
+        // Adapters that were trained on features of the same source share one encoder, because
+        // loading a model is expensive.
+        let mut opened: Vec<(FeatureSource, Option<Arc<ImageEncoder>>)> = Vec::new();
+        for (name, adapter) in &before.adapters {
+            let encoder = before.image_encoders.get(name).cloned();
+            if encoder.is_some() || refused == Refused::LeaveOut {
+                opened.push((adapter.adapter.source().clone(), encoder));
+            }
+        }
+
+        for (name, adapter) in &loaded.adapters {
+            let source = adapter.adapter.source();
+            let encoder = match opened.iter().find(|(other, _)| other.is_like(source)) {
+                Some((_, encoder)) => encoder.clone(),
+                None => {
+                    let encoder = opened_for(name, source, encoders)
+                        .map(|encoder| Arc::new(encoder.counted_in(self.metrics.clone())));
+                    opened.push((source.clone(), encoder.clone()));
+                    encoder
+                }
+            };
+            if let Some(encoder) = encoder {
+                loaded.image_encoders.insert(name.clone(), encoder);
+            }
+        }
+    }
+
+    /// The current revision of a room; if it is refused, the one that was served before.
+    async fn tried_room(
+        &self,
+        name: &str,
+        revision: u64,
+        adapters: &BTreeMap<String, Arc<StoredAdapter>>,
+        before: &Snapshot,
+        refused: Refused,
+    ) -> TriedRoom {
+        let known = before.rooms.get(name);
+        let same = known.filter(|known| known.summary.revision == revision);
+        if let Some(same) = same
+            && is_up_to_date(same, adapters, refused)
+        {
+            return TriedRoom {
+                served: Some(same.clone()),
+                refusal: None,
+            };
+        }
+
+        let refusal = match kept(&before.refused.rooms, name, revision, refused) {
+            Some(refusal) => refusal,
+            None => match self.room(name, revision, adapters, known).await {
+                Ok(room) => {
+                    return TriedRoom {
+                        served: Some(Arc::new(room)),
+                        refusal: None,
+                    };
+                }
+                Err(refusal) => {
+                    log_refusal("room", name, before.refused.rooms.get(name), &refusal);
+                    refusal
+                }
+            },
+        };
+
+        TriedRoom {
+            served: known.cloned(),
+            refusal: Some(refusal),
+        }
+    }
+
+    /// A room that is to be served. `known` is the room as it was served before: what is in memory
+    /// of it is loaded anew now, so that no request has to wait for it.
+    async fn room(
+        &self,
+        name: &str,
+        revision: u64,
+        adapters: &BTreeMap<String, Arc<StoredAdapter>>,
+        known: Option<&Arc<ServedRoom>>,
+    ) -> Result<ServedRoom, Refusal> {
+        let refusal =
+            |problem: seese3_store::Error| Refusal::new(revision, &Problem::Store(problem));
+
+        let summary = self.store.room_summary(name, Some(revision)).await;
+        let summary = summary.map_err(refusal)?;
+        let id = RoomId::new(name).map_err(|error| {
+            refusal(seese3_store::Error::Damaged {
+                file: format!("rooms/{name}"),
+                problem: error.to_string(),
+            })
+        })?;
+
+        let serving = known.map_or_else(Vec::new, |known| known.adapters());
+        let candidate = |adapter: Arc<StoredAdapter>| {
+            let is_earlier = |served: &&Arc<StoredAdapter>| {
+                served.name == adapter.name && served.revision != adapter.revision
+            };
+            Candidate {
+                earlier: serving.iter().find(is_earlier).cloned(),
+                adapter,
+            }
+        };
+        let fitting = fitting(adapters, &id, &summary.features);
+        let candidates = fitting.into_iter().map(candidate).collect();
+
+        let room = ServedRoom::new(id, summary, candidates, self.rooms.clone());
+        if self.memory.preload || known.is_some_and(|known| known.in_memory().is_some()) {
+            let same = known.filter(|known| known.summary.revision == revision);
+            room.preload(same.map(AsRef::as_ref)).await?;
+        }
+        Ok(room)
+    }
+}
+
+/// Counts the rooms that are in memory.
+fn count_rooms(rooms: &Arc<RoomCache>, metrics: &Metrics) {
+    let counted = rooms.clone();
+    metrics.gauge_elsewhere(
+        "rooms_in_memory",
+        "Rooms whose frames, latents and indexes are in memory",
+        move || counted.size().0,
+    );
+
+    let counted = rooms.clone();
+    metrics.gauge_elsewhere(
+        "rooms_in_memory_bytes",
+        "About what the rooms in memory hold",
+        move || counted.size().1,
+    );
+}
+
+/// Whether a room is served as it would be if it were made anew.
+fn is_up_to_date(
+    room: &ServedRoom,
+    adapters: &BTreeMap<String, Arc<StoredAdapter>>,
+    refused: Refused,
+) -> bool {
+    let fitting = fitting(adapters, &room.id, &room.summary.features);
+    let tried = room.candidates.iter().map(|candidate| &candidate.adapter);
+    let is_same = |(tried, now): (&Arc<StoredAdapter>, &Arc<StoredAdapter>)| {
+        (&tried.name, tried.revision) == (&now.name, now.revision)
+    };
+    if tried.len() != fitting.len() || !tried.zip(&fitting).all(is_same) {
+        return false;
+    }
+
+    let in_room = room.refused_adapters();
+    let of_room = room.refusal();
+    let mut refusals = in_room.values().chain(&of_room);
+    match refused {
+        Refused::TryAgain => refusals.next().is_none(),
+        Refused::LeaveOut => !refusals.any(|refusal| refusal.may_pass),
+    }
+}
+
+/// Runs work on a blocking thread.
+async fn blocking<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, RunError> + Send + 'static,
+) -> Result<T, RunError> {
+    tokio::task::spawn_blocking(work)
+        .await
+        .map_err(|error| RunError::Loading(error.to_string()))?
+}
+
+/// Logs why a revision is refused, unless that has been logged.
+fn log_refusal(kind: &str, name: &str, known: Option<&Refusal>, refusal: &Refusal) {
+    if known != Some(refusal) {
+        refusal.log(kind, name);
+    }
+}
+
+/// The refusal of a revision that is not to be tried again.
+fn kept(
+    before: &BTreeMap<String, Refusal>,
+    name: &str,
+    revision: u64,
+    refused: Refused,
+) -> Option<Refusal> {
+    before
+        .get(name)
+        .filter(|refusal| refused == Refused::LeaveOut && refusal.revision == revision)
+        .filter(|refusal| !refusal.may_pass)
+        .cloned()
+}
+
+/// The image encoder of an adapter; none if it is not at hand or cannot be used, which the log
+/// says.
+fn opened_for(
+    adapter: &str,
+    source: &FeatureSource,
+    encoders: &ImageEncoders,
+) -> Option<ImageEncoder> {
+    let opened: Result<_, seese3_encoder::Error> =
+        image_encoder::open_for(adapter, source, encoders);
+    opened.unwrap_or_else(|problem| {
+        tracing::error!(adapter, %problem, "the adapter is served without images");
+        None
+    })
+}
+
+/// The adapters that fit a room with features of these sources, in order of preference: those
+/// fitted to this room, then those trained in it, then the newest, and behind all of them those of
+/// experiments. The first is the room's default where an operator chose none.
+fn fitting(
+    adapters: &BTreeMap<String, Arc<StoredAdapter>>,
+    room: &RoomId,
+    sources: &[FeatureSource],
+) -> Vec<Arc<StoredAdapter>> {
+    // An adapter fits a room that has features made as its training features were. One that was
+    // fitted to a room serves that room alone.
+    let fits = |adapter: &&Arc<StoredAdapter>| {
+        let has_features = sources
+            .iter()
+            .any(|source| source.is_like(adapter.adapter.source()));
+        let is_of_another = |fit: &RoomFit| fit.room != *room;
+
+        has_features && !adapter.room_fit.as_ref().is_some_and(is_of_another)
+    };
+    let rank = |adapter: &StoredAdapter| {
+        let is_trained_here = adapter.record.rooms.iter().any(|(name, _)| name == room);
+        let is_fitted_here = adapter.room_fit.is_some();
+        (
+            !adapter.is_experiment,
+            is_fitted_here,
+            is_trained_here,
+            adapter.created.clone(),
+            adapter.name.clone(),
+        )
+    };
+
+    let mut ranked: Vec<Arc<StoredAdapter>> = adapters.values().filter(fits).cloned().collect();
+    ranked.sort_by_key(|adapter| std::cmp::Reverse(rank(adapter)));
+    ranked
+}

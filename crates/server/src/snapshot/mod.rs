@@ -1,0 +1,341 @@
+//! The rooms, adapters and image encoders that a server answers from, loaded, verified and
+//! immutable. [`Loader`] makes a new snapshot when the store has changed; requests in flight keep
+//! the one that they began with.
+
+mod cache;
+mod content;
+mod loading;
+mod room_loading;
+mod loaded;
+mod served;
+
+pub use content::frames_content;
+pub use loaded::ServedNavigator;
+pub use loading::{Loader, Refused, RoomMemory};
+use room_loading::Problem;
+pub use served::ServedRoom;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use super::Error;
+use super::auth::RoomScope;
+use super::image_encoder::ImageEncoder;
+use super::metrics::ServedCounts;
+use super::two_views::TwoViewReader;
+use seese3_store::StoredAdapter;
+
+/// A revision that is in the store and cannot be served.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Refusal {
+    /// The revision.
+    pub revision: u64,
+    /// Why, in words; it may name files of the store.
+    pub reason: String,
+    /// Whether it may be different next time: a file that could not be read, not one that is
+    /// damaged.
+    pub may_pass: bool,
+}
+
+impl Refusal {
+    fn new(revision: u64, problem: &Problem) -> Self {
+        Self {
+            revision,
+            reason: problem.to_string(),
+            may_pass: problem.may_pass(),
+        }
+    }
+
+    fn log(&self, kind: &str, name: &str) {
+        let Self {
+            revision, reason, ..
+        } = self;
+        tracing::error!(kind, name, revision, reason, "a revision cannot be served");
+    }
+}
+
+/// What is refused, by name.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Refusals {
+    /// Why the newest choices of defaults do not hold, and older ones do.
+    pub defaults: Option<String>,
+    pub rooms: BTreeMap<String, Refusal>,
+    pub adapters: BTreeMap<String, Refusal>,
+}
+
+/// The current revision of every room and adapter of a store that can be served.
+#[derive(Default)]
+pub struct Snapshot {
+    rooms: BTreeMap<String, Arc<ServedRoom>>,
+    /// The adapters that an operator chose, by room.
+    default_adapters: BTreeMap<String, String>,
+    adapters: BTreeMap<String, Arc<StoredAdapter>>,
+    image_encoders: BTreeMap<String, Arc<ImageEncoder>>,
+    two_views: Option<Arc<TwoViewReader>>,
+    refused: Refusals,
+}
+
+impl Snapshot {
+    /// What was found to be unfit to be served when this snapshot was made. An older revision of it
+    /// may be served instead.
+    pub fn refused(&self) -> &Refusals {
+        &self.refused
+    }
+
+    /// The same with the rooms of `scope` alone, and without adapters that were fitted to others.
+    pub fn seen_by(&self, scope: &RoomScope) -> Self {
+        let rooms = self.rooms.iter().filter(|(name, _)| scope.contains(name));
+        let is_seen = |(_, adapter): &(&String, &Arc<StoredAdapter>)| {
+            let fit = adapter.room_fit.as_ref();
+            fit.is_none_or(|fit| scope.contains(fit.room.as_str()))
+        };
+        let refused_rooms = self.refused.rooms.iter();
+
+        let chosen = self.default_adapters.iter();
+
+        Self {
+            rooms: owned(rooms),
+            default_adapters: owned(chosen.filter(|(name, _)| scope.contains(name))),
+            adapters: owned(self.adapters.iter().filter(is_seen)),
+            image_encoders: self.image_encoders.clone(),
+            two_views: self.two_views.clone(),
+            refused: Refusals {
+                rooms: owned(refused_rooms.filter(|(name, _)| scope.contains(name))),
+                // An adapter may be named after its room.
+                adapters: BTreeMap::new(),
+                defaults: None,
+            },
+        }
+    }
+
+    /// The image encoders alone.
+    pub fn without_rooms(&self) -> Self {
+        Self {
+            image_encoders: self.image_encoders.clone(),
+            ..Self::default()
+        }
+    }
+
+    /// How many adapters are refused in one of their rooms, over all rooms.
+    pub fn refused_in_rooms(&self) -> usize {
+        let rooms = self.rooms.values();
+        rooms.map(|room| room.refused_adapters().len()).sum()
+    }
+
+    /// How many rooms are refused, those included that turned out to be damaged when they were
+    /// first asked for.
+    pub fn refused_rooms(&self) -> usize {
+        let later = |(name, room): &(&String, &Arc<ServedRoom>)| {
+            room.refusal().is_some() && !self.refused.rooms.contains_key(*name)
+        };
+        self.refused.rooms.len() + self.rooms.iter().filter(later).count()
+    }
+
+    /// What is served and what is refused, for metrics.
+    pub(super) fn counts(&self) -> ServedCounts {
+        ServedCounts {
+            rooms: self.rooms.len(),
+            adapters: self.adapters().len(),
+            refused: [
+                ("room", self.refused_rooms()),
+                ("adapter", self.refused.adapters.len()),
+                ("adapter of a room", self.refused_in_rooms()),
+                ("defaults", usize::from(self.refused.defaults.is_some())),
+            ],
+        }
+    }
+
+    /// Whether requests for a room are answered, as far as is known.
+    pub fn answers_in(&self, room: &str) -> bool {
+        let room = self.rooms.get(room);
+        room.is_some_and(|room| room.refusal().is_none())
+    }
+
+    /// Whether both snapshots answer alike: every room and adapter was taken over unchanged.
+    pub fn is_like(&self, other: &Self) -> bool {
+        fn same<T>(ours: &BTreeMap<String, Arc<T>>, theirs: &BTreeMap<String, Arc<T>>) -> bool {
+            let is_same = |((name, ours), (other, theirs)): ((&String, &Arc<T>), _)| {
+                let (other, theirs): (&String, &Arc<T>) = (other, theirs);
+                name == other && Arc::ptr_eq(ours, theirs)
+            };
+            ours.len() == theirs.len() && ours.iter().zip(theirs).all(is_same)
+        }
+
+        same(&self.rooms, &other.rooms)
+            && same(&self.adapters, &other.adapters)
+            && same(&self.image_encoders, &other.image_encoders)
+            && self.default_adapters == other.default_adapters
+            && self.refused == other.refused
+    }
+
+    /// The reader of motions between two images, if this server has one.
+    pub fn two_views(&self) -> Option<&TwoViewReader> {
+        self.two_views.as_deref()
+    }
+
+    /// The image encoder of an adapter.
+    ///
+    /// # Errors
+    /// [`Error::Precondition`] if this server has no encoder for it.
+    pub fn image_encoder(&self, adapter: &StoredAdapter) -> Result<&ImageEncoder, Error> {
+        self.image_encoders.get(&adapter.name).map(AsRef::as_ref).ok_or_else(|| {
+            let encoder = &adapter.adapter.source().encoder;
+            Error::Precondition(format!(
+                "images cannot be sent for adapter '{}': this server has no encoder '{encoder}'; start it with \
+                 --encoder, name another adapter, or send the feature",
+                adapter.name
+            ))
+        })
+    }
+
+    /// How many rooms it has.
+    pub fn room_count(&self) -> usize {
+        self.rooms.len()
+    }
+
+    /// How many adapters it has.
+    pub fn adapter_count(&self) -> usize {
+        self.adapters.len()
+    }
+
+    /// Rooms by name.
+    pub fn rooms(&self) -> &BTreeMap<String, Arc<ServedRoom>> {
+        &self.rooms
+    }
+
+    /// Adapters by name.
+    pub fn adapters(&self) -> &BTreeMap<String, Arc<StoredAdapter>> {
+        &self.adapters
+    }
+
+    /// A room by name.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if the name is empty, [`Error::NotFound`] if there is no such room,
+    /// [`Error::Precondition`] if it is in the store and cannot be served.
+    pub fn room(&self, name: &str) -> Result<&Arc<ServedRoom>, Error> {
+        if name.is_empty() {
+            return Err(Error::invalid("room", "is required"));
+        }
+
+        self.rooms
+            .get(name)
+            .ok_or_else(|| match self.refused.rooms.get(name) {
+                Some(refusal) => refused_error("room", name, refusal),
+                None => Error::not_found("room", name, self.rooms.keys()),
+            })
+    }
+
+    /// An adapter by name.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if the name is empty, [`Error::NotFound`] if there is no such adapter,
+    /// [`Error::Precondition`] if it is in the store and cannot be served.
+    pub fn adapter(&self, name: &str) -> Result<&Arc<StoredAdapter>, Error> {
+        if name.is_empty() {
+            return Err(Error::invalid("adapter", "is required"));
+        }
+
+        self.adapters
+            .get(name)
+            .ok_or_else(|| match self.refused.adapters.get(name) {
+                Some(refusal) => refused_error("adapter", name, refusal),
+                None => Error::not_found("adapter", name, self.adapters.keys()),
+            })
+    }
+
+    /// The adapters that serve a room, the default first.
+    pub fn adapters_of(&self, room: &ServedRoom) -> Vec<Arc<StoredAdapter>> {
+        let chosen = self.default_adapters.get(room.id.as_str());
+        let mut adapters = room.adapters();
+
+        // Stable, so that the others keep their order.
+        adapters.sort_by_key(|adapter| chosen != Some(&adapter.name));
+        adapters
+    }
+
+    /// The default adapter of a room: the one that an operator chose, or the one that is preferred.
+    fn default_adapter(&self, room: &ServedRoom) -> Result<Arc<StoredAdapter>, Error> {
+        let id = &room.id;
+        let first = self.adapters_of(room).into_iter().next();
+
+        // Another adapter in place of the one that was chosen would be a silent change of answers.
+        match (self.default_adapters.get(id.as_str()), first) {
+            (Some(chosen), first) if first.as_ref().is_none_or(|first| first.name != *chosen) => {
+                Err(Error::Precondition(format!(
+                    "adapter '{chosen}' was chosen as the default of room '{id}' and does not serve \
+                     it; name another, or choose another"
+                )))
+            }
+            (_, Some(first)) => Ok(first),
+            (_, None) => Err(Error::Precondition(format!(
+                "no adapter fits room '{id}'; train one"
+            ))),
+        }
+    }
+
+    /// A room under the adapter of that name, or under the room's default adapter if the name is
+    /// empty. Loads the room if it is not in memory: only for threads that may block.
+    ///
+    /// # Errors
+    /// As [`Snapshot::room`] and [`Snapshot::adapter`]; [`Error::Precondition`] if the room cannot
+    /// be loaded, the adapter does not fit it, or none does.
+    pub fn navigator(&self, room: &str, adapter: &str) -> Result<Arc<ServedNavigator>, Error> {
+        let served = self.room(room)?;
+
+        // What is wrong with a name costs no loading.
+        if !adapter.is_empty() {
+            self.adapter(adapter)?;
+        }
+        let loaded = served.load()?;
+        let wanted = match adapter {
+            "" => self.default_adapter(served)?,
+            name => self.adapter(name)?.clone(),
+        };
+
+        let navigator = loaded.under_any(&wanted.name);
+        navigator
+            .cloned()
+            .ok_or_else(|| does_not_serve(served, &wanted))
+    }
+}
+
+/// Why an adapter does not serve a room.
+fn does_not_serve(room: &ServedRoom, adapter: &StoredAdapter) -> Error {
+    let name = &adapter.name;
+    if let Some(fit) = &adapter.room_fit
+        && fit.room != room.id
+    {
+        return Error::Precondition(format!(
+            "adapter '{name}' was fitted to room '{}' and serves no other",
+            fit.room
+        ));
+    }
+
+    if let Some(refusal) = room.refused_adapters().get(name) {
+        return refused_error("adapter", name, refusal);
+    }
+
+    let source = &adapter.adapter.source().name;
+    Error::Precondition(format!(
+        "room '{}' has no features '{source}', which adapter '{name}' needs",
+        room.id
+    ))
+}
+
+fn owned<'a, T: Clone + 'a>(
+    entries: impl Iterator<Item = (&'a String, &'a T)>,
+) -> BTreeMap<String, T> {
+    entries
+        .map(|(name, entry)| (name.clone(), entry.clone()))
+        .collect()
+}
+
+/// The caller learns that it is the operator's turn. The reason stays in the log: it may name
+/// files.
+fn refused_error(kind: &str, name: &str, refusal: &Refusal) -> Error {
+    Error::Precondition(format!(
+        "{kind} '{name}' cannot be served: its revision {} was refused, and the server's log says why",
+        refusal.revision
+    ))
+}

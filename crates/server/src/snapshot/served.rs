@@ -1,0 +1,174 @@
+//! A room that is served. What its manifest says is always at hand; frames, latents and indexes are
+//! loaded when they are asked for, and may be dropped and loaded again.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::super::Error;
+use super::cache::{Key, RoomCache};
+use super::loaded::{Candidate, LoadedRoom};
+use super::room_loading::RoomToLoad;
+use super::{Refusal, refused_error};
+use seese3_core::room::RoomId;
+use seese3_store::{RoomSummary, StoredAdapter};
+
+/// A revision of a room that is served.
+pub struct ServedRoom {
+    /// The room's name.
+    pub id: RoomId,
+    /// What its manifest says.
+    pub summary: RoomSummary,
+    /// The adapters that fit the room, in order of preference.
+    pub(super) candidates: Vec<Candidate>,
+    /// What the last loading has shown; none before the first.
+    shown: Mutex<Option<Shown>>,
+    cache: Arc<RoomCache>,
+    pub(super) key: Key,
+}
+
+/// What loading a room shows of it.
+enum Shown {
+    Loaded {
+        adapters: Vec<Arc<StoredAdapter>>,
+        refused: BTreeMap<String, Refusal>,
+    },
+    Refused(Refusal),
+}
+
+impl ServedRoom {
+    pub(super) fn new(
+        id: RoomId,
+        summary: RoomSummary,
+        candidates: Vec<Candidate>,
+        cache: Arc<RoomCache>,
+    ) -> Self {
+        Self {
+            id,
+            summary,
+            candidates,
+            shown: Mutex::new(None),
+            key: cache.new_key(),
+            cache,
+        }
+    }
+
+    /// The adapters that serve the room, in order of preference. Before the room was loaded for the
+    /// first time: those that should.
+    pub fn adapters(&self) -> Vec<Arc<StoredAdapter>> {
+        match &*self.shown() {
+            Some(Shown::Loaded { adapters, .. }) => adapters.clone(),
+            Some(Shown::Refused(_)) | None => self
+                .candidates
+                .iter()
+                .map(|candidate| candidate.adapter.clone())
+                .collect(),
+        }
+    }
+
+    /// Whether an adapter of this name serves the room, as far as is known.
+    pub fn is_served_by(&self, adapter: &str) -> bool {
+        self.adapters().iter().any(|served| served.name == adapter)
+    }
+
+    /// Why the room cannot be loaded, if that was tried.
+    pub fn refusal(&self) -> Option<Refusal> {
+        match &*self.shown() {
+            Some(Shown::Refused(refusal)) => Some(refusal.clone()),
+            _ => None,
+        }
+    }
+
+    /// Why an adapter that fits by its features does not serve the room, by name.
+    pub fn refused_adapters(&self) -> BTreeMap<String, Refusal> {
+        match &*self.shown() {
+            Some(Shown::Loaded { refused, .. }) => refused.clone(),
+            _ => BTreeMap::new(),
+        }
+    }
+
+    /// Everything that answers are computed from. Reads the store if the room is not in memory:
+    /// only for threads that may block.
+    ///
+    /// # Errors
+    /// [`Error::Precondition`] if the room cannot be loaded. The log says why.
+    pub fn load(&self) -> Result<Arc<LoadedRoom>, Error> {
+        // Damaged files do not heal. A file that could not be read is tried again.
+        let refused = self.refusal().filter(|refusal| !refusal.may_pass);
+        let loaded = match refused {
+            Some(refusal) => Err(refusal),
+            None => self.get_or_load(),
+        };
+
+        loaded.map_err(|refusal| refused_error("room", self.id.as_str(), &refusal))
+    }
+
+    fn get_or_load(&self) -> Result<Arc<LoadedRoom>, Refusal> {
+        self.cache.get_or_load(self.key, || {
+            let known = self.refusal();
+            let loaded = self.cache.block_on(self.loaded(Some(self)));
+            if let Err(refusal) = &loaded
+                && known.as_ref() != Some(refusal)
+            {
+                refusal.log("room", self.id.as_str());
+            }
+            loaded
+        })
+    }
+
+    /// Loads the room ahead of the first request for it. `before` is the same revision as it was
+    /// served before: what did not change is taken over from it.
+    ///
+    /// # Errors
+    /// Why the room cannot be loaded.
+    pub(super) async fn preload(&self, before: Option<&ServedRoom>) -> Result<(), Refusal> {
+        let loaded = self.loaded(before).await?;
+        self.cache.insert(self.key, loaded);
+        Ok(())
+    }
+
+    async fn loaded(&self, before: Option<&ServedRoom>) -> Result<Arc<LoadedRoom>, Refusal> {
+        let loaded_before = before.and_then(ServedRoom::in_memory);
+        let loaded = self.cache.load(RoomToLoad {
+            id: &self.id,
+            revision: self.summary.revision,
+            candidates: &self.candidates,
+            refused_before: before.map_or_else(BTreeMap::new, ServedRoom::refused_adapters),
+            loaded_before: loaded_before.as_deref(),
+        });
+        let loaded = loaded.await;
+
+        self.remember(loaded.as_ref());
+        loaded.map(Arc::new)
+    }
+
+    /// What is in memory, if anything is.
+    pub(super) fn in_memory(&self) -> Option<Arc<LoadedRoom>> {
+        self.cache.get(self.key)
+    }
+
+    /// Remembers what loading has shown.
+    pub(super) fn remember(&self, loaded: Result<&LoadedRoom, &Refusal>) {
+        let now = match loaded {
+            Ok(loaded) => Shown::Loaded {
+                adapters: loaded
+                    .navigators
+                    .iter()
+                    .map(|served| served.adapter.clone())
+                    .collect(),
+                refused: loaded.refused.clone(),
+            },
+            Err(refusal) => Shown::Refused(refusal.clone()),
+        };
+        *self.shown() = Some(now);
+    }
+
+    fn shown(&self) -> std::sync::MutexGuard<'_, Option<Shown>> {
+        self.shown.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Drop for ServedRoom {
+    fn drop(&mut self) {
+        self.cache.forget(self.key);
+    }
+}

@@ -1,0 +1,466 @@
+//! Errors as gRPC statuses. This is the only place where status codes are chosen.
+
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt};
+
+use seese3_core::room::FrameId;
+use seese3_core::{adapter, cancel, eval, navigation, room, splits};
+
+/// How like a served name one has to be to be taken for a misspelling of it, 0 to 1: one wrong letter
+/// in four.
+const NEARLY: f64 = 0.75;
+
+/// The domain of this service's error reasons.
+const DOMAIN: &str = "seese3.v1";
+
+/// What can be full, so that a request is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Full {
+    /// The lane of short requests.
+    ShortRequests,
+    /// The lane of requests with images.
+    Images,
+    /// The lane of batches and evaluations.
+    LongRequests,
+    /// The server's Track streams.
+    Streams,
+    /// The Track streams of one caller.
+    CallersStreams,
+    /// The requests and streams of one caller.
+    CallersRequests,
+    /// The connections; who is refused hears nothing.
+    Connections,
+    /// The bytes of all uploads in progress.
+    Uploads,
+    /// The fits in progress, of which there is one.
+    Fits,
+    /// The memory of requests in progress.
+    Memory,
+    /// The changes of the catalog that wait for their turn.
+    Changes,
+}
+
+impl Full {
+    /// All of them.
+    pub const ALL: [Self; 11] = [
+        Self::ShortRequests,
+        Self::Images,
+        Self::LongRequests,
+        Self::Streams,
+        Self::CallersStreams,
+        Self::CallersRequests,
+        Self::Connections,
+        Self::Uploads,
+        Self::Fits,
+        Self::Memory,
+        Self::Changes,
+    ];
+
+    /// The words of messages and metrics.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::ShortRequests => "short requests",
+            Self::Images => "requests with images",
+            Self::LongRequests => "batches and evaluations",
+            Self::Streams => "Track streams",
+            Self::CallersStreams => "Track streams of this caller",
+            Self::CallersRequests => "requests of this caller",
+            Self::Connections => "connections",
+            Self::Uploads => "bytes of uploads",
+            Self::Fits => "fits",
+            Self::Memory => "bytes of requests",
+            Self::Changes => "changes",
+        }
+    }
+}
+
+impl std::fmt::Display for Full {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.words())
+    }
+}
+
+/// Why a request is refused or fails.
+#[derive(Debug, Clone, thiserror::Error, PartialEq)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum Error {
+    #[error("{field}: {problem}")]
+    Invalid { field: String, problem: String },
+    #[error("{field}: '{name}' is not served{}", meant(nearest.as_ref()))]
+    NotFound {
+        field: String,
+        name: String,
+        /// The served name that is most like it, if one nearly is.
+        nearest: Option<String>,
+    },
+    #[error("{field}: '{name}' is not in the store")]
+    NotStored { field: String, name: String },
+    #[error("{0}")]
+    Precondition(String),
+    #[error("the server is not ready: it is loading its store or stopping; try again")]
+    Loading,
+    #[error("the server is busy: as many {what} as it takes are waiting or open; try again later")]
+    Full { what: Full },
+    #[error("{problem}")]
+    Unauthenticated { problem: &'static str },
+    #[error("{name}: {problem}")]
+    Conflict { name: String, problem: String },
+    #[error("the request could not be received: {problem}")]
+    Transport { code: Code, problem: String },
+    #[error("the caller has no right to {verb}: the operator gives it in the server's --auth-file")]
+    Forbidden { verb: &'static str },
+    #[error("the caller may not change {what}: its rooms stand in the server's --auth-file")]
+    OutOfScope { what: &'static str },
+    #[error("the deadline passed before the answer was ready")]
+    Deadline,
+    #[error("the request was cancelled")]
+    Cancelled,
+    #[error("internal error; the server's log has the cause under the request id")]
+    Internal,
+}
+
+impl Error {
+    /// An error in the request field `field`.
+    pub fn invalid(field: impl Into<String>, problem: impl ToString) -> Self {
+        Self::Invalid {
+            field: field.into(),
+            problem: problem.to_string(),
+        }
+    }
+
+    /// A name that is none of the `served` ones.
+    pub fn not_found<'a>(
+        field: &str,
+        name: &str,
+        served: impl IntoIterator<Item = &'a String>,
+    ) -> Self {
+        let likeness = |served: &String| strsim::normalized_damerau_levenshtein(served, name);
+        let nearest = served
+            .into_iter()
+            .map(|served| (likeness(served), served))
+            .filter(|(likeness, _)| *likeness >= NEARLY)
+            .max_by(|a, b| a.0.total_cmp(&b.0));
+
+        Self::NotFound {
+            field: field.to_owned(),
+            name: name.to_owned(),
+            nearest: nearest.map(|(_, name)| name.clone()),
+        }
+    }
+
+    /// A frame that the room does not have.
+    pub fn no_frame(field: &str, frame: FrameId) -> Self {
+        Self::NotFound {
+            field: field.to_owned(),
+            name: frame.to_string(),
+            nearest: None,
+        }
+    }
+
+    /// The same error with its field prefixed by the field that contains it.
+    pub fn within(self, parent: &str) -> Self {
+        match self {
+            Self::Invalid { field, problem } => Self::Invalid {
+                field: format!("{parent}.{field}"),
+                problem,
+            },
+            Self::NotFound {
+                field,
+                name,
+                nearest,
+            } => Self::NotFound {
+                field: format!("{parent}.{field}"),
+                name,
+                nearest,
+            },
+            other => other,
+        }
+    }
+
+    /// The same error with its field replaced by another name.
+    pub fn named(self, name: &str) -> Self {
+        match self {
+            Self::Invalid { problem, .. } => Self::Invalid {
+                field: name.to_owned(),
+                problem,
+            },
+            Self::NotFound {
+                name: missing,
+                nearest,
+                ..
+            } => Self::NotFound {
+                field: name.to_owned(),
+                name: missing,
+                nearest,
+            },
+            other => other,
+        }
+    }
+
+    /// The gRPC code.
+    pub fn code(&self) -> Code {
+        match self {
+            Self::Invalid { .. } => Code::InvalidArgument,
+            Self::NotFound { .. } | Self::NotStored { .. } => Code::NotFound,
+            Self::Precondition(_) => Code::FailedPrecondition,
+            Self::Conflict { .. } => Code::Aborted,
+            Self::Transport { code, .. } => *code,
+            Self::Loading => Code::Unavailable,
+            Self::Full { .. } => Code::ResourceExhausted,
+            Self::Unauthenticated { .. } => Code::Unauthenticated,
+            Self::Forbidden { .. } | Self::OutOfScope { .. } => Code::PermissionDenied,
+            Self::Deadline => Code::DeadlineExceeded,
+            Self::Cancelled => Code::Cancelled,
+            Self::Internal => Code::Internal,
+        }
+    }
+
+    fn reason(&self) -> &'static str {
+        match self {
+            Self::Invalid { .. } => "INVALID_FIELD",
+            Self::NotFound { .. } => "NOT_SERVED",
+            Self::NotStored { .. } => "NOT_STORED",
+            Self::Precondition(_) => "PRECONDITION",
+            Self::Conflict { .. } => "CONFLICT",
+            Self::Transport { .. } => "TRANSPORT",
+            Self::Loading => "NOT_READY",
+            Self::Full { .. } => "BUSY",
+            Self::Unauthenticated { .. } => "UNAUTHENTICATED",
+            Self::Forbidden { .. } => "FORBIDDEN",
+            Self::OutOfScope { .. } => "OUT_OF_SCOPE",
+            Self::Deadline => "DEADLINE",
+            Self::Cancelled => "CANCELLED",
+            Self::Internal => "INTERNAL",
+        }
+    }
+}
+
+fn meant(nearest: Option<&String>) -> String {
+    nearest.map_or_else(String::new, |name| format!("; did you mean '{name}'?"))
+}
+
+impl From<Error> for Status {
+    fn from(error: Error) -> Self {
+        let mut details = ErrorDetails::new();
+        let mut metadata = std::collections::HashMap::new();
+        match &error {
+            Error::Full { what } => metadata.insert("full".to_owned(), what.words().to_owned()),
+            Error::Forbidden { verb } => metadata.insert("verb".to_owned(), (*verb).to_owned()),
+            _ => None,
+        };
+        details.set_error_info(error.reason(), DOMAIN, metadata);
+
+        // Details in the standard types of google.rpc, so that a client learns the field to
+        // change, the missing resource, or when to retry, without reading the message.
+        match &error {
+            Error::Invalid { field, problem } => {
+                details.add_bad_request_violation(brief(field), brief(problem));
+            }
+            Error::NotFound { field, name, .. } => {
+                details.set_resource_info(brief(field), brief(name), "", "is not served");
+            }
+            Error::NotStored { field, name } => {
+                details.set_resource_info(brief(field), brief(name), "", "is not in the store");
+            }
+            Error::Full { .. } => {
+                details.set_retry_info(Some(std::time::Duration::from_millis(500)));
+            }
+            _ => {}
+        }
+
+        Self::with_error_details(error.code(), brief(&error.to_string()), details)
+    }
+}
+
+/// The text as one line of at most 300 characters and an ellipsis: it may quote what a caller sent,
+/// and gRPC metadata must stay small.
+pub fn brief(text: &str) -> String {
+    const MOST: usize = 300;
+
+    let mut line: String = text
+        .chars()
+        .take(MOST)
+        .map(|c| if c.is_control() { ' ' } else { c })
+        .collect();
+
+    if text.chars().nth(MOST).is_some() {
+        line.push('…');
+    }
+
+    line
+}
+
+impl From<cancel::Cancelled> for Error {
+    fn from(_: cancel::Cancelled) -> Self {
+        Self::Cancelled
+    }
+}
+
+impl From<navigation::Error> for Error {
+    fn from(error: navigation::Error) -> Self {
+        use navigation::Error as E;
+
+        // The field that the caller has to change. Errors that no change of the request can cure
+        // return early.
+        let field = match &error {
+            E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => {
+                return Self::no_frame("source.frame_id", *frame);
+            }
+            E::TargetFrame(room::Error::UnknownFrame { frame, .. }) => {
+                return Self::no_frame("displacement.target_frame_id", *frame);
+            }
+            E::Cancelled(_) => return Self::Cancelled,
+            // Features were checked when the store was loaded, so a misfit now is the server's
+            // own fault.
+            E::FeatureRows { .. } | E::Features(_) => return Self::Internal,
+            E::SourceFrame(_) => "source.frame_id",
+            E::TargetFrame(_) => "displacement.target_frame_id",
+            E::Adapter(
+                adapter::Error::NoCorrector { .. }
+                | adapter::Error::NoErrorCovariance
+                | adapter::Error::GatedMotion
+                | adapter::Error::WhitenedColumns { .. },
+            ) => "navigator",
+            E::Adapter(problem) => return view_error(problem).within("source"),
+            E::Refit(_) | E::Pairs(_) => return Self::Precondition(error.to_string()),
+            E::Steps { .. } => "steps",
+            E::TopK { .. } | E::FramesInAnswer { .. } => "top_k",
+            E::NoTwist | E::TwistNotFinite { .. } | E::TwistBeyondPi { .. } => "displacement",
+            E::PoseNeeded { .. } => "source_pose",
+            E::NoCandidates { .. } => "exclude_radius",
+        };
+
+        Self::invalid(field, error)
+    }
+}
+
+/// A feature or a latent that does not fit the adapter. The field is relative to the view that
+/// contains it.
+pub fn view_error(error: &adapter::Error) -> Error {
+    use adapter::Error as E;
+
+    let field = match error {
+        E::LatentDim { .. }
+        | E::LatentRange { .. }
+        | E::Gate { .. }
+        | E::NotFinite { what: "latent", .. } => "latent.values",
+        E::FeatureSource { .. } => "feature.source_name",
+        _ => "feature.values",
+    };
+
+    Error::invalid(field, error)
+}
+
+impl From<eval::Error> for Error {
+    fn from(error: eval::Error) -> Self {
+        use eval::Error as E;
+
+        // As above, with the field names of the evaluation requests.
+        let field = match &error {
+            E::Cancelled(_) | E::Navigation(navigation::Error::Cancelled(_)) => {
+                return Self::Cancelled;
+            }
+            E::Navigation(navigation::Error::Adapter(
+                adapter::Error::NoCorrector { .. }
+                | adapter::Error::NoErrorCovariance
+                | adapter::Error::GatedMotion
+                | adapter::Error::WhitenedColumns { .. },
+            ))
+            | E::Adapter(
+                adapter::Error::NoErrorCovariance
+                | adapter::Error::GatedMotion
+                | adapter::Error::WhitenedColumns { .. },
+            ) => "navigators",
+            E::Navigation(navigation::Error::Refit(_)) => {
+                return Self::Precondition(error.to_string());
+            }
+
+            // Evaluations use the room's own frames and features, which were checked when the
+            // store was loaded.
+            E::Navigation(_) | E::Adapter(_) => return Self::Internal,
+            E::Room(_) => "room",
+            E::Pairs(
+                splits::Error::ZeroStride
+                | splits::Error::NoPairs { .. }
+                | splits::Error::EmptyRange { .. },
+            ) => "stride",
+            E::Pairs(splits::Error::NoDatasetSplit) => "split",
+            E::Threshold { .. } | E::ThresholdCount { .. } => "thresholds",
+            E::NoCandidates { .. } => "exclude_radius",
+            E::NothingToFitOn { .. } => "navigators",
+            E::NoPredictions | E::MixedPredictions => "predictions",
+            E::NotACandidate { .. } | E::NotATestPair { .. } | E::Excluded { .. } => "predictions",
+            E::Prediction { position, problem } => {
+                return Self::invalid(format!("predictions[{position}]"), problem);
+            }
+        };
+
+        Self::invalid(field, error)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the page of errors, which is written by hand: it has a row for each error, with its reason
+    /// and its code.
+    #[test]
+    fn every_reason_is_documented() {
+        let page =
+            std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/errors.md"))
+                .unwrap();
+        let name = || "a".to_owned();
+        let errors = [
+            (Error::invalid("a", "b"), "INVALID_ARGUMENT"),
+            (Error::no_frame("a", FrameId(0)), "NOT_FOUND"),
+            (
+                Error::NotStored {
+                    field: name(),
+                    name: name(),
+                },
+                "NOT_FOUND",
+            ),
+            (Error::Precondition(name()), "FAILED_PRECONDITION"),
+            (Error::Loading, "UNAVAILABLE"),
+            (
+                Error::Full {
+                    what: Full::Streams,
+                },
+                "RESOURCE_EXHAUSTED",
+            ),
+            (Error::Unauthenticated { problem: "a" }, "UNAUTHENTICATED"),
+            (
+                Error::Conflict {
+                    name: name(),
+                    problem: name(),
+                },
+                "ABORTED",
+            ),
+            (Error::Forbidden { verb: "a" }, "PERMISSION_DENIED"),
+            (Error::OutOfScope { what: "a" }, "PERMISSION_DENIED"),
+            (Error::Deadline, "DEADLINE_EXCEEDED"),
+            (Error::Cancelled, "CANCELLED"),
+            (Error::Internal, "INTERNAL"),
+        ];
+
+        for (error, code) in errors {
+            let row = format!("| `{}` | `{code}` |", error.reason());
+            assert!(page.contains(&row), "{row}");
+        }
+    }
+
+    /// Oracle: by hand: a letter left out is one edit of seven, 0.86; another name shares hardly
+    /// a letter.
+    #[test]
+    fn a_name_that_is_nearly_right_is_suggested() {
+        let served = ["kitchen".to_owned(), "office".to_owned()];
+        let message = |name: &str| Error::not_found("room", name, &served).to_string();
+
+        assert_eq!(
+            message("kitchn"),
+            "room: 'kitchn' is not served; did you mean 'kitchen'?"
+        );
+        assert_eq!(message("hallway"), "room: 'hallway' is not served");
+    }
+}

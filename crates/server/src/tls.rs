@@ -1,0 +1,184 @@
+//! TLS: certificates from files, which may be replaced while the server runs.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, PoisonError, RwLock};
+use std::time::Duration;
+
+use rustls_pki_types::pem::PemObject;
+use rustls_pki_types::{CertificateDer, PrivateKeyDer};
+use sha2::{Digest, Sha256};
+use tokio_rustls::TlsAcceptor;
+use tokio_rustls::rustls::crypto::ring;
+use tokio_rustls::rustls::server::WebPkiClientVerifier;
+use tokio_rustls::rustls::{RootCertStore, ServerConfig};
+
+/// The time between two looks at the files.
+const LOOK: Duration = Duration::from_secs(5);
+
+/// The files of a server's certificate, in PEM.
+#[derive(Debug, Clone)]
+pub struct TlsFiles {
+    /// The server's certificate, followed by those that lead to its authority.
+    pub cert: PathBuf,
+    /// The private key of the first certificate.
+    pub key: PathBuf,
+    /// The authorities that clients' certificates must come from; none if clients need none.
+    pub client_ca: Option<PathBuf>,
+}
+
+/// Why files give no TLS.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum TlsError {
+    #[error("{option}: {} cannot be read: {problem}", file.display())]
+    Unreadable {
+        option: &'static str,
+        file: PathBuf,
+        problem: std::io::Error,
+    },
+    #[error("{option}: {} holds no {what} in PEM", file.display())]
+    Empty {
+        option: &'static str,
+        file: PathBuf,
+        what: &'static str,
+    },
+    #[error("--tls-cert, --tls-key or --tls-client-ca: {0}")]
+    Unfit(String),
+}
+
+/// The TLS of a server, as its files are now.
+#[derive(Debug)]
+pub struct Tls {
+    files: TlsFiles,
+    /// Digest of the files' content as it was first read.
+    opened: [u8; 32],
+    current: RwLock<Arc<ServerConfig>>,
+}
+
+impl Tls {
+    /// Reads the files.
+    ///
+    /// # Errors
+    /// [`TlsError`], naming the option.
+    pub fn open(files: TlsFiles) -> Result<Self, TlsError> {
+        let (config, opened) = read(&files)?;
+        Ok(Self {
+            files,
+            opened,
+            current: RwLock::new(Arc::new(config)),
+        })
+    }
+
+    /// Accepts connections with the certificate of now.
+    pub fn acceptor(&self) -> TlsAcceptor {
+        let current = self.current.read();
+        TlsAcceptor::from(current.unwrap_or_else(PoisonError::into_inner).clone())
+    }
+
+    /// Looks from time to time whether the files have changed; never completes. New connections get
+    /// the new certificate. Files that do not fit together, as while they are being replaced, change
+    /// nothing.
+    pub async fn follow_files(&self) {
+        let mut seen = Some(self.opened);
+        let mut trouble = String::new();
+
+        loop {
+            tokio::time::sleep(LOOK).await;
+
+            // A file system that does not answer must hold up nothing but this.
+            let files = self.files.clone();
+            let Ok(found) = tokio::task::spawn_blocking(move || read(&files)).await else {
+                return;
+            };
+            match found {
+                Ok((config, digest)) => {
+                    trouble.clear();
+                    if seen.replace(digest) != Some(digest) {
+                        let current = self.current.write();
+                        *current.unwrap_or_else(PoisonError::into_inner) = Arc::new(config);
+                        tracing::info!("the certificate was replaced");
+                    }
+                }
+                Err(error) if error.to_string() != trouble => {
+                    trouble = error.to_string();
+                    tracing::error!(%error, "the new certificate cannot be used; the one before stays");
+                }
+                Err(_) => {}
+            }
+        }
+    }
+}
+
+/// The configuration that files give, and a digest of their content.
+fn read(files: &TlsFiles) -> Result<(ServerConfig, [u8; 32]), TlsError> {
+    let TlsFiles {
+        cert,
+        key,
+        client_ca,
+    } = files;
+    let unfit = |error: &dyn std::fmt::Display| TlsError::Unfit(error.to_string());
+
+    let mut digest = Sha256::new();
+    let mut content = |option, file: &Path| {
+        let bytes = std::fs::read(file).map_err(|problem| TlsError::Unreadable {
+            option,
+            file: file.to_owned(),
+            problem,
+        })?;
+        digest.update((bytes.len() as u64).to_le_bytes());
+        digest.update(&bytes);
+        Ok(bytes)
+    };
+
+    let chain = certificates("--tls-cert", cert, &content("--tls-cert", cert)?)?;
+    let private = content("--tls-key", key)?;
+    let private = PrivateKeyDer::from_pem_slice(&private).map_err(|_| TlsError::Empty {
+        option: "--tls-key",
+        file: key.clone(),
+        what: "private key",
+    })?;
+
+    let provider = Arc::new(ring::default_provider());
+    let builder = ServerConfig::builder_with_provider(provider.clone())
+        .with_safe_default_protocol_versions()
+        .map_err(|error| unfit(&error))?;
+
+    let builder = match client_ca {
+        None => builder.with_no_client_auth(),
+        Some(file) => {
+            let option = "--tls-client-ca";
+            let mut roots = RootCertStore::empty();
+            for authority in certificates(option, file, &content(option, file)?)? {
+                roots.add(authority).map_err(|error| unfit(&error))?;
+            }
+
+            let verifier =
+                WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
+            builder.with_client_cert_verifier(verifier.map_err(|error| unfit(&error))?)
+        }
+    };
+
+    let mut config = builder
+        .with_single_cert(chain, private)
+        .map_err(|error| unfit(&error))?;
+    config.alpn_protocols = vec![b"h2".to_vec()];
+
+    Ok((config, digest.finalize().into()))
+}
+
+fn certificates(
+    option: &'static str,
+    file: &Path,
+    content: &[u8],
+) -> Result<Vec<CertificateDer<'static>>, TlsError> {
+    let all: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(content).collect();
+
+    match all {
+        Ok(all) if !all.is_empty() => Ok(all),
+        _ => Err(TlsError::Empty {
+            option,
+            file: file.to_owned(),
+            what: "certificate",
+        }),
+    }
+}

@@ -1,0 +1,204 @@
+//! What a robot measures besides the views of the stream's own camera: the direction of gravity, and
+//! what its other cameras see.
+
+use nalgebra::{Unit, Vector3};
+
+use super::super::Error;
+use super::configuration::{LONGEST_NAME, StreamFrames, clear_name, unnamed, within};
+use seese3_client::proto::v1 as pb;
+use seese3_core::geometry::Pose;
+use seese3_robot::tracking::MeasuredGravity;
+
+/// The most other cameras of one stream.
+const MOST_CAMERAS: usize = 8;
+/// The standard deviation of a measured direction of gravity if its sender states none, and what it
+/// may state, radians.
+const GRAVITY_DEVIATION: f64 = 0.03;
+const GRAVITY_DEVIATIONS: std::ops::RangeInclusive<f64> = 1e-3..=1.0;
+/// Directions shorter than this have none.
+const SHORTEST: f64 = 1e-9;
+
+/// The sensors of a stream besides its own camera.
+#[derive(Debug, Clone)]
+pub struct Sensors {
+    gravity_in_map: Option<Unit<Vector3<f64>>>,
+    base_from_camera: Option<Pose>,
+    /// The names of the base and of the stream's own camera.
+    base: String,
+    camera: String,
+    other_cameras: Vec<OtherCamera>,
+}
+
+/// Another camera on the robot.
+#[derive(Debug, Clone)]
+struct OtherCamera {
+    name: String,
+    /// In the frame of the stream's own camera.
+    camera_from_other: Pose,
+}
+
+/// One of the other cameras, as frames name it.
+#[derive(Debug, Clone, Copy)]
+pub struct NamedCamera {
+    /// Its place in the configuration.
+    pub number: u32,
+    pub camera_from_other: Pose,
+}
+
+impl Sensors {
+    /// The sensors that a configuration names.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`], naming the field, for a direction without length, too many cameras, a name
+    /// that is empty, too long or used twice, and a bad pose.
+    pub fn of(config: &pb::TrackConfig, frames: &StreamFrames) -> Result<Self, Error> {
+        let gravity_in_map = config
+            .gravity_in_map
+            .map(|given| direction("gravity_in_map", given))
+            .transpose()?;
+        if gravity_in_map.is_some() && config.room.is_empty() {
+            return Err(Error::invalid(
+                "gravity_in_map",
+                "needs the room in whose world frame it is",
+            ));
+        }
+
+        if config.other_cameras.len() > MOST_CAMERAS {
+            return Err(Error::invalid(
+                "other_cameras",
+                format!(
+                    "must be at most {MOST_CAMERAS}, not {}",
+                    config.other_cameras.len()
+                ),
+            ));
+        }
+
+        let names = &frames.names;
+        let mut used = vec![&names.map, &names.odom, &names.camera, &names.base];
+        let mut other_cameras = Vec::new();
+        for (number, given) in config.other_cameras.iter().enumerate() {
+            let field = format!("other_cameras[{number}]");
+            let name = &given.name;
+            let is_too_long = name.len() > LONGEST_NAME || name.chars().any(char::is_control);
+            if name.is_empty() || is_too_long || used.contains(&name) {
+                let problem = format!(
+                    "must be a name of 1 to {LONGEST_NAME} bytes that no other camera or frame has"
+                );
+                return Err(Error::invalid(format!("{field}.name"), problem));
+            }
+            used.push(name);
+
+            let mut pose = given
+                .pose
+                .clone()
+                .ok_or_else(|| Error::invalid(format!("{field}.pose"), "is required"))?;
+            clear_name(&mut pose.child_frame, name);
+            let parent = match frames.base_from_camera {
+                Some(_) => &names.base,
+                None => &names.camera,
+            };
+            clear_name(&mut pose.parent_frame, parent);
+            let pose = unnamed(pose).map_err(|error| error.within(&format!("{field}.pose")))?;
+
+            other_cameras.push(OtherCamera {
+                name: name.clone(),
+                camera_from_other: match frames.base_from_camera {
+                    Some(base_from_camera) => base_from_camera.inverse() * pose,
+                    None => pose,
+                },
+            });
+        }
+
+        Ok(Self {
+            gravity_in_map,
+            base_from_camera: frames.base_from_camera,
+            base: names.base.clone(),
+            camera: names.camera.clone(),
+            other_cameras,
+        })
+    }
+
+    /// The other camera of this name.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if there is none.
+    pub fn other_camera(&self, name: &str) -> Result<NamedCamera, Error> {
+        let number = self
+            .other_cameras
+            .iter()
+            .position(|other| other.name == name);
+        let number = number.ok_or_else(|| {
+            let known: Vec<&str> = self
+                .other_cameras
+                .iter()
+                .map(|other| other.name.as_str())
+                .collect();
+            let problem = match known.as_slice() {
+                [] => "names a camera, and the configuration names no other_cameras".to_owned(),
+                known => format!("must be one of: {}", known.join(", ")),
+            };
+            Error::invalid("camera", problem)
+        })?;
+
+        Ok(NamedCamera {
+            number: number as u32,
+            camera_from_other: self.other_cameras[number].camera_from_other,
+        })
+    }
+
+    /// The name of one of the other cameras; empty for a number that is none.
+    pub fn camera_name(&self, number: u32) -> String {
+        self.other_cameras
+            .get(number as usize)
+            .map_or_else(String::new, |other| other.name.clone())
+    }
+
+    /// A measured direction of gravity in the camera's frame.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] for a direction without length, a frame that is neither the camera's nor the
+    /// base's, a deviation out of range, and where gravity is not known in the map.
+    pub fn gravity(&self, given: &pb::MeasuredGravity) -> Result<MeasuredGravity, Error> {
+        let in_world = self.gravity_in_map.ok_or_else(|| {
+            Error::invalid("direction", "needs gravity_in_map in the configuration")
+        })?;
+        let measured = given
+            .direction
+            .ok_or_else(|| Error::invalid("direction", "is required"))?;
+        let measured = direction("direction", measured)?;
+
+        let frame = given.frame.as_str();
+        let in_camera = match self.base_from_camera {
+            Some(base_from_camera) if frame.is_empty() || frame == self.base => {
+                base_from_camera.rotation.inverse() * measured
+            }
+            _ if frame.is_empty() || frame == self.camera => measured,
+            base_from_camera => {
+                let problem = match base_from_camera {
+                    Some(_) => format!("must be {} or {}", self.base, self.camera),
+                    None => format!("must be {}: the base is not known", self.camera),
+                };
+                return Err(Error::invalid("frame", problem));
+            }
+        };
+
+        let deviation_rad = given.deviation_rad.unwrap_or(GRAVITY_DEVIATION);
+        Ok(MeasuredGravity {
+            in_world,
+            in_camera,
+            deviation_rad: within("deviation_rad", deviation_rad, GRAVITY_DEVIATIONS)?,
+        })
+    }
+}
+
+fn direction(field: &str, given: pb::Vector3) -> Result<Unit<Vector3<f64>>, Error> {
+    let given = Vector3::new(given.x, given.y, given.z);
+    let largest = given.amax();
+    let is_finite = given.iter().all(|value| value.is_finite());
+    if !(is_finite && largest > SHORTEST) {
+        return Err(Error::invalid(field, "must be finite and longer than 0"));
+    }
+
+    // Divided first, so that squares of large numbers stay finite.
+    Ok(Unit::new_normalize(given / largest))
+}

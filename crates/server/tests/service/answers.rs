@@ -1,0 +1,783 @@
+//! What the server answers is what the oracles and the definitions say.
+
+use seese3_client::proto::v1 as pb;
+use seese3_server::Config;
+
+use crate::harness::{
+    by_twist, feature, feature_row, frame, latent, oracle, question, start, to_frame, twist,
+};
+use seese3_testing::{golden, json, near, number};
+
+fn expected() -> serde_json::Value {
+    json(&golden().join("navigation/synthetic_expected.json"))
+}
+
+fn compare(what: &str, scores: &pb::NavigatorScores, expected: &serde_json::Value) {
+    let included = &expected["source_included"];
+    near(what, scores.mse.unwrap(), number(&expected["mse"]), 1e-9);
+
+    near(
+        what,
+        scores.r2.unwrap(),
+        number(&expected["r2_variance_weighted"]),
+        1e-8,
+    );
+
+    compare_hits(what, scores, included);
+}
+
+fn compare_hits(what: &str, scores: &pb::NavigatorScores, included: &serde_json::Value) {
+    assert_eq!(u64::from(scores.n), included["n"].as_u64().unwrap());
+
+    near(
+        what,
+        scores.top1.unwrap().rate,
+        number(&included["top1"]),
+        1e-12,
+    );
+
+    near(
+        what,
+        scores.translation_m_median,
+        number(&included["median_t_m"]),
+        1e-9,
+    );
+
+    near(
+        what,
+        scores.rotation_rad_median,
+        number(&included["median_R_rad"]),
+        1e-9,
+    );
+
+    for hit in &scores.hit_rates {
+        let key = hit.threshold.to_string();
+        let rate = hit.rate.unwrap();
+        near(what, rate.rate, number(&included["hit"][&key]), 1e-12);
+
+        near(
+            what,
+            rate.low,
+            number(&included["hit_wilson95"][&key][0]),
+            1e-9,
+        );
+
+        near(
+            what,
+            rate.high,
+            number(&included["hit_wilson95"][&key][1]),
+            1e-9,
+        );
+    }
+}
+
+/// Oracle: NumPy, scikit-learn and SciPy, through the wire; progress names every navigator in
+/// order.
+#[tokio::test]
+async fn evaluate_streams_progress_and_the_oracles_table() {
+    let server = start(Config::default()).await;
+
+    let request = pb::EvaluateRequest {
+        room: "synthetic".to_owned(),
+        ..pb::EvaluateRequest::default()
+    };
+
+    let mut begun = Vec::new();
+    let report = server
+        .client
+        .evaluate(request, |step| begun.push(step.navigator))
+        .await
+        .unwrap();
+    let names: Vec<&str> = report
+        .navigators
+        .iter()
+        .map(|row| row.name.as_str())
+        .collect();
+
+    assert_eq!(begun, names);
+
+    assert_eq!(
+        (
+            report.n,
+            report.candidate_count,
+            report.in_room,
+            report.leaks
+        ),
+        (80, 120, true, false)
+    );
+
+    let expected = expected();
+    for (ours, theirs) in [
+        ("identity", "identity"),
+        ("inverse-poincare-affine", "inverse_affine"),
+        ("inverse-poincare-homogeneous", "inverse_homogeneous"),
+        ("inverse-poincare-literal", "inverse_literal"),
+        ("ridge-refit", "refit_raw_no_intercept_80_20"),
+    ] {
+        let row = report
+            .navigators
+            .iter()
+            .find(|row| row.name == ours)
+            .unwrap();
+        compare(ours, row, &expected["navigators"][theirs]);
+    }
+}
+
+/// Oracle: two ways to one number: the frames that Navigate retrieves in the last of three steps,
+/// handed in with the frame that this step started from, get the scores that Evaluate gives the
+/// same walks. Without that frame, some of them are refused, since a walk may come back to its
+/// source.
+#[tokio::test]
+async fn walks_that_snap_can_be_handed_in() {
+    let server = start(Config::default()).await;
+    let (steps, stride, radius) = (3, 40, 30);
+    let evaluate = pb::EvaluateRequest {
+        room: "synthetic".to_owned(),
+        split: "whole".to_owned(),
+        navigators: vec!["inverse-poincare-affine".to_owned()],
+        stride: Some(stride),
+        exclude_source: true,
+        exclude_radius: radius,
+        steps: Some(steps),
+        mode: pb::Mode::Snap.into(),
+        ..pb::EvaluateRequest::default()
+    };
+    let report = server.client.evaluate(evaluate, drop).await.unwrap();
+
+    let mut predictions = Vec::new();
+    for source in 0..600 - stride {
+        let walk = pb::NavigateRequest {
+            source: frame(source),
+            displacement: to_frame(source + stride),
+            navigator: "inverse-poincare-affine".to_owned(),
+            steps: Some(steps),
+            mode: pb::Mode::Snap.into(),
+            exclude_source: true,
+            exclude_radius: radius,
+            ..question()
+        };
+        let walked = server.client.navigate(walk).await.unwrap().steps;
+        let retrieved = |step: usize| walked[step].frames[0].frame_id;
+
+        predictions.push(pb::Prediction {
+            source_frame_id: source,
+            target_frame_id: source + stride,
+            prediction: Some(pb::prediction::Prediction::RetrievedFrameId(retrieved(2))),
+            last_step_frame_id: Some(retrieved(1)),
+        });
+    }
+
+    let request = |predictions| pb::ScorePredictionsRequest {
+        room: "synthetic".to_owned(),
+        split: "whole".to_owned(),
+        exclude_source: true,
+        exclude_radius: radius,
+        predictions,
+        ..pb::ScorePredictionsRequest::default()
+    };
+    let scored = server
+        .client
+        .score_predictions(request(predictions.clone()))
+        .await
+        .unwrap()
+        .scores
+        .unwrap();
+
+    let expected = &report.navigators[0];
+    assert_eq!((scored.n, expected.n), (560, 560));
+    assert_eq!(scored.hit_rates, expected.hit_rates);
+    assert_eq!(scored.top1, expected.top1);
+
+    for prediction in &mut predictions {
+        prediction.last_step_frame_id = None;
+    }
+    let refused = server.client.score_predictions(request(predictions)).await;
+    assert!(refused.unwrap_err().to_string().contains("is excluded"));
+}
+
+/// Oracle: as above; the client brings the oracle's own latents, and then its retrieved frames.
+#[tokio::test]
+async fn a_clients_predictions_get_the_oracles_scores() {
+    let server = start(Config::default()).await;
+    let latents = oracle("g_hat.refit_zscored_intercept_80_20");
+    let frames = oracle("retrieved.refit_zscored_intercept_80_20.source_included");
+    let pairs = (480..560).map(|source| (source, source + 40));
+
+    let prediction = |(source_frame_id, target_frame_id), prediction| pb::Prediction {
+        source_frame_id,
+        target_frame_id,
+        prediction: Some(prediction),
+        ..pb::Prediction::default()
+    };
+
+    let by_latent = latents
+        .outer_iter()
+        .zip(pairs.clone())
+        .map(|(latent, pair)| {
+            prediction(
+                pair,
+                pb::prediction::Prediction::Latent(pb::Latent {
+                    values: latent.to_vec(),
+                }),
+            )
+        });
+
+    let by_frame = frames.iter().zip(pairs).map(|(&frame, pair)| {
+        prediction(
+            pair,
+            pb::prediction::Prediction::RetrievedFrameId(frame as u32),
+        )
+    });
+
+    let expected = &expected()["navigators"]["refit_zscored_intercept_80_20"];
+
+    let request = |predictions| pb::ScorePredictionsRequest {
+        room: "synthetic".to_owned(),
+        split: "time".to_owned(),
+        predictions,
+        ..pb::ScorePredictionsRequest::default()
+    };
+    let scored = server
+        .client
+        .score_predictions(request(by_latent.collect()))
+        .await
+        .unwrap();
+
+    assert_eq!(scored.candidate_count, 120);
+
+    compare("latents", &scored.scores.unwrap(), expected);
+
+    let scores = server
+        .client
+        .score_predictions(request(by_frame.collect()))
+        .await
+        .unwrap()
+        .scores
+        .unwrap();
+
+    assert_eq!((scores.mse, scores.r2), (None, None));
+
+    compare_hits("frames", &scores, &expected["source_included"]);
+}
+
+/// Oracle: PyTorch's test R² of the trained adapter, from motions estimated one by one over the
+/// wire.
+#[tokio::test]
+async fn estimated_motions_have_pytorchs_r2() {
+    let server = start(Config::default()).await;
+    let truth = oracle("test_twists");
+    let mut predicted = ndarray::Array2::zeros(truth.dim());
+    for (row, source) in (480..560u32).enumerate() {
+        let (first, second) = match row % 2 {
+            0 => (frame(source), frame(source + 40)),
+            _ => (
+                feature(feature_row(source as usize)),
+                feature(feature_row(source as usize + 40)),
+            ),
+        };
+
+        let room = "synthetic".to_owned();
+        let request = pb::EstimateMotionRequest {
+            room,
+            first,
+            second,
+            ..Default::default()
+        };
+
+        let motion = server
+            .client
+            .estimate_motion(request)
+            .await
+            .unwrap()
+            .motion
+            .unwrap();
+
+        let v = motion.linear.unwrap();
+        let w = motion.angular.unwrap();
+        predicted
+            .row_mut(row)
+            .assign(&ndarray::arr1(&[v.x, v.y, v.z, w.x, w.y, w.z]));
+    }
+
+    let stated = &json(&golden().join("m4_adapter/synthetic_expected.json"))["trained_k1"]["test_r2"]
+        ["per_component"];
+    for component in 0..6 {
+        let y = truth.column(component);
+        let p = predicted.column(component);
+        let mean = y.mean().unwrap();
+        let (residual, total): (f64, f64) = y.iter().zip(p).fold((0.0, 0.0), |(r, t), (y, p)| {
+            (r + (y - p).powi(2), t + (y - mean).powi(2))
+        });
+
+        near(
+            "R²",
+            1.0 - residual / total,
+            number(&stated[component]),
+            1e-9,
+        );
+    }
+}
+
+/// Oracle: SciPy's twist of the pair, and the definitions: the truth is log(P₁⁻¹P₂), a frame is its
+/// own place.
+#[tokio::test]
+async fn frames_of_a_room_are_answered_with_the_truth() {
+    let server = start(Config::default()).await;
+    let truth = oracle("test_twists");
+
+    let request = |second| pb::EstimateMotionRequest {
+        room: "synthetic".to_owned(),
+        first: frame(485),
+        second,
+        ..pb::EstimateMotionRequest::default()
+    };
+    let answer = server
+        .client
+        .estimate_motion(request(frame(525)))
+        .await
+        .unwrap();
+
+    assert_eq!(answer.reader(), pb::MotionReader::Adapter);
+    assert!(answer.covariance.is_empty());
+
+    let six = |twist: pb::Twist| {
+        let v = twist.linear.unwrap();
+        let w = twist.angular.unwrap();
+        [v.x, v.y, v.z, w.x, w.y, w.z]
+    };
+    let found = six(answer.motion.unwrap());
+
+    let stated = six(answer.true_motion.unwrap());
+    let mut squares = 0.0;
+    for component in 0..6 {
+        near("truth", stated[component], truth[(5, component)], 1e-9);
+        squares += (found[component] - truth[(5, component)]).powi(2);
+    }
+
+    let error = answer.error.unwrap();
+    near("error", error.twist_norm, squares.sqrt(), 1e-9);
+
+    assert!(
+        error
+            .thresholds
+            .iter()
+            .all(|hit| hit.met == (error.twist_norm < hit.threshold))
+            && error.thresholds.len() == 4
+    );
+
+    let blind = server
+        .client
+        .estimate_motion(request(feature(feature_row(525))))
+        .await
+        .unwrap();
+
+    assert!(
+        blind.error.is_none() && blind.true_motion.is_none(),
+        "a feature has no pose"
+    );
+
+    let request = pb::LocalizeRequest {
+        rooms: vec!["synthetic".to_owned()],
+        view: frame(123),
+        top_k: Some(2),
+        ..pb::LocalizeRequest::default()
+    };
+    let places = server.client.localize(request).await.unwrap().places;
+
+    assert_eq!(places[0].error.as_ref().unwrap().twist_norm, 0.0);
+    assert!(places[1].error.as_ref().unwrap().translation_m > 0.0);
+}
+
+/// Oracle: the definition of a closed loop over motions one after another: the second motion's goal
+/// is the composed one, so going there in a list or at once ends at the same frame when each motion
+/// is one step.
+#[tokio::test]
+async fn a_closed_loop_steers_every_motion_to_its_planned_goal() {
+    let server = start(Config::default()).await;
+    let first = [0.1, 0.0, 0.2, 0.0, 0.1, 0.0];
+    let second = [0.2, 0.1, 0.0, 0.1, 0.0, 0.1];
+
+    let ask = |displacement| pb::NavigateRequest {
+        displacement,
+        mode: pb::Mode::ClosedLoop.into(),
+        ..question()
+    };
+
+    let list = pb::displacement::Displacement::Twists(pb::TwistList {
+        twists: vec![twist(first), twist(second)],
+    });
+    let list = Some(pb::Displacement {
+        displacement: Some(list),
+    });
+    let both = server.client.navigate(ask(list)).await.unwrap();
+
+    // From the frame that the first motion retrieved, straight to the pose that the list plans.
+    let goal = both.steps[1].requested_pose.clone().unwrap();
+    let to_goal = Some(pb::Displacement {
+        displacement: Some(pb::displacement::Displacement::TargetPose(goal)),
+    });
+
+    let reached = both.steps[0].frames[0].frame_id;
+    let direct = server
+        .client
+        .navigate(pb::NavigateRequest {
+            source: frame(reached),
+            ..ask(to_goal)
+        })
+        .await
+        .unwrap();
+
+    assert_eq!(
+        both.steps[1].frames[0].frame_id,
+        direct.steps[0].frames[0].frame_id
+    );
+
+    near(
+        "distance",
+        both.steps[1].frames[0].distance,
+        direct.steps[0].frames[0].distance,
+        1e-9,
+    );
+}
+
+/// Oracle: the definitions. Zero motion stays put at distance 0; the open loop's end is the same in
+/// any number of steps; a target frame is the same question as its pose and as its twist.
+#[tokio::test]
+async fn equal_questions_have_equal_answers() {
+    let server = start(Config::default()).await;
+
+    let still = pb::NavigateRequest {
+        displacement: by_twist([0.0; 6]),
+        steps: Some(3),
+        ..question()
+    };
+    let answer = server.client.navigate(still).await.unwrap();
+
+    for step in &answer.steps {
+        assert_eq!(
+            (step.frames[0].frame_id, step.frames[0].distance),
+            (500, 0.0)
+        );
+        assert_eq!(step.error.as_ref().unwrap().twist_norm, 0.0);
+    }
+
+    let one = server.client.navigate(question()).await.unwrap();
+    let end = |answer: &pb::NavigateResponse| answer.steps.last().unwrap().clone();
+
+    let eight = pb::NavigateRequest {
+        steps: Some(8),
+        ..question()
+    };
+    let eight = server.client.navigate(eight).await.unwrap();
+
+    assert_eq!(eight.steps.len(), 8);
+
+    let a = end(&one).latent.unwrap().values;
+    let b = end(&eight).latent.unwrap().values;
+    assert!(a.iter().zip(&b).all(|(a, b)| (a - b).abs() < 1e-12));
+
+    let target = server
+        .client
+        .localize(pb::LocalizeRequest {
+            rooms: vec!["synthetic".to_owned()],
+            view: frame(540),
+            ..pb::LocalizeRequest::default()
+        })
+        .await
+        .unwrap();
+
+    let pose = target.places[0].frame.clone().unwrap().pose.unwrap();
+    assert_eq!(pose.parent_frame, "rooms/synthetic");
+
+    for displacement in [
+        pb::displacement::Displacement::TargetPose(pose),
+        pb::displacement::Displacement::Twist(one.displacement.unwrap()),
+        pb::displacement::Displacement::Twists(pb::TwistList {
+            twists: vec![one.displacement.unwrap()],
+        }),
+    ] {
+        let displacement = Some(pb::Displacement {
+            displacement: Some(displacement),
+        });
+
+        let same = server
+            .client
+            .navigate(pb::NavigateRequest {
+                displacement,
+                ..question()
+            })
+            .await
+            .unwrap();
+
+        let same = end(&same);
+        let one = end(&one);
+        assert_eq!(same.frames[0].frame_id, one.frames[0].frame_id);
+
+        near(
+            "distance",
+            same.frames[0].distance,
+            one.frames[0].distance,
+            1e-9,
+        );
+
+        near(
+            "error",
+            same.error.unwrap().twist_norm,
+            one.error.unwrap().twist_norm,
+            1e-9,
+        );
+    }
+}
+
+/// Oracle: the definitions. A frame, its feature and its latent are the same source; without a pose
+/// there is no truth, so there is no error; hits say whether the error is below each threshold.
+#[tokio::test]
+async fn a_feature_answers_as_its_frame_does_but_knows_no_truth() {
+    let server = start(Config::default()).await;
+    let numbers = [0.1, 0.0, 0.3, 0.0, -0.2, 0.0];
+    let by_frame = pb::NavigateRequest {
+        displacement: by_twist(numbers),
+        top_k: Some(3),
+        ..question()
+    };
+
+    let frame_answer = server.client.navigate(by_frame.clone()).await.unwrap();
+
+    let still = pb::NavigateRequest {
+        displacement: by_twist([0.0; 6]),
+        ..question()
+    };
+    let latent_of = server.client.navigate(still).await.unwrap().steps[0]
+        .latent
+        .clone()
+        .unwrap()
+        .values;
+
+    for source in [feature(feature_row(500)), latent(latent_of)] {
+        let answer = server
+            .client
+            .navigate(pb::NavigateRequest {
+                source,
+                ..by_frame.clone()
+            })
+            .await
+            .unwrap();
+
+        let frames = |answer: &pb::NavigateResponse| {
+            answer.steps[0]
+                .frames
+                .iter()
+                .map(|hit| hit.frame_id)
+                .collect::<Vec<_>>()
+        };
+
+        assert_eq!(frames(&answer), frames(&frame_answer));
+        assert!(answer.steps[0].error.is_none() && answer.steps[0].requested_pose.is_none());
+        assert!(answer.displacement.is_none());
+    }
+
+    let error = frame_answer.steps[0].error.clone().unwrap();
+    assert_eq!(error.thresholds.len(), 4);
+
+    assert!(
+        error
+            .thresholds
+            .iter()
+            .all(|hit| hit.met == (error.twist_norm < hit.threshold))
+    );
+}
+
+/// Oracle: the contract of exclusion and of k, and that a list of motions is their composition.
+#[tokio::test]
+async fn exclusion_counts_and_lists_of_motions() {
+    let server = start(Config::default()).await;
+
+    let excluded = pb::NavigateRequest {
+        displacement: by_twist([0.0; 6]),
+        top_k: Some(20),
+        exclude_source: true,
+        exclude_radius: 3,
+        ..question()
+    };
+
+    let hits = server.client.navigate(excluded).await.unwrap().steps[0]
+        .frames
+        .clone();
+
+    assert_eq!(hits.len(), 20);
+    assert!(hits.iter().all(|hit| hit.frame_id.abs_diff(500) > 3));
+    assert!(hits.is_sorted_by(|a, b| (a.distance, a.frame_id) < (b.distance, b.frame_id)));
+
+    let there = twist([0.2, 0.0, 0.1, 0.0, 0.3, 0.0]);
+    let back = twist([-0.2, 0.0, -0.1, 0.0, -0.3, 0.0]);
+    let list = pb::displacement::Displacement::Twists(pb::TwistList {
+        twists: vec![there, back],
+    });
+    let displacement = Some(pb::Displacement {
+        displacement: Some(list),
+    });
+
+    let answer = server
+        .client
+        .navigate(pb::NavigateRequest {
+            displacement,
+            steps: Some(2),
+            ..question()
+        })
+        .await
+        .unwrap();
+
+    assert_eq!(answer.steps.len(), 4);
+
+    let last = &answer.steps[3];
+    assert_eq!(
+        last.frames[0].frame_id, 500,
+        "there and back is where it began"
+    );
+
+    assert!(last.error.as_ref().unwrap().twist_norm < 1e-9);
+}
+
+/// Oracle: one question at a time.
+#[tokio::test]
+async fn a_batch_answers_as_its_questions_do_and_one_failure_is_alone() {
+    let server = start(Config::default()).await;
+
+    let bad = pb::NavigateRequest {
+        room: "nope".to_owned(),
+        ..question()
+    };
+
+    let snap = pb::NavigateRequest {
+        mode: pb::Mode::Snap.into(),
+        steps: Some(4),
+        ..question()
+    };
+    let results = server
+        .client
+        .batch_navigate(vec![question(), bad, snap.clone()])
+        .await
+        .unwrap();
+
+    let alone = [
+        server.client.navigate(question()).await.unwrap(),
+        server.client.navigate(snap).await.unwrap(),
+    ];
+
+    let response = |result: &pb::BatchNavigateResult| match result.result.clone().unwrap() {
+        pb::batch_navigate_result::Result::Response(response) => response,
+        pb::batch_navigate_result::Result::Failure(failure) => panic!("{}", failure.message),
+    };
+
+    assert_eq!([response(&results[0]), response(&results[2])], alone);
+
+    let Some(pb::batch_navigate_result::Result::Failure(failure)) = &results[1].result else {
+        panic!("the second question names no room");
+    };
+
+    assert_eq!(failure.code, i32::from(tonic::Code::NotFound));
+}
+
+/// Oracle: a frame's own feature is at distance 0 from it and nothing is nearer, in one room or in
+/// all.
+#[tokio::test]
+async fn a_mapped_feature_is_found_in_its_room() {
+    let server = start(Config::default()).await;
+
+    let request = pb::LocalizeRequest {
+        view: feature(feature_row(123)),
+        top_k: Some(5),
+        ..Default::default()
+    };
+    let answer = server.client.localize(request).await.unwrap();
+
+    assert_eq!((answer.room_count, answer.places.len()), (2, 5));
+
+    let best = &answer.places[0];
+    assert_eq!(
+        (
+            best.room.as_ref().unwrap().name.as_str(),
+            best.frame.as_ref().unwrap().frame_id
+        ),
+        ("synthetic", 123)
+    );
+
+    assert!(best.frame.as_ref().unwrap().distance < 1e-12);
+}
+
+/// Oracle: what was published.
+#[tokio::test]
+async fn the_catalog_lists_what_the_store_has() {
+    let server = start(Config::default()).await;
+    let rooms = server.client.rooms().await.unwrap();
+    let names: Vec<_> = rooms
+        .iter()
+        .map(|room| room.revision.clone().unwrap().name)
+        .collect();
+
+    assert_eq!(names, ["synthetic", "synthetic_b"]);
+
+    assert_eq!(
+        (rooms[0].frame_count, rooms[0].adapters.clone()),
+        (600, vec!["oracle".to_owned()])
+    );
+
+    assert_eq!(rooms[0].features[0].dim, 48);
+
+    let adapter = server.client.adapter("oracle").await.unwrap().unwrap();
+    assert_eq!(
+        (adapter.latent_dim, adapter.stride, adapter.split.as_str()),
+        (20, 40, "time")
+    );
+
+    assert_eq!(
+        adapter.test.unwrap().direction,
+        None,
+        "a score without meaning is absent"
+    );
+
+    let expected = json(&golden().join("m4_adapter/synthetic_expected.json"));
+    near(
+        "mu",
+        adapter.target_mean.unwrap().linear.unwrap().x,
+        number(&expected["mu"][0]),
+        1e-12,
+    );
+
+    near(
+        "sd",
+        adapter.target_deviation.unwrap().angular.unwrap().z,
+        number(&expected["sd"][5]),
+        1e-12,
+    );
+}
+
+/// Oracle: the exact index.
+#[tokio::test]
+async fn the_hnsw_index_answers_as_the_exact_one_here_and_says_what_it_is() {
+    use seese3_core::index::HnswParameters;
+    use seese3_core::navigation::IndexKind;
+
+    let index = IndexKind::Hnsw(HnswParameters::default());
+    let exact = start(Config::default()).await;
+
+    let hnsw = start(Config {
+        index,
+        ..Config::default()
+    })
+    .await;
+
+    for source in (0..560).step_by(40) {
+        let request = pb::NavigateRequest {
+            source: frame(source),
+            displacement: to_frame(source + 40),
+            top_k: Some(10),
+            ..question()
+        };
+        let a = exact.client.navigate(request.clone()).await.unwrap();
+
+        let b = hnsw.client.navigate(request).await.unwrap();
+        assert_eq!(a.steps, b.steps);
+        assert!(a.exact && !b.exact);
+    }
+}

@@ -1,0 +1,786 @@
+//! Changes of the catalog over the wire: uploads, defaults, removals, fits, and who may make them.
+
+use std::sync::Arc;
+
+use seese3_client::proto::v1 as pb;
+use seese3_client::{Client, Error};
+use seese3_core::features::Features;
+use seese3_core::room::Room;
+use seese3_server::{Config, Keyring};
+use seese3_store::Store;
+use sha2::{Digest, Sha256};
+use tonic::Code;
+
+use crate::harness::{
+    TestServer, feature, features_of, filled_store, oracle_adapter, question, record, room_of,
+    start_on,
+};
+use crate::security::{client_with, principal};
+use seese3_testing::world;
+
+/// A server that takes changes.
+async fn start_writable() -> (TestServer, Store) {
+    let (folder, store) = filled_store().await;
+    let server = start_on(folder, store.clone(), writable()).await;
+    (server, store)
+}
+
+fn writable() -> Config {
+    Config {
+        writable: true,
+        ..Config::default()
+    }
+}
+
+/// An upload as a test alters it before it is sent.
+#[derive(Clone)]
+struct Upload {
+    spec: pb::RoomUpload,
+    batches: Vec<pb::FrameBatch>,
+    /// None to send what was uploaded.
+    sha256: Option<Vec<u8>>,
+    frame_count: Option<u32>,
+}
+
+impl Upload {
+    /// A room and its features, in batches of 100 frames.
+    fn of(name: &str, room: &Room, features: &Features) -> Self {
+        let source = features.source();
+        let bytes = |row: usize| -> Vec<u8> {
+            let matrix = room.poses()[row].to_homogeneous().transpose();
+            matrix.iter().flat_map(|x| x.to_le_bytes()).collect()
+        };
+        let rows: Vec<usize> = (0..room.frame_count()).collect();
+        let batches = rows
+            .chunks(100)
+            .map(|rows| pb::FrameBatch {
+                poses: rows.iter().flat_map(|&row| bytes(row)).collect(),
+                features: vec![
+                    rows.iter()
+                        .flat_map(|&row| features.rows().row(row).to_vec())
+                        .flat_map(f32::to_le_bytes)
+                        .collect(),
+                ],
+                timestamps_ns: rows.iter().map(|&row| row as i64 * 33_000_000).collect(),
+                frame_names: rows.iter().map(|row| format!("frame-{row}")).collect(),
+                ..pb::FrameBatch::default()
+            })
+            .collect();
+
+        Self {
+            spec: pb::RoomUpload {
+                name: name.to_owned(),
+                features: vec![pb::FeatureSource {
+                    name: source.name.clone(),
+                    dim: source.dim as u32,
+                    ..pb::FeatureSource::default()
+                }],
+                ..pb::RoomUpload::default()
+            },
+            batches,
+            sha256: None,
+            frame_count: None,
+        }
+    }
+
+    fn synthetic(name: &str) -> Self {
+        Self::of(
+            name,
+            &room_of("any", "synthetic"),
+            &features_of("synthetic"),
+        )
+    }
+
+    fn messages(self) -> Vec<pb::CreateRoomRequest> {
+        use pb::create_room_request::Message;
+
+        let mut digest = Sha256::new();
+        let mut frame_count = 0;
+        for batch in &self.batches {
+            digest.update(&batch.poses);
+            batch.features.iter().for_each(|rows| digest.update(rows));
+            batch.images.iter().for_each(|image| digest.update(image));
+            frame_count += batch.poses.len() as u32 / 128;
+        }
+
+        let end = pb::UploadEnd {
+            frame_count: self.frame_count.unwrap_or(frame_count),
+            sha256: self.sha256.unwrap_or_else(|| digest.finalize().to_vec()),
+        };
+        let batches = self.batches.into_iter().map(Message::Frames);
+        std::iter::once(Message::Room(self.spec))
+            .chain(batches)
+            .chain([Message::End(end)])
+            .map(|message| pb::CreateRoomRequest {
+                message: Some(message),
+            })
+            .collect()
+    }
+
+    async fn send(self, client: &Client) -> Result<pb::CreateRoomResponse, Error> {
+        client
+            .create_room(tokio_stream::iter(self.messages()))
+            .await
+    }
+}
+
+fn code_and_field<T: std::fmt::Debug>(answer: Result<T, Error>) -> (Code, String) {
+    let error = answer.unwrap_err();
+    let code = error.code().unwrap_or_else(|| panic!("{error}"));
+    (code, error.field().unwrap_or_default())
+}
+
+/// Oracle: a room that was published from the disk with the same frames and features.
+#[tokio::test]
+async fn an_uploaded_room_answers_as_one_from_the_disk() {
+    let (server, store) = start_writable().await;
+    let answer = Upload::synthetic("rooms/uploaded")
+        .send(&server.client)
+        .await
+        .unwrap();
+    assert_eq!(
+        (
+            answer.revision.unwrap().revision,
+            answer.created,
+            answer.served
+        ),
+        (1, true, true)
+    );
+
+    // It is served as soon as the upload is answered.
+    let asked = |room: &str| {
+        server.client.navigate(pb::NavigateRequest {
+            room: room.to_owned(),
+            top_k: Some(5),
+            ..question()
+        })
+    };
+    let (here, there) = (
+        asked("uploaded").await.unwrap(),
+        asked("synthetic").await.unwrap(),
+    );
+    assert_eq!(here.steps[0].frames.len(), 5);
+    for (here, there) in here.steps[0].frames.iter().zip(&there.steps[0].frames) {
+        assert_eq!(here.frame_id, there.frame_id);
+        assert!((here.distance - there.distance).abs() < 1e-9);
+        assert_eq!(here.frame_name, format!("frame-{}", here.frame_id));
+        assert_eq!(
+            here.timestamp_ns,
+            Some(i64::from(here.frame_id) * 33_000_000)
+        );
+    }
+
+    // The same again is the same revision.
+    let again = Upload::synthetic("rooms/uploaded")
+        .send(&server.client)
+        .await
+        .unwrap();
+    assert_eq!(
+        (
+            again.revision.unwrap().revision,
+            again.created,
+            again.served
+        ),
+        (1, false, true)
+    );
+    assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+}
+
+/// Oracle: the protocol. Nothing of a refused upload is in the store.
+#[tokio::test]
+async fn unfit_uploads_are_refused_and_leave_nothing() {
+    let (server, store) = start_writable().await;
+    let good = Upload::synthetic("rooms/bad");
+
+    let altered = |alter: &dyn Fn(&mut Upload)| {
+        let mut upload = good.clone();
+        alter(&mut upload);
+        upload
+    };
+    let nan_pose = |upload: &mut Upload| {
+        upload.batches[1].poses[..8].copy_from_slice(&f64::NAN.to_le_bytes());
+    };
+    let transposed = |upload: &mut Upload| {
+        // The translation of the first frame moves into its last row.
+        upload.batches[0].poses[96..104].copy_from_slice(&1.0_f64.to_le_bytes());
+    };
+    let nan_feature = |upload: &mut Upload| {
+        upload.batches[2].features[0][..4].copy_from_slice(&f32::NAN.to_le_bytes());
+    };
+
+    for (upload, field) in [
+        (altered(&|u| u.spec.name = "bad".to_owned()), "room.name"),
+        (
+            altered(&|u| u.spec.name = "rooms/../x".to_owned()),
+            "room.name",
+        ),
+        (
+            altered(&|u| u.spec.name = "rooms/bad/revisions/1".to_owned()),
+            "room.name",
+        ),
+        (
+            altered(&|u| u.spec.name = "adapters/bad".to_owned()),
+            "room.name",
+        ),
+        (altered(&|u| u.spec.features.clear()), "room.features"),
+        (
+            altered(&|u| u.spec.features[0].dim = 0),
+            "room.features.dim",
+        ),
+        (
+            altered(&|u| u.spec.features[0].dim = u32::MAX),
+            "room.features.dim",
+        ),
+        (
+            altered(&|u| u.spec.features[0].name = "a/b".to_owned()),
+            "room.features.name",
+        ),
+        (
+            altered(&|u| u.spec.encode_for = "adapters/oracle".to_owned()),
+            "room.encode_for",
+        ),
+        (
+            altered(&|u| u.spec.licence = "x".repeat(2_000)),
+            "room.licence",
+        ),
+        (
+            altered(&|u| {
+                u.spec.camera = Some(pb::Pinhole {
+                    width: 640.0,
+                    height: 480.0,
+                    focal: f64::NAN,
+                    ..pb::Pinhole::default()
+                });
+            }),
+            "room.camera",
+        ),
+        (altered(&nan_pose), "frames.poses"),
+        (altered(&transposed), "frames.poses"),
+        (
+            altered(&|u| u.batches[0].poses.truncate(127)),
+            "frames.poses",
+        ),
+        (altered(&|u| u.batches[0].poses.clear()), "frames.poses"),
+        (
+            altered(&|u| {
+                u.batches[0].features[0].pop();
+            }),
+            "frames.features",
+        ),
+        (
+            altered(&|u| u.batches[0].features.clear()),
+            "frames.features",
+        ),
+        (
+            altered(&|u| u.batches[0].images.push(vec![1])),
+            "frames.images",
+        ),
+        (
+            altered(&|u| {
+                u.batches[1].timestamps_ns.pop();
+            }),
+            "frames.timestamps_ns",
+        ),
+        (
+            altered(&|u| u.batches[1].frame_names.clear()),
+            "frames.frame_names",
+        ),
+        (
+            altered(&|u| u.batches[1].sequences = vec![0; 100]),
+            "frames.sequences",
+        ),
+        (altered(&nan_feature), "frames.features"),
+        (altered(&|u| u.batches.clear()), "frames"),
+        (altered(&|u| u.frame_count = Some(3)), "end.frame_count"),
+        (altered(&|u| u.sha256 = Some(vec![0; 32])), "end.sha256"),
+        (altered(&|u| u.sha256 = Some(Vec::new())), "end.sha256"),
+    ] {
+        let refused = code_and_field(upload.send(&server.client).await);
+        assert_eq!(refused, (Code::InvalidArgument, field.to_owned()));
+    }
+
+    // Messages in the wrong order, and an upload that is broken off.
+    let messages = good.clone().messages();
+    for (sent, field) in [
+        (messages[1..].to_vec(), "room"),
+        ([&messages[..1], &messages[..1]].concat(), "room"),
+        (messages[..2].to_vec(), "end"),
+        (Vec::new(), "room"),
+        (
+            vec![messages[0].clone(), pb::CreateRoomRequest { message: None }],
+            "message",
+        ),
+        ([&messages[..], &messages[1..2]].concat(), "message"),
+    ] {
+        let answer = server.client.create_room(tokio_stream::iter(sent)).await;
+        assert_eq!(
+            code_and_field(answer),
+            (Code::InvalidArgument, field.to_owned())
+        );
+    }
+
+    let checked = altered(&|u| u.spec.validate_only = true)
+        .send(&server.client)
+        .await
+        .unwrap();
+    assert_eq!(checked.revision, None);
+
+    assert!(!server.folder.path().join("rooms/bad").exists());
+    let defaults = store.defaults().await.unwrap();
+    assert_eq!(store.current_rooms(&defaults).await.unwrap().len(), 2);
+
+    // What was altered is what was refused.
+    assert!(good.send(&server.client).await.unwrap().served);
+}
+
+/// Oracle: the bound itself.
+#[tokio::test]
+async fn uploads_together_hold_no_more_than_they_may() {
+    let (folder, store) = filled_store().await;
+    let config = Config {
+        upload_bytes: 200_000,
+        ..writable()
+    };
+    let server = start_on(folder, store, config).await;
+
+    let refused = Upload::synthetic("rooms/large").send(&server.client).await;
+    assert_eq!(refused.unwrap_err().code(), Some(Code::ResourceExhausted));
+
+    // What the refused one held is free again.
+    let mut small = Upload::synthetic("rooms/small");
+    small.batches.truncate(1);
+    assert!(small.send(&server.client).await.unwrap().served);
+}
+
+/// Oracle: the definition of an idempotent request.
+#[tokio::test]
+async fn a_change_that_is_sent_again_is_made_once() {
+    let (server, _) = start_writable().await;
+    let upload = |name: &str| {
+        let mut upload = Upload::synthetic(name);
+        upload.spec.request_id = "first".to_owned();
+        upload
+    };
+
+    let first = upload("rooms/new").send(&server.client).await.unwrap();
+    let again = upload("rooms/new").send(&server.client).await.unwrap();
+    assert_eq!(first, again);
+    assert!(again.created);
+
+    let other = upload("rooms/other").send(&server.client).await;
+    assert_eq!(
+        code_and_field(other),
+        (Code::InvalidArgument, "request_id".to_owned())
+    );
+
+    let delete = pb::DeleteRoomRequest {
+        name: "rooms/new".to_owned(),
+        request_id: "second".to_owned(),
+        validate_only: false,
+    };
+    for _ in 0..2 {
+        assert_eq!(
+            server.client.delete_room(delete.clone()).await.unwrap(),
+            [1]
+        );
+    }
+    let gone = pb::DeleteRoomRequest {
+        request_id: "third".to_owned(),
+        ..delete
+    };
+    assert_eq!(
+        code_and_field(server.client.delete_room(gone).await).0,
+        Code::NotFound
+    );
+}
+
+/// Oracle: by hand. The newest adapter answers until another one is chosen; what was chosen is
+/// taken back by one call; a chosen one cannot be removed.
+#[tokio::test]
+async fn defaults_are_chosen_and_taken_back() {
+    let (server, store) = start_writable().await;
+    store
+        .publish_adapter(
+            "trial",
+            &oracle_adapter(),
+            &record(),
+            features_of("synthetic").rows(),
+        )
+        .await
+        .unwrap();
+
+    let answering = async || {
+        let answer = server.client.navigate(question()).await.unwrap();
+        answer.adapter.unwrap().name
+    };
+    let choose = |default: Option<pb::set_default_request::Default>| {
+        server.client.set_default(pb::SetDefaultRequest {
+            name: "rooms/synthetic".to_owned(),
+            default,
+            ..pb::SetDefaultRequest::default()
+        })
+    };
+    let adapter = |name: &str| Some(pb::set_default_request::Default::Adapter(name.to_owned()));
+
+    let defaults = choose(adapter("adapters/trial")).await.unwrap();
+    assert_eq!(defaults.len(), 1);
+    assert_eq!(
+        (defaults[0].name.as_str(), defaults[0].adapter.as_str()),
+        ("rooms/synthetic", "adapters/trial")
+    );
+    assert_eq!(answering().await, "trial");
+
+    assert_eq!(choose(None).await.unwrap(), []);
+    choose(adapter("adapters/trial")).await.unwrap();
+    choose(adapter("adapters/oracle")).await.unwrap();
+    assert_eq!(answering().await, "oracle");
+    let room = server.client.room("synthetic").await.unwrap().unwrap();
+    assert_eq!(room.adapters, ["oracle", "trial"]);
+
+    let delete = |name: &str| {
+        server.client.delete_adapter(pb::DeleteAdapterRequest {
+            name: name.to_owned(),
+            ..pb::DeleteAdapterRequest::default()
+        })
+    };
+    assert_eq!(
+        code_and_field(delete("adapters/oracle").await).0,
+        Code::FailedPrecondition
+    );
+
+    let rolled_back = server
+        .client
+        .roll_back_default(pb::RollBackDefaultRequest::default())
+        .await
+        .unwrap();
+    assert_eq!(rolled_back[0].adapter, "adapters/trial");
+    assert_eq!(answering().await, "trial");
+
+    // Nothing chosen: the newest, and not what was chosen last.
+    choose(adapter("adapters/oracle")).await.unwrap();
+    assert!(choose(None).await.unwrap().is_empty());
+    assert_eq!(answering().await, "trial");
+    assert_eq!(delete("adapters/trial").await.unwrap(), [1]);
+    assert_eq!(answering().await, "oracle");
+
+    for (name, default, field) in [
+        ("synthetic", adapter("adapters/oracle"), "name"),
+        ("rooms/synthetic", adapter("oracle"), "adapter"),
+        ("adapters/oracle", adapter("adapters/oracle"), "adapter"),
+        ("rooms/synthetic/revisions/1", None, "name"),
+    ] {
+        let request = pb::SetDefaultRequest {
+            name: name.to_owned(),
+            default,
+            ..pb::SetDefaultRequest::default()
+        };
+        assert_eq!(
+            code_and_field(server.client.set_default(request).await),
+            (Code::InvalidArgument, field.to_owned())
+        );
+    }
+    assert_eq!(
+        code_and_field(choose(adapter("adapters/nobody")).await).0,
+        Code::NotFound
+    );
+    let revision = Some(pb::set_default_request::Default::Revision(7));
+    assert_eq!(code_and_field(choose(revision).await).0, Code::NotFound);
+}
+
+/// Oracle: the adapter in the store that it came from; damage that the test does.
+#[tokio::test]
+async fn an_adapter_moves_from_store_to_server() {
+    let (server, _) = start_writable().await;
+    let (_folder, other) = filled_store().await;
+    let (manifest, weights) = other.adapter_files("oracle", None).await.unwrap();
+
+    let send = async |name: &str, manifest: Vec<u8>, parts: Vec<Vec<u8>>| {
+        use pb::publish_adapter_request::Message;
+
+        let upload = pb::AdapterUpload {
+            name: name.to_owned(),
+            manifest,
+            ..pb::AdapterUpload::default()
+        };
+        let parts = parts.into_iter().map(Message::Weights);
+        let messages: Vec<_> = std::iter::once(Message::Adapter(upload))
+            .chain(parts)
+            .map(|message| pb::PublishAdapterRequest {
+                message: Some(message),
+            })
+            .collect();
+        server
+            .client
+            .publish_adapter(tokio_stream::iter(messages))
+            .await
+    };
+
+    let halves = weights.chunks(weights.len() / 2 + 1);
+    let halves: Vec<Vec<u8>> = halves.map(<[u8]>::to_vec).collect();
+    let answer = send("adapters/copy", manifest.clone(), halves.clone())
+        .await
+        .unwrap();
+    assert!(answer.created && answer.served);
+
+    let mut request = question();
+    request.adapter = "oracle".to_owned();
+    let original = server.client.navigate(request.clone()).await.unwrap();
+    request.adapter = "copy".to_owned();
+    let copy = server.client.navigate(request).await.unwrap();
+    assert_eq!(original.steps, copy.steps);
+
+    let mut altered = weights.clone();
+    let middle = altered.len() / 2;
+    altered[middle] ^= 1;
+    let mut altered_manifest = manifest.clone();
+    let at = altered_manifest.len() / 2;
+    altered_manifest[at] ^= 1;
+    for (name, manifest, parts, field) in [
+        (
+            "adapters/x",
+            manifest.clone(),
+            vec![altered],
+            "adapter.manifest",
+        ),
+        (
+            "adapters/x",
+            altered_manifest,
+            halves.clone(),
+            "adapter.manifest",
+        ),
+        (
+            "adapters/x",
+            b"{}".to_vec(),
+            halves.clone(),
+            "adapter.manifest",
+        ),
+        (
+            "adapters/x",
+            manifest.clone(),
+            vec![weights[..9].to_vec()],
+            "weights",
+        ),
+        (
+            "adapters/x",
+            manifest.clone(),
+            vec![[&weights[..], &[0]].concat()],
+            "weights",
+        ),
+        ("rooms/x", manifest.clone(), halves.clone(), "adapter.name"),
+        ("adapters/..", manifest.clone(), halves, "adapter.name"),
+    ] {
+        assert_eq!(
+            code_and_field(send(name, manifest, parts).await),
+            (Code::InvalidArgument, field.to_owned())
+        );
+    }
+    assert_eq!(server.client.adapters().await.unwrap().len(), 2);
+}
+
+/// Oracle: the recorded poses: the adapter that was fitted on the server locates views of its room.
+#[tokio::test]
+async fn a_room_is_fitted_on_the_server() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+    let (hall, features) = world::served("hall");
+    store
+        .publish_room(&hall, std::slice::from_ref(&features))
+        .await
+        .unwrap();
+    let server = start_on(folder, store, writable()).await;
+
+    let request = pb::RefitRoomRequest {
+        name: "rooms/hall".to_owned(),
+        request_id: "fit".to_owned(),
+        ..pb::RefitRoomRequest::default()
+    };
+    let mut steps = 0;
+    let result = server
+        .client
+        .refit_room(request.clone(), |step| {
+            steps += 1;
+            assert!((1..=step.total).contains(&step.done));
+        })
+        .await
+        .unwrap();
+    assert!(result.created && result.served && steps > 0);
+    assert_eq!(
+        result.revision.as_ref().unwrap().name,
+        "hall.made-up.fitted"
+    );
+
+    let located = server
+        .client
+        .localize(pb::LocalizeRequest {
+            rooms: vec!["hall".to_owned()],
+            view: feature(features.rows().row(100).to_vec()),
+            ..pb::LocalizeRequest::default()
+        })
+        .await
+        .unwrap();
+    assert!(located.located.is_some());
+
+    // The same again is answered from memory, without a fit.
+    let mut steps = 0;
+    let again = server
+        .client
+        .refit_room(request.clone(), |_| steps += 1)
+        .await;
+    assert_eq!((again.unwrap(), steps), (result, 0));
+
+    for (request, code, field) in [
+        (
+            pb::RefitRoomRequest {
+                name: "rooms/nowhere".to_owned(),
+                request_id: String::new(),
+                ..request.clone()
+            },
+            Code::NotFound,
+            "room",
+        ),
+        (
+            pb::RefitRoomRequest {
+                seed: u64::MAX,
+                ..request.clone()
+            },
+            Code::InvalidArgument,
+            "seed",
+        ),
+        (
+            pb::RefitRoomRequest {
+                features: "none".to_owned(),
+                request_id: String::new(),
+                ..request.clone()
+            },
+            Code::InvalidArgument,
+            "features",
+        ),
+        (
+            pb::RefitRoomRequest {
+                base_adapter: "adapters/hall.made-up.fitted".to_owned(),
+                request_id: String::new(),
+                ..request
+            },
+            Code::InvalidArgument,
+            "base_adapter",
+        ),
+    ] {
+        let refused = server.client.refit_room(request, |_| ()).await;
+        assert_eq!(code_and_field(refused), (code, field.to_owned()));
+    }
+}
+
+/// Oracle: the meaning of the flag and of the file of credentials.
+#[tokio::test]
+async fn only_those_who_may_change_what_they_may() {
+    let (folder, store) = filled_store().await;
+    let closed = start_on(folder, store, Config::default()).await;
+    let refused = Upload::synthetic("rooms/new").send(&closed.client).await;
+    assert_eq!(refused.unwrap_err().code(), Some(Code::FailedPrecondition));
+
+    let (folder, store) = filled_store().await;
+    let file = folder.path().join("auth.toml");
+    let callers = [
+        principal("reader", "\"catalog\", \"navigate\"", "\"*\""),
+        principal("writer", "\"write\", \"catalog\"", "\"*\""),
+        principal("mover", "\"write\", \"catalog\"", "\"new-*\""),
+    ];
+    std::fs::write(&file, callers.concat()).unwrap();
+    let config = Config {
+        keyring: Some(Arc::new(Keyring::open(file).unwrap())),
+        ..writable()
+    };
+    let server = start_on(folder, store, config).await;
+
+    let outcome = async |caller: Option<&str>, room: &str| {
+        let client = client_with(&server, caller).await;
+        match Upload::synthetic(room).send(&client).await {
+            Ok(_) => Code::Ok,
+            Err(error) => error.code().unwrap(),
+        }
+    };
+    for (caller, room, expected) in [
+        (None, "rooms/new-1", Code::Unauthenticated),
+        (Some("reader"), "rooms/new-1", Code::PermissionDenied),
+        (Some("mover"), "rooms/new-1", Code::Ok),
+        (Some("mover"), "rooms/old", Code::PermissionDenied),
+        (Some("writer"), "rooms/old", Code::Ok),
+    ] {
+        assert_eq!(outcome(caller, room).await, expected, "{caller:?} {room}");
+    }
+
+    // Adapters answer everywhere, so they are for those who see every room.
+    let delete = pb::DeleteAdapterRequest {
+        name: "adapters/oracle".to_owned(),
+        ..pb::DeleteAdapterRequest::default()
+    };
+    for (caller, expected) in [("mover", Code::PermissionDenied), ("writer", Code::Ok)] {
+        let client = client_with(&server, Some(caller)).await;
+        let code = match client.delete_adapter(delete.clone()).await {
+            Ok(_) => Code::Ok,
+            Err(error) => error.code().unwrap(),
+        };
+        assert_eq!(code, expected, "{caller}");
+    }
+}
+
+/// Oracle: the bound on waiting changes: each is made or refused as one too many, and the server
+/// goes on. More than one blocking thread each would be more than there are.
+#[tokio::test]
+async fn many_changes_at_once_are_made_or_refused() {
+    let (server, store) = start_writable().await;
+    let mut changes = tokio::task::JoinSet::new();
+
+    for number in 0..600 {
+        let client = server.client.clone();
+        changes.spawn(async move {
+            let default = match number % 2 {
+                0 => None,
+                _ => Some(pb::set_default_request::Default::Revision(1)),
+            };
+            let request = pb::SetDefaultRequest {
+                name: "rooms/synthetic".to_owned(),
+                default,
+                ..pb::SetDefaultRequest::default()
+            };
+            match client.set_default(request).await {
+                Ok(_) => Code::Ok,
+                Err(error) => error.code().unwrap(),
+            }
+        });
+    }
+
+    let codes = changes.join_all().await;
+    let count = |code: Code| codes.iter().filter(|found| **found == code).count();
+    assert_eq!(count(Code::Ok) + count(Code::ResourceExhausted), 600);
+    assert!(count(Code::Ok) >= 64, "{} were made", count(Code::Ok));
+
+    assert!(server.client.navigate(question()).await.is_ok());
+    assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+}
+
+/// Oracle: the promise: a change that was admitted is made, whoever waits for it, and the same
+/// change that is sent again meanwhile is the same change.
+#[tokio::test]
+async fn a_caller_that_goes_away_leaves_its_change() {
+    let (server, store) = start_writable().await;
+    let upload = || {
+        let mut upload = Upload::synthetic("rooms/left");
+        upload.spec.request_id = "left".to_owned();
+        upload
+    };
+
+    let client = server.client.clone();
+    let leaving = tokio::spawn(async move { upload().send(&client).await });
+    let both = Upload::synthetic("rooms/left");
+    let sent_again = {
+        let mut again = both;
+        again.spec.request_id = "left".to_owned();
+        again.send(&server.client).await.unwrap()
+    };
+    leaving.abort();
+    let _ = leaving.await;
+
+    assert_eq!(sent_again.revision.unwrap().revision, 1);
+    assert_eq!(store.load_room("left", None).await.unwrap().revision, 1);
+}

@@ -1,0 +1,219 @@
+//! An adapter that was fitted to a room, over the wire: it serves that room alone, and says where a
+//! view is, how sure that is, and what told it.
+
+use std::sync::Arc;
+
+use seese3_client::convert;
+use seese3_client::proto::v1 as pb;
+use seese3_core::geometry::PoseError;
+use seese3_core::room::FrameId;
+use seese3_core::training::RoomData;
+use seese3_robot::fitting::fit;
+use seese3_server::Config;
+use seese3_store::{BaseAdapter, RoomFit, Store};
+use tonic::Code;
+
+use crate::harness::{TestServer, feature, frame, latent, start_on};
+use seese3_testing::world::{calibrated, served};
+
+/// The places hall and attic, an adapter of both, and one that goes on from it in the hall.
+async fn server() -> TestServer {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+    for name in ["hall", "attic"] {
+        let (room, features) = served(name);
+        store.publish_room(&room, &[features]).await.unwrap();
+    }
+
+    let (adapter, record) = calibrated();
+    let (room, features) = served("hall");
+    store
+        .publish_adapter("base", &adapter, &record, features.rows())
+        .await
+        .unwrap();
+
+    let data = RoomData {
+        room: &room,
+        revision: 1,
+        features: &features,
+    };
+    let mapped: Vec<FrameId> = (0..room.frame_count() as u32).map(FrameId).collect();
+    let fitted = fit(&data, &mapped, Some(&Arc::new(adapter)), 0, &|_| ()).unwrap();
+    let room_fit = RoomFit {
+        room: room.id().clone(),
+        room_revision: 1,
+        base: Some(BaseAdapter {
+            name: "base".to_owned(),
+            revision: 1,
+        }),
+        rules: fitted.rules.clone(),
+    };
+    store
+        .publish_fitted("hall.fitted", &fitted, &room_fit, features.rows())
+        .await
+        .unwrap();
+
+    // What is read back is what was published.
+    let stored = store.load_adapter("hall.fitted", None).await.unwrap();
+    assert_eq!(stored.room_fit, Some(room_fit));
+
+    start_on(folder, store, Config::default()).await
+}
+
+fn localize(room: &str, view: Option<pb::View>) -> pb::LocalizeRequest {
+    pb::LocalizeRequest {
+        rooms: vec![room.to_owned()],
+        adapter: "hall.fitted".to_owned(),
+        view,
+        ..pb::LocalizeRequest::default()
+    }
+}
+
+/// Oracle: the recorded pose of the frame whose feature is sent, and the promises of the protocol.
+#[tokio::test]
+async fn a_view_is_located_in_the_room_of_its_adapter() {
+    let server = server().await;
+    let (room, features) = served("hall");
+
+    for row in [7, 100, 233] {
+        let view = feature(features.rows().row(row).to_vec());
+        let answer = server
+            .client
+            .localize(localize("hall", view))
+            .await
+            .unwrap();
+        let located = answer.located.unwrap();
+
+        let pose = convert::pose(&located.pose.unwrap()).unwrap();
+        let error = PoseError::between(&pose, &room.poses()[row]);
+        assert!(
+            error.translation_m < 0.01 && error.rotation_rad < 0.01,
+            "{error:?}"
+        );
+        assert_eq!(located.covariance.len(), 36);
+        assert_eq!(located.frame_id as usize, row);
+        assert!(["fitted", "zero-shot", "nearest-frame"].contains(&&*located.translation_reader));
+        assert!((0.0..=1.0).contains(&located.rotation_gain));
+    }
+
+    // A stored frame has a pose of its own.
+    let answer = server
+        .client
+        .localize(localize("hall", frame(3)))
+        .await
+        .unwrap();
+    assert!(answer.located.is_none());
+}
+
+/// Oracle: the promise of NavigateTo: nothing is planned for a view that tells no place. An adapter
+/// that was fitted to a room and calibrated nowhere knows that too.
+#[tokio::test]
+async fn a_fitted_adapter_starts_no_way_from_elsewhere() {
+    use pb::navigate_to_request::Goal;
+
+    let server = server().await;
+    let ask = async |values: Vec<f32>| {
+        let asked = pb::NavigateToRequest {
+            room: "hall".to_owned(),
+            source: feature(values),
+            goal: Some(Goal::GoalFrameId(120)),
+            ..Default::default()
+        };
+        server.client.navigate_to(asked, |_| ()).await.unwrap()
+    };
+
+    let own = ask(served("hall").1.rows().row(40).to_vec()).await;
+    assert_eq!(own.adapter.unwrap().name, "hall.fitted");
+    assert_eq!(
+        own.outcome,
+        pb::NavigateToOutcome::Reached as i32,
+        "{}",
+        own.message
+    );
+    assert!(
+        own.arrival_probability
+            .is_some_and(|probability| probability > 0.5)
+    );
+
+    let width = served("hall").1.rows().ncols();
+    for elsewhere in [
+        served("attic").1.rows().row(40).to_vec(),
+        vec![0.0; width],
+        served("hall").1.rows().row(40).mapv(|x| 10.0 * x).to_vec(),
+    ] {
+        let answer = ask(elsewhere).await;
+        assert_eq!(
+            answer.outcome(),
+            pb::NavigateToOutcome::StartUnknown,
+            "{}",
+            answer.message
+        );
+    }
+}
+
+/// Oracle: the promise that a fitted adapter serves its own room alone, where it is the default.
+#[tokio::test]
+async fn a_fitted_adapter_serves_no_other_room() {
+    let server = server().await;
+    let view = feature(served("attic").1.rows().row(0).to_vec());
+    let refused = server
+        .client
+        .localize(localize("attic", view.clone()))
+        .await;
+    assert_eq!(refused.unwrap_err().code(), Some(Code::FailedPrecondition));
+
+    let by_default = |room: &str| pb::LocalizeRequest {
+        adapter: String::new(),
+        ..localize(room, view.clone())
+    };
+    let attic = server.client.localize(by_default("attic")).await.unwrap();
+    assert_eq!(attic.adapter.unwrap().name, "base");
+    assert!(attic.located.is_none());
+
+    let hall = server.client.localize(by_default("hall")).await.unwrap();
+    assert_eq!(hall.adapter.unwrap().name, "hall.fitted");
+}
+
+/// Oracle: the promise of the protocol: the room that an adapter was fitted to answers with the
+/// pose that it locates, the other room with that of its nearest frame; a latent has no feature to
+/// locate.
+#[tokio::test]
+async fn a_fitted_room_is_relocalised_by_its_own_adapter() {
+    let server = server().await;
+    let (room, features) = served("hall");
+    let ask = |view: Option<pb::View>| pb::RelocalizeRequest {
+        views: vec![view.unwrap()],
+        ..pb::RelocalizeRequest::default()
+    };
+
+    // Noise keeps the view apart from the frame that it resembles.
+    let view: Vec<f32> = features.rows().row(100).iter().map(|x| x + 0.01).collect();
+    let found = server.client.relocalize(ask(feature(view.clone()))).await;
+    let found = found.unwrap();
+
+    let [hall, attic] = found.rooms.as_slice() else {
+        panic!("{found:?}")
+    };
+    assert_eq!(hall.room.as_ref().unwrap().name, "hall");
+    assert!(attic.located.is_none() && attic.pose.is_some());
+
+    let located = hall.located.as_ref().unwrap();
+    assert_eq!(
+        (&hall.pose, &hall.covariance),
+        (&located.pose, &located.covariance)
+    );
+    let alone = server
+        .client
+        .localize(localize("hall", feature(view)))
+        .await;
+    assert_eq!(alone.unwrap().located.as_ref(), Some(located));
+
+    let pose = convert::pose(hall.pose.as_ref().unwrap()).unwrap();
+    let error = PoseError::between(&pose, &room.poses()[100]);
+    assert!(error.translation_m < 0.05, "{error:?}");
+
+    let row = features.rows().row(100).to_vec();
+    let view = latent(calibrated().0.embed_one(&row).unwrap().to_vec());
+    let found = server.client.relocalize(ask(view)).await.unwrap();
+    assert!(found.rooms.iter().all(|room| room.located.is_none()));
+}

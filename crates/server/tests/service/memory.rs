@@ -1,0 +1,197 @@
+//! What requests may hold in memory: bodies that never arrive, messages that grow when they are
+//! decoded, answers that are too large.
+
+use std::time::Duration;
+
+use prost::Message;
+use seese3_client::proto::v1 as pb;
+use seese3_server::{Config, Metrics};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tonic::Code;
+
+use crate::harness::{question, start};
+use crate::http2::{NAVIGATE, frame, headers, opened, prefixed, silent_calls};
+
+/// The memory that is held, as the metrics say.
+fn held(metrics: &Metrics) -> u64 {
+    let text = metrics.text();
+    let line = text
+        .lines()
+        .find_map(|line| line.strip_prefix("seese3_memory_held_bytes "));
+    line.unwrap().parse().unwrap()
+}
+
+/// Waits until as much is held as wanted.
+async fn until_held(metrics: &Metrics, is_wanted: impl Fn(u64) -> bool) -> u64 {
+    for _ in 0..2_000 {
+        let now = held(metrics);
+        if is_wanted(now) {
+            return now;
+        }
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    panic!("{} bytes are held", held(metrics));
+}
+
+/// Oracle: the bound and the time limit themselves.
+#[tokio::test]
+async fn bodies_that_never_arrive_hold_little_and_not_for_long() {
+    let metrics = Metrics::default();
+    let server = start(Config {
+        memory_bytes: 2 << 20,
+        receive_within: Duration::from_secs(2),
+        metrics: metrics.clone(),
+        ..Config::default()
+    })
+    .await;
+    assert_eq!(until_held(&metrics, |held| held == 0).await, 0);
+
+    // A call counts for 16 KiB and what it has sent.
+    let ten = silent_calls(&server.address, 10, &[0; 1_000]).await;
+    let expected = 10 * ((16 << 10) + 1_000);
+    until_held(&metrics, |held| held == expected).await;
+
+    // As many as fit: a further call is refused, and is answered when they have been given up.
+    let many = silent_calls(&server.address, 200, &[]).await;
+    until_held(&metrics, |held| held > (2 << 20) - (17 << 10)).await;
+    let refused = server.client.navigate(question()).await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::ResourceExhausted));
+
+    until_held(&metrics, |held| held == 0).await;
+    assert!(server.client.navigate(question()).await.is_ok());
+
+    drop((ten, many));
+    until_held(&metrics, |held| held == 0).await;
+}
+
+/// Oracle: by hand: two bytes for each request of a batch are hundreds when it is decoded.
+#[tokio::test]
+async fn a_message_that_grows_when_it_is_decoded_is_refused_before() {
+    let metrics = Metrics::default();
+    let server = start(Config {
+        metrics: metrics.clone(),
+        ..Config::default()
+    })
+    .await;
+
+    let empty = vec![pb::NavigateRequest::default(); 2_000_000];
+    let refused = server.client.batch_navigate(empty).await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::InvalidArgument), "{refused}");
+    assert_eq!(refused.field().as_deref(), Some("request"));
+
+    // A batch of the largest size is small beside that.
+    let batch = vec![question(); 256];
+    let answers = server.client.batch_navigate(batch).await.unwrap();
+    assert_eq!(answers.len(), 256);
+    until_held(&metrics, |held| held == 0).await;
+}
+
+/// Oracle: the bound itself.
+#[tokio::test]
+async fn an_answer_that_finds_no_memory_is_refused() {
+    let server = start(Config {
+        memory_bytes: 300_000,
+        ..Config::default()
+    })
+    .await;
+    assert!(server.client.navigate(question()).await.is_ok());
+
+    let large = pb::NavigateRequest {
+        steps: Some(100),
+        top_k: Some(100),
+        ..question()
+    };
+    let refused = server.client.navigate(large).await.unwrap_err();
+    assert_eq!(refused.code(), Some(Code::ResourceExhausted));
+    assert!(server.client.navigate(question()).await.is_ok());
+}
+
+/// Oracle: the time limit itself. The caller's window is closed, or has room for one byte, and it
+/// reads or does not read what else the server sends.
+#[tokio::test]
+async fn a_response_that_is_not_received_is_not_kept() {
+    let metrics = Metrics::default();
+    let server = start(Config {
+        response_timeout: Duration::from_secs(2),
+        metrics: metrics.clone(),
+        ..Config::default()
+    })
+    .await;
+    let large = pb::NavigateRequest {
+        steps: Some(100),
+        top_k: Some(100),
+        ..question()
+    };
+
+    for window in [0, 1] {
+        // SETTINGS_INITIAL_WINDOW_SIZE.
+        let mut stream = opened(&server.address, &[0, 4, 0, 0, 0, window]).await;
+        let call = [
+            frame(1, 4, 1, &headers(NAVIGATE)),
+            frame(0, 1, 1, &prefixed(&large.encode_to_vec())),
+        ];
+        stream.write_all(&call.concat()).await.unwrap();
+
+        // The response has far more than one piece; what was taken over goes with the connection.
+        until_held(&metrics, |held| held > 200_000).await;
+        until_held(&metrics, |held| held == 0).await;
+        let mut rest = Vec::new();
+        let ended = stream.read_to_end(&mut rest);
+        let ended = tokio::time::timeout(Duration::from_secs(5), ended).await;
+        assert!(ended.is_ok(), "the connection is closed");
+    }
+
+    // A response that is received costs nobody the connection.
+    for _ in 0..5 {
+        assert!(server.client.navigate(large.clone()).await.is_ok());
+        tokio::time::sleep(Duration::from_millis(500)).await;
+    }
+}
+
+/// Oracle: gRPC: a request of one message has one message. What is behind it is not decoded.
+#[tokio::test]
+async fn a_second_message_is_not_decoded() {
+    let metrics = Metrics::default();
+    let server = start(Config {
+        metrics: metrics.clone(),
+        ..Config::default()
+    })
+    .await;
+
+    let two = [prefixed(&[]), prefixed(&[0; 50_000])].concat();
+    let mut stream = silent_calls(&server.address, 1, &[]).await;
+    for part in two.chunks(10_000) {
+        stream.write_all(&frame(0, 0, 1, part)).await.unwrap();
+    }
+    until_held(&metrics, |held| held > 50_000).await;
+    stream.write_all(&frame(0, 1, 1, &[])).await.unwrap();
+
+    // It is refused, and nothing of it is held any more.
+    until_held(&metrics, |held| held == 0).await;
+    let refused = r#"method="/seese3.v1.NavigationService/Navigate",code="INVALID_ARGUMENT"} 1"#;
+    assert!(metrics.text().contains(refused), "{}", metrics.text());
+}
+
+/// Oracle: by hand: two bytes for each name of a room are a string when they are decoded.
+#[tokio::test]
+async fn a_message_of_a_stream_that_grows_is_refused_too() {
+    let server = start(Config {
+        memory_bytes: 32 << 20,
+        ..Config::default()
+    })
+    .await;
+
+    let config = pb::TrackConfig {
+        rooms: vec![String::new(); 2_000_000],
+        ..pb::TrackConfig::default()
+    };
+    let request = pb::TrackRequest {
+        message: Some(pb::track_request::Message::Config(config)),
+    };
+    let opened = server.client.track(tokio_stream::iter([request])).await;
+    let refused = match opened {
+        Err(error) => error.code().unwrap(),
+        Ok(mut answers) => answers.message().await.unwrap_err().code(),
+    };
+    assert_eq!(refused, Code::InvalidArgument);
+}

@@ -1,0 +1,498 @@
+//! Tokens, certificates, rights by verb and room, and the bounds on connections.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
+use seese3_client::proto::v1 as pb;
+use seese3_client::{Client, ClientTls, ConnectOptions};
+use seese3_server::{Config, Keyring, Tls, TlsFiles};
+use sha2::{Digest, Sha256};
+use tokio::io::AsyncReadExt;
+use tokio::net::TcpStream;
+use tonic::Code;
+
+use crate::harness::{TestServer, filled_store, frame, question, start_on, to_frame};
+
+const DEADLINE: Duration = Duration::from_secs(20);
+const VERBS: [&str; 6] = [
+    "navigate", "localize", "track", "evaluate", "catalog", "write",
+];
+
+fn hex_digest(bytes: &[u8]) -> String {
+    let digest = Sha256::digest(bytes);
+    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// One principal of a file of credentials, whose token is its name.
+pub fn principal(name: &str, verbs: &str, rooms: &str) -> String {
+    format!(
+        "[[principal]]\nname = \"{name}\"\ntoken_sha256 = \"{}\"\nverbs = [{verbs}]\nrooms = [{rooms}]\nstreams = 1\n",
+        hex_digest(name.as_bytes())
+    )
+}
+
+/// A principal for every verb with all rooms, one with all verbs and one room, and one with all.
+fn credentials() -> String {
+    let all = VERBS.map(|verb| format!("\"{verb}\"")).join(", ");
+    let mut file: String = VERBS
+        .map(|verb| principal(verb, &format!("\"{verb}\""), "\"*\""))
+        .concat();
+    file += &principal("one-room", &all, "\"synthetic\"");
+    file += &principal("everything", &all, "\"*\"");
+    file
+}
+
+async fn start_with(config: Config) -> TestServer {
+    let (folder, store) = filled_store().await;
+    start_on(folder, store, config).await
+}
+
+async fn start_with_credentials() -> TestServer {
+    let (folder, store) = filled_store().await;
+    let file = folder.path().join("auth.toml");
+    std::fs::write(&file, credentials()).unwrap();
+    let config = Config {
+        keyring: Some(Arc::new(Keyring::open(file).unwrap())),
+        writable: true,
+        ..Config::default()
+    };
+
+    start_on(folder, store, config).await
+}
+
+pub async fn client_with(server: &TestServer, token: Option<&str>) -> Client {
+    let options = ConnectOptions {
+        deadline: DEADLINE,
+        token: token.map(str::to_owned),
+        tls: None,
+    };
+    Client::connect_with(&server.address, options)
+        .await
+        .unwrap()
+}
+
+fn code_of<T: std::fmt::Debug>(answer: Result<T, seese3_client::Error>) -> Code {
+    match answer {
+        Ok(_) => Code::Ok,
+        Err(error) => error.code().unwrap_or_else(|| panic!("{error}")),
+    }
+}
+
+/// Asks one RPC of each verb, in their order.
+async fn asked(client: &Client) -> [Code; 6] {
+    asked_in(client, "synthetic").await
+}
+
+/// Asks one RPC of each verb about a room.
+async fn asked_in(client: &Client, room: &str) -> [Code; 6] {
+    let localized = client.localize(pb::LocalizeRequest {
+        rooms: vec![room.to_owned()],
+        view: frame(3),
+        ..pb::LocalizeRequest::default()
+    });
+    let estimated = client.estimate_motion(pb::EstimateMotionRequest {
+        room: room.to_owned(),
+        first: frame(3),
+        second: frame(5),
+        ..pb::EstimateMotionRequest::default()
+    });
+    let evaluated = client.evaluate(
+        pb::EvaluateRequest {
+            room: room.to_owned(),
+            stride: Some(40),
+            ..pb::EvaluateRequest::default()
+        },
+        |_| (),
+    );
+
+    let navigated = pb::NavigateRequest {
+        room: room.to_owned(),
+        source: frame(3),
+        displacement: to_frame(5),
+        ..pb::NavigateRequest::default()
+    };
+    let nothing_chosen = client.set_default(pb::SetDefaultRequest {
+        name: format!("rooms/{room}"),
+        ..pb::SetDefaultRequest::default()
+    });
+
+    [
+        code_of(client.navigate(navigated).await),
+        code_of(localized.await),
+        code_of(estimated.await),
+        code_of(evaluated.await),
+        code_of(client.room(room).await),
+        code_of(nothing_chosen.await),
+    ]
+}
+
+/// Oracle: the meaning of the file: a caller may what its verbs say and nothing else; nobody may
+/// anything without a token that is known; health needs none.
+#[tokio::test]
+async fn a_caller_may_what_its_verbs_say_and_nothing_else() {
+    let server = start_with_credentials().await;
+
+    for (granted, verb) in VERBS.iter().enumerate() {
+        let codes = asked(&client_with(&server, Some(verb)).await).await;
+        for (needed, code) in codes.into_iter().enumerate() {
+            let expected = if needed == granted {
+                Code::Ok
+            } else {
+                Code::PermissionDenied
+            };
+            assert_eq!(code, expected, "{verb} asks what needs {}", VERBS[needed]);
+        }
+    }
+
+    let everything = client_with(&server, Some("everything")).await;
+    assert_eq!(asked(&everything).await, [Code::Ok; 6]);
+
+    for token in [None, Some("nobody"), Some("Everything")] {
+        let client = client_with(&server, token).await;
+        assert_eq!(
+            asked(&client).await,
+            [Code::Unauthenticated; 6],
+            "{token:?}"
+        );
+        assert!(client.serves("").await.unwrap(), "health needs no token");
+    }
+}
+
+/// Oracle: the meaning of the file, for every verb with every kind of scope, and every room: what
+/// is not in both does not exist or is forbidden. Each caller has one verb.
+#[tokio::test]
+async fn every_verb_is_held_to_every_scope() {
+    let scopes = [
+        ("all", "\"*\"", [true, true]),
+        ("one", "\"synthetic\"", [true, false]),
+        ("other", "\"synthetic_b\"", [false, true]),
+        ("beginning", "\"synthetic_*\"", [false, true]),
+        ("none", "\"elsewhere\"", [false, false]),
+    ];
+    let mut file = String::new();
+    for verb in VERBS {
+        for (name, rooms, _) in scopes {
+            file += &principal(&format!("{verb}-{name}"), &format!("\"{verb}\""), rooms);
+        }
+    }
+    let (folder, store) = filled_store().await;
+    let auth = folder.path().join("auth.toml");
+    std::fs::write(&auth, file).unwrap();
+    let config = Config {
+        keyring: Some(Arc::new(Keyring::open(auth).unwrap())),
+        writable: true,
+        ..Config::default()
+    };
+    let server = start_on(folder, store, config).await;
+
+    for (granted, verb) in VERBS.iter().enumerate() {
+        for (name, _, seen) in scopes {
+            let client = client_with(&server, Some(&format!("{verb}-{name}"))).await;
+            for (room, is_seen) in ["synthetic", "synthetic_b"].into_iter().zip(seen) {
+                let codes = asked_in(&client, room).await;
+                for (needed, code) in codes.into_iter().enumerate() {
+                    let expected = match (needed == granted, is_seen, VERBS[needed]) {
+                        // Whether there is such a room is not told to who may not change it.
+                        (false, ..) | (true, false, "write") => Code::PermissionDenied,
+                        (true, false, _) => Code::NotFound,
+                        (true, true, _) => Code::Ok,
+                    };
+                    let asks = VERBS[needed];
+                    assert_eq!(code, expected, "{verb}-{name} asks {asks} of {room}");
+                }
+            }
+        }
+    }
+}
+
+/// Oracle: PyJWT, which signed the tokens, and the meaning of `scope`.
+#[cfg(feature = "jwt")]
+#[tokio::test]
+async fn tokens_that_an_issuer_signed_are_taken() {
+    let (folder, store) = filled_store().await;
+    let jwt = seese3_testing::golden().join("jwt");
+    let file = folder.path().join("auth.toml");
+    let all = VERBS.map(|verb| format!("\"{verb}\"")).join(", ");
+    std::fs::copy(jwt.join("p256.pem"), folder.path().join("login.pem")).unwrap();
+    let issuer = format!(
+        "[[issuer]]\nissuer = \"https://login.example.org\"\naudience = \"seese3\"\n\
+         public_keys = [\"login.pem\"]\nverbs = [{all}]\nrooms = [\"*\"]\n"
+    );
+    std::fs::write(&file, issuer).unwrap();
+    let config = Config {
+        keyring: Some(Arc::new(Keyring::open(file).unwrap())),
+        writable: true,
+        ..Config::default()
+    };
+    let server = start_on(folder, store, config).await;
+
+    let tokens = std::fs::read(jwt.join("tokens.json")).unwrap();
+    let tokens: serde_json::Value = serde_json::from_slice(&tokens).unwrap();
+    let codes =
+        async |token: &serde_json::Value| asked(&client_with(&server, token.as_str()).await).await;
+
+    assert_eq!(codes(&tokens["good"]["ES256"]).await, [Code::Ok; 6]);
+    let denied = Code::PermissionDenied;
+    let scoped = codes(&tokens["narrowed"]["scope"]).await;
+    assert_eq!(scoped, [Code::Ok, denied, denied, denied, denied, Code::Ok]);
+    for what in ["expired", "of another key", "of no algorithm"] {
+        let codes = codes(&tokens["bad"][what][0]).await;
+        assert_eq!(codes, [Code::Unauthenticated; 6], "{what}");
+    }
+}
+
+/// Oracle: the promise: a room that a caller may not see is answered exactly as one that does not
+/// exist.
+#[tokio::test]
+async fn a_room_out_of_reach_does_not_exist() {
+    let server = start_with_credentials().await;
+    let client = client_with(&server, Some("one-room")).await;
+    assert_eq!(asked(&client).await, [Code::Ok; 6]);
+
+    let names: Vec<String> = client
+        .rooms()
+        .await
+        .unwrap()
+        .into_iter()
+        .map(|room| room.revision.unwrap().name)
+        .collect();
+    assert_eq!(names, ["synthetic"]);
+
+    let navigate = async |room: &str| {
+        let request = pb::NavigateRequest {
+            room: room.to_owned(),
+            source: frame(10),
+            displacement: to_frame(20),
+            ..pb::NavigateRequest::default()
+        };
+        client.navigate(request).await.unwrap_err().to_string()
+    };
+    let hidden = navigate("synthetic_b").await;
+    let unknown = navigate("synthetic_c").await;
+    assert_eq!(hidden.replace("synthetic_b", "synthetic_c"), unknown);
+
+    // All rooms are searched, of those that may be seen.
+    let localized = client
+        .localize(pb::LocalizeRequest {
+            adapter: "oracle".to_owned(),
+            view: crate::harness::feature(crate::harness::feature_row(3)),
+            ..pb::LocalizeRequest::default()
+        })
+        .await
+        .unwrap();
+    assert_eq!(localized.room_count, 1);
+}
+
+/// An authority, and certificates that it issued.
+struct Authority {
+    issuer: CertifiedIssuer<'static, KeyPair>,
+}
+
+impl Authority {
+    fn new() -> Self {
+        let mut params = CertificateParams::new(Vec::new()).unwrap();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        let key = KeyPair::generate().unwrap();
+        Self {
+            issuer: CertifiedIssuer::self_signed(params, key).unwrap(),
+        }
+    }
+
+    fn pem(&self) -> Vec<u8> {
+        self.issuer.pem().into_bytes()
+    }
+
+    /// A certificate and its key, in PEM, and the certificate's fingerprint.
+    fn issue(&self, name: &str) -> (Vec<u8>, Vec<u8>, String) {
+        let params = CertificateParams::new(vec![name.to_owned()]).unwrap();
+        let key = KeyPair::generate().unwrap();
+        let certificate = params.signed_by(&key, &self.issuer).unwrap();
+
+        (
+            certificate.pem().into_bytes(),
+            key.serialize_pem().into_bytes(),
+            hex_digest(certificate.der()),
+        )
+    }
+
+    /// Files of a server's certificate.
+    fn server_files(&self, folder: &Path, asks_clients: bool) -> TlsFiles {
+        let (cert, key, _) = self.issue("127.0.0.1");
+        let write = |name: &str, content: &[u8]| -> PathBuf {
+            let file = folder.join(name);
+            std::fs::write(&file, content).unwrap();
+            file
+        };
+
+        TlsFiles {
+            cert: write("server.pem", &cert),
+            key: write("server.key", &key),
+            client_ca: asks_clients.then(|| write("ca.pem", &self.pem())),
+        }
+    }
+}
+
+async fn tls_client(
+    address: &str,
+    authority: &Authority,
+    identity: Option<(Vec<u8>, Vec<u8>)>,
+) -> Result<Client, seese3_client::Error> {
+    let options = ConnectOptions {
+        deadline: DEADLINE,
+        token: None,
+        tls: Some(ClientTls {
+            authorities: authority.pem(),
+            identity,
+        }),
+    };
+    Client::connect_with(address, options).await
+}
+
+/// A server with TLS, which the harness's own client, in plain text, cannot wait for.
+async fn start_tls(config: Config) -> (String, tempfile::TempDir) {
+    let (folder, store) = filled_store().await;
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    tokio::spawn(seese3_server::run(
+        listener,
+        store,
+        config,
+        std::future::pending(),
+    ));
+    (address, folder)
+}
+
+async fn serves(client: &Client) -> bool {
+    for _ in 0..1_000 {
+        if client.serves("").await.unwrap_or(false) {
+            return true;
+        }
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    false
+}
+
+/// Oracle: what TLS promises: a client that trusts the authority is answered, and neither plain
+/// text nor another authority is; a replaced certificate is used without a restart.
+#[tokio::test]
+async fn tls_answers_who_trusts_it_and_takes_a_new_certificate() {
+    let folder = tempfile::tempdir().unwrap();
+    let authority = Authority::new();
+    let files = authority.server_files(folder.path(), false);
+    let config = Config {
+        tls: Some(Arc::new(Tls::open(files).unwrap())),
+        ..Config::default()
+    };
+    let (address, _store) = start_tls(config).await;
+
+    let client = tls_client(&address, &authority, None).await.unwrap();
+    assert!(serves(&client).await);
+    assert!(client.navigate(question()).await.is_ok());
+
+    let plain = Client::connect(&address, DEADLINE).await;
+    assert!(match plain {
+        Ok(client) => client.navigate(question()).await.is_err(),
+        Err(_) => true,
+    });
+    let other = Authority::new();
+    assert!(tls_client(&address, &other, None).await.is_err());
+
+    // The other authority's certificate takes the place of the first; old connections stay.
+    other.server_files(folder.path(), false);
+    let began = Instant::now();
+    while tls_client(&address, &other, None).await.is_err() {
+        assert!(
+            began.elapsed() < DEADLINE,
+            "the certificate was never replaced"
+        );
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    }
+    assert!(client.navigate(question()).await.is_ok());
+}
+
+/// Oracle: what mutual TLS promises, and the meaning of `certificate_sha256`.
+#[tokio::test]
+async fn a_certificate_is_needed_and_says_who_is_calling() {
+    let folder = tempfile::tempdir().unwrap();
+    let authority = Authority::new();
+    let (robot_cert, robot_key, fingerprint) = authority.issue("robot");
+    let (guest_cert, guest_key, _) = authority.issue("guest");
+
+    let auth = folder.path().join("auth.toml");
+    let known = format!(
+        "[[principal]]\nname = \"robot\"\ncertificate_sha256 = \"{fingerprint}\"\nverbs = [\"navigate\"]\nrooms = [\"*\"]\n"
+    );
+    std::fs::write(&auth, known).unwrap();
+    let files = authority.server_files(folder.path(), true);
+    let config = Config {
+        tls: Some(Arc::new(Tls::open(files).unwrap())),
+        keyring: Some(Arc::new(Keyring::open(auth).unwrap())),
+        ..Config::default()
+    };
+    let (address, _store) = start_tls(config).await;
+
+    let robot = tls_client(&address, &authority, Some((robot_cert, robot_key))).await;
+    let robot = robot.unwrap();
+    assert!(serves(&robot).await);
+    assert_eq!(code_of(robot.navigate(question()).await), Code::Ok);
+    assert_eq!(code_of(robot.rooms().await), Code::PermissionDenied);
+
+    let guest = tls_client(&address, &authority, Some((guest_cert, guest_key))).await;
+    let guest = guest.unwrap().navigate(question()).await;
+    assert_eq!(code_of(guest), Code::Unauthenticated);
+
+    // Without any certificate the connection ends, at the handshake or at its first use.
+    let nobody = tls_client(&address, &authority, None).await;
+    assert!(match nobody {
+        Ok(client) => client.navigate(question()).await.is_err(),
+        Err(_) => true,
+    });
+}
+
+/// Oracle: the bounds themselves: connections beyond the limit are closed at once, and those that
+/// say nothing do not hold up the end of the server.
+#[tokio::test]
+async fn silent_connections_are_bounded_and_hold_nobody_up() {
+    let config = Config {
+        connections: 3,
+        ..Config::default()
+    };
+    let server = start_with(config).await;
+
+    // One place is the client's.
+    let silent = [
+        TcpStream::connect(&server.address).await.unwrap(),
+        TcpStream::connect(&server.address).await.unwrap(),
+    ];
+    let mut refused = TcpStream::connect(&server.address).await.unwrap();
+
+    // A silent connection that has a place is closed too, after ten seconds.
+    let at_once = Duration::from_secs(5);
+    let ended = tokio::time::timeout(at_once, refused.read(&mut [0; 1])).await;
+    assert!(
+        !matches!(ended.unwrap(), Ok(1..)),
+        "it is closed and hears nothing"
+    );
+    assert!(server.client.navigate(question()).await.is_ok());
+
+    drop(silent);
+    let began = Instant::now();
+    while Client::connect(&server.address, DEADLINE).await.is_err() {
+        assert!(
+            began.elapsed() < DEADLINE,
+            "the places are never free again"
+        );
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+
+    let _silent = TcpStream::connect(&server.address).await.unwrap();
+    let began = Instant::now();
+    server.stop.send(()).unwrap();
+    server.ended.await.unwrap().unwrap();
+    assert!(
+        began.elapsed() < Duration::from_secs(8),
+        "below the drain time of 10 s"
+    );
+}

@@ -1,0 +1,1055 @@
+//! Following a camera over the wire: answers, refusals, and going on elsewhere.
+
+use seese3_client::convert;
+use seese3_client::proto::v1 as pb;
+use seese3_client::proto::v1::track_request::Message;
+use seese3_client::proto::v1::track_response::Answer;
+use seese3_core::geometry::{Pinhole, PixelCamera, Pose, PoseError};
+use seese3_core::room::{Provenance, Room};
+use seese3_server::{Config, TokenKey};
+use seese3_store::Store;
+use tonic::Code;
+
+use crate::harness::{TestServer, feature, frame, start_on};
+use seese3_testing::world::{FRAMES, calibrated, place, served};
+
+/// Two places, and an adapter that can be followed with; `key` seals tokens.
+async fn server(key: &[u8]) -> TestServer {
+    start_followed(Config {
+        token_key: TokenKey::new(key).unwrap(),
+        ..Config::default()
+    })
+    .await
+}
+
+/// Two places, and an adapter that can be followed with.
+pub async fn start_followed(config: Config) -> TestServer {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+    for name in ["hall", "attic"] {
+        let (room, features) = served(name);
+        store.publish_room(&room, &[features]).await.unwrap();
+    }
+
+    let (adapter, record) = calibrated();
+    store
+        .publish_adapter("followed", &adapter, &record, served("hall").1.rows())
+        .await
+        .unwrap();
+
+    start_on(folder, store, config).await
+}
+
+const KEY: &[u8] = b"a secret of the tests";
+
+pub fn config() -> pb::TrackConfig {
+    pb::TrackConfig {
+        room: "hall".to_owned(),
+        ..pb::TrackConfig::default()
+    }
+}
+
+pub fn begin(config: pb::TrackConfig) -> pb::TrackRequest {
+    pb::TrackRequest {
+        message: Some(Message::Config(config)),
+    }
+}
+
+/// Row `row` of the hall, as a camera's frame with that number and time.
+pub fn seen(row: usize) -> pb::TrackRequest {
+    seen_of("hall", row)
+}
+
+fn seen_of(room: &str, row: usize) -> pb::TrackRequest {
+    let view = feature(served(room).1.rows().row(row).to_vec());
+    message(pb::TrackFrame {
+        timestamp_ns: row as i64 * 33_000_000,
+        sequence: row as u64 + 1,
+        view,
+        ..pb::TrackFrame::default()
+    })
+}
+
+fn message(frame: pb::TrackFrame) -> pb::TrackRequest {
+    pb::TrackRequest {
+        message: Some(Message::Frame(frame)),
+    }
+}
+
+/// All answers of a stream; an error ends it.
+pub async fn answers(
+    server: &TestServer,
+    requests: Vec<pb::TrackRequest>,
+) -> Result<Vec<pb::TrackResponse>, tonic::Status> {
+    let mut stream = match server.client.track(tokio_stream::iter(requests)).await {
+        Ok(stream) => stream,
+        Err(seese3_client::Error::Refused(status)) => return Err(*status),
+        Err(other) => panic!("{other}"),
+    };
+
+    let mut answers = Vec::new();
+    while let Some(mut answer) = stream.message().await? {
+        if let Some(Answer::Update(update)) = &mut answer.answer {
+            // The one thing that two runs may differ in.
+            update.elapsed_ns = 0;
+        }
+
+        answers.push(answer);
+    }
+
+    Ok(answers)
+}
+
+fn update(answer: &pb::TrackResponse) -> &pb::TrackUpdate {
+    match &answer.answer {
+        Some(Answer::Update(update)) => update,
+        other => panic!("no update: {other:?}"),
+    }
+}
+
+fn matrix(numbers: &[f64]) -> nalgebra::Matrix6<f64> {
+    nalgebra::Matrix6::from_row_slice(numbers)
+}
+
+fn initial_pose(row: usize) -> Option<pb::InitialPose> {
+    let pose = served("hall").0.poses()[row];
+    let t = pose.translation.vector;
+    let q = pose.rotation.coords;
+
+    let pose = pb::Pose {
+        position: Some(pb::Vector3 {
+            x: t.x,
+            y: t.y,
+            z: t.z,
+        }),
+        orientation: Some(pb::Quaternion {
+            w: q.w,
+            x: q.x,
+            y: q.y,
+            z: q.z,
+        }),
+        ..pb::Pose::default()
+    };
+
+    Some(pb::InitialPose {
+        pose: Some(pose),
+        ..pb::InitialPose::default()
+    })
+}
+
+/// Oracle: the recorded poses, and the definitions: odom begins at the origin, map is odom seen
+/// from map, covariances are symmetric and positive definite.
+#[tokio::test]
+async fn a_camera_in_a_mapped_room_is_followed() {
+    let server = server(KEY).await;
+
+    let requests = [begin(config())]
+        .into_iter()
+        .chain((0..120).map(seen))
+        .collect();
+    let answers = answers(&server, requests).await.unwrap();
+
+    assert_eq!(answers.len(), 121);
+    assert!(matches!(&answers[0].answer, Some(Answer::Started(started)) if started.room.is_some()));
+
+    let poses = served("hall").0.poses().to_vec();
+
+    for (row, answer) in answers[1..].iter().enumerate() {
+        let update = update(answer);
+        assert_eq!(
+            (update.sequence, update.timestamp_ns),
+            (row as u64 + 1, row as i64 * 33_000_000)
+        );
+
+        for covariance in [
+            &update.odom_from_camera_covariance,
+            &update.motion_covariance,
+        ] {
+            let covariance = matrix(covariance);
+            assert!(
+                (covariance - covariance.transpose()).amax() < 1e-12
+                    && covariance.cholesky().is_some(),
+                "{row}"
+            );
+        }
+    }
+
+    let searching = update(&answers[1]);
+    let candidate = searching.candidate.as_ref().unwrap();
+    assert_eq!(
+        (candidate.sequence, candidate.agreed, candidate.needed),
+        (1, 1, 10)
+    );
+
+    assert!(
+        searching.map_from_camera.is_none(),
+        "it is reported, not believed"
+    );
+
+    let last = update(&answers[120]);
+    assert!(last.candidate.is_none());
+    assert_eq!(last.status(), pb::TrackStatus::Tracking, "{}", last.reason);
+
+    let of = |pose: &Option<pb::Pose>| convert::pose(pose.as_ref().unwrap()).unwrap();
+
+    let error = PoseError::between(&of(&last.map_from_camera), &poses[119]);
+    assert!(
+        error.translation_m < 0.2 && error.rotation_rad < 0.2,
+        "{error:?}"
+    );
+
+    let through = of(&last.map_from_odom) * of(&last.odom_from_camera);
+    assert!(PoseError::between(&through, &of(&last.map_from_camera)).translation_m < 1e-9);
+    assert_eq!(last.map_from_odom.as_ref().unwrap().parent_frame, "map");
+    assert_eq!(last.odom_from_camera.as_ref().unwrap().parent_frame, "odom");
+
+    let first = update(&answers[1]);
+    assert!(
+        of(&first.odom_from_camera).translation.vector.norm() < 1e-12
+            && first.body_velocity.is_none()
+    );
+}
+
+/// Oracle: a stream that was never cut, bit by bit, tokens and all; the second server shares the
+/// store's content and the key, and nothing else.
+#[tokio::test]
+async fn a_stream_goes_on_at_another_server_as_if_it_had_never_been_cut() {
+    let one = server(KEY).await;
+    let two = server(KEY).await;
+
+    let whole = answers(
+        &one,
+        [begin(config())]
+            .into_iter()
+            .chain((0..60).map(seen))
+            .collect(),
+    )
+    .await
+    .unwrap();
+
+    for cut in [1, 7, 31, 60] {
+        let first = answers(
+            &one,
+            [begin(config())]
+                .into_iter()
+                .chain((0..cut).map(seen))
+                .collect(),
+        )
+        .await
+        .unwrap();
+
+        assert_eq!(first, whole[..=cut], "up to {cut}");
+
+        let resume = pb::TrackConfig {
+            resume_token: first[cut].resume_token.clone(),
+            ..pb::TrackConfig::default()
+        };
+        let rest = [begin(resume)]
+            .into_iter()
+            .chain((cut..60).map(seen))
+            .collect();
+
+        let second = answers(&two, rest).await.unwrap();
+        assert_eq!(second[1..], whole[cut + 1..], "from {cut}");
+    }
+}
+
+/// Oracle: the stream that brings a token with every answer: the others answer the same, with
+/// tokens where they were asked for, and go on from them.
+#[tokio::test]
+async fn tokens_come_when_they_are_asked_for() {
+    let server = server(KEY).await;
+    let frames = |asking: usize| -> Vec<pb::TrackRequest> {
+        (0..20)
+            .map(seen)
+            .enumerate()
+            .map(|(row, mut request)| {
+                if let Some(Message::Frame(frame)) = &mut request.message {
+                    frame.with_token = row == asking;
+                }
+                request
+            })
+            .collect()
+    };
+    let stream = async |token_every: Option<u32>| {
+        let config = pb::TrackConfig {
+            token_every,
+            ..config()
+        };
+        let requests = [vec![begin(config)], frames(12)].concat();
+        answers(&server, requests).await.unwrap()
+    };
+
+    let whole = stream(None).await;
+    for (every, expected) in [(Some(0), vec![12]), (Some(5), vec![4, 9, 12, 14, 19])] {
+        let thin = stream(every).await;
+        let rows = 0..20;
+        let with_token: Vec<usize> = rows
+            .filter(|row| !thin[row + 1].resume_token.is_empty())
+            .collect();
+        assert_eq!(with_token, expected, "{every:?}");
+        assert!(
+            !thin[0].resume_token.is_empty(),
+            "the first answer brings one"
+        );
+        for (thin, whole) in thin.iter().zip(&whole) {
+            assert_eq!(thin.answer, whole.answer);
+        }
+
+        let resume = pb::TrackConfig {
+            resume_token: thin[13].resume_token.clone(),
+            ..pb::TrackConfig::default()
+        };
+        let rest = [vec![begin(resume)], (13..20).map(seen).collect()].concat();
+        let rest = answers(&server, rest).await.unwrap();
+        assert_eq!(rest.len(), 8);
+        for (rest, whole) in rest[1..].iter().zip(&whole[14..]) {
+            assert_eq!(rest.answer, whole.answer);
+        }
+    }
+}
+
+/// Oracle: the promise: forged, altered, foreign and outdated tokens are refused by name.
+#[tokio::test]
+async fn tokens_that_are_not_genuine_are_refused() {
+    let other = self::server(b"another secret, long enough").await;
+    let server = server(KEY).await;
+    let first = answers(&server, vec![begin(config()), seen(0)])
+        .await
+        .unwrap();
+    let token = first[1].resume_token.clone();
+    let mut altered = token.clone();
+
+    altered[40] ^= 1;
+
+    for (what, server, token) in [
+        ("altered", &server, altered),
+        ("forged", &server, vec![7; 300]),
+        ("another server's", &other, token.clone()),
+    ] {
+        let resume = pb::TrackConfig {
+            resume_token: token,
+            ..pb::TrackConfig::default()
+        };
+        let error = answers(server, vec![begin(resume), seen(1)])
+            .await
+            .unwrap_err();
+
+        assert_eq!(error.code(), Code::InvalidArgument, "{what}: {error:?}");
+
+        assert!(
+            error.message().contains("resume_token"),
+            "{what}: {error:?}"
+        );
+    }
+
+    let both = pb::TrackConfig {
+        resume_token: token.clone(),
+        ..config()
+    };
+
+    assert_eq!(
+        answers(&server, vec![begin(both)])
+            .await
+            .unwrap_err()
+            .code(),
+        Code::InvalidArgument
+    );
+
+    let (room, features) = place("hall", 99);
+    let store = Store::open(other.folder.path().to_str().unwrap()).unwrap();
+    store.publish_room(&room, &[features]).await.unwrap();
+
+    let newer = start_on(
+        tempfile::tempdir().unwrap(),
+        store,
+        Config {
+            token_key: TokenKey::new(KEY).unwrap(),
+            ..Config::default()
+        },
+    );
+
+    let resume = pb::TrackConfig {
+        resume_token: token,
+        ..pb::TrackConfig::default()
+    };
+    let error = answers(&newer.await, vec![begin(resume)])
+        .await
+        .unwrap_err();
+
+    assert_eq!(error.code(), Code::FailedPrecondition, "{error:?}");
+}
+
+/// Oracle: the same stream without them: what is refused leaves no trace.
+#[tokio::test]
+async fn late_and_duplicate_frames_are_refused_and_leave_no_trace() {
+    let server = server(KEY).await;
+    let plain = answers(
+        &server,
+        [begin(config())]
+            .into_iter()
+            .chain((0..20).map(seen))
+            .collect(),
+    )
+    .await
+    .unwrap();
+
+    let late = pb::TrackFrame {
+        timestamp_ns: 0,
+        sequence: 100,
+        view: feature(vec![0.0; 48]),
+        ..pb::TrackFrame::default()
+    };
+
+    let duplicate = pb::TrackFrame {
+        timestamp_ns: i64::MAX,
+        sequence: 3,
+        view: feature(vec![0.0; 48]),
+        ..pb::TrackFrame::default()
+    };
+
+    let narrow = pb::TrackFrame {
+        timestamp_ns: i64::MAX,
+        sequence: 100,
+        view: feature(vec![0.0; 47]),
+        ..pb::TrackFrame::default()
+    };
+
+    let nan = pb::TrackFrame {
+        timestamp_ns: i64::MAX,
+        sequence: 100,
+        view: feature(vec![f32::NAN; 48]),
+        ..pb::TrackFrame::default()
+    };
+
+    let of_room = pb::TrackFrame {
+        timestamp_ns: i64::MAX,
+        sequence: 100,
+        view: frame(3),
+        ..pb::TrackFrame::default()
+    };
+
+    let empty = pb::TrackFrame {
+        timestamp_ns: i64::MAX,
+        sequence: 100,
+        view: None,
+        ..pb::TrackFrame::default()
+    };
+    let bad = [late, duplicate, narrow, nan, of_room, empty].map(message);
+    let requests = [begin(config())]
+        .into_iter()
+        .chain((0..10).map(seen))
+        .chain(bad)
+        .chain((10..20).map(seen));
+
+    let found = answers(&server, requests.collect()).await.unwrap();
+    assert_eq!(found[..11], plain[..11]);
+    assert_eq!(found[17..], plain[11..]);
+
+    use pb::TrackRefusalReason as Reason;
+
+    let reasons = [
+        Reason::Late,
+        Reason::Duplicate,
+        Reason::View,
+        Reason::View,
+        Reason::View,
+        Reason::View,
+    ];
+
+    for (answer, reason) in found[11..17].iter().zip(reasons) {
+        let Some(Answer::Refusal(refusal)) = &answer.answer else {
+            panic!("{answer:?}")
+        };
+
+        assert_eq!(refusal.reason(), reason, "{refusal:?}");
+        assert!(!refusal.message.is_empty());
+    }
+}
+
+/// Oracle: the promise: a view that jumps is LOST, another place is never believed, and the
+/// covariance grows meanwhile.
+#[tokio::test]
+async fn a_camera_in_another_place_is_lost_and_less_and_less_sure() {
+    let server = server(KEY).await;
+    let moon = place("moon", 77).1;
+
+    let elsewhere = |row: usize| {
+        // Nothing like any of the places.
+        let strange = |column: usize| 4.0 * (column as f32 * 1.7).sin();
+        let seen = moon.rows().row(row).to_vec();
+
+        let view = feature(
+            seen.into_iter()
+                .enumerate()
+                .map(|(column, x)| x + strange(column))
+                .collect(),
+        );
+
+        message(pb::TrackFrame {
+            timestamp_ns: row as i64 * 33_000_000,
+            sequence: row as u64 + 1,
+            view,
+            ..pb::TrackFrame::default()
+        })
+    };
+
+    let known = pb::TrackConfig {
+        initial_pose: initial_pose(0),
+        ..config()
+    };
+    let requests = [begin(known)]
+        .into_iter()
+        .chain((0..20).map(seen))
+        .chain((20..40).map(elsewhere));
+
+    let found = answers(&server, requests.collect()).await.unwrap();
+    assert_eq!(update(&found[20]).status(), pb::TrackStatus::Tracking);
+
+    assert_eq!(
+        update(&found[21]).status(),
+        pb::TrackStatus::Lost,
+        "{}",
+        update(&found[21]).reason
+    );
+
+    let mut before = 0.0;
+    for answer in &found[21..] {
+        let update = update(answer);
+
+        // Made-up places are few, and this adapter is not sure of them: it may look for a place,
+        // but believes none.
+        assert!(
+            [pb::TrackStatus::Lost, pb::TrackStatus::Relocalizing].contains(&update.status()),
+            "{}",
+            update.reason
+        );
+
+        if update.status() == pb::TrackStatus::Lost {
+            let volume = matrix(&update.map_from_camera_covariance).determinant();
+            assert!(volume > before, "the covariance did not grow");
+            before = volume;
+        }
+    }
+}
+
+/// Oracle: the order of messages, by hand.
+#[tokio::test]
+async fn a_stream_is_configured_once_and_first() {
+    let server = server(KEY).await;
+    let with_camera = |focal: f64| {
+        begin(pb::TrackConfig {
+            camera: Some(pb::Pinhole {
+                width: 1280.0,
+                height: 960.0,
+                focal,
+                ..pb::Pinhole::default()
+            }),
+            ..config()
+        })
+    };
+
+    // The hall was mapped with 585 pixels in images 640 wide, which see 57 degrees across. 1,100 in
+    // images 1,280 wide see 60; 1,000 see 65.
+    answers(&server, vec![with_camera(1_100.0)]).await.unwrap();
+
+    for (requests, word) in [
+        (vec![seen(0)], "config"),
+        (vec![], "config"),
+        (vec![with_camera(1_000.0)], "config.camera"),
+        (vec![with_camera(-5.0)], "config.camera"),
+        (vec![begin(config()), begin(config())], "config"),
+        (
+            vec![begin(config()), pb::TrackRequest { message: None }],
+            "message",
+        ),
+        (
+            vec![begin(pb::TrackConfig {
+                room: "nowhere".to_owned(),
+                ..config()
+            })],
+            "config.room",
+        ),
+        (
+            vec![begin(pb::TrackConfig {
+                rooms: vec!["hall".to_owned()],
+                ..config()
+            })],
+            "config.rooms",
+        ),
+        (
+            vec![begin(pb::TrackConfig {
+                fusion: 9,
+                ..config()
+            })],
+            "config.fusion",
+        ),
+        (
+            vec![begin(pb::TrackConfig {
+                back_pressure: 9,
+                ..config()
+            })],
+            "config.back_pressure",
+        ),
+        (
+            vec![begin(pb::TrackConfig {
+                keyframes: Some(pb::KeyframePolicy {
+                    displacement: Some(f64::NAN),
+                    frames: None,
+                }),
+                ..config()
+            })],
+            "config.keyframes.displacement",
+        ),
+        (
+            vec![begin(pb::TrackConfig {
+                keyframes: Some(pb::KeyframePolicy {
+                    displacement: None,
+                    frames: Some(0),
+                }),
+                ..config()
+            })],
+            "config.keyframes.frames",
+        ),
+        (
+            vec![begin(pb::TrackConfig {
+                initial_pose: Some(pb::InitialPose::default()),
+                ..config()
+            })],
+            "config.initial_pose.pose",
+        ),
+        (
+            vec![begin(pb::TrackConfig {
+                frames: Some(pb::FrameNames {
+                    map: "x".to_owned(),
+                    odom: "x".to_owned(),
+                    camera: String::new(),
+                    base: String::new(),
+                }),
+                ..config()
+            })],
+            "config.frames",
+        ),
+    ] {
+        let error = answers(&server, requests).await.unwrap_err();
+        assert!(
+            [Code::InvalidArgument, Code::NotFound].contains(&error.code()),
+            "{error:?}"
+        );
+
+        assert!(
+            error.message().contains(word),
+            "{error:?} does not say {word}"
+        );
+    }
+}
+
+/// Oracle: the contract: where no room is named, those that are too small to track in, or that
+/// another camera has mapped, are left out; and they are refused by name.
+#[tokio::test]
+async fn rooms_that_cannot_be_tracked_in_do_not_stop_a_search() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::create(folder.path().to_str().unwrap()).unwrap();
+    let (adapter, record) = calibrated();
+    for name in ["hall", "attic", "small"] {
+        let (room, features) = served(name);
+        let rows: Vec<usize> = (0..if name == "small" { 2 } else { FRAMES }).collect();
+        let wide = PixelCamera {
+            width: 640.0,
+            height: 480.0,
+            focal: 320.0,
+            centre: None,
+        };
+        let provenance = match name {
+            "attic" => Provenance {
+                camera: Some(Pinhole::new(wide).unwrap()),
+                ..Provenance::default()
+            },
+            _ => room.provenance().clone(),
+        };
+        let room = Room::new(room.id().clone(), room.frames().select(&rows), provenance);
+        store
+            .publish_room(&room.unwrap(), &[features.select(&rows)])
+            .await
+            .unwrap();
+    }
+    store
+        .publish_adapter("followed", &adapter, &record, served("hall").1.rows())
+        .await
+        .unwrap();
+    let server = start_on(folder, store, Config::default()).await;
+
+    let anywhere = pb::TrackConfig {
+        camera: Some(pb::Pinhole {
+            width: 640.0,
+            height: 480.0,
+            focal: 585.0,
+            ..pb::Pinhole::default()
+        }),
+        ..pb::TrackConfig::default()
+    };
+    let requests = [begin(anywhere.clone())]
+        .into_iter()
+        .chain((0..30).map(seen));
+    let found = answers(&server, requests.collect()).await.unwrap();
+    assert_eq!(update(&found[30]).room.as_ref().unwrap().name, "hall");
+
+    for (room, code, word) in [
+        ("small", Code::FailedPrecondition, "too few"),
+        ("attic", Code::InvalidArgument, "config.camera"),
+    ] {
+        let named = pb::TrackConfig {
+            room: room.to_owned(),
+            ..anywhere.clone()
+        };
+        let error = answers(&server, vec![begin(named)]).await.unwrap_err();
+        assert_eq!(error.code(), code, "{error:?}");
+        assert!(error.message().contains(word), "{error:?}");
+    }
+}
+
+/// Oracle: the recorded poses: a camera that is put somewhere is there at its last frame, however
+/// old its keyframe is.
+#[tokio::test]
+async fn a_camera_is_put_where_it_is_not_where_its_keyframe_was() {
+    let server = server(KEY).await;
+
+    let config = pb::TrackConfig {
+        initial_pose: initial_pose(0),
+        fusion: pb::Fusion::None as i32,
+        ..config()
+    };
+
+    let put = pb::TrackRequest {
+        message: Some(Message::SetInitialPose(pb::SetInitialPose {
+            initial_pose: initial_pose(8),
+        })),
+    };
+    let requests = [begin(config)]
+        .into_iter()
+        .chain((0..9).map(seen))
+        .chain([put, seen(9)]);
+
+    let found = answers(&server, requests.collect()).await.unwrap();
+    assert_eq!(
+        update(&found[9]).keyframe_sequence,
+        1,
+        "the keyframe is old"
+    );
+
+    let named = update(&found[11]).map_from_camera.clone().unwrap();
+    let plain = pb::Pose {
+        parent_frame: String::new(),
+        child_frame: String::new(),
+        ..named
+    };
+    let error = PoseError::between(
+        &convert::pose(&plain).unwrap(),
+        &served("hall").0.poses()[9],
+    );
+
+    assert!(
+        error.translation_m < 0.05 && error.rotation_rad < 0.05,
+        "{error:?}"
+    );
+}
+
+/// Oracle: the recorded rooms: a room that is not named is found, the first one by name as well as
+/// the second, also when the stream is cut before that.
+#[tokio::test]
+async fn a_room_that_is_not_named_is_found() {
+    let server = server(KEY).await;
+    let nowhere = pb::TrackConfig::default();
+
+    for room in ["attic", "hall"] {
+        let whole = [begin(nowhere.clone())]
+            .into_iter()
+            .chain((0..40).map(|row| seen_of(room, row)))
+            .collect();
+        let found = answers(&server, whole).await.unwrap();
+
+        let last = update(&found[40]);
+        assert_eq!(
+            last.status(),
+            pb::TrackStatus::Tracking,
+            "{room}: {}",
+            last.reason
+        );
+        assert_eq!(last.room.as_ref().unwrap().name, room);
+
+        let map_from_camera = convert::pose(last.map_from_camera.as_ref().unwrap()).unwrap();
+        let error = PoseError::between(&map_from_camera, &served(room).0.poses()[39]);
+        assert!(error.translation_m < 0.2, "{room}: {error:?}");
+
+        let resume = pb::TrackConfig {
+            resume_token: found[4].resume_token.clone(),
+            ..nowhere.clone()
+        };
+        let rest = [begin(resume)]
+            .into_iter()
+            .chain((4..40).map(|row| seen_of(room, row)))
+            .collect();
+        assert_eq!(answers(&server, rest).await.unwrap()[1..], found[5..]);
+    }
+}
+
+/// Oracle: the definitions of both verbs.
+#[tokio::test]
+async fn a_camera_can_be_put_and_forgotten() {
+    let server = server(KEY).await;
+
+    let put = pb::TrackRequest {
+        message: Some(Message::SetInitialPose(pb::SetInitialPose {
+            initial_pose: initial_pose(5),
+        })),
+    };
+
+    let reset = pb::TrackRequest {
+        message: Some(Message::Reset(pb::Reset {})),
+    };
+    let requests = [begin(config())]
+        .into_iter()
+        .chain((0..5).map(seen))
+        .chain([put, seen(5), reset, seen(0)]);
+
+    let found = answers(&server, requests.collect()).await.unwrap();
+    assert!(matches!(found[6].answer, Some(Answer::Acknowledged(_))));
+
+    let after = update(&found[7]);
+    assert_eq!(
+        after.status(),
+        pb::TrackStatus::Tracking,
+        "{}",
+        after.reason
+    );
+
+    assert!(after.map_from_camera.is_some());
+
+    let fresh = update(&found[9]);
+    assert_eq!(
+        (fresh.keyframe_sequence, fresh.body_velocity.is_none()),
+        (1, true)
+    );
+
+    assert_eq!(found[9], found[1], "as if nothing had been");
+}
+
+/// Oracle: the recorded rooms and poses; what looks like no room is called ambiguous.
+#[tokio::test]
+async fn a_view_is_found_among_rooms_or_called_ambiguous() {
+    let server = server(KEY).await;
+    let before = server.client.rooms().await.unwrap();
+
+    for (room, row) in [("hall", 50), ("attic", 250)] {
+        let view = feature(served(room).1.rows().row(row).to_vec()).unwrap();
+        let request = pb::RelocalizeRequest {
+            views: vec![view],
+            top_k: Some(2),
+            ..Default::default()
+        };
+        let found = server.client.relocalize(request).await.unwrap();
+
+        assert!(
+            !found.ambiguous && found.margin.is_none_or(|margin| margin > 1.1),
+            "{found:?}"
+        );
+
+        assert_eq!((found.room_count, found.rooms.len()), (2, 2));
+        assert_eq!(found.rooms[0].room.as_ref().unwrap().name, room);
+
+        assert_eq!(
+            (
+                found.rooms[0].frames.len(),
+                found.rooms[0].frames[0].frame_id
+            ),
+            (2, row as u32)
+        );
+
+        let pose = convert::pose(found.rooms[0].pose.as_ref().unwrap()).unwrap();
+        let error = PoseError::between(&pose, &served(room).0.poses()[row]);
+        assert!(error.translation_m < 1e-9, "{error:?}");
+        assert!(matrix(&found.rooms[0].covariance).cholesky().is_some());
+    }
+
+    let strange = feature((0..48).map(|column| (column as f32).sin() * 9.0).collect()).unwrap();
+    let request = pb::RelocalizeRequest {
+        views: vec![strange.clone(), strange],
+        ..Default::default()
+    };
+    let found = server.client.relocalize(request).await.unwrap();
+
+    assert!(found.ambiguous && !found.reason.is_empty(), "{found:?}");
+
+    assert_eq!(
+        server.client.rooms().await.unwrap(),
+        before,
+        "nothing changes"
+    );
+
+    for (request, field) in [
+        (pb::RelocalizeRequest::default(), "views"),
+        (
+            pb::RelocalizeRequest {
+                views: vec![frame(1).unwrap()],
+                ..Default::default()
+            },
+            "views[0].frame_id",
+        ),
+        (
+            pb::RelocalizeRequest {
+                views: vec![pb::View::default()],
+                ..Default::default()
+            },
+            "views[0]",
+        ),
+        (
+            pb::RelocalizeRequest {
+                max_rooms: Some(0),
+                ..Default::default()
+            },
+            "max_rooms",
+        ),
+    ] {
+        let error = server.client.relocalize(request).await.unwrap_err();
+        assert_eq!(error.field().as_deref(), Some(field), "{error}");
+    }
+}
+
+/// Oracle: composition, and the stream without a base. The base's poses are the camera's, moved by
+/// the mounting; odometry begins at the base; the camera's map poses and motions are what they
+/// were.
+#[tokio::test]
+async fn a_robot_gets_the_poses_of_its_base() {
+    let server = server(KEY).await;
+    let frames = || (0..40).map(seen);
+    let mounting = Pose::new(
+        nalgebra::Vector3::new(0.3, 0.1, 0.5),
+        nalgebra::Vector3::new(0.2, -1.4, 0.3),
+    );
+    let on_base = pb::TrackConfig {
+        base_from_camera: Some(convert::pose_to_wire(&mounting, "base_link", "camera")),
+        ..config()
+    };
+
+    let plain = answers(
+        &server,
+        [begin(config())].into_iter().chain(frames()).collect(),
+    );
+    let plain = plain.await.unwrap();
+    let based = answers(
+        &server,
+        [begin(on_base)].into_iter().chain(frames()).collect(),
+    );
+    let based = based.await.unwrap();
+
+    let pose = |given: &Option<pb::Pose>| convert::pose(given.as_ref().unwrap()).unwrap();
+    let near = |a: Pose, b: Pose| {
+        let apart = PoseError::between(&a, &b);
+        assert!(
+            apart.translation_m < 1e-9 && apart.rotation_rad < 1e-7,
+            "{apart:?}"
+        );
+    };
+
+    let first = update(&based[1]);
+    near(pose(&first.odom_from_base), Pose::identity());
+    assert!(update(&plain[1]).odom_from_base.is_none());
+
+    let (plain, based) = (update(&plain[40]), update(&based[40]));
+    assert_eq!(plain.motion, based.motion);
+    assert_eq!(plain.map_from_camera, based.map_from_camera);
+    assert_eq!(
+        plain.map_from_camera_covariance,
+        based.map_from_camera_covariance
+    );
+
+    near(
+        pose(&based.map_from_base) * mounting,
+        pose(&based.map_from_camera),
+    );
+    near(
+        pose(&based.map_from_odom) * pose(&based.odom_from_base),
+        pose(&based.map_from_base),
+    );
+    near(
+        pose(&based.odom_from_camera),
+        mounting * pose(&plain.odom_from_camera),
+    );
+    assert_eq!(
+        based.map_from_base.as_ref().unwrap().child_frame,
+        "base_link"
+    );
+    assert_eq!(based.map_from_base_covariance.len(), 36);
+
+    // A point that is fixed to the base moves with the base's velocity and with the camera's.
+    let moved = |velocity: &Option<pb::Twist>| convert::twist(velocity.as_ref().unwrap()).unwrap();
+    let of_camera = moved(&based.body_velocity);
+    let of_base = moved(&based.base_velocity);
+    let turn = mounting.rotation * of_camera.angular;
+    assert!((turn - of_base.angular).norm() < 1e-9);
+    let at_camera = of_base.linear + of_base.angular.cross(&mounting.translation.vector);
+    assert!((at_camera - mounting.rotation * of_camera.linear).norm() < 1e-9);
+}
+
+/// Oracle: the rules of TrackFrame.odometry: what is wrong with it refuses the frame by its name,
+/// and the next frame is answered as if it had not been sent.
+#[tokio::test]
+async fn odometry_that_is_none_is_refused() {
+    let server = server(KEY).await;
+    let with = |row: usize, odometry: pb::MeasuredOdometry| {
+        let mut request = seen(row);
+        if let Some(Message::Frame(frame)) = &mut request.message {
+            frame.odometry = Some(odometry);
+        }
+        request
+    };
+    let good = pb::MeasuredOdometry {
+        pose: Some(convert::pose_to_wire(&Pose::identity(), "wheels", "")),
+        ..Default::default()
+    };
+    let bad = [
+        (pb::MeasuredOdometry::default(), "odometry.pose"),
+        (
+            pb::MeasuredOdometry {
+                pose: Some(pb::Pose::default()),
+                ..good.clone()
+            },
+            "odometry.pose",
+        ),
+        (
+            pb::MeasuredOdometry {
+                translation_share: Some(f64::NAN),
+                ..good.clone()
+            },
+            "translation_share",
+        ),
+        (
+            pb::MeasuredOdometry {
+                rotation_share: Some(0.0),
+                ..good.clone()
+            },
+            "rotation_share",
+        ),
+    ];
+
+    for (odometry, word) in bad {
+        let sent = vec![
+            begin(config()),
+            with(0, good.clone()),
+            with(1, odometry),
+            seen(2),
+        ];
+        let heard = answers(&server, sent).await.unwrap();
+        match &heard[2].answer {
+            Some(Answer::Refusal(refusal)) => {
+                assert_eq!(refusal.reason(), pb::TrackRefusalReason::Odometry);
+                assert!(refusal.message.contains(word), "{}", refusal.message);
+            }
+            other => panic!("{other:?}"),
+        }
+
+        let plain = vec![begin(config()), with(0, good.clone()), seen(2)];
+        let plain = answers(&server, plain).await.unwrap();
+        assert_eq!(heard[3], plain[2]);
+    }
+}

@@ -1,0 +1,424 @@
+//! An adapter as bytes: its weights as safetensors, with the golden vectors that prove that it still
+//! computes the same, and the checks of files that come from another store.
+
+use std::sync::Arc;
+
+use nalgebra::{Matrix6, Vector6};
+use ndarray::{Array2, ArrayView2};
+
+use super::format::{AdapterBody, TrainingEntry};
+use super::stored_adapter::{RoomFit, StoredAdapter};
+use super::tensors::{TensorReader, TensorWriter};
+use super::{Error, error_model, manifest, room_fit, sha256};
+use seese3_core::adapter::{
+    self, Adapter, Corrector, CorrectorKind, Mixture, Network, TargetScale,
+};
+
+/// The frame of every twist: the body frame of the source camera (A-1).
+pub(super) const TWIST_FRAME: &str = "body";
+/// The tensor with the second moment Σ of the adapter's errors, (6, 6) f64 on (v, ω).
+const ERROR_COVARIANCE: &str = "error.covariance";
+/// The largest number of golden inputs that are stored with an adapter.
+const GOLDEN_ROWS: usize = 8;
+/// The largest accepted difference from a golden output, in units of the larger of 1 and the
+/// magnitude of that output.
+const GOLDEN_TOLERANCE: f64 = 1e-6;
+
+/// What errors call the files of an adapter that come from elsewhere.
+pub(super) const UPLOADED_MANIFEST: &str = "the manifest";
+const UPLOADED_WEIGHTS: &str = "the weights";
+
+/// The size in bytes that the manifest of an adapter states for its weights.
+///
+/// # Errors
+/// [`Error::Damaged`] if the manifest is truncated or altered, [`Error::Schema`] if a newer program
+/// wrote it.
+pub fn stated_weights_size(manifest: &[u8]) -> Result<u64, Error> {
+    let body: AdapterBody = manifest::decode(UPLOADED_MANIFEST, manifest)?;
+    Ok(body.weights.bytes)
+}
+
+/// Checks the manifest and the weights of an adapter that comes from another store, and returns it.
+///
+/// # Errors
+/// [`Error::Damaged`] if one is truncated or altered, they do not belong together, or the adapter was
+/// fitted to a room, since it serves only the revision of the room that its own store has;
+/// [`Error::Schema`] if a newer program wrote the manifest.
+pub fn check_adapter_files(manifest: &[u8], weights: &[u8]) -> Result<StoredAdapter, Error> {
+    let body: AdapterBody = manifest::decode(UPLOADED_MANIFEST, manifest)?;
+    let damaged = |file: &str, problem: &str| Error::Damaged {
+        file: file.to_owned(),
+        problem: problem.to_owned(),
+    };
+
+    if weights.len() as u64 != body.weights.bytes || sha256(weights) != body.weights.sha256 {
+        let problem = "do not have the size and the checksum that the manifest states";
+        return Err(damaged(UPLOADED_WEIGHTS, problem));
+    }
+    if body.fitted_to.is_some() {
+        let problem =
+            "is of an adapter that was fitted to a room of its own store; fit one to the room here";
+        return Err(damaged(UPLOADED_MANIFEST, problem));
+    }
+
+    assembled(body, UPLOADED_MANIFEST, UPLOADED_WEIGHTS, weights)
+}
+
+/// The adapter of a manifest and its weights, after its golden inputs gave their stored outputs.
+/// `manifest` and `file` name the two in errors.
+pub(super) fn assembled(
+    body: AdapterBody,
+    manifest: &str,
+    file: &str,
+    bytes: &[u8],
+) -> Result<StoredAdapter, Error> {
+    // Motions in another frame or of another scale would be wrong without any other sign, so
+    // the conventions are checked before any tensor is read.
+    if body.twist_frame != TWIST_FRAME || body.deviation_ddof != 0 {
+        let problem = format!(
+            "has twists in the frame '{}' and targets of ddof {}; this program supports only \
+            '{TWIST_FRAME}' and 0",
+            body.twist_frame, body.deviation_ddof
+        );
+        return Err(Error::Damaged {
+            file: manifest.to_owned(),
+            problem,
+        });
+    }
+
+    let damaged = |problem: String| Error::Damaged {
+        file: file.to_owned(),
+        problem,
+    };
+
+    let tensors = TensorReader::new(file, bytes)?;
+    let error_model = error_model::read(&tensors, file)?;
+    let mixing = body.training.mixing().map_err(&damaged)?;
+
+    // The names of the tensors follow from the number of charts and their mixing, both of which
+    // stand in the manifest.
+    let network = Mixture::from_tensors(body.training.charts, mixing, |name| {
+        read_weights(&tensors, name)
+    });
+    let network = network.map_err(|error| error.within(file))?;
+
+    // W predicts z-scored motions; μ and σ turn them back into metres and radians.
+    let scale = TargetScale {
+        mean: vector6(&tensors, "target.mean", file)?,
+        deviation: vector6(&tensors, "target.deviation", file)?,
+    };
+
+    let error_covariance = match tensors.has(ERROR_COVARIANCE) {
+        true => Some(matrix6(&tensors, ERROR_COVARIANCE, file)?),
+        false => None,
+    };
+
+    let correctors = read_correctors(&tensors, &body.training, network.coordinate_count(), file)?;
+
+    // The optional parts are added one by one, and each is checked as it is added.
+    let adapter = Adapter::new(body.source.into(), network, scale)
+        .and_then(|adapter| adapter.with_correctors(correctors))
+        .and_then(|adapter| match error_covariance {
+            Some(covariance) => adapter.with_error_covariance(covariance),
+            None => Ok(adapter),
+        })
+        .and_then(|adapter| match error_model {
+            Some(error_model) => adapter.with_error_model(error_model),
+            None => Ok(adapter),
+        })
+        .map_err(|error| damaged(error.to_string()))?;
+
+    // The checksums show that the file is intact. The golden vectors show that this program, on
+    // this machine, still computes the same function from it.
+    check_golden(&adapter, &tensors, file)?;
+    let record = body.training.record().map_err(|word| Error::Damaged {
+        file: manifest.to_owned(),
+        problem: format!("has {word}, which this program does not know"),
+    })?;
+
+    let room_fit = match body.fitted_to {
+        Some(entry) => Some(room_fit::read(entry, &tensors, file)?),
+        None => None,
+    };
+
+    Ok(StoredAdapter {
+        room_fit,
+        is_experiment: body.experiment,
+        name: body.adapter,
+        revision: body.revision,
+        created: body.created,
+        adapter: Arc::new(adapter),
+        record,
+    })
+}
+
+/// Why weights could not be taken from a file.
+enum WeightError {
+    File(Error),
+    Shape(adapter::Error),
+}
+
+impl From<adapter::Error> for WeightError {
+    fn from(error: adapter::Error) -> Self {
+        Self::Shape(error)
+    }
+}
+
+impl WeightError {
+    fn within(self, file: &str) -> Error {
+        match self {
+            Self::File(error) => error,
+            Self::Shape(error) => Error::Damaged {
+                file: file.to_owned(),
+                problem: error.to_string(),
+            },
+        }
+    }
+}
+
+fn read_weights(tensors: &TensorReader<'_>, name: &str) -> Result<Array2<f32>, WeightError> {
+    tensors.f32(name).map_err(WeightError::File)
+}
+
+/// Reads the correctors that the manifest names. They share the weights file; a prefix tells their
+/// tensors apart.
+fn read_correctors(
+    tensors: &TensorReader<'_>,
+    training: &TrainingEntry,
+    coordinate_count: usize,
+    file: &str,
+) -> Result<Vec<Corrector<f32>>, Error> {
+    let corrector = |name: &String| {
+        let kind = CorrectorKind::from_name(name).ok_or_else(|| Error::Damaged {
+            file: file.to_owned(),
+            problem: format!("has a corrector '{name}', which this program does not know"),
+        })?;
+        let read = |tensor: &str| read_weights(tensors, &corrector_tensor(kind, tensor));
+
+        Corrector::from_tensors(kind, coordinate_count, read).map_err(|error| error.within(file))
+    };
+
+    training.correctors.iter().map(corrector).collect()
+}
+
+fn corrector_tensor(kind: CorrectorKind, tensor: &str) -> String {
+    format!("corrector.{}.{tensor}", kind.name())
+}
+
+/// The shape of a tensor in PyTorch; in this program every tensor is two-dimensional.
+fn torch_shape(name: &str, array: &Array2<f32>) -> Vec<usize> {
+    let last = name.rsplit('.').next().unwrap_or(name);
+    match array.dim() {
+        (1, 1) if last == "log_tau" => Vec::new(),
+        (1, columns) if last.contains("bias") || is_norm(name) => vec![columns],
+        (rows, columns) => vec![rows, columns],
+    }
+}
+
+/// Whether a tensor is a LayerNorm's weight, which is a vector.
+fn is_norm(name: &str) -> bool {
+    name.ends_with("phi.1.weight") || name.contains(".norm") || name.starts_with("norm")
+}
+
+pub(super) fn adapter_file(
+    name: &str,
+    adapter: &Adapter,
+    features: ArrayView2<'_, f32>,
+    room_fit: Option<&RoomFit>,
+) -> Result<Vec<u8>, Error> {
+    let mut tensors = TensorWriter::default();
+
+    // Weights keep PyTorch's names and shapes.
+    for (name, array) in adapter
+        .network()
+        .names()
+        .iter()
+        .zip(adapter.network().parameters())
+    {
+        tensors.f32(name, &torch_shape(name, array), array.iter().copied());
+    }
+
+    for corrector in adapter.correctors() {
+        for (name, array) in corrector.names().iter().zip(corrector.parameters()) {
+            let shape = torch_shape(name, array);
+            let name = corrector_tensor(corrector.kind(), name);
+            tensors.f32(&name, &shape, array.iter().copied());
+        }
+    }
+
+    tensors.f64("target.mean", &[6], adapter.scale().mean.iter().copied());
+
+    tensors.f64(
+        "target.deviation",
+        &[6],
+        adapter.scale().deviation.iter().copied(),
+    );
+
+    if let Some(covariance) = adapter.error_covariance() {
+        tensors.f64(
+            ERROR_COVARIANCE,
+            &[6, 6],
+            covariance.transpose().iter().copied(),
+        );
+    }
+
+    if let Some(error_model) = adapter.error_model() {
+        error_model::write(&mut tensors, error_model);
+    }
+
+    if let Some(room_fit) = room_fit {
+        room_fit::write(&mut tensors, &room_fit.rules);
+    }
+
+    write_golden(&mut tensors, adapter, features).map_err(|error| Error::Damaged {
+        file: name.to_owned(),
+        problem: error.to_string(),
+    })?;
+    tensors.finish(name)
+}
+
+/// Writes golden vectors: some of the training features, and what the adapter makes of them.
+fn write_golden(
+    tensors: &mut TensorWriter,
+    adapter: &Adapter,
+    features: ArrayView2<'_, f32>,
+) -> Result<(), adapter::Error> {
+    // The golden inputs are spread evenly over the training features.
+    let rows: Vec<usize> = (0..features.nrows())
+        .step_by(features.nrows().div_ceil(GOLDEN_ROWS).max(1))
+        .collect();
+    let golden = features.select(ndarray::Axis(0), &rows);
+
+    // The golden outputs are what this program computes now: latents, motions and corrected steps.
+    let latents = adapter.embed(golden.view())?;
+
+    let twists = golden_twists(adapter, &latents);
+
+    tensors.f32(
+        "golden.features",
+        &[golden.nrows(), golden.ncols()],
+        golden.iter().copied(),
+    );
+
+    tensors.f64(
+        "golden.latents",
+        &[latents.nrows(), latents.ncols()],
+        latents.iter().copied(),
+    );
+
+    tensors.f64(
+        "golden.twists",
+        &[twists.nrows(), 6],
+        twists.iter().copied(),
+    );
+
+    for corrector in adapter.correctors() {
+        let steps = golden_steps(adapter, corrector.kind(), &latents)?;
+        let name = golden_corrector(corrector.kind());
+        tensors.f64(
+            &name,
+            &[steps.nrows(), steps.ncols()],
+            steps.iter().copied(),
+        );
+    }
+
+    Ok(())
+}
+
+/// The motion from the first golden latent to each, shape (n, 6).
+fn golden_twists(adapter: &Adapter, latents: &Array2<f64>) -> Array2<f64> {
+    Array2::from_shape_fn((latents.nrows(), 6), |(row, column)| {
+        adapter.motion(latents.row(0), latents.row(row)).to_vector()[column]
+    })
+}
+
+fn golden_corrector(kind: CorrectorKind) -> String {
+    format!("golden.corrector.{}", kind.name())
+}
+
+/// The corrected latent step from each golden latent, for the motion from the first golden latent
+/// to it. Same shape as `latents`.
+fn golden_steps(
+    adapter: &Adapter,
+    kind: CorrectorKind,
+    latents: &Array2<f64>,
+) -> Result<Array2<f64>, adapter::Error> {
+    let mut steps = Array2::zeros(latents.dim());
+    for (latent, mut into) in latents.outer_iter().zip(steps.outer_iter_mut()) {
+        let twist = adapter.motion(latents.row(0), latent);
+        into.assign(&adapter.corrected_step(kind, latent, twist)?);
+    }
+
+    Ok(steps)
+}
+
+fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Result<(), Error> {
+    let damaged = |problem: String| Error::Damaged {
+        file: file.to_owned(),
+        problem,
+    };
+
+    let features = tensors.f32("golden.features")?;
+
+    // With no inputs every comparison below would succeed.
+    if features.nrows() == 0 {
+        return Err(damaged("has no golden inputs".to_owned()));
+    }
+
+    let latents = adapter
+        .embed(features.view())
+        .map_err(|error| damaged(error.to_string()))?;
+    let twists = golden_twists(adapter, &latents);
+
+    // Recompute every kind of output, and pair it with the one that was stored.
+    let mut checked = Vec::new();
+    for corrector in adapter.correctors() {
+        let kind = corrector.kind();
+        let steps =
+            golden_steps(adapter, kind, &latents).map_err(|error| damaged(error.to_string()))?;
+        checked.push((kind.name(), steps, tensors.f64(&golden_corrector(kind))?));
+    }
+
+    checked.push(("latents", latents, tensors.f64("golden.latents")?));
+    checked.push(("twists", twists, tensors.f64("golden.twists")?));
+
+    // Sums may be rounded differently on another machine, so the outputs need not agree in every
+    // bit.
+    for (what, found, stored) in checked {
+        let near = |(found, stored): (&f64, &f64)| {
+            // The tolerance of an infinite output would let everything pass.
+            stored.is_finite() && (found - stored).abs() <= GOLDEN_TOLERANCE * stored.abs().max(1.0)
+        };
+        if found.dim() != stored.dim() || !found.iter().zip(&stored).all(near) {
+            return Err(damaged(format!(
+                "its golden inputs do not give its golden {what} on this machine; publish it again"
+            )));
+        }
+    }
+
+    Ok(())
+}
+
+fn matrix6(tensors: &TensorReader<'_>, name: &str, file: &str) -> Result<Matrix6<f64>, Error> {
+    let array = tensors.f64(name)?;
+    if array.dim() != (6, 6) {
+        return Err(Error::Damaged {
+            file: file.to_owned(),
+            problem: format!("'{name}' does not have 6 by 6 numbers"),
+        });
+    }
+
+    Ok(Matrix6::from_fn(|row, column| array[(row, column)]))
+}
+
+fn vector6(tensors: &TensorReader<'_>, name: &str, file: &str) -> Result<Vector6<f64>, Error> {
+    let array = tensors.f64(name)?;
+    if array.dim() != (1, 6) {
+        return Err(Error::Damaged {
+            file: file.to_owned(),
+            problem: format!("'{name}' does not have 6 numbers"),
+        });
+    }
+
+    Ok(Vector6::from_fn(|row, _| array[(0, row)]))
+}

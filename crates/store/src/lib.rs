@@ -1,0 +1,606 @@
+//! The store: versioned, checksummed rooms and adapters, in a local folder or an object store.
+//!
+//! ```text
+//! rooms/NAME/objects/…               tensors and lists of names; the file name contains the hash
+//! rooms/NAME/revisions/000001.json   the manifest, written last: a revision is visible completely
+//!                                    or not at all
+//! rooms/NAME/revisions/000002.gone   a revision that was removed: its number is not given again
+//! adapters/NAME/…                    the same for an adapter
+//! defaults/000001.json               what an operator chose, see [`Defaults`]
+//! ```
+//!
+//! Tensors are safetensors files; Python reads them with `safetensors.numpy.load_file(path)`.
+//! Published revisions never change.
+
+pub mod fit_stored_room;
+mod bucket;
+mod manifest;
+mod resource;
+mod stored_adapter;
+mod tensors;
+mod defaults;
+mod error_model;
+mod format;
+mod room_files;
+mod verification;
+mod contents;
+mod garbage;
+mod removal;
+mod room_fit;
+mod rooms;
+mod adapter_files;
+mod extension;
+mod adapters;
+
+pub use adapter_files::{check_adapter_files, stated_weights_size};
+
+pub use contents::{Contents, RevisionContents};
+pub use defaults::{Choice, Defaults, StandingDefaults};
+pub use extension::{ExtendedRoom, OtherFeatures};
+pub use garbage::{Garbage, GarbageFile};
+pub use removal::Removed;
+pub use resource::{Kind, ResourceName, ResourceNameError};
+pub use rooms::{RoomSummary, StoredRoom, check_features};
+pub use stored_adapter::{BaseAdapter, RoomFit, StoredAdapter};
+pub use verification::Finding;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use object_store::local::LocalFileSystem;
+use object_store::path::Path;
+use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload};
+use sha2::{Digest, Sha256};
+use tokio_stream::StreamExt;
+
+/// Why the store could not be read or written. Each message names the file, room or adapter
+/// concerned; where there is a remedy, it says so.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each variant's message says what it is")]
+pub enum Error {
+    #[error("store '{location}' cannot be opened: {problem}")]
+    Open { location: String, problem: String },
+    #[error(
+        "store '{location}' does not exist; make one with `seese3 import … --store {location}`"
+    )]
+    Missing { location: String },
+    #[error("{kind} '{name}' is not in the store; it has {}", listed(known))]
+    Unknown {
+        kind: &'static str,
+        name: String,
+        known: Vec<String>,
+    },
+    #[error("{kind} '{name}' has no revision {revision}; its newest is {newest}")]
+    UnknownRevision {
+        kind: &'static str,
+        name: String,
+        revision: u64,
+        newest: u64,
+    },
+    #[error("room '{room}' has no features '{name}'; it has {}", listed(known))]
+    UnknownFeatures {
+        room: String,
+        name: String,
+        known: Vec<String>,
+    },
+    #[error("room '{room}' has {}; name one", several(known))]
+    WhichFeatures { room: String, known: Vec<String> },
+    #[error("{name:?} cannot name {what}: use 1 to 100 letters, digits, '.', '-' or '_'")]
+    Name { what: &'static str, name: String },
+    #[error("{file}: {problem}")]
+    Damaged { file: String, problem: String },
+    #[error(
+        "{file} was written by a newer version (schema {schema}, this program reads {}); update the program",
+        manifest::SCHEMA
+    )]
+    Schema { file: String, schema: u64 },
+    #[error("{file}: {cause}")]
+    Io { file: String, cause: String },
+    #[error("{file} is missing; restore it, or publish again")]
+    Absent { file: String },
+    #[error(
+        "could not publish '{name}': every number that was tried is taken, by other publishers or by something that is not a file"
+    )]
+    Contended { name: String },
+    #[error("features '{name}' have {rows} rows, room '{room}' has {frame_count} frames")]
+    FeatureRows {
+        name: String,
+        rows: usize,
+        room: String,
+        frame_count: usize,
+    },
+    #[error("features '{name}' were given twice")]
+    DuplicateFeatures { name: String },
+    #[error(
+        "room '{room}' has other frames since revision {revision}; give another name, or replace it on purpose"
+    )]
+    OtherFrames { room: String, revision: u64 },
+    #[error("frames cannot be added to room '{room}': {problem}")]
+    CannotAdd { room: String, problem: String },
+    #[error("{resource} cannot be removed: {reason}")]
+    InUse { resource: String, reason: String },
+    #[error("no default was ever chosen, so there is nothing to take back")]
+    NothingToTakeBack,
+}
+
+fn several(names: &[String]) -> String {
+    if names.is_empty() {
+        "no features".to_owned()
+    } else {
+        format!("several features ({})", names.join(", "))
+    }
+}
+
+fn listed(names: &[String]) -> String {
+    if names.is_empty() {
+        "none".to_owned()
+    } else {
+        names.join(", ")
+    }
+}
+
+/// The result of publishing: a new revision, or the existing one with the same content.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Published {
+    /// The number of the revision, counted from 1.
+    pub revision: u64,
+    /// Whether this call created the revision. Publishing unchanged content creates none.
+    pub is_new: bool,
+    /// The path of the manifest, relative to the root of the store.
+    pub manifest: String,
+}
+
+/// Larger numbers are never given, so that there is always a next one.
+const HIGHEST: u64 = 999_999_999_999;
+/// How many revision numbers publishing tries before it fails, each lost to a faster publisher.
+const ATTEMPTS: u64 = 16;
+
+/// An opened store.
+#[derive(Debug, Clone)]
+pub struct Store {
+    objects: Arc<dyn ObjectStore>,
+    location: String,
+    /// The folder of a local store.
+    folder: Option<PathBuf>,
+}
+
+/// The numbers of the files in a folder of numbered files, such as `revisions/`.
+#[derive(Debug, Default)]
+struct Numbers {
+    /// Those that are there, in ascending order.
+    present: Vec<u64>,
+    /// The highest that was ever given, 0 if none was: the file may have been removed since.
+    highest: u64,
+}
+
+impl Store {
+    /// Opens the store in a folder, which is created if necessary, or at an object-store URL.
+    ///
+    /// # Errors
+    /// [`Error::Open`] if the folder cannot be created or the store cannot be opened.
+    pub fn create(location: &str) -> Result<Self, Error> {
+        if !location.contains("://") {
+            std::fs::create_dir_all(location).map_err(|error| Error::Open {
+                location: location.to_owned(),
+                problem: error.to_string(),
+            })?;
+        }
+
+        Self::open(location)
+    }
+
+    /// Opens the store in an existing folder, or at an object-store URL.
+    ///
+    /// # Errors
+    /// [`Error::Missing`] if the folder does not exist; [`Error::Open`] if the URL is not valid or
+    /// not supported, or if the folder cannot be opened.
+    pub fn open(location: &str) -> Result<Self, Error> {
+        let failed = |problem: String| Error::Open {
+            location: location.to_owned(),
+            problem,
+        };
+
+        if location.contains("://") {
+            let url = url::Url::parse(location).map_err(|error| failed(error.to_string()))?;
+            let (objects, prefix) = bucket::open(&url).map_err(failed)?;
+
+            // From here on, all paths are relative to the folder in the URL, as they are for a
+            // local store.
+            let objects = object_store::prefix::PrefixStore::new(objects, prefix);
+
+            return Ok(Self {
+                objects: Arc::new(objects),
+                location: location.to_owned(),
+                folder: None,
+            });
+        }
+
+        if !std::path::Path::new(location).is_dir() {
+            return Err(Error::Missing {
+                location: location.to_owned(),
+            });
+        }
+
+        let objects = LocalFileSystem::new_with_prefix(location)
+            .map_err(|error| failed(error.to_string()))?;
+
+        // Every write reaches the disk before the next one starts. Otherwise a power failure could
+        // leave a manifest whose objects were lost.
+        let objects = objects.with_fsync(true);
+
+        Ok(Self {
+            objects: Arc::new(objects),
+            location: location.to_owned(),
+            folder: Some(PathBuf::from(location)),
+        })
+    }
+
+    /// Uses an object store that is already open; `location` is its name in error messages.
+    pub fn with_objects(objects: Arc<dyn ObjectStore>, location: &str) -> Self {
+        Self {
+            objects,
+            location: location.to_owned(),
+            folder: None,
+        }
+    }
+
+    /// The folder or URL, exactly as the caller gave it.
+    pub fn location(&self) -> &str {
+        &self.location
+    }
+
+    /// The full path of a file of this store, for error messages.
+    fn shown(&self, path: &Path) -> String {
+        format!("{}/{path}", self.location.trim_end_matches('/'))
+    }
+
+    /// Converts an error of the object store. A missing object gets a message of its own that says
+    /// what to do.
+    fn io(&self, path: &Path, error: &object_store::Error) -> Error {
+        let file = self.shown(path);
+        match error {
+            object_store::Error::NotFound { .. } => Error::Absent { file },
+            // What the file system said, without the name of the library's class of errors.
+            object_store::Error::Generic { source, .. } => Error::Io {
+                file,
+                cause: source.to_string(),
+            },
+            other => Error::Io {
+                file,
+                cause: other.to_string(),
+            },
+        }
+    }
+
+    async fn read(&self, path: &Path) -> Result<Vec<u8>, Error> {
+        // Opening a pipe would wait for someone to write into it.
+        if let Some(folder) = &self.folder
+            && std::fs::metadata(folder.join(path.as_ref())).is_ok_and(|found| !found.is_file())
+        {
+            return Err(Error::Damaged {
+                file: self.shown(path),
+                problem: "is not a regular file; restore it, or publish again".to_owned(),
+            });
+        }
+
+        let io = |error| self.io(path, &error);
+        let bytes = self
+            .objects
+            .get(path)
+            .await
+            .map_err(io)?
+            .bytes()
+            .await
+            .map_err(io)?;
+
+        Ok(bytes.to_vec())
+    }
+
+    /// Reads an object and checks its length and checksum against the manifest. Returns the name of
+    /// the file, for error messages, and its bytes.
+    async fn read_object(
+        &self,
+        folder: &Path,
+        object: &manifest::ObjectRef,
+    ) -> Result<(String, Vec<u8>), Error> {
+        let path = folder.clone().join("objects").join(object.file.as_str());
+        let file = self.shown(&path);
+        let bytes = self.read(&path).await?;
+
+        // The length is compared first: it needs no hashing, and its difference points to a
+        // truncated file.
+        let problem = if bytes.len() as u64 != object.bytes {
+            format!(
+                "is {} bytes long, its manifest says {}: it was truncated or altered",
+                bytes.len(),
+                object.bytes
+            )
+        } else if sha256(&bytes) != object.sha256 {
+            "does not have the checksum that its manifest states: it was altered".to_owned()
+        } else {
+            return Ok((file, bytes));
+        };
+
+        Err(Error::Damaged {
+            file,
+            problem: format!("{problem}; publish it again"),
+        })
+    }
+
+    /// Writes an object under a name that contains the hash of its content, so that writing the
+    /// same content twice is harmless.
+    async fn write_object(
+        &self,
+        folder: &Path,
+        stem: &str,
+        extension: &str,
+        bytes: Vec<u8>,
+    ) -> Result<manifest::ObjectRef, Error> {
+        let sha256 = sha256(&bytes);
+
+        // 64 bits of the hash keep different contents apart: an existing object is only ever
+        // replaced by the same bytes.
+        let file = format!("{stem}-{}.{extension}", &sha256[..16]);
+        let path = folder.clone().join("objects").join(file.as_str());
+        let size = bytes.len() as u64;
+
+        let written = self.objects.put(&path, PutPayload::from(bytes)).await;
+        written.map_err(|error| self.io(&path, &error))?;
+
+        Ok(manifest::ObjectRef {
+            file,
+            sha256,
+            bytes: size,
+        })
+    }
+
+    /// Whether an object that a revision needs is missing: somebody may have collected it as
+    /// garbage while the revision was being published.
+    async fn lacks<'a>(
+        &self,
+        folder: &Path,
+        objects: impl Iterator<Item = &'a manifest::ObjectRef>,
+    ) -> Result<bool, Error> {
+        for object in objects {
+            let path = folder.clone().join("objects").join(object.file.as_str());
+            match self.objects.head(&path).await {
+                Ok(_) => {}
+                Err(object_store::Error::NotFound { .. }) => return Ok(true),
+                Err(error) => return Err(self.io(&path, &error)),
+            }
+        }
+
+        Ok(false)
+    }
+
+    /// Writes a manifest unless the revision already exists. Returns whether it was written.
+    async fn write_manifest(
+        &self,
+        folder: &Path,
+        revision: u64,
+        bytes: Vec<u8>,
+    ) -> Result<bool, Error> {
+        self.write_new(&revision_path(folder, revision), bytes)
+            .await
+    }
+
+    /// Writes a file unless it exists. Returns whether it was written.
+    async fn write_new(&self, path: &Path, bytes: Vec<u8>) -> Result<bool, Error> {
+        // `Create` fails if the object exists. This one atomic write decides which of several
+        // concurrent writers gets the number.
+        let options = PutOptions::from(PutMode::Create);
+        match self
+            .objects
+            .put_opts(path, PutPayload::from(bytes), options)
+            .await
+        {
+            Ok(_) => Ok(true),
+            Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
+            Err(error) => Err(self.io(path, &error)),
+        }
+    }
+
+    /// The names of all rooms, or of all adapters, that have at least one revision; sorted.
+    async fn names(&self, kind: Kind) -> Result<Vec<String>, Error> {
+        let numbered = self.numbered(kind).await?;
+        Ok(numbered.into_iter().map(|(name, _)| name).collect())
+    }
+
+    /// The same, each with the revision that its name alone means by these choices.
+    async fn current(&self, kind: Kind, defaults: &Defaults) -> Result<Vec<(String, u64)>, Error> {
+        let current = |(name, numbers): (String, Numbers)| {
+            let chosen = defaults.revision(kind, &name);
+            let newest = numbers.present.last().copied();
+            chosen.or(newest).map(|revision| (name, revision))
+        };
+
+        let numbered = self.numbered(kind).await?;
+        Ok(numbered.into_iter().filter_map(current).collect())
+    }
+
+    /// The names of all rooms, or of all adapters, each with its revisions; sorted.
+    async fn numbered(&self, kind: Kind) -> Result<Vec<(String, Numbers)>, Error> {
+        let mut numbered = Vec::new();
+
+        for (name, folder) in self.folders(kind).await? {
+            // A folder without a revision was left by an interrupted publication, since the
+            // manifest is written last, or by a removal. It does not count as published.
+            let numbers = self.revisions(&folder).await?;
+            if !numbers.present.is_empty() {
+                numbered.push((name, numbers));
+            }
+        }
+
+        Ok(numbered)
+    }
+
+    /// Whether there is, or ever was, a room or an adapter.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if the store cannot be listed.
+    pub async fn remembers(&self, kind: Kind) -> Result<bool, Error> {
+        for (_, folder) in self.folders(kind).await? {
+            if self.revisions(&folder).await?.highest > 0 {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// Refuses a path of a local store where there is something else than a folder: it would be
+    /// listed as an empty one.
+    fn check_folder(&self, path: &Path) -> Result<(), Error> {
+        let Some(root) = &self.folder else {
+            return Ok(());
+        };
+        let place = root.join(path.as_ref());
+        if std::fs::symlink_metadata(&place).is_ok() && !place.is_dir() {
+            return Err(Error::Damaged {
+                file: self.shown(path),
+                problem: "is not a folder; restore it".to_owned(),
+            });
+        }
+        Ok(())
+    }
+
+    /// The folders of a kind, whether they have a revision or not, by name; sorted.
+    async fn folders(&self, kind: Kind) -> Result<Vec<(String, Path)>, Error> {
+        let folder = Path::from(kind.collection());
+        self.check_folder(&folder)?;
+        let listed = self.objects.list_with_delimiter(Some(&folder)).await;
+        let listed = listed.map_err(|error| self.io(&folder, &error))?;
+
+        let named = |prefix: Path| {
+            let name = prefix.filename().map(str::to_owned)?;
+            seese3_core::room::is_plain_name(&name).then_some((name, prefix))
+        };
+        let mut folders: Vec<(String, Path)> = listed
+            .common_prefixes
+            .into_iter()
+            .filter_map(named)
+            .collect();
+
+        folders.sort();
+        Ok(folders)
+    }
+
+    /// The revisions of a room or an adapter.
+    async fn revisions(&self, folder: &Path) -> Result<Numbers, Error> {
+        self.numbered_files(&folder.clone().join("revisions")).await
+    }
+
+    /// The numbers of the files in a folder.
+    async fn numbered_files(&self, folder: &Path) -> Result<Numbers, Error> {
+        self.check_folder(folder)?;
+        let mut listed = self.objects.list(Some(folder));
+        let mut numbers = Numbers::default();
+
+        while let Some(entry) = listed.next().await {
+            let entry = entry.map_err(|error| self.io(folder, &error))?;
+            let name = entry.location.filename().unwrap_or_default();
+            let Some((number, extension)) = name.split_once('.') else {
+                continue;
+            };
+            let Some(number) = number.parse().ok().filter(|number| *number <= HIGHEST) else {
+                continue;
+            };
+
+            // Only names that this program gives count: a copy such as `2.json` is no revision.
+            match extension {
+                "json" if name == manifest_name(number) => numbers.present.push(number),
+                "gone" if name == gone_name(number) => {}
+                _ => continue,
+            }
+            numbers.highest = numbers.highest.max(number);
+        }
+
+        numbers.present.sort_unstable();
+        Ok(numbers)
+    }
+
+    /// The folder of a room or an adapter, and the requested revision, or else the one that the
+    /// name alone means: that which an operator chose, or the newest.
+    async fn resolve(
+        &self,
+        kind: Kind,
+        name: &str,
+        revision: Option<u64>,
+    ) -> Result<(Path, u64), Error> {
+        let revision = match revision {
+            Some(revision) => Some(revision),
+            None => self.defaults().await?.revision(kind, name),
+        };
+
+        self.published(kind, name, revision).await
+    }
+
+    /// The folder of a room or an adapter, and the requested revision or else the newest.
+    async fn published(
+        &self,
+        kind: Kind,
+        name: &str,
+        revision: Option<u64>,
+    ) -> Result<(Path, u64), Error> {
+        let folder = folder_of(kind, name);
+
+        // A name that is not valid cannot have been published. It is treated like an unknown one
+        // and never listed as a path.
+        let revisions = if seese3_core::room::is_plain_name(name) {
+            self.revisions(&folder).await?.present
+        } else {
+            Vec::new()
+        };
+
+        let Some(&newest) = revisions.last() else {
+            let known = self.names(kind).await?;
+            return Err(Error::Unknown {
+                kind: kind.name(),
+                name: name.to_owned(),
+                known,
+            });
+        };
+
+        match revision {
+            None => Ok((folder, newest)),
+            Some(wanted) if revisions.contains(&wanted) => Ok((folder, wanted)),
+            Some(revision) => Err(Error::UnknownRevision {
+                kind: kind.name(),
+                name: name.to_owned(),
+                revision,
+                newest,
+            }),
+        }
+    }
+}
+
+fn folder_of(kind: Kind, name: &str) -> Path {
+    Path::from(kind.collection()).join(name)
+}
+
+fn revision_path(folder: &Path, revision: u64) -> Path {
+    folder
+        .clone()
+        .join("revisions")
+        .join(manifest_name(revision))
+}
+
+fn manifest_name(revision: u64) -> String {
+    format!("{revision:06}.json")
+}
+
+/// The file that stands for a removed revision.
+fn gone_name(revision: u64) -> String {
+    format!("{revision:06}.gone")
+}
+
+/// The first 16 hexadecimal digits of a text's SHA-256, for use in file names.
+pub fn short_digest(text: &str) -> String {
+    sha256(text.as_bytes())[..16].to_owned()
+}
+
+fn sha256(bytes: &[u8]) -> String {
+    Sha256::digest(bytes)
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect()
+}

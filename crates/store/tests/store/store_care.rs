@@ -1,0 +1,519 @@
+//! Looking after a store: what is chosen, removed, collected and verified.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use object_store::local::LocalFileSystem;
+use seese3_core::features::Features;
+use seese3_core::room::{FrameId, Room};
+use seese3_core::training::RoomData;
+use seese3_robot::fitting::fit;
+use seese3_store::{Choice, Defaults, Error, ResourceName, RoomFit, Store};
+
+use crate::dying::Dying;
+use crate::store::{files, stored};
+use seese3_testing::recording::{adapter, room, set};
+use seese3_testing::world;
+
+use crate::current_rooms;
+
+fn named(text: &str) -> ResourceName {
+    text.parse().unwrap()
+}
+
+/// A store with three revisions of room `a`, each with one set of features more.
+async fn three_revisions() -> (tempfile::TempDir, Store) {
+    let (folder, store) = stored().await;
+    let sets = [set("f", 1.0), set("g", 2.0), set("h", 3.0)];
+    for (position, set) in sets.iter().enumerate() {
+        let published = store
+            .publish_room(&room("a"), std::slice::from_ref(set))
+            .await
+            .unwrap();
+        assert_eq!(published.revision, position as u64 + 1);
+    }
+
+    (folder, store)
+}
+
+async fn feature_names(store: &Store, revision: Option<u64>) -> Vec<String> {
+    let stored = store.load_room("a", revision).await.unwrap();
+    let names = stored.features.iter().map(|set| set.source().name.clone());
+    names.collect()
+}
+
+/// Oracle: the definition of a default, by hand.
+#[tokio::test]
+async fn a_name_means_what_was_chosen() {
+    let (_folder, store) = three_revisions().await;
+    assert_eq!(feature_names(&store, None).await, ["f", "g", "h"]);
+    assert_eq!(current_rooms(&store).await, [("a".to_owned(), 3)]);
+
+    store
+        .choose(&Choice::Revision(named("rooms/a/revisions/2")))
+        .await
+        .unwrap();
+    assert_eq!(feature_names(&store, None).await, ["f", "g"]);
+    assert_eq!(current_rooms(&store).await, [("a".to_owned(), 2)]);
+
+    // What is published next has the next number, and the choice holds.
+    let published = store
+        .publish_room(&room("a"), &[set("i", 4.0)])
+        .await
+        .unwrap();
+    assert_eq!(published.revision, 4);
+    assert_eq!(feature_names(&store, None).await, ["f", "g"]);
+
+    store
+        .choose(&Choice::Revision(named("rooms/a/revisions/4")))
+        .await
+        .unwrap();
+    assert_eq!(feature_names(&store, None).await, ["f", "g", "h", "i"]);
+    store.take_back_choice().await.unwrap();
+    assert_eq!(feature_names(&store, None).await, ["f", "g"]);
+
+    store
+        .choose(&Choice::Nothing(named("rooms/a")))
+        .await
+        .unwrap();
+    assert_eq!(feature_names(&store, None).await, ["f", "g", "h", "i"]);
+
+    // Taken back step by step, as far back as anything was chosen.
+    for expected in [&["f", "g"][..], &["f", "g", "h", "i"]] {
+        store.take_back_choice().await.unwrap();
+        assert_eq!(feature_names(&store, None).await, expected);
+    }
+    assert!(matches!(
+        store.take_back_choice().await,
+        Err(Error::NothingToTakeBack)
+    ));
+
+    // What is gone cannot be meant again.
+    store
+        .choose(&Choice::Revision(named("rooms/a/revisions/1")))
+        .await
+        .unwrap();
+    store
+        .choose(&Choice::Nothing(named("rooms/a")))
+        .await
+        .unwrap();
+    store.remove(&named("rooms/a/revisions/1")).await.unwrap();
+    store.take_back_choice().await.unwrap();
+    assert_eq!(feature_names(&store, None).await, ["f", "g", "h", "i"]);
+
+    let unknown = Choice::Revision(named("rooms/a/revisions/9"));
+    assert!(matches!(
+        store.choose(&unknown).await,
+        Err(Error::UnknownRevision { revision: 9, .. })
+    ));
+}
+
+/// Oracle: the contract itself. Removed numbers are not given again, what is chosen stays, and the
+/// space is free only after the collection.
+#[tokio::test]
+async fn what_is_removed_is_gone_and_its_number_too() {
+    let (folder, store) = three_revisions().await;
+    store
+        .choose(&Choice::Revision(named("rooms/a/revisions/1")))
+        .await
+        .unwrap();
+    assert!(matches!(
+        store.remove(&named("rooms/a/revisions/1")).await,
+        Err(Error::InUse { .. })
+    ));
+
+    let removed = store.remove(&named("rooms/a/revisions/3")).await.unwrap();
+    assert_eq!(removed.revisions, [3]);
+    assert!(matches!(
+        store.load_room("a", Some(3)).await,
+        Err(Error::UnknownRevision { newest: 2, .. })
+    ));
+
+    // No age is too long to be asked for.
+    let for_ever = store.collect_garbage(Duration::MAX).await.unwrap();
+    assert!(for_ever.files.is_empty());
+    let ages = store
+        .collect_garbage(Duration::from_secs(1 << 42))
+        .await
+        .unwrap();
+    assert!(ages.files.is_empty());
+
+    // A publisher may have begun from what was removed just now, so its objects stay for an hour.
+    let hour = Duration::from_secs(3_600);
+    assert!(store.find_garbage(hour).await.unwrap().files.is_empty());
+    assert_eq!(files(folder.path(), "features-h").len(), 1);
+
+    // Not even if the objects themselves were written long ago.
+    for file in files(folder.path(), "objects/") {
+        let long_ago = std::time::SystemTime::now() - 100 * hour;
+        let file = std::fs::File::options().write(true).open(file).unwrap();
+        file.set_modified(long_ago).unwrap();
+    }
+    assert!(store.find_garbage(hour).await.unwrap().files.is_empty());
+
+    let garbage = store.collect_garbage(Duration::ZERO).await.unwrap();
+    assert_eq!(garbage.files.len(), 1, "{garbage:?}");
+    assert!(files(folder.path(), "features-h").is_empty());
+    assert_eq!(feature_names(&store, Some(2)).await, ["f", "g"]);
+    assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+
+    let published = store
+        .publish_room(&room("a"), &[set("k", 5.0)])
+        .await
+        .unwrap();
+    assert_eq!(published.revision, 4);
+
+    // The whole room, with what was chosen for it.
+    let removed = store.remove(&named("rooms/a")).await.unwrap();
+    assert_eq!(removed.revisions, [1, 2, 4]);
+    assert!(current_rooms(&store).await.is_empty());
+    store.collect_garbage(Duration::ZERO).await.unwrap();
+    assert!(files(folder.path(), "safetensors").is_empty());
+
+    let published = store
+        .publish_room(&room("a"), &[set("f", 1.0)])
+        .await
+        .unwrap();
+    assert_eq!(published.revision, 5);
+    assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+}
+
+/// Oracle: the objects that the manifests on disk name, read by hand from their JSON.
+#[tokio::test]
+async fn live_objects_are_never_garbage() {
+    // The publication of a second revision is killed at each of its writes.
+    for survives in 0..12 {
+        let (folder, store) = stored().await;
+        store
+            .publish_room(&room("a"), &[set("f", 1.0)])
+            .await
+            .unwrap();
+
+        let files_of = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
+        let dying = Store::with_objects(Arc::new(Dying::new(files_of, survives)), "dying");
+        let ended = dying
+            .publish_room(&room("a"), &[set("g", 2.0), set("h", 3.0)])
+            .await;
+
+        // What a write leaves that is killed before its file has a name.
+        let unfinished = folder.path().join("rooms/a/objects/frames.safetensors#1");
+        std::fs::write(&unfinished, b"half").unwrap();
+
+        let objects = |word: &str| {
+            let found = files(folder.path(), "objects/").into_iter();
+            let name =
+                |path: std::path::PathBuf| path.file_name().unwrap().to_str().unwrap().to_owned();
+            found
+                .map(name)
+                .filter(|name| name.contains(word))
+                .collect::<BTreeSet<String>>()
+        };
+        let named: BTreeSet<String> = files(folder.path(), "revisions/")
+            .iter()
+            .flat_map(|manifest| object_names(manifest))
+            .collect();
+
+        let garbage = store.collect_garbage(Duration::ZERO).await.unwrap();
+        assert_eq!(objects(""), named, "killed after {survives} writes");
+        assert!(
+            garbage.files.iter().any(|file| file.path.ends_with("#1")),
+            "{garbage:?}"
+        );
+        assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+
+        let revision = store.load_room("a", None).await.unwrap().revision;
+        assert_eq!(revision, if ended.is_ok() { 2 } else { 1 });
+    }
+}
+
+/// The names of the objects in a manifest.
+fn object_names(manifest: &Path) -> Vec<String> {
+    fn collect(value: &serde_json::Value, names: &mut Vec<String>) {
+        if let Some(name) = value.get("file").and_then(serde_json::Value::as_str) {
+            names.push(name.to_owned());
+        }
+        match value {
+            serde_json::Value::Array(entries) => {
+                entries.iter().for_each(|entry| collect(entry, names));
+            }
+            serde_json::Value::Object(entries) => {
+                entries.values().for_each(|entry| collect(entry, names));
+            }
+            _ => {}
+        }
+    }
+
+    let mut names = Vec::new();
+    collect(&seese3_testing::json(manifest), &mut names);
+    names
+}
+
+/// Oracle: the contract itself: the newest revision is there until the last of them goes.
+#[tokio::test]
+async fn a_removal_that_dies_leaves_the_newest() {
+    for survives in 0..7 {
+        let (folder, store) = three_revisions().await;
+        store
+            .choose(&Choice::Revision(named("rooms/a/revisions/1")))
+            .await
+            .unwrap();
+        let files_of = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
+        let dying = Store::with_objects(Arc::new(Dying::new(files_of, survives)), "dying");
+        assert!(dying.remove(&named("rooms/a")).await.is_err());
+
+        // The choice is taken back first; it would hide what is still there.
+        let expected: &[&str] = match survives {
+            0 => &["f"],
+            _ => &["f", "g", "h"],
+        };
+        assert_eq!(feature_names(&store, None).await, expected);
+        assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+
+        // The second try finishes what the first began.
+        store.remove(&named("rooms/a")).await.unwrap();
+        assert!(current_rooms(&store).await.is_empty());
+    }
+}
+
+/// Oracle: the promise: what is removed makes room on a full disk, and its numbers are not given
+/// again.
+#[tokio::test]
+async fn a_full_disk_can_be_emptied() {
+    let (folder, store) = three_revisions().await;
+    let files_of = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
+    let full = Store::with_objects(Arc::new(Dying::full(files_of)), "full");
+    assert!(full.publish_room(&room("b"), &[]).await.is_err());
+
+    full.remove(&named("rooms/a")).await.unwrap();
+    assert!(current_rooms(&full).await.is_empty());
+    full.collect_garbage(Duration::ZERO).await.unwrap();
+    assert!(files(folder.path(), "objects/").is_empty());
+
+    let again = store.publish_room(&room("a"), &[set("f", 1.0)]).await;
+    assert_eq!(again.unwrap().revision, 4);
+}
+
+/// Oracle: by hand. Where the file of the newest choices is damaged, those before it stand, nobody
+/// chooses on top of it, and it can be taken back.
+#[tokio::test]
+async fn damaged_choices_can_be_taken_back() {
+    let (folder, store) = three_revisions().await;
+    for revision in [1, 2] {
+        let resource = named(&format!("rooms/a/revisions/{revision}"));
+        store.choose(&Choice::Revision(resource)).await.unwrap();
+    }
+    let newest = folder.path().join("defaults/000002.json");
+    let intact = std::fs::read(&newest).unwrap();
+    std::fs::write(&newest, &intact[..intact.len() / 2]).unwrap();
+
+    let standing = store.standing_defaults().await.unwrap();
+    let current = store.current_rooms(&standing.defaults).await.unwrap();
+    assert_eq!(current, [("a".to_owned(), 1)]);
+    let refused = standing.refused.unwrap().to_string();
+    assert!(refused.contains("defaults/000002.json"), "{refused}");
+
+    let third = Choice::Revision(named("rooms/a/revisions/3"));
+    assert!(matches!(
+        store.choose(&third).await,
+        Err(Error::Damaged { .. })
+    ));
+
+    store.take_back_choice().await.unwrap();
+    assert_eq!(current_rooms(&store).await, [("a".to_owned(), 1)]);
+    assert!(store.standing_defaults().await.unwrap().refused.is_none());
+
+    // Without any file that can be read, nothing is chosen.
+    for file in files(folder.path(), "defaults/") {
+        std::fs::write(file, "{").unwrap();
+    }
+    let standing = store.standing_defaults().await.unwrap();
+    let current = store.current_rooms(&standing.defaults).await.unwrap();
+    assert_eq!(current, [("a".to_owned(), 3)]);
+    assert!(standing.refused.is_some());
+
+    assert_eq!(store.take_back_choice().await.unwrap(), Defaults::default());
+    assert!(store.standing_defaults().await.unwrap().refused.is_none());
+
+    // A number that leaves no room for a next one was not given by us.
+    let alien = folder.path().join(format!("defaults/{}.json", u64::MAX));
+    std::fs::write(alien, "{").unwrap();
+    store.choose(&third).await.unwrap();
+    assert_eq!(current_rooms(&store).await, [("a".to_owned(), 3)]);
+
+    std::fs::remove_dir_all(folder.path().join("defaults")).unwrap();
+    std::fs::write(folder.path().join("defaults"), "").unwrap();
+    assert!(store.standing_defaults().await.unwrap().refused.is_some());
+    assert!(!store.verify(&|_| ()).await.unwrap().is_empty());
+}
+
+/// Oracle: the damage that the test does. Each file is found by its name.
+#[tokio::test]
+async fn verification_finds_damage_and_broken_references() {
+    let (folder, store) = three_revisions().await;
+    let (room, set) = (room("a"), set("f", 1.0));
+    let (adapter, record) = adapter(&room, &set);
+    store
+        .publish_adapter("base", &adapter, &record, set.rows())
+        .await
+        .unwrap();
+    store
+        .choose(&Choice::Adapter {
+            room: "a".to_owned(),
+            adapter: "base".to_owned(),
+        })
+        .await
+        .unwrap();
+    assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+    assert!(matches!(
+        store.remove(&named("adapters/base")).await,
+        Err(Error::InUse { .. })
+    ));
+
+    for (word, resource) in [
+        ("features-g", "rooms/a/revisions/2"),
+        ("weights-", "adapters/base/revisions/1"),
+        ("revisions/000001.json", "revisions/1"),
+        ("defaults/000001.json", "defaults"),
+    ] {
+        let altered = files(folder.path(), word);
+        assert!(!altered.is_empty(), "no file {word}");
+        for file in altered {
+            let intact = std::fs::read(&file).unwrap();
+            let mut altered = intact.clone();
+            let middle = altered.len() / 2;
+            altered[middle] ^= 1;
+            std::fs::write(&file, &altered).unwrap();
+
+            let findings = store.verify(&|_| ()).await.unwrap();
+            assert!(
+                findings
+                    .iter()
+                    .any(|finding| finding.resource.contains(resource)
+                        && finding
+                            .problem
+                            .contains(file.file_name().unwrap().to_str().unwrap())),
+                "{}: {findings:?}",
+                file.display()
+            );
+            std::fs::write(&file, &intact).unwrap();
+        }
+    }
+    assert!(store.verify(&|_| ()).await.unwrap().is_empty());
+}
+
+/// Oracle: the reference itself: a fitted adapter names the adapter that it began from.
+#[tokio::test]
+async fn what_a_fitted_adapter_needs_stays() {
+    let (_folder, store) = stored().await;
+    let (hall, features) = world::served("hall");
+    store
+        .publish_room(&hall, std::slice::from_ref(&features))
+        .await
+        .unwrap();
+    let (base, record) = world::calibrated();
+    store
+        .publish_adapter("base", &base, &record, features.rows())
+        .await
+        .unwrap();
+
+    let data = RoomData {
+        room: &hall,
+        revision: 1,
+        features: &features,
+    };
+    let mapped: Vec<FrameId> = (0..hall.frame_count() as u32).map(FrameId).collect();
+    let fitted = fit(&data, &mapped, None, 0, &|_| ()).unwrap();
+    let room_fit = RoomFit {
+        room: hall.id().clone(),
+        room_revision: 1,
+        base: Some(seese3_store::BaseAdapter {
+            name: "base".to_owned(),
+            revision: 1,
+        }),
+        rules: fitted.rules.clone(),
+    };
+    publish_fitted(&store, &fitted, &room_fit, &features).await;
+
+    let refused = store.remove(&named("adapters/base")).await;
+    assert!(
+        matches!(&refused, Err(Error::InUse { reason, .. }) if reason.contains("adapters/fitted/revisions/1")),
+        "{refused:?}"
+    );
+
+    store.remove(&named("adapters/fitted")).await.unwrap();
+    store.remove(&named("adapters/base")).await.unwrap();
+}
+
+async fn publish_fitted(
+    store: &Store,
+    fitted: &seese3_robot::fitting::Fitted,
+    room_fit: &RoomFit,
+    features: &Features,
+) {
+    store
+        .publish_fitted("fitted", fitted, room_fit, features.rows())
+        .await
+        .unwrap();
+}
+
+/// Oracle: the promise: a revision that was published has its objects, whoever collects garbage
+/// meanwhile. The objects that are published again were left by a removal long ago.
+#[tokio::test]
+async fn garbage_that_is_published_again_is_not_collected() {
+    let (folder, store) = stored().await;
+    let (room, features) = (room("a"), [set("f", 1.0)]);
+    let long_ago = std::time::SystemTime::now() - Duration::from_secs(10 * 3_600);
+
+    for round in 0..10 {
+        let published = store.publish_room(&room, &features).await.unwrap();
+        assert!(published.is_new);
+        store.remove(&named("rooms/a")).await.unwrap();
+        for file in files(folder.path(), "rooms/a") {
+            let file = std::fs::File::options().write(true).open(file).unwrap();
+            file.set_modified(long_ago).unwrap();
+        }
+
+        let collecting = {
+            let store = store.clone();
+            let pause = Duration::from_micros(300 * round);
+            tokio::spawn(async move {
+                tokio::time::sleep(pause).await;
+                store.collect_garbage(Duration::from_secs(3_600)).await
+            })
+        };
+        store.publish_room(&room, &features).await.unwrap();
+        collecting.await.unwrap().unwrap();
+
+        let findings = store.verify(&|_| ()).await.unwrap();
+        assert!(findings.is_empty(), "round {round}: {findings:?}");
+        store.remove(&named("rooms/a")).await.unwrap();
+    }
+}
+
+/// Oracle: the promise: of two recordings under one name one is published, unless the other is to
+/// replace it; the same frames with other features are no other recording.
+#[tokio::test]
+async fn other_frames_are_not_published_by_accident() {
+    let (_folder, store) = stored().await;
+    let first = room("a");
+    let mut frames = first.frames().clone();
+    frames.poses.reverse();
+    let other = Room::new(first.id().clone(), frames, first.provenance().clone()).unwrap();
+
+    let publish = async |room: &Room, scale: f32| {
+        let features = [set("f", scale)];
+        store.publish_same_frames(room, &features).await
+    };
+    assert_eq!(publish(&first, 1.0).await.unwrap().revision, 1);
+    assert_eq!(publish(&first, 2.0).await.unwrap().revision, 2);
+    let refused = publish(&other, 1.0).await;
+    assert!(
+        matches!(refused, Err(Error::OtherFrames { revision: 2, .. })),
+        "{refused:?}"
+    );
+
+    let replaced = store.publish_room(&other, &[set("f", 1.0)]).await.unwrap();
+    assert_eq!(replaced.revision, 3);
+}

@@ -1,0 +1,348 @@
+//! The studio: procedural rooms, rendered by ray casting, which give images with exact poses
+//! without a data set.
+//!
+//! - World axes: x and y along the floor, z up, metres. The floor is z = 0, and the room begins at
+//!   (0, 0).
+//! - Everything follows from a seed. Images are those of a pinhole camera with square pixels.
+
+mod camera_path;
+mod candidates;
+mod texture;
+mod hand_held;
+mod solid;
+mod surfaces;
+mod furniture;
+mod light;
+mod render;
+mod suite;
+mod photograph;
+mod film;
+mod visits;
+mod suites;
+
+pub use camera_path::camera_path;
+pub use film::{Film, Variation};
+pub use render::{Camera, Sampling, render};
+pub use suite::{SuiteRoom, Walk};
+pub use suites::Suite;
+
+use nalgebra::{Point3, Vector3};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use candidates::Shade;
+use solid::Solid;
+use texture::Colour;
+
+/// Frames per second of a recording.
+const FRAMES_PER_SECOND: f64 = 30.0;
+
+/// A furnished room.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    /// Width (x), depth (y) and height (z), metres.
+    size: Vector3<f64>,
+    shell: Shell,
+    solids: Vec<Solid>,
+    lamp: Point3<f64>,
+    light: Light,
+    /// Which boxes may be between the lamp and a point.
+    shade: Shade,
+    /// Strength of the fine detail of all surfaces, 0 to 1.
+    detail: f64,
+}
+
+/// How a room is lit.
+#[derive(Debug, Clone, Copy)]
+struct Light {
+    /// Brightness of the lamp on a surface that faces it at about one metre.
+    lamp: f64,
+    /// Factors of the lamp's light in red, green and blue.
+    lamp_tint: [f64; 3],
+    /// Ambient light, which comes from all directions.
+    sky: f64,
+    /// The middle of a window and the light that comes through it, or none at night.
+    window: Option<(Point3<f64>, f64)>,
+    /// Factor of the light that the lamp's own panel shines with.
+    panel: f64,
+    /// Factor of the light of the view out of a window.
+    daylight: f64,
+}
+
+impl Light {
+    const PLAIN: Self = Self {
+        lamp: 1.9,
+        lamp_tint: [1.0; 3],
+        sky: 0.30,
+        window: None,
+        panel: 1.0,
+        daylight: 1.0,
+    };
+}
+
+/// Surfaces of the floor, the walls and the ceiling.
+#[derive(Debug, Clone)]
+struct Shell {
+    seed: u32,
+    wall_colours: [Colour; 4],
+    wallpaper: Wallpaper,
+    floor: Floor,
+    /// Rectangles on each wall, in wall coordinates (along, up), metres.
+    panels: [Vec<Panel>; 4],
+    rug: Rug,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Floor {
+    Planks(Colour),
+    Tiles(Colour),
+    Carpet(Colour),
+}
+
+/// Pattern of the walls; lengths in metres.
+#[derive(Debug, Clone, Copy)]
+enum Wallpaper {
+    None,
+    /// Vertical stripes with this period.
+    Stripes(f64),
+    /// Boards from the floor up to this height.
+    Boards(f64),
+    Bricks,
+}
+
+/// A rectangle on a wall.
+#[derive(Debug, Clone, Copy)]
+struct Panel {
+    low: [f64; 2],
+    high: [f64; 2],
+    kind: PanelKind,
+    seed: u32,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum PanelKind {
+    Picture,
+    Window,
+    Door,
+    Note,
+}
+
+/// A rectangle on the floor.
+#[derive(Debug, Clone, Copy)]
+struct Rug {
+    low: [f64; 2],
+    high: [f64; 2],
+    colours: [Colour; 2],
+}
+
+impl Scene {
+    /// The room of a seed, 4.4 to 6.4 m by 3.8 to 5.2 m, with furniture along its walls and a table
+    /// in the middle.
+    pub fn new(seed: u64) -> Self {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let size = Vector3::new(
+            random.random_range(4.4..6.4),
+            random.random_range(3.8..5.2),
+            random.random_range(2.5..2.9),
+        );
+        let shell = Shell::new(size, &mut random);
+
+        let solids = furniture::furnish(size, &mut random);
+
+        let lamp = Point3::new(
+            size.x * random.random_range(0.4..0.6),
+            size.y * random.random_range(0.4..0.6),
+            size.z - 0.25,
+        );
+
+        Self::lit_by(size, shell, solids, lamp, Light::PLAIN)
+    }
+
+    /// A room of `size`, metres, whose lamp hangs at `lamp`.
+    fn lit_by(
+        size: Vector3<f64>,
+        shell: Shell,
+        solids: Vec<Solid>,
+        lamp: Point3<f64>,
+        light: Light,
+    ) -> Self {
+        let mut scene = Self {
+            size,
+            shell,
+            solids,
+            lamp,
+            light,
+            shade: Shade::default(),
+            detail: 0.0,
+        };
+        scene.shade_lamp();
+
+        scene
+    }
+
+    /// Notes which boxes are around the lamp. It must be called whenever a box has moved.
+    fn shade_lamp(&mut self) {
+        self.shade = Shade::new(self.lamp, &self.solids, light::LIFT_M);
+    }
+
+    /// Width (x), depth (y) and height (z), metres.
+    pub fn size(&self) -> Vector3<f64> {
+        self.size
+    }
+}
+
+impl Shell {
+    fn new(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Self {
+        // One of the four walls has an accent colour.
+        let base = Colour::of_hue(random.random_range(0.0..1.0), 0.22, 0.78);
+        let accent = Colour::of_hue(random.random_range(0.0..1.0), 0.45, 0.6);
+        let accent_wall = random.random_range(0..4);
+        let wall_colours =
+            std::array::from_fn(|wall| if wall == accent_wall { accent } else { base });
+
+        let wood = Colour::of_hue(
+            random.random_range(0.05..0.1),
+            0.55,
+            random.random_range(0.35..0.6),
+        );
+
+        let tile = Colour::of_hue(random.random_range(0.0..1.0), 0.15, 0.65);
+        let floor = if random.random_bool(0.6) {
+            Floor::Planks(wood)
+        } else {
+            Floor::Tiles(tile)
+        };
+
+        // The window is never in the wall of the door.
+        let door_wall = random.random_range(0..4);
+        let window_wall = (door_wall + random.random_range(1..4)) % 4;
+
+        // Walls are numbered counterclockwise, seen from above, from the wall y = 0: the even
+        // ones run along x.
+        let panels = std::array::from_fn(|wall| {
+            let length = if wall % 2 == 0 { size.x } else { size.y };
+
+            let feature = if wall == door_wall {
+                Some(PanelKind::Door)
+            } else if wall == window_wall {
+                Some(PanelKind::Window)
+            } else {
+                None
+            };
+
+            wall_panels(length, feature, random)
+        });
+
+        let centre = [size.x * 0.5, size.y * 0.5];
+        let half = [random.random_range(0.8..1.3), random.random_range(0.6..1.0)];
+
+        let rug = Rug {
+            low: [centre[0] - half[0], centre[1] - half[1]],
+            high: [centre[0] + half[0], centre[1] + half[1]],
+            colours: [
+                Colour::of_hue(random.random_range(0.0..1.0), 0.6, 0.45),
+                Colour::of_hue(random.random_range(0.0..1.0), 0.3, 0.75),
+            ],
+        };
+
+        Self {
+            seed: random.random(),
+            wall_colours,
+            wallpaper: Wallpaper::None,
+            floor,
+            panels,
+            rug,
+        }
+    }
+}
+
+impl Shell {
+    /// Takes colour out of the walls; a `share` of 0 leaves grey.
+    fn fade(&mut self, share: f64) {
+        for colour in &mut self.wall_colours {
+            let grey = colour.0.iter().sum::<f64>() / 3.0;
+            *colour = Colour([grey; 3]).mixed(*colour, share);
+        }
+    }
+
+    /// Pins notes and prints to the walls, three or fewer per metre.
+    fn pin_up(&mut self, size: Vector3<f64>, random: &mut ChaCha8Rng) {
+        for (wall, panels) in self.panels.iter_mut().enumerate() {
+            let length = if wall.is_multiple_of(2) {
+                size.x
+            } else {
+                size.y
+            };
+            let notes = length * random.random_range(0.2..3.0);
+
+            for _ in 0..notes as usize {
+                let [width, height] = [0, 1].map(|_| random.random_range(0.08..0.4));
+                let low = [
+                    random.random_range(0.1..length - width - 0.1),
+                    random.random_range(0.4..(size.z - height - 0.2)),
+                ];
+
+                panels.push(Panel {
+                    low,
+                    high: [low[0] + width, low[1] + height],
+                    kind: PanelKind::Note,
+                    seed: random.random(),
+                });
+            }
+        }
+    }
+}
+
+/// The panels of one wall: the door or the window, if there is one, and pictures beside it.
+fn wall_panels(length: f64, feature: Option<PanelKind>, random: &mut ChaCha8Rng) -> Vec<Panel> {
+    let mut panels = Vec::new();
+    let mut taken = None;
+    if let Some(kind) = feature {
+        let (width, low, high) = if kind == PanelKind::Door {
+            (0.9, 0.0, 2.05)
+        } else {
+            (1.5, 0.95, 2.15)
+        };
+
+        let middle = length * random.random_range(0.35..0.65);
+        let from = middle - width / 2.0;
+        let to = middle + width / 2.0;
+
+        panels.push(Panel {
+            low: [from, low],
+            high: [to, high],
+            kind,
+            seed: random.random(),
+        });
+
+        // Pictures keep 15 cm away from the door or window.
+        taken = Some((from - 0.15, to + 0.15));
+    }
+
+    // Each third of the wall gets a picture, unless it would overlap the door or window or reach
+    // into a corner of the room.
+    for slot in 0..3 {
+        let middle = length * (f64::from(slot) + 0.5) / 3.0 + random.random_range(-0.2..0.2);
+        let width = random.random_range(0.4..0.9);
+        let height = random.random_range(0.4..0.7);
+        let from = middle - width / 2.0;
+
+        let to = middle + width / 2.0;
+        if taken.is_some_and(|(low, high)| from < high && to > low)
+            || from < 0.1
+            || to > length - 0.1
+        {
+            continue;
+        }
+
+        let bottom = random.random_range(1.25..1.5);
+        panels.push(Panel {
+            low: [from, bottom],
+            high: [to, bottom + height],
+            kind: PanelKind::Picture,
+            seed: random.random(),
+        });
+    }
+
+    panels
+}

@@ -1,0 +1,109 @@
+//! Made-up places that a camera sways in, and an adapter whose errors were measured there: what
+//! following is tested with.
+
+use seese3_core::adapter::{Adapter, Preset, TrainingRecord};
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::{Pinhole, PixelCamera, Pose};
+use seese3_core::room::{Frames, Provenance, Room, RoomId};
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
+use seese3_robot::calibration::calibrate;
+
+pub const FRAMES: usize = 300;
+const COLUMNS: usize = 48;
+
+/// A number between -1 and 1 that depends on nothing but its place.
+fn noise(seed: u64, place: usize) -> f64 {
+    let mixed = (seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ place as u64)
+        .wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    ((mixed ^ (mixed >> 29)).wrapping_mul(0x94d0_49bb_1331_11eb) >> 40) as f64 / f64::from(1 << 23)
+        - 1.0
+}
+
+/// A made-up place: a camera that sways and comes back, and features that tell where it is, with
+/// noise, and which place it is.
+pub fn place(name: &str, seed: u64) -> (Room, Features) {
+    let phase = |axis: usize| 3.0 * noise(seed, 1_000_000 + axis);
+    let sway = |t: usize, axis: usize| (t as f64 / (18.0 + 3.0 * axis as f64) + phase(axis)).sin();
+
+    let poses: Vec<Pose> = (0..FRAMES)
+        .map(|t| {
+            let position =
+                nalgebra::Vector3::new(0.6 * sway(t, 0), 0.1 * sway(t, 1), 0.8 * sway(t, 2));
+            let turn =
+                nalgebra::Vector3::new(0.05 * sway(t, 3), 0.3 * sway(t, 4), 0.05 * sway(t, 5));
+
+            Pose::new(position, turn)
+        })
+        .collect();
+
+    let features = ndarray::Array2::from_shape_fn((FRAMES, COLUMNS), |(row, column)| {
+        let t = poses[row].translation.vector;
+        let r = poses[row].rotation.scaled_axis();
+        let numbers = [t.x, t.y, t.z, r.x, r.y, r.z];
+        let seen: f64 = (0..6).map(|i| noise(7, column * 6 + i) * numbers[i]).sum();
+
+        let which = 2.0 * noise(seed, 2_000_000 + column);
+        (seen + which + 0.01 * noise(seed, row * COLUMNS + column)) as f32
+    });
+
+    let frames = Frames {
+        poses,
+        ..Frames::default()
+    };
+    let camera = PixelCamera {
+        width: 640.0,
+        height: 480.0,
+        focal: 585.0,
+        centre: None,
+    };
+    let provenance = Provenance {
+        camera: Some(Pinhole::new(camera).unwrap()),
+        ..Provenance::default()
+    };
+    let room = Room::new(RoomId::new(name).unwrap(), frames, provenance).unwrap();
+
+    (
+        room,
+        Features::new(FeatureSource::imported("made-up", COLUMNS), features).unwrap(),
+    )
+}
+
+/// The places that the adapter learned from.
+pub fn served(name: &str) -> (Room, Features) {
+    place(name, if name == "hall" { 1 } else { 2 })
+}
+
+/// An adapter learned in both, its errors measured in four others.
+pub fn calibrated() -> (Adapter, TrainingRecord) {
+    let learned = [served("hall"), served("attic"), place("barn", 3)];
+    let mut plan = TrainingPlan::of(Preset::PaperBase, Split::Whole, 10, 0);
+    plan.config.epochs = 60;
+
+    let room_data: Vec<RoomData<'_>> = learned
+        .iter()
+        .map(|(room, features)| RoomData {
+            room,
+            revision: 1,
+            features,
+        })
+        .collect();
+
+    let (adapter, record) = train_adapter(&room_data, &plan, &mut |_| ()).unwrap();
+    let others: Vec<(Room, Features)> = (10..14)
+        .map(|seed| place(&format!("other{seed}"), seed))
+        .collect();
+
+    let room_data: Vec<RoomData<'_>> = others
+        .iter()
+        .map(|(room, features)| RoomData {
+            room,
+            revision: 1,
+            features,
+        })
+        .collect();
+
+    let (adapter, report) = calibrate(adapter, &record, &room_data).unwrap();
+    assert!(report.can_track);
+    (adapter, record)
+}

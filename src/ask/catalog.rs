@@ -1,0 +1,64 @@
+//! `seese3 catalog`: the rooms and adapters of a server.
+
+use clap::Args;
+
+use super::{Server, revision, wire_json};
+use crate::output::{JsonOutput, say};
+use serde_json::json;
+
+#[derive(Debug, Args)]
+pub struct Catalog {
+    #[command(flatten)]
+    server: Server,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Catalog {
+    pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+        let client = self.server.connect().await?;
+        let rooms = client.rooms().await?;
+        let adapters = client.adapters().await?;
+
+        for room in &rooms {
+            let features: Vec<String> = room
+                .features
+                .iter()
+                .map(|source| format!("{} ({})", source.name, source.dim))
+                .collect();
+
+            say(format_args!(
+                "room {}: {} frames, features {}; adapters {}",
+                revision(room.revision.as_ref()),
+                room.frame_count,
+                features.join(", "),
+                room.adapters.join(", ")
+            ));
+        }
+
+        for adapter in &adapters {
+            // An adapter trained with --split whole has no test pairs, so its test R² is
+            // undefined.
+            let r2 = adapter
+                .test
+                .and_then(|test| test.overall)
+                .map_or("undefined".to_owned(), |r2| format!("{r2:.3}"));
+
+            say(format_args!(
+                "adapter {}: preset {}, split {}, stride {}, test R² {r2}",
+                revision(adapter.revision.as_ref()),
+                adapter.preset,
+                adapter.split,
+                adapter.stride
+            ));
+        }
+
+        let rooms = rooms.iter().map(|room| wire_json("Room", room));
+        let adapters = adapters.iter().map(|adapter| wire_json("Adapter", adapter));
+        self.json.write(&json!({
+            "rooms": rooms.collect::<anyhow::Result<Vec<_>>>()?,
+            "adapters": adapters.collect::<anyhow::Result<Vec<_>>>()?,
+        }))
+    }
+}

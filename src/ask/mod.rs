@@ -1,0 +1,236 @@
+//! Requests to a running server: one file per command, and what they share.
+
+mod catalog;
+mod localize;
+mod motion;
+mod navigate;
+mod relocalize;
+mod wire_json;
+
+pub use catalog::Catalog;
+pub use localize::Localize;
+pub use motion::Motion;
+pub use navigate::Navigate;
+#[cfg(feature = "lab")]
+pub use navigate::say_navigation;
+pub use relocalize::Relocalize;
+pub use wire_json::wire_json;
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use clap::Args;
+
+use seese3_client::proto::v1 as pb;
+use seese3_client::{Client, ClientTls, ConnectOptions};
+use seese3_data::datasets::read_features;
+
+#[derive(Debug, Args)]
+pub struct Server {
+    /// The server's address, HOST:PORT
+    #[arg(long, env = "SEESE3_SERVER", default_value = "127.0.0.1:50051")]
+    server: String,
+    /// Deadline of each call, seconds, 1 to 86400; of a stream (`track`) only until it is open
+    #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
+    deadline: u64,
+    /// File with the token that the server asks for
+    #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_FILE")]
+    token_file: Option<PathBuf>,
+    /// Authorities of the server's certificate, in PEM: the connection is TLS
+    #[arg(long, value_name = "FILE", env = "SEESE3_TLS_CA")]
+    tls_ca: Option<PathBuf>,
+    /// This client's certificate in PEM, if the server asks for one
+    #[arg(long, value_name = "FILE", requires_all = ["tls_key", "tls_ca"])]
+    tls_cert: Option<PathBuf>,
+    /// The private key of the certificate, in PEM
+    #[arg(long, value_name = "FILE", requires = "tls_cert")]
+    tls_key: Option<PathBuf>,
+}
+
+impl Server {
+    /// Connects to the server, with the deadline for every later call.
+    pub async fn connect(&self) -> anyhow::Result<Client> {
+        let read = |option: &str, file: &PathBuf| {
+            std::fs::read(file)
+                .with_context(|| format!("{option}: {} cannot be read", file.display()))
+        };
+
+        let token = match &self.token_file {
+            None => None,
+            Some(file) => {
+                let text = String::from_utf8(read("--token-file", file)?);
+                let text = text.ok().filter(|text| !text.trim().is_empty());
+                let text =
+                    text.with_context(|| format!("--token-file: {} has no token", file.display()))?;
+                Some(text.trim().to_owned())
+            }
+        };
+
+        let identity = match (&self.tls_cert, &self.tls_key) {
+            (Some(cert), Some(key)) => Some((read("--tls-cert", cert)?, read("--tls-key", key)?)),
+            _ => None,
+        };
+        let tls = match &self.tls_ca {
+            None => None,
+            Some(file) => Some(ClientTls {
+                authorities: read("--tls-ca", file)?,
+                identity,
+            }),
+        };
+
+        let options = ConnectOptions {
+            deadline: Duration::from_secs(self.deadline),
+            token,
+            tls,
+        };
+        Ok(Client::connect_with(&self.server, options).await?)
+    }
+}
+
+/// A view from outside the room: one row of a NumPy file of features, or an image file.
+#[derive(Debug, Args)]
+struct FeatureRow {
+    /// A JPEG or PNG file; the server must have been started with --encoder
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["feature", "row"])]
+    image: Option<PathBuf>,
+    /// A NumPy file of features, shape (n, d); --row chooses one
+    #[arg(long, value_name = "FILE", requires = "row")]
+    feature: Option<PathBuf>,
+    /// The row of the --feature file, counted from 0
+    #[arg(long)]
+    row: Option<usize>,
+}
+
+impl FeatureRow {
+    fn view(&self) -> anyhow::Result<Option<pb::View>> {
+        if let Some(file) = &self.image {
+            return Ok(Some(image_view(file)?));
+        }
+
+        match (&self.feature, self.row) {
+            (Some(file), Some(row)) => Ok(Some(feature_view(file, row)?)),
+            (None, Some(_)) => bail!("--row needs --feature FILE"),
+            _ => Ok(None),
+        }
+    }
+}
+
+fn feature_view(file: &Path, row: usize) -> anyhow::Result<pb::View> {
+    let features = read_features(file)?;
+    if row >= features.nrows() {
+        bail!(
+            "{} has {} rows; --row {row} is out of range (rows are counted from 0)",
+            file.display(),
+            features.nrows()
+        );
+    }
+
+    // A NumPy file does not say which encoder made it, so the source name stays empty and the
+    // server can only check the width.
+    let feature = pb::Feature {
+        values: features.row(row).to_vec(),
+        source_name: String::new(),
+    };
+
+    Ok(pb::View {
+        view: Some(pb::view::View::Feature(feature)),
+    })
+}
+
+fn image_view(file: &Path) -> anyhow::Result<pb::View> {
+    let bytes = std::fs::read(file).with_context(|| file.display().to_string())?;
+    Ok(pb::View {
+        view: Some(pb::view::View::Image(bytes)),
+    })
+}
+
+fn frame_view(frame: u32) -> pb::View {
+    pb::View {
+        view: Some(pb::view::View::FrameId(frame)),
+    }
+}
+
+fn error_text(error: &pb::PoseError) -> String {
+    let checks: Vec<String> = error
+        .thresholds
+        .iter()
+        .map(|check| {
+            format!(
+                "@{} {}",
+                check.threshold,
+                if check.met { "hit" } else { "miss" }
+            )
+        })
+        .collect();
+
+    // ‖Δ‖ is the norm of the difference between the wanted and the retrieved motion, metres and
+    // radians mixed: what Hit@ε compares with ε.
+    format!(
+        "  error {:.3} m {:.2}°, ‖Δ‖ {:.3} ({})",
+        error.translation_m,
+        error.rotation_rad.to_degrees(),
+        error.twist_norm,
+        checks.join(", ")
+    )
+}
+
+fn frame_text(frame: &pb::RetrievedFrame) -> String {
+    format!(
+        "frame {:5}  distance {:.4}  at {}",
+        frame.frame_id,
+        frame.distance,
+        pose_text(frame.pose.as_ref())
+    )
+}
+
+fn pose_text(pose: Option<&pb::Pose>) -> String {
+    let pose = pose.cloned().unwrap_or_default();
+    let p = pose.position.unwrap_or_default();
+    let q = pose.orientation.unwrap_or_default();
+
+    format!(
+        "({:.3}, {:.3}, {:.3}) m, wxyz ({:.3}, {:.3}, {:.3}, {:.3}) in {}",
+        p.x, p.y, p.z, q.w, q.x, q.y, q.z, pose.parent_frame
+    )
+}
+
+/// The standard deviations of position and rotation, each as one number: the root of the sum of the
+/// variances along its three axes. Nothing where the covariance is not known.
+fn deviations_text(covariance: &[f64]) -> String {
+    let Some(variances) = diagonal(covariance) else {
+        return String::new();
+    };
+
+    let deviation = |part: &[f64]| part.iter().sum::<f64>().sqrt();
+    let metres = deviation(&variances[..3]);
+    let degrees = deviation(&variances[3..]).to_degrees();
+
+    // There is no direction further away than the opposite one.
+    if degrees < 180.0 {
+        format!(", ± {metres:.3} m, ± {degrees:.2}°")
+    } else {
+        format!(", ± {metres:.3} m, in any direction")
+    }
+}
+
+fn motion_text(motion: &pb::Twist) -> String {
+    let v = motion.linear.unwrap_or_default();
+    let w = motion.angular.unwrap_or_default();
+
+    format!(
+        "v ({:.4}, {:.4}, {:.4}) m, ω ({:.4}, {:.4}, {:.4}) rad",
+        v.x, v.y, v.z, w.x, w.y, w.z
+    )
+}
+
+fn revision(revision: Option<&pb::Revision>) -> String {
+    revision.map_or(String::new(), |revision| {
+        format!("'{}' revision {}", revision.name, revision.revision)
+    })
+}
+
+/// The diagonal of a 6×6 matrix, row by row; none for another length.
+fn diagonal(matrix: &[f64]) -> Option<[f64; 6]> {
+    (matrix.len() == 36).then(|| std::array::from_fn(|row| matrix[7 * row]))
+}

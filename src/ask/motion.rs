@@ -1,0 +1,151 @@
+//! `seese3 motion`: the camera motion between two views.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, bail};
+use clap::Args;
+
+use super::{
+    Server, diagonal, error_text, feature_view, frame_view, image_view, motion_text, revision,
+    wire_json,
+};
+use crate::camera::CameraOption;
+use crate::output::{JsonOutput, say};
+use seese3_client::proto::v1 as pb;
+
+#[derive(Debug, Args)]
+pub struct Motion {
+    #[command(flatten)]
+    server: Server,
+    /// Name of the adapter; may be omitted when a room is named or the server has only one adapter
+    #[arg(long, default_value = "")]
+    adapter: String,
+    /// Name of the room that the frames belong to
+    #[arg(long, default_value = "")]
+    room: String,
+    /// The frame that the motion starts from: a row of the room, counted from 0
+    #[arg(long, requires = "to", conflicts_with_all = ["frames", "images", "feature"])]
+    from: Option<u32>,
+    /// The frame that it leads to
+    #[arg(long, requires = "from")]
+    to: Option<u32>,
+    /// The same in one: frames A,B of the room
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "A,B",
+        conflicts_with = "feature"
+    )]
+    frames: Option<Vec<u32>>,
+    /// Two JPEG or PNG files, A,B; the server must have been started with --encoder or --two-view
+    #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "feature"])]
+    images: Option<Vec<PathBuf>>,
+    /// The camera that took --images, in pixels. With it, a server started with --two-view compares
+    /// the images themselves, unless --adapter names who reads the motion
+    #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]", requires = "images")]
+    camera: Option<CameraOption>,
+    /// A NumPy file of features, shape (n, d); --rows chooses two
+    #[arg(long, alias = "features", value_name = "FILE", requires = "rows")]
+    feature: Option<PathBuf>,
+    /// Two rows of the --feature file, A,B, counted from 0
+    #[arg(long, value_delimiter = ',', value_name = "A,B")]
+    rows: Option<Vec<usize>>,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Motion {
+    /// The two views.
+    fn views(&self) -> anyhow::Result<(pb::View, pb::View)> {
+        // Both views come from one kind of input: frames of a room, rows of a feature file, or
+        // image files.
+        let frames = match self.from.zip(self.to) {
+            Some((from, to)) => Some(vec![from, to]),
+            None => self.frames.clone(),
+        };
+        match (frames.as_deref(), &self.feature, self.rows.as_deref()) {
+            (Some(&[a, b]), _, _) => Ok((frame_view(a), frame_view(b))),
+            (None, Some(file), Some(&[a, b])) => {
+                Ok((feature_view(file, a)?, feature_view(file, b)?))
+            }
+            _ => match self.images.as_deref() {
+                Some([a, b]) => Ok((image_view(a)?, image_view(b)?)),
+                _ => {
+                    bail!("--from A --to B, --feature FILE --rows A,B or --images A,B is required")
+                }
+            },
+        }
+    }
+
+    pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+
+        let (first, second) = self.views()?;
+        let camera = self.camera.map(|CameraOption(camera)| pb::Pinhole {
+            width: camera.width,
+            height: camera.height,
+            focal: camera.focal,
+            centre_x: camera.centre.map(|centre| centre.x),
+            centre_y: camera.centre.map(|centre| centre.y),
+        });
+
+        let request = pb::EstimateMotionRequest {
+            adapter: self.adapter,
+            room: self.room,
+            first: Some(first),
+            second: Some(second),
+            camera,
+            ..pb::EstimateMotionRequest::default()
+        };
+
+        let answer = self
+            .server
+            .connect()
+            .await?
+            .estimate_motion(request)
+            .await?;
+        let motion = answer
+            .motion
+            .as_ref()
+            .context("the server sent no motion")?;
+
+        match answer.reader() {
+            pb::MotionReader::TwoView => say("read from where things are in both images"),
+            pb::MotionReader::None => {
+                say("the images show too little in common: no motion is read");
+            }
+            pb::MotionReader::Adapter | pb::MotionReader::Unspecified => say(format_args!(
+                "adapter {}",
+                revision(answer.adapter.as_ref())
+            )),
+        }
+
+        say(format_args!(
+            "motion {} in the body frame of the first camera",
+            motion_text(motion)
+        ));
+
+        // Standard deviations: the roots of the means of the covariance's diagonal.
+        if let Some(variances) = diagonal(&answer.covariance) {
+            let deviation = |part: &[f64]| (part.iter().sum::<f64>() / 3.0).sqrt();
+            say(format_args!(
+                "give or take {:.3} m, {:.1}° along each axis",
+                deviation(&variances[..3]),
+                deviation(&variances[3..]).to_degrees()
+            ));
+        }
+
+        // The true motion is only known when both views are frames of the room, whose poses were
+        // recorded.
+        if let (Some(truth), Some(error)) = (&answer.true_motion, &answer.error) {
+            say(format_args!(
+                "truth  {}{}",
+                motion_text(truth),
+                error_text(error)
+            ));
+        }
+
+        self.json
+            .write(&wire_json("EstimateMotionResponse", &answer)?)
+    }
+}

@@ -1,0 +1,170 @@
+//! `seese3 navigate`: the frames that a camera motion leads to.
+
+use anyhow::bail;
+use clap::Args;
+
+use super::{
+    FeatureRow, Server, error_text, frame_text, frame_view, motion_text, revision, wire_json,
+};
+use crate::named::one_of;
+use crate::output::{JsonOutput, say};
+use seese3_client::proto::v1 as pb;
+use seese3_core::adapter::Reading;
+use seese3_core::navigation::Mode;
+
+#[derive(Debug, Args)]
+pub struct Navigate {
+    #[command(flatten)]
+    server: Server,
+    /// Name of the room to navigate in
+    #[arg(long)]
+    room: String,
+    /// Name of the adapter; if empty, the default of the room: one that was fitted to it, then one that
+    /// was trained in it, then the newest that fits
+    #[arg(long, default_value = "")]
+    adapter: String,
+    /// Start at this frame of the room (its row, counted from 0)
+    #[arg(long, conflicts_with_all = ["feature", "image"])]
+    from: Option<u32>,
+    #[command(flatten)]
+    feature: FeatureRow,
+    /// Go to this frame of the room: the motion is computed from the recorded poses
+    #[arg(long, conflicts_with = "twist")]
+    to: Option<u32>,
+    /// The motion as vx,vy,vz,wx,wy,wz (se(3) twist), metres and radians, in the body frame of the
+    /// start camera (x right, y down, z forward)
+    #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
+    twist: Option<Vec<f64>>,
+    /// Number of equal steps that the motion is divided into
+    #[arg(long, default_value_t = 1)]
+    steps: u32,
+    /// Where each step starts from
+    #[arg(long, value_parser = one_of::<Mode>(), default_value = "open-loop")]
+    mode: Mode,
+    /// How the mean μ and deviation σ of the training motions enter the inverse of W; the server
+    /// takes homogeneous if neither this nor --navigator is given
+    #[arg(long, value_parser = one_of::<Reading>(), conflicts_with = "navigator")]
+    reading: Option<Reading>,
+    /// Navigator by name, instead of inverse Poincaré: corrector-mlp-3, ridge-refit,
+    /// inverse-poincare-affine+motion, …; if empty, inverse Poincaré in the given --reading
+    #[arg(long, default_value = "")]
+    navigator: String,
+    /// Number of nearest frames returned for each step
+    #[arg(long, default_value_t = 1)]
+    top_k: u32,
+    /// Never retrieve the frame that a step starts from
+    #[arg(long)]
+    exclude_source: bool,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Navigate {
+    pub async fn run(self) -> anyhow::Result<()> {
+        use pb::displacement::Displacement;
+
+        self.json.begin()?;
+
+        // A navigation starts from exactly one view. Clap refuses two of them together; here it
+        // remains to check that there is one.
+        let source = match (self.from, self.feature.view()?) {
+            (Some(frame), _) => frame_view(frame),
+            (None, Some(view)) => view,
+            (None, None) => {
+                bail!("--from FRAME, --feature FILE --row ROW or --image FILE is required")
+            }
+        };
+
+        let displacement = match (self.to, &self.twist) {
+            (Some(frame), _) => Displacement::TargetFrameId(frame),
+            (None, Some(numbers)) => Displacement::Twist(twist(numbers)?),
+            (None, None) => bail!("--to FRAME or --twist vx,vy,vz,wx,wy,wz is required"),
+        };
+
+        let mode = match self.mode {
+            Mode::OpenLoop => pb::Mode::OpenLoop,
+            Mode::Snap => pb::Mode::Snap,
+            Mode::ClosedLoop => pb::Mode::ClosedLoop,
+        };
+
+        // An unspecified reading leaves the choice to the server: homogeneous, unless --navigator
+        // already names one.
+        let reading = match self.reading {
+            None => pb::Reading::Unspecified,
+            Some(Reading::Affine) => pb::Reading::Affine,
+            Some(Reading::Homogeneous) => pb::Reading::Homogeneous,
+            Some(Reading::Literal) => pb::Reading::Literal,
+        };
+
+        // Fields left at their defaults are filled in by the server, the thresholds of Hit@ε
+        // among them.
+        let request = pb::NavigateRequest {
+            room: self.room,
+            adapter: self.adapter,
+            source: Some(source),
+            displacement: Some(pb::Displacement {
+                displacement: Some(displacement),
+            }),
+            steps: Some(self.steps),
+            mode: mode.into(),
+            reading: reading.into(),
+            navigator: self.navigator,
+            top_k: Some(self.top_k),
+            exclude_source: self.exclude_source,
+            ..pb::NavigateRequest::default()
+        };
+
+        let answer = self.server.connect().await?.navigate(request).await?;
+        say_navigation(&answer);
+        self.json.write(&wire_json("NavigateResponse", &answer)?)
+    }
+}
+
+fn twist(numbers: &[f64]) -> anyhow::Result<pb::Twist> {
+    let &[vx, vy, vz, wx, wy, wz] = numbers else {
+        bail!(
+            "--twist needs six numbers, vx,vy,vz,wx,wy,wz, got {}",
+            numbers.len()
+        );
+    };
+
+    let vector = |x, y, z| Some(pb::Vector3 { x, y, z });
+    Ok(pb::Twist {
+        linear: vector(vx, vy, vz),
+        angular: vector(wx, wy, wz),
+    })
+}
+
+/// Prints a navigation: the revisions used, the whole motion, and each step's nearest frames. Also
+/// used by `seese3 demo`.
+pub fn say_navigation(answer: &pb::NavigateResponse) {
+    let room = revision(answer.room.as_ref());
+    let adapter = revision(answer.adapter.as_ref());
+    say(format_args!(
+        "room {room}, adapter {adapter}, {}",
+        answer.navigator
+    ));
+
+    if let Some(motion) = &answer.displacement {
+        say(format_args!("motion {}", motion_text(motion)));
+    }
+
+    for step in &answer.steps {
+        // The best frame carries the step's number and its pose error; the others are listed
+        // below it.
+        for (rank, frame) in step.frames.iter().enumerate() {
+            let label = if rank == 0 {
+                format!("step {}", step.step)
+            } else {
+                String::new()
+            };
+
+            let error = step
+                .error
+                .as_ref()
+                .filter(|_| rank == 0)
+                .map_or(String::new(), error_text);
+            say(format_args!("{label:8}{}{error}", frame_text(frame)));
+        }
+    }
+}

@@ -1,0 +1,100 @@
+//! `seese3 relocalize`: in which room a camera is, and where in it, from some of its views.
+
+use std::path::PathBuf;
+
+use anyhow::bail;
+use clap::Args;
+
+use super::{Server, deviations_text, feature_view, image_view, pose_text, revision, wire_json};
+use crate::output::{JsonOutput, say};
+use seese3_client::proto::v1 as pb;
+
+#[derive(Debug, Args)]
+pub struct Relocalize {
+    #[command(flatten)]
+    server: Server,
+    /// A room to search; all rooms that the adapter fits if none is named; may be given several
+    /// times
+    #[arg(long = "room")]
+    rooms: Vec<String>,
+    /// Name of the adapter; may be omitted when only one that can track fits the rooms
+    #[arg(long, default_value = "")]
+    adapter: String,
+    /// JPEG or PNG files, A,B,…: views of one camera that hardly moves between them, the newest last;
+    /// the server must have been started with --encoder
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "A,B,…",
+        conflicts_with = "features"
+    )]
+    images: Vec<PathBuf>,
+    /// A NumPy file of features, shape (n, d); --rows chooses some
+    #[arg(long, value_name = "FILE", requires = "rows")]
+    features: Option<PathBuf>,
+    /// Rows of the --features file, A,B,…, counted from 0, the newest last
+    #[arg(
+        long,
+        value_delimiter = ',',
+        value_name = "A,B,…",
+        requires = "features"
+    )]
+    rows: Vec<usize>,
+    /// The largest number of rooms returned; all are compared
+    #[arg(long, default_value_t = 3)]
+    max_rooms: u32,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Relocalize {
+    pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+        let views = match &self.features {
+            Some(file) => {
+                let rows = self.rows.iter();
+                rows.map(|row| feature_view(file, *row))
+                    .collect::<anyhow::Result<_>>()?
+            }
+            None if self.images.is_empty() => {
+                bail!("--images A,B,… or --features FILE --rows A,B,… is required")
+            }
+            None => {
+                let images = self.images.iter();
+                images
+                    .map(|image| image_view(image))
+                    .collect::<anyhow::Result<_>>()?
+            }
+        };
+
+        let request = pb::RelocalizeRequest {
+            rooms: self.rooms,
+            adapter: self.adapter,
+            views,
+            max_rooms: Some(self.max_rooms),
+            top_k: None,
+        };
+        let answer = self.server.connect().await?.relocalize(request).await?;
+
+        say(format_args!(
+            "adapter {}, {} rooms searched: {}",
+            revision(answer.adapter.as_ref()),
+            answer.room_count,
+            match answer.ambiguous {
+                true => format!("do not rely on it, {}", answer.reason),
+                false => "clear".to_owned(),
+            }
+        ));
+        for found in &answer.rooms {
+            say(format_args!(
+                "room {}: at {:.2} of its limit, camera at {}{}",
+                revision(found.room.as_ref()),
+                found.out_of_distribution,
+                pose_text(found.pose.as_ref()),
+                deviations_text(&found.covariance)
+            ));
+        }
+
+        self.json.write(&wire_json("RelocalizeResponse", &answer)?)
+    }
+}

@@ -1,0 +1,76 @@
+//! `seese3 check`: looks for mistakes in what is stored.
+
+use std::path::PathBuf;
+
+use anyhow::bail;
+use clap::{Args, Subcommand};
+
+use super::encode::images_root;
+use super::output::{JsonOutput, say};
+use super::pose_report::{PoseReport, PosesFrom};
+use seese3_store::Store;
+
+#[derive(Debug, Args)]
+pub struct Check {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    /// A room: what its camera did, and whether its poses can be those of its images. Fails if they
+    /// are wrong
+    Room(CheckRoom),
+}
+
+#[derive(Debug, Args)]
+struct CheckRoom {
+    /// The store: a folder, or a URL of a bucket (feature `cloud`)
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// Name of the room
+    #[arg(long)]
+    room: String,
+    /// The folder of the images, if it is no longer where the room was imported from
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Check {
+    pub async fn run(self) -> anyhow::Result<()> {
+        let What::Room(arguments) = self.what;
+        arguments.run().await
+    }
+}
+
+impl CheckRoom {
+    async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+        let store = Store::open(&self.store)?;
+        let room = store.load_room(&self.room, None).await?.room;
+
+        let mut report = PoseReport::of_path(&room);
+        if !room.images().is_empty() {
+            let root = images_root(&room, self.images.as_deref())?;
+            report.look_at_images(&room, &root, room.poses(), PosesFrom::Store);
+        }
+
+        self.json.write(&report.json(&room))?;
+        say(format_args!(
+            "room '{}': {} frames",
+            room.id(),
+            room.frame_count()
+        ));
+        report.say();
+
+        if report.is_wrong() {
+            bail!(
+                "the poses of room '{}' are wrong: see the warnings",
+                room.id()
+            );
+        }
+        Ok(())
+    }
+}

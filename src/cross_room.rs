@@ -1,0 +1,369 @@
+//! `seese3 cross-room`: train on some rooms, navigate zero-shot in others.
+
+use anyhow::{Context, bail};
+use clap::Args;
+use serde::Serialize;
+
+use super::evaluate::navigators_named;
+use super::named::one_of;
+use super::output::{JsonOutput, say};
+use super::progress::bar;
+use super::protocol::ProtocolOptions;
+use super::rooms::{data, load_rooms, room_words};
+use seese3_core::adapter::Reading;
+use seese3_core::eval::{Protocol, check_thresholds};
+use seese3_core::features::Features;
+use seese3_core::navigation::NavigatorKind;
+use seese3_core::navigation::{Refit, RetrievalMetric, StepKind};
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan};
+use seese3_lab::experiments::cross_room::{
+    CrossRoomPlan, CrossRoomProgress, CrossRoomRun, nested_choice, train_and_test,
+};
+use seese3_lab::report::{
+    CrossRoomJson, cross_room_json, cross_room_table, rooms_table, scaling_table,
+};
+use seese3_store::{Store, StoredRoom};
+
+#[derive(Debug, Args)]
+pub struct CrossRoom {
+    /// The store: a folder, or a URL of a bucket (feature `cloud`)
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// Training rooms: names, or patterns with *; may be given several times
+    #[arg(long, required = true)]
+    train: Vec<String>,
+    /// Held-out rooms to evaluate in: names, or patterns with *; may be given several times
+    #[arg(long, required = true)]
+    test: Vec<String>,
+    /// Name of the feature set, the same for every room; may be omitted when the first training
+    /// room has only one
+    #[arg(long)]
+    features: Option<String>,
+    /// Room counts of the scaling curve, separated by commas; each count includes the
+    /// --calibration-rooms rooms. All rooms of --train if omitted
+    #[arg(long, value_delimiter = ',')]
+    sizes: Vec<usize>,
+    /// Number of rooms, out of each count, that are not trained on but used to measure the
+    /// adapter's errors for +calibrated navigators
+    #[arg(long, alias = "aside", default_value_t = 0)]
+    calibration_rooms: usize,
+    /// Number of adapters trained per room count, with seeds --seed, --seed + 1, …; 1 to 1000
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000))]
+    seeds: u64,
+    /// First seed, at most 1000000: decides initial weights, drawn pairs and their order, and which
+    /// rooms each count takes
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=1_000_000))]
+    seed: u64,
+    #[command(flatten)]
+    protocol: ProtocolOptions,
+    /// Split of the held-out rooms: which pairs are tested, and among which frames answers are
+    /// searched
+    #[arg(long, value_parser = one_of::<Split>(), default_value = "whole")]
+    test_split: Split,
+    /// Navigators by name, separated by commas; if omitted: identity, inverse Poincaré (affine and
+    /// homogeneous; with --calibration-rooms also +calibrated) and the ridge refits that the test
+    /// split allows
+    #[arg(long, value_delimiter = ',')]
+    navigators: Vec<String>,
+    /// Navigator that the others' Hit@ε is compared with
+    #[arg(long, default_value = "inverse-poincare-affine")]
+    baseline: String,
+    /// ε of Hit@ε: the largest ‖ΔP_target − ΔP_retrieved‖ that counts as a hit, metres and radians
+    /// mixed
+    #[arg(long, default_value_t = 0.1)]
+    threshold: f64,
+    /// Never retrieve the source frame
+    #[arg(long)]
+    exclude_source: bool,
+    /// Also print a table with one line per held-out room
+    #[arg(long)]
+    rooms: bool,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+type Loaded = (StoredRoom, Features);
+
+/// The file of --json: the results, and the protocol without which they mean little.
+#[derive(Debug, Serialize)]
+struct CrossRoomRecord {
+    #[serde(flatten)]
+    results: CrossRoomJson,
+    features: String,
+    stride: u32,
+    preset: &'static str,
+    epochs: usize,
+    learning_rate: f64,
+    split: &'static str,
+    source_excluded: bool,
+    test_split: &'static str,
+    threshold: f64,
+}
+
+impl CrossRoom {
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one command, from its arguments to what it prints"
+    )]
+    pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+
+        let store = Store::open(&self.store)?;
+        let train = load_rooms(&store, &self.train, self.features.as_deref()).await?;
+        let source = train[0].1.source().name.clone();
+
+        // All rooms are loaded with one feature set, that of the first training room: an adapter
+        // only fits the features it was trained on.
+        let test = load_rooms(&store, &self.test, Some(&source)).await?;
+        let shared = |(room, _): &&Loaded| {
+            test.iter()
+                .any(|(other, _)| other.room.id() == room.room.id())
+        };
+
+        // A room on both sides would turn zero-shot transfer into memorisation.
+        if let Some((room, _)) = train.iter().find(shared) {
+            bail!(
+                "room '{}' is both learned from and held out; leave it out of one",
+                room.room.id()
+            );
+        }
+
+        // Everything that can be refused is checked before the first adapter is trained.
+        let sizes = self.sizes(train.len())?;
+        let protocol = self.test_protocol()?;
+        check_thresholds(&protocol.thresholds)?;
+        let plan = self.protocol.plan(self.seed)?;
+        let progress = bar(
+            (sizes.len() as u64) * self.seeds * (plan.config.epochs + test.len()) as u64,
+            "rooms",
+        );
+
+        let held_out: Vec<RoomData<'_>> = test.iter().map(data).collect();
+        let mut runs = Vec::new();
+        for &size in &sizes {
+            for seed in self.seed..self.seed + self.seeds {
+                // With one seed, the rooms of a smaller count are among those of a larger one, so
+                // that the curve shows the effect of adding rooms.
+                let chosen: Vec<RoomData<'_>> = nested_choice(size, train.len(), seed)
+                    .into_iter()
+                    .map(|room| data(&train[room]))
+                    .collect();
+
+                let result = train_and_test(
+                    &chosen,
+                    &held_out,
+                    &CrossRoomPlan {
+                        training: &plan.with_seed(seed),
+                        calibration_rooms: self.calibration_rooms,
+                        protocol: &protocol,
+                    },
+                    &CrossRoomProgress {
+                        epoch: &|| progress.inc(1),
+                        room: &|| progress.inc(1),
+                    },
+                )?;
+                runs.push(result.run);
+            }
+        }
+
+        progress.finish_and_clear();
+
+        // Some held-out rooms may be skipped, for instance as too short for the stride. A run
+        // that skipped all of them has nothing to report.
+        if let Some((room, why)) = runs
+            .iter()
+            .find(|run| run.outcomes.is_empty())
+            .and_then(|run| run.skipped.first())
+        {
+            bail!("no held-out room could be evaluated; room '{room}': {why}");
+        }
+
+        self.say(&train, &test, &plan, &runs)?;
+
+        // The protocol is written beside the scores, which mean little without it.
+        if self.json.is_wanted() {
+            let record = CrossRoomRecord {
+                results: cross_room_json(&runs, &self.baseline),
+                features: source,
+                stride: plan.stride,
+                preset: plan.preset.name(),
+                epochs: plan.config.epochs,
+                learning_rate: plan.config.learning_rate,
+                split: plan.split.name(),
+                source_excluded: self.exclude_source,
+                test_split: protocol.split.name(),
+                threshold: self.threshold,
+            };
+            self.json.write(&record)?;
+        }
+
+        Ok(())
+    }
+
+    fn sizes(&self, rooms: usize) -> anyhow::Result<Vec<usize>> {
+        let sizes = if self.sizes.is_empty() {
+            vec![rooms]
+        } else {
+            self.sizes.clone()
+        };
+
+        // A count includes the calibration rooms, and at least one room has to be left for
+        // training.
+        for &size in &sizes {
+            if size <= self.calibration_rooms || size > rooms {
+                bail!(
+                    "--sizes: {size} rooms must be more than --calibration-rooms, {}, and at most {rooms}",
+                    self.calibration_rooms
+                );
+            }
+        }
+
+        Ok(sizes)
+    }
+
+    fn test_protocol(&self) -> anyhow::Result<Protocol> {
+        let full = |step: StepKind| NavigatorKind::Step(step, RetrievalMetric::Full);
+        let refit = |in_sample: bool| {
+            full(StepKind::Refit(Refit {
+                z_scored: true,
+                intercept: false,
+                in_sample,
+            }))
+        };
+
+        let inverse = |reading: Reading, metric: RetrievalMetric| {
+            NavigatorKind::Step(StepKind::InversePoincare(reading), metric)
+        };
+
+        // The default table: the baseline that stays where it is, inverse Poincaré, and the
+        // refits that the test split can fit.
+        let mut navigators = navigators_named(&self.navigators)?;
+        if navigators.is_empty() {
+            navigators = vec![NavigatorKind::Identity];
+
+            navigators.extend(
+                [Reading::Affine, Reading::Homogeneous]
+                    .map(|reading| inverse(reading, RetrievalMetric::Full)),
+            );
+
+            if self.calibration_rooms > 0 {
+                navigators.push(inverse(Reading::Homogeneous, RetrievalMetric::Calibrated));
+            }
+
+            // A refit is fitted on training pairs of the held-out room, which the split `whole`
+            // does not set apart. The in-sample refit takes the test pairs instead.
+            if self.test_split != Split::Whole {
+                navigators.push(refit(false));
+            }
+
+            navigators.push(refit(true));
+        }
+
+        // Refuse what no held-out room could answer; otherwise every room would be skipped after
+        // the training.
+        for kind in &navigators {
+            match kind {
+                NavigatorKind::Step(StepKind::Corrector(_), _) => {
+                    bail!("--navigators: this command trains no correctors; leave them out")
+                }
+                NavigatorKind::Step(_, RetrievalMetric::Calibrated)
+                    if self.calibration_rooms == 0 =>
+                {
+                    bail!(
+                        "--navigators: '{}' needs calibration rooms; give --calibration-rooms N",
+                        kind.name()
+                    );
+                }
+                NavigatorKind::Step(StepKind::Refit(refit), _)
+                    if !refit.in_sample && self.test_split == Split::Whole =>
+                {
+                    bail!(
+                        "--navigators: '{}' has no pairs to be fitted on under --test-split whole",
+                        kind.name()
+                    );
+                }
+                _ => {}
+            }
+        }
+
+        let baseline = NavigatorKind::from_name(&self.baseline).with_context(|| {
+            format!(
+                "--baseline: '{}' is not one of {}",
+                self.baseline,
+                NavigatorKind::known_names()
+            )
+        })?;
+
+        // The tables need both rows: wins are counted against Identity, differences against the
+        // baseline.
+        for needed in [NavigatorKind::Identity, baseline] {
+            if !navigators.contains(&needed) {
+                navigators.push(needed);
+            }
+        }
+
+        // Each test motion is taken in a single open-loop step, as in the paper.
+        Ok(Protocol {
+            split: self.test_split,
+            thresholds: vec![self.threshold],
+            // Radius 0: only the source frame itself is excluded, not its neighbours in time.
+            exclude_source: self.exclude_source.then_some(0),
+            navigators,
+            ..Protocol::paper(self.protocol.plan(self.seed)?.stride)
+        })
+    }
+
+    fn say(
+        &self,
+        train: &[Loaded],
+        test: &[Loaded],
+        plan: &TrainingPlan,
+        runs: &[CrossRoomRun],
+    ) -> anyhow::Result<()> {
+        say(format_args!(
+            "rooms to learn from: {}, features '{}', preset {} with {} epochs, split {}; held out: {}, stride {}, split \
+             {}, source {}",
+            room_words(train),
+            train[0].1.source().name,
+            plan.preset.name(),
+            plan.config.epochs,
+            plan.split,
+            room_words(test),
+            plan.stride,
+            self.test_split,
+            if self.exclude_source {
+                "excluded"
+            } else {
+                "included"
+            },
+        ));
+
+        for run in runs {
+            for (room, why) in &run.skipped {
+                say(format_args!("room '{room}' was skipped: {why}"));
+            }
+        }
+
+        // With several room counts or seeds, the scaling curve comes first: one line per run.
+        if runs.len() > 1 {
+            say(scaling_table(runs, &self.baseline, self.threshold).trim_end());
+        }
+
+        // Only the last run is printed by navigator and by room; the JSON file has every run.
+        let last = runs.last().context("no run")?;
+        say(format_args!(
+            "the last run: {} training rooms, {} calibration rooms, seed {}:",
+            last.training_rooms.len(),
+            last.calibration_rooms.len(),
+            last.seed
+        ));
+
+        say(cross_room_table(last, &self.baseline, self.threshold).trim_end());
+        if self.rooms {
+            say(rooms_table(last).trim_end());
+        }
+
+        Ok(())
+    }
+}

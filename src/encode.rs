@@ -1,0 +1,453 @@
+//! `seese3 encode`: computes features from the images of a stored room.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context, bail};
+use clap::Args;
+use serde_json::json;
+
+use super::encoder::{EncoderOptions, RuntimeOptions};
+use super::output::{JsonOutput, say};
+use super::progress::bar;
+use seese3_core::cancel::Cancellation;
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::geometry::Pose;
+use seese3_core::room::{Room, is_plain_name};
+use seese3_encoder::{Encoded, Encoder, Journal, Kept, OnBadImage, Task, encode_room, read_image};
+use seese3_store::{Published, Store, StoredRoom};
+
+/// The number of unreadable images that are listed one by one; beyond that they are only counted.
+const NAMED: usize = 20;
+
+#[derive(Debug, Args)]
+pub struct Encode {
+    /// The store: a folder, or a URL of a bucket (feature `cloud`)
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// Name of the room; it must have been imported from a recording with images
+    #[arg(long)]
+    room: String,
+    /// The encoder: an ONNX file, or `pixels` or `builtin`, which need no model file
+    #[arg(long)]
+    model: String,
+    #[command(flatten)]
+    encoder: EncoderOptions,
+    #[command(flatten)]
+    runtime: RuntimeOptions,
+    /// Frames per run of the model, 1 to 4096
+    #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=4_096))]
+    batch: u32,
+    /// Folder that the room's image paths start from, if the images were moved since the import
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
+    /// Prefix of the feature names, PREFIX-LAYER-POOLING; the model's file name without extension
+    /// if omitted
+    #[arg(long = "as", value_name = "PREFIX")]
+    prefix: Option<String>,
+    /// Drop frames whose image cannot be read, instead of stopping. The room's new revision is
+    /// without these frames, in all its features
+    #[arg(long)]
+    skip_bad: bool,
+    /// Encode even if the room already has these features, and discard an unfinished run
+    #[arg(long)]
+    again: bool,
+    /// Folder for the journal, which keeps encoded rows until the room is complete, so that an
+    /// interrupted run can resume; STORE/unfinished if omitted, required for a bucket
+    #[arg(long, value_name = "DIR")]
+    journal: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Encode {
+    pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+        let runtime = self.runtime.runtime();
+        let encoder = self.encoder.open(&self.model, &runtime)?;
+        let store = Store::open(&self.store)?;
+        let stored = store.load_room(&self.room, None).await?;
+
+        // Names and the image folder are checked first, so that a long run does not fail at its
+        // end.
+        let sources = encoder.sources(&self.prefix());
+        check_names(&sources)?;
+        let root = images_root(&stored.room, self.images.as_deref())?;
+
+        // Features count as present only if encoder, layer and preprocessing agree too. A set of
+        // the same name that was made differently is replaced.
+        if !self.again && sources.iter().all(|source| has(&stored, source)) {
+            let names: Vec<&str> = sources.iter().map(|source| source.name.as_str()).collect();
+            let room = &self.room;
+            let revision = stored.revision;
+            say(format_args!(
+                "already there in room '{room}' revision {revision}: {}",
+                names.join(", ")
+            ));
+
+            return self.write_record(&sources, revision, 0, &[]);
+        }
+
+        say_replaced(&stored, &sources);
+        say(format_args!(
+            "encoder {} by {}, {}",
+            encoder.id(),
+            encoder.runtime(),
+            sources[0].preprocess
+        ));
+
+        // The journal keeps the rows of an interrupted run. Its key covers everything that
+        // decides them, so that rows of another model or of changed images are never mixed in.
+        let key = key(&stored, &encoder, &root);
+        let path = self.journal_path(&key)?;
+        if self.again && path.exists() {
+            std::fs::remove_file(&path).with_context(|| path.display().to_string())?;
+        }
+
+        // Opening locks the journal, so that two processes cannot encode the same room into it at
+        // once.
+        let (mut journal, before) = Journal::open(&path, &key, encoder.dims().iter().sum())?;
+        let begun = Instant::now();
+
+        let encoded = self.encode(
+            &stored.room,
+            &root,
+            &encoder,
+            Kept {
+                journal: &mut journal,
+                before,
+            },
+        )?;
+
+        let seconds = begun.elapsed().as_secs_f64();
+        say_bad(&stored.room, &encoded);
+
+        if encoded.good.is_empty() {
+            bail!(seese3_encoder::Error::AllBad {
+                room: self.room.clone()
+            });
+        }
+
+        // Another process may have published the room in the meantime. The rows belong to the
+        // frames that were encoded, so these must not have changed.
+        let newest = store.load_room(&self.room, None).await?;
+        if !same_poses(&newest.room, &stored.room) {
+            bail!(
+                "room '{}' got other frames while it was encoded (revision {}, was {}); run the command again",
+                self.room,
+                newest.revision,
+                stored.revision
+            );
+        }
+
+        let published = publish(&store, newest, &sources, &encoded).await?;
+
+        // The rows are safe in the store, so the journal is no longer needed.
+        journal.finish()?;
+
+        say_encoded(&encoded, &sources, seconds);
+        let revision = published.revision;
+        let location = store.location();
+        say(format_args!(
+            "published room '{}' revision {revision}: {location}/{}",
+            self.room, published.manifest
+        ));
+
+        let encoded_now = encoded.good.len() - encoded.resumed.min(encoded.good.len());
+        self.write_record(&sources, revision, encoded_now, &encoded.bad)
+    }
+
+    /// What was done, as JSON.
+    fn write_record(
+        &self,
+        sources: &[FeatureSource],
+        revision: u64,
+        encoded: usize,
+        left_out: &[(usize, String)],
+    ) -> anyhow::Result<()> {
+        let features: Vec<_> = sources
+            .iter()
+            .map(|source| json!({ "name": source.name, "columns": source.dim }))
+            .collect();
+        let left_out: Vec<_> = left_out
+            .iter()
+            .map(|(frame, problem)| json!({ "frame": frame, "problem": problem }))
+            .collect();
+
+        self.json.write(&json!({
+            "room": self.room,
+            "revision": revision,
+            "features": features,
+            "encoded": encoded,
+            "left_out": left_out,
+        }))
+    }
+
+    fn prefix(&self) -> String {
+        let stem = || {
+            Path::new(&self.model)
+                .file_stem()
+                .map(|stem| stem.to_string_lossy().into_owned())
+        };
+        self.prefix.clone().or_else(stem).unwrap_or_default()
+    }
+
+    fn journal_path(&self, key: &str) -> anyhow::Result<PathBuf> {
+        let folder = match &self.journal {
+            Some(folder) => folder.clone(),
+            None if self.store.contains("://") => {
+                bail!("--journal DIR is required for a store in a bucket")
+            }
+            None => Path::new(&self.store).join("unfinished"),
+        };
+
+        // Another encoder, room revision or image folder gives another key, and hence a journal
+        // of its own.
+        Ok(folder.join(format!(
+            "{}-{}.rows",
+            self.room,
+            seese3_store::short_digest(key)
+        )))
+    }
+
+    fn encode(
+        &self,
+        room: &Room,
+        root: &Path,
+        encoder: &Encoder,
+        kept: Kept<'_>,
+    ) -> anyhow::Result<Encoded> {
+        let images = room.images();
+        let image = |row: usize| read_image(root, &images[row]);
+        let cancel = Cancellation::default();
+
+        let on_bad = if self.skip_bad {
+            OnBadImage::Skip
+        } else {
+            OnBadImage::Stop
+        };
+
+        let task = Task {
+            timeline: room.timeline(),
+            image: &image,
+            batch: self.batch as usize,
+            on_bad,
+            cancel: &cancel,
+        };
+
+        let progress = bar(room.frame_count() as u64, "encoding");
+
+        // Decoding, encoding and tract all run on this pool, so that --threads limits them
+        // together.
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(self.runtime.threads())
+            .build()?;
+
+        let told = |done: usize| progress.set_position(done as u64);
+        let encoded = pool.install(|| encode_room(&task, encoder, Some(kept), &told));
+        progress.finish_and_clear();
+
+        encoded.context("what was encoded is kept; the same command goes on from there")
+    }
+}
+
+/// Prints which stored features are replaced: those of the same name that were made differently.
+fn say_replaced(stored: &StoredRoom, sources: &[FeatureSource]) {
+    for source in sources
+        .iter()
+        .filter(|source| stored.features(&source.name).is_some() && !has(stored, source))
+    {
+        say(format_args!(
+            "replaces features '{}', made with another encoder, layer or preprocessing",
+            source.name
+        ));
+    }
+}
+
+/// Prints how many frames were encoded, how fast, and into which features.
+fn say_encoded(encoded: &Encoded, sources: &[FeatureSource], seconds: f64) {
+    // Resumed rows cost no time in this run and would inflate the rate.
+    let fresh = encoded.good.len() - encoded.resumed.min(encoded.good.len());
+    let rate = fresh as f64 / seconds;
+    say(format_args!(
+        "encoded {fresh} frames in {seconds:.1} s ({rate:.0} a second), {} were done before",
+        encoded.resumed
+    ));
+
+    for source in sources {
+        say(format_args!(
+            "features '{}': {} columns",
+            source.name, source.dim
+        ));
+    }
+}
+
+/// The folder that the room's image paths start from: `given`, or where the images were at import.
+pub(super) fn images_root(room: &Room, given: Option<&Path>) -> anyhow::Result<PathBuf> {
+    if room.images().is_empty() {
+        bail!(seese3_encoder::Error::NoImages {
+            room: room.id().to_string()
+        });
+    }
+
+    let root = given.map_or_else(
+        || PathBuf::from(&room.provenance().images_root),
+        Path::to_owned,
+    );
+
+    if !root.is_dir() {
+        bail!(
+            "{} is not a folder; give the folder of the images with --images DIR",
+            root.display()
+        );
+    }
+
+    Ok(root)
+}
+
+/// Whether the room has features of this name that were made in the same way.
+pub fn has(stored: &StoredRoom, source: &FeatureSource) -> bool {
+    stored
+        .features(&source.name)
+        .is_some_and(|set| set.source() == source)
+}
+
+/// A text that covers everything that decides the rows of a run: room, revision, images with their
+/// sizes and times, runtime, and sources.
+fn key(stored: &StoredRoom, encoder: &Encoder, root: &Path) -> String {
+    let room = &stored.room;
+    let sources = encoder.sources("");
+
+    // A file that was rewritten has another size or modification time.
+    let state = |image: &String| {
+        // An image inside a container is written FILE@OFFSET+LENGTH; the state is that of the
+        // container.
+        let file = image
+            .rsplit_once('@')
+            .map_or(image.as_str(), |(file, _)| file);
+        let metadata = std::fs::metadata(root.join(file)).ok()?;
+
+        Some((metadata.len(), metadata.modified().ok()))
+    };
+
+    let states: Vec<_> = room.images().iter().map(state).collect();
+    format!(
+        "{}\n{}\n{}\n{}\n{:?}\n{:?}\n{:?}\n{:?}",
+        room.id(),
+        stored.revision,
+        root.display(),
+        encoder.runtime(),
+        room.images(),
+        states,
+        room.timeline().sequences,
+        sources
+    )
+}
+
+/// Rejects layers whose features would have no valid or no distinct name, before anything is
+/// encoded.
+pub fn check_names(sources: &[FeatureSource]) -> anyhow::Result<()> {
+    for (position, FeatureSource { name, layer, .. }) in sources.iter().enumerate() {
+        if !is_plain_name(name) {
+            bail!(
+                "layer '{layer}' would give features of the name '{name}', which is over 100 characters or empty; give --as PREFIX"
+            );
+        }
+
+        if sources[..position].iter().any(|other| other.name == *name) {
+            bail!(
+                "two layers would give features of the name '{name}'; encode them apart, with --as PREFIX"
+            );
+        }
+    }
+
+    Ok(())
+}
+
+/// Whether two rooms have the same number of frames and the same poses, up to 1e-9 in each entry of
+/// the homogeneous matrices.
+pub fn same_poses(a: &Room, b: &Room) -> bool {
+    let near = |(a, b): (&Pose, &Pose)| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-9;
+    a.frame_count() == b.frame_count() && a.poses().iter().zip(b.poses()).all(near)
+}
+
+fn say_bad(room: &Room, encoded: &Encoded) {
+    for (row, problem) in encoded.bad.iter().take(NAMED) {
+        say(format_args!(
+            "left out frame {row} ({}): {problem}",
+            room.images()[*row]
+        ));
+    }
+
+    if !encoded.bad.is_empty() {
+        say(format_args!(
+            "left out {} frames in all; the room's new revision does not have them",
+            encoded.bad.len()
+        ));
+    }
+}
+
+/// Splits encoded rows (n, Σ d), in which the layers stand side by side, into one feature set (n,
+/// d) per source.
+pub fn by_layer(
+    sources: &[FeatureSource],
+    rows: &ndarray::Array2<f32>,
+) -> anyhow::Result<Vec<Features>> {
+    let mut from = 0;
+    let mut features = Vec::with_capacity(sources.len());
+    for source in sources {
+        let columns = rows
+            .slice(ndarray::s![.., from..from + source.dim])
+            .to_owned();
+        features.push(Features::new(source.clone(), columns)?);
+
+        from += source.dim;
+    }
+
+    Ok(features)
+}
+
+/// Publishes the rows with the frames that they belong to. Frames that were left out on purpose leave
+/// the room with other frames.
+async fn publish(
+    store: &Store,
+    newest: StoredRoom,
+    sources: &[FeatureSource],
+    encoded: &Encoded,
+) -> anyhow::Result<Published> {
+    let is_whole = encoded.good.len() == newest.room.frame_count();
+    let (room, features) = whole(newest, sources, encoded)?;
+
+    Ok(match is_whole {
+        true => store.publish_same_frames(&room, &features).await?,
+        false => store.publish_room(&room, &features).await?,
+    })
+}
+
+/// The room and its new feature sets. If frames were dropped, the room and all its feature sets are
+/// without them.
+fn whole(
+    stored: StoredRoom,
+    sources: &[FeatureSource],
+    encoded: &Encoded,
+) -> anyhow::Result<(Room, Vec<Features>)> {
+    let mut features = by_layer(sources, &encoded.rows)?;
+    if encoded.bad.is_empty() {
+        return Ok((stored.room, features));
+    }
+
+    // Without the bad frames it is a room of other poses, to which the store carries nothing
+    // over. The older features are therefore cut to the same frames and published again.
+    let frames = stored.room.frames().select(&encoded.good);
+    let provenance = stored.room.provenance().clone();
+    let room = Room::new(stored.room.id().clone(), frames, provenance)?;
+
+    let others = stored.features.iter().filter(|set| {
+        sources
+            .iter()
+            .all(|source| source.name != set.source().name)
+    });
+    features.extend(others.map(|set| set.select(&encoded.good)));
+
+    Ok((room, features))
+}

@@ -1,0 +1,354 @@
+//! The options that choose and configure an encoder, shared by the commands that run one.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use clap::{Args, ValueEnum};
+
+use seese3_encoder::{
+    self, Encoder, EncoderRecipe, Filter, Layer, ModelTask, Pooling, Preparation, Preprocess,
+    Resize, Runtime, RuntimeKind,
+};
+
+/// Which runtime runs ONNX models, and on how many threads.
+#[derive(Debug, Clone, Args)]
+pub struct RuntimeOptions {
+    /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
+    #[arg(long, value_enum, default_value_t = RuntimeName::Tract, env = "SEESE3_RUNTIME")]
+    runtime: RuntimeName,
+    /// Path of the shared library of onnxruntime
+    #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
+    library: Option<PathBuf>,
+    /// Number of threads, at most 1024; 0 takes all cores
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u16).range(..=1024))]
+    threads: u16,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum RuntimeName {
+    /// Pure Rust, needs no library
+    Tract,
+    /// A shared library, loaded when a model is opened
+    Onnxruntime,
+}
+
+impl From<RuntimeName> for RuntimeKind {
+    fn from(name: RuntimeName) -> Self {
+        match name {
+            RuntimeName::Tract => Self::Tract,
+            RuntimeName::Onnxruntime => Self::OnnxRuntime,
+        }
+    }
+}
+
+impl RuntimeOptions {
+    /// The options in the form that the library takes.
+    pub fn runtime(&self) -> Runtime {
+        Runtime {
+            kind: self.runtime.into(),
+            threads: self.threads(),
+            library: self.library.clone(),
+        }
+    }
+
+    /// The number of threads, with 0 resolved to the number of cores.
+    pub fn threads(&self) -> usize {
+        if self.threads > 0 {
+            usize::from(self.threads)
+        } else {
+            std::thread::available_parallelism().map_or(1, usize::from)
+        }
+    }
+}
+
+/// How images are preprocessed, and which layers are kept and how they are pooled.
+#[derive(Debug, Clone, Args)]
+pub struct EncoderOptions {
+    /// Preprocessing and layer defaults of a well-known encoder, by a name that `seese3 encoders`
+    /// lists; the options below override single values
+    #[arg(long)]
+    recipe: Option<String>,
+    /// Preprocessing, where there is no recipe: the JSON FILE that the model's authors publish (the
+    /// preprocessor_config.json of transformers, the config.json of timm), or that of a family: `imagenet`
+    /// (torchvision), `clip`, `half` (-1 to 1: SigLIP, Inception) or `unit` (0 to 1)
+    #[arg(long, value_name = "FAMILY|FILE", value_parser = preprocessing, conflicts_with = "recipe")]
+    preprocess: Option<Preprocessing>,
+    /// Layers to keep, by output name, separated by commas; `all` keeps every output that the model
+    /// declares
+    #[arg(long, value_delimiter = ',', default_value = "all")]
+    layers: Vec<String>,
+    /// Pooling of a layer's output to one row: cls, mean, grid2x2, grid4x4 or any gridCOLUMNSxROWS;
+    /// the recipe's if omitted, else mean
+    #[arg(long)]
+    pool: Option<String>,
+    /// Number of tokens before the patch tokens (class token and registers), which pooling skips;
+    /// the recipe's if omitted, else 0, which is refused where the number of tokens speaks against it
+    #[arg(long, value_name = "N")]
+    prefix_tokens: Option<usize>,
+    /// What layer numbers count from: 0, 1, or `name` for unnumbered layers; only recorded with the
+    /// features; the recipe's if omitted, else name
+    #[arg(long)]
+    base: Option<String>,
+    /// Whether the layers include the encoder's final norm: none or final; only recorded with the
+    /// features; the recipe's if omitted, else unspecified
+    #[arg(long)]
+    norm: Option<String>,
+    /// Images per clip, 1 to 256, centred on the frame that is encoded; the recipe's if omitted,
+    /// else 1
+    #[arg(long, value_name = "T", value_parser = clap::value_parser!(u32).range(1..=256))]
+    window: Option<u32>,
+    /// Resize: WIDTHxHEIGHT of the whole image, shortest:PIXELS for the shorter edge, or none; if
+    /// omitted the recipe's, else the input size that the model declares, else none
+    #[arg(long)]
+    resize: Option<String>,
+    /// Resize filter: bilinear, bicubic or lanczos3; the recipe's if omitted, else bilinear
+    #[arg(long)]
+    filter: Option<String>,
+    /// Central crop after the resize, WIDTHxHEIGHT pixels, or none; the recipe's if omitted, else
+    /// none
+    #[arg(long)]
+    crop: Option<String>,
+    /// Normalisation, first step: pixel values 0 to 255 are divided by this; the recipe's if
+    /// omitted, else 1
+    #[arg(long)]
+    divisor: Option<f32>,
+    /// Normalisation, second step: this mean is subtracted, R,G,B or one number; the recipe's if
+    /// omitted, else 0
+    #[arg(long, value_name = "R,G,B")]
+    mean: Option<String>,
+    /// Normalisation, last step: divided by this deviation, R,G,B or one number; the recipe's if
+    /// omitted, else 1
+    #[arg(long, value_name = "R,G,B")]
+    std: Option<String>,
+}
+
+/// Where the preprocessing comes from if no recipe has it.
+#[derive(Debug, Clone)]
+enum Preprocessing {
+    Family(Preprocess),
+    File(PathBuf),
+}
+
+fn preprocessing(text: &str) -> Result<Preprocessing, String> {
+    let family = Preprocess::ALL
+        .into_iter()
+        .find(|family| family.name() == text);
+    let file = || {
+        let file = PathBuf::from(text);
+        file.is_file().then_some(Preprocessing::File(file))
+    };
+
+    family
+        .map(Preprocessing::Family)
+        .or_else(file)
+        .ok_or_else(|| "is none of imagenet, clip, half, unit, and no file".to_owned())
+}
+
+impl EncoderOptions {
+    /// Opens the encoder: `builtin`, `pixels`, or the ONNX model in a file.
+    pub fn open(&self, model: &str, runtime: &Runtime) -> anyhow::Result<Encoder> {
+        // These two encoders are fixed. An option that they would ignore is refused, so that
+        // nobody takes it for applied.
+        match model {
+            "builtin" | "pixels" if !self.is_plain() => {
+                bail!(
+                    "'{model}' is one fixed encoder; leave out --layers, --pool, --recipe, \
+                    --resize and the other options for models"
+                )
+            }
+            "builtin" => Ok(Encoder::builtin()),
+            "pixels" => Ok(Encoder::pixels()),
+            _ => self.open_file(Path::new(model), runtime),
+        }
+    }
+
+    fn open_file(&self, file: &Path, runtime: &Runtime) -> anyhow::Result<Encoder> {
+        // An ONNX file needs a runtime that this program was built with.
+        if !runtime.kind.is_built() {
+            return Err(seese3_encoder::Error::NotBuilt {
+                runtime: runtime.kind.name(),
+            }
+            .into());
+        }
+
+        if !file.is_file() {
+            bail!(
+                "{} is not a file; give an ONNX file, `pixels` or `builtin`",
+                file.display()
+            );
+        }
+
+        let recipe = self.recipe()?;
+        let preparation = self.preparation(recipe, file)?;
+
+        // `all` stands for the outputs that the file declares, in its order.
+        let names = if self.layers == ["all"] {
+            seese3_encoder::declared_outputs(file)?
+        } else {
+            self.layers.clone()
+        };
+
+        // For each setting an option wins over the recipe, and the recipe over the default.
+        let skip = self
+            .prefix_tokens
+            .unwrap_or(recipe.map_or(0, |recipe| recipe.prefix_tokens));
+
+        let pooling: Pooling = self
+            .pool
+            .as_deref()
+            .unwrap_or(recipe.map_or("mean", |recipe| recipe.pooling.as_str()))
+            .parse()?;
+
+        let word = |given: &Option<String>, recipe: Option<&str>, otherwise: &str| {
+            given
+                .clone()
+                .unwrap_or_else(|| recipe.unwrap_or(otherwise).to_owned())
+        };
+
+        // `base` and `norm` only describe the layer for later readers; they do not change its
+        // numbers.
+        let layer = |name: &String| Layer {
+            name: name.clone(),
+            base: word(
+                &self.base,
+                recipe.map(|recipe| recipe.base.as_str()),
+                "name",
+            ),
+            norm: word(
+                &self.norm,
+                recipe.map(|recipe| recipe.norm.as_str()),
+                seese3_core::features::UNSPECIFIED,
+            ),
+            pooling: pooling.after(skip),
+        };
+
+        let window = self
+            .window
+            .map_or(recipe.map_or(1, |recipe| recipe.window), |window| {
+                window as usize
+            });
+
+        let layers = names.iter().map(layer).collect();
+        Ok(Encoder::model(
+            ModelTask {
+                file: file.to_owned(),
+                preparation,
+                layers,
+                window,
+                is_prefix_stated: self.prefix_tokens.is_some() || recipe.is_some(),
+            },
+            runtime,
+        )?)
+    }
+
+    /// Whether every option was left at its default.
+    fn is_plain(&self) -> bool {
+        // Destructured with no `..`, so that a new option breaks the build here.
+        let Self {
+            recipe,
+            preprocess,
+            layers,
+            pool,
+            prefix_tokens,
+            base,
+            norm,
+            window,
+            resize,
+            filter,
+            crop,
+            divisor,
+            mean,
+            std,
+        } = self;
+
+        let words = [recipe, pool, base, norm, resize, filter, crop, mean, std];
+        let numbers = [prefix_tokens.is_some(), window.is_some(), divisor.is_some()];
+
+        preprocess.is_none()
+            && layers == &["all"]
+            && words.iter().all(|word| word.is_none())
+            && numbers == [false; 3]
+    }
+
+    fn recipe(&self) -> anyhow::Result<Option<&'static EncoderRecipe>> {
+        let Some(name) = &self.recipe else {
+            return Ok(None);
+        };
+
+        let known = || {
+            seese3_encoder::RECIPES
+                .iter()
+                .map(|recipe| recipe.name.as_str())
+                .collect::<Vec<_>>()
+                .join(", ")
+        };
+
+        seese3_encoder::recipe(name)
+            .map(Some)
+            .with_context(|| format!("there is no recipe '{name}'; there are {}", known()))
+    }
+
+    fn preparation(
+        &self,
+        recipe: Option<&EncoderRecipe>,
+        file: &Path,
+    ) -> anyhow::Result<Preparation> {
+        let says = self.divisor.is_some() || self.mean.is_some() || self.std.is_some();
+
+        // There is no default normalisation: a wrong one gives features that look plausible and
+        // are wrong. Either a recipe or explicit numbers are required.
+        let chosen = match &self.preprocess {
+            Some(Preprocessing::Family(family)) => {
+                Some(family.preparation(seese3_encoder::declared_size(file)?)?)
+            }
+            Some(Preprocessing::File(config)) => {
+                Some(seese3_encoder::read_preprocess_file(config)?)
+            }
+            None => None,
+        };
+        let known = recipe.map(|recipe| recipe.preparation.clone()).or(chosen);
+        let mut preparation = match known {
+            Some(preparation) => preparation,
+            None if !says => bail!(
+                "how are images prepared for {}? give --recipe NAME (see `seese3 encoders`), --preprocess imagenet, \
+                 clip, half, unit or its authors' JSON file, or --divisor, --mean and --std, with --resize and --crop where they are needed",
+                file.display()
+            ),
+            None => {
+                // Without a recipe, the whole image is resized to the input size that the model
+                // declares, whatever its aspect ratio.
+                let size = seese3_encoder::declared_size(file)?;
+                let resize = size.map_or(Resize::None, |(width, height)| Resize::Whole {
+                    width,
+                    height,
+                });
+
+                Preparation {
+                    resize,
+                    ..Preparation::default()
+                }
+            }
+        };
+
+        // Each option replaces one value of the recipe and leaves the others.
+        if let Some(resize) = &self.resize {
+            preparation.resize = resize.parse()?;
+        }
+        if let Some(filter) = &self.filter {
+            preparation.filter = filter.parse::<Filter>()?;
+        }
+        if let Some(crop) = &self.crop {
+            preparation.crop = seese3_encoder::parse_crop(crop)?;
+        }
+
+        preparation.divisor = self.divisor.unwrap_or(preparation.divisor);
+        if let Some(mean) = &self.mean {
+            preparation.mean = seese3_encoder::parse_channels("--mean", mean)?;
+        }
+        if let Some(std) = &self.std {
+            preparation.deviation = seese3_encoder::parse_channels("--std", std)?;
+        }
+
+        Ok(preparation)
+    }
+}

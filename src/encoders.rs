@@ -1,0 +1,114 @@
+//! `seese3 encoders`: the known encoders and how their images are prepared.
+
+use clap::Args;
+use serde_json::json;
+
+use super::output::{JsonOutput, say};
+use seese3_encoder::{EncoderRecipe, RECIPES, RuntimeKind};
+
+#[derive(Debug, Args)]
+pub struct Encoders {
+    /// Show only this recipe, with its script for the ONNX export
+    name: Option<String>,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Encoders {
+    pub fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+
+        // With a name, one recipe is printed with its export script; without, all of them without
+        // scripts.
+        let chosen: Vec<_> = RECIPES
+            .iter()
+            .filter(|recipe| self.name.as_ref().is_none_or(|name| *name == recipe.name))
+            .collect();
+
+        if chosen.is_empty() {
+            let known: Vec<&str> = RECIPES.iter().map(|recipe| recipe.name.as_str()).collect();
+            anyhow::bail!(
+                "there is no recipe '{}'; there are {}",
+                self.name.unwrap_or_default(),
+                known.join(", ")
+            );
+        }
+
+        let records: Vec<_> = chosen.iter().map(|recipe| recipe_json(recipe)).collect();
+        self.json.write(&records)?;
+
+        if self.name.is_none() {
+            say("Without a model:");
+            say("  pixels    raw pixels at 320x240, averaged over 16x12 patches, 576 columns");
+
+            say("  builtin   gradient orientations and colour, weight-free stand-in, 528 columns");
+
+            say("");
+            say(
+                "With a model: seese3 encode --model FILE.onnx --recipe NAME. Any ONNX image model works whose values",
+            );
+
+            say(
+                "are named; without a recipe say how images are prepared (--resize, --divisor, --mean, --std).",
+            );
+
+            say("");
+        }
+
+        for recipe in chosen {
+            say(format_args!("{}: {}", recipe.name, recipe.about));
+
+            say(format_args!(
+                "  images   {}",
+                recipe.preparation.describe(recipe.window)
+            ));
+
+            say(format_args!(
+                "  layers   {}; base {}, norm {}, {} prefix tokens, pool {}",
+                recipe.layers, recipe.base, recipe.norm, recipe.prefix_tokens, recipe.pooling
+            ));
+
+            say(format_args!("  paper    {}", recipe.paper));
+            say(format_args!("  checked  {}", recipe.checked));
+
+            if self.name.is_some() {
+                say("  export");
+
+                recipe
+                    .export
+                    .lines()
+                    .for_each(|line| say(format_args!("    {line}")));
+            }
+
+            say("");
+        }
+
+        // Both runtimes are cargo features, so a build may lack either.
+        let built = |kind: RuntimeKind| {
+            if kind.is_built() {
+                "built in"
+            } else {
+                "not built: --features full"
+            }
+        };
+
+        say(format_args!(
+            "Runtimes: tract ({}), onnxruntime ({})",
+            built(RuntimeKind::Tract),
+            built(RuntimeKind::OnnxRuntime)
+        ));
+
+        Ok(())
+    }
+}
+
+fn recipe_json(recipe: &EncoderRecipe) -> serde_json::Value {
+    json!({
+        "name": recipe.name,
+        "about": recipe.about,
+        "images": recipe.preparation.describe(recipe.window),
+        "layers": recipe.layers,
+        "pooling": recipe.pooling.to_string(),
+        "prefix_tokens": recipe.prefix_tokens,
+    })
+}

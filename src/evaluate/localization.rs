@@ -1,0 +1,132 @@
+//! `seese3 evaluate localization`: maps a part of a room and locates the views of the other part.
+
+use anyhow::bail;
+use clap::Args;
+
+use seese3_core::eval::has_seen;
+use seese3_lab::experiments::localization::{LocalizationProtocol, RuleScores, evaluate};
+use seese3_lab::report::{LocalizationContext, localization_json, localization_table};
+
+use super::super::fit::fitting_bar;
+use super::super::output::{JsonOutput, say};
+use seese3_core::training::RoomData;
+use seese3_store::Store;
+
+#[derive(Debug, Args)]
+pub struct Localization {
+    /// The store
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// The room
+    #[arg(long)]
+    room: String,
+    /// An adapter that learned from other rooms: it reads motions by itself and, with --fit, its
+    /// weights are where the fitted one begins
+    #[arg(long)]
+    adapter: Option<String>,
+    /// Name of the feature set; by default that of the adapter, or the room's only one
+    #[arg(long)]
+    features: Option<String>,
+    /// Fit an adapter to the mapped frames alone, and answer by the rules that were measured on
+    /// them
+    #[arg(long)]
+    fit: bool,
+    /// Every so many frames one is mapped; the views of the others are located
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    map_every: u32,
+    /// Map nothing of every fifth of twenty blocks of the recording, and locate the views of these
+    /// blocks alone
+    #[arg(long)]
+    map_blocks: bool,
+    /// Seed of the fitted adapter
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
+    seed: u64,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Localization {
+    pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+        if self.adapter.is_none() && !self.fit {
+            bail!("give --adapter, or --fit to fit one to the mapped frames");
+        }
+
+        let store = Store::open(&self.store)?;
+        let stored_adapter = match &self.adapter {
+            Some(name) => Some(store.load_adapter(name, None).await?),
+            None => None,
+        };
+        let of_adapter = stored_adapter
+            .as_ref()
+            .map(|stored| stored.adapter.source().name.clone());
+        let wanted = self.features.clone().or(of_adapter);
+        let (stored, features) = store.load_room_with(&self.room, wanted.as_deref()).await?;
+
+        let is_leak = stored_adapter
+            .as_ref()
+            .is_some_and(|adapter| has_seen(&adapter.record, stored.room.id()));
+        if is_leak {
+            say(format_args!(
+                "LEAK: the adapter has seen room '{}'",
+                self.room
+            ));
+        }
+
+        let data = RoomData {
+            room: &stored.room,
+            revision: stored.revision,
+            features: &features,
+        };
+        let protocol = LocalizationProtocol {
+            map_every: self.map_every as usize,
+            withhold_blocks: self.map_blocks,
+            seed: self.seed,
+        };
+
+        let progress = fitting_bar(self.fit);
+        let adapter = stored_adapter.as_ref().map(|stored| &stored.adapter);
+        let found = evaluate(&data, adapter, self.fit, &protocol, &|_| progress.inc(1))?;
+        progress.finish_and_clear();
+
+        say(format_args!(
+            "room '{}' revision {}, features '{}': {} frames mapped, {} views located",
+            self.room,
+            stored.revision,
+            features.source().name,
+            found.mapped,
+            found.asked
+        ));
+        say(localization_table(&found).trim_end());
+
+        if let Some(rules) = &found.rules {
+            say_rules(rules);
+        }
+
+        if self.json.is_wanted() {
+            let context = LocalizationContext {
+                room: self.room.clone(),
+                features: features.source().name.clone(),
+                adapter: self.adapter.clone(),
+                map_every: protocol.map_every,
+                map_blocks: self.map_blocks,
+                seed: self.seed,
+            };
+            self.json.write(&localization_json(&found, context))?;
+        }
+
+        Ok(())
+    }
+}
+
+/// Says how often the rules took the nearest frame's own pose, and whether their covariances hold.
+fn say_rules(rules: &RuleScores) {
+    say(format_args!(
+        "ours took the nearest frame's own translation for {:.0} % of the views and its rotation for {:.0} %; its \
+         covariances hold {:.3} of the errors at 68 % and {:.3} at 95 %",
+        100.0 * rules.translation_unread,
+        100.0 * rules.rotation_unread,
+        rules.coverage.within_68,
+        rules.coverage.within_95
+    ));
+}

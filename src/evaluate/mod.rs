@@ -1,0 +1,478 @@
+//! `seese3 evaluate`: the paper's navigation table on a room's held-out pairs, and the errors of
+//! estimated trajectories.
+
+mod localization;
+mod motion;
+mod odometry;
+mod planning;
+mod robustness;
+mod trajectory;
+
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context, bail};
+use clap::{Args, Subcommand};
+
+use super::named::one_of;
+use super::output::{JsonOutput, STANDARD_OUTPUT, check_writable, say, write_file};
+use super::progress::bar;
+use seese3_core::adapter::TrainingRecord;
+use seese3_core::cancel::Cancellation;
+use seese3_core::eval::{
+    Baselines, Leak, Protocol, Report, TestPairs, TrainedOn, evaluate, has_seen, is_calibrated_in,
+};
+use seese3_core::features::Features;
+use seese3_core::motion_scores::MotionScores;
+use seese3_core::navigation::NavigatorKind;
+use seese3_core::navigation::{IndexKind, Mode, Navigator};
+use seese3_core::room::RoomId;
+use seese3_core::splits::Split;
+use seese3_core::training::{motions, predictions};
+use seese3_lab::report::{
+    AdapterJson, EvaluationContext, MotionBaselines, RoomJson, baselines_text, curve_thresholds,
+    curves_svg, evaluation_csv, evaluation_json, evaluation_latex, evaluation_table, hit_curves,
+    report_at,
+};
+use seese3_store::{Store, StoredAdapter, StoredRoom};
+
+#[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true)]
+pub struct Evaluate {
+    #[command(subcommand)]
+    what: Option<What>,
+    #[command(flatten)]
+    navigation: Option<Navigation>,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    /// Track held-out frames of rooms: path errors, covariances, tracking status, relocalisation
+    Odometry(odometry::Odometry),
+    /// Locate single views in a partly mapped room: an adapter, also one fitted to the mapped
+    /// frames, beside the nearest frame
+    Localization(localization::Localization),
+    /// Read the motion between two views of a room, beside no motion and the mean motion
+    Motion(motion::Motion),
+    /// Plan ways from unmapped views to mapped goals, beside greedy search, a pose graph and a
+    /// topological graph
+    Planning(planning::Planning),
+    /// Track held-out frames whose images are turned, blurred, darkened, hidden, frozen or thinned
+    /// out, beside the nearest frame and standing still
+    Robustness(robustness::Robustness),
+    /// APE and RPE of an estimated trajectory against the true one, as evo defines them
+    Trajectory(trajectory::EvaluateTrajectory),
+}
+
+/// Says which rooms an adapter has learned from or was calibrated on.
+fn say_leaks(rooms: &[(StoredRoom, Features)], record: &TrainingRecord) {
+    for (room, _) in rooms {
+        let room = room.room.id();
+        if has_seen(record, room) {
+            say(format_args!("LEAK: the adapter has seen room '{room}'"));
+        }
+    }
+}
+
+impl Evaluate {
+    pub async fn run(self) -> anyhow::Result<()> {
+        match (self.what, self.navigation) {
+            (Some(What::Odometry(odometry)), _) => odometry.run().await,
+            (Some(What::Localization(localization)), _) => localization.run().await,
+            (Some(What::Motion(motion)), _) => motion.run().await,
+            (Some(What::Planning(planning)), _) => planning.run().await,
+            (Some(What::Robustness(robustness)), _) => robustness.run().await,
+            (Some(What::Trajectory(trajectory)), _) => trajectory.run(),
+            (None, Some(navigation)) => navigation.run().await,
+            (None, None) => {
+                bail!("name a room with --room, or what to evaluate: see `seese3 evaluate --help`")
+            }
+        }
+    }
+}
+
+/// Options of the navigation table.
+#[derive(Debug, Args)]
+struct Navigation {
+    /// The store
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// The room
+    #[arg(long)]
+    room: String,
+    /// Name of its feature set; by default the one that the adapter was trained on
+    #[arg(long)]
+    features: Option<String>,
+    /// Name of the adapter; by default the newest that was trained on the room (with --split, if
+    /// given)
+    #[arg(long)]
+    adapter: Option<String>,
+    /// Frames from the source to the target of a pair; by default as the adapter was trained
+    #[arg(long)]
+    stride: Option<u32>,
+    /// How frames are split into training and test; by default as the adapter was trained
+    #[arg(long, value_parser = one_of::<Split>())]
+    split: Option<Split>,
+    /// Do not retrieve the source frame
+    #[arg(long)]
+    exclude_source: bool,
+    /// ε of Hit@ε, separated by commas
+    #[arg(long, value_delimiter = ',', default_values_t = seese3_core::navigation::HIT_THRESHOLDS)]
+    thresholds: Vec<f64>,
+    /// Rows of the table by name, separated by commas; +row-space, +whitened or +motion may follow
+    /// the name of a step, and +calibrated that of inverse-poincare-homogeneous
+    #[arg(long, value_delimiter = ',')]
+    navigators: Vec<String>,
+    /// Number of equal steps that each motion is cut into
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1_000))]
+    steps: u32,
+    /// How these steps are chained
+    #[arg(long, value_parser = one_of::<Mode>(), default_value = "open-loop")]
+    mode: Mode,
+    /// Seed of the random navigator
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Draw Hit@ε over ε up to 1, a curve for each navigator, to this SVG file
+    #[arg(long, value_name = "FILE.svg", value_parser = plot_file)]
+    plot: Option<PathBuf>,
+    /// Write the table to this file: .csv for programs, .tex for LaTeX with booktabs
+    #[arg(long, value_name = "FILE.csv|FILE.tex", value_parser = table_file)]
+    table: Option<PathBuf>,
+    // Flattened, it would keep clap from telling whether any option of the table was given.
+    /// Also write the results as JSON to this file; "-", or no name, is standard output, where
+    /// nothing else is then printed
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = STANDARD_OUTPUT)]
+    json: Option<PathBuf>,
+}
+
+/// A file whose name does not promise another kind of picture.
+fn plot_file(text: &str) -> Result<PathBuf, String> {
+    match Path::new(text).extension().and_then(OsStr::to_str) {
+        Some("svg") => Ok(PathBuf::from(text)),
+        _ => Err("must end with .svg".to_owned()),
+    }
+}
+
+/// A file whose name says in which form the table is wanted.
+fn table_file(text: &str) -> Result<PathBuf, String> {
+    match Path::new(text).extension().and_then(OsStr::to_str) {
+        Some("csv" | "tex") => Ok(PathBuf::from(text)),
+        _ => Err("must end with .csv or .tex".to_owned()),
+    }
+}
+
+impl Navigation {
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one command, from its arguments to what it prints"
+    )]
+    async fn run(self) -> anyhow::Result<()> {
+        let json = JsonOutput::to(self.json.clone());
+        json.begin()?;
+        for file in self.plot.iter().chain(&self.table) {
+            check_writable(file)?;
+        }
+
+        let store = Store::open(&self.store)?;
+        let chosen = choose(&store, &self, self.split).await?;
+
+        // Without a name, the features are those that the adapter was trained on.
+        let features_name = self
+            .features
+            .clone()
+            .unwrap_or_else(|| chosen.adapter.source().name.clone());
+        let (stored, features) = store
+            .load_room_with(&self.room, Some(&features_name))
+            .await?;
+
+        let record = chosen.record.clone();
+        let protocol = self.protocol(&record)?;
+        let room = Arc::new(stored.room);
+        let navigator = Navigator::new(room, &features, chosen.adapter.clone(), IndexKind::Exact)?;
+
+        // Counted before the work starts, since the progress bar needs a total.
+        let rows = protocol.rows(&navigator)?.len();
+        let progress = bar(rows as u64, "evaluating");
+
+        let report = evaluate(
+            &navigator,
+            &protocol,
+            &Cancellation::default(),
+            &mut |done, kind| {
+                progress.set_position(done as u64);
+                progress.set_message(kind.name());
+            },
+        )?;
+
+        progress.finish_and_clear();
+
+        // A curve has more thresholds than the table.
+        let curves = report;
+        let report = report_at(&curves, &self.thresholds);
+
+        let trained_on = store
+            .trained_on(&record, navigator.room().id(), stored.revision)
+            .await?;
+        let in_room = trained_on != TrainedOn::Nothing;
+        let leak = Leak::of(&record, trained_on, protocol.split);
+
+        say(format_args!(
+            "room '{}' revision {}, features '{features_name}', adapter '{}' revision {} ({})",
+            self.room,
+            stored.revision,
+            chosen.name,
+            chosen.revision,
+            if in_room {
+                "trained in this room"
+            } else {
+                "never saw this room"
+            },
+        ));
+
+        let side = if self.exclude_source {
+            "excluded"
+        } else {
+            "included"
+        };
+        say(format_args!(
+            "split {}, stride {}: {} test pairs, {} candidate frames, source {side}",
+            protocol.split, protocol.stride, report.n, report.candidate_count
+        ));
+
+        // Warnings come before the table, so that nobody reads it without them.
+        say_caveats(&protocol, &record, navigator.room().id(), leak);
+        say(evaluation_table(&report).trim_end());
+
+        let learned_here = trained_on == TrainedOn::TheseFrames;
+        let motion = motion_baselines(&navigator, &features, &record, &protocol, learned_here)?;
+        say(baselines_text(&motion));
+
+        self.write_files(&report, &curves)?;
+        if json.is_wanted() {
+            // The file says what was evaluated and whether it leaks, so that it can be judged by
+            // itself.
+            let context = EvaluationContext {
+                room: RoomJson {
+                    name: self.room.clone(),
+                    revision: stored.revision,
+                },
+                features: features_name,
+                adapter: AdapterJson {
+                    name: chosen.name,
+                    revision: chosen.revision,
+                    preset: record.preset,
+                    trained_split: record.split.name(),
+                    trained_stride: record.stride,
+                    seed: record.config.seed,
+                },
+                in_room,
+                leaks: leak.is_some(),
+            };
+            json.write(&evaluation_json(&report, &motion, context))?;
+        }
+
+        Ok(())
+    }
+
+    /// The thresholds of the table, and those of the curves if they are drawn.
+    fn all_thresholds(&self) -> Vec<f64> {
+        let mut all = self.thresholds.clone();
+        if self.plot.is_some() {
+            all.extend(curve_thresholds());
+            all.sort_by(f64::total_cmp);
+            all.dedup();
+        }
+        all
+    }
+
+    /// Writes the table and the curves to the files that were asked for.
+    fn write_files(&self, report: &Report, curves: &Report) -> anyhow::Result<()> {
+        if let Some(file) = &self.table {
+            let text = match file.extension().and_then(OsStr::to_str) {
+                Some("tex") => evaluation_latex(report),
+                _ => evaluation_csv(report),
+            };
+            write_file(file, text.as_bytes())?;
+            say(format_args!("wrote {}", file.display()));
+        }
+
+        if let Some(file) = &self.plot {
+            let title = format!(
+                "{}: {} motions over {} frames, split {}",
+                self.room, report.n, report.protocol.stride, report.protocol.split
+            );
+            let mut drawn = hit_curves(curves, title);
+            if self.navigators.is_empty() {
+                // Other metrics of a navigator, and those that have seen the test pairs, would hide
+                // the rest.
+                let is_plain = |name: &str| !name.contains('+') && !name.ends_with("-in-sample");
+                drawn.series.retain(|series| is_plain(&series.name));
+            }
+            let svg = curves_svg(&drawn)?;
+            write_file(file, svg.as_bytes())?;
+            say(format_args!("wrote {}", file.display()));
+        }
+        Ok(())
+    }
+
+    /// The protocol of the options; where they leave out split or stride, the adapter's own.
+    fn protocol(&self, record: &TrainingRecord) -> anyhow::Result<Protocol> {
+        Ok(Protocol {
+            split: self.split.unwrap_or(record.split),
+            stride: self.stride.unwrap_or(record.stride),
+            exclude_source: self.exclude_source.then_some(0),
+            thresholds: self.all_thresholds(),
+            seed: self.seed,
+            steps: self.steps,
+            mode: self.mode,
+            navigators: navigators_named(&self.navigators)?,
+        })
+    }
+}
+
+/// How well the adapter reads the motions of the test pairs, beside the simplest answers.
+fn motion_baselines(
+    navigator: &Navigator,
+    features: &Features,
+    record: &TrainingRecord,
+    protocol: &Protocol,
+    learned_here: bool,
+) -> anyhow::Result<MotionBaselines> {
+    let room = navigator.room();
+    let adapter = navigator.adapter();
+    let test = TestPairs {
+        split: protocol.split,
+        stride: protocol.stride,
+    };
+
+    let pairs = test.split.test_pairs(room.timeline(), test.stride)?;
+    let predicted = predictions(adapter, features.rows(), &pairs)?;
+    Ok(MotionBaselines {
+        motion: MotionScores::of(&motions(room.poses(), &pairs), &predicted),
+        baselines: Baselines::of(
+            adapter.scale(),
+            record.optimiser_steps(),
+            room,
+            &test,
+            learned_here,
+        )?,
+    })
+}
+
+/// Prints what a reader of the table must know: several steps per motion, and leaks.
+fn say_caveats(protocol: &Protocol, record: &TrainingRecord, room: &RoomId, leak: Option<Leak>) {
+    if protocol.steps > 1 {
+        say(format_args!(
+            "{} equal parts of each motion, {}",
+            protocol.steps,
+            protocol.mode.name()
+        ));
+    }
+
+    // The calibrated metric uses errors measured on the very poses that it is tested on.
+    if is_calibrated_in(record, room) {
+        say(
+            "LEAK: the adapter's errors were measured in this room; +calibrated has seen its poses",
+        );
+    }
+
+    let why = match leak {
+        None => return,
+        Some(Leak::OtherFrames) => "on other frames of this room".to_owned(),
+        Some(Leak::Split) => format!("under the split '{}'", record.split),
+    };
+    say(format_args!(
+        "LEAK: the adapter was trained {why}; test pairs may have been trained on"
+    ));
+}
+
+/// The navigators with these names, or an error that lists the known names.
+pub fn navigators_named(names: &[String]) -> anyhow::Result<Vec<NavigatorKind>> {
+    let named = |name: &String| {
+        let unknown = || {
+            format!(
+                "--navigators: '{name}' is not one of {}",
+                NavigatorKind::known_names()
+            )
+        };
+        NavigatorKind::from_name(name).with_context(unknown)
+    };
+
+    names.iter().map(named).collect()
+}
+
+/// The adapter that was named, else the newest that was trained on the room, with these features
+/// and this split where they are given. Adapters of the wanted stride come first.
+async fn choose(
+    store: &Store,
+    wanted: &Navigation,
+    split: Option<Split>,
+) -> anyhow::Result<StoredAdapter> {
+    if let Some(name) = &wanted.adapter {
+        return Ok(store.load_adapter(name, None).await?);
+    }
+
+    let names = store.adapter_names().await?;
+    let mut fitting = Vec::new();
+    for name in &names {
+        let stored = match store.load_adapter(name, None).await {
+            Ok(stored) => stored,
+            // One adapter that cannot be read must not hide the others.
+            Err(error) => {
+                say(format_args!("passed over adapter '{name}': {error}"));
+                continue;
+            }
+        };
+
+        // Rooms are compared by name: the adapter may have been trained on another revision.
+        let fits = wanted
+            .features
+            .as_ref()
+            .is_none_or(|name| *name == stored.adapter.source().name)
+            && stored
+                .record
+                .rooms
+                .iter()
+                .any(|(room, _)| room.as_str() == wanted.room)
+            && split.is_none_or(|split| split == stored.record.split)
+            // A fitted adapter has learned from every frame: its scores here would say nothing.
+            && stored.room_fit.is_none();
+
+        if fits {
+            fitting.push(stored);
+        }
+    }
+
+    let same_stride = |stored: &StoredAdapter| {
+        wanted
+            .stride
+            .is_none_or(|stride| stride == stored.record.stride)
+    };
+
+    // Compared in this order: none of an experiment, the right stride, then the date, then the name.
+    let best = |a: &StoredAdapter| {
+        (
+            !a.is_experiment,
+            same_stride(a),
+            a.created.clone(),
+            a.name.clone(),
+        )
+    };
+
+    match fitting.into_iter().max_by(|a, b| best(a).cmp(&best(b))) {
+        Some(stored) => Ok(stored),
+        None => bail!(
+            "no adapter was trained on room '{}' with these features and this split; the store has {}; \
+             train one with `seese3 train --store {} --room {}`, or name one with --adapter",
+            wanted.room,
+            if names.is_empty() {
+                "none".to_owned()
+            } else {
+                names.join(", ")
+            },
+            wanted.store,
+            wanted.room,
+        ),
+    }
+}

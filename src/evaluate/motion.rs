@@ -1,0 +1,165 @@
+//! `seese3 evaluate motion`: how well the motion between two views of a room is read.
+
+use anyhow::Context;
+use clap::Args;
+
+use seese3_core::eval::has_seen;
+use seese3_core::features::Features;
+use seese3_core::room::Room;
+use seese3_core::splits::Split;
+use seese3_lab::experiments::motion::{Maps, evaluate};
+use seese3_lab::report::{motion_evaluation_json, motion_table};
+
+use super::super::camera::CameraOption;
+use super::super::output::{JsonOutput, say};
+use super::super::progress::bar;
+use seese3_encoder::{Pooling, Preparation};
+use seese3_store::{Store, StoredAdapter};
+
+#[derive(Debug, Args)]
+pub struct Motion {
+    /// The store
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// The room
+    #[arg(long)]
+    room: String,
+    /// The adapter
+    #[arg(long, required_unless_present = "two_view")]
+    adapter: Option<String>,
+    /// Also read each motion from where things are in both images, by these features: a grid of an
+    /// encoder's feature map that is as fine as the map, for instance xfeat-fusion-grid40x30
+    #[arg(long, value_name = "FEATURES")]
+    two_view: Option<String>,
+    /// The camera of the images, in pixels, for --two-view; the room's own if omitted
+    #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]", requires = "two_view")]
+    camera: Option<CameraOption>,
+    /// Frames from the first view to the second
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
+    stride: u32,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Motion {
+    pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+
+        let store = Store::open(&self.store)?;
+        let stored = store.load_room(&self.room, None).await?;
+        let features = async |name: &str| -> anyhow::Result<Features> {
+            let (other, features) = store.load_room_with(&self.room, Some(name)).await?;
+            anyhow::ensure!(
+                other.revision == stored.revision,
+                "room '{}' was published again meanwhile; try again",
+                self.room
+            );
+
+            Ok(features)
+        };
+
+        let adapter = match &self.adapter {
+            Some(name) => {
+                let adapter = store.load_adapter(name, None).await?;
+                let features = features(&adapter.adapter.source().name).await?;
+                Some((adapter, features))
+            }
+            None => None,
+        };
+        let dense = match &self.two_view {
+            Some(name) => Some(features(name).await?),
+            None => None,
+        };
+
+        let maps = dense
+            .as_ref()
+            .map(|dense| self.maps(&stored.room, dense))
+            .transpose()?;
+        let pairs = Split::Whole.test_pairs(stored.room.timeline(), self.stride)?;
+        let progress = bar(pairs.len() as u64, "reading");
+        let found = evaluate(
+            &stored.room,
+            adapter
+                .as_ref()
+                .map(|(stored, features)| (stored.adapter.as_ref(), features)),
+            maps,
+            &pairs,
+            &|| progress.inc(1),
+        )?;
+        progress.finish_and_clear();
+
+        let in_room = adapter
+            .as_ref()
+            .map(|(adapter, _)| has_seen(&adapter.record, stored.room.id()));
+        say(format_args!(
+            "room '{}' revision {}, stride {}: {} pairs",
+            self.room, stored.revision, self.stride, found.n
+        ));
+        if let Some((adapter, _)) = &adapter {
+            say_adapter(adapter, in_room == Some(true));
+        }
+        say(motion_table(&found).trim_end());
+
+        if self.json.is_wanted() {
+            let named = self.adapter.as_deref().zip(in_room);
+            let record = motion_evaluation_json(&found, &self.room, named, self.stride);
+            self.json.write(&record)?;
+        }
+
+        Ok(())
+    }
+
+    /// The room's frames as feature maps, and the camera that took them.
+    fn maps<'a>(&self, room: &Room, dense: &'a Features) -> anyhow::Result<Maps<'a>> {
+        let source = dense.source();
+        let shape = source
+            .pooling
+            .parse::<Pooling>()
+            .ok()
+            .and_then(|pooling| pooling.map_shape(source.dim))
+            .with_context(|| {
+                format!(
+                    "--two-view {}: is pooled as '{}', and a grid of the whole feature map is \
+                     needed: encode the room with --pool gridCxR, C and R the columns and rows of \
+                     the layer's map",
+                    source.name, source.pooling
+                )
+            })?;
+
+        // A crop would change where the image's middle and edges are.
+        if let Ok((Preparation { crop: Some(_), .. }, _)) = Preparation::parse(&source.preprocess) {
+            anyhow::bail!(
+                "--two-view {}: its images were cropped, so that the camera's focal length does \
+                 not hold for them; encode them whole",
+                source.name
+            );
+        }
+
+        let camera = match (self.camera, room.provenance().camera) {
+            (Some(camera), _) => camera.pinhole()?,
+            (None, Some(camera)) => camera,
+            (None, None) => anyhow::bail!(
+                "room '{}' states no camera: give --camera, or import the room with --camera",
+                self.room
+            ),
+        };
+
+        Ok(Maps {
+            features: dense,
+            shape,
+            camera,
+        })
+    }
+}
+
+fn say_adapter(adapter: &StoredAdapter, in_room: bool) {
+    let seen = if in_room {
+        "LEAK: it has seen this room"
+    } else {
+        "never saw this room"
+    };
+    say(format_args!(
+        "adapter '{}' revision {} ({seen})",
+        adapter.name, adapter.revision
+    ));
+}

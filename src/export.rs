@@ -1,0 +1,121 @@
+//! `seese3 export`: writes a stored room in a format that other programs read.
+
+use std::path::PathBuf;
+
+use anyhow::bail;
+use clap::{Args, Subcommand};
+use serde_json::json;
+
+use super::output::{JsonOutput, check_folder, check_writable, say, write_file};
+use seese3_data::datasets::write_numpy;
+use seese3_data::export::{kitti_trajectory, tum_trajectory};
+use seese3_store::{Store, StoredRoom};
+
+#[derive(Debug, Args)]
+pub struct Export {
+    #[command(subcommand)]
+    format: Format,
+}
+
+#[derive(Debug, Subcommand)]
+enum Format {
+    /// A folder with poses.npy, timestamps.npy, frame_ids.npy, features_NAME.npy and bundle.json
+    Numpy(From),
+    /// A TUM trajectory file, "timestamp tx ty tz qx qy qz qw" per line: seconds, metres,
+    /// world_from_camera
+    Tum(Timed),
+    /// A KITTI trajectory file: the first three rows of world_from_camera per line, metres
+    Kitti(From),
+}
+
+#[derive(Debug, Args)]
+struct From {
+    /// The store: a folder, or a URL of a bucket (feature `cloud`)
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// Name of the room
+    #[arg(long)]
+    room: String,
+    /// Revision of the room; the newest if omitted
+    #[arg(long)]
+    revision: Option<u64>,
+    /// Output path: a folder for numpy, a file for the other formats
+    #[arg(long)]
+    out: PathBuf,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+#[derive(Debug, Args)]
+struct Timed {
+    #[command(flatten)]
+    from: From,
+    /// Frames per second, 0.001 to 1000000: makes timestamps for a room that has none, starting at
+    /// 0
+    #[arg(long)]
+    rate: Option<f64>,
+}
+
+impl Export {
+    pub async fn run(self) -> anyhow::Result<()> {
+        match self.format {
+            Format::Numpy(from) => {
+                let stored = from.load().await?;
+                let files = write_numpy(&from.out, &stored.room, &stored.features)?;
+                for file in &files {
+                    say(format_args!("wrote {}", file.display()));
+                }
+                from.json.write(&json!({ "files": files }))
+            }
+            Format::Tum(Timed { from, rate }) => {
+                let stored = from.load().await?;
+
+                // The format needs a time per pose. Recorded times are never overridden; a room
+                // without them gets evenly spaced ones.
+                let times = match (stored.room.timestamps_ns(), rate) {
+                    ([], Some(rate)) if (1e-3..=1e6).contains(&rate) => {
+                        (0..stored.room.frame_count())
+                            .map(|row| (row as f64 / rate * 1e9).round() as i64)
+                            .collect()
+                    }
+                    ([], Some(rate)) => {
+                        bail!("--rate must be 0.001 to 1,000,000 frames a second, got {rate}")
+                    }
+                    ([], None) => bail!(
+                        "room '{}' has no timestamps, which the format needs; give --rate FRAMES_A_SECOND, \
+                         or export kitti",
+                        from.room
+                    ),
+                    (times, None) => times.to_vec(),
+                    (_, Some(_)) => bail!(
+                        "room '{}' has timestamps of its own; leave out --rate",
+                        from.room
+                    ),
+                };
+
+                from.write(&tum_trajectory(&times, stored.room.poses()))
+            }
+            Format::Kitti(from) => {
+                let stored = from.load().await?;
+                from.write(&kitti_trajectory(stored.room.poses()))
+            }
+        }
+    }
+}
+
+impl From {
+    async fn load(&self) -> anyhow::Result<StoredRoom> {
+        self.json.begin()?;
+        check_folder(&self.out)?;
+        Ok(Store::open(&self.store)?
+            .load_room(&self.room, self.revision)
+            .await?)
+    }
+
+    fn write(&self, text: &str) -> anyhow::Result<()> {
+        check_writable(&self.out)?;
+        write_file(&self.out, text.as_bytes())?;
+        say(format_args!("wrote {}", self.out.display()));
+        self.json.write(&json!({ "files": [&self.out] }))
+    }
+}

@@ -1,0 +1,103 @@
+//! `seese3 fit`: fits an adapter to one room and publishes it.
+
+use clap::Args;
+use indicatif::ProgressBar;
+use serde_json::json;
+
+use seese3_core::training::RoomData;
+use seese3_robot::fitting::{FITTING_EPOCHS, Fitted, PartRule};
+
+use super::output::{JsonOutput, say, say_published};
+use super::progress::bar;
+use seese3_store::Store;
+use seese3_store::fit_stored_room::{self, Refit};
+
+#[derive(Debug, Args)]
+pub struct Fit {
+    /// The store: a folder, or a URL of a bucket (feature `cloud`)
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// The room, all of whose frames are its map
+    #[arg(long)]
+    room: String,
+    /// An adapter that learned from other rooms: its weights are where the fitted one begins, and
+    /// it stays a reader of motions beside it where it was measured to be better
+    #[arg(long)]
+    adapter: Option<String>,
+    /// Name of the feature set; by default that of the adapter, or the room's only one
+    #[arg(long)]
+    features: Option<String>,
+    /// Seed of the drawn pairs, of the noise and, without --adapter, of the initial weights
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
+    seed: u64,
+    /// Name of the fitted adapter in the store; ROOM.FEATURES.fitted if omitted
+    #[arg(long)]
+    name: Option<String>,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Fit {
+    pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+        let store = Store::open(&self.store)?;
+        let request = fit_stored_room::Request {
+            room: self.room,
+            base: self.adapter,
+            features: self.features,
+            name: self.name,
+            seed: self.seed,
+        };
+        let refit = Refit::prepare(&store, request).await?;
+
+        let progress = fitting_bar(true);
+        let fitted = refit.fit(&|_| progress.inc(1))?;
+        progress.finish_and_clear();
+
+        let published = refit.publish(&store, &fitted).await?;
+        say_fitted(&fitted, &refit.data());
+        say_published(&store, refit.name(), &published);
+
+        self.json.write(&json!({
+            "adapter": refit.name(),
+            "revision": published.revision,
+            "created": published.is_new,
+            "room": refit.data().room.id().as_str(),
+            "train_r2": fitted.record.train.overall,
+        }))
+    }
+}
+
+/// Prints what was fitted, and the rules that were measured.
+fn say_fitted(fitted: &Fitted, data: &RoomData<'_>) {
+    let mapped = data.room.frame_count();
+    say(format_args!(
+        "room '{}' revision {}, features '{}': fitted to {mapped} frames, train R² {:.3}",
+        data.room.id(),
+        data.revision,
+        data.features.source().name,
+        fitted.record.train.overall
+    ));
+
+    say("measured on frames left out, by the distance of a view from the map:");
+    for rule in fitted.rules.rules() {
+        say(format_args!(
+            "  up to {:.3}: translation {}, rotation {}",
+            rule.up_to,
+            part_words(rule.translation),
+            part_words(rule.rotation)
+        ));
+    }
+}
+
+/// A bar over the epochs of a fit and of its folds; without a fit it stays empty.
+pub fn fitting_bar(is_fitted: bool) -> ProgressBar {
+    bar(if is_fitted { FITTING_EPOCHS } else { 0 }, "fitting")
+}
+
+fn part_words(rule: PartRule) -> String {
+    if rule.gain == 0.0 {
+        return rule.reader.name().to_owned();
+    }
+    format!("{} × {:.1}", rule.reader.name(), rule.gain)
+}

@@ -1,0 +1,347 @@
+//! Where a recording goes and how it is read: the options and the steps that all formats share.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use clap::Args;
+use serde_json::json;
+
+use super::said::{say_dropped, say_frames};
+use crate::camera::CameraOption;
+use crate::encode::same_poses;
+use crate::output::{JsonOutput, say};
+use crate::pose_options::{DirectionName, PoseOptions};
+use crate::pose_report::{PoseReport, PosesFrom};
+use crate::progress::bar;
+use seese3_core::features::{FeatureSource, Features};
+use seese3_core::room::{Frames, Provenance, Room, RoomId};
+use seese3_data::datasets::{self, Reader, Recording, Unusable};
+use seese3_store::{Store, check_features};
+
+#[derive(Debug, Args)]
+pub struct Destination {
+    /// The store: a folder, created if it does not exist, or a URL of a bucket
+    /// (feature `cloud`)
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// Name of the room in the store; derived from the path if omitted
+    #[arg(long, visible_alias = "room")]
+    pub name: Option<String>,
+    /// Keep every K-th usable frame of each sequence
+    #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    every: u32,
+    /// Fail and publish nothing if a frame is unusable, instead of dropping it, and if the poses are
+    /// wrong (contradicted by the images, all the same, identities where tracking was lost, steps that
+    /// no camera makes in metres, times that do not rise), instead of warning
+    #[arg(long)]
+    strict: bool,
+    /// Publish a new revision even if the store has a room of this name with other frames; the
+    /// features of those frames are not carried over
+    #[arg(long)]
+    replace: bool,
+    /// Features of all usable frames, NAME=FILE.npy, shape (n, d), one row per frame before
+    /// --every; may be given several times
+    #[arg(long = "features", value_name = "NAME=FILE")]
+    features: Vec<String>,
+    /// Licence of the recording, stored with the room
+    #[arg(long, default_value = "")]
+    licence: String,
+    /// The camera of the images, in pixels; motions between two images are read with it
+    #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]")]
+    camera: Option<CameraOption>,
+    #[command(flatten)]
+    read_as: PoseOptions,
+    /// Do not compare the poses with the images
+    #[arg(long)]
+    skip_pose_check: bool,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Destination {
+    /// Refuses to replace a room of the same name by one with other frames, unless --replace was
+    /// given.
+    async fn refuse_other_frames(&self, store: &Store, room: &Room) -> anyhow::Result<()> {
+        let before = match store.load_room(room.id().as_str(), None).await {
+            Ok(before) => before.room,
+            Err(seese3_store::Error::Unknown { .. }) => return Ok(()),
+            Err(error) => return Err(error.into()),
+        };
+
+        // Features belong to frames: new frames would silently lose the features that were
+        // computed for the old ones.
+        if self.replace || same_poses(&before, room) {
+            return Ok(());
+        }
+
+        bail!(
+            "room '{}' is in the store with other frames ({} from {}, these are {}); give another --name, or --replace, \
+             which leaves its features behind",
+            room.id(),
+            before.frame_count(),
+            before.provenance().format,
+            room.frame_count()
+        );
+    }
+
+    /// Finds out before the work whether its results can be written.
+    pub fn begin(&self) -> anyhow::Result<()> {
+        self.json.begin()
+    }
+
+    /// Reads a recording with a progress bar, dropping or refusing unusable frames as --strict
+    /// says.
+    pub fn read<T>(
+        &self,
+        read: impl FnOnce(&mut Reader<'_>) -> Result<T, datasets::Error>,
+    ) -> anyhow::Result<T> {
+        self.begin()?;
+
+        let progress = bar(0, "reading");
+
+        let unusable = if self.strict {
+            Unusable::Refuse
+        } else {
+            Unusable::Drop
+        };
+
+        // Only the reader knows how many frames there are, so the bar gets its length from it.
+        let mut tell = |done: usize, total: usize| {
+            progress.set_length(total as u64);
+            progress.set_position(done as u64);
+        };
+        let recording = read(&mut Reader {
+            unusable,
+            progress: &mut tell,
+        })?;
+
+        progress.finish_and_clear();
+        Ok(recording)
+    }
+
+    /// The room of a recording. An exported bundle states its name, format and licence: the
+    /// original format is kept, and --licence and --name win over the stated ones.
+    fn room(
+        &self,
+        format: &str,
+        path: &Path,
+        recording: &Recording,
+        frames: Frames,
+    ) -> anyhow::Result<Room> {
+        let stated = &recording.stated;
+        let either = |given: &str, stated: &str| {
+            if given.is_empty() {
+                stated.to_owned()
+            } else {
+                given.to_owned()
+            }
+        };
+        let provenance = Provenance {
+            format: either(&stated.format, format),
+            licence: either(&self.licence, &stated.licence),
+            images_root: recording.images_root.clone(),
+            worst_rotation_deviation: recording.worst_rotation_deviation,
+            camera: self
+                .camera
+                .map(CameraOption::pinhole)
+                .transpose()?
+                .or(stated.camera),
+        };
+
+        // The name given wins, then the bundle's own, then one derived from the path.
+        let name = match &self.name {
+            Some(name) => name.clone(),
+            None if !stated.name.is_empty() => stated.name.clone(),
+            None => name_from(format, path).context("--name NAME is required")?,
+        };
+        let id = RoomId::new(&name).context("give another name with --name")?;
+        Ok(Room::new(id, frames, provenance)?)
+    }
+
+    /// Prints what was read.
+    fn say_read(
+        &self,
+        room: &Room,
+        features: &[Features],
+        recording: &Recording,
+        read_count: usize,
+    ) {
+        let times = if room.timestamps_ns().is_empty() {
+            "without timestamps"
+        } else {
+            "with timestamps"
+        };
+
+        let thinned = if self.every > 1 {
+            format!(", every {} of {read_count}", self.every)
+        } else {
+            String::new()
+        };
+        say(format_args!(
+            "room '{}': {} frames {times}{thinned}",
+            room.id(),
+            room.frame_count()
+        ));
+
+        say_frames(room);
+        let deviation = recording.worst_rotation_deviation;
+        say(format_args!(
+            "rotations: R Rᵀ differs from the identity by at most {deviation:.1e}; projected onto SO(3)"
+        ));
+
+        for set in features {
+            say(format_args!(
+                "features '{}': {} columns",
+                set.source().name,
+                set.source().dim
+            ));
+        }
+
+        say_dropped(&recording.dropped);
+    }
+
+    /// Reads the feature files that options name. They have one row per usable frame, and are checked
+    /// against that count before --every thins both.
+    fn read_features(&self, recording: &mut Recording) -> anyhow::Result<()> {
+        for given in &self.features {
+            recording.features.push(read_features(given)?);
+        }
+
+        let read_count = recording.frames.poses.len();
+        for set in &recording.features {
+            let rows = set.rows().nrows();
+            let unusable = recording.dropped.len();
+            if rows != read_count {
+                let name = &set.source().name;
+                bail!(
+                    "features '{name}' have {rows} rows, the recording has {read_count} usable frames \
+                     ({unusable} dropped)"
+                );
+            }
+        }
+
+        Ok(())
+    }
+
+    pub async fn publish(
+        &self,
+        format: &str,
+        path: &Path,
+        mut recording: Recording,
+        direction: DirectionName,
+    ) -> anyhow::Result<()> {
+        let read_count = recording.frames.poses.len();
+
+        self.read_features(&mut recording)?;
+
+        // Frames and features keep the same rows; counting starts anew in each sequence.
+        let kept = recording.every(self.every as usize);
+        let features = recording
+            .features
+            .iter()
+            .map(|set| set.select(&kept))
+            .collect::<Vec<_>>();
+
+        // The images are compared with the poses as they are stated, so that a mistake can be named
+        // by the options that mend it.
+        let mut frames = recording.frames.select(&kept);
+        let read_as = self.read_as.convention(direction);
+        let stated = self.read_as.scaled(&frames.poses);
+        let read = stated.iter().map(|pose| read_as.to_world_from_camera(pose));
+        frames.poses = read.collect();
+        let room = self.room(format, path, &recording, frames)?;
+
+        // The last checks come before the first write: a refused import leaves the store as it
+        // was.
+        check_features(&room, &features)?;
+        let store = Store::create(&self.store)?;
+        self.refuse_other_frames(&store, &room).await?;
+
+        self.say_read(&room, &features, &recording, read_count);
+        let mut report = PoseReport::of_path(&room);
+        if !self.skip_pose_check && !room.images().is_empty() {
+            let root = Path::new(&recording.images_root);
+            let from = PosesFrom::Recording(read_as);
+            report.look_at_images(&room, root, &stated, from);
+        }
+        report.say();
+        if format == "colmap" && self.read_as.has_no_scale() {
+            eprintln!(
+                "warning: COLMAP's unit of length is arbitrary, and everything here is in metres: give --scale \
+                 FACTOR, or --scale 1 if the model was aligned with known positions"
+            );
+        }
+
+        if self.strict && report.has_unreadable_images() {
+            bail!(
+                "images of room '{}' cannot be read, see the warnings; nothing was published (--strict)",
+                room.id()
+            );
+        }
+        if self.strict && report.is_wrong() {
+            bail!(
+                "the poses of room '{}' are wrong, see the warnings; nothing was published (--strict)",
+                room.id()
+            );
+        }
+        let published = match self.replace {
+            true => store.publish_room(&room, &features).await?,
+            false => store.publish_same_frames(&room, &features).await?,
+        };
+
+        // Publishing the same content again makes no new revision, so an import can safely be
+        // repeated.
+        let state = if published.is_new {
+            "published"
+        } else {
+            "already there, unchanged:"
+        };
+
+        say(format_args!(
+            "{state} revision {}: {}/{}",
+            published.revision,
+            store.location(),
+            published.manifest
+        ));
+
+        let mut record = report.json(&room);
+        record["revision"] = json!(published.revision);
+        record["created"] = json!(published.is_new);
+        record["dropped"] = json!(recording.dropped.len());
+        self.json.write(&record)
+    }
+}
+
+/// A room's name from its path. Folder names of 12-Scenes rooms and 7-Scenes sequences repeat, so
+/// the name of the parent folder is put before them.
+fn name_from(format: &str, path: &Path) -> Option<String> {
+    // A path such as `.` only has a name once it is resolved.
+    let path = path.canonicalize().ok()?;
+    let stem = if path.is_file() {
+        path.file_stem()
+    } else {
+        path.file_name()
+    };
+    let own = stem?.to_string_lossy().into_owned();
+
+    let above = path
+        .parent()
+        .and_then(Path::file_name)
+        .map(|name| name.to_string_lossy().into_owned());
+
+    match (format, above) {
+        ("12scenes", Some(house)) => Some(format!("{house}-{own}")),
+        ("7scenes", Some(scene)) if own.starts_with("seq-") => Some(format!("{scene}-{own}")),
+        _ => Some(own),
+    }
+}
+
+fn read_features(given: &str) -> anyhow::Result<Features> {
+    let Some((name, file)) = given.split_once('=') else {
+        bail!("--features '{given}' is not NAME=FILE.npy");
+    };
+    let rows = datasets::read_features(&PathBuf::from(file))?;
+    let dim = rows.ncols();
+
+    Features::new(FeatureSource::imported(name, dim), rows).with_context(|| file.to_owned())
+}

@@ -1,0 +1,246 @@
+//! `seese3 import`: reads a recording from disk and publishes it as a room in a store.
+//!
+//! | file | what |
+//! | --- | --- |
+//! | here | the formats, and what each of them is asked for |
+//! | `bag`, `numpy` | formats with more to ask for |
+//! | `destination` | where a recording goes and how it is read, the same for every format |
+//! | `said` | what is printed about the frames |
+
+#[cfg_attr(not(feature = "bags"), path = "bag_not_built.rs")]
+mod bag;
+mod destination;
+mod numpy;
+mod said;
+
+use std::path::{Path, PathBuf};
+
+use clap::{Args, Subcommand};
+
+use super::pose_options::DirectionOption;
+use bag::BagPath;
+use destination::Destination;
+use numpy::Numpy;
+use seese3_data::datasets::{self, Kitti, Reader, Recording, SevenScenes};
+
+#[derive(Debug, Args)]
+pub struct Import {
+    #[command(subcommand)]
+    format: Format,
+}
+
+#[derive(Debug, Subcommand)]
+enum Format {
+    /// ScanNet: an exported scene's folder (color/, pose/), or a .sens file
+    Scannet(Plain),
+    /// ARKitScenes: a video's folder (lowres_wide/, lowres_wide.traj)
+    Arkitscenes(Plain),
+    /// TUM RGB-D: a sequence's folder (rgb.txt, groundtruth.txt)
+    Tum(Plain),
+    /// 12-Scenes: a room's folder (data/, split.txt)
+    #[command(name = "12scenes")]
+    TwelveScenes(Plain),
+    /// 7-Scenes: a scene's folder (seq-XX/frame-XXXXXX.pose.txt), or one sequence's
+    #[command(name = "7scenes")]
+    SevenScenes(Seven),
+    /// A folder of your own: images/, and poses.npy (n, 4, 4) in the order of the images' names
+    Folder(Plain),
+    /// COLMAP: a model (cameras and images, .bin or .txt), or a project's folder with sparse/0
+    Colmap(Colmap),
+    /// NeRF, instant-ngp and nerfstudio: a transforms.json, or its folder
+    Transforms(Plain),
+    /// KITTI odometry: a file of poses, with the folder of its images
+    Kitti(KittiFiles),
+    /// EuRoC MAV: a sequence's folder (mav0/cam0, mav0/state_groundtruth_estimate0)
+    Euroc(Euroc),
+    /// A bag of ROS 2 (.mcap, .db3) or a recording of Foxglove, with images and poses or /tf
+    #[command(visible_alias = "mcap")]
+    Bag(BagPath),
+    /// NumPy files: poses (n, 4, 4) world_from_camera in metres, features (n, d)
+    Numpy(Numpy),
+    /// A folder that `seese3 export numpy` wrote
+    Bundle(Plain),
+}
+
+#[derive(Debug, Args)]
+struct Plain {
+    /// The folder or file to read
+    path: PathBuf,
+    #[command(flatten)]
+    poses: DirectionOption,
+    #[command(flatten)]
+    to: Destination,
+}
+
+#[derive(Debug, Args)]
+struct Seven {
+    /// The scene's folder, or one sequence's
+    path: PathBuf,
+    /// One sequence, for instance seq-01; if omitted, all sequences of the scene make one room
+    #[arg(long)]
+    sequence: Option<String>,
+    /// A text file with a 4x4 matrix, rgb_from_depth in metres: poses of the depth camera are
+    /// converted to those of the colour camera
+    #[arg(long, value_name = "FILE")]
+    rgb_from_depth: Option<PathBuf>,
+    #[command(flatten)]
+    poses: DirectionOption,
+    #[command(flatten)]
+    to: Destination,
+}
+
+#[derive(Debug, Args)]
+struct Colmap {
+    /// The model's folder, or the project's
+    path: PathBuf,
+    /// The folder that the names of images start from; looked for beside the model if omitted
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
+    #[command(flatten)]
+    poses: DirectionOption,
+    #[command(flatten)]
+    to: Destination,
+}
+
+#[derive(Debug, Args)]
+struct KittiFiles {
+    /// The file of poses, twelve numbers a line
+    path: PathBuf,
+    /// The folder of the images, in the order of their numbers, such as sequences/00/image_2
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
+    /// The file of times, seconds, one a line, such as sequences/00/times.txt
+    #[arg(long, value_name = "FILE")]
+    times: Option<PathBuf>,
+    #[command(flatten)]
+    poses: DirectionOption,
+    #[command(flatten)]
+    to: Destination,
+}
+
+#[derive(Debug, Args)]
+struct Euroc {
+    /// The sequence's folder
+    path: PathBuf,
+    /// Which of its cameras
+    #[arg(long = "device", value_name = "NAME", default_value = "cam0")]
+    device: String,
+    #[command(flatten)]
+    poses: DirectionOption,
+    #[command(flatten)]
+    to: Destination,
+}
+
+impl Import {
+    pub async fn run(self) -> anyhow::Result<()> {
+        match self.format {
+            Format::Scannet(plain) => plain.import("scannet", scannet).await,
+            Format::Arkitscenes(plain) => {
+                plain
+                    .import("arkitscenes", datasets::read_arkitscenes)
+                    .await
+            }
+            Format::Tum(plain) => plain.import("tum", datasets::read_tum).await,
+            Format::TwelveScenes(plain) => {
+                plain.import("12scenes", datasets::read_twelve_scenes).await
+            }
+            Format::SevenScenes(seven) => seven.import().await,
+            Format::Folder(plain) => {
+                plain
+                    .import("folder", |path, _| datasets::read_folder(path))
+                    .await
+            }
+            Format::Colmap(colmap) => colmap.import().await,
+            Format::Transforms(plain) => {
+                plain.import("transforms", datasets::read_transforms).await
+            }
+            Format::Kitti(kitti) => kitti.import().await,
+            Format::Euroc(euroc) => euroc.import().await,
+            Format::Bag(bag) => bag.import().await,
+            Format::Numpy(numpy) => numpy.import().await,
+            Format::Bundle(plain) => {
+                plain
+                    .import("bundle", |path, _| datasets::read_bundle(path))
+                    .await
+            }
+        }
+    }
+}
+
+/// A `.sens` file holds a whole scan; otherwise an exporter has unpacked it into a folder.
+fn scannet(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, datasets::Error> {
+    if path.is_file() {
+        datasets::read_sens(path, reader)
+    } else {
+        datasets::read_scannet(path, reader)
+    }
+}
+
+impl Seven {
+    async fn import(self) -> anyhow::Result<()> {
+        let choice = SevenScenes {
+            sequence: self.sequence,
+            rgb_from_depth: self.rgb_from_depth,
+        };
+        let read =
+            |reader: &mut Reader<'_>| datasets::read_seven_scenes(&self.path, &choice, reader);
+        let recording = self.to.read(read)?;
+
+        self.to
+            .publish("7scenes", &self.path, recording, self.poses.direction)
+            .await
+    }
+}
+
+impl Colmap {
+    async fn import(self) -> anyhow::Result<()> {
+        let read = |reader: &mut Reader<'_>| {
+            datasets::read_colmap(&self.path, self.images.as_deref(), reader)
+        };
+        let recording = self.to.read(read)?;
+
+        self.to
+            .publish("colmap", &self.path, recording, self.poses.direction)
+            .await
+    }
+}
+
+impl KittiFiles {
+    async fn import(self) -> anyhow::Result<()> {
+        let beside = Kitti {
+            images: self.images,
+            times: self.times,
+        };
+        let read = |reader: &mut Reader<'_>| datasets::read_kitti(&self.path, &beside, reader);
+        let recording = self.to.read(read)?;
+
+        self.to
+            .publish("kitti", &self.path, recording, self.poses.direction)
+            .await
+    }
+}
+
+impl Euroc {
+    async fn import(self) -> anyhow::Result<()> {
+        let read = |reader: &mut Reader<'_>| datasets::read_euroc(&self.path, &self.device, reader);
+        let recording = self.to.read(read)?;
+
+        self.to
+            .publish("euroc", &self.path, recording, self.poses.direction)
+            .await
+    }
+}
+
+impl Plain {
+    /// Reads a recording of one format and publishes it.
+    async fn import(
+        self,
+        format: &str,
+        read: impl FnOnce(&Path, &mut Reader<'_>) -> Result<Recording, datasets::Error>,
+    ) -> anyhow::Result<()> {
+        let recording = self.to.read(|reader| read(&self.path, reader))?;
+        self.to
+            .publish(format, &self.path, recording, self.poses.direction)
+            .await
+    }
+}

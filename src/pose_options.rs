@@ -1,0 +1,198 @@
+//! The options that say how a recording's poses are written down.
+
+use clap::{Args, ValueEnum};
+use seese3_core::geometry::Pose;
+use seese3_data::pose_check::{Axes, Convention, Direction, QuaternionOrder};
+
+/// How poses are written down in the files.
+#[derive(Debug, Clone, Args)]
+pub struct PoseOptions {
+    /// Which way the camera's axes point in the poses
+    #[arg(long, value_enum, default_value_t = AxesName::Opencv)]
+    convention: AxesName,
+    /// Order of the numbers of quaternions in the files; `wxyz` where a format that has the scalar
+    /// last was written with the scalar first
+    #[arg(long, value_enum, default_value_t = QuaternionName::AsTheFormat)]
+    quaternions: QuaternionName,
+    /// By how many degrees the images are turned clockwise against the camera that the poses are of
+    #[arg(long, value_name = "DEGREES", default_value_t = 0, value_parser = quarter_turns)]
+    images_turned: u16,
+    /// Multiply all translations by this, to get metres: 0.001 for millimetres
+    #[arg(long, value_name = "FACTOR", value_parser = scale)]
+    scale: Option<f64>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum AxesName {
+    /// x right, y down, z forward
+    Opencv,
+    /// x right, y up, z backward; also Blender, NeRF and ARKit
+    Opengl,
+    /// x forward, y left, z up
+    Ros,
+}
+
+/// The option `--poses` of most formats.
+#[derive(Debug, Clone, Args)]
+pub struct DirectionOption {
+    /// Which transform the poses are, after what the format itself says has been applied
+    #[arg(long = "poses", value_enum, default_value_t = DirectionName::WorldFromCamera)]
+    pub direction: DirectionName,
+}
+
+/// The two transforms that a pose can be, by their names on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+#[value(rename_all = "snake_case")]
+pub enum DirectionName {
+    /// From the camera to the world: the translation is the camera's position
+    #[default]
+    WorldFromCamera,
+    /// From the world to the camera: the inverse
+    CameraFromWorld,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum QuaternionName {
+    /// As the format has them
+    AsTheFormat,
+    /// The scalar first
+    Wxyz,
+}
+
+fn quarter_turns(text: &str) -> Result<u16, String> {
+    match text.parse() {
+        Ok(degrees @ (0 | 90 | 180 | 270)) => Ok(degrees),
+        _ => Err("must be 0, 90, 180 or 270".to_owned()),
+    }
+}
+
+fn scale(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(factor) if factor.is_finite() && factor > 0.0 => Ok(factor),
+        _ => Err("must be a number above 0".to_owned()),
+    }
+}
+
+impl PoseOptions {
+    /// The convention that is meant.
+    pub fn convention(&self, direction: DirectionName) -> Convention {
+        Convention {
+            axes: match self.convention {
+                AxesName::Opencv => Axes::OpenCv,
+                AxesName::Opengl => Axes::OpenGl,
+                AxesName::Ros => Axes::Ros,
+            },
+            direction: match direction {
+                DirectionName::WorldFromCamera => Direction::WorldFromCamera,
+                DirectionName::CameraFromWorld => Direction::CameraFromWorld,
+            },
+            image_quarter_turns: (self.images_turned / 90) as u8,
+            quaternions: match self.quaternions {
+                QuaternionName::AsTheFormat => QuaternionOrder::Stated,
+                QuaternionName::Wxyz => QuaternionOrder::ScalarFirst,
+            },
+        }
+    }
+
+    /// Whether nothing was said of the unit of translations.
+    pub fn has_no_scale(&self) -> bool {
+        self.scale.is_none()
+    }
+
+    /// Poses with their translations in metres, still in the convention in which they are stated.
+    pub fn scaled(&self, poses: &[Pose]) -> Vec<Pose> {
+        let scaled = poses.iter().map(|pose| {
+            let mut pose = *pose;
+            pose.translation.vector *= self.scale.unwrap_or(1.0);
+            pose
+        });
+        scaled.collect()
+    }
+}
+
+/// The options that read poses in a convention, as they are typed.
+pub fn flags_of(convention: Convention) -> String {
+    let axes = match convention.axes {
+        Axes::OpenCv => "opencv",
+        Axes::OpenGl => "opengl",
+        Axes::Ros => "ros",
+    };
+    let direction = match convention.direction {
+        Direction::WorldFromCamera => "world_from_camera",
+        Direction::CameraFromWorld => "camera_from_world",
+    };
+
+    let mut flags = Vec::new();
+    let usual = Convention::default();
+    if convention.axes != usual.axes {
+        flags.push(format!("--convention {axes}"));
+    }
+    if convention.direction != usual.direction {
+        flags.push(format!("--poses {direction}"));
+    }
+    if convention.quaternions == QuaternionOrder::ScalarFirst {
+        flags.push("--quaternions wxyz".to_owned());
+    }
+    if convention.image_quarter_turns > 0 {
+        let degrees = 90 * u16::from(convention.image_quarter_turns);
+        flags.push(format!("--images-turned {degrees}"));
+    }
+    if flags.is_empty() {
+        flags.push("without options on poses".to_owned());
+    }
+
+    flags.join(" ")
+}
+
+/// A convention in words: what the poses are then.
+pub fn in_words(convention: Convention) -> String {
+    let axes = match convention.axes {
+        Axes::OpenCv => "along x right, y down, z forward",
+        Axes::OpenGl => "along OpenGL's axes",
+        Axes::Ros => "along the axes of a ROS body",
+    };
+    let direction = match convention.direction {
+        Direction::WorldFromCamera => "world_from_camera",
+        Direction::CameraFromWorld => "camera_from_world, the inverse,",
+    };
+    let quaternions = match convention.quaternions {
+        QuaternionOrder::Stated => "",
+        QuaternionOrder::ScalarFirst => ", with the scalar of quaternions first",
+    };
+    let turned = match convention.image_quarter_turns {
+        0 => String::new(),
+        turns => format!(
+            ", of images that were turned clockwise by {} degrees",
+            90 * u16::from(turns)
+        ),
+    };
+
+    format!("{direction} {axes}{quaternions}{turned}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Debug, Parser)]
+    struct Command {
+        #[command(flatten)]
+        options: PoseOptions,
+        #[command(flatten)]
+        direction: DirectionOption,
+    }
+
+    /// Oracle: the promise of the messages: the options that are named give the convention that is
+    /// meant.
+    #[test]
+    fn what_is_advised_is_understood() {
+        for convention in Convention::all() {
+            let flags = flags_of(convention);
+            let words = flags.split(' ').filter(|_| flags.starts_with("--"));
+            let command = Command::try_parse_from(["import"].into_iter().chain(words)).unwrap();
+            let understood = command.options.convention(command.direction.direction);
+            assert_eq!(understood, convention, "{flags}");
+        }
+    }
+}

@@ -1,0 +1,255 @@
+//! `seese3 push`: uploads a room or an adapter to a server.
+
+use anyhow::bail;
+use clap::Args;
+use serde_json::json;
+use sha2::{Digest, Sha256};
+
+use super::ask::Server;
+use super::output::{JsonOutput, say};
+use seese3_client::proto::v1 as pb;
+use seese3_core::features::Features;
+use seese3_core::geometry::Pose;
+use seese3_server::{pinhole_to_wire, source_to_wire};
+use seese3_store::{Kind, ResourceName, Store, StoredRoom};
+
+/// The size of a message, bytes, as far as frames can be divided: well below what servers take.
+const MESSAGE_BYTES: usize = 1 << 20;
+
+#[derive(Debug, Args)]
+pub struct Push {
+    /// rooms/NAME or adapters/NAME, or one revision: rooms/NAME/revisions/NUMBER
+    name: ResourceName,
+    /// The store: a folder, or a URL of a bucket (feature `cloud`)
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// The name on the server; the same if omitted
+    #[arg(long = "as", value_name = "NAME")]
+    renamed: Option<String>,
+    /// Add the frames behind those of the room of this name on the server, whose world frame their
+    /// poses are in
+    #[arg(long)]
+    extend: bool,
+    /// With --extend: the room's features that these frames do not have may be missing in its new
+    /// revision
+    #[arg(long, requires = "extend")]
+    drop_other_features: bool,
+    /// Of a room: afterwards let the server fit an adapter to all of its frames
+    #[arg(long, conflicts_with = "validate_only")]
+    refit: bool,
+    /// Only let the server check it
+    #[arg(long)]
+    validate_only: bool,
+    #[command(flatten)]
+    server: Server,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Push {
+    pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+        let store = Store::open(&self.store)?;
+        let target = target(&self.name, self.renamed.as_deref())?;
+        if (self.extend || self.refit) && self.name.kind == Kind::Adapter {
+            bail!("--extend and --refit are for rooms; an adapter is published as a whole");
+        }
+        let client = self.server.connect().await?;
+
+        let (revision, created, served) = match self.name.kind {
+            Kind::Room => {
+                let stored = store.load_room(&self.name.name, self.name.revision).await?;
+                let messages = room_messages(&stored, self.upload(&stored, &target))?;
+                let answer = client.create_room(tokio_stream::iter(messages)).await?;
+                (answer.revision, answer.created, answer.served)
+            }
+            Kind::Adapter => {
+                let files = store.adapter_files(&self.name.name, self.name.revision);
+                let (manifest, weights) = files.await?;
+                let messages = adapter_messages(manifest, &weights, &target, self.validate_only);
+                let answer = client.publish_adapter(tokio_stream::iter(messages)).await?;
+                (answer.revision, answer.created, answer.served)
+            }
+        };
+
+        let Some(revision) = revision else {
+            say(format_args!("{target} would be accepted"));
+            return self
+                .json
+                .write(&json!({ "name": target.to_string(), "valid": true }));
+        };
+        let state = match (created, served) {
+            (true, true) => "published and served",
+            (false, true) if self.extend => "it has these frames already",
+            (false, true) => "already there, unchanged, and served",
+            (true, false) => "published; the server answers from another revision",
+            (false, false) => "already there, unchanged; the server answers from another revision",
+        };
+        say(format_args!(
+            "{}: {state}",
+            target.clone().at(revision.revision)
+        ));
+
+        let mut fitted_adapter = None;
+        if self.refit {
+            let request = pb::RefitRoomRequest {
+                name: target.to_string(),
+                ..pb::RefitRoomRequest::default()
+            };
+            let fitted = client.refit_room(request, |_| ()).await?.revision;
+            let fitted = fitted.unwrap_or_default();
+            say(format_args!(
+                "adapters/{}/revisions/{}: fitted to it",
+                fitted.name, fitted.revision
+            ));
+            fitted_adapter = Some(json!({ "name": fitted.name, "revision": fitted.revision }));
+        }
+
+        self.json.write(&json!({
+            "name": target.to_string(),
+            "revision": revision.revision,
+            "created": created,
+            "served": served,
+            "fitted_adapter": fitted_adapter,
+        }))
+    }
+
+    /// The description of a room's upload.
+    fn upload(&self, stored: &StoredRoom, target: &ResourceName) -> pb::RoomUpload {
+        let provenance = stored.room.provenance();
+        // A room that is extended keeps its own.
+        let own = |words: &String| {
+            if self.extend {
+                String::new()
+            } else {
+                words.clone()
+            }
+        };
+
+        pb::RoomUpload {
+            name: target.to_string(),
+            features: stored
+                .features
+                .iter()
+                .map(|set| source_to_wire(set.source()))
+                .collect(),
+            encode_for: String::new(),
+            format: own(&provenance.format),
+            licence: own(&provenance.licence),
+            camera: provenance.camera.as_ref().map(pinhole_to_wire),
+            request_id: String::new(),
+            validate_only: self.validate_only,
+            extend: self.extend,
+            drop_other_features: self.drop_other_features,
+        }
+    }
+}
+
+/// The name on the server. It may be given as a plain name or as that of a room or adapter.
+fn target(source: &ResourceName, renamed: Option<&str>) -> anyhow::Result<ResourceName> {
+    let collection = source.kind.collection();
+    let name = match renamed {
+        None => source.name.clone(),
+        Some(given) => match given.split_once('/') {
+            Some((first, name)) if first == collection => name.to_owned(),
+            _ => given.to_owned(),
+        },
+    };
+
+    Ok(format!("{collection}/{name}").parse()?)
+}
+
+/// The messages of an upload. What the protocol does not carry, the numbers and the held-out marks
+/// of a dataset and the paths of its images, stays behind.
+fn room_messages(
+    stored: &StoredRoom,
+    upload: pb::RoomUpload,
+) -> anyhow::Result<Vec<pb::CreateRoomRequest>> {
+    use pb::create_room_request::Message;
+
+    if stored.features.is_empty() {
+        bail!("the room has no features; `seese3 encode` makes them");
+    }
+
+    let columns: usize = stored.features.iter().map(|set| set.rows().ncols()).sum();
+    let at_once = (MESSAGE_BYTES / (128 + 4 * columns)).max(1);
+    let frame_count = stored.room.frame_count();
+    let mut digest = Sha256::new();
+    let mut messages = vec![Message::Room(upload)];
+
+    for first in (0..frame_count).step_by(at_once) {
+        let batch = batch(stored, first..(first + at_once).min(frame_count));
+        digest.update(&batch.poses);
+        batch.features.iter().for_each(|rows| digest.update(rows));
+        messages.push(Message::Frames(batch));
+    }
+    messages.push(Message::End(pb::UploadEnd {
+        frame_count: frame_count as u32,
+        sha256: digest.finalize().to_vec(),
+    }));
+
+    Ok(messages
+        .into_iter()
+        .map(|message| pb::CreateRoomRequest {
+            message: Some(message),
+        })
+        .collect())
+}
+
+fn batch(stored: &StoredRoom, rows: std::ops::Range<usize>) -> pb::FrameBatch {
+    /// The part of a column; empty if the room has no such column.
+    fn part<T: Clone>(column: &[T], rows: &std::ops::Range<usize>) -> Vec<T> {
+        column.get(rows.clone()).unwrap_or_default().to_vec()
+    }
+
+    let pose_bytes = |pose: &Pose| {
+        // nalgebra stores a matrix by column; the transpose gives the rows that NumPy has.
+        let matrix = pose.to_homogeneous().transpose();
+        let numbers = matrix.iter().flat_map(|number| number.to_le_bytes());
+        numbers.collect::<Vec<u8>>()
+    };
+    let feature_bytes = |set: &Features| {
+        let part = set.rows().slice_move(ndarray::s![rows.clone(), ..]);
+        part.iter()
+            .flat_map(|number| number.to_le_bytes())
+            .collect()
+    };
+
+    let frames = stored.room.frames();
+    pb::FrameBatch {
+        poses: frames.poses[rows.clone()]
+            .iter()
+            .flat_map(pose_bytes)
+            .collect(),
+        features: stored.features.iter().map(feature_bytes).collect(),
+        images: Vec::new(),
+        timestamps_ns: part(&frames.timestamps_ns, &rows),
+        frame_names: part(&frames.names, &rows),
+        sequences: part(&frames.sequences, &rows),
+    }
+}
+
+fn adapter_messages(
+    manifest: Vec<u8>,
+    weights: &[u8],
+    target: &ResourceName,
+    validate_only: bool,
+) -> Vec<pb::PublishAdapterRequest> {
+    use pb::publish_adapter_request::Message;
+
+    let upload = pb::AdapterUpload {
+        name: target.to_string(),
+        manifest,
+        request_id: String::new(),
+        validate_only,
+    };
+    let parts = weights.chunks(MESSAGE_BYTES);
+    let parts = parts.map(|part| Message::Weights(part.to_vec()));
+
+    std::iter::once(Message::Adapter(upload))
+        .chain(parts)
+        .map(|message| pb::PublishAdapterRequest {
+            message: Some(message),
+        })
+        .collect()
+}

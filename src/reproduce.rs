@@ -1,0 +1,254 @@
+//! `seese3 reproduce`: the paper's tables and figures on given rooms, as one report.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context, bail};
+use clap::Args;
+use serde::Serialize;
+
+use seese3_core::features::Features;
+use seese3_core::image::RgbImage;
+use seese3_core::room::{FrameId, Room, is_plain_name};
+use seese3_lab::report::Document;
+use seese3_lab::reproduction::{
+    EXPERIMENTS, FeatureSet, Images, Options, Reproduced, ReproducedAdapter, Reproduction,
+    ReproductionRecord, adapter_names, check, reproduce,
+};
+
+use super::output::{JsonOutput, say, write_file, write_json};
+use super::progress::bar;
+use super::rooms::{data, load_rooms};
+use seese3_encoder::{encode_png, read_image};
+use seese3_store::{Store, StoredRoom};
+
+#[derive(Debug, Args)]
+pub struct Reproduce {
+    /// The store
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// Rooms that one adapter is trained on together: names, or patterns with *
+    #[arg(long, required = true)]
+    train: Vec<String>,
+    /// Held-out rooms, which the adapters of several rooms never see: names, or patterns with *
+    #[arg(long, required = true)]
+    test: Vec<String>,
+    /// Rooms that each get an adapter of their own, for the tables within a room: names, or
+    /// patterns with *
+    #[arg(long = "in-room", required = true)]
+    in_room: Vec<String>,
+    /// Feature sets that every room has, separated by commas; the last one is the control and
+    /// should need no trained encoder
+    #[arg(long, required = true, value_delimiter = ',')]
+    features: Vec<String>,
+    /// Frames from source to target
+    #[arg(long, default_value_t = 25)]
+    stride: u32,
+    /// Strides of the curves within a room
+    #[arg(long, value_delimiter = ',', default_values_t = [5, 10, 20, 40])]
+    strides: Vec<u32>,
+    /// Numbers of training rooms along the scaling curve
+    #[arg(long, value_delimiter = ',', default_values_t = [5, 10, 20, 35, 50, 75, 100])]
+    sizes: Vec<usize>,
+    /// How many of the training rooms are calibration rooms, which the adapter's errors are
+    /// measured in
+    #[arg(long, alias = "aside", default_value_t = 20)]
+    calibration_rooms: usize,
+    /// How many seeds, from 0 on, where a table averages over seeds
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
+    seeds: u64,
+    /// The same for the table of the alternatives A to D, in which the paper takes 15
+    #[arg(long, default_value_t = 15, value_parser = clap::value_parser!(u64).range(1..=100))]
+    formulation_seeds: u64,
+    /// Epochs, in place of every preset's own: for a quick trial of the command
+    #[arg(long)]
+    epochs: Option<usize>,
+    /// Folder of the report; created if it does not exist
+    #[arg(long, default_value = "reproduction")]
+    out: PathBuf,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+type Loaded = (StoredRoom, Features);
+
+/// The rooms of the three groups, each with the same one of its feature sets.
+struct LoadedSet {
+    features: String,
+    train: Vec<Loaded>,
+    test: Vec<Loaded>,
+    in_room: Vec<Loaded>,
+}
+
+impl LoadedSet {
+    fn borrowed(&self) -> FeatureSet<'_> {
+        FeatureSet {
+            features: self.features.clone(),
+            train: self.train.iter().map(data).collect(),
+            test: self.test.iter().map(data).collect(),
+            in_room: self.in_room.iter().map(data).collect(),
+        }
+    }
+}
+
+/// Images where the rooms were recorded.
+struct RecordedImages;
+
+impl Images for RecordedImages {
+    fn read(&self, room: &Room, frame: FrameId) -> Result<RgbImage, String> {
+        let root = PathBuf::from(&room.provenance().images_root);
+        read_image(&root, &room.images()[frame.row()]).map_err(|error| error.to_string())
+    }
+
+    fn png(&self, image: &RgbImage) -> Result<Vec<u8>, String> {
+        encode_png(image).map_err(|error| error.to_string())
+    }
+}
+
+impl Reproduce {
+    pub async fn run(self) -> anyhow::Result<()> {
+        self.json.begin()?;
+        let begun = Instant::now();
+        let store = Store::open(&self.store)?;
+        let sets = self.load(&store).await?;
+        let reproduction = Reproduction {
+            options: self.options(),
+            sets: sets.iter().map(LoadedSet::borrowed).collect(),
+            images: &RecordedImages,
+        };
+
+        // Everything that can be refused is refused now, and not after hours of training.
+        check(&reproduction)?;
+        for name in adapter_names(&reproduction) {
+            if !is_plain_name(&name) {
+                bail!("adapter name '{name}' is not valid: give shorter --features or --in-room");
+            }
+        }
+        std::fs::create_dir_all(&self.out)
+            .with_context(|| format!("{} cannot be made", self.out.display()))?;
+
+        let progress = bar(EXPERIMENTS, "reproduce");
+        let Reproduced {
+            document,
+            record,
+            adapters,
+        } = reproduce(&reproduction, &|| progress.inc(1))?;
+        progress.finish_and_clear();
+
+        // A run that fails before this point publishes nothing.
+        let published = publish(&store, &adapters).await?;
+        let record = FileRecord {
+            record,
+            adapters: published,
+            seconds: begun.elapsed().as_secs_f64(),
+        };
+
+        write(&self.out, &document, &record)?;
+        self.json.write(&record)
+    }
+
+    fn options(&self) -> Options {
+        Options {
+            stride: self.stride,
+            strides: self.strides.clone(),
+            sizes: self.sizes.clone(),
+            calibration_rooms: self.calibration_rooms,
+            seeds: self.seeds,
+            formulation_seeds: self.formulation_seeds,
+            epochs: self.epochs,
+        }
+    }
+
+    async fn load(&self, store: &Store) -> anyhow::Result<Vec<LoadedSet>> {
+        let mut sets = Vec::new();
+        for features in &self.features {
+            sets.push(LoadedSet {
+                features: features.clone(),
+                train: load_rooms(store, &self.train, Some(features)).await?,
+                test: load_rooms(store, &self.test, Some(features)).await?,
+                in_room: load_rooms(store, &self.in_room, Some(features)).await?,
+            });
+        }
+
+        Ok(sets)
+    }
+}
+
+/// The file `record.json`.
+#[derive(Debug, Serialize)]
+struct FileRecord {
+    #[serde(flatten)]
+    record: ReproductionRecord,
+    adapters: Vec<PublishedAdapter>,
+    /// Wall time of the whole run.
+    seconds: f64,
+}
+
+/// An adapter in the store, and how it was trained.
+#[derive(Debug, Serialize)]
+struct PublishedAdapter {
+    name: String,
+    revision: u64,
+    preset: String,
+    seed: u64,
+    epochs: usize,
+    charts: usize,
+    split: &'static str,
+    stride: u32,
+    pairs: usize,
+    rooms: usize,
+    calibration_rooms: usize,
+}
+
+/// Publishes every adapter.
+async fn publish(
+    store: &Store,
+    adapters: &[ReproducedAdapter],
+) -> anyhow::Result<Vec<PublishedAdapter>> {
+    let mut published = Vec::with_capacity(adapters.len());
+    for reproduced in adapters {
+        let record = &reproduced.record;
+        let revision = store
+            .publish_experiment(
+                &reproduced.name,
+                &reproduced.adapter,
+                record,
+                reproduced.golden_features.view(),
+            )
+            .await?
+            .revision;
+
+        published.push(PublishedAdapter {
+            name: reproduced.name.clone(),
+            revision,
+            preset: record.preset.clone(),
+            seed: record.config.seed,
+            epochs: record.config.epochs,
+            charts: record.config.charts,
+            split: record.split.name(),
+            stride: record.stride,
+            pairs: record.pair_count,
+            rooms: record.rooms.len(),
+            calibration_rooms: record.calibrated_on.len(),
+        });
+    }
+
+    Ok(published)
+}
+
+fn write(out: &Path, document: &Document, record: &FileRecord) -> anyhow::Result<()> {
+    for picture in document.pictures() {
+        write_file(&out.join(&picture.name), &picture.bytes)?;
+    }
+
+    write_file(&out.join("report.md"), document.markdown("").as_bytes())?;
+    write_file(&out.join("report.html"), document.html().as_bytes())?;
+    write_json(&out.join("record.json"), record)?;
+
+    say(format_args!(
+        "wrote {0}/report.html, {0}/report.md and {0}/record.json",
+        out.display()
+    ));
+
+    Ok(())
+}

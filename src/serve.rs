@@ -1,0 +1,456 @@
+//! `seese3 serve`: answers over gRPC until SIGTERM or Ctrl-C.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use clap::{ArgAction, Args, ValueEnum};
+use tokio::net::TcpListener;
+use tokio::sync::Notify;
+
+use super::encoder::RuntimeName;
+use super::log::{LogFormat, Traces, start_log};
+use super::output::say;
+use seese3_core::navigation::{IndexKind, Limits};
+use seese3_encoder::{Bounds, Runtime};
+use seese3_server::{
+    Config, ImageEncoders, Keyring, Listeners, Reload, RoomMemory, Tls, TlsFiles, TokenKey, run,
+    shutdown_signal,
+};
+use seese3_store::Store;
+
+#[derive(Debug, Args)]
+pub struct Serve {
+    /// File of settings in TOML, each named as its flag without the dashes; flags and the environment
+    /// go before it
+    #[arg(long, value_name = "FILE", env = "SEESE3_CONFIG")]
+    config: Option<PathBuf>,
+    /// The store to serve: a folder, or a URL of a bucket (feature `cloud`)
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// Address to listen on, HOST:PORT; port 0 takes a free port
+    #[arg(long, env = "SEESE3_LISTEN", default_value = "127.0.0.1:50051")]
+    listen: String,
+    /// Address for those who operate the server, HOST:PORT: /metrics for Prometheus, /livez and
+    /// /readyz, over plain HTTP; none if omitted. Whoever reaches it may read it
+    #[arg(long, value_name = "ADDR", env = "SEESE3_METRICS_LISTEN")]
+    metrics_listen: Option<String>,
+    /// File with the callers and their rights, in TOML; everybody may call everything if omitted
+    #[arg(long, value_name = "FILE", env = "SEESE3_AUTH_FILE")]
+    auth_file: Option<PathBuf>,
+    /// The server's certificate and those above it, in PEM; plain text if omitted
+    #[arg(
+        long,
+        value_name = "FILE",
+        env = "SEESE3_TLS_CERT",
+        requires = "tls_key"
+    )]
+    tls_cert: Option<PathBuf>,
+    /// The private key of the certificate, in PEM
+    #[arg(
+        long,
+        value_name = "FILE",
+        env = "SEESE3_TLS_KEY",
+        requires = "tls_cert"
+    )]
+    tls_key: Option<PathBuf>,
+    /// Authorities in PEM: only clients with a certificate of theirs may connect
+    #[arg(
+        long,
+        value_name = "FILE",
+        env = "SEESE3_TLS_CLIENT_CA",
+        requires = "tls_cert"
+    )]
+    tls_client_ca: Option<PathBuf>,
+    /// Largest number of connections at a time, 1 to 1000000; one more is closed at once
+    #[arg(long, env = "SEESE3_MAX_CONNECTIONS", default_value_t = Config::default().connections, value_parser = bounded(1, 1_000_000))]
+    max_connections: usize,
+    /// How the nearest frames are searched
+    #[arg(long, env = "SEESE3_INDEX", value_enum, default_value_t = IndexName::Exact)]
+    index: IndexName,
+    /// Load and verify every room before it is served; with `false`, when it is first asked for: the
+    /// start is short, and a damaged room is noticed late
+    #[arg(long, env = "SEESE3_PRELOAD", default_value_t = RoomMemory::default().preload, default_missing_value = "true", num_args = 0..=1, action = ArgAction::Set)]
+    preload: bool,
+    /// What the rooms in memory may hold together, about, 1048576 to 1099511627776 bytes; beyond it
+    /// the room that was asked for the longest time ago is dropped, and loaded again when it is asked
+    /// for; no bound if omitted. A room that is in use by a stream stays
+    #[arg(long, env = "SEESE3_MAX_ROOM_BYTES", value_parser = bounded(1 << 20, 1 << 40))]
+    max_room_bytes: Option<usize>,
+    /// Also accept images instead of features, encoded by these models: `builtin`, `pixels`, or the
+    /// ONNX files that the adapters' features were made with, separated by commas; none if omitted
+    #[arg(
+        long = "encoder",
+        value_name = "MODEL",
+        env = "SEESE3_ENCODER",
+        value_delimiter = ','
+    )]
+    encoders: Vec<String>,
+    /// XFeat's ONNX file: the motion between two images of a known camera is then read from where
+    /// things are in both, in rooms that nobody has mapped
+    #[arg(long, value_name = "FILE", env = "SEESE3_TWO_VIEW")]
+    two_view: Option<PathBuf>,
+    /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
+    #[arg(long, env = "SEESE3_RUNTIME", value_enum, default_value_t = RuntimeName::Tract)]
+    runtime: RuntimeName,
+    /// Path of the shared library of onnxruntime
+    #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
+    library: Option<std::path::PathBuf>,
+    /// Largest accepted image, 1 to 1000000000 pixels after decoding
+    #[arg(long, env = "SEESE3_MAX_IMAGE_PIXELS", default_value_t = 16_000_000, value_parser = clap::value_parser!(u64).range(1..=1_000_000_000))]
+    max_image_pixels: u64,
+    /// Largest number of steps in one navigation
+    #[arg(long, env = "SEESE3_MAX_STEPS", default_value_t = Limits::default().steps, value_parser = clap::value_parser!(u32).range(1..))]
+    max_steps: u32,
+    /// Largest number of frames returned for one step or one localisation
+    #[arg(long, env = "SEESE3_MAX_TOP_K", default_value_t = Limits::default().top_k, value_parser = clap::value_parser!(u32).range(1..))]
+    max_top_k: u32,
+    /// Largest number of frames in one answer (steps times frames per step)
+    #[arg(long, env = "SEESE3_MAX_FRAMES_IN_ANSWER", default_value_t = Limits::default().frames_in_answer, value_parser = clap::value_parser!(u64).range(1..))]
+    max_frames_in_answer: u64,
+    /// What all requests in progress may hold in memory together, 16777216 to 1099511627776 bytes:
+    /// what has arrived, what it becomes when it is decoded, and answers that are not sent yet.
+    /// Beyond it requests are refused
+    #[arg(long, env = "SEESE3_MAX_MEMORY_BYTES", default_value_t = Config::default().memory_bytes, value_parser = bounded(16 << 20, 1 << 40))]
+    max_memory_bytes: usize,
+    /// Let callers change the catalog: upload and remove rooms and adapters, fit, choose defaults. With
+    /// --auth-file only those with the verb "write"
+    #[arg(long, env = "SEESE3_WRITABLE")]
+    writable: bool,
+    /// Let callers that list a room's frames also see its images, as thumbnails of at most 512 pixels in
+    /// width. They are read from where the room was imported from
+    #[arg(long, env = "SEESE3_THUMBNAILS")]
+    thumbnails: bool,
+    /// What all uploads in progress may hold in memory together, 1048576 to 1099511627776 bytes
+    #[arg(long, env = "SEESE3_MAX_UPLOAD_BYTES", default_value_t = Config::default().upload_bytes, value_parser = bounded(1 << 20, 1 << 40))]
+    max_upload_bytes: usize,
+    /// Largest message accepted from a client, 1024 to 1073741824 bytes; also the size limit of an
+    /// encoded image
+    #[arg(long, env = "SEESE3_MAX_MESSAGE_BYTES", default_value_t = Config::default().message_bytes, value_parser = bounded(1_024, 1 << 30))]
+    max_message_bytes: usize,
+    /// Time limit of a request, seconds, 1 to 86400, whatever deadline the client sets
+    #[arg(long, env = "SEESE3_MAX_REQUEST_SECONDS", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=86_400))]
+    max_request_seconds: u64,
+    /// Time for which requests are still accepted after SIGTERM or Ctrl-C while health says
+    /// NOT_SERVING, so that load balancers notice first, seconds, 0 to 86400
+    #[arg(long, env = "SEESE3_LAME_DUCK_SECONDS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=86_400))]
+    lame_duck_seconds: u64,
+    /// Time that running requests then get to finish, seconds, 0 to 86400
+    #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = 10, value_parser = clap::value_parser!(u64).range(0..=86_400))]
+    drain_seconds: u64,
+    /// Seconds between two looks for changes of the store, 0 to 86400; new revisions are then served
+    /// without a restart. 0 looks only when the process gets SIGHUP, which also tries again what was
+    /// refused
+    #[arg(long, env = "SEESE3_RELOAD_SECONDS", default_value_t = 5, value_parser = clap::value_parser!(u64).range(0..=86_400))]
+    reload_seconds: u64,
+    /// Largest number of tracking streams at a time, 1 to 1000000; one more is refused
+    #[arg(long, env = "SEESE3_MAX_STREAMS", default_value_t = Config::default().streams, value_parser = bounded(1, 1_000_000))]
+    max_streams: usize,
+    /// File with a secret of at least 16 bytes that signs the resume tokens of tracking streams.
+    /// Servers with the same secret can continue each other's streams; if omitted, the key is
+    /// random and tokens are void once the server ends
+    #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_KEY_FILE")]
+    token_key_file: Option<PathBuf>,
+    /// Requests computed at the same time, and threads of an onnxruntime session, 1 to 1024; the
+    /// number of cores if omitted
+    #[arg(long, env = "SEESE3_THREADS", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+    /// Requests that may wait for a thread, 0 to 1000000; further ones are refused
+    #[arg(long, env = "SEESE3_QUEUE", default_value_t = 1_024, value_parser = clap::value_parser!(u32).range(0..=1_000_000))]
+    queue: u32,
+    /// Format of the log, which goes to standard error; RUST_LOG sets what is logged
+    #[arg(long, env = "SEESE3_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
+    log_format: LogFormat,
+    /// Send spans of requests to the OpenTelemetry collector at this address, such as
+    /// http://127.0.0.1:4317 (OTLP over gRPC, plain text). Needs a build with the feature `otlp`
+    #[arg(long, value_name = "URL", env = "SEESE3_OTLP_ENDPOINT")]
+    otlp_endpoint: Option<String>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum IndexName {
+    /// Exact: the distance to every frame is computed
+    Exact,
+    /// Approximate HNSW graph (crate hnsw_rs), for rooms of 100,000 frames and more
+    Hnsw,
+}
+
+impl IndexName {
+    fn kind(self) -> anyhow::Result<IndexKind> {
+        match self {
+            Self::Exact => Ok(IndexKind::Exact),
+            #[cfg(feature = "hnsw")]
+            Self::Hnsw => Ok(IndexKind::Hnsw(
+                seese3_core::index::HnswParameters::default(),
+            )),
+            #[cfg(not(feature = "hnsw"))]
+            Self::Hnsw => Err(super::output::not_built("--index hnsw", "hnsw")),
+        }
+    }
+}
+
+/// Parses a count that must lie in a range.
+fn bounded(least: u64, most: u64) -> clap::builder::RangedU64ValueParser<usize> {
+    clap::builder::RangedU64ValueParser::new().range(least..=most)
+}
+
+impl Serve {
+    pub async fn run(self) -> anyhow::Result<()> {
+        let traces = self.traces()?;
+        let log = start_log(self.log_format, traces.as_ref());
+        let store = Store::open(&self.store)?;
+        let config = self.server_config()?;
+        let losses = log.losses();
+        config.metrics.count_elsewhere(
+            "log_lines_lost",
+            "Lines of the log that could not be written",
+            move || losses.count(),
+        );
+
+        // The port is opened before the store is loaded: health checks are answered at once,
+        // NOT_SERVING until everything is loaded.
+        let listener = TcpListener::bind(&self.listen)
+            .await
+            .with_context(|| format!("cannot listen on {}", self.listen))?;
+
+        // With port 0 the system chose the port; the line on standard output tells scripts which
+        // one.
+        let address = listener
+            .local_addr()
+            .context("the listener has no address")?;
+        say(format_args!("listening on {address}"));
+
+        let operations = match &self.metrics_listen {
+            None => None,
+            Some(address) => {
+                let listener = TcpListener::bind(address).await;
+                let listener = listener
+                    .with_context(|| format!("--metrics-listen: cannot listen on {address}"))?;
+                let address = listener
+                    .local_addr()
+                    .context("the listener has no address")?;
+                say(format_args!("metrics on {address}"));
+                Some(listener)
+            }
+        };
+        let listeners = Listeners {
+            grpc: listener,
+            operations,
+        };
+
+        let (asked, again) = tokio::sync::oneshot::channel();
+        let stopping = async move {
+            shutdown_signal().await;
+            // An error means that the server ended by itself.
+            let _ = asked.send(());
+        };
+        let signalled_twice = async move {
+            match again.await {
+                Ok(()) => shutdown_signal().await,
+                Err(_) => std::future::pending().await,
+            }
+        };
+
+        tokio::select! {
+            ended = run(listeners, store, config, stopping) => ended?,
+            // Whoever signals twice does not want to wait for requests in flight.
+            () = signalled_twice => bail!("a second signal came: requests in flight were given up"),
+        }
+
+        match log.losses().count() {
+            0 => say("stopped"),
+            lost => say(format_args!("stopped; {lost} lines of the log were lost")),
+        }
+
+        Ok(())
+    }
+}
+
+/// Files that a server has open besides its connections: the store's, the log, listeners.
+const FILES_KEPT: u64 = 128;
+
+/// As many connections as were asked for, or as the system lets this process have. The limit is
+/// raised as far as that goes: by default it is lower than one server needs.
+fn connections_within_file_limit(asked: usize) -> usize {
+    #[cfg(unix)]
+    {
+        use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+
+        let limit = getrlimit(Resource::Nofile);
+        let raised = Rlimit {
+            current: limit.maximum,
+            maximum: limit.maximum,
+        };
+
+        // Where it cannot be raised, the current limit holds.
+        let now = match setrlimit(Resource::Nofile, raised) {
+            Ok(()) => limit.maximum,
+            Err(_) => limit.current,
+        };
+        let Some(files) = now else {
+            return asked;
+        };
+
+        let possible = usize::try_from(files.saturating_sub(FILES_KEPT)).unwrap_or(usize::MAX);
+        if possible < asked {
+            tracing::warn!(
+                asked,
+                possible,
+                "fewer connections: raise the limit of open files (LimitNOFILE, ulimit -n)"
+            );
+        }
+        asked.min(possible.max(1))
+    }
+
+    #[cfg(not(unix))]
+    asked
+}
+
+/// Notified whenever the process gets SIGHUP.
+fn reload_on_hangup() -> Arc<Notify> {
+    let asked = Arc::new(Notify::new());
+
+    #[cfg(unix)]
+    {
+        use tokio::signal::unix::{SignalKind, signal};
+
+        let asked = asked.clone();
+        tokio::spawn(async move {
+            // Where the handler cannot be installed, the server still looks from time to time.
+            let Ok(mut hangup) = signal(SignalKind::hangup()) else {
+                return;
+            };
+            while hangup.recv().await.is_some() {
+                asked.notify_one();
+            }
+        });
+    }
+
+    asked
+}
+
+impl Serve {
+    /// Fails where `serve` would before it opens its port.
+    pub fn check(&self) -> anyhow::Result<()> {
+        Store::open(&self.store)?;
+        self.server_config().map(drop)
+    }
+
+    fn server_config(&self) -> anyhow::Result<Config> {
+        let defaults = Config::default();
+
+        // One number bounds both the requests computed at a time and the threads of an
+        // onnxruntime session.
+        let threads = self.threads.map_or(defaults.threads, usize::from);
+
+        Ok(Config {
+            index: self.index.kind()?,
+            rooms: RoomMemory {
+                preload: self.preload,
+                bytes: self.max_room_bytes,
+            },
+            encoders: (!self.encoders.is_empty() || self.two_view.is_some()).then(|| {
+                ImageEncoders {
+                    models: self.encoders.clone(),
+                    two_view: self.two_view.clone(),
+                    runtime: Runtime {
+                        kind: self.runtime.into(),
+                        threads,
+                        library: self.library.clone(),
+                    },
+                    bounds: Bounds {
+                        // An image arrives within a single message, so it cannot be larger than that.
+                        bytes: self.max_message_bytes as u64,
+                        pixels: self.max_image_pixels,
+                    },
+                }
+            }),
+            limits: Limits {
+                steps: self.max_steps,
+                top_k: self.max_top_k,
+                frames_in_answer: self.max_frames_in_answer,
+            },
+            memory_bytes: self.max_memory_bytes,
+            writable: self.writable,
+            thumbnails: self.thumbnails,
+            upload_bytes: self.max_upload_bytes,
+            message_bytes: self.max_message_bytes,
+            threads,
+            queue: self.queue as usize,
+            longest: Duration::from_secs(self.max_request_seconds),
+            streams: self.max_streams,
+            token_key: self.token_key()?,
+            lame_duck: Duration::from_secs(self.lame_duck_seconds),
+            drain: Duration::from_secs(self.drain_seconds),
+            connections: connections_within_file_limit(self.max_connections),
+            tls: self.tls()?.map(Arc::new),
+            keyring: self.keyring()?.map(Arc::new),
+            reload: Reload {
+                every: (self.reload_seconds > 0).then(|| Duration::from_secs(self.reload_seconds)),
+                asked: reload_on_hangup(),
+            },
+            ..defaults
+        })
+    }
+
+    #[cfg(feature = "otlp")]
+    fn traces(&self) -> anyhow::Result<Option<Traces>> {
+        let Some(endpoint) = &self.otlp_endpoint else {
+            return Ok(None);
+        };
+        let traces = Traces::open(endpoint);
+        traces
+            .map(Some)
+            .map_err(|problem| anyhow::anyhow!("--otlp-endpoint {endpoint}: {problem}"))
+    }
+
+    #[cfg(not(feature = "otlp"))]
+    fn traces(&self) -> anyhow::Result<Option<Traces>> {
+        match &self.otlp_endpoint {
+            None => Ok(None),
+            Some(_) => Err(super::output::not_built("--otlp-endpoint", "otlp")),
+        }
+    }
+
+    fn tls(&self) -> anyhow::Result<Option<Tls>> {
+        // Values of the configuration file reach clap as defaults, to which its rules on what belongs
+        // together do not apply.
+        let (cert, key) = match (&self.tls_cert, &self.tls_key) {
+            (Some(cert), Some(key)) => (cert, key),
+            (None, None) if self.tls_client_ca.is_none() => return Ok(None),
+            _ => bail!("--tls-cert and --tls-key belong together, and --tls-client-ca needs both"),
+        };
+        let files = TlsFiles {
+            cert: cert.clone(),
+            key: key.clone(),
+            client_ca: self.tls_client_ca.clone(),
+        };
+
+        Ok(Some(Tls::open(files)?))
+    }
+
+    fn keyring(&self) -> anyhow::Result<Option<Keyring>> {
+        let Some(file) = &self.auth_file else {
+            return Ok(None);
+        };
+        if self.tls_cert.is_none() {
+            tracing::warn!(
+                "tokens travel in plain text: give --tls-cert, or listen on loopback behind a proxy"
+            );
+        }
+
+        Ok(Some(Keyring::open(file.clone())?))
+    }
+
+    fn token_key(&self) -> anyhow::Result<TokenKey> {
+        let Some(file) = &self.token_key_file else {
+            return Ok(TokenKey::random());
+        };
+        let secret = std::fs::read(file)
+            .with_context(|| format!("--token-key-file: {} cannot be read", file.display()))?;
+
+        TokenKey::new(&secret)
+            .map_err(|problem| anyhow::anyhow!("--token-key-file: {} {problem}", file.display()))
+    }
+}

@@ -1,0 +1,369 @@
+//! `seese3 store`: looks after a store.
+
+use std::time::Duration;
+
+use anyhow::bail;
+use clap::{Args, Subcommand};
+use serde_json::{Value, json};
+
+use super::output::{JsonOutput, say};
+use super::progress::spinner;
+use seese3_store::{Choice, Contents, Kind, ResourceName, RevisionContents, Store};
+
+#[derive(Debug, Args)]
+pub struct StoreCommand {
+    #[command(subcommand)]
+    action: Action,
+}
+
+#[derive(Debug, Subcommand)]
+enum Action {
+    /// List the rooms and adapters, with their revisions and what is the default
+    List(List),
+    /// Show every revision of one room or adapter
+    Show(Show),
+    /// Show or choose what the name alone means: which revision, and which adapter answers in a room
+    Default(Default),
+    /// Remove a room, an adapter or one revision; `gc` frees the space
+    Rm(Remove),
+    /// Remove files that nothing needs: of interrupted writes, and of what was removed
+    Gc(CollectGarbage),
+    /// Read everything and check it: checksums, golden vectors, references
+    Verify(Verify),
+}
+
+/// The store, and the form of the output.
+#[derive(Debug, Args)]
+struct Common {
+    /// The store: a folder, or a URL of a bucket (feature `cloud`)
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Common {
+    fn open(&self) -> anyhow::Result<Store> {
+        self.json.begin()?;
+        Ok(Store::open(&self.store)?)
+    }
+}
+
+#[derive(Debug, Args)]
+struct List {
+    #[command(flatten)]
+    common: Common,
+}
+
+#[derive(Debug, Args)]
+struct Show {
+    /// rooms/NAME or adapters/NAME, or one revision: rooms/NAME/revisions/NUMBER
+    name: ResourceName,
+    #[command(flatten)]
+    common: Common,
+}
+
+#[derive(Debug, Args)]
+struct Default {
+    /// What the default is of: a room or an adapter with a revision, or a room followed by an
+    /// adapter. All defaults are shown if omitted
+    name: Option<ResourceName>,
+    /// The adapter that answers in the room when a request names none
+    #[arg(requires = "name", conflicts_with = "unset")]
+    adapter: Option<ResourceName>,
+    /// Choose nothing: the newest revision, and the adapter that is preferred
+    #[arg(long, requires = "name")]
+    unset: bool,
+    /// Take the last choice back
+    #[arg(long, conflicts_with_all = ["name", "unset"])]
+    back: bool,
+    #[command(flatten)]
+    common: Common,
+}
+
+#[derive(Debug, Args)]
+struct Remove {
+    /// rooms/NAME or adapters/NAME, or one revision: rooms/NAME/revisions/NUMBER
+    name: ResourceName,
+    /// Only say what would be removed
+    #[arg(long)]
+    dry_run: bool,
+    #[command(flatten)]
+    common: Common,
+}
+
+#[derive(Debug, Args)]
+struct CollectGarbage {
+    /// Leave files alone that were written in the last SECONDS: somebody may be publishing them
+    #[arg(long, value_name = "SECONDS", default_value_t = 3_600)]
+    older_than: u64,
+    /// Only say what would be removed
+    #[arg(long)]
+    dry_run: bool,
+    #[command(flatten)]
+    common: Common,
+}
+
+#[derive(Debug, Args)]
+struct Verify {
+    #[command(flatten)]
+    common: Common,
+}
+
+impl StoreCommand {
+    pub async fn run(self) -> anyhow::Result<()> {
+        match self.action {
+            Action::List(arguments) => arguments.run().await,
+            Action::Show(arguments) => arguments.run().await,
+            Action::Default(arguments) => arguments.run().await,
+            Action::Rm(arguments) => arguments.run().await,
+            Action::Gc(arguments) => arguments.run().await,
+            Action::Verify(arguments) => arguments.run().await,
+        }
+    }
+}
+
+impl List {
+    async fn run(self) -> anyhow::Result<()> {
+        let store = self.common.open()?;
+        let contents = store.contents().await?;
+        let listed: Vec<Value> = contents.iter().map(contents_json).collect();
+        self.common.json.write(&listed)?;
+
+        for held in &contents {
+            let current = held
+                .revisions
+                .iter()
+                .find(|held_revision| held_revision.revision == held.current);
+            let about = current.map_or_else(|| "is missing".to_owned(), about);
+            say(format_args!("{}  {}", headline(held), about));
+        }
+        Ok(())
+    }
+}
+
+impl Show {
+    async fn run(self) -> anyhow::Result<()> {
+        let store = self.common.open()?;
+        let held = store.contents_of(&self.name).await?;
+        self.common.json.write(&contents_json(&held))?;
+
+        say(headline(&held));
+        for revision in &held.revisions {
+            let mark = match revision.revision == held.current {
+                true => "*",
+                false => " ",
+            };
+            say(format_args!(
+                "{mark} revisions/{}  {}",
+                revision.revision,
+                about(revision)
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl Default {
+    async fn run(self) -> anyhow::Result<()> {
+        let store = self.common.open()?;
+
+        if self.back {
+            store.take_back_choice().await?;
+        } else if let Some(choice) = self.choice()? {
+            store.choose(&choice).await?;
+        }
+
+        // What holds now, in each case.
+        let contents = store.contents().await?;
+        let listed: Vec<Value> = contents.iter().map(contents_json).collect();
+        self.common.json.write(&listed)?;
+
+        let chosen: Vec<&Contents> = contents
+            .iter()
+            .filter(|held| held.is_chosen || held.default_adapter.is_some())
+            .collect();
+        if chosen.is_empty() {
+            say("nothing is chosen: names mean the newest revision");
+        }
+        for held in chosen {
+            say(headline(held));
+        }
+        Ok(())
+    }
+
+    fn choice(&self) -> anyhow::Result<Option<Choice>> {
+        let Some(name) = &self.name else {
+            return Ok(None);
+        };
+
+        Ok(Some(match (&self.adapter, name.kind, name.revision) {
+            (None, _, None) if self.unset => Choice::Nothing(name.clone()),
+            (None, _, Some(_)) if self.unset => bail!("--unset takes a name without a revision"),
+            (None, _, Some(_)) => Choice::Revision(name.clone()),
+            (Some(adapter), Kind::Room, None)
+                if adapter.kind == Kind::Adapter && adapter.revision.is_none() =>
+            {
+                Choice::Adapter {
+                    room: name.name.clone(),
+                    adapter: adapter.name.clone(),
+                }
+            }
+            _ => bail!(
+                "name a revision ({name}/revisions/NUMBER), a room and an adapter (rooms/NAME \
+                 adapters/NAME), or give --unset"
+            ),
+        }))
+    }
+}
+
+impl Remove {
+    async fn run(self) -> anyhow::Result<()> {
+        let store = self.common.open()?;
+        let removed = match self.dry_run {
+            true => store.check_removable(&self.name).await?,
+            false => store.remove(&self.name).await?,
+        };
+
+        self.common.json.write(&json!({
+            "name": self.name.to_string(),
+            "revisions": removed.revisions,
+            "dry_run": self.dry_run,
+        }))?;
+
+        let word = match self.dry_run {
+            true => "would remove",
+            false => "removed",
+        };
+        let numbers: Vec<String> = removed.revisions.iter().map(u64::to_string).collect();
+        say(format_args!(
+            "{word} {}: revisions {}; `seese3 store gc` frees their space",
+            self.name,
+            numbers.join(", ")
+        ));
+        Ok(())
+    }
+}
+
+impl CollectGarbage {
+    async fn run(self) -> anyhow::Result<()> {
+        let store = self.common.open()?;
+        let older_than = Duration::from_secs(self.older_than);
+        let garbage = match self.dry_run {
+            true => store.find_garbage(older_than).await?,
+            false => store.collect_garbage(older_than).await?,
+        };
+
+        let files: Vec<Value> = garbage
+            .files
+            .iter()
+            .map(|file| json!({ "path": file.path, "bytes": file.bytes }))
+            .collect();
+        self.common.json.write(&json!({
+            "files": files,
+            "bytes": garbage.bytes(),
+            "left_alone": garbage.left_alone,
+            "dry_run": self.dry_run,
+        }))?;
+
+        for file in &garbage.files {
+            say(&file.path);
+        }
+        for folder in &garbage.left_alone {
+            say(format_args!("left alone: {folder}"));
+        }
+        let word = match self.dry_run {
+            true => "would free",
+            false => "freed",
+        };
+        say(format_args!(
+            "{word} {} in {} files",
+            size(garbage.bytes()),
+            garbage.files.len()
+        ));
+        Ok(())
+    }
+}
+
+impl Verify {
+    async fn run(self) -> anyhow::Result<()> {
+        let store = self.common.open()?;
+        let progress = spinner("verifying");
+        let findings = store
+            .verify(&|resource| progress.set_message(resource.to_string()))
+            .await?;
+        progress.finish_and_clear();
+
+        let listed: Vec<Value> = findings
+            .iter()
+            .map(|finding| json!({ "name": finding.resource, "problem": finding.problem }))
+            .collect();
+        self.common.json.write(&json!({ "findings": listed }))?;
+        for finding in &findings {
+            say(format_args!("{}: {}", finding.resource, finding.problem));
+        }
+
+        match findings.len() {
+            0 => {
+                say("everything can be read and belongs together");
+                Ok(())
+            }
+            found => bail!("{found} findings"),
+        }
+    }
+}
+
+/// The name, the current revision and what was chosen.
+fn headline(held: &Contents) -> String {
+    let chosen = match held.is_chosen {
+        true => ", chosen",
+        false => "",
+    };
+    let adapter = match &held.default_adapter {
+        Some(adapter) => format!(", default adapters/{adapter}"),
+        None => String::new(),
+    };
+    let count = held.revisions.len();
+
+    format!(
+        "{}  revision {}{chosen}, {count} kept{adapter}",
+        held.resource, held.current
+    )
+}
+
+fn about(revision: &RevisionContents) -> String {
+    match &revision.manifest {
+        Ok(summary) => format!(
+            "{}  {}  {}",
+            summary.created.get(..19).unwrap_or(&summary.created),
+            size(summary.bytes),
+            summary.about
+        ),
+        Err(problem) => problem.clone(),
+    }
+}
+
+fn contents_json(held: &Contents) -> Value {
+    let revision = |revision: &RevisionContents| match &revision.manifest {
+        Ok(summary) => json!({
+            "revision": revision.revision,
+            "created": summary.created,
+            "bytes": summary.bytes,
+            "about": summary.about,
+        }),
+        Err(problem) => json!({ "revision": revision.revision, "problem": problem }),
+    };
+
+    json!({
+        "name": held.resource.to_string(),
+        "current": held.current,
+        "chosen": held.is_chosen,
+        "default_adapter": held.default_adapter,
+        "revisions": held.revisions.iter().map(revision).collect::<Vec<_>>(),
+    })
+}
+
+/// A size in the unit that suits it.
+fn size(bytes: u64) -> indicatif::DecimalBytes {
+    indicatif::DecimalBytes(bytes)
+}

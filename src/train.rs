@@ -1,0 +1,257 @@
+//! `seese3 train`: trains an adapter and publishes it.
+
+use anyhow::{Context, bail};
+use clap::Args;
+
+use seese3_core::adapter::{Adapter, CorrectorKind, TrainingRecord};
+use seese3_core::features::Features;
+use seese3_core::splits::Split;
+use seese3_core::training::{RoomData, TrainingPlan};
+use seese3_lab::experiments::seeds::{SeededTraining, TrainingRun, train_seeds};
+use seese3_lab::report::{training_json, training_remark, training_table};
+use seese3_robot::calibration::{calibrate, check_unseen};
+
+use super::output::{JsonOutput, say, say_published};
+use super::progress::bar;
+use super::protocol::ProtocolOptions;
+use super::rooms::{data, load_rooms, room_words};
+use seese3_store::{Store, StoredRoom};
+
+/// The largest number of seeds in one command.
+const MAX_SEEDS: u64 = 1_000;
+
+#[derive(Debug, Args)]
+pub struct Train {
+    /// The store: a folder, or a URL of a bucket (feature `cloud`)
+    #[arg(long, env = "SEESE3_STORE")]
+    store: String,
+    /// Training rooms: names, or patterns with *; may be given several times; one adapter is
+    /// trained on all of them
+    #[arg(long = "room", required = true)]
+    rooms: Vec<String>,
+    /// Name of the feature set, the same for every room; may be omitted when the first room has
+    /// only one
+    #[arg(long)]
+    features: Option<String>,
+    #[command(flatten)]
+    protocol: ProtocolOptions,
+    /// Corrector navigators to train after the adapter, separated by commas: linear, mlp-2, mlp-3,
+    /// attention, or all; none if omitted
+    #[arg(long, value_delimiter = ',')]
+    correctors: Vec<String>,
+    /// Calibration rooms, in which the adapter's errors are measured: names, or patterns with *,
+    /// none of them a training room. One is enough for +calibrated navigators; tracking and
+    /// relocalisation need two or more
+    #[arg(long)]
+    calibrate_on: Vec<String>,
+    /// Seed of initial weights, drawn pairs and their order, 0 to 2³² − 1; weights and order are
+    /// those of PyTorch's generator
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
+    seed: u64,
+    /// Number of adapters to train, with seeds --seed, --seed + 1, …, 1 to 1000: mean and deviation
+    /// of the scores are reported, the first adapter is published
+    #[arg(long, default_value_t = 1)]
+    seeds: u64,
+    /// Name of the adapter in the store; made from the rooms, features and protocol if omitted
+    #[arg(long)]
+    name: Option<String>,
+    #[command(flatten)]
+    json: JsonOutput,
+}
+
+impl Train {
+    pub async fn run(self) -> anyhow::Result<()> {
+        if self.seeds == 0 || self.seeds > MAX_SEEDS {
+            bail!("--seeds must be 1 to {MAX_SEEDS}, got {}", self.seeds);
+        }
+        self.json.begin()?;
+
+        let store = Store::open(&self.store)?;
+        let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
+
+        let plan = TrainingPlan {
+            correctors: correctors(&self.correctors)?,
+            ..self.protocol.plan(self.seed)?
+        };
+
+        let source = rooms[0].1.source().name.clone();
+
+        // Errors are measured on the features that the adapter is trained on.
+        let calibration = match self.calibrate_on.is_empty() {
+            true => Vec::new(),
+            false => load_rooms(&store, &self.calibrate_on, Some(&source)).await?,
+        };
+
+        // Errors in a training room are not representative of other rooms. Refuse such a
+        // calibration room now, not after the training.
+        for room in &calibration {
+            check_unseen(
+                &data(room),
+                rooms.iter().map(|(stored, _)| stored.room.id()),
+            )?;
+        }
+
+        // Only the first seed's adapter is calibrated and published; the other seeds show how far
+        // the scores vary.
+        let SeededTraining {
+            mut adapter,
+            mut runs,
+        } = train_with_progress(&rooms, &plan, self.seeds)?;
+        if !calibration.is_empty() {
+            adapter = calibrated(adapter, &mut runs[0].record, &calibration)?;
+        }
+
+        let features = &rooms[0].1;
+        let name = self.name.unwrap_or_else(|| default_name(&rooms, &plan));
+        let record = &runs[0].record;
+        let published = store
+            .publish_adapter(&name, &adapter, record, features.rows())
+            .await?;
+
+        let split = plan.split;
+        let stride = plan.stride;
+        let preset = plan.preset.name();
+
+        say(format_args!(
+            "{}, features '{}' ({} columns), preset {preset}, stride {stride}, split {split}",
+            room_words(&rooms),
+            features.source().name,
+            features.source().dim,
+        ));
+
+        // Under `whole` nothing is held out: the printed scores are in-sample, and the text has
+        // to say so.
+        let judged = match split {
+            Split::Whole => {
+                "no test pairs; train R², and in-sample Hit@0.1 of inverse Poincaré (affine)"
+                    .to_owned()
+            }
+            _ => format!(
+                "{} test pairs; test R² by room, averaged, and Hit@0.1 of inverse Poincaré (affine)",
+                record.test.n
+            ),
+        };
+
+        say(format_args!(
+            "{} training pairs, {} epochs, {judged}:",
+            record.pair_count, record.config.epochs
+        ));
+
+        say_scores(&runs);
+        say_published(&store, &name, &published);
+        self.json
+            .write(&training_json(&runs, &name, published.revision))?;
+
+        Ok(())
+    }
+}
+
+/// Prints the table of the seeds, and what its reader should not miss.
+fn say_scores(runs: &[TrainingRun]) {
+    say(training_table(runs).trim_end());
+    if let Some(remark) = training_remark(runs) {
+        say(remark);
+    }
+
+    // A motion component that is constant over the test pairs has no R².
+    let test = &runs[0].record.test;
+    let still = test.still_components();
+    if test.n > 0 && still > 0 {
+        say(format_args!(
+            "{still} of the 6 components of the motion never vary and are left out of the means"
+        ));
+    }
+}
+
+/// The adapter with its errors measured in the calibration rooms, which the record then names.
+fn calibrated(
+    adapter: Adapter,
+    record: &mut TrainingRecord,
+    rooms: &[(StoredRoom, Features)],
+) -> anyhow::Result<Adapter> {
+    let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
+    let (adapter, report) = calibrate(adapter, record, &room_data)?;
+    if !report.can_track {
+        say("one room is too few to tell rooms apart in: the adapter can navigate, not track");
+    }
+
+    record.calibrated_on = report.rooms;
+    say(format_args!("errors measured in {}", room_words(rooms)));
+    Ok(adapter)
+}
+
+fn correctors(names: &[String]) -> anyhow::Result<Vec<CorrectorKind>> {
+    if names == ["all"] {
+        return Ok(CorrectorKind::ALL.to_vec());
+    }
+
+    let kind = |name: &String| {
+        let known = CorrectorKind::ALL.map(CorrectorKind::name).join(", ");
+        CorrectorKind::from_name(name)
+            .with_context(|| format!("--correctors: '{name}' is not one of {known}"))
+    };
+
+    names.iter().map(kind).collect()
+}
+
+/// Trains one adapter per seed under one progress bar, whose loss is that of the seed that reported
+/// last.
+pub fn train_with_progress(
+    rooms: &[(StoredRoom, Features)],
+    plan: &TrainingPlan,
+    seeds: u64,
+) -> anyhow::Result<SeededTraining> {
+    let epochs = (plan.config.epochs as u64).saturating_mul(seeds);
+    let progress = bar(epochs, "training");
+
+    let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
+    let trained = train_seeds(&room_data, plan, seeds, &|epoch| {
+        // A plan with a floor in steps has more epochs than its preset.
+        progress.set_length((epoch.epochs as u64).saturating_mul(seeds));
+        progress.set_message(format!("loss {:.4}", epoch.loss));
+        progress.inc(1);
+    })?;
+
+    progress.finish_and_clear();
+    Ok(trained)
+}
+
+/// The default name of an adapter: rooms, features, preset, stride and split, and the architecture
+/// or loss where it differs from the preset's.
+pub fn default_name(rooms: &[(StoredRoom, Features)], plan: &TrainingPlan) -> String {
+    let TrainingPlan {
+        preset,
+        split,
+        stride,
+        config,
+        ..
+    } = plan;
+
+    let first = rooms[0].0.room.id();
+    let features = &rooms[0].1.source().name;
+
+    let others = if rooms.len() > 1 {
+        format!("-and-{}-more", rooms.len() - 1)
+    } else {
+        String::new()
+    };
+    let mut name = format!(
+        "{first}{others}.{features}.{}.s{stride}.{split}",
+        preset.name()
+    );
+
+    // Other settings, such as epochs and rates, do not enter the name; adapters that differ only
+    // in them become revisions of one name.
+    let plain = preset.config(0);
+    if config.charts > 1 {
+        name.push_str(&format!(".{}{}", config.mixing.name(), config.charts));
+    }
+    if config.loss != plain.loss {
+        name.push_str(&format!(".{}", config.loss.name()));
+    }
+    if config.latent != plain.latent {
+        name.push_str(&format!(".g{}", config.latent));
+    }
+
+    name
+}
