@@ -388,7 +388,7 @@ impl Serve {
             keyring: self.keyring()?.map(Arc::new),
             reload: Reload {
                 every: (self.reload_seconds > 0).then(|| Duration::from_secs(self.reload_seconds)),
-                asked: reload_on_hangup(),
+                requested: reload_on_hangup(),
             },
             ..defaults
         })

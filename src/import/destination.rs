@@ -6,7 +6,7 @@ use anyhow::{Context, bail};
 use clap::Args;
 use serde_json::json;
 
-use super::said::{say_dropped, say_frames};
+use super::frame_summary::{say_dropped, say_frames};
 use crate::camera::CameraOption;
 use crate::encode::same_poses;
 use crate::output::{JsonOutput, say};

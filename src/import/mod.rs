@@ -5,13 +5,13 @@
 //! | here | the formats, and what each of them is asked for |
 //! | `bag`, `numpy` | formats with more to ask for |
 //! | `destination` | where a recording goes and how it is read, the same for every format |
-//! | `said` | what is printed about the frames |
+//! | `frame_summary` | what is printed about the frames |
 
 #[cfg_attr(not(feature = "bags"), path = "bag_not_built.rs")]
 mod bag;
 mod destination;
 mod numpy;
-mod said;
+mod frame_summary;
 
 use std::path::{Path, PathBuf};
 

@@ -10,11 +10,11 @@ use clap::{Args, Subcommand};
 #[derive(Debug, Args)]
 pub struct Sweep {
     #[command(subcommand)]
-    over: Over,
+    over: SweepKind,
 }
 
 #[derive(Debug, Subcommand)]
-enum Over {
+enum SweepKind {
     /// M1 to M4 of every layer of an encoder's features, with the best layer by each metric
     Layers(layers::Layers),
     /// Adapters over a grid of latent sizes, charts, learning rates, losses and seeds; resumable
@@ -27,9 +27,9 @@ enum Over {
 impl Sweep {
     pub async fn run(self) -> anyhow::Result<()> {
         match self.over {
-            Over::Layers(layers) => layers.run().await,
-            Over::Adapters(adapters) => adapters.run().await,
-            Over::Formulations(formulations) => formulations.run().await,
+            SweepKind::Layers(layers) => layers.run().await,
+            SweepKind::Adapters(adapters) => adapters.run().await,
+            SweepKind::Formulations(formulations) => formulations.run().await,
         }
     }
 }

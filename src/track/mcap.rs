@@ -2,13 +2,13 @@
 
 use anyhow::Context;
 
-use super::{Heard, Seen, map, odom, plain};
+use super::{ReceivedAnswers, RecordedView, map, odom, plain};
 use seese3_client::convert;
 use seese3_core::geometry::Twist;
 use seese3_data::export::{McapRecording, RecordedOdometry};
 
 /// Poses, transforms and images of a stream as the bytes of an MCAP file.
-pub fn recorded(heard: &Heard, seen: &[Seen]) -> anyhow::Result<Vec<u8>> {
+pub fn recorded(heard: &ReceivedAnswers, seen: &[RecordedView]) -> anyhow::Result<Vec<u8>> {
     let names = &heard.names;
     let mut recording = McapRecording::new()?;
     for update in &heard.updates {
@@ -42,7 +42,7 @@ pub fn recorded(heard: &Heard, seen: &[Seen]) -> anyhow::Result<Vec<u8>> {
         let row = usize::try_from(update.sequence)
             .unwrap_or(usize::MAX)
             .saturating_sub(1);
-        if let Some(Seen::Image(file)) = seen.get(row) {
+        if let Some(RecordedView::Image(file)) = seen.get(row) {
             let image = std::fs::read(file)
                 .with_context(|| format!("{} cannot be read", file.display()))?;
             recording.image(time, &names.camera, &image)?;

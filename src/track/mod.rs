@@ -74,7 +74,7 @@ pub struct Track {
 
 /// The server's answers, sorted by kind, with the frame names and the last resume token.
 #[derive(Default)]
-struct Heard {
+struct ReceivedAnswers {
     updates: Vec<pb::TrackUpdate>,
     refusals: Vec<pb::TrackRefusal>,
     names: pb::FrameNames,
@@ -147,7 +147,7 @@ impl Track {
 
         let mut answers = client.track(ReceiverStream::new(requests)).await?;
         let progress = bar((end - from) as u64, "tracking");
-        let mut heard = Heard::default();
+        let mut heard = ReceivedAnswers::default();
         let mut ended = Ok(());
         let mut lines = self.json.lines()?;
 
@@ -206,11 +206,11 @@ impl Track {
         }
     }
 
-    fn views(&self) -> anyhow::Result<Vec<Seen>> {
+    fn views(&self) -> anyhow::Result<Vec<RecordedView>> {
         if let Some(file) = &self.feature {
             return Ok(read_features(file)?
                 .outer_iter()
-                .map(|row| Seen::Feature(row.to_vec()))
+                .map(|row| RecordedView::Feature(row.to_vec()))
                 .collect());
         }
 
@@ -239,7 +239,7 @@ impl Track {
             bail!("{} has no .jpg, .jpeg or .png file", folder.display());
         }
 
-        Ok(files.into_iter().map(Seen::Image).collect())
+        Ok(files.into_iter().map(RecordedView::Image).collect())
     }
 
     fn config(&self) -> anyhow::Result<pb::TrackConfig> {
@@ -276,7 +276,7 @@ impl Track {
         })
     }
 
-    fn report(&self, heard: &Heard, seen: &[Seen]) -> anyhow::Result<()> {
+    fn report(&self, heard: &ReceivedAnswers, seen: &[RecordedView]) -> anyhow::Result<()> {
         // Only changes of the tracking status are printed, each with its reason.
         let mut before = None;
         for update in &heard.updates {
@@ -349,12 +349,12 @@ impl Track {
 
 /// One frame of the input.
 #[derive(Clone)]
-enum Seen {
+enum RecordedView {
     Feature(Vec<f32>),
     Image(PathBuf),
 }
 
-impl Seen {
+impl RecordedView {
     /// The view as it is sent; none if the image file cannot be read.
     fn view(&self) -> Option<pb::view::View> {
         match self {

@@ -223,7 +223,7 @@ impl Encoder {
         // With two clips in it, an output whose first axis is not the batch is noticed.
         let outputs = encoder.outputs(&[vec![&grey; window], vec![&grey; window]])?;
 
-        let seen = pooling::Seen {
+        let seen = pooling::InputSize {
             width,
             height,
             window,
@@ -391,7 +391,7 @@ impl Encoder {
         let outputs = self.outputs(clips)?;
         let runtime = self.backbone.runtime();
 
-        let seen = pooling::Seen {
+        let seen = pooling::InputSize {
             width: clips[0][0].width,
             height: clips[0][0].height,
             window: self.window,

@@ -46,7 +46,7 @@ impl Pooling {
 
     /// Refuses a mean or a grid over all tokens of an output whose first tokens are no patches: a
     /// class token or registers, by the number of tokens.
-    pub(super) fn check_prefix(self, shape: &[usize], seen: Seen) -> Result<(), Problem> {
+    pub(super) fn check_prefix(self, shape: &[usize], seen: InputSize) -> Result<(), Problem> {
         let is_over_all = matches!(self, Self::Mean { skip: 0 } | Self::Grid { skip: 0, .. });
 
         match (shape, is_over_all) {
@@ -91,7 +91,11 @@ impl Pooling {
     }
 
     /// Pools the output for one clip to a row.
-    pub(super) fn pool(self, output: ArrayViewD<'_, f32>, seen: Seen) -> Result<Vec<f32>, Problem> {
+    pub(super) fn pool(
+        self,
+        output: ArrayViewD<'_, f32>,
+        seen: InputSize,
+    ) -> Result<Vec<f32>, Problem> {
         let shape = output.shape().to_vec();
         let wrong = || Problem::Shape {
             pooling: self,
@@ -177,7 +181,7 @@ impl Pooling {
 
 /// The input of the network: the size of its images in pixels, and the number of images in a clip.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Seen {
+pub(super) struct InputSize {
     pub width: usize,
     pub height: usize,
     pub window: usize,
@@ -187,7 +191,7 @@ pub(super) struct Seen {
 /// distillation, and registers.
 const MOST_PREFIX_TOKENS: usize = 8;
 
-impl Seen {
+impl InputSize {
     /// The number of tokens before the patches, where `tokens` are too many for the patches of the
     /// image alone, and a few of them fewer are not.
     fn prefix(self, tokens: usize) -> Option<usize> {
@@ -341,7 +345,7 @@ mod tests {
     use super::*;
     use ndarray::{Array2, ArrayD};
 
-    const SQUARE: Seen = Seen {
+    const SQUARE: InputSize = InputSize {
         width: 14,
         height: 14,
         window: 1,
@@ -419,7 +423,7 @@ mod tests {
     /// tokens of a clip also have a time axis.
     #[test]
     fn tokens_lie_in_the_images_shape() {
-        let seen = |width, height, window| Seen {
+        let seen = |width, height, window| InputSize {
             width,
             height,
             window,

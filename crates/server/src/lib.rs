@@ -17,7 +17,7 @@ mod traces;
 mod metrics;
 mod connections;
 mod image_encoder;
-mod measure;
+mod request_metrics;
 mod operations;
 mod workers;
 mod auth;
@@ -68,9 +68,9 @@ use tower_http::trace::TraceLayer;
 use auth::{AuthLayer, Principal};
 use catalog::Changes;
 use health::RoomHealth;
-use measure::MeasureLayer;
 use memory::{Memory, MemoryLayer, respond};
-use reload::Looks;
+use reload::ReloadHandle;
+use request_metrics::RequestMetricsLayer;
 use seese3_client::proto::FILE_DESCRIPTOR_SET;
 use seese3_client::proto::v1::catalog_service_server::CatalogServiceServer;
 use seese3_client::proto::v1::evaluation_service_server::EvaluationServiceServer;
@@ -310,8 +310,8 @@ pub async fn run(
     let metrics = config.metrics.clone();
     let (stop, stopped) = oneshot::channel::<()>();
     let workers = Workers::new(&config);
-    let (looks, asked) = Looks::new();
-    let changes = Changes::new(store.clone(), looks, &config);
+    let (reload_handle, reload_requests) = ReloadHandle::new();
+    let changes = Changes::new(store.clone(), reload_handle, &config);
 
     let handlers = Handlers {
         phase: watched.clone(),
@@ -369,7 +369,7 @@ pub async fn run(
     tokio::select! {
         ended = &mut server => return ended,
         () = &mut shutdown => {}
-        () = reload::keep_current(loader, config.reload, asked, config.writable, &phase, &metrics) => {}
+        () = reload::keep_current(loader, config.reload, reload_requests, config.writable, &phase, &metrics) => {}
     }
 
     tracing::info!(bound_s = config.drain.as_secs_f64(), "draining");
@@ -525,7 +525,7 @@ fn server(
                 .on_failure(()),
         )
         .layer(PropagateRequestIdLayer::new(telemetry::REQUEST_ID))
-        .layer(MeasureLayer(metrics.clone()))
+        .layer(RequestMetricsLayer(metrics.clone()))
         .layer(AuthLayer {
             keyring,
             metrics: metrics.clone(),

@@ -19,7 +19,7 @@ use seese3_core::navigation::{Error as E, Source, StepError};
 use seese3_core::room;
 use seese3_robot::fitting::RoomReader;
 use seese3_robot::planning::{BelievedStart, KnownRoom};
-use seese3_robot::tracking::{Belief, PoseReader};
+use seese3_robot::tracking::{PoseReader, PoseWithCovariance};
 
 #[tonic::async_trait]
 impl LocalizationService for Handlers {
@@ -166,7 +166,7 @@ fn believed(
     let seen = BelievedStart::seen(room, latent, feature);
 
     let covariance = seen.covariance.map(|covariance| {
-        let belief = Belief {
+        let belief = PoseWithCovariance {
             pose: seen.pose,
             covariance,
         };

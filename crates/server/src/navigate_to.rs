@@ -31,7 +31,7 @@ use seese3_robot::planning::{
     BelievedStart, Hops, KnownRoom, LEAST_ARRIVAL_PROBABILITY, NoRoute, Planned, Route,
     RouteBounds, StartUnknown, plan,
 };
-use seese3_robot::tracking::{Belief, PoseReader};
+use seese3_robot::tracking::{PoseReader, PoseWithCovariance};
 
 /// The stream of feedback events and the final result.
 pub type Events = Pin<Box<dyn Stream<Item = Result<pb::NavigateToResponse, Status>> + Send>>;
@@ -41,7 +41,7 @@ pub type Events = Pin<Box<dyn Stream<Item = Result<pb::NavigateToResponse, Statu
 const MOST_SHORT_FRAMES: usize = 5_000;
 
 /// A checked request: everything that a pursuit needs.
-struct Ready {
+struct CheckedRequest {
     served: Arc<ServedNavigator>,
     /// The view, with the pose that it is believed to have.
     view: Start,
@@ -98,7 +98,7 @@ impl Handlers {
     /// Sends feedback and then the result, or the error. Stops when the caller has gone away.
     async fn pursue(
         self,
-        ready: Ready,
+        ready: CheckedRequest,
         budget: Duration,
         events: mpsc::Sender<Result<pb::NavigateToResponse, Status>>,
     ) {
@@ -149,7 +149,7 @@ impl Handlers {
     }
 }
 
-impl Ready {
+impl CheckedRequest {
     /// Whether the last of some frames is within the tolerance of the goal.
     fn ends_within(&self, frames: &[FrameId]) -> bool {
         let poses = self.served.navigator.room().poses();
@@ -206,7 +206,7 @@ fn ready(
     snapshot: &Snapshot,
     request: pb::NavigateToRequest,
     most_steps: u32,
-) -> Result<Ready, Error> {
+) -> Result<CheckedRequest, Error> {
     // Destructured with no `..`, so that a new field breaks the build here.
     let pb::NavigateToRequest {
         room,
@@ -259,7 +259,7 @@ fn ready(
     let hops = step.map_or(Hops::Preferably(own_step), Hops::AtMost);
     let pursuit = bounds(
         Pursuit::of(navigator),
-        Asked {
+        PursuitOverrides {
             step,
             tolerance_m,
             tolerance_rad,
@@ -269,7 +269,7 @@ fn ready(
         most_steps,
     )?;
 
-    Ok(Ready {
+    Ok(CheckedRequest {
         served,
         view,
         start,
@@ -328,7 +328,7 @@ fn goal_pose(goal: Option<Goal>, navigator: &Navigator, room: &str) -> Result<Po
 }
 
 /// What a request says of the bounds of its pursuit.
-struct Asked {
+struct PursuitOverrides {
     step: Option<f64>,
     tolerance_m: Option<f64>,
     tolerance_rad: Option<f64>,
@@ -337,7 +337,7 @@ struct Asked {
 }
 
 /// The bounds of a pursuit: what was asked for, and the room's own where nothing was.
-fn bounds(own: Pursuit, asked: Asked, most_steps: u32) -> Result<Pursuit, Error> {
+fn bounds(own: Pursuit, asked: PursuitOverrides, most_steps: u32) -> Result<Pursuit, Error> {
     let positive_or = |field: &str, given: Option<f64>, own: f64| match given {
         None => Ok(own),
         Some(given) if given.is_finite() && given > 0.0 => Ok(given),
@@ -399,7 +399,7 @@ fn feedback_to_wire(
 fn start_to_wire(start: &BelievedStart, served: &ServedNavigator) -> pb::StartOfWay {
     let room = served.navigator.room().id().as_str();
     let covariance = start.covariance.map(|covariance| {
-        let belief = Belief {
+        let belief = PoseWithCovariance {
             pose: start.pose,
             covariance,
         };
@@ -413,7 +413,7 @@ fn start_to_wire(start: &BelievedStart, served: &ServedNavigator) -> pb::StartOf
     }
 }
 
-fn result_to_wire(ended: &Ended, ready: &Ready) -> pb::NavigateToResult {
+fn result_to_wire(ended: &Ended, ready: &CheckedRequest) -> pb::NavigateToResult {
     let mut result = pb::NavigateToResult {
         room: Some(convert::room_revision(&ready.served)),
         adapter: Some(convert::adapter_revision(&ready.served)),

@@ -1,7 +1,7 @@
-//! Noticing that the store has changed, and serving what it has now.
+//! Reloads the store when it has changed.
 //!
-//! A new snapshot is loaded beside the one that is being served and then takes its place in one
-//! step. Requests and streams in flight keep the snapshot that they began with.
+//! A new snapshot is loaded while the old one is served, and replaces it atomically. Requests and
+//! streams in flight keep the snapshot that they started with.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,43 +12,43 @@ use super::Phase;
 use super::metrics::{Metrics, ReloadOutcome};
 use super::snapshot::{Loader, Refused, Snapshot};
 
-/// When a server looks for changes of its store.
+/// When a server checks its store for changes.
 #[derive(Debug, Clone)]
 pub struct Reload {
-    /// The time between two looks; none to look only when asked to.
+    /// Interval between two checks; `None` to check only when `requested` is notified.
     pub every: Option<Duration>,
-    /// Notified to look now, and to try again what was refused.
-    pub asked: Arc<Notify>,
+    /// Notify it to check now, and to retry what was refused.
+    pub requested: Arc<Notify>,
 }
 
 impl Default for Reload {
     fn default() -> Self {
         Self {
             every: Some(Duration::from_secs(5)),
-            asked: Arc::default(),
+            requested: Arc::default(),
         }
     }
 }
 
-/// Asks for a look at the store, and waits for it: for those who changed the store themselves.
+/// Triggers a reload and waits for it, after a write by this server.
 #[derive(Debug, Clone)]
-pub(super) struct Looks(mpsc::UnboundedSender<oneshot::Sender<()>>);
+pub(super) struct ReloadHandle(mpsc::UnboundedSender<oneshot::Sender<()>>);
 
-/// Where looks are asked for.
-pub(super) type LookRequests = mpsc::UnboundedReceiver<oneshot::Sender<()>>;
+/// Receiver of the requests of all [`ReloadHandle`]s.
+pub(super) type ReloadRequests = mpsc::UnboundedReceiver<oneshot::Sender<()>>;
 
-impl Looks {
-    pub fn new() -> (Self, LookRequests) {
-        let (asks, asked) = mpsc::unbounded_channel();
-        (Self(asks), asked)
+impl ReloadHandle {
+    pub fn new() -> (Self, ReloadRequests) {
+        let (sender, receiver) = mpsc::unbounded_channel();
+        (Self(sender), receiver)
     }
 
-    /// Completes after a look that began after this call, or when the server serves no more.
-    pub async fn look(&self) {
-        let (done, looked) = oneshot::channel();
+    /// Completes after a reload that began after this call, or when the server stops.
+    pub async fn now(&self) {
+        let (done, checked) = oneshot::channel();
         if self.0.send(done).is_ok() {
             // An error means that the server is stopping.
-            let _ = looked.await;
+            let _ = checked.await;
         }
     }
 }
@@ -57,25 +57,24 @@ impl Looks {
 pub(super) async fn keep_current(
     loader: Loader,
     reload: Reload,
-    mut asked: LookRequests,
+    mut requests: ReloadRequests,
     is_writable: bool,
     phase: &watch::Sender<Phase>,
     metrics: &Metrics,
 ) {
-    // Trouble that lasts is logged once.
-    let mut trouble = String::new();
+    // An error that persists is logged once.
+    let mut logged_problem = String::new();
 
     loop {
-        // They are told when they are dropped, at the end of this look.
+        // Dropped at the end of this iteration, which completes the callers' `now`.
         let mut waiting: Vec<oneshot::Sender<()>> = Vec::new();
-        let refused = next_look(&reload, &mut asked, &mut waiting).await;
+        let refused = next_check(&reload, &mut requests, &mut waiting).await;
         let Phase::Serving(before) = phase.borrow().clone() else {
             continue;
         };
 
         let now = match loader.load(before.clone(), refused).await {
-            // Whoever changes the store through this server may remove the last room, of which a trace
-            // is left.
+            // A caller may remove the last room through this server; the store then remembers it.
             Ok(now)
                 if now.rooms().is_empty() && !(is_writable && loader.remembers_rooms().await) =>
             {
@@ -86,8 +85,8 @@ pub(super) async fn keep_current(
         };
         match now {
             Ok(now) => {
-                trouble.clear();
-                // Also where nothing changed: a room may have turned out to be damaged meanwhile.
+                logged_problem.clear();
+                // Also if nothing changed: a room may have been found damaged in the meantime.
                 metrics.serving(now.counts());
                 if now.is_like(&before) {
                     metrics.reloaded(ReloadOutcome::Unchanged);
@@ -98,25 +97,25 @@ pub(super) async fn keep_current(
                 metrics.reloaded(ReloadOutcome::Changed);
                 phase.send_replace(Phase::Serving(Arc::new(now)));
             }
-            // A store that cannot be reached, or is gone, takes nothing from what is served.
+            // If the store cannot be reached, the old snapshot is still served.
             Err(problem) => {
                 metrics.reloaded(ReloadOutcome::Failed);
-                if problem != trouble {
+                if problem != logged_problem {
                     tracing::error!(
                         problem,
                         "the store could not be read again; serving goes on"
                     );
-                    trouble = problem;
+                    logged_problem = problem;
                 }
             }
         }
     }
 }
 
-/// Waits until it is time for the next look, or until one is asked for. Collects who waits for it.
-async fn next_look(
+/// Waits for the next interval or for a request. Collects the callers that wait for this check.
+async fn next_check(
     reload: &Reload,
-    asked: &mut LookRequests,
+    requests: &mut ReloadRequests,
     waiting: &mut Vec<oneshot::Sender<()>>,
 ) -> Refused {
     let pause = async {
@@ -128,15 +127,15 @@ async fn next_look(
 
     let refused = tokio::select! {
         () = pause => Refused::LeaveOut,
-        () = reload.asked.notified() => Refused::TryAgain,
-        Some(done) = asked.recv() => {
+        () = reload.requested.notified() => Refused::TryAgain,
+        Some(done) = requests.recv() => {
             waiting.push(done);
             Refused::LeaveOut
         }
     };
 
-    // Whoever asked up to now is content with this look.
-    while let Ok(done) = asked.try_recv() {
+    // One check answers all requests received so far.
+    while let Ok(done) = requests.try_recv() {
         waiting.push(done);
     }
     refused

@@ -188,7 +188,7 @@ impl Workers {
     /// # Errors
     /// [`Error::Loading`] if the server abandoned the work while stopping, [`Error::Internal`] if
     /// it panicked.
-    pub async fn run_admitted<T: Send + 'static>(
+    pub async fn run_unbounded<T: Send + 'static>(
         &self,
         lane: Lane,
         work: impl FnOnce() -> T + Send + 'static,

@@ -2,7 +2,7 @@
 
 use ndarray::{Axis, concatenate, s};
 
-use super::rooms::Over;
+use super::rooms::PublishPolicy;
 use super::{
     ATTEMPTS, Error, Kind, Published, RoomSummary, Store, StoredRoom, check_features, revision_path,
 };
@@ -97,7 +97,7 @@ impl Store {
 
             // Somebody else may have published meanwhile: then the frames belong behind theirs.
             match self
-                .publish_over(&room, &features, Over::Revision(base))
+                .publish_over(&room, &features, PublishPolicy::Revision(base))
                 .await
             {
                 Err(Error::OtherFrames { .. }) => {}

@@ -64,7 +64,7 @@ struct RoomObjects {
 
 /// Which newest revision may be published over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Over {
+pub(super) enum PublishPolicy {
     AnyFrames,
     SameFrames,
     /// The newest one has this number.
@@ -121,7 +121,8 @@ impl Store {
         room: &Room,
         features: &[Features],
     ) -> Result<Published, Error> {
-        self.publish_over(room, features, Over::AnyFrames).await
+        self.publish_over(room, features, PublishPolicy::AnyFrames)
+            .await
     }
 
     /// Publishes a room as [`Store::publish_room`] does, but not over other frames: of several who
@@ -135,7 +136,8 @@ impl Store {
         room: &Room,
         features: &[Features],
     ) -> Result<Published, Error> {
-        self.publish_over(room, features, Over::SameFrames).await
+        self.publish_over(room, features, PublishPolicy::SameFrames)
+            .await
     }
 
     /// Publishes a room as [`Store::publish_room`] does.
@@ -147,7 +149,7 @@ impl Store {
         &self,
         room: &Room,
         features: &[Features],
-        over: Over,
+        over: PublishPolicy,
     ) -> Result<Published, Error> {
         check_features(room, features)?;
         let folder = folder_of(Kind::Room, room.id().as_str());
@@ -187,7 +189,7 @@ impl Store {
             // Row i of the features belongs to frame i. Features published earlier therefore stay
             // valid as long as the poses are the same.
             let newest_revision = newest.as_ref().map(|newest| newest.revision);
-            if matches!(over, Over::Revision(base) if Some(base) != newest_revision) {
+            if matches!(over, PublishPolicy::Revision(base) if Some(base) != newest_revision) {
                 return Err(Error::OtherFrames {
                     room: room.id().to_string(),
                     revision: numbers.highest,
@@ -198,7 +200,7 @@ impl Store {
                 if newest.frames == body.frames || self.has_poses(&folder, newest, room).await? {
                     let kept = features_to_keep(newest, &objects.features);
                     body.features.extend(kept);
-                } else if over == Over::SameFrames {
+                } else if over == PublishPolicy::SameFrames {
                     return Err(Error::OtherFrames {
                         room: room.id().to_string(),
                         revision: newest.revision,

@@ -13,7 +13,7 @@ pub(super) const LIFT_M: f64 = 1e-3;
 
 /// What a ray sees.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Seen {
+pub(super) struct LitPoint {
     pub light: [f64; 3],
     /// From the ray's origin, metres.
     pub distance: f64,
@@ -28,7 +28,7 @@ impl Scene {
         ray: &Ray,
         candidates: impl Iterator<Item = &'a Solid>,
         spread: f64,
-    ) -> Seen {
+    ) -> LitPoint {
         // A ray always ends at the shell. That distance limits the search for nearer furniture,
         // and every hit limits it further.
         let (mut limit, axis) = self.shell_reach(ray);
@@ -53,7 +53,7 @@ impl Scene {
                 .scaled(detail(u, v, finest, self.detail, seed));
         }
 
-        Seen {
+        LitPoint {
             light: self.lit(&surface, ray),
             distance: surface.distance,
         }

@@ -4,7 +4,7 @@ use nalgebra::{Point3, Vector3};
 
 use super::Scene;
 use super::candidates::Spheres;
-use super::light::Seen;
+use super::light::LitPoint;
 use super::solid::{Ray, Solid};
 use seese3_core::geometry::Pose;
 use seese3_core::image::RgbImage;
@@ -179,7 +179,7 @@ struct View<'a> {
 
 impl View<'_> {
     /// What is seen through a point of the image, in pixels from the top left corner.
-    fn seen(&self, column: f64, row: f64) -> Seen {
+    fn seen(&self, column: f64, row: f64) -> LitPoint {
         let ray = self
             .camera
             .ray(self.scale, self.world_from_camera, column, row);
@@ -194,7 +194,7 @@ impl View<'_> {
     }
 
     /// What the corners over a row of pixels see; nothing if pixels share no rays.
-    fn corners(&self, row: usize) -> Vec<Seen> {
+    fn corners(&self, row: usize) -> Vec<LitPoint> {
         if self.camera.sampling == Sampling::Full {
             return Vec::new();
         }
@@ -205,8 +205,8 @@ impl View<'_> {
     }
 
     /// A pixel by the four corners around it, and by rays inside it where these differ.
-    fn shared(&self, around: &[Seen; 4], column: usize, row: usize) -> Seen {
-        let around = &around.map(|corner| Seen {
+    fn shared(&self, around: &[LitPoint; 4], column: usize, row: usize) -> LitPoint {
+        let around = &around.map(|corner| LitPoint {
             light: corner.light.map(|channel| channel.min(self.ceiling)),
             ..corner
         });
@@ -220,14 +220,14 @@ impl View<'_> {
         let corners = mean(around);
         let middle = self.seen(column as f64 + 0.5, row as f64 + 0.5);
 
-        Seen {
+        LitPoint {
             light: std::array::from_fn(|c| (corners.light[c] + middle.light[c]) / 2.0),
             distance: corners.distance.min(middle.distance),
         }
     }
 
     /// A pixel by a regular grid of rays inside it.
-    fn inner(&self, column: usize, row: usize) -> Seen {
+    fn inner(&self, column: usize, row: usize) -> LitPoint {
         let mut light = [0.0; 3];
         let mut distance = f64::INFINITY;
         for sample in 0..SUPERSAMPLING * SUPERSAMPLING {
@@ -241,7 +241,7 @@ impl View<'_> {
         }
 
         let light = light.map(|channel| channel / (SUPERSAMPLING * SUPERSAMPLING) as f64);
-        Seen { light, distance }
+        LitPoint { light, distance }
     }
 }
 
@@ -302,7 +302,7 @@ impl Tiles {
 }
 
 /// Whether the light of a pixel's corners differs by no more than [`CALM`].
-fn calm(corners: &[Seen; 4]) -> bool {
+fn calm(corners: &[LitPoint; 4]) -> bool {
     (0..3).all(|c| {
         let of = corners.map(|corner| corner.light[c]);
         let low = of.into_iter().fold(f64::INFINITY, f64::min);
@@ -313,7 +313,7 @@ fn calm(corners: &[Seen; 4]) -> bool {
 }
 
 /// The mean light of a pixel's corners, and the distance of the nearest.
-fn mean(corners: &[Seen; 4]) -> Seen {
+fn mean(corners: &[LitPoint; 4]) -> LitPoint {
     let light =
         std::array::from_fn(|c| corners.iter().map(|corner| corner.light[c]).sum::<f64>() / 4.0);
     let distance = corners
@@ -321,7 +321,7 @@ fn mean(corners: &[Seen; 4]) -> Seen {
         .map(|corner| corner.distance)
         .fold(f64::INFINITY, f64::min);
 
-    Seen { light, distance }
+    LitPoint { light, distance }
 }
 
 fn to_srgb(light: f64) -> u8 {

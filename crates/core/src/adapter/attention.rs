@@ -62,7 +62,7 @@ pub(super) struct Attention<T> {
 }
 
 /// Attention weights of one sample, indexed by head, query token and key token.
-type Looks<T> = [[[T; 2]; 2]; HEADS];
+type AttentionWeights<T> = [[[T; 2]; 2]; HEADS];
 
 /// Intermediate values and output of a LayerNorm's forward pass.
 struct Normed<T> {
@@ -79,7 +79,7 @@ pub(super) struct Activations<T> {
     /// Queries, keys and values, shape (2n, 3·64).
     projected: Array2<T>,
     /// Attention weights, one entry for each sample.
-    looks: Vec<Looks<T>>,
+    looks: Vec<AttentionWeights<T>>,
     seen: Array2<T>,
     between: Normed<T>,
     inner: Array2<T>,
@@ -291,7 +291,7 @@ fn columns(part: usize, head: usize) -> std::ops::Range<usize> {
 
 /// Scaled dot-product attention between the two tokens of each sample: the attention weights, and
 /// for each token the mean of the values under its weights.
-fn attend<T: Real>(projected: &Array2<T>, n: usize) -> (Vec<Looks<T>>, Array2<T>) {
+fn attend<T: Real>(projected: &Array2<T>, n: usize) -> (Vec<AttentionWeights<T>>, Array2<T>) {
     let scale = T::of((HEAD as f64).sqrt().recip());
     let mut seen = Array2::zeros((2 * n, WIDTH));
     let mut looks = Vec::with_capacity(n);
@@ -328,7 +328,7 @@ fn attend<T: Real>(projected: &Array2<T>, n: usize) -> (Vec<Looks<T>>, Array2<T>
 /// attention's output.
 fn attend_backward<T: Real>(
     projected: &Array2<T>,
-    looks: &[Looks<T>],
+    looks: &[AttentionWeights<T>],
     d_seen: &Array2<T>,
 ) -> Array2<T> {
     let scale = T::of((HEAD as f64).sqrt().recip());

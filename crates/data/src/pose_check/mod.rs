@@ -244,7 +244,7 @@ fn verdict(
     observed: &[ObservedPair],
     stated: &MotionFit,
 ) -> Verdict {
-    let conventions = Likely::of(poses, observed);
+    let conventions = RankedConventions::of(poses, observed);
     let best = conventions.explained;
     let (translations, with_translations) = best_translations(poses, read_as, observed);
 
@@ -298,14 +298,14 @@ fn verdict(
 }
 
 /// The conventions that explain most, and how much that is.
-struct Likely {
+struct RankedConventions {
     /// The best first; those after it explain hardly less.
     likely: Vec<Convention>,
     /// What the best one explains, 0 to 1.
     explained: f64,
 }
 
-impl Likely {
+impl RankedConventions {
     fn of(poses: &[Pose], observed: &[ObservedPair]) -> Self {
         let explained = |convention: Convention| {
             let motions = motions(poses, convention, observed);
@@ -335,7 +335,7 @@ fn rarer_mistake(
     let transposed = |pose: &Pose| Pose::from_parts(pose.translation, pose.rotation.inverse());
     let transposed: Vec<Pose> = poses.iter().map(transposed).collect();
     let transposed = fit_motions(&motions(&transposed, read_as, observed), observed).explained;
-    let mirrored = Likely::of(poses, &mirrored(observed));
+    let mirrored = RankedConventions::of(poses, &mirrored(observed));
 
     let explained = transposed.max(mirrored.explained);
     if explained < EXPLAINS || explained - usual < RARER_BETTER_BY {

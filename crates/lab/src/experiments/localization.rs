@@ -8,7 +8,7 @@ use seese3_core::room::FrameId;
 use seese3_core::splits::is_in_left_out_block;
 use seese3_core::statistics::{Coverage, RecordedMedian, coverage, median_of_recording, quantile};
 use seese3_core::training::RoomData;
-use seese3_robot::fitting::{Fitted, Localizer, MotionReader, ReadingRules, Readings, fit};
+use seese3_robot::fitting::{Fitted, Localizer, MotionHypotheses, MotionReader, ReadingRules, fit};
 
 use super::Error;
 
@@ -192,7 +192,7 @@ pub fn evaluate(
 
 /// A view that is asked for: what the readers say of it, and where its camera truly was.
 struct View<'a> {
-    readings: Readings,
+    readings: MotionHypotheses,
     truth: &'a Pose,
 }
 

@@ -3,7 +3,7 @@
 
 use seese3_core::geometry::{Pose, PoseError, body_twist};
 use seese3_core::statistics::{mean, root_mean_square};
-use seese3_robot::tracking::{Belief, Replay, Status};
+use seese3_robot::tracking::{PoseWithCovariance, Replay, Status};
 
 /// An answer further than this from the truth is wrong, metres.
 const WRONG_BEYOND_M: f64 = 0.5;
@@ -77,7 +77,7 @@ impl TrackingScores {
             if !keep(row) {
                 continue;
             }
-            let odom_belief = Belief {
+            let odom_belief = PoseWithCovariance {
                 pose: *odom,
                 covariance: update.odom.covariance,
             };

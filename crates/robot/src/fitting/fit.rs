@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::folds::{Fold, folds};
 use super::localizer::Localizer;
 use super::pairs::{PAIRS, longest_rows, pairs};
-use super::rules::{ReadingRules, Trial};
+use super::rules::{HeldOutView, ReadingRules};
 use super::{Error, check_mapped};
 use seese3_core::adapter::{
     self, Adapter, EpochProgress, PairPlan, Samples, TrainConfig, TrainingRecord, train,
@@ -153,7 +153,7 @@ fn trials(
     base: Option<&Arc<Adapter>>,
     seed: u64,
     progress: &(dyn Fn(EpochProgress) + Sync),
-) -> Result<Vec<Trial>, Error> {
+) -> Result<Vec<HeldOutView>, Error> {
     let (adapter, _) = trained(data, &fold.mapped, base, seed, progress)?;
     let localizer = Localizer::new(data, &fold.mapped, base.cloned(), Some(Arc::new(adapter)))?;
 
@@ -164,7 +164,7 @@ fn trials(
             let readings = localizer.read(&feature)?;
             let mapped_pose = localizer.pose(readings.nearest.frame);
             let truth = body_twist(mapped_pose, &data.room.poses()[frame.row()]);
-            Ok(Trial {
+            Ok(HeldOutView {
                 readings,
                 truth,
                 is_interleaved: fold.is_interleaved,

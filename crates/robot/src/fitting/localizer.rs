@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use ndarray::{Array1, Array2, ArrayView2};
 
-use super::readings::{PartRule, Readings};
+use super::hypotheses::{MotionHypotheses, PartRule};
 use super::rules::ReadingRules;
 use super::{Error, check_mapped};
-use crate::tracking::Belief;
+use crate::tracking::PoseWithCovariance;
 use seese3_core::adapter::{self, Adapter, column_scale};
 use seese3_core::geometry::{Pose, Twist, body_twist, exp};
 use seese3_core::index::{ExactIndex, Index, Neighbour};
@@ -34,7 +34,7 @@ pub struct LocatedView {
     /// column.
     pub nearest: Neighbour,
     /// `world_from_camera`, with the covariance of its error in its body frame.
-    pub pose: Belief,
+    pub pose: PoseWithCovariance,
     /// What told the translation from that frame.
     pub translation: PartRule,
     /// What told the rotation from that frame.
@@ -135,7 +135,7 @@ impl Localizer {
     ///
     /// # Errors
     /// [`Error::Adapter`] when the feature has another width or a number that is not finite.
-    pub fn read(&self, feature: &[f32]) -> Result<Readings, Error> {
+    pub fn read(&self, feature: &[f32]) -> Result<MotionHypotheses, Error> {
         let expected = self.standardisation.mean.len();
         if feature.len() != expected {
             let actual = feature.len();
@@ -158,7 +158,7 @@ impl Localizer {
         let zero_shot = self.motion_by(&self.zero_shot, nearest.frame, feature)?;
         let fitted = self.motion_by(&self.fitted, nearest.frame, feature)?;
 
-        Ok(Readings {
+        Ok(MotionHypotheses {
             nearest,
             distance: nearest.distance,
             zero_shot,
@@ -228,13 +228,13 @@ impl Localizer {
     }
 
     /// Where the camera of a view is, from what the readers say of it.
-    pub fn located(&self, readings: &Readings, rules: &ReadingRules) -> LocatedView {
+    pub fn located(&self, readings: &MotionHypotheses, rules: &ReadingRules) -> LocatedView {
         let rule = rules.at(readings.distance);
         let motion = readings.combined(rule.translation, rule.rotation);
 
         LocatedView {
             nearest: readings.nearest,
-            pose: Belief {
+            pose: PoseWithCovariance {
                 pose: self.pose(readings.nearest.frame) * exp(&motion),
                 covariance: rule.covariance_at(readings.distance, readings.disagreement),
             },

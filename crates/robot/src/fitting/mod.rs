@@ -14,13 +14,13 @@ mod fit;
 mod folds;
 mod localizer;
 mod pairs;
-mod readings;
+mod hypotheses;
 mod room_reader;
 mod rules;
 
 pub use fit::{FEWEST_MAPPED_FRAMES, FITTED_PRESET, FITTING_EPOCHS, Fitted, fit};
+pub use hypotheses::{MotionHypotheses, MotionReader, PartRule};
 pub use localizer::{Localizer, LocatedView};
-pub use readings::{MotionReader, PartRule, Readings};
 pub use room_reader::RoomReader;
 pub use rules::{ReadingRule, ReadingRules};
 

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::{Error, Fitted, Localizer, LocatedView, ReadingRules};
-use crate::tracking::{Belief, PoseReader};
+use crate::tracking::{PoseReader, PoseWithCovariance};
 use seese3_core::adapter::Adapter;
 use seese3_core::room::FrameId;
 use seese3_core::training::RoomData;
@@ -46,7 +46,7 @@ impl RoomReader {
 impl PoseReader for RoomReader {
     /// None also for a view that is further from the map than any that the rules were made for:
     /// what is read there errs more than its covariance says.
-    fn read_pose(&self, feature: &[f32]) -> Option<Belief> {
+    fn read_pose(&self, feature: &[f32]) -> Option<PoseWithCovariance> {
         let view = self.locate(feature).ok()?;
         let furthest = self.rules.rules().last()?.up_to;
         (view.nearest.distance <= furthest).then_some(view.pose)

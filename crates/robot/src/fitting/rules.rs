@@ -3,7 +3,7 @@
 use nalgebra::{Matrix6, Vector3, Vector6};
 
 use super::Error;
-use super::readings::{MotionReader, PartRule, Readings};
+use super::hypotheses::{MotionHypotheses, MotionReader, PartRule};
 use crate::calibration::robust_covariance;
 use seese3_core::geometry::{Pose, Twist, body_twist, exp};
 use seese3_core::statistics::{Rate, median};
@@ -27,7 +27,7 @@ pub struct ReadingRule {
     /// What tells the rotation.
     pub rotation: PartRule,
     /// The covariance of the located pose's error in its body frame, on (v, ω), metres and radians,
-    /// over u² + u₀²: the squares of the [`Readings::disagreement`] and of `least_disagreement`.
+    /// over u² + u₀²: the squares of the [`MotionHypotheses::disagreement`] and of `least_disagreement`.
     pub covariance: Matrix6<f64>,
     /// u₀: a quarter of the median disagreement of the trials, so that errors are not taken for
     /// zero where readings happen to agree.
@@ -53,9 +53,9 @@ impl ReadingRule {
 pub struct ReadingRules(Vec<ReadingRule>);
 
 /// What the readers said of a view whose true place is known.
-pub struct Trial {
+pub struct HeldOutView {
     /// What they said.
-    pub readings: Readings,
+    pub readings: MotionHypotheses,
     /// The true motion from the mapped frame to the view.
     pub truth: Twist,
     /// Whether the view lies between two mapped frames of one path.
@@ -122,7 +122,7 @@ impl ReadingRules {
     /// # Errors
     /// [`Error::AllAlike`] when no trial is at a distance, [`Error::Adapter`] when the errors make no
     /// covariance.
-    pub(super) fn measured(mut trials: Vec<Trial>) -> Result<Self, Error> {
+    pub(super) fn measured(mut trials: Vec<HeldOutView>) -> Result<Self, Error> {
         // Between repeated images there is nothing to read.
         trials.retain(|trial| trial.readings.distance > 0.0);
         if trials.is_empty() {
@@ -145,7 +145,7 @@ impl ReadingRules {
                 least_disagreement: least_disagreement(part),
             };
 
-            let elsewhere: Vec<&Trial> =
+            let elsewhere: Vec<&HeldOutView> =
                 part.iter().filter(|trial| !trial.is_interleaved).collect();
             let judging = if elsewhere.len() >= FEWEST_MATCHES {
                 elsewhere
@@ -181,7 +181,7 @@ impl ReadingRules {
 }
 
 /// A quarter of the median disagreement; above zero.
-fn least_disagreement(trials: &[Trial]) -> f64 {
+fn least_disagreement(trials: &[HeldOutView]) -> f64 {
     let found: Vec<f64> = trials
         .iter()
         .map(|trial| trial.readings.disagreement)
@@ -190,7 +190,7 @@ fn least_disagreement(trials: &[Trial]) -> f64 {
 }
 
 /// The reader and the gain with the smallest median error of one part of the motion.
-fn best_reader(trials: &[Trial], part: fn(&Twist) -> Vector3<f64>) -> PartRule {
+fn best_reader(trials: &[HeldOutView], part: fn(&Twist) -> Vector3<f64>) -> PartRule {
     let unread: Vec<f64> = trials
         .iter()
         .map(|trial| part(&trial.truth).norm())
@@ -228,7 +228,7 @@ fn best_reader(trials: &[Trial], part: fn(&Twist) -> Vector3<f64>) -> PartRule {
 }
 
 /// The error of the located pose, in its body frame.
-fn residual(trial: &Trial, translation: PartRule, rotation: PartRule) -> Vector6<f64> {
+fn residual(trial: &HeldOutView, translation: PartRule, rotation: PartRule) -> Vector6<f64> {
     let located = exp(&trial.readings.combined(translation, rotation));
     let truth: Pose = exp(&trial.truth);
     body_twist(&located, &truth).to_vector()
@@ -241,7 +241,7 @@ mod tests {
     use seese3_core::room::FrameId;
 
     /// Trials in which the fitted reader is right near the map and misleads far from it.
-    fn trials(count: usize) -> Vec<Trial> {
+    fn trials(count: usize) -> Vec<HeldOutView> {
         let mut random = <rand_chacha::ChaCha8Rng as rand::SeedableRng>::seed_from_u64(1);
         (0..count)
             .map(|at| {
@@ -258,8 +258,8 @@ mod tests {
                     (0.0, 1.0)
                 };
 
-                Trial {
-                    readings: Readings {
+                HeldOutView {
+                    readings: MotionHypotheses {
                         nearest: Neighbour {
                             frame: FrameId(0),
                             distance,

@@ -4,7 +4,7 @@ use nalgebra::{Cholesky, Vector6};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use crate::tracking::Belief;
+use crate::tracking::PoseWithCovariance;
 use seese3_core::geometry::{Pose, PoseError, Twist, exp};
 use seese3_core::statistics::normal_deviates;
 
@@ -16,7 +16,7 @@ const SAMPLES: usize = 400;
 /// start counts, and a turned start turns the whole way. From 400 errors that are always the same;
 /// 0 if the covariance is not positive definite. Poses are `world_from_camera`.
 pub fn arrival_probability(
-    start: &Belief,
+    start: &PoseWithCovariance,
     last: &Pose,
     goal: &Pose,
     tolerance_m: f64,
@@ -50,7 +50,7 @@ mod tests {
     /// its axis, ends 0.2 m beside the goal for each such deviation.
     #[test]
     fn errors_of_the_start_are_carried_to_the_end() {
-        let start = |along: f64, about: f64| Belief {
+        let start = |along: f64, about: f64| PoseWithCovariance {
             pose: Pose::identity(),
             covariance: nalgebra::Matrix6::from_diagonal(&Vector6::new(
                 along * along,
@@ -62,7 +62,8 @@ mod tests {
             )),
         };
         let ahead = Pose::new(Vector3::new(0.0, 0.0, 2.0), Vector3::zeros());
-        let probability = |start: &Belief| arrival_probability(start, &ahead, &ahead, 0.1, 0.5);
+        let probability =
+            |start: &PoseWithCovariance| arrival_probability(start, &ahead, &ahead, 0.1, 0.5);
 
         assert!((probability(&start(0.1, 1e-6)) - 0.683).abs() < 0.05);
         assert!((probability(&start(1e-6, 0.1)) - 0.383).abs() < 0.05);

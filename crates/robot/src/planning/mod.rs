@@ -13,7 +13,7 @@ pub use arrival::arrival_probability;
 pub use pose_graph::{Hops, NoRoute, PoseGraph, Route, RouteBounds};
 pub use start::{BelievedStart, KnownRoom};
 
-use crate::tracking::Belief;
+use crate::tracking::PoseWithCovariance;
 use seese3_core::cancel::{Cancellation, Cancelled};
 use seese3_core::geometry::Pose;
 use seese3_core::navigation::Navigator;
@@ -86,7 +86,7 @@ pub fn plan(
         .last()
         .map_or(start.pose, |frame| poses[frame.row()]);
     let arrival_probability = start.covariance.map(|covariance| {
-        let start = Belief {
+        let start = PoseWithCovariance {
             pose: start.pose,
             covariance,
         };

@@ -3,7 +3,7 @@
 use nalgebra::Matrix6;
 use ndarray::ArrayView1;
 
-use crate::tracking::{Belief, Map, MapQuery, PoseReader};
+use crate::tracking::{Map, MapQuery, PoseReader, PoseWithCovariance};
 use seese3_core::geometry::Pose;
 use seese3_core::navigation::Navigator;
 
@@ -71,7 +71,7 @@ impl BelievedStart {
             None => reader.and_then(|(reader, feature)| reader.distance_over_range(feature)),
         };
 
-        let belief: Option<Belief> = read.or(matched.map(|found| found.anchor.belief));
+        let belief: Option<PoseWithCovariance> = read.or(matched.map(|found| found.anchor.belief));
         Self {
             // A room has frames, so that one is nearest.
             pose: match &belief {

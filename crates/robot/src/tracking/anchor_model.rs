@@ -9,7 +9,7 @@
 use nalgebra::{Matrix5, Matrix6, Vector5, Vector6};
 use ndarray::{Array2, ArrayView1};
 
-use super::Belief;
+use super::PoseWithCovariance;
 use super::appearance::part_of;
 use super::clock::seconds_between;
 use seese3_core::adapter::ErrorModel;
@@ -88,7 +88,7 @@ pub struct Blend {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MapAnchor {
     /// `world_from_camera`.
-    pub belief: Belief,
+    pub belief: PoseWithCovariance,
     /// The errors of later anchors of this kind resemble this one's for about so long, seconds.
     pub memory_s: f64,
     /// The share of the covariance that no number of anchors takes away, 0 to 1.
@@ -299,7 +299,7 @@ impl AnchorModel {
         } = self.at(size);
 
         MapAnchor {
-            belief: Belief {
+            belief: PoseWithCovariance {
                 pose: blend.pose_with(gain),
                 covariance,
             },
@@ -351,7 +351,7 @@ impl AnchorModel {
 pub fn calibrated_anchor(error_model: &ErrorModel, blend: &Blend) -> MapAnchor {
     let errors = error_model.anchor_errors(blend.distance);
     MapAnchor {
-        belief: Belief {
+        belief: PoseWithCovariance {
             pose: blend.pose_with(errors.gain),
             covariance: errors.covariance,
         },

@@ -5,11 +5,11 @@ use nalgebra::Matrix6;
 use super::dead_reckoning::{EarlierView, Poses};
 use super::gravity::CountedGravity;
 use super::health::TrackingHealth;
-use super::rig::{MatchedView, Seen};
+use super::rig::{MatchedView, RigMatches};
 use super::sight::Sight;
 use super::state::{Candidate, Observation, State};
 use super::tracker::Tracker;
-use super::{Belief, MapAnchor, MovingBelief};
+use super::{MapAnchor, PoseVelocity, PoseWithCovariance};
 use seese3_core::geometry::Twist;
 
 /// 99 % of χ² with six degrees of freedom: an anchor whose surprise is larger counts for less.
@@ -25,18 +25,18 @@ const LONGEST_PAUSE_S: f64 = 10.0;
 
 /// An anchor as it counts beside those before it.
 #[derive(Debug, Clone, Copy)]
-struct CountedAnchor {
+struct InflatedAnchor {
     /// Its covariance is multiplied for the likeness of its error to those of anchors before it.
-    belief: Belief,
+    belief: PoseWithCovariance,
     /// The covariance of its error, if that lasts; else zero.
     lasting: Matrix6<f64>,
 }
 
-impl CountedAnchor {
+impl InflatedAnchor {
     /// The anchor as one of several of one time, which together tell as much as one.
     fn shared_by(self, count: usize) -> Self {
         Self {
-            belief: Belief {
+            belief: PoseWithCovariance {
                 covariance: self.belief.covariance * count as f64,
                 ..self.belief
             },
@@ -67,7 +67,7 @@ fn correct_believed(
     poses: &mut Poses,
     frame: &Observation,
     room: usize,
-    counted: CountedAnchor,
+    counted: InflatedAnchor,
 ) -> Correction {
     let anchor = counted.belief;
     let Some(believed) = poses.map_pose.filter(|_| state.room == Some(room)) else {
@@ -83,7 +83,7 @@ fn correct_believed(
 
     // Motions and errors have heavier tails than a Gaussian: a surprising anchor is believed less,
     // but believed.
-    let doubted = Belief {
+    let doubted = PoseWithCovariance {
         covariance: anchor.covariance * (surprise / GATE).max(1.0).powi(2),
         ..anchor
     };
@@ -97,7 +97,7 @@ fn correct_believed(
 }
 
 /// The squared Mahalanobis distance of an anchor from a believed pose.
-fn surprise_at(believed: &Belief, anchor: &Belief) -> f64 {
+fn surprise_at(believed: &PoseWithCovariance, anchor: &PoseWithCovariance) -> f64 {
     believed
         .innovation(anchor)
         .map_or(f64::INFINITY, |innovation| innovation.squared_length)
@@ -117,7 +117,7 @@ impl MatchedView<'_> {
     /// are blurred, noisy or partly hidden do not, and their features still tell where they were
     /// taken. Only where the camera is known to be in the room, and only if the features tell more
     /// than a view of an unmapped part does. The limit was chosen on calibration rooms and the
-    /// kitchen: at three times [`Belief::tells_a_place`] unmapped parts make poses worse.
+    /// kitchen: at three times [`PoseWithCovariance::tells_a_place`] unmapped parts make poses worse.
     fn is_hint(&self, health: TrackingHealth) -> bool {
         health.is_confirmed()
             && self.matched.is_by_feature
@@ -133,7 +133,7 @@ impl Tracker {
         state: &mut State,
         poses: &mut Poses,
         frame: &Observation,
-        seen: &Seen<'_>,
+        seen: &RigMatches<'_>,
         gravity: Option<&CountedGravity>,
     ) -> Correction {
         let leading = &seen.leading;
@@ -148,7 +148,7 @@ impl Tracker {
             let anchor = self.anchor(state, frame, view, gravity);
             anchor.shared_by(1 + others.len())
         });
-        let of_others: Vec<CountedAnchor> = of_others.collect();
+        let of_others: Vec<InflatedAnchor> = of_others.collect();
 
         // An image that is repeated tells nothing new.
         let correction = if leading.is_repeated || leading.sight != Sight::Clear {
@@ -183,7 +183,7 @@ impl Tracker {
         poses: &mut Poses,
         frame: &Observation,
         view: &MatchedView<'_>,
-        anchor: CountedAnchor,
+        anchor: InflatedAnchor,
     ) -> Correction {
         if !self.settings.fuse || !view.may_correct(state.health) {
             return Correction::NONE;
@@ -206,7 +206,7 @@ impl Tracker {
         frame: &Observation,
         view: &MatchedView<'_>,
         gravity: Option<&CountedGravity>,
-    ) -> CountedAnchor {
+    ) -> InflatedAnchor {
         let MapAnchor {
             belief,
             memory_s,
@@ -239,8 +239,8 @@ impl Tracker {
             1.0
         };
 
-        CountedAnchor {
-            belief: Belief {
+        InflatedAnchor {
+            belief: PoseWithCovariance {
                 covariance: belief.covariance * inflation,
                 ..belief
             },
@@ -257,7 +257,7 @@ impl Tracker {
         poses: &mut Poses,
         frame: &Observation,
         room: usize,
-        counted: CountedAnchor,
+        counted: InflatedAnchor,
     ) -> Correction {
         let anchor = counted.belief;
 
@@ -290,7 +290,7 @@ impl Tracker {
             state.room = Some(room);
             state.corrected_ns = Some(frame.time_ns);
             let prior = self.maps[room].motion_prior();
-            poses.map_pose = Some(MovingBelief::at(map_pose, prior));
+            poses.map_pose = Some(PoseVelocity::at(map_pose, prior));
             poses.lasting = counted.lasting;
         } else {
             let sight = Sight::of(frame.is_blank, state.unchanged_frames);
@@ -316,7 +316,7 @@ impl Tracker {
         state: &State,
         candidate: Candidate,
         frame: &Observation,
-    ) -> (Belief, u32) {
+    ) -> (PoseWithCovariance, u32) {
         // Where another camera speaks for the place, the stream's own may see no motion.
         let sight = Sight::of(frame.is_blank, state.unchanged_frames);
         let seen = candidate.latent.filter(|_| sight == Sight::Clear);

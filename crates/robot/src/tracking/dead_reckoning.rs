@@ -7,10 +7,10 @@ use nalgebra::Matrix6;
 use ndarray::{ArrayView1, s};
 
 use super::health::Continuity;
-use super::moving::ReadMotion;
+use super::pose_velocity::ReadMotion;
 use super::state::{Keyframe, Observation, State};
 use super::tracker::Tracker;
-use super::{Belief, MotionPrior, MovingBelief};
+use super::{MotionPrior, PoseVelocity, PoseWithCovariance};
 use seese3_core::adapter::MotionErrors;
 use seese3_core::geometry::{Pose, Twist, adjoint, body_twist, exp};
 
@@ -69,13 +69,13 @@ struct Carried {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Poses {
     /// `odom_from_camera` and the velocity as readings alone tell it.
-    pub odom: MovingBelief,
+    pub odom: PoseVelocity,
     /// `map_from_camera` and the velocity as the filter believes them.
-    pub map_pose: Option<MovingBelief>,
+    pub map_pose: Option<PoseVelocity>,
     /// The covariance of the lasting error of the anchor that corrected the map pose last.
     pub lasting: Matrix6<f64>,
     /// `map_from_camera` as it is reported.
-    pub reported_pose: Option<Belief>,
+    pub reported_pose: Option<PoseWithCovariance>,
 }
 
 /// A motion since the keyframe, the covariance of its error, and where it leads.
@@ -184,7 +184,7 @@ impl Tracker {
         keyframe: &Keyframe,
         frame: &Observation,
         reading: MotionReading,
-    ) -> MovingBelief {
+    ) -> PoseVelocity {
         let from = EarlierView {
             latent: &keyframe.latent,
             time_ns: keyframe.time_ns,
@@ -203,7 +203,7 @@ impl Tracker {
                 .last
                 .as_ref()
                 .map_or(keyframe.odom.pose, |last| last.odom.pose);
-            return MovingBelief {
+            return PoseVelocity {
                 pose: last * exp(&step.unwrap_or_default()),
                 ..odom
             };
@@ -237,8 +237,9 @@ impl Tracker {
 
     /// The first frame, which is the origin of `odom`.
     fn origin(&self, state: &State) -> Prediction {
-        let origin = Belief::known(Pose::identity(), ORIGIN_DEVIATION, ORIGIN_DEVIATION);
-        let at = |pose: Belief| MovingBelief::at(pose, self.prior(state.room));
+        let origin =
+            PoseWithCovariance::known(Pose::identity(), ORIGIN_DEVIATION, ORIGIN_DEVIATION);
+        let at = |pose: PoseWithCovariance| PoseVelocity::at(pose, self.prior(state.room));
 
         Prediction {
             motion: Twist::default(),
@@ -254,7 +255,7 @@ impl Tracker {
 
     /// A belief of an earlier view at a frame: by how cameras move, and by the motion in between where
     /// one is known.
-    fn carried(&self, belief: &MovingBelief, way: Carried) -> MovingBelief {
+    fn carried(&self, belief: &PoseVelocity, way: Carried) -> PoseVelocity {
         let Carried {
             room,
             from_ns,
@@ -270,13 +271,13 @@ impl Tracker {
     /// says nothing beside it. The velocity is that of the last step.
     fn driven(
         &self,
-        belief: &MovingBelief,
+        belief: &PoseVelocity,
         measured: &ReadMotion,
         state: &State,
         frame: &Observation,
-    ) -> MovingBelief {
+    ) -> PoseVelocity {
         let place = belief.place().moved(measured.motion, &measured.covariance);
-        let moving = MovingBelief::at(place, self.prior(state.room));
+        let moving = PoseVelocity::at(place, self.prior(state.room));
 
         // The step is from the last frame that brought a pose, which may not be the last one.
         let step = state.measured.step(frame.measured.as_ref());
@@ -286,7 +287,7 @@ impl Tracker {
             .map_or(frame.time_ns, |last| last.time_ns);
         let seconds = frame.time_ns.abs_diff(last_ns) as f64 * 1e-9;
         match step {
-            Some(step) if seconds > 0.0 => MovingBelief {
+            Some(step) if seconds > 0.0 => PoseVelocity {
                 velocity: step.scaled(seconds.recip()),
                 ..moving
             },
@@ -325,9 +326,13 @@ impl Tracker {
 
     /// A believed map pose as it is reported: with the covariance that such poses were measured to
     /// have.
-    pub(super) fn reported(&self, believed: &MovingBelief, lasting: &Matrix6<f64>) -> Belief {
+    pub(super) fn reported(
+        &self,
+        believed: &PoseVelocity,
+        lasting: &Matrix6<f64>,
+    ) -> PoseWithCovariance {
         let place = believed.place();
-        Belief {
+        PoseWithCovariance {
             covariance: place.covariance * self.map_pose_factor + lasting,
             ..place
         }

@@ -6,7 +6,7 @@
 
 use nalgebra::{Cholesky, Matrix3, SMatrix, SVector, Unit, Vector3};
 
-use super::{Belief, MovingBelief, Observation, State};
+use super::{Observation, PoseVelocity, PoseWithCovariance, State};
 use seese3_core::geometry::{Pose, Twist, exp};
 
 /// 99 % of χ² with two degrees of freedom, those of a tilt.
@@ -142,7 +142,7 @@ impl CountedGravity {
     }
 
     /// By how much it contradicts a pose, radians; none if it does not.
-    pub(super) fn contradicts(&self, pose: &Belief) -> Option<f64> {
+    pub(super) fn contradicts(&self, pose: &PoseWithCovariance) -> Option<f64> {
         let tilt = self.measured.tilt(&pose.pose);
         let of_rotation = pose.covariance.fixed_view::<3, 3>(3, 3).into_owned();
         let is_surprise = tilt.surprise(&of_rotation, self.variance) > GATE;
@@ -150,7 +150,7 @@ impl CountedGravity {
     }
 }
 
-impl Belief {
+impl PoseWithCovariance {
     /// The pose of a view, corrected by the gravity that was measured beside it: however many views
     /// there are, each is turned at most to where gravity says.
     #[must_use]
@@ -171,7 +171,7 @@ impl Belief {
     }
 }
 
-impl MovingBelief {
+impl PoseVelocity {
     /// The belief when gravity was measured.
     #[must_use]
     pub(super) fn levelled(&self, gravity: &CountedGravity) -> Self {
@@ -230,7 +230,7 @@ mod tests {
         let truth = level * exp(&roll);
         let (right, down) = (Vector3::x(), truth.rotation.inverse() * DOWN);
 
-        let independent = Belief::known(level, 0.1, 0.2);
+        let independent = PoseWithCovariance::known(level, 0.1, 0.2);
         // Also where errors of roll went along with those of position and heading.
         let mut together = independent;
         for other in [0, 4] {
@@ -267,7 +267,7 @@ mod tests {
     /// of .02 rad is none.
     #[test]
     fn gravity_that_a_sure_view_contradicts_is_doubted() {
-        let view = Belief::known(turned(DOWN, -0.4), 0.005, 0.005);
+        let view = PoseWithCovariance::known(turned(DOWN, -0.4), 0.005, 0.005);
         let pitched = |angle: f64| {
             let truth = view.pose
                 * exp(&Twist::from_vector(&Vector6::new(
@@ -306,7 +306,7 @@ mod tests {
         let prior = MotionPrior::assumed();
         let level = turned(DOWN, 0.0);
         let truth = level * exp(&Twist::from_vector(&Vector6::new(0., 0., 0., 0., 0., 0.02)));
-        let believed = MovingBelief::at(Belief::known(level, 0.1, 0.02), &prior);
+        let believed = PoseVelocity::at(PoseWithCovariance::known(level, 0.1, 0.02), &prior);
 
         for (seconds, expected) in [(f64::INFINITY, 0.01), (0.1, 0.02 / 41.01)] {
             let gravity = gravity_at(&truth, 0.02).counted_after(seconds);

@@ -10,7 +10,7 @@ use super::anchor_model::{
 use super::appearance::{Appearance, RoomAppearance};
 use super::clock::frame_period_s;
 use super::motion_prior::MotionPrior;
-use super::{Belief, Error, room_errors};
+use super::{Error, PoseWithCovariance, room_errors};
 use seese3_core::adapter::{ErrorModel, MotionErrors, TEMPORAL_NEIGHBOURS};
 use seese3_core::index::{ExactIndex, Exclusion, Index, Neighbour};
 use seese3_core::navigation::Navigator;
@@ -24,7 +24,7 @@ const SAMPLED_FRAMES: usize = 1_000;
 pub trait PoseReader: Send + Sync {
     /// The pose of a view, `world_from_camera`, from its raw feature of shape (d,); none if the
     /// feature cannot be read.
-    fn read_pose(&self, feature: &[f32]) -> Option<Belief>;
+    fn read_pose(&self, feature: &[f32]) -> Option<PoseWithCovariance>;
 
     /// How far a view is from the map, over the furthest that the reader was tried at: above 1 it
     /// reads nothing. None if it does not know such a distance.
@@ -212,7 +212,7 @@ impl Map {
     }
 
     /// The pose of a view by the reader of this room; none without one, or without a feature.
-    pub(super) fn pose_by_reader(&self, feature: Option<&[f32]>) -> Option<Belief> {
+    pub(super) fn pose_by_reader(&self, feature: Option<&[f32]>) -> Option<PoseWithCovariance> {
         self.pose_reader.as_ref()?.read_pose(feature?)
     }
 

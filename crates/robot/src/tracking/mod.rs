@@ -5,20 +5,20 @@
 //! - A [`Tracker`] follows a stream of frames; its whole memory of a stream is a [`State`].
 //! - [`replay`] runs a recording through a tracker and compares the answers with the true path.
 //!
-//! A [`Belief`] is a pose with the covariance of its error in its own body frame, on (v, ω).
+//! A [`PoseWithCovariance`] is a pose with the covariance of its error in its own body frame, on (v, ω).
 
 mod anchor_model;
 mod anchoring;
 mod appearance;
-mod belief;
+mod pose_with_covariance;
 mod clock;
 mod dead_reckoning;
 mod gravity;
 mod health;
 mod map;
-mod measured;
+mod wheel_odometry;
 mod motion_prior;
-mod moving;
+mod pose_velocity;
 mod recent_matches;
 mod relocalize;
 mod replay;
@@ -33,14 +33,13 @@ mod view;
 
 pub use anchor_model::MapAnchor;
 pub use anchoring::ANCHORS_TO_AGREE;
-pub use belief::{Belief, Innovation};
 pub use clock::{ASSUMED_PERIOD_S, frame_period_s, seconds_between};
 pub use gravity::MeasuredGravity;
 pub use health::{Continuity, FrameEvidence, TrackingHealth};
 pub use map::{Map, MapMatch, MapQuery, PoseReader};
-pub use measured::{Drift, Driven, LastMeasured, MeasuredPose, MeasuredSince};
 pub use motion_prior::MotionPrior;
-pub use moving::MovingBelief;
+pub use pose_velocity::PoseVelocity;
+pub use pose_with_covariance::{Innovation, PoseWithCovariance};
 pub use recent_matches::RecentMatches;
 pub use relocalize::{ROOM_RATIO, Relocalization, RoomMatch, relocalize};
 pub use replay::{
@@ -51,6 +50,7 @@ pub use rig::{OtherCamera, OtherView};
 pub use state::{Candidate, Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
 pub use tracker::{Tracker, TrackerSettings};
 pub use view::{View, motion};
+pub use wheel_odometry::{Drift, LastMeasured, MeasuredPose, OdometryAccumulator, OdometryDelta};
 
 use seese3_core::adapter;
 use seese3_core::room::RoomId;

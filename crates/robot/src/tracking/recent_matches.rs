@@ -4,7 +4,7 @@
 //! look most alike agree by chance, so that a view seems to be placed to two centimetres and is ten
 //! centimetres off. How well the views just before it were placed tells better what to think of it.
 
-use super::Belief;
+use super::PoseWithCovariance;
 
 /// Views are remembered for about so long, seconds. Chosen on calibration rooms, from 0.3 to 1.2,
 /// where it makes little difference.
@@ -22,7 +22,7 @@ pub struct RecentMatches {
 
 impl RecentMatches {
     /// As it is after one more match; `before` is none for the first.
-    pub(super) fn after(before: Option<Self>, time_ns: i64, anchor: &Belief) -> Self {
+    pub(super) fn after(before: Option<Self>, time_ns: i64, anchor: &PoseWithCovariance) -> Self {
         let log_deviation = anchor.position_deviation_m().ln();
         let Some(before) = before else {
             return Self {
@@ -40,9 +40,9 @@ impl RecentMatches {
     }
 
     /// An anchor that is no surer than the matches lately were.
-    pub(super) fn tempered(&self, anchor: Belief) -> Belief {
+    pub(super) fn tempered(&self, anchor: PoseWithCovariance) -> PoseWithCovariance {
         let factor = self.log_deviation.exp() / anchor.position_deviation_m();
-        Belief {
+        PoseWithCovariance {
             covariance: anchor.covariance * factor.max(1.0).powi(2),
             ..anchor
         }
@@ -54,8 +54,8 @@ mod tests {
     use super::*;
     use seese3_core::geometry::Pose;
 
-    fn known(deviation: f64) -> Belief {
-        Belief::known(Pose::identity(), deviation, deviation)
+    fn known(deviation: f64) -> PoseWithCovariance {
+        PoseWithCovariance::known(Pose::identity(), deviation, deviation)
     }
 
     /// Oracle: by hand. After matches of 16 cm one of 1 cm comes a tenth of a second later: the mean

@@ -3,7 +3,7 @@
 use ndarray::ArrayView2;
 
 use super::clock::{ASSUMED_PERIOD_S, seconds_between};
-use super::{Belief, Observation, State, Status, Tracker, Update};
+use super::{Observation, PoseWithCovariance, State, Status, Tracker, Update};
 use seese3_core::geometry::{Pose, PoseError, body_twist, log};
 use seese3_core::room::{FrameId, Room};
 use seese3_core::trajectory::Trajectory;
@@ -199,7 +199,7 @@ fn start(tracker: &Tracker, frames: &[Played], initial_pose: InitialPose) -> Sta
     let first = frames.first().map(|played| played.truth);
 
     match (initial_pose, first) {
-        (InitialPose::Given, Some(pose)) => tracker.start(Some(Belief::known(
+        (InitialPose::Given, Some(pose)) => tracker.start(Some(PoseWithCovariance::known(
             pose,
             INITIAL_DEVIATION,
             INITIAL_DEVIATION,

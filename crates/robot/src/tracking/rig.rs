@@ -12,7 +12,7 @@ use super::map::MapMatch;
 use super::sight::{Sight, UNCHANGED_DISTANCE, distance};
 use super::state::{Observation, State};
 use super::tracker::Tracker;
-use super::{Belief, MapQuery, ROOM_RATIO, RecentMatches};
+use super::{MapQuery, PoseWithCovariance, ROOM_RATIO, RecentMatches};
 use seese3_core::geometry::Pose;
 
 /// What another camera on the same robot saw at the time of a frame.
@@ -65,7 +65,7 @@ impl MatchedView<'_> {
     }
 
     /// Where the mapped frames that it resembles place the stream's own camera.
-    pub(super) fn placed(&self) -> Belief {
+    pub(super) fn placed(&self) -> PoseWithCovariance {
         let belief = self.matched.anchor.belief;
         match self.other {
             Some(other) => belief.of_attached(&other.camera_from_other.inverse()),
@@ -85,7 +85,7 @@ impl MatchedView<'_> {
 }
 
 /// What all cameras see at one time.
-pub(super) struct Seen<'a> {
+pub(super) struct RigMatches<'a> {
     /// The view that looks most like a room: the stream's own, if none looks more like it.
     pub leading: MatchedView<'a>,
     /// Whether the stream's own view looks like a room.
@@ -99,7 +99,7 @@ pub(super) struct Seen<'a> {
 impl Tracker {
     /// Matches all views of a frame. The stream's own has been recorded before; those of other cameras
     /// are recorded here.
-    pub(super) fn look<'a>(&self, state: &mut State, frame: &'a Observation) -> Seen<'a> {
+    pub(super) fn look<'a>(&self, state: &mut State, frame: &'a Observation) -> RigMatches<'a> {
         let own = View {
             latent: frame.latent.view(),
             feature: frame.feature.as_deref(),
@@ -135,7 +135,7 @@ impl Tracker {
         }
 
         beside.retain(|view| view.sight == Sight::Clear && !view.is_repeated);
-        Seen {
+        RigMatches {
             leading,
             own_matches_room,
             is_seen_by_other,

@@ -5,8 +5,8 @@ use ndarray::Array1;
 
 use super::health::TrackingHealth;
 use super::{
-    Belief, MeasuredGravity, MeasuredPose, MeasuredSince, MovingBelief, OtherCamera, OtherView,
-    RecentMatches, Status,
+    MeasuredGravity, MeasuredPose, OdometryAccumulator, OtherCamera, OtherView, PoseVelocity,
+    PoseWithCovariance, RecentMatches, Status,
 };
 use seese3_core::geometry::Twist;
 use seese3_core::index::Neighbour;
@@ -63,7 +63,7 @@ pub struct State {
     /// Where the camera was when its map pose was last corrected, if it is believed.
     pub place: Option<Place>,
     /// The pose that was given from outside, until the first frame arrives: `world_from_camera`.
-    pub initial_pose: Option<Belief>,
+    pub initial_pose: Option<PoseWithCovariance>,
     /// Whitened latents of the last frames, the newest last: what a jump of the view is told by.
     pub recent: Vec<Vec<f64>>,
     /// Whether the frames follow from one another and match the room.
@@ -77,7 +77,7 @@ pub struct State {
     /// When an anchor last corrected the map pose, nanoseconds on the sensor's clock.
     pub corrected_ns: Option<i64>,
     /// What other sensors measured since the keyframe and the last place.
-    pub measured: MeasuredSince,
+    pub measured: OdometryAccumulator,
     /// What is remembered of the robot's other cameras.
     pub other_cameras: Vec<OtherCamera>,
     /// When its own camera last showed anything new, nanoseconds on the sensor's clock.
@@ -99,7 +99,7 @@ pub struct LastFrame {
     /// Its latent.
     pub latent: Vec<f64>,
     /// `odom_from_camera`.
-    pub odom: Belief,
+    pub odom: PoseWithCovariance,
 }
 
 /// The frame that motions are read from.
@@ -114,10 +114,10 @@ pub struct Keyframe {
     pub latent: Vec<f64>,
     /// `odom_from_camera` at this frame and the camera's velocity, of which nothing is known but
     /// what motions were read.
-    pub odom: MovingBelief,
+    pub odom: PoseVelocity,
     /// `map_from_camera` as it is reported: with the covariance that its errors were measured to
     /// have, and also after the tracker stopped believing it.
-    pub reported_pose: Option<Belief>,
+    pub reported_pose: Option<PoseWithCovariance>,
 }
 
 /// Where the camera is believed to have been at a frame: what anchors are compared with.
@@ -129,7 +129,7 @@ pub struct Place {
     /// Its latent; none if the camera was covered or frozen, and another one told the place.
     pub latent: Option<Vec<f64>>,
     /// `map_from_camera` and the camera's velocity.
-    pub belief: MovingBelief,
+    pub belief: PoseVelocity,
     /// The covariance of the lasting error of the anchor that corrected it last, which the filter
     /// cannot average away; zero where its errors do not last.
     #[cfg_attr(
@@ -152,7 +152,7 @@ pub struct Candidate {
     /// That frame's latent; none if the camera was covered or frozen, and another one spoke.
     pub latent: Option<Vec<f64>>,
     /// `map_from_camera` at that frame.
-    pub map_pose: Belief,
+    pub map_pose: PoseWithCovariance,
     /// How many anchors in a row agreed.
     pub agreeing_anchors: u32,
 }
@@ -169,12 +169,12 @@ pub struct Update {
     /// Whether this frame is the keyframe from now on.
     pub is_keyframe: bool,
     /// `odom_from_camera`.
-    pub odom: Belief,
+    pub odom: PoseWithCovariance,
     /// `map_from_camera` as it is reported; the map's frame is the room's world. The last pose is
     /// still given, less and less surely, while a stream is LOST or RELOCALIZING in a single room,
     /// and where it is LOST because its position became too uncertain: look at `status` before
     /// using it.
-    pub map_pose: Option<Belief>,
+    pub map_pose: Option<PoseWithCovariance>,
     /// The camera's velocity in its body frame, metres and radians per second: that of the fused
     /// pose where one is believed, else what readings alone tell; none for the first frame.
     pub velocity: Option<Twist>,

@@ -1,27 +1,27 @@
 //! The status of a stream: whether its pose should be trusted, and why.
 
-use super::belief::PLACE_DEVIATION_M;
 use super::health::{FRAMES_TO_RECOVER, TrackingHealth};
 use super::map::MapMatch;
+use super::pose_with_covariance::PLACE_DEVIATION_M;
 use super::rig::MatchedView;
 use super::sight::Sight;
 use super::state::State;
 use super::tracker::Tracker;
-use super::{ANCHORS_TO_AGREE, Belief, Status};
+use super::{ANCHORS_TO_AGREE, PoseWithCovariance, Status};
 
 /// Frames without a match after which a known place is in doubt.
 const FRAMES_UNTIL_DOUBT: u32 = 10;
 
 impl Tracker {
     /// The status after a frame, and the reason in words. `reported_pose` is where the frame was
-    /// taken, if that is believed; `contradiction` is by how much measured gravity contradicts it,
+    /// taken, if that is believed; `gravity_error_rad` is by how much measured gravity contradicts it,
     /// radians.
     pub(super) fn status(
         &self,
         state: &State,
-        reported_pose: Option<&Belief>,
+        reported_pose: Option<&PoseWithCovariance>,
         leading: &MatchedView<'_>,
-        contradiction: Option<f64>,
+        gravity_error_rad: Option<f64>,
     ) -> (Status, String) {
         if let TrackingHealth::Lost { certain_matches } = state.health {
             return (
@@ -78,7 +78,7 @@ impl Tracker {
             return (Status::Degraded, reason);
         }
 
-        if let Some(angle) = contradiction {
+        if let Some(angle) = gravity_error_rad {
             let reason = format!(
                 "gravity is measured {:.0}° from where the views place it: the robot speeds up or brakes, or gravity_in_map or the sensor's axes are not what was said",
                 angle.to_degrees()

@@ -23,7 +23,7 @@ use super::rig::MatchedView;
 use super::sight::{Sight, UNCHANGED_DISTANCE, distance};
 use super::state::{Keyframe, LastFrame, Observation, Place, Refusal, State, Update};
 use super::tracker::Tracker;
-use super::{Belief, MovingBelief};
+use super::{PoseVelocity, PoseWithCovariance};
 use seese3_core::adapter::JUMP_WINDOW;
 
 /// After a longer pause than this, in frames of the calibration rooms, a jump could not be noticed:
@@ -33,7 +33,7 @@ const LONGEST_GAP: u64 = 15;
 impl Tracker {
     /// The state of a stream before its first frame: in the only map, or in one that is to be
     /// found. `initial_pose` is `world_from_camera` of the first frame, if it is known.
-    pub fn start(&self, initial_pose: Option<Belief>) -> State {
+    pub fn start(&self, initial_pose: Option<PoseWithCovariance>) -> State {
         let health = if initial_pose.is_some() {
             TrackingHealth::confirmed()
         } else {
@@ -49,7 +49,7 @@ impl Tracker {
     }
 
     /// Sets where a stream's camera is, `world_from_camera`; `odom` continues as it was.
-    pub fn set_pose(&self, state: &mut State, pose: Belief) {
+    pub fn set_pose(&self, state: &mut State, pose: PoseWithCovariance) {
         state.health = TrackingHealth::confirmed();
         state.candidate = None;
         state.frames_off_map = 0;
@@ -61,13 +61,13 @@ impl Tracker {
                     time_ns: last.time_ns,
                     sequence: last.sequence,
                     latent: last.latent.clone(),
-                    odom: MovingBelief::at(last.odom, self.prior(state.room)),
+                    odom: PoseVelocity::at(last.odom, self.prior(state.room)),
                     reported_pose: Some(pose),
                 });
                 state.place = Some(Place {
                     time_ns: last.time_ns,
                     latent: Some(last.latent.clone()),
-                    belief: MovingBelief::at(pose, self.prior(state.room)),
+                    belief: PoseVelocity::at(pose, self.prior(state.room)),
                     lasting: Matrix6::zeros(),
                 });
                 state.measured = state.measured.begun(last.time_ns);
@@ -174,8 +174,9 @@ impl Tracker {
         let judged_pose = poses.map_pose.and(poses.reported_pose);
 
         let best = &seen.leading;
-        let contradiction = gravity.and_then(|gravity| contradiction(&gravity, best, &poses));
-        let (status, reason) = self.status(state, judged_pose.as_ref(), best, contradiction);
+        let gravity_error_rad =
+            gravity.and_then(|gravity| gravity_error_rad(&gravity, best, &poses));
+        let (status, reason) = self.status(state, judged_pose.as_ref(), best, gravity_error_rad);
 
         Update {
             motion: prediction.motion,
@@ -339,7 +340,11 @@ fn remember(
 
 /// By how much measured gravity contradicts where a view that looks like the room was taken, or the
 /// pose that several views told, radians; none if it does not.
-fn contradiction(gravity: &CountedGravity, view: &MatchedView<'_>, poses: &Poses) -> Option<f64> {
+fn gravity_error_rad(
+    gravity: &CountedGravity,
+    view: &MatchedView<'_>,
+    poses: &Poses,
+) -> Option<f64> {
     let placed = view.matches_room().then(|| view.placed());
     let by_view = placed.and_then(|placed| gravity.contradicts(&placed));
     by_view.or_else(|| gravity.contradicts(poses.reported_pose.as_ref()?))

@@ -75,14 +75,14 @@ pub(super) struct Found<'a> {
     depth_spread: f64,
     rotation: Rotation3<f64>,
     translation: Vector3<f64>,
-    seen: Vec<Seen>,
+    seen: Vec<MatchedPoint>,
     /// Twice the negative logarithm of the posterior density.
     cost: f64,
 }
 
 /// A match under a motion.
 #[derive(Clone, Copy)]
-struct Seen {
+struct MatchedPoint {
     /// log ρ, beyond its prior mean.
     excess: f64,
     inverse_depth: f64,
@@ -197,12 +197,12 @@ impl<'a> Found<'a> {
             excess,
         } = guess;
         let shift = rotation.inverse() * translation;
-        let seen: Vec<Seen> = matches
+        let seen: Vec<MatchedPoint> = matches
             .iter()
             .zip(excess)
             .map(|(matched, excess)| {
                 let direction = rotation.inverse() * matched.direction;
-                Seen::of(
+                MatchedPoint::of(
                     matched,
                     direction,
                     shift,
@@ -381,7 +381,7 @@ impl<'a> Found<'a> {
     }
 }
 
-impl Seen {
+impl MatchedPoint {
     /// A match whose direction in the second camera's axes is `turned`, seen from `shift` away in
     /// these axes, with the depth that suits it best.
     fn of(

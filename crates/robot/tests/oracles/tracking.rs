@@ -9,8 +9,8 @@ use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Frames, Room, RoomId};
 use seese3_core::statistics::root_mean_square;
 use seese3_robot::tracking::{
-    Belief, Drift, Map, MapQuery, MeasuredPose, Observation, PoseReader, State, Status, Tracker,
-    TrackerSettings, Update,
+    Drift, Map, MapQuery, MeasuredPose, Observation, PoseReader, PoseWithCovariance, State, Status,
+    Tracker, TrackerSettings, Update,
 };
 use seese3_testing::world::{FRAMES, calibrated, place, served};
 
@@ -65,7 +65,11 @@ fn a_wrong_match_cannot_pull_the_pose() {
     }
 
     let tracker = tracker(&adapter, poses, &features);
-    let mut state = tracker.start(Some(Belief::known(room.poses()[41], 0.05, 0.05)));
+    let mut state = tracker.start(Some(PoseWithCovariance::known(
+        room.poses()[41],
+        0.05,
+        0.05,
+    )));
     let mut refused = 0;
     for row in (41..141).step_by(2) {
         let update = observe(&tracker, &mut state, &features, row);
@@ -97,7 +101,7 @@ fn a_known_camera_with_spoilt_latents_is_corrected_by_its_features() {
         map(&adapter, room.poses().to_vec(), &features).with_features(features.rows(), &mapped);
     let tracker = Tracker::new(vec![Arc::new(map)], TrackerSettings::of(&adapter)).unwrap();
 
-    let errors = |with_features: bool, initial_pose: Option<Belief>| {
+    let errors = |with_features: bool, initial_pose: Option<PoseWithCovariance>| {
         let mut state = tracker.start(initial_pose);
         let mut errors = Vec::new();
         for row in (41..141).step_by(2) {
@@ -120,7 +124,7 @@ fn a_known_camera_with_spoilt_latents_is_corrected_by_its_features() {
         errors
     };
 
-    let known = Some(Belief::known(room.poses()[41], 0.05, 0.05));
+    let known = Some(PoseWithCovariance::known(room.poses()[41], 0.05, 0.05));
     let (with, without) = (errors(true, known), errors(false, known));
     assert_eq!((with.len(), without.len()), (50, 50));
     let (with, without) = (root_mean_square(&with), root_mean_square(&without));
@@ -168,7 +172,7 @@ fn odom_never_jumps() {
             let went = step(&odom, &update.odom.pose);
             let corrected = place
                 .zip(update.map_pose)
-                .map(|(a, b): (Pose, Belief)| step(&a, &b.pose));
+                .map(|(a, b): (Pose, PoseWithCovariance)| step(&a, &b.pose));
             jumped |= corrected.is_some_and(|corrected| corrected > went + 0.3);
 
             assert!(
@@ -195,7 +199,7 @@ fn what_a_gap_hid_is_not_taken_on_trust() {
     let (room, features) = served("hall");
     let elsewhere = place("moon", 77).1;
     let tracker = tracker(&adapter, room.poses().to_vec(), &features);
-    let mut state = tracker.start(Some(Belief::known(room.poses()[1], 0.05, 0.05)));
+    let mut state = tracker.start(Some(PoseWithCovariance::known(room.poses()[1], 0.05, 0.05)));
 
     for row in (1..41).step_by(2) {
         let update = observe(&tracker, &mut state, &features, row);
@@ -244,9 +248,9 @@ struct Knowing(Vec<Pose>);
 
 impl PoseReader for Knowing {
     /// The feature's only number is the frame's row.
-    fn read_pose(&self, feature: &[f32]) -> Option<Belief> {
+    fn read_pose(&self, feature: &[f32]) -> Option<PoseWithCovariance> {
         let pose = *self.0.get(feature[0] as usize)?;
-        Some(Belief::known(pose, 0.01, 0.01))
+        Some(PoseWithCovariance::known(pose, 0.01, 0.01))
     }
 }
 
@@ -344,7 +348,7 @@ fn a_camera_that_sees_nothing_new_is_not_tracked() {
     let (room, features) = served("hall");
     let tracker = tracker(&adapter, room.poses().to_vec(), &features);
 
-    let mut state = tracker.start(Some(Belief::known(room.poses()[1], 0.01, 0.01)));
+    let mut state = tracker.start(Some(PoseWithCovariance::known(room.poses()[1], 0.01, 0.01)));
     let mut number = 0;
     let mut show = |row: usize, is_blank: bool| {
         number += 1;
@@ -420,7 +424,11 @@ fn wheels_carry_a_blind_camera() {
     let tracker = tracker(&adapter, room.poses().to_vec(), &features);
 
     let ride = |has_wheels: bool| {
-        let mut state = tracker.start(Some(Belief::known(room.poses()[41], 0.01, 0.01)));
+        let mut state = tracker.start(Some(PoseWithCovariance::known(
+            room.poses()[41],
+            0.01,
+            0.01,
+        )));
         // The wheels' own frame is not the room's, and every motion that they report is 3 % too
         // long.
         let mut wheels = Pose::new(

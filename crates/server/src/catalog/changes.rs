@@ -11,7 +11,7 @@ use tracing::Instrument;
 
 use super::super::auth::Principal;
 use super::super::metrics::Metrics;
-use super::super::reload::Looks;
+use super::super::reload::ReloadHandle;
 use super::super::snapshot::Snapshot;
 use super::super::status::Full;
 use super::super::{Config, Error, Handlers, Phase};
@@ -28,7 +28,7 @@ const MOST_WAITING: usize = 64;
 /// What changes of the catalog share.
 pub struct Changes {
     pub store: Store,
-    looks: Looks,
+    reload: ReloadHandle,
     recent: Arc<Mutex<Recent>>,
     /// Changes that may wait for their turn.
     waiting: Arc<Semaphore>,
@@ -40,10 +40,10 @@ pub struct Changes {
 }
 
 impl Changes {
-    pub fn new(store: Store, looks: Looks, config: &Config) -> Self {
+    pub fn new(store: Store, reload: ReloadHandle, config: &Config) -> Self {
         Self {
             store,
-            looks,
+            reload,
             recent: Arc::default(),
             waiting: Arc::new(Semaphore::new(MOST_WAITING)),
             upload_pieces: config.upload_bytes / PIECE,
@@ -87,7 +87,7 @@ impl Changes {
                 }
 
                 let made = on_blocking_thread(change).await??;
-                changes.looks.look().await;
+                changes.reload.now().await;
                 let answer = answer(made);
                 recent.remember(identity, answer.encode_to_vec());
                 Ok(answer)

@@ -147,7 +147,7 @@ impl Handlers {
             });
             fitted.map(|fitted| (refit, fitted))
         };
-        let (refit, fitted) = self.workers.run_admitted(Lane::Long, fit).await??;
+        let (refit, fitted) = self.workers.run_unbounded(Lane::Long, fit).await??;
         let store = changes.store.clone();
         let name = refit.name().to_owned();
         let change = async move {

@@ -267,7 +267,7 @@ impl Handlers {
                 let adapter = snapshot.adapter(&adapter)?;
                 snapshot.image_encoder(adapter)?.feature("images", &image)
             };
-            rows.extend(self.workers.run_admitted(Lane::Images, encode).await??);
+            rows.extend(self.workers.run_unbounded(Lane::Images, encode).await??);
         }
 
         Ok(rows)

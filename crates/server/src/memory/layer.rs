@@ -18,7 +18,7 @@ use super::super::connections::Peer;
 use super::super::holding_body::holding;
 use super::decoded::{decoded_size, has_unary_response, is_stream};
 use super::response::{ResponseTimeout, in_pieces};
-use super::{HELD, Held, Memory};
+use super::{MEMORY_LEASE, Memory, MemoryLease};
 
 /// The paths of the health service. Those who watch stay, and have memory of their own: else many
 /// of them would hold that of those who check, or of requests.
@@ -89,7 +89,9 @@ where
 
             let is_unary = has_unary_response(request.uri().path());
             let peer = request.extensions().get::<Peer>().cloned();
-            let response = HELD.scope(held.clone(), inner.call(request)).await?;
+            let response = MEMORY_LEASE
+                .scope(held.clone(), inner.call(request))
+                .await?;
 
             let peer = peer.filter(|_| is_unary);
             let timeout = peer.map(|peer| ResponseTimeout::new(peer, layer.response_timeout));
@@ -100,7 +102,10 @@ where
 
 impl MemoryLayer {
     /// Receives a request as far as it has to be before a handler sees it.
-    async fn received(&self, request: Request<Body>) -> Result<(Held, Request<Body>), Error> {
+    async fn received(
+        &self,
+        request: Request<Body>,
+    ) -> Result<(MemoryLease, Request<Body>), Error> {
         let path = request.uri().path().to_owned();
         let memory = match path.as_str() {
             CHECK => &self.probes,
@@ -148,7 +153,7 @@ impl MemoryLayer {
     }
 
     /// All bytes of a request.
-    async fn whole(&self, mut body: Body, held: &Held) -> Result<Bytes, Error> {
+    async fn whole(&self, mut body: Body, held: &MemoryLease) -> Result<Bytes, Error> {
         let mut whole = BytesMut::new();
         while let Some(frame) = body.frame().await {
             let frame = frame.map_err(|status| Error::Transport {
@@ -176,7 +181,7 @@ impl MemoryLayer {
 struct CountedBody {
     body: Body,
     messages: Messages,
-    held: Held,
+    held: MemoryLease,
 }
 
 /// Finds the messages in the bytes of a stream.

@@ -27,7 +27,7 @@ const LEAST: usize = 16 << 10;
 
 tokio::task_local! {
     /// What the request that is being answered holds.
-    static HELD: Held;
+    static MEMORY_LEASE: MemoryLease;
 }
 
 /// The bytes that all requests hold together, and how many they may.
@@ -73,8 +73,8 @@ impl Memory {
     ///
     /// # Errors
     /// [`Error::Full`] if there is no memory for it.
-    fn begin(&self) -> Result<Held, Error> {
-        let held = Held(Arc::new(Share {
+    fn begin(&self) -> Result<MemoryLease, Error> {
+        let held = MemoryLease(Arc::new(Share {
             memory: self.clone(),
             bytes: AtomicUsize::new(0),
         }));
@@ -85,7 +85,7 @@ impl Memory {
 
 /// What one request holds. It is free again when the last clone is dropped.
 #[derive(Debug, Clone)]
-struct Held(Arc<Share>);
+struct MemoryLease(Arc<Share>);
 
 #[derive(Debug)]
 struct Share {
@@ -93,7 +93,7 @@ struct Share {
     bytes: AtomicUsize,
 }
 
-impl Held {
+impl MemoryLease {
     /// Holds more bytes.
     ///
     /// # Errors
@@ -139,7 +139,9 @@ pub fn respond<A: Message>(answer: A) -> Result<Response<A>, Status> {
     let bytes = 3 * answer.encoded_len();
 
     // Outside of a request, as in a unit test, nothing is counted.
-    HELD.try_with(|held| held.hold(bytes)).unwrap_or(Ok(()))?;
+    MEMORY_LEASE
+        .try_with(|held| held.hold(bytes))
+        .unwrap_or(Ok(()))?;
     Ok(Response::new(answer))
 }
 

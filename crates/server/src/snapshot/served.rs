@@ -21,13 +21,13 @@ pub struct ServedRoom {
     /// The adapters that fit the room, in order of preference.
     pub(super) candidates: Vec<Candidate>,
     /// What the last loading has shown; none before the first.
-    shown: Mutex<Option<Shown>>,
+    load_state: Mutex<Option<LoadState>>,
     cache: Arc<RoomCache>,
     pub(super) key: Key,
 }
 
 /// What loading a room shows of it.
-enum Shown {
+enum LoadState {
     Loaded {
         adapters: Vec<Arc<StoredAdapter>>,
         refused: BTreeMap<String, Refusal>,
@@ -46,7 +46,7 @@ impl ServedRoom {
             id,
             summary,
             candidates,
-            shown: Mutex::new(None),
+            load_state: Mutex::new(None),
             key: cache.new_key(),
             cache,
         }
@@ -55,9 +55,9 @@ impl ServedRoom {
     /// The adapters that serve the room, in order of preference. Before the room was loaded for the
     /// first time: those that should.
     pub fn adapters(&self) -> Vec<Arc<StoredAdapter>> {
-        match &*self.shown() {
-            Some(Shown::Loaded { adapters, .. }) => adapters.clone(),
-            Some(Shown::Refused(_)) | None => self
+        match &*self.load_state() {
+            Some(LoadState::Loaded { adapters, .. }) => adapters.clone(),
+            Some(LoadState::Refused(_)) | None => self
                 .candidates
                 .iter()
                 .map(|candidate| candidate.adapter.clone())
@@ -72,16 +72,16 @@ impl ServedRoom {
 
     /// Why the room cannot be loaded, if that was tried.
     pub fn refusal(&self) -> Option<Refusal> {
-        match &*self.shown() {
-            Some(Shown::Refused(refusal)) => Some(refusal.clone()),
+        match &*self.load_state() {
+            Some(LoadState::Refused(refusal)) => Some(refusal.clone()),
             _ => None,
         }
     }
 
     /// Why an adapter that fits by its features does not serve the room, by name.
     pub fn refused_adapters(&self) -> BTreeMap<String, Refusal> {
-        match &*self.shown() {
-            Some(Shown::Loaded { refused, .. }) => refused.clone(),
+        match &*self.load_state() {
+            Some(LoadState::Loaded { refused, .. }) => refused.clone(),
             _ => BTreeMap::new(),
         }
     }
@@ -149,7 +149,7 @@ impl ServedRoom {
     /// Remembers what loading has shown.
     pub(super) fn remember(&self, loaded: Result<&LoadedRoom, &Refusal>) {
         let now = match loaded {
-            Ok(loaded) => Shown::Loaded {
+            Ok(loaded) => LoadState::Loaded {
                 adapters: loaded
                     .navigators
                     .iter()
@@ -157,13 +157,15 @@ impl ServedRoom {
                     .collect(),
                 refused: loaded.refused.clone(),
             },
-            Err(refusal) => Shown::Refused(refusal.clone()),
+            Err(refusal) => LoadState::Refused(refusal.clone()),
         };
-        *self.shown() = Some(now);
+        *self.load_state() = Some(now);
     }
 
-    fn shown(&self) -> std::sync::MutexGuard<'_, Option<Shown>> {
-        self.shown.lock().unwrap_or_else(PoisonError::into_inner)
+    fn load_state(&self) -> std::sync::MutexGuard<'_, Option<LoadState>> {
+        self.load_state
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 }
 

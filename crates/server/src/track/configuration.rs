@@ -8,7 +8,7 @@ use super::super::relocalization::rooms_to_track_in;
 use super::super::snapshot::{ServedNavigator, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
-use seese3_robot::tracking::{Belief, Drift, MeasuredPose, TrackerSettings};
+use seese3_robot::tracking::{Drift, MeasuredPose, PoseWithCovariance, TrackerSettings};
 
 /// The standard deviation by axis of a pose whose sender states none: 0.1 m and 0.1 rad.
 const KNOWN: f64 = 0.1;
@@ -201,7 +201,11 @@ impl StreamFrames {
     /// # Errors
     /// [`Error::Invalid`] if the pose is missing or not valid, or a standard deviation is out of
     /// range.
-    pub fn known_pose(&self, given: pb::InitialPose, room: &str) -> Result<Belief, Error> {
+    pub fn known_pose(
+        &self,
+        given: pb::InitialPose,
+        room: &str,
+    ) -> Result<PoseWithCovariance, Error> {
         let pb::InitialPose {
             pose,
             translation_deviation_m,
@@ -220,7 +224,7 @@ impl StreamFrames {
         let translation = deviation("translation_deviation_m", translation_deviation_m)?;
         let rotation = deviation("rotation_deviation_rad", rotation_deviation_rad)?;
 
-        Ok(self.of_camera(Belief::known(pose, translation, rotation), body))
+        Ok(self.of_camera(PoseWithCovariance::known(pose, translation, rotation), body))
     }
 
     /// The odometry of another sensor, as the camera's.
@@ -276,7 +280,7 @@ impl StreamFrames {
     }
 
     /// A belief of a body's pose as one of the camera's.
-    fn of_camera(&self, belief: Belief, body: Body) -> Belief {
+    fn of_camera(&self, belief: PoseWithCovariance, body: Body) -> PoseWithCovariance {
         match (body, self.base_from_camera) {
             (Body::Base, Some(base_from_camera)) => belief.of_attached(&base_from_camera),
             _ => belief,

@@ -75,7 +75,7 @@ impl Handlers {
         let mut phase = self.phase.clone();
         let first = tokio::select! {
             first = tokio::time::timeout(self.config.longest, requests.message()) => first,
-            () = told_to_stop(&mut phase) => return Err(Error::Loading.into()),
+            () = shutdown_requested(&mut phase) => return Err(Error::Loading.into()),
         };
 
         let config = match first.map_err(|_| Error::Deadline)?? {
@@ -132,7 +132,7 @@ impl Handlers {
                     };
                     let _ = answers.try_send(Err(revoked.into()));
                 }
-                () = told_to_stop(&mut phase) => {
+                () = shutdown_requested(&mut phase) => {
                     // The caller can resume on another server with the token of its last answer. A
                     // reader that is too slow to take this error is not waited for.
                     let _ = answers.try_send(Err(Error::Loading.into()));
@@ -220,7 +220,7 @@ impl Handlers {
             _ => Lane::Short,
         };
         self.workers
-            .run_admitted(lane, move || {
+            .run_unbounded(lane, move || {
                 let answer = match message {
                     Message::Frame(frame) => session.take(frame, since.elapsed()),
                     Message::SetInitialPose(given) => Ok(session.put(given)),
@@ -256,7 +256,7 @@ async fn revoked(keyring: Option<&Arc<Keyring>>, caller: Option<&Arc<Principal>>
 }
 
 /// Completes when the server is no longer serving.
-async fn told_to_stop(phase: &mut watch::Receiver<Phase>) {
+async fn shutdown_requested(phase: &mut watch::Receiver<Phase>) {
     // An error means that the server is gone. The guard is dropped at once, because `run` cannot
     // change the phase while it lives.
     let _ = phase

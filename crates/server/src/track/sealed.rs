@@ -142,12 +142,12 @@ mod tests {
     use super::*;
     use seese3_core::geometry::{Pose, Twist};
     use seese3_robot::tracking::{
-        Belief, Candidate, Driven, Keyframe, LastFrame, LastMeasured, MeasuredSince, MovingBelief,
-        OtherCamera, Place, RecentMatches, TrackingHealth,
+        Candidate, Keyframe, LastFrame, LastMeasured, OdometryAccumulator, OdometryDelta,
+        OtherCamera, Place, PoseVelocity, PoseWithCovariance, RecentMatches, TrackingHealth,
     };
 
-    fn odd_moving(pose: Pose) -> MovingBelief {
-        let mut moving = MovingBelief {
+    fn odd_moving(pose: Pose) -> PoseVelocity {
+        let mut moving = PoseVelocity {
             pose,
             velocity: Twist::from_vector(&Vector6::repeat(0.1)),
             covariance: SMatrix::from_diagonal_element(1.0 / 3.0),
@@ -157,10 +157,10 @@ mod tests {
         moving
     }
 
-    fn odd_measured(pose: Pose) -> MeasuredSince {
-        MeasuredSince {
+    fn odd_measured(pose: Pose) -> OdometryAccumulator {
+        OdometryAccumulator {
             last: Some(LastMeasured { time_ns: -9, pose }),
-            keyframe: Some(Driven {
+            keyframe: Some(OdometryDelta {
                 pose,
                 way_m: 1.0 / 7.0,
                 turns_rad: 0.3,
@@ -176,7 +176,7 @@ mod tests {
             nalgebra::Vector3::new(0.3, 1.0 / 3.0, -0.7),
         );
 
-        let belief = Belief::known(odd, 0.1, 0.2).moved(
+        let belief = PoseWithCovariance::known(odd, 0.1, 0.2).moved(
             seese3_core::geometry::Twist {
                 linear: nalgebra::Vector3::new(0.1, 0.2, 0.3),
                 angular: nalgebra::Vector3::y() * 0.4,

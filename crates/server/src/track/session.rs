@@ -20,7 +20,7 @@ use super::wire;
 use seese3_client::proto::v1 as pb;
 use seese3_core::navigation::Source;
 use seese3_robot::tracking::{
-    Belief, Observation, OtherView, Refusal, State, Tracker, Update, View,
+    Observation, OtherView, PoseWithCovariance, Refusal, State, Tracker, Update, View,
 };
 
 const FIELD: &str = "config";
@@ -336,7 +336,7 @@ impl Session {
         self.answer(answer)
     }
 
-    fn place_of(&self, given: pb::SetInitialPose) -> Result<Belief, Error> {
+    fn place_of(&self, given: pb::SetInitialPose) -> Result<PoseWithCovariance, Error> {
         let field = "set_initial_pose.initial_pose";
         let given = given
             .initial_pose

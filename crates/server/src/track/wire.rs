@@ -8,7 +8,7 @@ use super::configuration::StreamFrames;
 use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::{Pose, Twist, adjoint};
 use seese3_core::navigation::RetrievedFrame;
-use seese3_robot::tracking::{ANCHORS_TO_AGREE, Belief, Status, Update};
+use seese3_robot::tracking::{ANCHORS_TO_AGREE, PoseWithCovariance, Status, Update};
 
 /// An update as a wire message. Its `timestamp_ns`, `sequence`, `elapsed_ns` and `best_camera` are
 /// left 0 or empty; the session fills them in.
@@ -98,9 +98,9 @@ pub fn update(
 
 /// The tracker's odometry begins at the camera; where the base is known, the stream's begins at the
 /// base.
-fn odom_of_stream(odom: &Belief, frames: &StreamFrames) -> Belief {
+fn odom_of_stream(odom: &PoseWithCovariance, frames: &StreamFrames) -> PoseWithCovariance {
     match frames.base_from_camera {
-        Some(base_from_camera) => Belief {
+        Some(base_from_camera) => PoseWithCovariance {
             pose: base_from_camera * odom.pose,
             ..*odom
         },

@@ -28,7 +28,7 @@ async fn start_watched() -> (TestServer, Store, Arc<Notify>) {
     let config = Config {
         reload: Reload {
             every: None,
-            asked: asked.clone(),
+            requested: asked.clone(),
         },
         ..Config::default()
     };
@@ -223,7 +223,7 @@ async fn a_server_starts_beside_damage_and_outlives_its_store() {
     let asked = Arc::new(Notify::new());
     let reload = Reload {
         every: Some(Duration::from_millis(20)),
-        asked,
+        requested: asked,
     };
     let config = Config {
         reload,

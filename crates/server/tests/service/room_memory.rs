@@ -18,7 +18,7 @@ async fn start_with(rooms: RoomMemory) -> (TestServer, Config) {
         rooms,
         reload: Reload {
             every: None,
-            asked: Arc::new(Notify::new()),
+            requested: Arc::new(Notify::new()),
         },
         ..Config::default()
     };
@@ -112,7 +112,7 @@ async fn damage_is_noticed_when_a_room_is_first_asked_for() {
         rooms: lazy,
         reload: Reload {
             every: None,
-            asked: asked.clone(),
+            requested: asked.clone(),
         },
         ..Config::default()
     };
@@ -185,11 +185,11 @@ async fn a_stream_holds_its_own_room_alone() {
     let config = Config {
         reload: Reload {
             every: None,
-            asked: Arc::new(Notify::new()),
+            requested: Arc::new(Notify::new()),
         },
         ..Config::default()
     };
-    let asked = config.reload.asked.clone();
+    let asked = config.reload.requested.clone();
     let server = start_followed(config.clone()).await;
     assert_eq!(metric(&config, "seese3_rooms_in_memory"), 2.0);
 

@@ -7,7 +7,7 @@
 
 use nalgebra::{Matrix6, Vector6};
 
-use super::moving::ReadMotion;
+use super::pose_velocity::ReadMotion;
 use super::state::Observation;
 use seese3_core::geometry::{Pose, Twist, body_twist, exp, log};
 
@@ -37,7 +37,7 @@ pub struct Drift {
 /// What was driven from an earlier frame to the last one that brought a pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct Driven {
+pub struct OdometryDelta {
     /// The later camera's pose in the earlier one.
     pub pose: Pose,
     /// The length of the way, metres.
@@ -59,21 +59,21 @@ pub struct LastMeasured {
 /// What was measured up to the last frame that brought a pose.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct MeasuredSince {
+pub struct OdometryAccumulator {
     /// That frame.
     pub last: Option<LastMeasured>,
-    /// Driven since the keyframe; none if that brought no pose.
-    pub keyframe: Option<Driven>,
-    /// Driven since the frame of the last place; none if that brought no pose.
-    pub place: Option<Driven>,
+    /// OdometryDelta since the keyframe; none if that brought no pose.
+    pub keyframe: Option<OdometryDelta>,
+    /// OdometryDelta since the frame of the last place; none if that brought no pose.
+    pub place: Option<OdometryDelta>,
 }
 
-impl MeasuredSince {
+impl OdometryAccumulator {
     /// As it is when the frame of this time, the last of its stream, has become keyframe and place.
     #[must_use]
     pub(super) fn begun(self, time_ns: i64) -> Self {
         let brought_pose = self.last.filter(|last| last.time_ns == time_ns);
-        let begun = brought_pose.map(|_| Driven::not_at_all());
+        let begun = brought_pose.map(|_| OdometryDelta::zero());
         Self {
             last: self.last,
             keyframe: begun,
@@ -86,8 +86,8 @@ impl MeasuredSince {
     pub(super) fn after(self, frame: &Observation, is_keyframe: bool, is_place: bool) -> Self {
         let measured = frame.measured.as_ref();
         let step = self.step(measured);
-        let or_begin = |begins: bool, since: Option<Driven>| match (begins, measured) {
-            (true, measured) => measured.map(|_| Driven::not_at_all()),
+        let or_begin = |begins: bool, since: Option<OdometryDelta>| match (begins, measured) {
+            (true, measured) => measured.map(|_| OdometryDelta::zero()),
             (false, None) => since,
             (false, Some(_)) => Some(since?.and(step?)),
         };
@@ -124,7 +124,11 @@ impl MeasuredSince {
         motion.is_unique_logarithm().then_some(motion)
     }
 
-    fn known(&self, since: Option<Driven>, measured: Option<&MeasuredPose>) -> Option<ReadMotion> {
+    fn known(
+        &self,
+        since: Option<OdometryDelta>,
+        measured: Option<&MeasuredPose>,
+    ) -> Option<ReadMotion> {
         let driven = since?.and(self.step(measured)?);
         let motion = log(&driven.pose);
 
@@ -135,9 +139,9 @@ impl MeasuredSince {
     }
 }
 
-impl Driven {
+impl OdometryDelta {
     /// From a frame to itself.
-    fn not_at_all() -> Self {
+    fn zero() -> Self {
         Self {
             pose: Pose::identity(),
             way_m: 0.0,
@@ -157,8 +161,8 @@ impl Driven {
 impl Drift {
     /// The covariance of the error of what was driven, on (v, ω) in the later camera's body frame. A
     /// heading that is wrong more and more leads aside by half of what it is wrong at the end.
-    fn over(self, driven: Driven) -> Matrix6<f64> {
-        let Driven {
+    fn over(self, driven: OdometryDelta) -> Matrix6<f64> {
+        let OdometryDelta {
             way_m, turns_rad, ..
         } = driven;
         let rotation = LEAST_DEVIATION_RAD + self.rotation_share * (turns_rad + way_m);
@@ -207,7 +211,7 @@ mod tests {
             )
         };
 
-        let mut since = MeasuredSince::default().after(&observed(0), true, true);
+        let mut since = OdometryAccumulator::default().after(&observed(0), true, true);
         for frame in 1..frames {
             since = since.after(&observed(frame), false, false);
         }
@@ -244,12 +248,12 @@ mod tests {
     /// Oracle: the rule, by hand: a place that is set at a frame without a pose is not measured from.
     #[test]
     fn a_place_at_a_silent_frame_begins_nothing() {
-        let since = MeasuredSince {
+        let since = OdometryAccumulator {
             last: Some(LastMeasured {
                 time_ns: 5,
                 pose: Pose::identity(),
             }),
-            ..MeasuredSince::default()
+            ..OdometryAccumulator::default()
         };
         assert!(since.begun(5).place.is_some() && since.begun(5).keyframe.is_some());
         assert!(since.begun(6).place.is_none() && since.begun(6).keyframe.is_none());
@@ -262,7 +266,7 @@ mod tests {
             linear: Vector3::new(0.1, 0.0, 0.0),
             angular: Vector3::new(0.0, 0.0, 0.1),
         };
-        let twice = Driven::not_at_all().and(step).and(step);
+        let twice = OdometryDelta::zero().and(step).and(step);
         let error = PoseError::between(&twice.pose, &exp(&step.times(2)));
         assert!(error.translation_m < 1e-12 && error.rotation_rad < 1e-7);
         assert!((twice.way_m - 0.2).abs() < 1e-12 && (twice.turns_rad - 0.2).abs() < 1e-12);

@@ -3,7 +3,7 @@
 use nalgebra::{Cholesky, Matrix6, SMatrix, SVector};
 
 use super::motion_prior::{Matrix12, MotionPrior};
-use super::{Belief, Innovation};
+use super::{Innovation, PoseWithCovariance};
 use seese3_core::geometry::{Pose, Twist, adjoint, exp, log};
 
 type Matrix18 = SMatrix<f64, 18, 18>;
@@ -17,7 +17,7 @@ const ABRUPTNESS: f64 = 4.0;
 /// = pose · exp(δ), and the velocity's, each ordered (v, ω); metres, radians and seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct MovingBelief {
+pub struct PoseVelocity {
     /// `parent_from_camera`.
     pub pose: Pose,
     /// In the camera's body frame, metres and radians per second.
@@ -37,9 +37,9 @@ pub(super) struct ReadMotion {
     pub covariance: Matrix6<f64>,
 }
 
-impl MovingBelief {
+impl PoseVelocity {
     /// A camera whose place is known and whose velocity is not.
-    pub fn at(place: Belief, prior: &MotionPrior) -> Self {
+    pub fn at(place: PoseWithCovariance, prior: &MotionPrior) -> Self {
         let mut covariance = Matrix12::zeros();
         covariance
             .fixed_view_mut::<6, 6>(0, 0)
@@ -56,8 +56,8 @@ impl MovingBelief {
     }
 
     /// Where the camera is, without its velocity.
-    pub fn place(&self) -> Belief {
-        Belief {
+    pub fn place(&self) -> PoseWithCovariance {
+        PoseWithCovariance {
             pose: self.pose,
             covariance: self.covariance.fixed_view::<6, 6>(0, 0).into_owned(),
         }
@@ -122,7 +122,7 @@ impl MovingBelief {
 
     /// How far a measured pose is from this one; none when the sum of the covariances is not
     /// positive definite.
-    pub fn innovation(&self, measured: &Belief) -> Option<Innovation> {
+    pub fn innovation(&self, measured: &PoseWithCovariance) -> Option<Innovation> {
         self.place().innovation(measured)
     }
 
@@ -130,7 +130,7 @@ impl MovingBelief {
     /// follows by its correlation with the pose. Where the sum of the covariances is not positive
     /// definite, this belief is returned unchanged.
     #[must_use]
-    pub fn corrected(&self, measured: &Belief) -> Self {
+    pub fn corrected(&self, measured: &PoseWithCovariance) -> Self {
         let place = self.place();
         let Some(sum) = Cholesky::new(place.covariance + measured.covariance) else {
             return *self;
@@ -189,14 +189,17 @@ mod tests {
         let way_velocity = abrupt(variance * reach, variance * reach * left);
         let velocity = abrupt(variance, variance * left * left);
 
-        let start = MovingBelief::at(Belief::known(Pose::identity(), 0.01, 0.01), &prior());
+        let start = PoseVelocity::at(
+            PoseWithCovariance::known(Pose::identity(), 0.01, 0.01),
+            &prior(),
+        );
         let later = start.moved(&prior(), time, None);
         let found = later.covariance;
         assert!((found[(0, 0)] - (1e-4 + way)).abs() < 1e-12);
         assert!((found[(0, 6)] - way_velocity).abs() < 1e-12);
         assert!((found[(6, 6)] - velocity).abs() < 1e-12);
 
-        let measured = Belief::known(Pose::translation(0.03, 0.0, 0.0), 0.02, 0.02);
+        let measured = PoseWithCovariance::known(Pose::translation(0.03, 0.0, 0.0), 0.02, 0.02);
         let corrected = later.corrected(&measured);
         let gain = 0.03 / (1e-4 + way + 4e-4);
         assert!((corrected.pose.translation.x - (1e-4 + way) * gain).abs() < 1e-12);
@@ -209,7 +212,10 @@ mod tests {
     /// nothing.
     #[test]
     fn a_reading_counts_as_much_as_it_is_sure() {
-        let start = MovingBelief::at(Belief::known(Pose::identity(), 0.1, 1e-6), &prior());
+        let start = PoseVelocity::at(
+            PoseWithCovariance::known(Pose::identity(), 0.1, 1e-6),
+            &prior(),
+        );
         let motion = Twist {
             linear: Vector3::new(0.2, -0.1, 0.05),
             angular: Vector3::new(0.0, 0.4, 0.1),
@@ -234,11 +240,14 @@ mod tests {
     /// Oracle: the definition of positive definite, over a long stream with corrections.
     #[test]
     fn a_covariance_stays_positive_definite() {
-        let mut belief = MovingBelief::at(Belief::known(Pose::identity(), 1e-6, 1e-6), &prior());
+        let mut belief = PoseVelocity::at(
+            PoseWithCovariance::known(Pose::identity(), 1e-6, 1e-6),
+            &prior(),
+        );
         for step in 0..5_000 {
             belief = belief.moved(&prior(), 0.02, None);
             if step % 3 == 0 {
-                belief = belief.corrected(&Belief::known(belief.pose, 1e-4, 1e-4));
+                belief = belief.corrected(&PoseWithCovariance::known(belief.pose, 1e-4, 1e-4));
             }
             assert!(
                 Cholesky::new(belief.covariance).is_some(),

@@ -13,7 +13,7 @@ const PLACE_DEVIATION_RAD: f64 = 0.105;
 /// (v, ω), metres and radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
-pub struct Belief {
+pub struct PoseWithCovariance {
     /// `parent_from_camera`.
     pub pose: Pose,
     /// Symmetric and positive definite.
@@ -34,7 +34,7 @@ pub struct Innovation {
     pub squared_length: f64,
 }
 
-impl Belief {
+impl PoseWithCovariance {
     /// A pose with independent errors; `translation_m` and `rotation_rad` are standard deviations
     /// along and about each axis.
     pub fn known(pose: Pose, translation_m: f64, rotation_rad: f64) -> Self {
@@ -83,7 +83,7 @@ impl Belief {
 
     /// How far a measured pose is from this one; none when the sum of the covariances is not
     /// positive definite.
-    pub fn innovation(&self, measured: &Belief) -> Option<Innovation> {
+    pub fn innovation(&self, measured: &PoseWithCovariance) -> Option<Innovation> {
         let twist = log(&self.pose.inv_mul(&measured.pose)).to_vector();
         let sum = Cholesky::new(self.covariance + measured.covariance)?;
 
@@ -97,7 +97,7 @@ impl Belief {
     /// in Joseph's form, which stays positive definite under rounding. Where the sum of the
     /// covariances is not positive definite, this belief is returned unchanged.
     #[must_use]
-    pub fn corrected(&self, measured: &Belief) -> Self {
+    pub fn corrected(&self, measured: &PoseWithCovariance) -> Self {
         let Some(sum) = Cholesky::new(self.covariance + measured.covariance) else {
             return *self;
         };
@@ -197,7 +197,7 @@ mod tests {
     #[test]
     fn a_moved_covariance_is_that_of_drawn_motions() {
         let mut random = ChaCha8Rng::seed_from_u64(1);
-        let start = Belief::known(Pose::translation(1.0, 2.0, 3.0), 0.02, 0.03);
+        let start = PoseWithCovariance::known(Pose::translation(1.0, 2.0, 3.0), 0.02, 0.03);
         let motion = twist([0.5, -0.2, 0.8], [0.1, 0.6, -0.2]);
         let noise = Matrix6::from_diagonal(&Vector6::new(4e-4, 1e-4, 9e-4, 1e-4, 4e-4, 2e-4));
         let found = start.moved(motion, &noise);
@@ -225,8 +225,8 @@ mod tests {
     /// variance; the squared length of a 2 m innovation with variances 1 + 1 is 2.
     #[test]
     fn two_equally_sure_poses_meet_in_the_middle() {
-        let ours = Belief::known(Pose::identity(), 1.0, 0.1);
-        let theirs = Belief::known(Pose::translation(2.0, 0.0, 0.0), 1.0, 0.1);
+        let ours = PoseWithCovariance::known(Pose::identity(), 1.0, 0.1);
+        let theirs = PoseWithCovariance::known(Pose::translation(2.0, 0.0, 0.0), 1.0, 0.1);
         let met = ours.corrected(&theirs);
 
         assert!((met.pose.translation.vector - Vector3::x()).norm() < 1e-12);
@@ -241,7 +241,7 @@ mod tests {
     fn covariances_for_ros_are_about_the_parents_axes() {
         let turn = Pose::rotation(Vector3::z() * std::f64::consts::FRAC_PI_2);
         let covariance = Matrix6::from_diagonal(&Vector6::new(4.0, 1.0, 1.0, 0.9, 0.1, 0.1));
-        let found = Belief {
+        let found = PoseWithCovariance {
             pose: turn,
             covariance,
         }
@@ -255,7 +255,7 @@ mod tests {
     #[test]
     fn a_covariance_stays_positive_definite() {
         let mut random = ChaCha8Rng::seed_from_u64(2);
-        let mut belief = Belief::known(Pose::identity(), 1e-6, 1e-6);
+        let mut belief = PoseWithCovariance::known(Pose::identity(), 1e-6, 1e-6);
         let noise = Matrix6::from_diagonal_element(1e-8);
         for step in 0..5_000 {
             let motion = Twist::from_vector(
@@ -264,7 +264,7 @@ mod tests {
             belief = belief.moved(motion, &noise);
 
             if step % 7 == 0 {
-                belief = belief.corrected(&Belief {
+                belief = belief.corrected(&PoseWithCovariance {
                     pose: belief.pose,
                     covariance: Matrix6::from_diagonal_element(1e-9),
                 });

@@ -16,13 +16,13 @@ use super::metrics::Metrics;
 
 /// Wraps a service so that its requests are counted.
 #[derive(Debug, Clone)]
-pub struct MeasureLayer(pub Metrics);
+pub struct RequestMetricsLayer(pub Metrics);
 
-impl<S> Layer<S> for MeasureLayer {
-    type Service = Measure<S>;
+impl<S> Layer<S> for RequestMetricsLayer {
+    type Service = RequestMetrics<S>;
 
     fn layer(&self, inner: S) -> Self::Service {
-        Measure {
+        RequestMetrics {
             inner,
             metrics: self.0.clone(),
         }
@@ -31,12 +31,12 @@ impl<S> Layer<S> for MeasureLayer {
 
 /// A service whose requests are counted.
 #[derive(Debug, Clone)]
-pub struct Measure<S> {
+pub struct RequestMetrics<S> {
     inner: S,
     metrics: Metrics,
 }
 
-impl<S, B> Service<Request<B>> for Measure<S>
+impl<S, B> Service<Request<B>> for RequestMetrics<S>
 where
     S: Service<Request<B>, Response = Response<Body>>,
     S::Future: Send + 'static,

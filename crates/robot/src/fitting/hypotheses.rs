@@ -47,7 +47,7 @@ impl PartRule {
 
 /// What the readers say of a view.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Readings {
+pub struct MotionHypotheses {
     /// The mapped frame that the view resembles most.
     pub nearest: Neighbour,
     /// Its distance, in deviations of a feature column.
@@ -62,7 +62,7 @@ pub struct Readings {
     pub disagreement: f64,
 }
 
-impl Readings {
+impl MotionHypotheses {
     /// The motion that a reader says; none of a reader that is not there.
     pub fn by(&self, reader: MotionReader) -> Option<Twist> {
         match reader {
