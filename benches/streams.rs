@@ -92,10 +92,13 @@ fn adapter(rooms: &[(Room, Features)]) -> (Adapter, seese3_core::adapter::Traini
 
     let plan = TrainingPlan::of(Preset::PaperBase, Split::Whole, 20, 0);
     let (adapter, record) = train_adapter(&room_data[..1], &plan, &mut |_| ()).unwrap();
-    let (adapter, report) = calibrate(adapter, &record, &room_data[1..]).unwrap();
-    assert!(report.can_track, "the streams need an adapter that tracks");
+    let calibrated = calibrate(adapter, record, &room_data[1..]).unwrap();
+    assert!(
+        calibrated.can_track,
+        "the streams need an adapter that tracks"
+    );
 
-    (adapter, record)
+    (calibrated.adapter, calibrated.record)
 }
 
 /// Answers every message with as many bytes as a tracker's answer has.

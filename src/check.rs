@@ -7,7 +7,8 @@ use clap::{Args, Subcommand};
 
 use super::encode::images_root;
 use super::output::{JsonOutput, say};
-use super::pose_report::{PoseReport, PosesFrom};
+use super::pose_report::{PosesFrom, check_with_images, report_json, say_report};
+use seese3_data::pose_check::check_room;
 use seese3_store::Store;
 
 #[derive(Debug, Args)]
@@ -51,19 +52,21 @@ impl CheckRoom {
         let store = Store::open(&self.store)?;
         let room = store.load_room(&self.room, None).await?.room;
 
-        let mut report = PoseReport::of_path(&room);
-        if !room.images().is_empty() {
+        let from = PosesFrom::Store;
+        let report = if room.images().is_empty() {
+            check_room(&room, None)
+        } else {
             let root = images_root(&room, self.images.as_deref())?;
-            report.look_at_images(&room, &root, room.poses(), PosesFrom::Store);
-        }
+            check_with_images(&room, &root, room.poses(), from)
+        };
 
-        self.json.write(&report.json(&room))?;
+        self.json.write(&report_json(&report, &room, from))?;
         say(format_args!(
             "room '{}': {} frames",
             room.id(),
             room.frame_count()
         ));
-        report.say();
+        say_report(&report, from);
 
         if report.is_wrong() {
             bail!(

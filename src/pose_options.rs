@@ -144,32 +144,6 @@ pub fn flags_of(convention: Convention) -> String {
     flags.join(" ")
 }
 
-/// A convention in words: what the poses are then.
-pub fn in_words(convention: Convention) -> String {
-    let axes = match convention.axes {
-        Axes::OpenCv => "along x right, y down, z forward",
-        Axes::OpenGl => "along OpenGL's axes",
-        Axes::Ros => "along the axes of a ROS body",
-    };
-    let direction = match convention.direction {
-        Direction::WorldFromCamera => "world_from_camera",
-        Direction::CameraFromWorld => "camera_from_world, the inverse,",
-    };
-    let quaternions = match convention.quaternions {
-        QuaternionOrder::Stated => "",
-        QuaternionOrder::ScalarFirst => ", with the scalar of quaternions first",
-    };
-    let turned = match convention.image_quarter_turns {
-        0 => String::new(),
-        turns => format!(
-            ", of images that were turned clockwise by {} degrees",
-            90 * u16::from(turns)
-        ),
-    };
-
-    format!("{direction} {axes}{quaternions}{turned}")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

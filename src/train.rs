@@ -98,7 +98,8 @@ impl Train {
             mut runs,
         } = train_with_progress(&rooms, &plan, self.seeds)?;
         if !calibration.is_empty() {
-            adapter = calibrated(adapter, &mut runs[0].record, &calibration)?;
+            let record = runs[0].record.clone();
+            (adapter, runs[0].record) = calibrated(adapter, record, &calibration)?;
         }
 
         let features = &rooms[0].1;
@@ -163,21 +164,20 @@ fn say_scores(runs: &[TrainingRun]) {
     }
 }
 
-/// The adapter with its errors measured in the calibration rooms, which the record then names.
+/// The adapter with its errors measured in the calibration rooms, and its finished record.
 fn calibrated(
     adapter: Adapter,
-    record: &mut TrainingRecord,
+    record: TrainingRecord,
     rooms: &[(StoredRoom, Features)],
-) -> anyhow::Result<Adapter> {
+) -> anyhow::Result<(Adapter, TrainingRecord)> {
     let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
-    let (adapter, report) = calibrate(adapter, record, &room_data)?;
-    if !report.can_track {
+    let calibrated = calibrate(adapter, record, &room_data)?;
+    if !calibrated.can_track {
         say("one room is too few to tell rooms apart in: the adapter can navigate, not track");
     }
 
-    record.calibrated_on = report.rooms;
     say(format_args!("errors measured in {}", room_words(rooms)));
-    Ok(adapter)
+    Ok((calibrated.adapter, calibrated.record))
 }
 
 fn correctors(names: &[String]) -> anyhow::Result<Vec<CorrectorKind>> {

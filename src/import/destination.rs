@@ -11,11 +11,12 @@ use crate::camera::CameraOption;
 use crate::encode::same_poses;
 use crate::output::{JsonOutput, say};
 use crate::pose_options::{DirectionName, PoseOptions};
-use crate::pose_report::{PoseReport, PosesFrom};
+use crate::pose_report::{PosesFrom, check_with_images, report_json, say_report};
 use crate::progress::bar;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::room::{Frames, Provenance, Room, RoomId};
 use seese3_data::datasets::{self, Reader, Recording, Unusable};
+use seese3_data::pose_check::check_room;
 use seese3_store::{Store, check_features};
 
 #[derive(Debug, Args)]
@@ -258,13 +259,14 @@ impl Destination {
         self.refuse_other_frames(&store, &room).await?;
 
         self.say_read(&room, &features, &recording, read_count);
-        let mut report = PoseReport::of_path(&room);
-        if !self.skip_pose_check && !room.images().is_empty() {
+        let from = PosesFrom::Recording(read_as);
+        let report = if self.skip_pose_check || room.images().is_empty() {
+            check_room(&room, None)
+        } else {
             let root = Path::new(&recording.images_root);
-            let from = PosesFrom::Recording(read_as);
-            report.look_at_images(&room, root, &stated, from);
-        }
-        report.say();
+            check_with_images(&room, root, &stated, from)
+        };
+        say_report(&report, from);
         if format == "colmap" && self.read_as.has_no_scale() {
             eprintln!(
                 "warning: COLMAP's unit of length is arbitrary, and everything here is in metres: give --scale \
@@ -304,7 +306,7 @@ impl Destination {
             published.manifest
         ));
 
-        let mut record = report.json(&room);
+        let mut record = report_json(&report, &room, from);
         record["revision"] = json!(published.revision);
         record["created"] = json!(published.is_new);
         record["dropped"] = json!(recording.dropped.len());

@@ -1,6 +1,8 @@
 //! Made-up places that a camera sways in, and an adapter whose errors were measured there: what
 //! following is tested with.
 
+use std::sync::LazyLock;
+
 use seese3_core::adapter::{Adapter, Preset, TrainingRecord};
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{Pinhole, PixelCamera, Pose};
@@ -74,8 +76,14 @@ pub fn served(name: &str) -> (Room, Features) {
     place(name, if name == "hall" { 1 } else { 2 })
 }
 
-/// An adapter learned in both, its errors measured in four others.
+/// An adapter learned in both, its errors measured in four others. It is trained once per test
+/// program.
 pub fn calibrated() -> (Adapter, TrainingRecord) {
+    static CALIBRATED: LazyLock<(Adapter, TrainingRecord)> = LazyLock::new(train_and_calibrate);
+    CALIBRATED.clone()
+}
+
+fn train_and_calibrate() -> (Adapter, TrainingRecord) {
     let learned = [served("hall"), served("attic"), place("barn", 3)];
     let mut plan = TrainingPlan::of(Preset::PaperBase, Split::Whole, 10, 0);
     plan.config.epochs = 60;
@@ -103,7 +111,7 @@ pub fn calibrated() -> (Adapter, TrainingRecord) {
         })
         .collect();
 
-    let (adapter, report) = calibrate(adapter, &record, &room_data).unwrap();
-    assert!(report.can_track);
-    (adapter, record)
+    let calibrated = calibrate(adapter, record, &room_data).unwrap();
+    assert!(calibrated.can_track);
+    (calibrated.adapter, calibrated.record)
 }

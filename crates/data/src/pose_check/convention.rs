@@ -1,5 +1,7 @@
 //! The conventions in which poses are written down, and how each is read.
 
+use std::fmt;
+
 use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion};
 
 use seese3_core::geometry::Pose;
@@ -93,6 +95,29 @@ impl Convention {
             });
         }
         all
+    }
+}
+
+/// The transform and its axes, such as `world_from_camera along x right, y down, z forward`.
+impl fmt::Display for Convention {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self.direction {
+            Direction::WorldFromCamera => "world_from_camera",
+            Direction::CameraFromWorld => "camera_from_world, the inverse,",
+        })?;
+        f.write_str(match self.axes {
+            Axes::OpenCv => " along x right, y down, z forward",
+            Axes::OpenGl => " along OpenGL's axes",
+            Axes::Ros => " along the axes of a ROS body",
+        })?;
+        if self.quaternions == QuaternionOrder::ScalarFirst {
+            f.write_str(", with the scalar of quaternions first")?;
+        }
+        if self.image_quarter_turns > 0 {
+            let degrees = 90 * u16::from(self.image_quarter_turns);
+            write!(f, ", of images turned clockwise by {degrees} degrees")?;
+        }
+        Ok(())
     }
 }
 

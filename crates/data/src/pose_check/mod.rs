@@ -23,6 +23,7 @@
 //! | `motion_fit` | how well poses explain the motion of images |
 //! | `evidence` | whether a small difference shows throughout a recording |
 //! | `path` | what the poses alone tell: extents, steps, jumps |
+//! | `report` | [`check_room`]: all checks of a room, and the warnings in words |
 //!
 //! Not a method of the paper. The limits were chosen on a real recording and on drawn rooms;
 //! docs/rooms-and-encoders.md reports them on rooms that were drawn afterwards.
@@ -31,11 +32,13 @@ mod convention;
 mod evidence;
 mod motion_fit;
 mod path;
+mod report;
 mod translations;
 
 pub use convention::{Axes, Convention, Direction, QuaternionOrder};
 pub use motion_fit::SceneEstimate;
 pub use path::{PathFacts, PathWarning, is_identity};
+pub use report::{ImageReport, LengthUnit, PoseReport, PoseWarning, RoomImages, check_room};
 pub use translations::Translations;
 
 use crate::image_motion::ImageMotion;
@@ -154,6 +157,39 @@ pub enum Verdict {
     TooFewPairs,
     /// The camera hardly moves.
     TooLittleMotion,
+}
+
+impl Verdict {
+    /// Whether the poses are certainly not those of the images.
+    pub fn is_contradiction(&self) -> bool {
+        match self {
+            Self::OtherConvention { .. }
+            | Self::MirroredImages { .. }
+            | Self::TransposedRotations { .. }
+            | Self::OtherTranslations { .. }
+            | Self::OtherRows { .. }
+            | Self::Unrelated { .. } => true,
+            Self::Agrees(_) | Self::Unclear { .. } | Self::TooFewPairs | Self::TooLittleMotion => {
+                false
+            }
+        }
+    }
+
+    /// The name of this verdict in machine-readable reports.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Agrees(_) => "agrees",
+            Self::OtherConvention { .. } => "other_convention",
+            Self::MirroredImages { .. } => "mirrored_images",
+            Self::TransposedRotations { .. } => "transposed_rotations",
+            Self::OtherTranslations { .. } => "other_translations",
+            Self::OtherRows { .. } => "other_rows",
+            Self::Unrelated { .. } => "unrelated",
+            Self::Unclear { .. } => "unclear",
+            Self::TooFewPairs => "too_few_pairs",
+            Self::TooLittleMotion => "too_little_motion",
+        }
+    }
 }
 
 /// The comparison of poses with images.

@@ -7,8 +7,8 @@ use seese3_core::geometry::Pose;
 use seese3_core::room::{FrameId, Frames, Provenance, Room, RoomId};
 use seese3_data::image_motion::ImageMotion;
 use seese3_data::pose_check::{
-    Convention, Direction, ObservedPair, PathFacts, PathWarning, QuaternionOrder, Translations,
-    Verdict, check,
+    Convention, Direction, ObservedPair, PathFacts, PathWarning, PoseWarning, QuaternionOrder,
+    RoomImages, Translations, Verdict, check, check_room,
 };
 
 /// The focal length of the camera, image widths.
@@ -341,4 +341,51 @@ fn the_facts_of_a_path_are_told() {
     back[40] = back[39];
     let falls = PathWarning::TimesFall { first: FrameId(40) };
     assert_eq!(warnings(straight, back), [falls]);
+}
+
+/// Oracle: by hand: a recording whose camera never moves is wrong without a look at its images; of three
+/// images one has another size and none can be decoded, so the comparison has no pair.
+#[test]
+fn one_call_checks_path_images_and_verdict() {
+    let still = Frames {
+        poses: vec![Pose::default(); 3],
+        images: ["a.png", "b.png", "c.png"].map(str::to_owned).to_vec(),
+        ..Frames::default()
+    };
+    let room = Room::new(RoomId::new("still").unwrap(), still, Provenance::default()).unwrap();
+
+    let report = check_room(&room, None);
+    assert!(report.is_wrong() && report.images.is_none());
+    assert_eq!(
+        report.warnings,
+        [PoseWarning::Path(PathWarning::NeverMoves)]
+    );
+
+    let report = check_room(
+        &room,
+        Some(&RoomImages {
+            size: &|image| {
+                Ok(if image == "b.png" {
+                    (320, 200)
+                } else {
+                    (320, 240)
+                })
+            },
+            read: &|_| None,
+            stated: room.poses(),
+            read_as: Convention::default(),
+            progress: &|_, _| (),
+        }),
+    );
+    let mixed = PoseWarning::MixedSizes {
+        sizes: vec![
+            (320, 240, 2, "a.png".to_owned()),
+            (320, 200, 1, "b.png".to_owned()),
+        ],
+    };
+    assert_eq!(
+        report.warnings,
+        [PoseWarning::Path(PathWarning::NeverMoves), mixed]
+    );
+    assert_eq!(report.images.unwrap().check.verdict, Verdict::TooFewPairs);
 }

@@ -17,7 +17,7 @@ use seese3_core::navigation::{IndexKind, Navigator, NavigatorKind};
 use seese3_core::room::RoomId;
 use seese3_core::statistics::{Rate, RoomMean, bootstrap_mean};
 use seese3_core::training::{RoomData, TrainingPlan, motions, predictions, train_adapter};
-use seese3_robot::calibration::calibrate_retrieval;
+use seese3_robot::calibration::{Calibrated, calibrate_retrieval};
 
 use super::Error;
 
@@ -141,9 +141,11 @@ pub fn train_and_test(
         train_adapter(training, plan.training, &mut |_| (progress.epoch)())?;
 
     if !calibration.is_empty() {
-        let (calibrated, report) = calibrate_retrieval(adapter, &record, calibration)?;
-        adapter = calibrated;
-        record.calibrated_on = report.rooms;
+        Calibrated {
+            adapter,
+            record,
+            ..
+        } = calibrate_retrieval(adapter, record, calibration)?;
     }
 
     let mut run = CrossRoomRun {

@@ -76,45 +76,46 @@ pub enum Error {
     NoPlaceFound,
 }
 
-/// What a calibration did.
-#[derive(Debug, Clone, PartialEq)]
-pub struct CalibrationReport {
-    /// The rooms that errors were measured in, with their revisions.
-    pub rooms: Vec<(RoomId, u64)>,
+/// A calibrated adapter with its finished record.
+#[derive(Debug, Clone)]
+pub struct Calibrated {
+    /// The adapter with its measured errors.
+    pub adapter: Adapter,
+    /// The training record; `calibrated_on` names the calibration rooms, which leak detection reads.
+    pub record: TrainingRecord,
     /// Whether the adapter can track cameras now; one room is too few.
     pub can_track: bool,
 }
 
-/// Calibrates an adapter for retrieval and, with two or more rooms, for tracking. `record` is how
-/// the adapter was trained; the caller adds the rooms of the report to its `calibrated_on`, by
-/// which leaks are told.
+/// Calibrates an adapter for retrieval and, with two or more rooms, for tracking. `record` is the
+/// record of its training.
 ///
 /// # Errors
-/// [`Error`], when the adapter learned from one of the rooms, a room is too short, or its features
+/// [`Error`], when the adapter was trained on one of the rooms, a room is too short, or its features
 /// are not the adapter's.
 pub fn calibrate(
     adapter: Adapter,
-    record: &TrainingRecord,
+    record: TrainingRecord,
     rooms: &[RoomData<'_>],
-) -> Result<(Adapter, CalibrationReport), Error> {
-    let (adapter, mut report) = calibrate_retrieval(adapter, record, rooms)?;
+) -> Result<Calibrated, Error> {
+    let mut calibrated = calibrate_retrieval(adapter, record, rooms)?;
     if rooms.len() < FEWEST_ROOMS_TO_TRACK {
-        return Ok((adapter, report));
+        return Ok(calibrated);
     }
 
-    let statistics = model::measure(&adapter, record, rooms)?;
+    let statistics = model::measure(&calibrated.adapter, &calibrated.record, rooms)?;
     let preliminary = ErrorModel::new(statistics.clone())?;
-    let adapter = Arc::new(adapter.with_error_model(preliminary)?);
+    let adapter = Arc::new(calibrated.adapter.with_error_model(preliminary)?);
 
     // The factor of map poses is measured with the tracker that the error model makes.
     let statistics = ErrorStatistics {
         map_pose_factor: map_pose_factor(&adapter, rooms)?.ok_or(Error::NoPlaceFound)?,
         ..statistics
     };
-    let adapter = Arc::unwrap_or_clone(adapter).with_error_model(ErrorModel::new(statistics)?)?;
-
-    report.can_track = true;
-    Ok((adapter, report))
+    let model = ErrorModel::new(statistics)?;
+    calibrated.adapter = Arc::unwrap_or_clone(adapter).with_error_model(model)?;
+    calibrated.can_track = true;
+    Ok(calibrated)
 }
 
 /// Calibrates an adapter for retrieval alone: measures the second moment of its motions' errors.
@@ -123,26 +124,26 @@ pub fn calibrate(
 /// As [`calibrate`].
 pub fn calibrate_retrieval(
     adapter: Adapter,
-    record: &TrainingRecord,
+    mut record: TrainingRecord,
     rooms: &[RoomData<'_>],
-) -> Result<(Adapter, CalibrationReport), Error> {
+) -> Result<Calibrated, Error> {
     check_rooms(rooms)?;
     for data in rooms {
         check_unseen(data, record.rooms.iter().map(|(room, _)| room))?;
         adapter.check_source(data.features.source())?;
     }
 
-    let covariance = error_covariance(&adapter, record, rooms)?;
-    let adapter = adapter.with_error_covariance(covariance)?;
+    let covariance = error_covariance(&adapter, &record, rooms)?;
+    record.calibrated_on = rooms
+        .iter()
+        .map(|data| (data.room.id().clone(), data.revision))
+        .collect();
 
-    let report = CalibrationReport {
-        rooms: rooms
-            .iter()
-            .map(|data| (data.room.id().clone(), data.revision))
-            .collect(),
+    Ok(Calibrated {
+        adapter: adapter.with_error_covariance(covariance)?,
+        record,
         can_track: false,
-    };
-    Ok((adapter, report))
+    })
 }
 
 /// The covariance of errors, see [`statistics::robust_covariance`].

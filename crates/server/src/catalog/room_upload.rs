@@ -19,6 +19,7 @@ use seese3_client::proto::v1 as pb;
 use seese3_core::features::{FeatureSource, Features, MAX_COLUMNS, UNSPECIFIED};
 use seese3_core::geometry;
 use seese3_core::room::{Frames, Provenance, Room, RoomId, is_plain_name};
+use seese3_data::pose_check::check_room;
 use seese3_store::{Kind, OtherFeatures, Published, ResourceName};
 
 /// How long an upload may send nothing.
@@ -117,6 +118,9 @@ impl Handlers {
         let name = received.name.name.clone();
         let memory = std::mem::take(&mut received.memory);
         let (room, features) = finished(received, &upload, &end)?;
+        for warning in check_room(&room, None).warnings {
+            tracing::warn!(room = name, %warning, "the poses of an uploaded room look wrong");
+        }
         let others = if upload.drop_other_features {
             OtherFeatures::LeftBehind
         } else {
