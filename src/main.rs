@@ -60,7 +60,7 @@ fn main() -> ExitCode {
     let cli = match config::parse() {
         Ok(cli) => cli,
         Err(error) => {
-            complain(&format_args!("{error:#}"));
+            complain(&with_causes(&error));
             return ExitCode::FAILURE;
         }
     };
@@ -81,10 +81,22 @@ fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            complain(&format_args!("{error:#}"));
+            complain(&with_causes(&error));
             ExitCode::FAILURE
         }
     }
+}
+
+/// The error's message, and those of its causes that it does not contain already: messages of the
+/// crates end with their cause.
+fn with_causes(error: &anyhow::Error) -> String {
+    let mut text = error.to_string();
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    text
 }
 
 /// Prints an error. Where standard error cannot be written, the exit code alone has to tell:

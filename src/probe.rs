@@ -8,6 +8,7 @@ use super::output::{JsonOutput, say};
 use super::progress::bar;
 use super::protocol::ProtocolOptions;
 use super::rooms::{data, load_rooms, room_words};
+use super::with_causes;
 use seese3_core::features::Features;
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::training::{RoomData, TrainingPlan};
@@ -291,7 +292,7 @@ fn probed(
     for result in probed {
         match result {
             Ok(found) => scores.push(found),
-            Err(error) if rooms.len() > 1 => skipped.push(format!("{error:#}")),
+            Err(error) if rooms.len() > 1 => skipped.push(with_causes(&error)),
             Err(error) => return Err(error),
         }
     }

@@ -458,7 +458,8 @@ fn drawn_before(
             problem: format!(
                 "was kept at {}×{}, but this encoder takes {}×{}; render into another store",
                 kept.width, kept.height, width, height
-            ),
+            )
+            .into(),
         }),
         Err(_) => Ok(None),
     }

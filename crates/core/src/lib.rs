@@ -107,3 +107,9 @@ pub mod eval;
 pub use nalgebra;
 /// Arrays of features and latents.
 pub use ndarray;
+
+/// The cause of an error: another error, or a sentence.
+///
+/// A message contains the text of its cause, so that one line is enough in a log or a gRPC status;
+/// [`std::error::Error::source`] gives programs the cause itself.
+pub type Cause = Box<dyn std::error::Error + Send + Sync>;

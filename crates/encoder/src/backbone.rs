@@ -1,6 +1,7 @@
 //! The network that turns prepared images into the outputs of layers: one of the built-in ones, or
 //! an ONNX model in one of two runtimes.
 
+use seese3_core::Cause;
 use std::path::Path;
 
 use ndarray::{ArrayD, Axis};
@@ -47,38 +48,38 @@ pub(super) fn open(
     preparation.check()?;
     let model = ModelFile::read(file)?;
 
-    let wrong = |problem: String| Error::Model {
+    let wrong = |problem: Cause| Error::Model {
         file: file.to_owned(),
         problem,
     };
 
     let names: Vec<String> = layers.iter().map(|layer| layer.name.clone()).collect();
     if names.is_empty() {
-        return Err(wrong("no layer was asked for".to_owned()));
+        return Err(wrong("no layer was asked for".into()));
     }
 
     // A layer may be a declared output or any other value that the graph computes.
     for (position, name) in names.iter().enumerate() {
         if !model.outputs.contains(name) && !model.inner.contains(name) {
             let known = model.outputs.join(", ");
-            return Err(wrong(format!(
-                "has no layer '{name}'; its outputs are {known}"
-            )));
+            return Err(wrong(
+                format!("has no layer '{name}'; its outputs are {known}").into(),
+            ));
         }
 
         if names[..position].contains(name) {
-            return Err(wrong(format!("layer '{name}' was asked for twice")));
+            return Err(wrong(format!("layer '{name}' was asked for twice").into()));
         }
     }
 
-    let clip_axis = clip_axis(&model.input, window).map_err(&wrong)?;
+    let clip_axis = clip_axis(&model.input, window).map_err(|problem| wrong(problem.into()))?;
 
     // A room is no multiple of such a batch, and a server's image is a batch of one.
     if let Some(batch) = model.input[0].filter(|&batch| batch > 1) {
         return Err(wrong(format!(
             "takes batches of exactly {batch} images; export it with an example of one image, or with \
              dynamic_shapes={{\"image\": {{0: \"batch\"}}}}"
-        )));
+        ).into()));
     }
 
     // The shape of the model's input. Axes that the file leaves open get the sizes of the prepared
@@ -91,9 +92,10 @@ pub(super) fn open(
         let (width, height) = wanted;
         let (w, h) = given;
 
-        return Err(wrong(format!(
-            "takes images of {width}x{height}, but --resize and --crop give {w}x{h}"
-        )));
+        return Err(wrong(
+            format!("takes images of {width}x{height}, but --resize and --crop give {w}x{h}")
+                .into(),
+        ));
     }
 
     let size = preparation.size().or(model.image_size());

@@ -19,6 +19,7 @@ use image::{
 };
 
 use super::Error;
+use seese3_core::Cause;
 use seese3_core::image::RgbImage;
 
 /// Limits on the size of an image.
@@ -61,10 +62,16 @@ impl Bounds {
 /// image is over `bounds`.
 pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Error> {
     // Messages of the decoders may contain line breaks; an error of ours is one line.
-    let one_line = |problem: String| problem.split_whitespace().collect::<Vec<_>>().join(" ");
-    let bad = |problem: String| Error::BadImage {
+    let one_line = |problem: Cause| {
+        problem
+            .to_string()
+            .split_whitespace()
+            .collect::<Vec<_>>()
+            .join(" ")
+    };
+    let bad = |problem: Cause| Error::BadImage {
         image: name.to_owned(),
-        problem: one_line(problem),
+        problem: one_line(problem).into(),
     };
 
     if bytes.len() as u64 > bounds.bytes {
@@ -72,15 +79,16 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
             "is {} bytes, over the limit of {}",
             bytes.len(),
             bounds.bytes
-        )));
+        )
+        .into()));
     }
 
     let format = image::guess_format(bytes).ok();
     if !matches!(format, Some(ImageFormat::Jpeg | ImageFormat::Png)) {
-        return Err(bad("is neither JPEG nor PNG".to_owned()));
+        return Err(bad("is neither JPEG nor PNG".into()));
     }
     if format == Some(ImageFormat::Jpeg) {
-        return decode_jpeg(bytes, bounds).map_err(bad);
+        return decode_jpeg(bytes, bounds).map_err(|problem| bad(problem.into()));
     }
 
     let read = |most: u64| {
@@ -97,8 +105,8 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
     // allocated for its pixels.
     let (width, height) = read(HEADER_ALLOC)
         .into_dimensions()
-        .map_err(|error| bad(error.to_string()))?;
-    check_size(width as usize, height as usize, bounds).map_err(bad)?;
+        .map_err(|error| bad(error.into()))?;
+    check_size(width as usize, height as usize, bounds).map_err(|problem| bad(problem.into()))?;
 
     // A pixel has at most four channels of 16 bits, 8 bytes; the decoder may use as much again.
     let most = (u64::from(width) * u64::from(height))
@@ -106,9 +114,9 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
         .saturating_add(HEADER_ALLOC);
     let mut decoder = read(most)
         .into_decoder()
-        .map_err(|error| bad(error.to_string()))?;
+        .map_err(|error| bad(error.into()))?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    let decoded = DynamicImage::from_decoder(decoder).map_err(|error| bad(error.to_string()))?;
+    let decoded = DynamicImage::from_decoder(decoder).map_err(|error| bad(error.into()))?;
 
     Ok(upright(decoded.into_rgb8(), orientation))
 }
@@ -214,7 +222,8 @@ pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
             problem: format!(
                 "is {length} bytes, over the limit of {}",
                 Bounds::LOCAL.bytes
-            ),
+            )
+            .into(),
         });
     }
 
@@ -242,7 +251,7 @@ pub fn image_size(root: &Path, image: &str) -> Result<(u32, u32), Error> {
     };
     let bad = |error: image::ImageError| Error::BadImage {
         image: path.display().to_string(),
-        problem: error.to_string(),
+        problem: error.into(),
     };
 
     let mut header = Vec::new();
@@ -305,7 +314,8 @@ fn open_part(root: &Path, image: &str) -> Result<ImagePart, Error> {
         if offset.saturating_add(part_length) > length {
             return Err(Error::BadImage {
                 image: root.join(image).display().to_string(),
-                problem: format!("reaches past the end of the file, which has {length} bytes"),
+                problem: format!("reaches past the end of the file, which has {length} bytes")
+                    .into(),
             });
         }
 
@@ -330,7 +340,7 @@ pub fn encode_png(picture: &RgbImage) -> Result<Vec<u8>, Error> {
         .write_image(&picture.bytes, width, height, ExtendedColorType::Rgb8)
         .map_err(|error| Error::BadImage {
             image: format!("picture of {width}×{height} pixels"),
-            problem: error.to_string(),
+            problem: error.into(),
         })?;
 
     Ok(bytes)

@@ -40,6 +40,7 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array2, ArrayD, Axis, IxDyn};
 
 use backbone::Backbone;
+use seese3_core::Cause;
 use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
 use seese3_core::room::is_plain_name;
@@ -51,22 +52,33 @@ pub enum Error {
     #[error("{}: {cause}", file.display())]
     Io {
         file: PathBuf,
+        #[source]
         cause: std::io::Error,
     },
     #[error("{image}: {problem}")]
-    BadImage { image: String, problem: String },
+    BadImage {
+        image: String,
+        #[source]
+        problem: Cause,
+    },
     #[error("{what} '{given}': {problem}")]
     Option {
         what: &'static str,
         given: String,
-        problem: String,
+        #[source]
+        problem: Cause,
     },
     #[error("{}: {problem}", file.display())]
-    Model { file: PathBuf, problem: String },
+    Model {
+        file: PathBuf,
+        #[source]
+        problem: Cause,
+    },
     #[error("the runtime '{runtime}' failed: {problem}")]
     Runtime {
         runtime: &'static str,
-        problem: String,
+        #[source]
+        problem: Cause,
     },
     #[error(
         "this program was built without the runtime '{runtime}'; build it with \
@@ -230,7 +242,7 @@ impl Encoder {
         };
 
         for (layer, output) in encoder.layers.iter_mut().zip(&outputs) {
-            let problem = |problem: String| Error::Model {
+            let problem = |problem: Cause| Error::Model {
                 file: file.clone(),
                 problem,
             };
@@ -241,11 +253,13 @@ impl Encoder {
             layer.pooling = layer.pooling.for_rank(one.ndim());
             if !is_prefix_stated {
                 let checked = layer.pooling.check_prefix(one.shape(), seen);
-                checked.map_err(|error| problem(format!("layer '{}': {error}", layer.name)))?;
+                checked
+                    .map_err(|error| problem(format!("layer '{}': {error}", layer.name).into()))?;
             }
 
             let row = layer.pooling.pool(one, seen);
-            let row = row.map_err(|error| problem(format!("layer '{}': {error}", layer.name)))?;
+            let row =
+                row.map_err(|error| problem(format!("layer '{}': {error}", layer.name).into()))?;
             encoder.dims.push(row.len());
         }
 
@@ -404,7 +418,7 @@ impl Encoder {
                 let pooled = layer.pooling.pool(one, seen);
                 let pooled = pooled.map_err(|error| Error::Runtime {
                     runtime,
-                    problem: error.to_string(),
+                    problem: error.into(),
                 })?;
 
                 // The trial run gave `dim`. Another width would not fit the columns of the layer.
@@ -414,7 +428,10 @@ impl Encoder {
                         layer.name,
                         pooled.len()
                     );
-                    return Err(Error::Runtime { runtime, problem });
+                    return Err(Error::Runtime {
+                        runtime,
+                        problem: problem.into(),
+                    });
                 }
 
                 if let Some(column) = pooled.iter().position(|value| !value.is_finite()) {
@@ -451,7 +468,7 @@ impl Encoder {
                     .to_owned();
             return Err(Error::BadImage {
                 image: "batch".to_owned(),
-                problem,
+                problem: problem.into(),
             });
         }
 
@@ -463,7 +480,8 @@ impl Encoder {
                 problem: format!(
                     "the encoder takes {wanted_width}x{wanted_height}; \
                     give a --resize or --crop to that size"
-                ),
+                )
+                .into(),
             });
         }
 
@@ -479,7 +497,7 @@ impl Encoder {
         let shape = IxDyn(&[clips.len(), self.window, 3, height, width]);
         let frames = ArrayD::from_shape_vec(shape, numbers).map_err(|error| Error::Runtime {
             runtime: self.runtime(),
-            problem: error.to_string(),
+            problem: error.into(),
         })?;
 
         let outputs = match &self.backbone {
@@ -505,7 +523,7 @@ impl Encoder {
 
                 return Err(Error::Runtime {
                     runtime: self.runtime(),
-                    problem,
+                    problem: problem.into(),
                 });
             }
         }

@@ -4,6 +4,7 @@
 //! - Weights may lie in other files of the same folder, as `torch.onnx.export` writes them. The identity
 //!   covers them too: the same graph with other weights is another encoder.
 
+use seese3_core::Cause;
 use std::collections::{BTreeSet, HashSet};
 use std::fs::File;
 use std::path::{Component, Path};
@@ -120,7 +121,7 @@ pub(super) struct ModelFile {
 
 impl ModelFile {
     pub fn read(file: &Path) -> Result<Self, Error> {
-        let wrong = |problem: String| Error::Model {
+        let wrong = |problem: Cause| Error::Model {
             file: file.to_owned(),
             problem,
         };
@@ -143,17 +144,20 @@ impl ModelFile {
 
         let [input] = inputs.as_slice() else {
             let names: Vec<&str> = inputs.iter().map(|input| input.name.as_str()).collect();
-            return Err(wrong(format!(
-                "has {} inputs ({}), expected one image",
-                names.len(),
-                names.join(", ")
-            )));
+            return Err(wrong(
+                format!(
+                    "has {} inputs ({}), expected one image",
+                    names.len(),
+                    names.join(", ")
+                )
+                .into(),
+            ));
         };
 
         let tensor = input.kind.as_ref().and_then(|kind| kind.tensor.as_ref());
         if tensor.is_some_and(|tensor| tensor.element != FLOAT) {
             return Err(wrong(
-                "has an input that is not float32; export it with an input of float32".to_owned(),
+                "has an input that is not float32; export it with an input of float32".into(),
             ));
         }
 
@@ -238,7 +242,7 @@ fn read_graph(file: &Path) -> Result<(Vec<u8>, GraphProto), Error> {
     let graph = model.ok().and_then(|model| model.graph);
     let graph = graph.ok_or_else(|| Error::Model {
         file: file.to_owned(),
-        problem: "is not an ONNX model; is it cut off?".to_owned(),
+        problem: "is not an ONNX model; is it cut off?".into(),
     })?;
 
     Ok((bytes, graph))
@@ -271,7 +275,7 @@ fn id_of(file: &Path, bytes: &[u8], graph: &GraphProto) -> Result<String, Error>
     let mut digest = Sha256::new();
     digest.update(bytes);
     for name in weight_files(graph) {
-        let wrong = |problem: String| Error::Model {
+        let wrong = |problem: Cause| Error::Model {
             file: file.to_owned(),
             problem,
         };
@@ -284,16 +288,17 @@ fn id_of(file: &Path, bytes: &[u8], graph: &GraphProto) -> Result<String, Error>
             return Err(wrong(format!(
                 "keeps weights in '{name}', which does not lie in the model's folder; move it there and \
                  export again"
-            )));
+            ).into()));
         }
 
         let weights = file.parent().unwrap_or(Path::new("")).join(name);
-        let mut weights = File::open(&weights).map_err(|cause| {
-            wrong(format!(
+        let mut weights =
+            File::open(&weights).map_err(|cause| {
+                wrong(format!(
                 "keeps weights in {}, which cannot be read: {cause}; copy it beside the model",
                 weights.display()
-            ))
-        })?;
+            ).into())
+            })?;
         std::io::copy(&mut weights, &mut digest).map_err(|cause| Error::Io {
             file: file.to_owned(),
             cause,

@@ -1,5 +1,6 @@
 //! Models in onnxruntime, whose shared library is loaded when the first model is opened.
 
+use seese3_core::Cause;
 use std::path::Path;
 use std::sync::{Mutex, OnceLock, PoisonError};
 
@@ -35,7 +36,7 @@ impl OnnxRuntime {
         shape: &[Option<usize>],
         runtime: &Runtime,
     ) -> Result<Self, Error> {
-        let wrong = |problem: String| Error::Model {
+        let wrong = |problem: Cause| Error::Model {
             file: file.to_owned(),
             problem,
         };
@@ -64,7 +65,7 @@ impl OnnxRuntime {
         };
 
         let session =
-            session.map_err(|error| wrong(format!("cannot be run by {NAME}: {error}")))?;
+            session.map_err(|error| wrong(format!("cannot be run by {NAME}: {error}").into()))?;
         let is_of_one = shape.first().copied().flatten().is_some();
 
         Ok(Self {
@@ -87,7 +88,7 @@ impl OnnxRuntime {
         let array = |name: &String| {
             let missing = || Error::Runtime {
                 runtime: NAME,
-                problem: format!("gave no output '{name}'"),
+                problem: format!("gave no output '{name}'").into(),
             };
             let output = outputs.get(name).ok_or_else(missing)?;
 
@@ -121,7 +122,7 @@ impl Runner for OnnxRuntime {
                 .collect();
             ndarray::concatenate(Axis(0), &parts).map_err(|error| Error::Runtime {
                 runtime: NAME,
-                problem: error.to_string(),
+                problem: error.to_string().into(),
             })
         };
 
@@ -133,18 +134,17 @@ fn environment(library: Option<&Path>) -> Result<&'static Environment, Error> {
     let help = "`pip install onnxruntime` brings the library, onnxruntime/capi/libonnxruntime.so.*; name it with \
                 --onnxruntime FILE or ORT_DYLIB_PATH";
 
-    let failed = |problem: String| Error::Runtime {
+    let failed = |problem: Cause| Error::Runtime {
         runtime: RuntimeKind::OnnxRuntime.name(),
         problem,
     };
-    let library =
-        library.ok_or_else(|| failed(format!("its shared library was not named; {help}")))?;
+    let library = library
+        .ok_or_else(|| failed(format!("its shared library was not named; {help}").into()))?;
 
     if !library.is_file() {
-        return Err(failed(format!(
-            "{} is not a file; {help}",
-            library.display()
-        )));
+        return Err(failed(
+            format!("{} is not a file; {help}", library.display()).into(),
+        ));
     }
 
     let load = || {
@@ -158,16 +158,13 @@ fn environment(library: Option<&Path>) -> Result<&'static Environment, Error> {
 
     // Later calls get the result of the first one, even if they name another library.
     LOADED.get_or_init(load).as_ref().map_err(|problem| {
-        failed(format!(
-            "{} cannot be loaded: {problem}; {help}",
-            library.display()
-        ))
+        failed(format!("{} cannot be loaded: {problem}; {help}", library.display()).into())
     })
 }
 
 fn failed<T: std::fmt::Display>(error: &T) -> Error {
     Error::Runtime {
         runtime: NAME,
-        problem: error.to_string(),
+        problem: error.to_string().into(),
     }
 }

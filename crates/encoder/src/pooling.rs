@@ -307,7 +307,8 @@ impl FromStr for Pooling {
             given: text.to_owned(),
             problem: format!(
                 "is not cls, mean, or gridCxR with 1 to {MOST_CELLS} columns and rows"
-            ),
+            )
+            .into(),
         };
 
         let (word, skip) = match text.split_once('@') {

@@ -8,6 +8,7 @@ use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer
 use sha2::{Digest, Sha256};
 
 use super::Error;
+use seese3_core::Cause;
 use seese3_core::image::RgbImage;
 
 /// How an image is resized.
@@ -105,7 +106,8 @@ impl Preparation {
                 image: format!("image of {}×{} pixels", image.width, image.height),
                 problem: format!(
                     "would be resized to {width}×{height}, over the limit of {LARGEST} a side"
-                ),
+                )
+                .into(),
             });
         }
 
@@ -161,7 +163,7 @@ impl Preparation {
         let wrong = |problem: &str| Error::Option {
             what: "preprocess",
             given: text.to_owned(),
-            problem: problem.to_owned(),
+            problem: problem.into(),
         };
 
         let mut preparation = Self::default();
@@ -210,7 +212,7 @@ impl Preparation {
             Err(Error::Option {
                 what,
                 given: self.text(1),
-                problem: problem.to_owned(),
+                problem: problem.into(),
             })
         };
 
@@ -256,7 +258,7 @@ impl std::str::FromStr for Filter {
             .ok_or_else(|| Error::Option {
                 what: "filter",
                 given: text.to_owned(),
-                problem: "is not bilinear, bicubic or lanczos3".to_owned(),
+                problem: "is not bilinear, bicubic or lanczos3".into(),
             })
     }
 }
@@ -275,7 +277,7 @@ impl std::str::FromStr for Resize {
                 _ => Err(Error::Option {
                     what: "resize",
                     given: text.to_owned(),
-                    problem: format!("the edge must be 1 to {LARGEST} pixels"),
+                    problem: format!("the edge must be 1 to {LARGEST} pixels").into(),
                 }),
             };
         }
@@ -299,7 +301,7 @@ pub(super) fn size(what: &'static str, text: &str) -> Result<(usize, usize), Err
     both.ok_or_else(|| Error::Option {
         what,
         given: text.to_owned(),
-        problem: format!("is not WIDTHxHEIGHT, each 1 to {LARGEST} pixels"),
+        problem: format!("is not WIDTHxHEIGHT, each 1 to {LARGEST} pixels").into(),
     })
 }
 
@@ -312,7 +314,7 @@ pub(super) fn three(what: &'static str, text: &str) -> Result<[f32; 3], Error> {
         _ => Err(Error::Option {
             what,
             given: text.to_owned(),
-            problem: "is not three numbers R,G,B".to_owned(),
+            problem: "is not three numbers R,G,B".into(),
         }),
     }
 }
@@ -323,13 +325,13 @@ pub(super) fn resized(
     height: usize,
     filter: Filter,
 ) -> Result<RgbImage, Error> {
-    let bad = |problem: String| Error::BadImage {
+    let bad = |problem: Cause| Error::BadImage {
         image: format!("image of {}×{} pixels", image.width, image.height),
-        problem: format!("cannot be resized to {width}×{height}: {problem}"),
+        problem: format!("cannot be resized to {width}×{height}: {problem}").into(),
     };
 
     if width * height == 0 || image.width * image.height == 0 {
-        return Err(bad("one of the two sizes is 0".to_owned()));
+        return Err(bad("one of the two sizes is 0".into()));
     }
 
     let from = ImageRef::new(
@@ -338,7 +340,7 @@ pub(super) fn resized(
         &image.bytes,
         PixelType::U8x3,
     )
-    .map_err(|error| bad(error.to_string()))?;
+    .map_err(|error| bad(error.into()))?;
 
     let mut to = Image::new(width as u32, height as u32, PixelType::U8x3);
 
@@ -351,7 +353,7 @@ pub(super) fn resized(
     let options = ResizeOptions::new().resize_alg(ResizeAlg::Convolution(filter));
     Resizer::new()
         .resize(&from, &mut to, &options)
-        .map_err(|error| bad(error.to_string()))?;
+        .map_err(|error| bad(error.into()))?;
 
     Ok(RgbImage {
         width,
@@ -364,7 +366,7 @@ fn cropped(image: &RgbImage, width: usize, height: usize) -> Result<RgbImage, Er
     if image.width < width || image.height < height {
         return Err(Error::BadImage {
             image: format!("image of {}×{} pixels", image.width, image.height),
-            problem: format!("is smaller than the crop of {width}×{height}"),
+            problem: format!("is smaller than the crop of {width}×{height}").into(),
         });
     }
 

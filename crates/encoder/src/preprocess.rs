@@ -54,7 +54,7 @@ impl Preprocess {
                 problem: format!(
                     "takes the middle square of an image, and the model takes {width}x{height}; give \
                      --divisor, --mean, --std and --resize {width}x{height} instead"
-                ),
+                ).into(),
             });
         }
 

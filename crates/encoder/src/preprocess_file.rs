@@ -87,7 +87,7 @@ pub fn read_preprocess_file(file: &Path) -> Result<Preparation, Error> {
         file: file.to_owned(),
         problem: format!(
             "{problem}; give --divisor, --mean and --std, with --resize, --filter and --crop, instead"
-        ),
+        ).into(),
     })
 }
 

@@ -141,7 +141,7 @@ pub fn encode_room(
     let rows =
         Array2::from_shape_vec((good.len(), width), numbers).map_err(|error| Error::Runtime {
             runtime: encoder.runtime(),
-            problem: error.to_string(),
+            problem: error.into(),
         })?;
 
     Ok(Encoded {
@@ -314,7 +314,7 @@ mod tests {
         if row == 3 {
             return Err(Error::BadImage {
                 image: "frame 3".to_owned(),
-                problem: "is cut".to_owned(),
+                problem: "is cut".into(),
             });
         }
 

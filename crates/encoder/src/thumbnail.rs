@@ -32,7 +32,7 @@ pub fn thumbnail(root: &Path, image: &str, width: usize) -> Result<Vec<u8>, Erro
         )
         .map_err(|error| Error::BadImage {
             image: root.join(image).display().to_string(),
-            problem: format!("cannot be made a thumbnail of: {error}"),
+            problem: format!("cannot be made a thumbnail of: {error}").into(),
         })?;
 
     Ok(bytes)

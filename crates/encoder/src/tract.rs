@@ -2,6 +2,7 @@
 //! plan for an open batch size is 2 to 6 times slower. The clips of a batch are spread over the
 //! threads of the calling rayon pool.
 
+use seese3_core::Cause;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -23,7 +24,7 @@ pub(super) struct Tract {
 
 impl Tract {
     pub fn open(file: &Path, names: &[String], shape: &[Option<usize>]) -> Result<Self, Error> {
-        let wrong = |problem: String| Error::Model {
+        let wrong = |problem: Cause| Error::Model {
             file: file.to_owned(),
             problem,
         };
@@ -35,7 +36,7 @@ impl Tract {
 
         // The plan is made for one exact shape: a batch of 1, and every other axis as it is known.
         let fixed: Option<Vec<usize>> = shape.iter().skip(1).copied().collect();
-        let fixed = fixed.ok_or_else(|| wrong(open()))?;
+        let fixed = fixed.ok_or_else(|| wrong(open().into()))?;
         let shape: Vec<usize> = std::iter::once(1).chain(fixed).collect();
 
         let plan = || {
@@ -60,12 +61,13 @@ impl Tract {
         // tract panics at some models that are damaged, and leaves nothing behind that anybody else
         // could see.
         let model = std::panic::catch_unwind(plan).map_err(|_| {
-            wrong("cannot be run by tract, which stopped while it planned the model".to_owned())
+            wrong("cannot be run by tract, which stopped while it planned the model".into())
         })?;
         let model = model.map_err(|error| {
-            wrong(format!(
-                "cannot be run by tract: {error:#}; --runtime onnxruntime may run it"
-            ))
+            wrong(
+                format!("cannot be run by tract: {error:#}; --runtime onnxruntime may run it")
+                    .into(),
+            )
         })?;
         Ok(Self {
             model,
@@ -74,7 +76,7 @@ impl Tract {
     }
 
     fn one(&self, clip: ArrayViewD<'_, f32>) -> Result<Vec<ArrayD<f32>>, Error> {
-        let failed = |problem: String| Error::Runtime {
+        let failed = |problem: Cause| Error::Runtime {
             runtime: "tract",
             problem,
         };
@@ -82,19 +84,19 @@ impl Tract {
         // The clip is a view into the batch, while tract takes a tensor of its own.
         let numbers: Vec<f32> = clip.iter().copied().collect();
         let input = Tensor::from_shape(clip.shape(), &numbers)
-            .map_err(|error| failed(format!("{error:#}")))?;
+            .map_err(|error| failed(format!("{error:#}").into()))?;
         let outputs = self
             .model
             .run(tvec!(input.into()))
-            .map_err(|error| failed(format!("{error:#}")))?;
+            .map_err(|error| failed(format!("{error:#}").into()))?;
 
         let array = |output: &tract_onnx::prelude::TValue| {
             let numbers = output.to_plain_array_view::<f32>();
-            let numbers = numbers.map_err(|error| failed(format!("{error:#}")))?;
+            let numbers = numbers.map_err(|error| failed(format!("{error:#}").into()))?;
             let shape = numbers.shape().to_vec();
 
             ArrayD::from_shape_vec(shape, numbers.iter().copied().collect())
-                .map_err(|error| failed(error.to_string()))
+                .map_err(|error| failed(error.into()))
         };
 
         outputs.iter().map(array).collect()
@@ -118,7 +120,7 @@ impl Runner for Tract {
                 let problem = format!("layer '{}' has no batch axis", self.names[output]);
                 Error::Runtime {
                     runtime: "tract",
-                    problem,
+                    problem: problem.into(),
                 }
             })
         };

@@ -172,7 +172,8 @@ pub fn open_for(
                 "gives {:?} columns, the adapter takes {}",
                 encoder.dims(),
                 source.dim
-            ),
+            )
+            .into(),
         });
     }
 

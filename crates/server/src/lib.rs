@@ -50,6 +50,7 @@ pub use tls::{Tls, TlsError, TlsFiles};
 pub use traces::Traces;
 pub use track::TokenKey;
 
+use seese3_core::Cause;
 use std::convert::Infallible;
 use std::future::Future;
 use std::pin::Pin;
@@ -192,19 +193,21 @@ pub enum RunError {
     #[error("--encoder {model}: {problem}")]
     Model {
         model: String,
+        #[source]
         problem: seese3_encoder::Error,
     },
     #[error("--two-view {}: {problem}; give XFeat's ONNX file (`seese3 encoders` says how to export it)", file.display())]
     TwoView {
         file: std::path::PathBuf,
-        problem: String,
+        #[source]
+        problem: Cause,
     },
     #[error("the server failed: {0}")]
     Transport(#[from] tonic::transport::Error),
     #[error("the reflection service cannot be made: {0}")]
-    Reflection(String),
+    Reflection(#[source] tonic_reflection::server::Error),
     #[error("loading the store failed: {0}")]
-    Loading(String),
+    Loading(#[source] tokio::task::JoinError),
 }
 
 /// Where a server listens.
@@ -501,7 +504,7 @@ fn server(
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
 
-    let failed = |error: tonic_reflection::server::Error| RunError::Reflection(error.to_string());
+    let failed = RunError::Reflection;
     let v1 = reflection().build_v1().map_err(failed)?;
     let v1alpha = reflection().build_v1alpha().map_err(failed)?;
 

@@ -1,5 +1,6 @@
 //! TLS: certificates from files, which may be replaced while the server runs.
 
+use seese3_core::Cause;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::Duration;
@@ -34,6 +35,7 @@ pub enum TlsError {
     Unreadable {
         option: &'static str,
         file: PathBuf,
+        #[source]
         problem: std::io::Error,
     },
     #[error("{option}: {} holds no {what} in PEM", file.display())]
@@ -43,7 +45,7 @@ pub enum TlsError {
         what: &'static str,
     },
     #[error("--tls-cert, --tls-key or --tls-client-ca: {0}")]
-    Unfit(String),
+    Unfit(#[source] Cause),
 }
 
 /// The TLS of a server, as its files are now.
@@ -116,8 +118,6 @@ fn read(files: &TlsFiles) -> Result<(ServerConfig, [u8; 32]), TlsError> {
         key,
         client_ca,
     } = files;
-    let unfit = |error: &dyn std::fmt::Display| TlsError::Unfit(error.to_string());
-
     let mut digest = Sha256::new();
     let mut content = |option, file: &Path| {
         let bytes = std::fs::read(file).map_err(|problem| TlsError::Unreadable {
@@ -141,7 +141,7 @@ fn read(files: &TlsFiles) -> Result<(ServerConfig, [u8; 32]), TlsError> {
     let provider = Arc::new(ring::default_provider());
     let builder = ServerConfig::builder_with_provider(provider.clone())
         .with_safe_default_protocol_versions()
-        .map_err(|error| unfit(&error))?;
+        .map_err(|error| TlsError::Unfit(error.into()))?;
 
     let builder = match client_ca {
         None => builder.with_no_client_auth(),
@@ -149,18 +149,21 @@ fn read(files: &TlsFiles) -> Result<(ServerConfig, [u8; 32]), TlsError> {
             let option = "--tls-client-ca";
             let mut roots = RootCertStore::empty();
             for authority in certificates(option, file, &content(option, file)?)? {
-                roots.add(authority).map_err(|error| unfit(&error))?;
+                roots
+                    .add(authority)
+                    .map_err(|error| TlsError::Unfit(error.into()))?;
             }
 
             let verifier =
                 WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
-            builder.with_client_cert_verifier(verifier.map_err(|error| unfit(&error))?)
+            builder
+                .with_client_cert_verifier(verifier.map_err(|error| TlsError::Unfit(error.into()))?)
         }
     };
 
     let mut config = builder
         .with_single_cert(chain, private)
-        .map_err(|error| unfit(&error))?;
+        .map_err(|error| TlsError::Unfit(error.into()))?;
     config.alpn_protocols = vec![b"h2".to_vec()];
 
     Ok((config, digest.finalize().into()))

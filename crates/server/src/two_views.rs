@@ -34,7 +34,7 @@ impl TwoViewReader {
         };
         let recipe = recipe("xfeat").ok_or(RunError::TwoView {
             file: file.clone(),
-            problem: "the recipe 'xfeat' is missing".to_owned(),
+            problem: "the recipe 'xfeat' is missing".into(),
         })?;
         let [channels, rows, columns] = MAP;
         let task = ModelTask {
@@ -54,18 +54,18 @@ impl TwoViewReader {
             is_prefix_stated: true,
         };
 
-        let failed = |problem: String| RunError::TwoView {
+        let failed = |problem: seese3_core::Cause| RunError::TwoView {
             file: file.clone(),
             problem,
         };
         let encoder =
-            Encoder::model(task, &encoders.runtime).map_err(|error| failed(error.to_string()))?;
+            Encoder::model(task, &encoders.runtime).map_err(|error| failed(error.into()))?;
         if encoder.dims() != [channels * rows * columns] {
             return Err(failed(format!(
                 "its layer '{LAYER}' gives {:?} numbers instead of {channels} channels on {columns} \
                  by {rows} cells",
                 encoder.dims()
-            )));
+            ).into()));
         }
 
         tracing::info!(

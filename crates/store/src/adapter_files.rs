@@ -10,6 +10,7 @@ use super::format::{AdapterBody, TrainingEntry};
 use super::stored_adapter::{RoomFit, StoredAdapter};
 use super::tensors::{TensorReader, TensorWriter};
 use super::{Error, error_model, manifest, room_fit, sha256};
+use seese3_core::Cause;
 use seese3_core::adapter::{
     self, Adapter, Corrector, CorrectorKind, Mixture, Network, TargetScale,
 };
@@ -48,7 +49,7 @@ pub fn check_adapter_files(manifest: &[u8], weights: &[u8]) -> Result<StoredAdap
     let body: AdapterBody = manifest::decode(UPLOADED_MANIFEST, manifest)?;
     let damaged = |file: &str, problem: &str| Error::Damaged {
         file: file.to_owned(),
-        problem: problem.to_owned(),
+        problem: problem.into(),
     };
 
     if weights.len() as u64 != body.weights.bytes || sha256(weights) != body.weights.sha256 {
@@ -82,18 +83,21 @@ pub(super) fn assembled(
         );
         return Err(Error::Damaged {
             file: manifest.to_owned(),
-            problem,
+            problem: problem.into(),
         });
     }
 
-    let damaged = |problem: String| Error::Damaged {
+    let damaged = |problem: Cause| Error::Damaged {
         file: file.to_owned(),
         problem,
     };
 
     let tensors = TensorReader::new(file, bytes)?;
     let error_model = error_model::read(&tensors, file)?;
-    let mixing = body.training.mixing().map_err(&damaged)?;
+    let mixing = body
+        .training
+        .mixing()
+        .map_err(|problem| damaged(problem.into()))?;
 
     // The names of the tensors follow from the number of charts and their mixing, both of which
     // stand in the manifest.
@@ -126,14 +130,14 @@ pub(super) fn assembled(
             Some(error_model) => adapter.with_error_model(error_model),
             None => Ok(adapter),
         })
-        .map_err(|error| damaged(error.to_string()))?;
+        .map_err(|error| damaged(error.into()))?;
 
     // The checksums show that the file is intact. The golden vectors show that this program, on
     // this machine, still computes the same function from it.
     check_golden(&adapter, &tensors, file)?;
     let record = body.training.record().map_err(|word| Error::Damaged {
         file: manifest.to_owned(),
-        problem: format!("has {word}, which this program does not know"),
+        problem: format!("has {word}, which this program does not know").into(),
     })?;
 
     let room_fit = match body.fitted_to {
@@ -170,7 +174,7 @@ impl WeightError {
             Self::File(error) => error,
             Self::Shape(error) => Error::Damaged {
                 file: file.to_owned(),
-                problem: error.to_string(),
+                problem: error.into(),
             },
         }
     }
@@ -191,7 +195,7 @@ fn read_correctors(
     let corrector = |name: &String| {
         let kind = CorrectorKind::from_name(name).ok_or_else(|| Error::Damaged {
             file: file.to_owned(),
-            problem: format!("has a corrector '{name}', which this program does not know"),
+            problem: format!("has a corrector '{name}', which this program does not know").into(),
         })?;
         let read = |tensor: &str| read_weights(tensors, &corrector_tensor(kind, tensor));
 
@@ -272,7 +276,7 @@ pub(super) fn adapter_file(
 
     write_golden(&mut tensors, adapter, features).map_err(|error| Error::Damaged {
         file: name.to_owned(),
-        problem: error.to_string(),
+        problem: error.into(),
     })?;
     tensors.finish(name)
 }
@@ -353,7 +357,7 @@ fn golden_steps(
 }
 
 fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Result<(), Error> {
-    let damaged = |problem: String| Error::Damaged {
+    let damaged = |problem: Cause| Error::Damaged {
         file: file.to_owned(),
         problem,
     };
@@ -362,20 +366,19 @@ fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Re
 
     // With no inputs every comparison below would succeed.
     if features.nrows() == 0 {
-        return Err(damaged("has no golden inputs".to_owned()));
+        return Err(damaged("has no golden inputs".into()));
     }
 
     let latents = adapter
         .embed(features.view())
-        .map_err(|error| damaged(error.to_string()))?;
+        .map_err(|error| damaged(error.into()))?;
     let twists = golden_twists(adapter, &latents);
 
     // Recompute every kind of output, and pair it with the one that was stored.
     let mut checked = Vec::new();
     for corrector in adapter.correctors() {
         let kind = corrector.kind();
-        let steps =
-            golden_steps(adapter, kind, &latents).map_err(|error| damaged(error.to_string()))?;
+        let steps = golden_steps(adapter, kind, &latents).map_err(|error| damaged(error.into()))?;
         checked.push((kind.name(), steps, tensors.f64(&golden_corrector(kind))?));
     }
 
@@ -392,7 +395,7 @@ fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Re
         if found.dim() != stored.dim() || !found.iter().zip(&stored).all(near) {
             return Err(damaged(format!(
                 "its golden inputs do not give its golden {what} on this machine; publish it again"
-            )));
+            ).into()));
         }
     }
 
@@ -404,7 +407,7 @@ fn matrix6(tensors: &TensorReader<'_>, name: &str, file: &str) -> Result<Matrix6
     if array.dim() != (6, 6) {
         return Err(Error::Damaged {
             file: file.to_owned(),
-            problem: format!("'{name}' does not have 6 by 6 numbers"),
+            problem: format!("'{name}' does not have 6 by 6 numbers").into(),
         });
     }
 
@@ -416,7 +419,7 @@ fn vector6(tensors: &TensorReader<'_>, name: &str, file: &str) -> Result<Vector6
     if array.dim() != (1, 6) {
         return Err(Error::Damaged {
             file: file.to_owned(),
-            problem: format!("'{name}' does not have 6 numbers"),
+            problem: format!("'{name}' does not have 6 numbers").into(),
         });
     }
 

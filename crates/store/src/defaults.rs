@@ -357,7 +357,10 @@ impl Store {
         let body: Body = manifest::decode(&file, &self.read(&path).await?)?;
         if body.number != number {
             let problem = format!("says it is number {}: it was moved or copied", body.number);
-            return Err(Error::Damaged { file, problem });
+            return Err(Error::Damaged {
+                file,
+                problem: problem.into(),
+            });
         }
 
         Ok(body)

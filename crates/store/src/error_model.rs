@@ -99,7 +99,7 @@ pub fn read(tensors: &TensorReader<'_>, file: &str) -> Result<Option<ErrorModel>
 
     let damaged = |error: seese3_core::adapter::Error| Error::Damaged {
         file: file.to_owned(),
-        problem: error.to_string(),
+        problem: error.into(),
     };
     let table = |name: &str| {
         let rows = sized(tensors, name, None, 38, file)?;
@@ -140,7 +140,7 @@ pub(super) fn sized(
         );
         return Err(Error::Damaged {
             file: file.to_owned(),
-            problem,
+            problem: problem.into(),
         });
     }
 

@@ -7,6 +7,7 @@ use super::{
     ATTEMPTS, Error, Kind, Published, RoomSummary, Store, StoredRoom, check_features, revision_path,
 };
 use crate::folder_of;
+use seese3_core::Cause;
 use seese3_core::features::Features;
 use seese3_core::geometry::Pose;
 use seese3_core::room::{Frames, Provenance, Room};
@@ -118,12 +119,13 @@ fn extended(
     features: &[Features],
     others: OtherFeatures,
 ) -> Result<ExtendedRoom, Error> {
-    let refused = |problem: String| Error::CannotAdd {
+    let refused = |problem: Cause| Error::CannotAdd {
         room: base.room.id().to_string(),
         problem,
     };
 
-    let features = joined_features(base, features, others).map_err(refused)?;
+    let features =
+        joined_features(base, features, others).map_err(|problem| refused(problem.into()))?;
     if has_frames(base, addition, &features) {
         return Ok(ExtendedRoom {
             room: base.room.clone(),
@@ -132,7 +134,8 @@ fn extended(
             is_there: true,
         });
     }
-    let frames = joined_frames(base.room.frames(), addition.frames()).map_err(refused)?;
+    let frames = joined_frames(base.room.frames(), addition.frames())
+        .map_err(|problem| refused(problem.into()))?;
 
     let known = base.room.provenance();
     let added = addition.provenance();
@@ -141,9 +144,9 @@ fn extended(
         _ => None,
     };
     if let Some(problem) = problem {
-        return Err(refused(format!(
-            "their camera {problem}; make a room of their own"
-        )));
+        return Err(refused(
+            format!("their camera {problem}; make a room of their own").into(),
+        ));
     }
 
     let provenance = Provenance {
@@ -155,7 +158,7 @@ fn extended(
     };
 
     let room = Room::new(base.room.id().clone(), frames, provenance)
-        .map_err(|error| refused(error.to_string()))?;
+        .map_err(|error| refused(error.into()))?;
     Ok(ExtendedRoom {
         room,
         features,

@@ -97,7 +97,7 @@ impl Store {
             return match std::fs::remove_file(folder.join(file)) {
                 Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(Error::Io {
                     file: self.shown(&path),
-                    cause: error.to_string(),
+                    cause: error.into(),
                 }),
                 _ => Ok(()),
             };
@@ -105,7 +105,7 @@ impl Store {
 
         match self.objects.delete(&path).await {
             Ok(()) | Err(object_store::Error::NotFound { .. }) => Ok(()),
-            Err(error) => Err(self.io(&path, &error)),
+            Err(error) => Err(self.io(&path, error)),
         }
     }
 
@@ -194,7 +194,7 @@ impl Store {
         let mut listed = self.objects.list(Some(folder));
         let mut entries = Vec::new();
         while let Some(entry) = listed.next().await {
-            entries.push(entry.map_err(|error| self.io(folder, &error))?);
+            entries.push(entry.map_err(|error| self.io(folder, error))?);
         }
 
         entries.sort_by(|a, b| a.location.cmp(&b.location));
@@ -209,7 +209,7 @@ impl Store {
         };
         let io = |path: &std::path::Path, error: std::io::Error| Error::Io {
             file: path.display().to_string(),
-            cause: error.to_string(),
+            cause: error.into(),
         };
 
         // Files that have got their name, or are gone, since they were listed need no care.

@@ -44,6 +44,7 @@ pub use rooms::{RoomSummary, StoredRoom, check_features};
 pub use stored_adapter::{BaseAdapter, RoomFit, StoredAdapter};
 pub use verification::Finding;
 
+use seese3_core::Cause;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -59,7 +60,11 @@ use tokio_stream::StreamExt;
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
     #[error("store '{location}' cannot be opened: {problem}")]
-    Open { location: String, problem: String },
+    Open {
+        location: String,
+        #[source]
+        problem: Cause,
+    },
     #[error(
         "store '{location}' does not exist; make one with `seese3 import … --store {location}`"
     )]
@@ -88,14 +93,22 @@ pub enum Error {
     #[error("{name:?} cannot name {what}: use 1 to 100 letters, digits, '.', '-' or '_'")]
     Name { what: &'static str, name: String },
     #[error("{file}: {problem}")]
-    Damaged { file: String, problem: String },
+    Damaged {
+        file: String,
+        #[source]
+        problem: Cause,
+    },
     #[error(
         "{file} was written by a newer version (schema {schema}, this program reads {}); update the program",
         manifest::SCHEMA
     )]
     Schema { file: String, schema: u64 },
     #[error("{file}: {cause}")]
-    Io { file: String, cause: String },
+    Io {
+        file: String,
+        #[source]
+        cause: Cause,
+    },
     #[error("{file} is missing; restore it, or publish again")]
     Absent { file: String },
     #[error(
@@ -116,7 +129,11 @@ pub enum Error {
     )]
     OtherFrames { room: String, revision: u64 },
     #[error("frames cannot be added to room '{room}': {problem}")]
-    CannotAdd { room: String, problem: String },
+    CannotAdd {
+        room: String,
+        #[source]
+        problem: Cause,
+    },
     #[error("{resource} cannot be removed: {reason}")]
     InUse { resource: String, reason: String },
     #[error("no default was ever chosen, so there is nothing to take back")]
@@ -182,7 +199,7 @@ impl Store {
         if !location.contains("://") {
             std::fs::create_dir_all(location).map_err(|error| Error::Open {
                 location: location.to_owned(),
-                problem: error.to_string(),
+                problem: error.into(),
             })?;
         }
 
@@ -195,14 +212,14 @@ impl Store {
     /// [`Error::Missing`] if the folder does not exist; [`Error::Open`] if the URL is not valid or
     /// not supported, or if the folder cannot be opened.
     pub fn open(location: &str) -> Result<Self, Error> {
-        let failed = |problem: String| Error::Open {
+        let failed = |problem: Cause| Error::Open {
             location: location.to_owned(),
             problem,
         };
 
         if location.contains("://") {
-            let url = url::Url::parse(location).map_err(|error| failed(error.to_string()))?;
-            let (objects, prefix) = bucket::open(&url).map_err(failed)?;
+            let url = url::Url::parse(location).map_err(|error| failed(error.into()))?;
+            let (objects, prefix) = bucket::open(&url).map_err(|problem| failed(problem.into()))?;
 
             // From here on, all paths are relative to the folder in the URL, as they are for a
             // local store.
@@ -221,8 +238,8 @@ impl Store {
             });
         }
 
-        let objects = LocalFileSystem::new_with_prefix(location)
-            .map_err(|error| failed(error.to_string()))?;
+        let objects =
+            LocalFileSystem::new_with_prefix(location).map_err(|error| failed(error.into()))?;
 
         // Every write reaches the disk before the next one starts. Otherwise a power failure could
         // leave a manifest whose objects were lost.
@@ -256,18 +273,18 @@ impl Store {
 
     /// Converts an error of the object store. A missing object gets a message of its own that says
     /// what to do.
-    fn io(&self, path: &Path, error: &object_store::Error) -> Error {
+    fn io(&self, path: &Path, error: object_store::Error) -> Error {
         let file = self.shown(path);
         match error {
             object_store::Error::NotFound { .. } => Error::Absent { file },
             // What the file system said, without the name of the library's class of errors.
             object_store::Error::Generic { source, .. } => Error::Io {
                 file,
-                cause: source.to_string(),
+                cause: source,
             },
             other => Error::Io {
                 file,
-                cause: other.to_string(),
+                cause: other.into(),
             },
         }
     }
@@ -279,11 +296,11 @@ impl Store {
         {
             return Err(Error::Damaged {
                 file: self.shown(path),
-                problem: "is not a regular file; restore it, or publish again".to_owned(),
+                problem: "is not a regular file; restore it, or publish again".into(),
             });
         }
 
-        let io = |error| self.io(path, &error);
+        let io = |error| self.io(path, error);
         let bytes = self
             .objects
             .get(path)
@@ -323,7 +340,7 @@ impl Store {
 
         Err(Error::Damaged {
             file,
-            problem: format!("{problem}; publish it again"),
+            problem: format!("{problem}; publish it again").into(),
         })
     }
 
@@ -345,7 +362,7 @@ impl Store {
         let size = bytes.len() as u64;
 
         let written = self.objects.put(&path, PutPayload::from(bytes)).await;
-        written.map_err(|error| self.io(&path, &error))?;
+        written.map_err(|error| self.io(&path, error))?;
 
         Ok(manifest::ObjectRef {
             file,
@@ -366,7 +383,7 @@ impl Store {
             match self.objects.head(&path).await {
                 Ok(_) => {}
                 Err(object_store::Error::NotFound { .. }) => return Ok(true),
-                Err(error) => return Err(self.io(&path, &error)),
+                Err(error) => return Err(self.io(&path, error)),
             }
         }
 
@@ -396,7 +413,7 @@ impl Store {
         {
             Ok(_) => Ok(true),
             Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
-            Err(error) => Err(self.io(path, &error)),
+            Err(error) => Err(self.io(path, error)),
         }
     }
 
@@ -457,7 +474,7 @@ impl Store {
         if std::fs::symlink_metadata(&place).is_ok() && !place.is_dir() {
             return Err(Error::Damaged {
                 file: self.shown(path),
-                problem: "is not a folder; restore it".to_owned(),
+                problem: "is not a folder; restore it".into(),
             });
         }
         Ok(())
@@ -468,7 +485,7 @@ impl Store {
         let folder = Path::from(kind.collection());
         self.check_folder(&folder)?;
         let listed = self.objects.list_with_delimiter(Some(&folder)).await;
-        let listed = listed.map_err(|error| self.io(&folder, &error))?;
+        let listed = listed.map_err(|error| self.io(&folder, error))?;
 
         let named = |prefix: Path| {
             let name = prefix.filename().map(str::to_owned)?;
@@ -496,7 +513,7 @@ impl Store {
         let mut numbers = Numbers::default();
 
         while let Some(entry) = listed.next().await {
-            let entry = entry.map_err(|error| self.io(folder, &error))?;
+            let entry = entry.map_err(|error| self.io(folder, error))?;
             let name = entry.location.filename().unwrap_or_default();
             let Some((number, extension)) = name.split_once('.') else {
                 continue;

@@ -4,6 +4,7 @@
 //! they stand in the file.
 
 use object_store::path::Path;
+use seese3_core::Cause;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::value::RawValue;
@@ -40,7 +41,7 @@ struct Versioned {
 pub fn encode(file: &str, body: &impl Serialize) -> Result<Vec<u8>, Error> {
     let damaged = |error: serde_json::Error| Error::Damaged {
         file: file.to_owned(),
-        problem: error.to_string(),
+        problem: error.into(),
     };
     let body = serde_json::to_string_pretty(body).map_err(damaged)?;
     let sha256 = sha256(body.as_bytes());
@@ -73,13 +74,13 @@ pub fn check_place(
 
     Err(Error::Damaged {
         file: file.to_owned(),
-        problem,
+        problem: problem.into(),
     })
 }
 
 /// The body of a manifest, after its checksum and its schema version were checked.
 pub fn decode<T: DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, Error> {
-    let damaged = |problem: String| Error::Damaged {
+    let damaged = |problem: Cause| Error::Damaged {
         file: file.to_owned(),
         problem,
     };
@@ -88,7 +89,7 @@ pub fn decode<T: DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, Error>
         damaged(format!(
             "is not a valid manifest ({error}): it was truncated or altered; restore it, or remove \
             it to return to the previous revision"
-        ))
+        ).into())
     })?;
 
     // The checksum covers the raw text of the body, so it is compared before the body is parsed.
@@ -96,14 +97,14 @@ pub fn decode<T: DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, Error>
         return Err(damaged(
             "does not have the checksum that it states: it was altered; restore it, or remove it \
         to return to the previous revision"
-                .to_owned(),
+                .into(),
         ));
     }
 
     // The schema version is parsed on its own first. A body of a newer schema may not fit `T`, and
     // the error should then ask for an update instead of reporting damage.
     let Versioned { schema } =
-        serde_json::from_str(envelope.body.get()).map_err(|error| damaged(error.to_string()))?;
+        serde_json::from_str(envelope.body.get()).map_err(|error| damaged(error.into()))?;
     if schema > SCHEMA {
         return Err(Error::Schema {
             file: file.to_owned(),
@@ -111,5 +112,5 @@ pub fn decode<T: DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, Error>
         });
     }
 
-    serde_json::from_str(envelope.body.get()).map_err(|error| damaged(error.to_string()))
+    serde_json::from_str(envelope.body.get()).map_err(|error| damaged(error.into()))
 }

@@ -82,7 +82,7 @@ impl Store {
             }
 
             let deleted = self.objects.delete(&manifest).await;
-            deleted.map_err(|error| self.io(&manifest, &error))?;
+            deleted.map_err(|error| self.io(&manifest, error))?;
         }
 
         Ok(removed)

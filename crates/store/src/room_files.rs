@@ -4,6 +4,7 @@ use ndarray::Array2;
 
 use super::Error;
 use super::tensors::{TensorReader, TensorWriter};
+use seese3_core::Cause;
 use seese3_core::features::Features;
 use seese3_core::geometry::{Pose, nearest_rotation};
 use seese3_core::room::{Frames, Room};
@@ -58,7 +59,7 @@ pub fn frames_file(room: &Room) -> Result<Vec<u8>, Error> {
 pub fn names_file(names: &[String]) -> Result<Vec<u8>, Error> {
     serde_json::to_vec(names).map_err(|error| Error::Damaged {
         file: "frame-names".to_owned(),
-        problem: error.to_string(),
+        problem: error.into(),
     })
 }
 
@@ -79,14 +80,14 @@ pub fn features_file(features: &Features) -> Result<Vec<u8>, Error> {
 pub fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
     let tensors = TensorReader::new(file, bytes)?;
 
-    let damaged = |problem: String| Error::Damaged {
+    let damaged = |problem: Cause| Error::Damaged {
         file: file.to_owned(),
         problem,
     };
 
     let matrices = tensors.f64("world_from_camera")?;
     if matrices.ncols() != 16 {
-        return Err(damaged("'world_from_camera' is not (n, 4, 4)".to_owned()));
+        return Err(damaged("'world_from_camera' is not (n, 4, 4)".into()));
     }
 
     // The stored entries carry rounding errors. Projection onto SO(3) makes the rotation exact
@@ -95,7 +96,7 @@ pub fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
         let m = nalgebra::Matrix4::from_row_iterator(matrix.iter().copied());
         let rotation = nearest_rotation(&m.fixed_view::<3, 3>(0, 0).into_owned());
         let rotation = rotation
-            .ok_or_else(|| damaged(format!("frame {row} has no valid rotation")))?
+            .ok_or_else(|| damaged(format!("frame {row} has no valid rotation").into()))?
             .rotation;
         let quaternion = nalgebra::UnitQuaternion::from_rotation_matrix(&rotation);
 
@@ -121,7 +122,7 @@ pub fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
     };
 
     let sequence = |value: i64| {
-        u32::try_from(value).map_err(|_| damaged(format!("{value} is no sequence number")))
+        u32::try_from(value).map_err(|_| damaged(format!("{value} is no sequence number").into()))
     };
 
     Ok(Frames {
@@ -151,6 +152,6 @@ pub fn read_features(file: &str, bytes: &[u8]) -> Result<Array2<f32>, Error> {
 pub fn read_names(file: &str, bytes: &[u8]) -> Result<Vec<String>, Error> {
     serde_json::from_slice(bytes).map_err(|error| Error::Damaged {
         file: file.to_owned(),
-        problem: error.to_string(),
+        problem: error.into(),
     })
 }

@@ -8,6 +8,7 @@ use super::error_model::sized;
 use super::format::FittedEntry;
 use super::stored_adapter::{BaseAdapter, RoomFit};
 use super::tensors::{TensorReader, TensorWriter};
+use seese3_core::Cause;
 use seese3_core::room::RoomId;
 use seese3_robot::fitting::{MotionReader, PartRule, ReadingRule, ReadingRules};
 
@@ -44,7 +45,7 @@ pub fn write(tensors: &mut TensorWriter, rules: &ReadingRules) {
 
 /// Reads what an adapter was fitted to.
 pub fn read(entry: FittedEntry, tensors: &TensorReader<'_>, file: &str) -> Result<RoomFit, Error> {
-    let damaged = |problem: String| Error::Damaged {
+    let damaged = |problem: Cause| Error::Damaged {
         file: file.to_owned(),
         problem,
     };
@@ -56,9 +57,9 @@ pub fn read(entry: FittedEntry, tensors: &TensorReader<'_>, file: &str) -> Resul
             .find(|(position, _)| *position as f64 == reader);
         match known {
             Some((_, reader)) => Ok(PartRule { reader, gain }),
-            None => Err(damaged(format!(
-                "names a reader {reader}, which this program does not know"
-            ))),
+            None => Err(damaged(
+                format!("names a reader {reader}, which this program does not know").into(),
+            )),
         }
     };
 
@@ -76,11 +77,11 @@ pub fn read(entry: FittedEntry, tensors: &TensorReader<'_>, file: &str) -> Resul
     let rules: Vec<ReadingRule> = rows.outer_iter().map(rule).collect::<Result<_, Error>>()?;
 
     Ok(RoomFit {
-        room: RoomId::new(&entry.room).map_err(|error| damaged(error.to_string()))?,
+        room: RoomId::new(&entry.room).map_err(|error| damaged(error.into()))?,
         room_revision: entry.room_revision,
         base: entry
             .base
             .map(|(name, revision)| BaseAdapter { name, revision }),
-        rules: ReadingRules::new(rules).map_err(|error| damaged(error.to_string()))?,
+        rules: ReadingRules::new(rules).map_err(|error| damaged(error.into()))?,
     })
 }

@@ -9,6 +9,7 @@ use super::room_files::{
     features_file, frames_file, names_file, read_features, read_frames, read_names,
 };
 use super::{ATTEMPTS, Defaults, Error, Kind, Published, Store, folder_of, revision_path};
+use seese3_core::Cause;
 use seese3_core::adapter::TrainingRecord;
 use seese3_core::eval::TrainedOn;
 use seese3_core::features::{FeatureSource, Features};
@@ -262,7 +263,7 @@ impl Store {
 
         let manifest = revision_path(folder, body.revision);
         let removed = self.objects.delete(&manifest).await;
-        removed.map_err(|error| self.io(&manifest, &error))?;
+        removed.map_err(|error| self.io(&manifest, error))?;
         Ok(false)
     }
 
@@ -559,7 +560,7 @@ impl Store {
 
         let damaged = |error: seese3_core::room::Error| Error::Damaged {
             file: self.shown(folder),
-            problem: error.to_string(),
+            problem: error.into(),
         };
 
         Ok((
@@ -596,16 +597,16 @@ impl Store {
 
         frames.images = self.read_names(&folder, body.images.as_ref()).await?;
         let manifest = self.shown(&revision_path(&folder, revision));
-        let damaged = |problem: String| Error::Damaged {
+        let damaged = |problem: Cause| Error::Damaged {
             file: manifest.clone(),
             problem,
         };
-        let id = RoomId::new(&body.room).map_err(|error| damaged(error.to_string()))?;
+        let id = RoomId::new(&body.room).map_err(|error| damaged(error.into()))?;
 
         // The checksums show that the files are intact; `Room::new` checks that they form a room,
         // for instance that all columns are equally long.
-        let room = Room::new(id, frames, body.provenance.into())
-            .map_err(|error| damaged(error.to_string()))?;
+        let room =
+            Room::new(id, frames, body.provenance.into()).map_err(|error| damaged(error.into()))?;
         let mut features = Vec::new();
 
         // `only` selects one set by its name. Without it, every set is loaded.
@@ -618,7 +619,7 @@ impl Store {
             let rows = read_features(&file, &bytes)?;
             let set = Features::new(entry.source.into(), rows).map_err(|error| Error::Damaged {
                 file: file.clone(),
-                problem: error.to_string(),
+                problem: error.into(),
             })?;
 
             // The two objects are intact each by itself, but they must also belong together.
@@ -628,7 +629,10 @@ impl Store {
                     set.rows().nrows(),
                     room.frame_count()
                 );
-                return Err(Error::Damaged { file, problem });
+                return Err(Error::Damaged {
+                    file,
+                    problem: problem.into(),
+                });
             }
 
             features.push(set);

@@ -1,5 +1,6 @@
 //! Reading and writing named arrays as safetensors files.
 
+use seese3_core::Cause;
 use std::collections::BTreeMap;
 
 use ndarray::{Array2, ArrayD};
@@ -48,7 +49,7 @@ impl TensorWriter {
 
     /// Serialises the collected tensors. `file` is the name used in errors.
     pub fn finish(self, file: &str) -> Result<Vec<u8>, Error> {
-        let damaged = |problem: String| Error::Damaged {
+        let damaged = |problem: Cause| Error::Damaged {
             file: file.to_owned(),
             problem,
         };
@@ -56,11 +57,11 @@ impl TensorWriter {
         let mut views = Vec::with_capacity(self.0.len());
         for (name, (dtype, shape, bytes)) in &self.0 {
             let view = TensorView::new(*dtype, shape.clone(), bytes)
-                .map_err(|error| damaged(error.to_string()))?;
+                .map_err(|error| damaged(error.into()))?;
             views.push((name.clone(), view));
         }
 
-        safetensors::serialize(views, None).map_err(|error| damaged(error.to_string()))
+        safetensors::serialize(views, None).map_err(|error| damaged(error.into()))
     }
 }
 
@@ -74,7 +75,7 @@ impl<'a> TensorReader<'a> {
     pub fn new(file: &'a str, bytes: &'a [u8]) -> Result<Self, Error> {
         let tensors = SafeTensors::deserialize(bytes).map_err(|error| Error::Damaged {
             file: file.to_owned(),
-            problem: error.to_string(),
+            problem: error.into(),
         })?;
         Ok(Self { file, tensors })
     }
@@ -103,22 +104,25 @@ impl<'a> TensorReader<'a> {
         dtype: Dtype,
         read: fn([u8; N]) -> T,
     ) -> Result<Array2<T>, Error> {
-        let damaged = |problem: String| Error::Damaged {
+        let damaged = |problem: Cause| Error::Damaged {
             file: self.file.to_owned(),
             problem,
         };
         let tensor = self
             .tensors
             .tensor(name)
-            .map_err(|_| damaged(format!("has no tensor '{name}'")))?;
+            .map_err(|_| damaged(format!("has no tensor '{name}'").into()))?;
 
         // Every tensor of the schema has exactly one type. A file with another type is refused, not
         // converted.
         if tensor.dtype() != dtype {
-            return Err(damaged(format!(
-                "tensor '{name}' is {:?}, expected {dtype:?}",
-                tensor.dtype()
-            )));
+            return Err(damaged(
+                format!(
+                    "tensor '{name}' is {:?}, expected {dtype:?}",
+                    tensor.dtype()
+                )
+                .into(),
+            ));
         }
 
         // The bytes are little-endian and need not be aligned, so each number is decoded from its
@@ -132,7 +136,7 @@ impl<'a> TensorReader<'a> {
             .collect();
 
         let array = ArrayD::from_shape_vec(tensor.shape().to_vec(), values)
-            .map_err(|e| damaged(e.to_string()))?;
+            .map_err(|e| damaged(e.into()))?;
 
         let shape = match tensor.shape() {
             [] => (1, 1),
@@ -142,6 +146,6 @@ impl<'a> TensorReader<'a> {
 
         array
             .into_shape_with_order(shape)
-            .map_err(|error| damaged(error.to_string()))
+            .map_err(|error| damaged(error.into()))
     }
 }

@@ -39,7 +39,7 @@ pub fn read_arkitscenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Record
         let problem = format!("'{name}' is not of the form VIDEO_SECONDS.png");
         let time = time.ok_or_else(|| Error::Malformed {
             file: folder.join(IMAGES),
-            problem,
+            problem: problem.into(),
         })?;
         images.push((time, stem.to_owned()));
     }
@@ -85,8 +85,13 @@ fn read_trajectory(file: &Path) -> Result<BTreeMap<i64, Pose>, Error> {
 
         // The time is taken from the text, because a double would be rounded.
         let word = row.split(' ').next().unwrap_or_default();
-        let time = nanoseconds(word)
-            .ok_or_else(|| wrong(file, line, format!("'{word}' is not a time in seconds")))?;
+        let time = nanoseconds(word).ok_or_else(|| {
+            wrong(
+                file,
+                line,
+                format!("'{word}' is not a time in seconds").into(),
+            )
+        })?;
 
         let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(rx, ry, rz));
         let camera_from_world = Pose::from_parts(Translation3::new(x, y, z), rotation);

@@ -21,6 +21,7 @@ use super::numpy::read_numbers;
 use super::{
     Error, Recording, Stated, entries, read_bytes, read_features, read_poses, read_timestamps,
 };
+use seese3_core::Cause;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::{Pinhole, PixelCamera};
 use seese3_core::room::Room;
@@ -110,12 +111,12 @@ pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
 /// names the file.
 pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     let file = folder.join(SAYS);
-    let malformed = |problem: String| Error::Malformed {
+    let malformed = |problem: Cause| Error::Malformed {
         file: file.clone(),
         problem,
     };
-    let bundle: Bundle = serde_json::from_slice(&read_bytes(&file)?)
-        .map_err(|error| malformed(error.to_string()))?;
+    let bundle: Bundle =
+        serde_json::from_slice(&read_bytes(&file)?).map_err(|error| malformed(error.into()))?;
 
     // Destructured with no `..`, so that a new field breaks the build here.
     let Bundle {
@@ -135,9 +136,9 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     } = bundle;
 
     if format != FORMAT {
-        return Err(malformed(format!(
-            "is of format '{format}', this program reads '{FORMAT}'"
-        )));
+        return Err(malformed(
+            format!("is of format '{format}', this program reads '{FORMAT}'").into(),
+        ));
     }
 
     let mut recording = read_numpy(folder)?;
@@ -177,7 +178,7 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
             })
         })
         .transpose()
-        .map_err(|error| malformed(format!("camera: {error}")))?;
+        .map_err(|error| malformed(format!("camera: {error}").into()))?;
 
     recording.stated = Stated {
         name,
@@ -202,7 +203,7 @@ fn stated_camera(camera: Pinhole) -> [f64; 4] {
 /// list have to match: an array that is not listed is refused, and so is a listed one that is
 /// missing.
 fn with_sources(read: Vec<Features>, stated: &[Made], file: &Path) -> Result<Vec<Features>, Error> {
-    let malformed = |problem: String| Error::Malformed {
+    let malformed = |problem: Cause| Error::Malformed {
         file: file.to_owned(),
         problem,
     };
@@ -211,7 +212,8 @@ fn with_sources(read: Vec<Features>, stated: &[Made], file: &Path) -> Result<Vec
     for set in read {
         let array = &set.source().name;
         let made = stated.iter().find(|made| made.name == *array);
-        let made = made.ok_or_else(|| malformed(format!("does not list features_{array}.npy")))?;
+        let made =
+            made.ok_or_else(|| malformed(format!("does not list features_{array}.npy").into()))?;
 
         // Destructured with no `..`, so that a new field breaks the build here.
         let Made {
@@ -238,9 +240,9 @@ fn with_sources(read: Vec<Features>, stated: &[Made], file: &Path) -> Result<Vec
 
     let is_missing = |made: &&Made| features.iter().all(|set| set.source().name != made.name);
     if let Some(Made { name, .. }) = stated.iter().find(is_missing) {
-        return Err(malformed(format!(
-            "names features '{name}', but features_{name}.npy is missing"
-        )));
+        return Err(malformed(
+            format!("names features '{name}', but features_{name}.npy is missing").into(),
+        ));
     }
 
     Ok(features)
@@ -266,7 +268,7 @@ pub fn write_numpy(
     if !entries(folder)?.is_empty() {
         return Err(Error::Malformed {
             file: folder.to_owned(),
-            problem: "is not empty; name another folder".to_owned(),
+            problem: "is not empty; name another folder".into(),
         });
     }
 
@@ -281,7 +283,7 @@ pub fn write_numpy(
         .collect();
     let poses = Array3::from_shape_vec((n, 4, 4), numbers).map_err(|error| Error::Malformed {
         file: folder.to_owned(),
-        problem: error.to_string(),
+        problem: error.into(),
     })?;
 
     files.push(write_array(folder, "poses.npy", &poses)?);
@@ -315,7 +317,7 @@ pub fn write_numpy(
     let text = serde_json::to_vec_pretty(&described(room, features)).map_err(|error| {
         Error::Malformed {
             file: file.clone(),
-            problem: error.to_string(),
+            problem: error.into(),
         }
     })?;
     std::fs::write(&file, text).map_err(|cause| Error::Io {
@@ -403,7 +405,7 @@ fn resolved(folder: &Path, root: &str) -> Result<String, Error> {
 
     let malformed = |problem: &str| Error::Malformed {
         file: folder.join(SAYS),
-        problem: problem.to_owned(),
+        problem: problem.into(),
     };
 
     path.to_str()
@@ -418,6 +420,6 @@ fn checked(
 ) -> Result<Features, Error> {
     Features::new(source, rows).map_err(|error| Error::Malformed {
         file: file.to_owned(),
-        problem: error.to_string(),
+        problem: error.into(),
     })
 }

@@ -19,7 +19,7 @@ pub(super) fn check_lengths(file: &Path, recording: &Recording) -> Result<(), Er
             );
             Err(Error::Malformed {
                 file: file.to_owned(),
-                problem,
+                problem: problem.into(),
             })
         }
     }
@@ -82,7 +82,7 @@ impl Collected {
             Err(error) => {
                 return Err(Error::Malformed {
                     file: file.to_owned(),
-                    problem: format!("{}: {error}", about.name),
+                    problem: format!("{}: {error}", about.name).into(),
                 });
             }
         }
@@ -138,7 +138,7 @@ impl Collected {
 
             let not_text = || Error::Malformed {
                 file: folder,
-                problem: "the path is not UTF-8".to_owned(),
+                problem: "the path is not UTF-8".into(),
             };
             recording.images_root = root.to_str().ok_or_else(not_text)?.to_owned();
         }

@@ -14,6 +14,7 @@ use super::collect::{About, Collected};
 use super::natural::sort_naturally;
 use super::text::number;
 use super::{DropReason, Error, Reader, Recording, read_bytes, read_text};
+use seese3_core::Cause;
 use seese3_core::geometry::{Pinhole, PixelCamera, Pose, pose_from_quaternion};
 
 /// Folders below a project in which models lie.
@@ -136,7 +137,7 @@ fn model_in(path: &Path) -> Result<PathBuf, Error> {
             problem:
                 "holds no COLMAP model: cameras and images as .bin or .txt, in this folder or in \
                   sparse/0"
-                    .to_owned(),
+                    .into(),
         })
 }
 
@@ -154,7 +155,7 @@ fn images_root(model: &Path, given: Option<&Path>, frames: &[Image]) -> Result<P
     folders.into_iter().find(has_one).ok_or_else(|| Error::Malformed {
         file: model.to_owned(),
         problem: "has no folder images beside it that holds the model's images; give it with --images DIR"
-            .to_owned(),
+            .into(),
     })
 }
 
@@ -234,7 +235,7 @@ fn pose(file: &Path, what: &str, numbers: [f64; 7]) -> Result<Pose, Error> {
     pose_from_quaternion([tx, ty, tz], Quaternion::new(w, x, y, z)).map_err(|problem| {
         Error::Malformed {
             file: file.to_owned(),
-            problem: format!("{what}: {problem}"),
+            problem: format!("{what}: {problem}").into(),
         }
     })
 }
@@ -248,32 +249,35 @@ fn text_cameras(file: &Path) -> Result<BTreeMap<u32, Camera>, Error> {
             continue;
         }
 
-        let wrong = |problem: String| Error::Line {
+        let wrong = |problem: Cause| Error::Line {
             file: file.to_owned(),
             line,
             problem,
         };
         let &[id, name, ref sizes @ ..] = words.as_slice() else {
-            return Err(wrong("is not ID MODEL WIDTH HEIGHT PARAMETERS".to_owned()));
+            return Err(wrong("is not ID MODEL WIDTH HEIGHT PARAMETERS".into()));
         };
         let id = id
             .parse()
-            .map_err(|_| wrong(format!("'{id}' is not the id of a camera")))?;
+            .map_err(|_| wrong(format!("'{id}' is not the id of a camera").into()))?;
         let numbers: Result<Vec<f64>, Error> =
             sizes.iter().map(|word| number(file, line, word)).collect();
         let numbers = numbers?;
 
         let model = CAMERA_MODELS.iter().find(|model| model.name == name);
         let [width, height, parameters @ ..] = numbers.as_slice() else {
-            return Err(wrong("is not ID MODEL WIDTH HEIGHT PARAMETERS".to_owned()));
+            return Err(wrong("is not ID MODEL WIDTH HEIGHT PARAMETERS".into()));
         };
         let camera = match model {
             Some(model) if model.numbers != parameters.len() => {
-                return Err(wrong(format!(
-                    "has {} parameters, {name} has {}",
-                    parameters.len(),
-                    model.numbers
-                )));
+                return Err(wrong(
+                    format!(
+                        "has {} parameters, {name} has {}",
+                        parameters.len(),
+                        model.numbers
+                    )
+                    .into(),
+                ));
             }
             Some(model) => model.camera(*width, *height, parameters),
             // A model of a newer COLMAP: its poses are read all the same.
@@ -300,7 +304,7 @@ fn text_images(file: &Path) -> Result<Vec<Image>, Error> {
             continue;
         }
 
-        let wrong = |problem: String| Error::Line {
+        let wrong = |problem: Cause| Error::Line {
             file: file.to_owned(),
             line,
             problem,
@@ -308,7 +312,7 @@ fn text_images(file: &Path) -> Result<Vec<Image>, Error> {
         let words: Vec<&str> = row.splitn(10, ' ').collect();
         let &[_, w, x, y, z, tx, ty, tz, camera, name] = words.as_slice() else {
             return Err(wrong(
-                "is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME".to_owned(),
+                "is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME".into(),
             ));
         };
 
@@ -318,7 +322,7 @@ fn text_images(file: &Path) -> Result<Vec<Image>, Error> {
         }
         let camera = camera
             .parse()
-            .map_err(|_| wrong(format!("'{camera}' is no number of a camera")))?;
+            .map_err(|_| wrong(format!("'{camera}' is no number of a camera").into()))?;
         images.push(Image {
             camera_from_world: pose(file, name, numbers)?,
             name: name.trim().to_owned(),
@@ -334,7 +338,7 @@ fn text_images(file: &Path) -> Result<Vec<Image>, Error> {
                 line,
                 problem: "is not a line of points, X Y POINT3D_ID each: every image has two lines, of which \
                           the second may be empty"
-                    .to_owned(),
+                    .into(),
             });
         }
     }
@@ -353,7 +357,7 @@ impl Bytes<'_> {
         Error::Malformed {
             file: self.file.to_owned(),
             problem: "ends in the middle of a record: the file is truncated, or is not COLMAP's"
-                .to_owned(),
+                .into(),
         }
     }
 
@@ -381,7 +385,7 @@ impl Bytes<'_> {
         let end = end.ok_or_else(|| self.cut())?;
         let text = std::str::from_utf8(&self.left[..end]).map_err(|_| Error::Malformed {
             file: self.file.to_owned(),
-            problem: "has a name that is not UTF-8".to_owned(),
+            problem: "has a name that is not UTF-8".into(),
         })?;
         self.left = &self.left[end + 1..];
         Ok(text.to_owned())
@@ -417,7 +421,7 @@ fn binary_cameras(file: &Path) -> Result<BTreeMap<u32, Camera>, Error> {
             problem: format!(
                 "camera {id} has model {kind}, which is not known here; convert the model to text with \
                  `colmap model_converter --output_type TXT`"
-            ),
+            ).into(),
         })?;
         let numbers: Result<Vec<f64>, Error> = (0..model.numbers).map(|_| bytes.f64()).collect();
         cameras.insert(id, model.camera(width, height, &numbers?));

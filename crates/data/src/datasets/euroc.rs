@@ -12,6 +12,7 @@ use nalgebra::{Matrix4, Quaternion};
 use super::collect::{About, Collected};
 use super::text::number;
 use super::{DropReason, Error, Reader, Recording, read_text};
+use seese3_core::Cause;
 use seese3_core::geometry::{Pinhole, PixelCamera, Pose, pose_from_matrix, pose_from_quaternion};
 
 /// The longest time between an image and its pose, nanoseconds.
@@ -87,12 +88,12 @@ fn rows(file: &Path, text: &str) -> Result<Vec<(usize, Vec<String>)>, Error> {
         Some((line, _)) => Err(wrong(
             file,
             *line,
-            "has no columns separated by commas".to_owned(),
+            "has no columns separated by commas".into(),
         )),
     }
 }
 
-fn wrong(file: &Path, line: usize, problem: String) -> Error {
+fn wrong(file: &Path, line: usize, problem: Cause) -> Error {
     Error::Line {
         file: file.to_owned(),
         line,
@@ -101,8 +102,13 @@ fn wrong(file: &Path, line: usize, problem: String) -> Error {
 }
 
 fn time(file: &Path, line: usize, word: &str) -> Result<i64, Error> {
-    word.parse()
-        .map_err(|_| wrong(file, line, format!("'{word}' is not a time in nanoseconds")))
+    word.parse().map_err(|_| {
+        wrong(
+            file,
+            line,
+            format!("'{word}' is not a time in nanoseconds").into(),
+        )
+    })
 }
 
 /// Times, nanoseconds, and poses of the body, `world_from_body`.
@@ -117,7 +123,8 @@ fn read_ground_truth(file: &Path) -> Result<Vec<(i64, Pose)>, Error> {
                 format!(
                     "has {} columns, expected time, position and quaternion",
                     columns.len()
-                ),
+                )
+                .into(),
             ));
         }
 
@@ -127,7 +134,7 @@ fn read_ground_truth(file: &Path) -> Result<Vec<(i64, Pose)>, Error> {
         }
         let [x, y, z, qw, qx, qy, qz] = numbers;
         let pose = pose_from_quaternion([x, y, z], Quaternion::new(qw, qx, qy, qz))
-            .map_err(|error| wrong(file, line, error.to_string()))?;
+            .map_err(|error| wrong(file, line, error.into()))?;
         poses.push((time(file, line, &columns[0])?, pose));
     }
 
@@ -154,17 +161,17 @@ struct Sensor {
 
 fn read_sensor(file: &Path) -> Result<Sensor, Error> {
     let text = read_text(file)?;
-    let malformed = |problem: String| Error::Malformed {
+    let malformed = |problem: Cause| Error::Malformed {
         file: file.to_owned(),
         problem,
     };
 
     let mounting = list(&text, "T_BS:").and_then(|numbers| <[f64; 16]>::try_from(numbers).ok());
     let mounting = mounting.ok_or_else(|| {
-        malformed("has no T_BS with sixteen numbers, the camera's pose on the body".to_owned())
+        malformed("has no T_BS with sixteen numbers, the camera's pose on the body".into())
     })?;
     let (body_from_camera, _) = pose_from_matrix(&Matrix4::from_row_slice(&mounting))
-        .map_err(|error| malformed(error.to_string()))?;
+        .map_err(|error| malformed(error.into()))?;
 
     let numbers = list(&text, "resolution:").zip(list(&text, "intrinsics:"));
     let camera = numbers.and_then(|(size, intrinsics)| {

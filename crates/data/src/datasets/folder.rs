@@ -26,7 +26,7 @@ pub fn read_folder(folder: &Path) -> Result<Recording, Error> {
                 "has {} images (.jpg, .jpeg, .png), and poses.npy {pose_count} poses; each image needs one, \
                  in the order of the numbers in their names",
                 images.len()
-            ),
+            ).into(),
         });
     }
 
@@ -65,7 +65,7 @@ pub(super) fn resolved(folder: &Path) -> Result<String, Error> {
     })?;
     let text = whole.to_str().ok_or_else(|| Error::Malformed {
         file: folder.to_owned(),
-        problem: "the path is not UTF-8".to_owned(),
+        problem: "the path is not UTF-8".into(),
     })?;
 
     Ok(text.to_owned())

@@ -45,7 +45,8 @@ pub fn read_kitti(
                 "has {count} {what}, {} has {} poses; each pose needs one",
                 poses.display(),
                 matrices.len()
-            ),
+            )
+            .into(),
         })
     };
     if let Some((file, times)) = beside.times.as_deref().zip(times.as_ref()) {
@@ -88,7 +89,7 @@ fn read_matrices(file: &Path) -> Result<Vec<Matrix4<f64>>, Error> {
             return Err(Error::Line {
                 file: file.to_owned(),
                 line,
-                problem: format!("has {} numbers, a pose has 12", numbers.len()),
+                problem: format!("has {} numbers, a pose has 12", numbers.len()).into(),
             });
         }
         numbers.extend([0.0, 0.0, 0.0, 1.0]);
@@ -113,7 +114,7 @@ fn read_times(file: &Path) -> Result<Vec<i64>, Error> {
         Err(Error::Line {
             file: file.to_owned(),
             line,
-            problem: format!("'{}' is not a time in seconds", row.trim()),
+            problem: format!("'{}' is not a time in seconds", row.trim()).into(),
         })
     };
     words.map(time).collect()

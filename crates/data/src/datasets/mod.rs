@@ -41,6 +41,7 @@ pub use twelve_scenes::read_twelve_scenes;
 
 use std::path::{Path, PathBuf};
 
+use seese3_core::Cause;
 use seese3_core::features::Features;
 use seese3_core::geometry::Pinhole;
 use seese3_core::room::{Frames, Timeline};
@@ -52,21 +53,28 @@ pub enum Error {
     #[error("{}: {cause}", file.display())]
     Io {
         file: PathBuf,
+        #[source]
         cause: std::io::Error,
     },
     #[error("{}: {problem}", file.display())]
-    Malformed { file: PathBuf, problem: String },
+    Malformed {
+        file: PathBuf,
+        #[source]
+        problem: Cause,
+    },
     #[error("{}, line {line}: {problem}", file.display())]
     Line {
         file: PathBuf,
         line: usize,
-        problem: String,
+        #[source]
+        problem: Cause,
     },
     #[error("{}, frame {frame}: {problem}", file.display())]
     Frame {
         file: PathBuf,
         frame: usize,
-        problem: String,
+        #[source]
+        problem: Cause,
     },
     #[error("{}: {} frames are unusable, the first is {}; leave out --strict to drop them", folder.display(), dropped.len(), dropped[0])]
     Strict {
@@ -235,7 +243,7 @@ fn read_bytes(file: &Path) -> Result<Vec<u8>, Error> {
 fn read_text(file: &Path) -> Result<String, Error> {
     let malformed = |_| Error::Malformed {
         file: file.to_owned(),
-        problem: "is not UTF-8 text".to_owned(),
+        problem: "is not UTF-8 text".into(),
     };
     // Some editors put a byte order mark before the text.
     let bytes = read_bytes(file)?;
@@ -255,7 +263,7 @@ fn entries(folder: &Path) -> Result<Vec<String>, Error> {
         let name = entry.map_err(io)?.file_name();
         let name = name.into_string().map_err(|name| Error::Malformed {
             file: folder.join(&name),
-            problem: "has a name that is not UTF-8; rename the file".to_owned(),
+            problem: "has a name that is not UTF-8; rename the file".into(),
         })?;
         names.push(name);
     }

@@ -7,6 +7,7 @@ use ndarray::{Array2, ArrayD, ArrayViewD, Ix2};
 use ndarray_npy::{ViewElement, ViewNpyError, ViewNpyExt};
 
 use super::{Error, Recording, read_bytes};
+use seese3_core::Cause;
 use seese3_core::geometry::{GivenPoseError, pose_from_matrix};
 use seese3_core::room::Frames;
 
@@ -67,7 +68,7 @@ impl NpyFile {
 fn malformed(file: &Path, problem: &str) -> Error {
     Error::Malformed {
         file: file.to_owned(),
-        problem: problem.to_owned(),
+        problem: problem.into(),
     }
 }
 
@@ -92,7 +93,7 @@ pub fn read_poses(file: &Path) -> Result<Recording, Error> {
 
     let mut worst: f64 = 0.0;
     for (frame, matrix) in matrices.outer_iter().enumerate() {
-        let wrong = |problem: String| Error::Frame {
+        let wrong = |problem: Cause| Error::Frame {
             file: file.to_owned(),
             frame,
             problem,
@@ -102,13 +103,11 @@ pub fn read_poses(file: &Path) -> Result<Recording, Error> {
         // belong to the poses by row.
         let matrix = Matrix4::from_row_iterator(matrix.iter().copied());
         let (pose, deviation) = pose_from_matrix(&matrix).map_err(|error| match error {
-            GivenPoseError::NotFinite => {
-                wrong("the pose has a number that is not finite".to_owned())
+            GivenPoseError::NotFinite => wrong("the pose has a number that is not finite".into()),
+            GivenPoseError::Singular => {
+                wrong("the upper left 3×3 block is not a rotation (singular or mirrored)".into())
             }
-            GivenPoseError::Singular => wrong(
-                "the upper left 3×3 block is not a rotation (singular or mirrored)".to_owned(),
-            ),
-            error => wrong(error.to_string()),
+            error => wrong(error.into()),
         })?;
         worst = worst.max(deviation);
         frames.poses.push(pose);

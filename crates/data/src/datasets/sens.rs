@@ -14,6 +14,7 @@
 //! assumed to be microseconds, and are kept only if they increase from frame to frame. Every size
 //! in the file is compared with the bytes that are left before it is used.
 
+use seese3_core::Cause;
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
@@ -125,16 +126,16 @@ impl<'a> Sens<'a> {
     fn header(&mut self) -> Result<u64, Error> {
         let version = u32::from_le_bytes(self.array("its version")?);
         if version != VERSION {
-            return Err(self.malformed(format!(
-                "is version {version} of the format, expected {VERSION}"
-            )));
+            return Err(self.malformed(
+                format!("is version {version} of the format, expected {VERSION}").into(),
+            ));
         }
 
         let name = self.number("its name's length")?;
         if name > LONGEST_NAME {
-            return Err(self.malformed(format!(
-                "has a sensor name of {name} bytes; is it a .sens file?"
-            )));
+            return Err(self.malformed(
+                format!("has a sensor name of {name} bytes; is it a .sens file?").into(),
+            ));
         }
 
         self.skip(name, "its name")?;
@@ -143,7 +144,7 @@ impl<'a> Sens<'a> {
         if !matches!(colour, 1 | 2) {
             let problem =
                 format!("stores colour in format {colour}; only PNG (1) and JPEG (2) are read");
-            return Err(self.malformed(problem));
+            return Err(self.malformed(problem.into()));
         }
 
         // The depth compression, the four image sizes and the depth shift are not needed.
@@ -157,7 +158,7 @@ impl<'a> Sens<'a> {
                 "is truncated: its header states {frames} frames, which do not fit into {} bytes",
                 self.size
             );
-            return Err(self.malformed(problem));
+            return Err(self.malformed(problem.into()));
         }
 
         Ok(frames)
@@ -230,13 +231,16 @@ impl<'a> Sens<'a> {
             return Ok(());
         }
 
-        Err(self.malformed(format!(
-            "is truncated in {what}, at byte {} of {}; copy it again",
-            self.at, self.size
-        )))
+        Err(self.malformed(
+            format!(
+                "is truncated in {what}, at byte {} of {}; copy it again",
+                self.at, self.size
+            )
+            .into(),
+        ))
     }
 
-    fn malformed(&self, problem: String) -> Error {
+    fn malformed(&self, problem: Cause) -> Error {
         Error::Malformed {
             file: self.path.to_owned(),
             problem,

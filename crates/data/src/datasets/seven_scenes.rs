@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use super::collect::{About, Collected};
 use super::text::read_matrix;
 use super::{DropReason, Error, Reader, Recording, entries, read_text};
+use seese3_core::Cause;
 use seese3_core::geometry::{Pose, pose_from_matrix};
 
 /// What to read of a scene.
@@ -146,7 +147,7 @@ fn image_stem(name: &str) -> Option<&str> {
 
 /// The scene's folder and the names of the sequences to read from it.
 fn sequences_of(folder: &Path, wanted: Option<&str>) -> Result<(PathBuf, Vec<String>), Error> {
-    let malformed = |problem: String| Error::Malformed {
+    let malformed = |problem: Cause| Error::Malformed {
         file: folder.to_owned(),
         problem,
     };
@@ -160,10 +161,13 @@ fn sequences_of(folder: &Path, wanted: Option<&str>) -> Result<(PathBuf, Vec<Str
 
     if let Some(wanted) = wanted {
         if !sequences.iter().any(|name| name == wanted) {
-            return Err(malformed(format!(
-                "has no sequence '{wanted}'; it has {}",
-                sequences.join(", ")
-            )));
+            return Err(malformed(
+                format!(
+                    "has no sequence '{wanted}'; it has {}",
+                    sequences.join(", ")
+                )
+                .into(),
+            ));
         }
 
         return Ok((folder.to_owned(), vec![wanted.to_owned()]));
@@ -183,13 +187,13 @@ fn sequences_of(folder: &Path, wanted: Option<&str>) -> Result<(PathBuf, Vec<Str
 
         return match (folder.parent(), name) {
             (Some(scene), Some(name)) => Ok((scene.to_owned(), vec![name])),
-            _ => Err(malformed("is the root folder".to_owned())),
+            _ => Err(malformed("is the root folder".into())),
         };
     }
 
     if sequences.is_empty() {
         return Err(malformed(
-            "holds neither frame-*.pose.txt nor a folder seq-XX".to_owned(),
+            "holds neither frame-*.pose.txt nor a folder seq-XX".into(),
         ));
     }
 
@@ -208,7 +212,7 @@ fn dataset_split(scene: &Path, sequences: &[String]) -> Result<Option<BTreeSet<S
     if let Some(both) = train.intersection(&test).next() {
         return Err(Error::Malformed {
             file: files[1].clone(),
-            problem: format!("lists {both}, as TrainSplit.txt does"),
+            problem: format!("lists {both}, as TrainSplit.txt does").into(),
         });
     }
 
@@ -221,7 +225,7 @@ fn dataset_split(scene: &Path, sequences: &[String]) -> Result<Option<BTreeSet<S
         );
         return Err(Error::Malformed {
             file: files[1].clone(),
-            problem,
+            problem: problem.into(),
         });
     }
 
@@ -246,7 +250,7 @@ fn split_file(file: &Path) -> Result<BTreeSet<String>, Error> {
             .ok_or_else(|| Error::Line {
                 file: file.to_owned(),
                 line,
-                problem,
+                problem: problem.into(),
             })
     };
 
@@ -255,14 +259,14 @@ fn split_file(file: &Path) -> Result<BTreeSet<String>, Error> {
 
 /// `depth_from_rgb`: the inverse of the rigid transform `rgb_from_depth` in a file.
 fn calibration(file: &Path) -> Result<Pose, Error> {
-    let malformed = |problem: String| Error::Malformed {
+    let malformed = |problem: Cause| Error::Malformed {
         file: file.to_owned(),
         problem,
     };
-    let matrix = read_matrix(file)?.map_err(|reason| malformed(reason.to_string()))?;
+    let matrix = read_matrix(file)?.map_err(|reason| malformed(reason.into()))?;
 
     let (rgb_from_depth, _) = pose_from_matrix(&matrix).map_err(|_| {
-        malformed("is not a rigid transform; expected rgb_from_depth, 4×4, metres".to_owned())
+        malformed("is not a rigid transform; expected rgb_from_depth, 4×4, metres".into())
     })?;
     Ok(rgb_from_depth.inverse())
 }

@@ -1,5 +1,6 @@
 //! Strict parsing of numbers in text files. Errors name the file and the line.
 
+use seese3_core::Cause;
 use std::path::Path;
 
 use nalgebra::Matrix4;
@@ -28,7 +29,7 @@ pub(super) fn read_matrix(file: &Path) -> Result<Result<Matrix4<f64>, DropReason
         0..16 => Ok(Err(DropReason::TruncatedPoseFile)),
         more => Err(Error::Malformed {
             file: file.to_owned(),
-            problem: format!("has {more} numbers, expected 16"),
+            problem: format!("has {more} numbers, expected 16").into(),
         }),
     }
 }
@@ -36,7 +37,7 @@ pub(super) fn read_matrix(file: &Path) -> Result<Result<Matrix4<f64>, DropReason
 /// Parses a number, which may be infinite or NaN.
 pub(super) fn number(file: &Path, line: usize, word: &str) -> Result<f64, Error> {
     word.parse()
-        .map_err(|_| wrong(file, line, format!("'{word}' is not a number")))
+        .map_err(|_| wrong(file, line, format!("'{word}' is not a number").into()))
 }
 
 /// Parses `N` finite numbers, separated by single spaces.
@@ -47,15 +48,19 @@ pub(super) fn finite_row<const N: usize>(
 ) -> Result<[f64; N], Error> {
     let words = spaced(file, line, text)?;
     let count = words.len();
-    let words: [&str; N] = words
-        .try_into()
-        .map_err(|_| wrong(file, line, format!("has {count} columns, expected {N}")))?;
+    let words: [&str; N] = words.try_into().map_err(|_| {
+        wrong(
+            file,
+            line,
+            format!("has {count} columns, expected {N}").into(),
+        )
+    })?;
 
     let mut row = [0.0; N];
     for (value, word) in row.iter_mut().zip(words) {
         *value = number(file, line, word)?;
         if !value.is_finite() {
-            return Err(wrong(file, line, format!("'{word}' is not finite")));
+            return Err(wrong(file, line, format!("'{word}' is not finite").into()));
         }
     }
 
@@ -72,7 +77,7 @@ pub(super) fn spaced<'a>(file: &Path, line: usize, text: &'a str) -> Result<Vec<
         return Err(wrong(
             file,
             line,
-            "columns must be separated by single spaces, with none at either end".to_owned(),
+            "columns must be separated by single spaces, with none at either end".into(),
         ));
     }
 
@@ -103,7 +108,7 @@ pub(super) fn nanoseconds(seconds: &str) -> Option<i64> {
         .checked_add(fraction.parse().ok()?)
 }
 
-pub(super) fn wrong(file: &Path, line: usize, problem: String) -> Error {
+pub(super) fn wrong(file: &Path, line: usize, problem: Cause) -> Error {
     Error::Line {
         file: file.to_owned(),
         line,

@@ -13,6 +13,7 @@ use super::collect::{About, Collected};
 use super::natural::sort_naturally;
 use super::{DropReason, Error, Reader, Recording, read_bytes};
 use crate::pose_check::{Axes, Convention};
+use seese3_core::Cause;
 use seese3_core::geometry::{Pinhole, PixelCamera};
 
 /// The parts of the file that are read.
@@ -56,7 +57,7 @@ pub fn read_transforms(path: &Path, reader: &mut Reader<'_>) -> Result<Recording
         path.to_owned()
     };
     let folder = file.parent().map_or_else(PathBuf::new, Path::to_owned);
-    let malformed = |problem: String| Error::Malformed {
+    let malformed = |problem: Cause| Error::Malformed {
         file: file.clone(),
         problem,
     };
@@ -65,7 +66,7 @@ pub fn read_transforms(path: &Path, reader: &mut Reader<'_>) -> Result<Recording
     let content = read_bytes(&file)?;
     let text = content.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&content);
     let transforms: Transforms =
-        serde_json::from_slice(text).map_err(|error| malformed(error.to_string()))?;
+        serde_json::from_slice(text).map_err(|error| malformed(error.into()))?;
     let mut frames = transforms.frames;
     sort_naturally(&mut frames, |frame| &frame.file_path);
 
@@ -101,7 +102,8 @@ pub fn read_transforms(path: &Path, reader: &mut Reader<'_>) -> Result<Recording
     for pose in &mut recording.frames.poses {
         *pose = opengl.to_world_from_camera(pose);
     }
-    recording.stated.camera = pinhole(transforms.camera).map_err(malformed)?;
+    recording.stated.camera =
+        pinhole(transforms.camera).map_err(|problem| malformed(problem.into()))?;
     Ok(recording)
 }
 

@@ -92,7 +92,7 @@ fn read_trajectory(file: &Path) -> Result<Vec<(i64, Pose)>, Error> {
 
         // The file writes the scalar part last; nalgebra takes it first.
         let pose = pose_from_quaternion([x, y, z], Quaternion::new(qw, qx, qy, qz))
-            .map_err(|error| wrong(file, line, error.to_string()))?;
+            .map_err(|error| wrong(file, line, error.into()))?;
         poses.push((time, pose));
     }
 
@@ -110,7 +110,7 @@ fn read_images(file: &Path) -> Result<Vec<(i64, String)>, Error> {
             return Err(wrong(
                 file,
                 line,
-                format!("has {} columns, expected timestamp and file", words.len()),
+                format!("has {} columns, expected timestamp and file", words.len()).into(),
             ));
         };
 
@@ -142,7 +142,7 @@ fn time(file: &Path, line: usize, row: &str) -> Result<i64, Error> {
             wrong(
                 file,
                 line,
-                format!("'{word}' is not a time in decimal seconds"),
+                format!("'{word}' is not a time in decimal seconds").into(),
             )
         })
 }

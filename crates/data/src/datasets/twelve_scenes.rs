@@ -107,15 +107,13 @@ fn sequence_lengths(file: &Path) -> Result<Vec<usize>, Error> {
             .split_whitespace()
             .find_map(|word| word.strip_prefix("[frames=")?.strip_suffix(']'));
         let length = frames.and_then(|frames| frames.parse::<u32>().ok());
-        lengths.push(
-            length.ok_or_else(|| wrong(file, line, "has no [frames=N]".to_owned()))? as usize,
-        );
+        lengths.push(length.ok_or_else(|| wrong(file, line, "has no [frames=N]".into()))? as usize);
     }
 
     if lengths.is_empty() {
         return Err(Error::Malformed {
             file: file.to_owned(),
-            problem: "lists no sequence".to_owned(),
+            problem: "lists no sequence".into(),
         });
     }
 

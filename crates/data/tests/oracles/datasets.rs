@@ -491,3 +491,20 @@ fn a_bundle_that_is_not_whole_is_refused() {
         refuses(read_bundle(out.path()), word);
     }
 }
+
+/// Oracle: the definition of `Error::source`: the error of the library that failed.
+#[test]
+fn an_error_keeps_its_cause() {
+    let folder = tempfile::tempdir().unwrap();
+    let cause = |error: &dyn std::error::Error| {
+        let source = error.source().expect("a cause");
+        source.is::<serde_json::Error>() || source.is::<std::io::Error>()
+    };
+
+    let absent = read_bundle(folder.path()).unwrap_err();
+    assert!(cause(&absent), "{absent:?}");
+
+    std::fs::write(folder.path().join("bundle.json"), "{").unwrap();
+    let malformed = read_bundle(folder.path()).unwrap_err();
+    assert!(cause(&malformed), "{malformed:?}");
+}

@@ -53,7 +53,7 @@ pub fn curves_svg(curves: &Curves) -> Result<String, Error> {
     {
         let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
         draw(&root, curves).map_err(|error| Error::Picture {
-            problem: error.to_string(),
+            problem: error.to_string().into(),
         })?;
     }
 

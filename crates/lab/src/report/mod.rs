@@ -71,7 +71,8 @@ pub enum Error {
     #[error("a picture cannot be drawn: {problem}")]
     Picture {
         /// What the library says.
-        problem: String,
+        #[source]
+        problem: seese3_core::Cause,
     },
     /// The Parquet library refused a table.
     #[error("a Parquet table cannot be written")]

@@ -37,7 +37,7 @@ pub fn path_svg(plot: &PathPlot) -> Result<String, Error> {
     {
         let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
         draw(&root, plot).map_err(|error| Error::Picture {
-            problem: error.to_string(),
+            problem: error.to_string().into(),
         })?;
     }
 

@@ -14,6 +14,7 @@
 //! of a client's certificate the fingerprint (`certificate_sha256`, that of its DER). Tokens that
 //! others signed are taken by `[[issuer]]`, see [`super::issuers`].
 
+use seese3_core::Cause;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -44,10 +45,15 @@ pub enum AuthError {
     #[error("--auth-file: {} cannot be read: {problem}", file.display())]
     Unreadable {
         file: PathBuf,
+        #[source]
         problem: std::io::Error,
     },
     #[error("--auth-file: {}: {problem}", file.display())]
-    Syntax { file: PathBuf, problem: String },
+    Syntax {
+        file: PathBuf,
+        #[source]
+        problem: Cause,
+    },
     #[error("--auth-file: {}: principal '{name}': {problem}", file.display())]
     Principal {
         file: PathBuf,
@@ -117,15 +123,15 @@ impl Credentials {
     }
 
     fn of(file: &Path, text: &str) -> Result<Self, AuthError> {
-        let syntax = |problem: String| AuthError::Syntax {
+        let syntax = |problem: seese3_core::Cause| AuthError::Syntax {
             file: file.to_owned(),
             problem,
         };
 
-        let form: FileForm = toml::from_str(text).map_err(|error| syntax(error.to_string()))?;
+        let form: FileForm = toml::from_str(text).map_err(|error| syntax(error.into()))?;
         if form.principal.is_empty() && form.issuer.is_empty() {
             let problem = "has no [[principal]] and no [[issuer]]: nobody could call";
-            return Err(syntax(problem.to_owned()));
+            return Err(syntax(problem.into()));
         }
 
         let mut names = BTreeSet::new();

@@ -387,7 +387,7 @@ impl Loader {
         let id = RoomId::new(name).map_err(|error| {
             refusal(seese3_store::Error::Damaged {
                 file: format!("rooms/{name}"),
-                problem: error.to_string(),
+                problem: error.into(),
             })
         })?;
 
@@ -460,7 +460,7 @@ async fn blocking<T: Send + 'static>(
 ) -> Result<T, RunError> {
     tokio::task::spawn_blocking(work)
         .await
-        .map_err(|error| RunError::Loading(error.to_string()))?
+        .map_err(RunError::Loading)?
 }
 
 /// Logs why a revision is refused, unless that has been logged.

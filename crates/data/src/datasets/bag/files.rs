@@ -63,7 +63,7 @@ fn files_of(bag: &Path) -> Result<Vec<PathBuf>, Error> {
     if names.is_empty() {
         return Err(Error::Malformed {
             file: bag.to_owned(),
-            problem: "has no .mcap and no .db3 files: it is not a bag of ROS 2".to_owned(),
+            problem: "has no .mcap and no .db3 files: it is not a bag of ROS 2".into(),
         });
     }
     let has = |ending: &str| names.iter().any(|name| name.ends_with(ending));
@@ -71,7 +71,7 @@ fn files_of(bag: &Path) -> Result<Vec<PathBuf>, Error> {
         return Err(Error::Malformed {
             file: bag.to_owned(),
             problem: "has .mcap and .db3 files, which may be the same recording twice: name one of the files"
-                .to_owned(),
+                .into(),
         });
     }
 
@@ -93,7 +93,7 @@ fn form_of(file: &Path) -> Result<Form, Error> {
     if !std::fs::metadata(file).map_err(io)?.is_file() {
         return Err(Error::Malformed {
             file: file.to_owned(),
-            problem: "is not a regular file".to_owned(),
+            problem: "is not a regular file".into(),
         });
     }
     let mut first = Vec::new();
@@ -113,6 +113,6 @@ fn form_of(file: &Path) -> Result<Form, Error> {
     };
     Err(Error::Malformed {
         file: file.to_owned(),
-        problem: problem.to_owned(),
+        problem: problem.into(),
     })
 }

@@ -1,5 +1,6 @@
 //! The messages of an MCAP file, read in pieces, whatever its size.
 
+use seese3_core::Cause;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
@@ -24,12 +25,13 @@ pub fn each_message(
         file: file.to_owned(),
         cause,
     };
-    let malformed = |problem: String| Error::Malformed {
+    let malformed = |problem: Cause| Error::Malformed {
         file: file.to_owned(),
         problem,
     };
-    let damaged =
-        |error: mcap::McapError| malformed(format!("is a truncated or damaged MCAP file: {error}"));
+    let damaged = |error: mcap::McapError| {
+        malformed(format!("is a truncated or damaged MCAP file: {error}").into())
+    };
 
     let mut source = File::open(file).map_err(io)?;
     let length = source.metadata().map_err(io)?.len();
@@ -68,7 +70,7 @@ pub fn each_message(
                                 log_time_ns: i64::try_from(header.log_time).unwrap_or(i64::MAX),
                                 data: &data,
                             })
-                            .map_err(malformed)?;
+                            .map_err(|problem| malformed(problem.into()))?;
                         }
                     }
                     _ => {}

@@ -30,6 +30,7 @@ use files::each_message;
 use message::{Kind, Message, Topic};
 use messages::{Image, ImageFile};
 use poses::Poses;
+use seese3_core::Cause;
 use seese3_core::geometry::Pose;
 pub use written_images::WrittenImages;
 
@@ -62,7 +63,7 @@ pub fn read_bag(
     bag: &Bag,
     reader: &mut Reader<'_>,
 ) -> Result<(Recording, WrittenImages), Error> {
-    let malformed = |problem: String| malformed(path, problem);
+    let malformed = |problem: String| malformed(path, problem.into());
     let Contents {
         topics,
         mut poses,
@@ -172,7 +173,7 @@ fn in_order(
     collected.finish(folder, reader)
 }
 
-fn malformed(path: &Path, problem: String) -> Error {
+fn malformed(path: &Path, problem: Cause) -> Error {
     Error::Malformed {
         file: path.to_owned(),
         problem,

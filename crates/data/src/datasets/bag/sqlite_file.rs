@@ -5,6 +5,7 @@
 //! | `topics` | `id`, `name`, `type` (the definition), `serialization_format` ("cdr") |
 //! | `messages` | `id` in the order of writing, `topic_id`, `timestamp` (nanoseconds), `data` |
 
+use seese3_core::Cause;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -18,11 +19,12 @@ pub fn each_message(
     file: &Path,
     take: &mut impl FnMut(&Message<'_>) -> Result<(), String>,
 ) -> Result<Vec<Topic>, Error> {
-    let malformed = |problem: String| Error::Malformed {
+    let malformed = |problem: Cause| Error::Malformed {
         file: file.to_owned(),
         problem,
     };
-    let damaged = |error: rusqlite::Error| malformed(format!("is a damaged .db3 bag: {error}"));
+    let damaged =
+        |error: rusqlite::Error| malformed(format!("is a damaged .db3 bag: {error}").into());
 
     // A name such as `file:a.db3` is a name here, and not a URI.
     let path = file.canonicalize().map_err(|cause| Error::Io {
@@ -33,9 +35,10 @@ pub fn each_message(
     let database = Connection::open_with_flags(path, flags).map_err(damaged)?;
     for table in ["topics", "messages"] {
         if !has_table(&database, table).map_err(damaged)? {
-            return Err(malformed(format!(
-                "is a database without the table '{table}': it is not a bag of ROS 2"
-            )));
+            return Err(malformed(
+                format!("is a database without the table '{table}': it is not a bag of ROS 2")
+                    .into(),
+            ));
         }
     }
 
@@ -48,7 +51,7 @@ pub fn each_message(
         let topic = topics.get(&row.get(0).map_err(damaged)?);
         if let Some((topic, kind)) = topic.and_then(|topic| Some((topic, topic.kind?))) {
             let message = message_of(row, topic, kind).map_err(damaged)?;
-            take(&message).map_err(malformed)?;
+            take(&message).map_err(|problem| malformed(problem.into()))?;
         }
     }
 
