@@ -641,7 +641,7 @@ fn an_adapter_is_fitted_and_its_views_are_located() {
     let from_b = ["fit", "--store", &store, "--adapter", "b"];
     refuses(
         &[&from_b[..], &["--room", "b"]].concat(),
-        &["'b'", "has seen"],
+        &["'b'", "was trained on"],
     );
     refuses(
         &["fit", "--store", &store, "--room", "a", "--name", "b"],

@@ -1,5 +1,5 @@
-//! An adapter as bytes: its weights as safetensors, with the golden vectors that prove that it still
-//! computes the same, and the checks of files that come from another store.
+//! Serialization of adapters: weights as safetensors with golden vectors, which verify that the
+//! adapter still computes the same outputs. Also checks files from another store.
 
 use std::sync::Arc;
 
@@ -17,19 +17,18 @@ use seese3_core::adapter::{
 
 /// The frame of every twist: the body frame of the source camera (A-1).
 pub(super) const TWIST_FRAME: &str = "body";
-/// The tensor with the second moment Σ of the adapter's errors, (6, 6) f64 on (v, ω).
+/// Name of the tensor with the second moment Σ of the adapter's errors, (6, 6) f64 on (v, ω).
 const ERROR_COVARIANCE: &str = "error.covariance";
-/// The largest number of golden inputs that are stored with an adapter.
+/// Maximum number of golden inputs stored with an adapter.
 const GOLDEN_ROWS: usize = 8;
-/// The largest accepted difference from a golden output, in units of the larger of 1 and the
-/// magnitude of that output.
+/// Tolerance of a golden output, relative to max(1, magnitude of that output).
 const GOLDEN_TOLERANCE: f64 = 1e-6;
 
-/// What errors call the files of an adapter that come from elsewhere.
+/// Names in error messages of adapter files that come from elsewhere.
 pub(super) const UPLOADED_MANIFEST: &str = "the manifest";
 const UPLOADED_WEIGHTS: &str = "the weights";
 
-/// The size in bytes that the manifest of an adapter states for its weights.
+/// Size of an adapter's weights in bytes, as stated by its manifest.
 ///
 /// # Errors
 /// [`Error::Damaged`] if the manifest is truncated or altered, [`Error::Schema`] if a newer program
@@ -39,11 +38,11 @@ pub fn stated_weights_size(manifest: &[u8]) -> Result<u64, Error> {
     Ok(body.weights.bytes)
 }
 
-/// Checks the manifest and the weights of an adapter that comes from another store, and returns it.
+/// Checks the manifest and the weights of an adapter from another store, and returns the adapter.
 ///
 /// # Errors
-/// [`Error::Damaged`] if one is truncated or altered, they do not belong together, or the adapter was
-/// fitted to a room, since it serves only the revision of the room that its own store has;
+/// [`Error::Damaged`] if a file is truncated or altered, if the two do not belong together, or if
+/// the adapter was fitted to a room: it is valid only for that room's revision in its own store.
 /// [`Error::Schema`] if a newer program wrote the manifest.
 pub fn check_adapter_files(manifest: &[u8], weights: &[u8]) -> Result<StoredAdapter, Error> {
     let body: AdapterBody = manifest::decode(UPLOADED_MANIFEST, manifest)?;
@@ -65,16 +64,16 @@ pub fn check_adapter_files(manifest: &[u8], weights: &[u8]) -> Result<StoredAdap
     assembled(body, UPLOADED_MANIFEST, UPLOADED_WEIGHTS, weights)
 }
 
-/// The adapter of a manifest and its weights, after its golden inputs gave their stored outputs.
-/// `manifest` and `file` name the two in errors.
+/// Builds the adapter from its manifest and weights, and checks its golden vectors. `manifest` and
+/// `file` name the two in errors.
 pub(super) fn assembled(
     body: AdapterBody,
     manifest: &str,
     file: &str,
     bytes: &[u8],
 ) -> Result<StoredAdapter, Error> {
-    // Motions in another frame or of another scale would be wrong without any other sign, so
-    // the conventions are checked before any tensor is read.
+    // Motions in another frame or of another scale would be silently wrong, so check the
+    // conventions before reading any tensor.
     if body.twist_frame != TWIST_FRAME || body.deviation_ddof != 0 {
         let problem = format!(
             "has twists in the frame '{}' and targets of ddof {}; this program supports only \
@@ -99,14 +98,14 @@ pub(super) fn assembled(
         .mixing()
         .map_err(|problem| damaged(problem.into()))?;
 
-    // The names of the tensors follow from the number of charts and their mixing, both of which
-    // stand in the manifest.
+    // The tensor names follow from the number of charts and their mixing, both stored in the
+    // manifest.
     let network = Mixture::from_tensors(body.training.charts, mixing, |name| {
         read_weights(&tensors, name)
     });
     let network = network.map_err(|error| error.within(file))?;
 
-    // W predicts z-scored motions; μ and σ turn them back into metres and radians.
+    // W predicts z-scored motions; μ and σ convert them back to meters and radians.
     let scale = TargetScale {
         mean: vector6(&tensors, "target.mean", file)?,
         deviation: vector6(&tensors, "target.deviation", file)?,
@@ -119,7 +118,7 @@ pub(super) fn assembled(
 
     let correctors = read_correctors(&tensors, &body.training, network.coordinate_count(), file)?;
 
-    // The optional parts are added one by one, and each is checked as it is added.
+    // Each optional part is checked as it is added.
     let adapter = Adapter::new(body.source.into(), network, scale)
         .and_then(|adapter| adapter.with_correctors(correctors))
         .and_then(|adapter| match error_covariance {
@@ -132,8 +131,8 @@ pub(super) fn assembled(
         })
         .map_err(|error| damaged(error.into()))?;
 
-    // The checksums show that the file is intact. The golden vectors show that this program, on
-    // this machine, still computes the same function from it.
+    // The checksums prove that the file is intact. The golden vectors prove that this program, on
+    // this machine, still computes the same function.
     check_golden(&adapter, &tensors, file)?;
     let record = body.training.record().map_err(|word| Error::Damaged {
         file: manifest.to_owned(),
@@ -156,7 +155,7 @@ pub(super) fn assembled(
     })
 }
 
-/// Why weights could not be taken from a file.
+/// Errors of reading weights from a file.
 enum WeightError {
     File(Error),
     Shape(adapter::Error),
@@ -184,8 +183,8 @@ fn read_weights(tensors: &TensorReader<'_>, name: &str) -> Result<Array2<f32>, W
     tensors.f32(name).map_err(WeightError::File)
 }
 
-/// Reads the correctors that the manifest names. They share the weights file; a prefix tells their
-/// tensors apart.
+/// Reads the correctors listed in the manifest. They share the weights file; a prefix identifies
+/// their tensors.
 fn read_correctors(
     tensors: &TensorReader<'_>,
     training: &TrainingEntry,
@@ -209,7 +208,7 @@ fn corrector_tensor(kind: CorrectorKind, tensor: &str) -> String {
     format!("corrector.{}.{tensor}", kind.name())
 }
 
-/// The shape of a tensor in PyTorch; in this program every tensor is two-dimensional.
+/// The PyTorch shape of a tensor; in this program every tensor is two-dimensional.
 fn torch_shape(name: &str, array: &Array2<f32>) -> Vec<usize> {
     let last = name.rsplit('.').next().unwrap_or(name);
     match array.dim() {
@@ -281,7 +280,7 @@ pub(super) fn adapter_file(
     tensors.finish(name)
 }
 
-/// Writes golden vectors: some of the training features, and what the adapter makes of them.
+/// Writes golden vectors: a sample of the training features with the adapter's outputs for them.
 fn write_golden(
     tensors: &mut TensorWriter,
     adapter: &Adapter,
@@ -293,7 +292,7 @@ fn write_golden(
         .collect();
     let golden = features.select(ndarray::Axis(0), &rows);
 
-    // The golden outputs are what this program computes now: latents, motions and corrected steps.
+    // The golden outputs are the current outputs: latents, motions and corrected steps.
     let latents = adapter.embed(golden.view())?;
 
     let twists = golden_twists(adapter, &latents);
@@ -329,7 +328,7 @@ fn write_golden(
     Ok(())
 }
 
-/// The motion from the first golden latent to each, shape (n, 6).
+/// The motions from the first golden latent to each golden latent, shape (n, 6).
 fn golden_twists(adapter: &Adapter, latents: &Array2<f64>) -> Array2<f64> {
     Array2::from_shape_fn((latents.nrows(), 6), |(row, column)| {
         adapter.motion(latents.row(0), latents.row(row)).to_vector()[column]
@@ -340,8 +339,8 @@ fn golden_corrector(kind: CorrectorKind) -> String {
     format!("golden.corrector.{}", kind.name())
 }
 
-/// The corrected latent step from each golden latent, for the motion from the first golden latent
-/// to it. Same shape as `latents`.
+/// The corrected latent step at each golden latent, for the motion from the first golden latent to
+/// it. Same shape as `latents`.
 fn golden_steps(
     adapter: &Adapter,
     kind: CorrectorKind,
@@ -364,7 +363,7 @@ fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Re
 
     let features = tensors.f32("golden.features")?;
 
-    // With no inputs every comparison below would succeed.
+    // Without inputs, every comparison below would pass.
     if features.nrows() == 0 {
         return Err(damaged("has no golden inputs".into()));
     }
@@ -374,7 +373,7 @@ fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Re
         .map_err(|error| damaged(error.into()))?;
     let twists = golden_twists(adapter, &latents);
 
-    // Recompute every kind of output, and pair it with the one that was stored.
+    // Recompute every output and pair it with the stored one.
     let mut checked = Vec::new();
     for corrector in adapter.correctors() {
         let kind = corrector.kind();
@@ -385,11 +384,10 @@ fn check_golden(adapter: &Adapter, tensors: &TensorReader<'_>, file: &str) -> Re
     checked.push(("latents", latents, tensors.f64("golden.latents")?));
     checked.push(("twists", twists, tensors.f64("golden.twists")?));
 
-    // Sums may be rounded differently on another machine, so the outputs need not agree in every
-    // bit.
+    // Summation may round differently on another machine, so outputs need not match bit for bit.
     for (what, found, stored) in checked {
         let near = |(found, stored): (&f64, &f64)| {
-            // The tolerance of an infinite output would let everything pass.
+            // An infinite output would have an infinite tolerance, so it fails.
             stored.is_finite() && (found - stored).abs() <= GOLDEN_TOLERANCE * stored.abs().max(1.0)
         };
         if found.dim() != stored.dim() || !found.iter().zip(&stored).all(near) {

@@ -14,7 +14,7 @@ use seese3_core::adapter::{Adapter, TrainingRecord};
 use seese3_core::room::is_plain_name;
 use seese3_robot::fitting::Fitted;
 
-/// What an adapter is published for.
+/// Intended use of a published adapter.
 enum Purpose<'a> {
     AnyRoom,
     OneRoom(&'a RoomFit),
@@ -22,15 +22,15 @@ enum Purpose<'a> {
 }
 
 impl Store {
-    /// Publishes an adapter as a new revision. Some rows of `features` (n, d), the features that it
-    /// was trained on, are stored as golden inputs, together with the outputs that it gives for
-    /// them. Publishing the same content again creates no revision.
+    /// Publishes an adapter as a new revision. A sample of `features` (n, d), its training
+    /// features, is stored as golden inputs together with the adapter's outputs. Publishing the
+    /// same content again creates no revision.
     ///
     /// # Errors
-    /// [`Error::Name`] if the name cannot be a folder, [`Error::Damaged`] if the features do not
-    /// fit the adapter, [`Error::Contended`] if other publishers took every revision number that
-    /// was tried, otherwise as [`Store::load_adapter`] if the newest revision cannot be read, or
-    /// [`Error::Io`] if the store cannot be written.
+    /// [`Error::Name`] if the name is not valid, [`Error::Damaged`] if the features do not fit the
+    /// adapter, [`Error::Contended`] if other publishers took every revision number tried,
+    /// [`Error::Io`] if the store cannot be written; as [`Store::load_adapter`] if the newest
+    /// revision cannot be read.
     pub async fn publish_adapter(
         &self,
         name: &str,
@@ -42,8 +42,8 @@ impl Store {
             .await
     }
 
-    /// Publishes an adapter of an experiment, as [`Store::publish_adapter`] does. It answers where it is
-    /// named; by default only where no other adapter fits.
+    /// Publishes an adapter of an experiment, like [`Store::publish_adapter`]. It is used when
+    /// requested by name, and as a default only where no other adapter fits.
     ///
     /// # Errors
     /// As [`Store::publish_adapter`].
@@ -58,7 +58,7 @@ impl Store {
             .await
     }
 
-    /// Publishes an adapter that was fitted to a room, as [`Store::publish_adapter`] does.
+    /// Publishes an adapter fitted to a room, like [`Store::publish_adapter`].
     ///
     /// # Errors
     /// As [`Store::publish_adapter`].
@@ -105,7 +105,7 @@ impl Store {
             training: TrainingEntry::new(record, adapter),
             fitted_to: room_fit.map(FittedEntry::from),
             experiment: matches!(purpose, Purpose::Experiment),
-            // What follows is set when it is published.
+            // Set by `publish_body`.
             adapter: String::new(),
             revision: 0,
             created: String::new(),
@@ -114,8 +114,8 @@ impl Store {
         self.publish_body(name, body, bytes).await
     }
 
-    /// Publishes a manifest with its weights under a name. Name, revision, date and the reference to
-    /// the weights are set here.
+    /// Publishes a manifest and its weights under a name. Sets the name, revision, date and weights
+    /// reference.
     async fn publish_body(
         &self,
         name: &str,
@@ -124,14 +124,13 @@ impl Store {
     ) -> Result<Published, Error> {
         let folder = folder_of(Kind::Adapter, name);
 
-        // The weights are written before the manifest that makes them visible.
+        // Write the weights before the manifest that makes them visible.
         let content = weights;
         let weights = self
             .write_object(&folder, "weights", "safetensors", content.clone())
             .await?;
 
-        // As for rooms: try to create the next revision, and start again if another publisher was
-        // faster.
+        // As for rooms: try to create the next revision, and retry if another publisher was faster.
         for _ in 0..ATTEMPTS {
             let numbers = self.revisions(&folder).await?;
             let newest = match numbers.present.last() {
@@ -147,7 +146,7 @@ impl Store {
                 ..body.clone()
             };
 
-            // Content that differs only in the revision number and the date is not published again.
+            // Do not publish again if only the revision number and the date differ.
             if let Some(newest) = newest {
                 let same = AdapterBody {
                     revision: newest.revision,
@@ -170,8 +169,8 @@ impl Store {
                 .write_manifest(&folder, body.revision, manifest::encode(&manifest, &body)?)
                 .await?
             {
-                // The manifest keeps its object from now on. What was collected before is written
-                // again.
+                // From now on the manifest protects its object from garbage collection. An object
+                // collected before is written again.
                 if self.lacks(&folder, body.objects()).await? {
                     self.write_object(&folder, "weights", "safetensors", content)
                         .await?;
@@ -189,14 +188,14 @@ impl Store {
         })
     }
 
-    /// Loads an adapter, the given revision or else the one that its name alone means, and checks that its golden inputs
-    /// still give their stored outputs.
+    /// Loads an adapter, in the given revision or else the current one, and checks that its golden
+    /// inputs still give their stored outputs.
     ///
     /// # Errors
-    /// [`Error::Unknown`] if there is no such adapter, [`Error::UnknownRevision`] if it has no such
-    /// revision, [`Error::Damaged`] if a file is truncated or altered or the golden outputs are not
-    /// reproduced, [`Error::Schema`] if a newer program wrote it, [`Error::Io`] if a file cannot be
-    /// read.
+    /// [`Error::Unknown`] or [`Error::UnknownRevision`] if the adapter or revision does not exist,
+    /// [`Error::Damaged`] if a file is truncated or altered or the golden outputs are not
+    /// reproduced, [`Error::Schema`] if a newer program wrote it, [`Error::Absent`] or
+    /// [`Error::Io`] if a file is missing or cannot be read.
     pub async fn load_adapter(
         &self,
         name: &str,
@@ -210,9 +209,8 @@ impl Store {
         assembled(body, &manifest, &file, &bytes)
     }
 
-    /// Publishes a revision that was taken from another store as a new revision of `name`: its
-    /// manifest and its weights, as they stand in the files there. Both are checked as if they were
-    /// loaded.
+    /// Publishes the manifest and weights files of another store's revision as a new revision of
+    /// `name`. Both are checked like on loading.
     ///
     /// # Errors
     /// [`Error::Damaged`] if the manifest or the weights are truncated, altered or do not belong
@@ -235,7 +233,7 @@ impl Store {
         self.publish_body(name, body, weights).await
     }
 
-    /// The files of an adapter, to be published in another store: its manifest and its weights.
+    /// The manifest and weights files of an adapter, for publishing in another store.
     ///
     /// # Errors
     /// As [`Store::load_adapter`].
@@ -260,8 +258,8 @@ impl Store {
         self.names(Kind::Adapter).await
     }
 
-    /// The names of all adapters, sorted, each with the revision that its name alone means by these
-    /// choices. No manifest is read.
+    /// The names of all adapters, sorted, each with its current revision under `defaults`. Reads no
+    /// manifest.
     ///
     /// # Errors
     /// [`Error::Io`] if the store cannot be listed.

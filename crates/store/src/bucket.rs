@@ -1,23 +1,23 @@
-//! Buckets of S3, Google Cloud Storage and Azure, with the feature `cloud`.
+//! Object stores by URL; S3, Google Cloud Storage and Azure need the feature `cloud`.
 
 use object_store::ObjectStore;
 use object_store::path::Path;
 use url::Url;
 
-/// Opens the bucket of a URL; the path is the prefix in the URL. Sends no request. Credentials and endpoints
-/// are read from the providers' usual environment variables.
+/// Opens the bucket of a URL; the returned path is the URL's prefix. Sends no request. Credentials
+/// and endpoints come from the providers' usual environment variables.
 ///
 /// # Errors
-/// Why it cannot be opened.
+/// The reason why it cannot be opened, as text.
 #[cfg(feature = "cloud")]
 pub fn open(url: &Url) -> Result<(Box<dyn ObjectStore>, Path), String> {
     object_store::parse_url_opts(url, std::env::vars()).map_err(|error| error.to_string())
 }
 
-/// Opens what needs no bucket, such as `file:` and `memory:`.
+/// Opens URLs that need no bucket, such as `file:` and `memory:`.
 ///
 /// # Errors
-/// That this program was built without buckets.
+/// A message that names the build feature, for any other URL.
 #[cfg(not(feature = "cloud"))]
 pub fn open(url: &Url) -> Result<(Box<dyn ObjectStore>, Path), String> {
     object_store::parse_url(url).map_err(|error| {

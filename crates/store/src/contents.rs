@@ -1,4 +1,4 @@
-//! What is in a store, revision by revision.
+//! Listing of a store's contents, by revision.
 
 use super::defaults::Defaults;
 use super::format::{AdapterBody, RoomBody};
@@ -7,44 +7,44 @@ use super::{Error, Kind, ResourceName, Store, folder_of};
 /// A room or an adapter with all its revisions.
 #[derive(Debug, Clone)]
 pub struct Contents {
-    /// Its name, without a revision.
+    /// The name, without a revision.
     pub resource: ResourceName,
-    /// The revision that the name alone means.
+    /// The current revision: the operator's default, else the newest.
     pub current: u64,
-    /// Whether an operator chose that; otherwise it is the newest.
+    /// Whether the current revision is an operator's default; otherwise it is the newest.
     pub is_chosen: bool,
-    /// The adapter that an operator chose for this room.
+    /// The operator's default adapter for this room.
     pub default_adapter: Option<String>,
-    /// Every revision, in ascending order.
+    /// All revisions, in ascending order.
     pub revisions: Vec<RevisionContents>,
 }
 
-/// One revision, read from its manifest alone.
+/// One revision, as described by its manifest.
 #[derive(Debug, Clone)]
 pub struct RevisionContents {
-    /// Counted from 1.
+    /// Revision number, from 1.
     pub revision: u64,
-    /// What the manifest says; why it cannot be read, if it cannot.
+    /// The manifest's summary, or the reason why it cannot be read.
     pub manifest: Result<ManifestSummary, String>,
 }
 
-/// What a manifest says.
+/// Summary of a manifest.
 #[derive(Debug, Clone)]
 pub struct ManifestSummary {
-    /// When it was published, RFC 3339.
+    /// Time of publication, RFC 3339.
     pub created: String,
-    /// The size of its objects, bytes. Revisions may share objects.
+    /// Total size of the revision's objects, bytes. Revisions may share objects.
     pub bytes: u64,
-    /// A few words on the content.
+    /// Short description of the content.
     pub about: String,
 }
 
 impl Store {
-    /// Everything in the store: rooms, then adapters, each sorted by name.
+    /// All rooms, then all adapters, each sorted by name.
     ///
     /// # Errors
-    /// [`Error::Io`] if the store cannot be read, otherwise as [`Store::defaults`]. A manifest that
-    /// is damaged is no error: its revision says so.
+    /// [`Error::Io`] if the store cannot be read, otherwise as [`Store::defaults`]. A damaged
+    /// manifest is not an error; it is reported in its revision.
     pub async fn contents(&self) -> Result<Vec<Contents>, Error> {
         let defaults = self.defaults().await?;
         let mut contents = Vec::new();
@@ -66,10 +66,11 @@ impl Store {
         Ok(contents)
     }
 
-    /// One room or adapter.
+    /// The contents of one room or adapter, limited to one revision if `resource` names one.
     ///
     /// # Errors
-    /// As [`Store::contents`]; [`Error::Unknown`] or [`Error::UnknownRevision`] if it is not there.
+    /// As [`Store::contents`]; [`Error::Unknown`] or [`Error::UnknownRevision`] if it is not in the
+    /// store.
     pub async fn contents_of(&self, resource: &ResourceName) -> Result<Contents, Error> {
         self.check_exists(resource).await?;
         let folder = folder_of(resource.kind, &resource.name);

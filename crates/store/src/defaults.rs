@@ -1,8 +1,8 @@
-//! Which revision of a room or adapter is meant by its name alone, and which adapter answers in a
-//! room when a request names none.
+//! Operator defaults: the current revision of a room or adapter, and the adapter that serves a room
+//! when a request names none.
 //!
-//! All choices of a store are one file, `defaults/000001.json`. A change writes the next number and
-//! keeps the files before it, so that the last change can be taken back.
+//! All defaults of a store are in one file, `defaults/000001.json`. A change writes the next number
+//! and keeps the earlier files, so that it can be rolled back.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -14,81 +14,80 @@ use super::{ATTEMPTS, Error, Kind, ResourceName, Store, manifest_name};
 
 const FOLDER: &str = "defaults";
 
-/// The choices of an operator. What is not chosen is the newest.
+/// The defaults set by an operator. Where none is set, the newest revision is used.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Defaults {
-    /// Revisions of rooms, by the room's name.
+    /// Default revisions of rooms, by room name.
     #[serde(default)]
     room_revisions: BTreeMap<String, u64>,
-    /// Revisions of adapters, by the adapter's name.
+    /// Default revisions of adapters, by adapter name.
     #[serde(default)]
     adapter_revisions: BTreeMap<String, u64>,
-    /// Adapters, by the name of the room in which they answer by default.
+    /// Default adapters of rooms, by room name.
     #[serde(default)]
     adapters: BTreeMap<String, String>,
 }
 
-/// The file of all choices.
+/// Content of a defaults file.
 #[derive(Debug, Serialize, Deserialize)]
 struct Body {
     schema: u64,
     /// The number in the file's name.
     number: u64,
-    /// When it was written, RFC 3339.
+    /// Time of writing, RFC 3339.
     created: String,
-    /// The number of the file whose choices these are again, if they were taken back to it; 0 for
-    /// no choices at all.
+    /// After a rollback, the number of the file whose defaults were restored; 0 for no defaults.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     back_to: Option<u64>,
     defaults: Defaults,
 }
 
-/// The choices that hold as far as their files can be read.
+/// The defaults in effect, where damaged files are skipped.
 #[derive(Debug)]
 pub struct StandingDefaults {
-    /// Those of the newest file that can be read; none were made if there is no such file.
+    /// The defaults of the newest readable file; empty if there is no such file.
     pub defaults: Defaults,
-    /// Why newer ones do not hold, if there are any.
+    /// Why the newest file was skipped, if it was.
     pub refused: Option<Error>,
 }
 
-/// The choices before the last change.
+/// The defaults before the last change.
 struct Before {
     /// The number of the newest file.
     newest: u64,
-    /// The number of the file that made these choices; 0 for none.
+    /// The number of the file that set these defaults; 0 for none.
     back_to: u64,
     defaults: Defaults,
 }
 
-/// One choice.
+/// A change of the defaults.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Choice {
-    /// This revision is meant by the name alone. The name has a revision.
+    /// Sets the default revision. The resource name includes the revision.
     Revision(ResourceName),
-    /// This adapter answers in this room when a request names none.
+    /// Sets the adapter that serves a room when a request names none.
     Adapter {
         /// The name of the room.
         room: String,
         /// The name of the adapter.
         adapter: String,
     },
-    /// Nothing is chosen for this room or adapter any more.
+    /// Clears the defaults of this room or adapter.
     Nothing(ResourceName),
 }
 
 impl Defaults {
-    /// The revision that the name alone means, if one is chosen.
+    /// The default revision of a room or adapter, if set.
     pub fn revision(&self, kind: Kind, name: &str) -> Option<u64> {
         self.revisions(kind).get(name).copied()
     }
 
-    /// The adapter that answers in a room when a request names none, if one is chosen.
+    /// The default adapter of a room, if set.
     pub fn adapter(&self, room: &str) -> Option<&str> {
         self.adapters.get(room).map(String::as_str)
     }
 
-    /// The rooms and adapters for which anything is chosen; rooms first, each sorted by name.
+    /// The rooms and adapters that have a default; rooms first, each sorted by name.
     pub fn chosen(&self) -> Vec<ResourceName> {
         let rooms: BTreeSet<&String> = self
             .room_revisions
@@ -100,14 +99,14 @@ impl Defaults {
         rooms.chain(adapters).collect()
     }
 
-    /// The rooms in which an adapter answers by default.
+    /// The rooms whose default adapter this is.
     pub fn rooms_of<'a>(&'a self, adapter: &'a str) -> impl Iterator<Item = &'a str> {
         let is_chosen = move |entry: &(&'a String, &'a String)| entry.1 == adapter;
         let rooms = self.adapters.iter().filter(is_chosen);
         rooms.map(|(room, _)| room.as_str())
     }
 
-    /// Drops the choices that name something that is gone.
+    /// Drops the defaults that refer to a removed resource.
     fn forget(&mut self, gone: &ResourceName) {
         let is_gone = |name: &String, revision: u64| {
             *name == gone.name && gone.revision.is_none_or(|gone| gone == revision)
@@ -129,7 +128,7 @@ impl Defaults {
         }
     }
 
-    /// Everything that the choices name.
+    /// All resources that the defaults refer to.
     pub(super) fn named(&self) -> Vec<ResourceName> {
         let mut named: Vec<ResourceName> = Vec::new();
         for kind in Kind::ALL {
@@ -193,7 +192,7 @@ impl Defaults {
 }
 
 impl Store {
-    /// The choices that hold now.
+    /// The current defaults.
     ///
     /// # Errors
     /// [`Error::Damaged`] if their file is truncated or altered, [`Error::Schema`] if a newer
@@ -202,7 +201,7 @@ impl Store {
         Ok(self.numbered_defaults().await?.1)
     }
 
-    /// The newest choices that can be read, and why newer files were passed over.
+    /// The newest readable defaults, and why newer files were skipped.
     ///
     /// # Errors
     /// [`Error::Io`] if the store cannot be read.
@@ -229,11 +228,11 @@ impl Store {
         Ok(StandingDefaults { defaults, refused })
     }
 
-    /// Whether a choice can be made.
+    /// Checks that a change can be made.
     ///
     /// # Errors
-    /// [`Error::Unknown`] or [`Error::UnknownRevision`] if what is chosen is not in the store,
-    /// [`Error::Io`] if it cannot be read.
+    /// [`Error::Unknown`] or [`Error::UnknownRevision`] if the chosen resource is not in the store,
+    /// [`Error::Io`] if the store cannot be read.
     pub async fn check_choice(&self, choice: &Choice) -> Result<(), Error> {
         match choice {
             Choice::Revision(resource) => self.check_exists(resource).await,
@@ -245,11 +244,11 @@ impl Store {
         }
     }
 
-    /// Makes a choice. Choosing again what holds already changes nothing.
+    /// Changes the defaults and returns them. Setting an existing default again writes nothing.
     ///
     /// # Errors
-    /// As [`Store::check_choice`] and [`Store::defaults`]; [`Error::Contended`] if others changed
-    /// the choices all the time.
+    /// As [`Store::check_choice`] and [`Store::defaults`]; [`Error::Contended`] if other writers
+    /// took every number tried.
     pub async fn choose(&self, choice: &Choice) -> Result<Defaults, Error> {
         self.check_choice(choice).await?;
 
@@ -264,12 +263,13 @@ impl Store {
         Err(contended())
     }
 
-    /// Takes the last change of the choices back: those before it hold again, as far as what they
-    /// name is still there. Done again, the change before that one is taken back. A change whose
-    /// file is damaged is taken back as well.
+    /// Rolls back the last change of the defaults; repeated calls roll back earlier changes.
+    /// Restored defaults that refer to removed resources are dropped. A change whose file is
+    /// damaged is also rolled back.
     ///
     /// # Errors
-    /// [`Error::NothingToTakeBack`] if nothing was ever chosen; otherwise as [`Store::choose`].
+    /// [`Error::NothingToTakeBack`] if there is no change to roll back; otherwise as
+    /// [`Store::choose`].
     pub async fn take_back_choice(&self) -> Result<Defaults, Error> {
         for _ in 0..ATTEMPTS {
             let Before {
@@ -297,7 +297,7 @@ impl Store {
         Err(contended())
     }
 
-    /// The choices before the last change. Files that cannot be read are passed over.
+    /// The defaults before the last change. Unreadable files are skipped.
     async fn before_last_change(&self) -> Result<Before, Error> {
         let numbers = self.numbers_of_defaults().await?;
         let newest = numbers.last().copied().unwrap_or_default();
@@ -329,7 +329,8 @@ impl Store {
         })
     }
 
-    /// The file of this number; the inner error says why it can never be read by this program.
+    /// The file of this number. The inner error means that this program can never read it (damaged,
+    /// or newer schema).
     async fn readable_defaults(&self, number: u64) -> Result<Result<Body, Error>, Error> {
         match self.read_defaults(number).await {
             Err(error @ (Error::Damaged { .. } | Error::Schema { .. })) => Ok(Err(error)),
@@ -337,7 +338,7 @@ impl Store {
         }
     }
 
-    /// The choices that hold now, with the number of their file; 0 if nothing was ever chosen.
+    /// The current defaults and the number of their file; 0 if no default was ever set.
     async fn numbered_defaults(&self) -> Result<(u64, Defaults), Error> {
         match self.numbers_of_defaults().await?.last() {
             None => Ok((0, Defaults::default())),
@@ -345,7 +346,7 @@ impl Store {
         }
     }
 
-    /// The numbers of the files of choices, in ascending order.
+    /// The numbers of the defaults files, in ascending order.
     async fn numbers_of_defaults(&self) -> Result<Vec<u64>, Error> {
         let numbers = self.numbered_files(&Path::from(FOLDER)).await?;
         Ok(numbers.present)
@@ -356,7 +357,7 @@ impl Store {
         let file = self.shown(&path);
         let body: Body = manifest::decode(&file, &self.read(&path).await?)?;
         if body.number != number {
-            let problem = format!("says it is number {}: it was moved or copied", body.number);
+            let problem = format!("is file number {}: it was moved or copied", body.number);
             return Err(Error::Damaged {
                 file,
                 problem: problem.into(),
@@ -366,7 +367,7 @@ impl Store {
         Ok(body)
     }
 
-    /// Writes the choices unless the number is taken. Returns whether they were written.
+    /// Writes the defaults unless the number is taken. Returns whether they were written.
     async fn write_defaults(
         &self,
         number: u64,
@@ -386,7 +387,7 @@ impl Store {
             .await
     }
 
-    /// Refuses what is not in the store.
+    /// Checks that a resource is in the store.
     pub(super) async fn check_exists(&self, resource: &ResourceName) -> Result<(), Error> {
         let ResourceName {
             kind,

@@ -1,4 +1,4 @@
-//! The calibration of an adapter, as tensors in its weights file.
+//! Storage of an adapter's calibration, as tensors in its weights file.
 
 use nalgebra::Matrix6;
 use ndarray::Array2;
@@ -10,16 +10,16 @@ use seese3_robot::tracking::ASSUMED_PERIOD_S;
 
 const FRAME_NOISE: &str = "calibration.flicker";
 const MOTION_SPREAD: &str = "calibration.spread";
-/// One row per stratum: the number of frames between the two views, the gain, and the 36 entries of
-/// the covariance on (v, ω), row by row.
+/// One row per stratum: the number of frames between the two views, the gain, and the covariance on
+/// (v, ω), 36 entries in row-major order.
 const MOTIONS: &str = "calibration.motions";
-/// As [`MOTIONS`], but the first column is the distance of the match, whitened by the covariance of
-/// the frame noise.
+/// As [`MOTIONS`], but the first column is the match distance, whitened by the covariance of the
+/// frame noise.
 const ANCHORS: &str = "calibration.anchors";
 /// Five numbers, in this order: the floor u₀ of the motion errors, the out-of-distribution limit,
 /// the certain-match limit, the jump distance and the map-pose factor.
 const LIMITS: &str = "calibration.limits";
-/// One number, seconds. Files of earlier versions have none: their rooms were taken at 30 Hz.
+/// Frame period, seconds. Absent in files of earlier versions, whose rooms were recorded at 30 Hz.
 const FRAME_PERIOD: &str = "calibration.period";
 
 pub fn write(tensors: &mut TensorWriter, error_model: &ErrorModel) {
@@ -44,7 +44,7 @@ pub fn write(tensors: &mut TensorWriter, error_model: &ErrorModel) {
         );
     }
 
-    // nalgebra iterates over a matrix by column; the transpose gives the entries row by row.
+    // nalgebra iterates in column-major order; the transpose gives row-major entries.
     let row = |stratum: &Stratum| {
         let covariance: Vec<f64> = stratum.covariance.transpose().iter().copied().collect();
         [stratum.at, stratum.gain].into_iter().chain(covariance)
@@ -60,7 +60,7 @@ pub fn write(tensors: &mut TensorWriter, error_model: &ErrorModel) {
 
     tensors.f64(FRAME_PERIOD, &[1], [*frame_period_s].into_iter());
 
-    // The order of the five numbers is part of the file format, and `read` relies on it.
+    // The order of the five numbers is part of the file format; `read` relies on it.
     tensors.f64(
         LIMITS,
         &[5],
@@ -77,8 +77,8 @@ pub fn write(tensors: &mut TensorWriter, error_model: &ErrorModel) {
 
 /// Reads the calibration; `None` if the file has none.
 pub fn read(tensors: &TensorReader<'_>, file: &str) -> Result<Option<ErrorModel>, Error> {
-    // The tensors of a calibration are written together, so one of them tells whether there is any.
-    // If another one is missing, the file is damaged.
+    // Calibration tensors are written together, so one of them indicates whether a calibration
+    // exists. If another is missing, the file is damaged.
     if !tensors.has(FRAME_NOISE) {
         return Ok(None);
     }
@@ -124,7 +124,7 @@ pub fn read(tensors: &TensorReader<'_>, file: &str) -> Result<Option<ErrorModel>
     ErrorModel::new(statistics).map(Some).map_err(damaged)
 }
 
-/// Reads a tensor that must have this number of columns and, if given, of rows.
+/// Reads a tensor and checks its number of columns and, if given, of rows.
 pub(super) fn sized(
     tensors: &TensorReader<'_>,
     name: &str,

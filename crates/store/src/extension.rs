@@ -1,4 +1,4 @@
-//! Adding frames to a room: a robot's own, for instance, of places that the map does not show yet.
+//! Adds frames to a stored room, for instance a robot's own frames of unmapped places.
 
 use ndarray::{Axis, concatenate, s};
 
@@ -12,28 +12,28 @@ use seese3_core::features::Features;
 use seese3_core::geometry::Pose;
 use seese3_core::room::{Frames, Provenance, Room};
 
-/// What becomes of a room's features for which no rows are added.
+/// Handling of feature sets for which no rows are added.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OtherFeatures {
-    /// Rows of every set are required.
+    /// Added rows are required for every feature set.
     Required,
-    /// The new revision does not have the other sets. Earlier revisions keep them.
+    /// The new revision omits the other feature sets. Earlier revisions keep them.
     LeftBehind,
 }
 
-/// A room with frames added, before it is published.
+/// An extended room that is not published yet.
 #[derive(Debug)]
 pub struct ExtendedRoom {
     room: Room,
     features: Vec<Features>,
-    /// The revision that the frames were added to.
+    /// The revision that was extended.
     base: u64,
-    /// Whether the room had the frames already.
+    /// Whether the room already had the frames.
     is_there: bool,
 }
 
 impl Store {
-    /// A summary of the newest revision of a room, whichever its name alone means.
+    /// Summary of the newest revision of a room, even if another one is the default.
     ///
     /// # Errors
     /// As [`Store::room_summary`].
@@ -43,15 +43,15 @@ impl Store {
             .await
     }
 
-    /// The newest revision of a room with frames behind its own: the room `addition`, which has the
-    /// same name, with `features`. Nothing is published.
+    /// Appends the frames of `addition`, with `features`, to the newest revision of the room of the
+    /// same name. Publishes nothing.
     ///
-    /// The added frames are sequences of their own. The result has no paths of images, since only
-    /// the first frames had any.
+    /// The added frames are separate sequences. The result has no image paths, because the added
+    /// frames have none.
     ///
     /// # Errors
-    /// [`Error::Unknown`] if there is no such room, [`Error::CannotAdd`] if the frames do not fit
-    /// to its own, otherwise as [`Store::load_room`].
+    /// [`Error::Unknown`] if there is no such room, [`Error::CannotAdd`] if the frames are not
+    /// compatible with its own, otherwise as [`check_features`] and [`Store::load_room`].
     pub async fn extended_room(
         &self,
         addition: &Room,
@@ -67,9 +67,8 @@ impl Store {
         extended(&base, addition, features, others)
     }
 
-    /// Adds frames to the newest revision of a room, as [`Store::extended_room`] says, and
-    /// publishes the result. Frames that the room has already, one after the other, are not added
-    /// again.
+    /// Extends the newest revision of a room, as [`Store::extended_room`], and publishes the
+    /// result. Frames that the room already has as a contiguous run are not added again.
     ///
     /// # Errors
     /// As [`Store::extended_room`] and [`Store::publish_room`].
@@ -96,7 +95,7 @@ impl Store {
                 });
             }
 
-            // Somebody else may have published meanwhile: then the frames belong behind theirs.
+            // If another publisher was faster, retry: append the frames to its revision.
             match self
                 .publish_over(&room, &features, PublishPolicy::Revision(base))
                 .await
@@ -112,7 +111,7 @@ impl Store {
     }
 }
 
-/// The frames of `addition` behind those of `base`.
+/// Appends the frames of `addition` to those of `base`.
 fn extended(
     base: &StoredRoom,
     addition: &Room,
@@ -167,7 +166,7 @@ fn extended(
     })
 }
 
-/// The room's sets of features, each with the added rows behind its own.
+/// The room's feature sets, each with the added rows appended.
 fn joined_features(
     base: &StoredRoom,
     added: &[Features],
@@ -192,8 +191,8 @@ fn joined_features(
                 continue;
             }
             return Err(format!(
-                "the room also has features '{name}': send rows of them too, or leave them behind on \
-                 purpose with drop_other_features"
+                "the room also has features '{name}': send their rows too, or drop them with \
+                 drop_other_features"
             ));
         };
 
@@ -206,8 +205,8 @@ fn joined_features(
     Ok(joined)
 }
 
-/// Which of the room's sets is made as an added one: that of the same name or, if none is, the only
-/// one that is made so.
+/// Index of the room's feature set that matches an added one: among sets with the same source
+/// settings, the one of the same name, or the only one.
 fn place_among(known: &[Features], added: &Features) -> Result<usize, String> {
     let alike: Vec<usize> = (0..known.len())
         .filter(|&place| known[place].source().is_like(added.source()))
@@ -227,12 +226,12 @@ fn place_among(known: &[Features], added: &Features) -> Result<usize, String> {
             };
             Err(if found.is_empty() {
                 format!(
-                    "features '{name}' differ in how they were made from the room's: {}",
+                    "features '{name}' were computed differently from the room's: {}",
                     names(&mut (0..known.len()))
                 )
             } else {
                 format!(
-                    "features '{name}' may be several of the room's, send them by name: {}",
+                    "features '{name}' match several of the room's, send them by name: {}",
                     names(&mut found.iter().copied())
                 )
             })
@@ -240,8 +239,8 @@ fn place_among(known: &[Features], added: &Features) -> Result<usize, String> {
     }
 }
 
-/// Whether the base already has the added frames, one after the other: the same poses, times and
-/// features. `joined` are the features of both.
+/// Whether the base already has the added frames as a contiguous run, with the same poses, times
+/// and features. `joined` has the rows of both.
 fn has_frames(base: &StoredRoom, addition: &Room, joined: &[Features]) -> bool {
     let known = base.room.frame_count();
     let added = addition.frame_count();
@@ -249,7 +248,7 @@ fn has_frames(base: &StoredRoom, addition: &Room, joined: &[Features]) -> bool {
         return false;
     }
 
-    // Stored rotations are projected when they are read, so that equal ones agree up to rounding.
+    // Reading projects stored rotations, so equal ones agree only up to rounding.
     let same = |a: &Pose, b: &Pose| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-12;
     let begins_at = |first: usize| {
         let times = base.room.timestamps_ns().get(first..first + added);
@@ -269,7 +268,7 @@ fn has_frames(base: &StoredRoom, addition: &Room, joined: &[Features]) -> bool {
     (0..=known - added).any(begins_at)
 }
 
-/// Every column of the known frames with that of the added ones behind it.
+/// Every column of the known frames, with that of the added frames appended.
 fn joined_frames(known: &Frames, added: &Frames) -> Result<Frames, String> {
     let before = known.poses.len();
     let count = added.poses.len();
@@ -277,14 +276,14 @@ fn joined_frames(known: &Frames, added: &Frames) -> Result<Frames, String> {
     let has_times = !known.timestamps_ns.is_empty();
     if has_times == added.timestamps_ns.is_empty() {
         let problem = if has_times {
-            "the room's frames have timestamps: send them for the added ones too"
+            "the room's frames have timestamps: send timestamps for the added frames too"
         } else {
-            "the room's frames have no timestamps: leave them out of the added ones"
+            "the room's frames have no timestamps: send the added frames without timestamps"
         };
         return Err(problem.to_owned());
     }
 
-    // A frame without a name has an empty one.
+    // Frames without a name get an empty one.
     let names = if known.names.is_empty() && added.names.is_empty() {
         Vec::new()
     } else {
@@ -298,7 +297,7 @@ fn joined_frames(known: &Frames, added: &Frames) -> Result<Frames, String> {
         names
     };
 
-    // The added frames begin a sequence: the camera was elsewhere in between.
+    // The added frames start a new sequence, since the camera was elsewhere in between.
     let last_sequence = known.sequences.iter().max().unwrap_or(&0);
     let mut sequences = known.sequences.clone();
     sequences.resize(before, 0);
@@ -307,7 +306,7 @@ fn joined_frames(known: &Frames, added: &Frames) -> Result<Frames, String> {
         let later = last_sequence
             .checked_add(1)
             .and_then(|next| next.checked_add(*own));
-        sequences.push(later.ok_or("its numbers of sequences are used up")?);
+        sequences.push(later.ok_or("its sequence numbers are exhausted")?);
     }
 
     let mut poses = known.poses.clone();

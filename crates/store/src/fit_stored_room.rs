@@ -1,4 +1,4 @@
-//! Fitting an adapter to a room of a store, and publishing it there.
+//! Fits an adapter to a stored room and publishes it in the same store.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use seese3_robot::fitting::{self, Fitted, fit};
 
 use crate::{BaseAdapter, Published, RoomFit, Store, StoredAdapter, StoredRoom};
 
-/// Why an adapter cannot be fitted to a stored room.
+/// Errors of fitting an adapter to a stored room.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
@@ -19,8 +19,8 @@ pub enum Error {
     #[error(transparent)]
     Fitting(#[from] fitting::Error),
     #[error(
-        "adapter '{base}' has seen room '{room}' or was itself fitted to a room; begin from one that \
-         learned from other rooms alone, or from none"
+        "adapter '{base}' was trained on room '{room}' or fitted to a room; use a base trained \
+         only on other rooms, or no base"
     )]
     Base { base: String, room: String },
     #[error("{name:?} cannot name an adapter: use 1 to 100 letters, digits, '.', '-' or '_'")]
@@ -29,22 +29,23 @@ pub enum Error {
     Taken { name: String, room: String },
 }
 
-/// What is to be fitted.
+/// Inputs of a fit.
 #[derive(Debug, Clone)]
 pub struct Request {
-    /// The room, all of whose frames are its map.
+    /// The room to fit to; all its frames are mapped.
     pub room: String,
-    /// An adapter that learned from other rooms: its weights are where the fitted one begins.
+    /// The pre-trained adapter to start from, trained on other rooms; random initial weights if
+    /// `None`.
     pub base: Option<String>,
-    /// The set of features; that of the base, or the room's only one, if none is named.
+    /// The feature set; if `None`, that of the base, or else the room's only one.
     pub features: Option<String>,
-    /// The name of the fitted adapter; ROOM.FEATURES.fitted if none is given.
+    /// Name of the fitted adapter; `ROOM.FEATURES.fitted` if `None`.
     pub name: Option<String>,
-    /// The seed of the drawn pairs, of the noise and, without a base, of the initial weights.
+    /// Seed of the sampled pairs, the noise and, without a base, the initial weights.
     pub seed: u64,
 }
 
-/// A fit that can begin: everything is read and checked.
+/// A prepared fit: all inputs are loaded and checked.
 #[derive(Debug)]
 pub struct Refit {
     stored: StoredRoom,
@@ -55,12 +56,12 @@ pub struct Refit {
 }
 
 impl Refit {
-    /// Reads what the fit needs.
+    /// Loads and checks the inputs of a fit.
     ///
     /// # Errors
-    /// [`Error::Base`] if the base has seen the room, since it would look better than it is;
-    /// [`Error::Name`] or [`Error::Taken`] if the name cannot be published; [`Error::Store`] if the
-    /// room, its features or the base cannot be read.
+    /// [`Error::Base`] if the base was trained on the room, since its errors there would be
+    /// underestimated, or was fitted to any room; [`Error::Name`] or [`Error::Taken`] if the name
+    /// cannot be published; [`Error::Store`] if the room, its features or the base cannot be read.
     pub async fn prepare(store: &Store, request: Request) -> Result<Self, Error> {
         let base = match &request.base {
             Some(name) => Some(store.load_adapter(name, None).await?),
@@ -91,12 +92,12 @@ impl Refit {
         })
     }
 
-    /// The name under which the fitted adapter is published.
+    /// Name under which the fitted adapter is published.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// The room and the features that are fitted to.
+    /// The room and the features to fit to.
     pub fn data(&self) -> RoomData<'_> {
         RoomData {
             room: &self.stored.room,
@@ -105,7 +106,8 @@ impl Refit {
         }
     }
 
-    /// Fits. `progress` hears of every epoch, [`fitting::FITTING_EPOCHS`] in all.
+    /// Runs the fit. `progress` is called after each epoch, [`fitting::FITTING_EPOCHS`] times in
+    /// all.
     ///
     /// # Errors
     /// [`Error::Fitting`], as [`fit`].
@@ -115,7 +117,7 @@ impl Refit {
         let network: Option<&Arc<Adapter>> = self.base.as_ref().map(|stored| &stored.adapter);
         let mut fitted = fit(&self.data(), &mapped, network, self.seed, progress)?;
 
-        // What the base has seen, the fitted adapter has seen too.
+        // The fitted adapter inherits the base's training data.
         if let Some(base) = &self.base {
             let record = &mut fitted.record;
             record.rooms.extend(base.record.rooms.iter().cloned());
@@ -127,10 +129,11 @@ impl Refit {
         Ok(fitted)
     }
 
-    /// Publishes what was fitted.
+    /// Publishes the fitted adapter.
     ///
     /// # Errors
-    /// [`Error::Taken`] if somebody else has taken the name, [`Error::Store`] if it cannot be written.
+    /// [`Error::Taken`] if the name was taken meanwhile, [`Error::Store`] if the store cannot be
+    /// written.
     pub async fn publish(&self, store: &Store, fitted: &Fitted) -> Result<Published, Error> {
         let room_fit = RoomFit {
             room: self.stored.room.id().clone(),
@@ -142,7 +145,7 @@ impl Refit {
             rules: fitted.rules.clone(),
         };
 
-        // The fit took minutes, in which somebody else may have taken the name.
+        // The fit takes minutes, and the name may have been taken meanwhile.
         check_name(store, &self.name, self.stored.room.id()).await?;
 
         let features = self.features.rows();
@@ -168,7 +171,8 @@ fn check_base(base: &StoredAdapter, room: &str) -> Result<(), Error> {
     Ok(())
 }
 
-/// Refuses, before anything is fitted, a name that cannot be published or that other adapters have.
+/// Checks, before the fit starts, that the name is valid and not taken by an adapter that was not
+/// fitted to this room.
 async fn check_name(store: &Store, name: &str, room: &RoomId) -> Result<(), Error> {
     if !is_plain_name(name) {
         return Err(Error::Name {

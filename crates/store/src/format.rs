@@ -1,4 +1,4 @@
-//! The bodies of manifests as they are written to disk, kept separate from the domain types.
+//! On-disk format of manifest bodies (DTOs), separate from the domain types.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,15 +17,15 @@ pub struct RoomBody {
     pub schema: u64,
     pub room: String,
     pub revision: u64,
-    /// When it was published, RFC 3339.
+    /// Time of publication, RFC 3339.
     pub created: String,
     pub frame_count: usize,
-    /// The tensors `world_from_camera` (n, 4, 4) f64, metres, and, where known, `timestamps_ns`,
-    /// `numbers`, `sequences` and `held_out` (0 or 1), each (n,) i64.
+    /// The tensor `world_from_camera` (n, 4, 4) f64, meters; optionally `timestamps_ns`, `numbers`,
+    /// `sequences` and `held_out` (0 or 1), each (n,) i64.
     pub frames: ObjectRef,
-    /// A JSON list of the frame names in the recording.
+    /// JSON list of the recording's frame names.
     pub frame_names: Option<ObjectRef>,
-    /// A JSON list of the image paths, one per frame, relative to the images root in `provenance`.
+    /// JSON list of image paths, one per frame, relative to the images root in `provenance`.
     #[serde(default)]
     pub images: Option<ObjectRef>,
     pub features: Vec<FeaturesEntry>,
@@ -33,7 +33,7 @@ pub struct RoomBody {
 }
 
 impl RoomBody {
-    /// Every object of the revision.
+    /// All objects of the revision.
     pub fn objects(&self) -> impl Iterator<Item = &ObjectRef> {
         let names = self.frame_names.iter().chain(&self.images);
         let features = self.features.iter().map(|entry| &entry.object);
@@ -41,7 +41,7 @@ impl RoomBody {
     }
 }
 
-/// One set of features of a room. Its object holds the tensor `features` (n, d) f32.
+/// A feature set of a room. Its object has the tensor `features` (n, d) f32.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FeaturesEntry {
     pub source: SourceEntry,
@@ -73,13 +73,13 @@ pub struct ProvenanceEntry {
     camera: Option<PinholeEntry>,
 }
 
-/// A pinhole camera that was checked when it was read.
+/// A pinhole camera, validated on reading.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "PinholeFields", into = "PinholeFields")]
 pub struct PinholeEntry(Pinhole);
 
-/// A pinhole camera as the manifest states it: lengths in image widths, the principal point from the
-/// top left corner, the height that of the images.
+/// A pinhole camera in the manifest. Unit: image widths. The principal point is relative to the top
+/// left corner; `height` is the image height.
 #[derive(Serialize, Deserialize)]
 struct PinholeFields {
     focal: f64,
@@ -117,39 +117,39 @@ pub struct AdapterBody {
     pub schema: u64,
     pub adapter: String,
     pub revision: u64,
-    /// When it was published, RFC 3339.
+    /// Time of publication, RFC 3339.
     pub created: String,
     pub source: SourceEntry,
     /// The tensors: weights f32 under PyTorch's names; `target.mean` and `target.deviation` (6,)
     /// f64, ordered (v, ω); and the golden vectors `golden.features`, `golden.latents` and
-    /// `golden.twists`, which are checked whenever the adapter is loaded.
+    /// `golden.twists`, checked at every load.
     pub weights: ObjectRef,
     /// The frame of the twists: always `body`, the body frame of the source camera.
     pub twist_frame: String,
     /// Delta degrees of freedom of `target.deviation`.
     pub deviation_ddof: u32,
     pub training: TrainingEntry,
-    /// The room that the adapter was fitted to; absent for one that is meant for any room.
+    /// The room that the adapter was fitted to; absent for an adapter for any room.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fitted_to: Option<FittedEntry>,
-    /// Whether it belongs to an experiment, and is not meant to answer in rooms.
+    /// Whether it belongs to an experiment and is not meant for serving.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub experiment: bool,
 }
 
 impl AdapterBody {
-    /// Every object of the revision.
+    /// All objects of the revision.
     pub fn objects(&self) -> impl Iterator<Item = &ObjectRef> {
         std::iter::once(&self.weights)
     }
 }
 
-/// The room of a fitted adapter. The weights object also holds the tensor `fit.rules`.
+/// The room of a fitted adapter. The weights object then also has the tensor `fit.rules`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FittedEntry {
     pub room: String,
     pub room_revision: u64,
-    /// The name and the revision of the adapter that reads motions beside the fitted one.
+    /// Name and revision of the base adapter, which predicts motions alongside the fitted one.
     pub base: Option<(String, u64)>,
 }
 
@@ -169,7 +169,7 @@ pub struct TrainingEntry {
     /// The number of charts, the paper's K.
     #[serde(default = "one_chart")]
     pub charts: usize,
-    /// How the charts are mixed: by a learned `gate`, or `even` for an ensemble.
+    /// Mixing of the charts: a learned `gate`, or `even` for an ensemble.
     #[serde(default = "by_gate")]
     mixing: String,
     #[serde(default = "squared_error")]
@@ -182,21 +182,20 @@ pub struct TrainingEntry {
     average: f64,
     #[serde(default)]
     through_zero: bool,
-    /// The calibration rooms with their revisions, in which the adapter's errors were measured. If
-    /// there are any, the weights object also holds `error.covariance`.
+    /// The calibration rooms with their revisions, on which the adapter's errors were measured. If
+    /// there are any, the weights object also has `error.covariance`.
     #[serde(default)]
     calibrated_on: Vec<(String, u64)>,
-    /// The names of the correctors. Their tensors in the weights object begin with
-    /// `corrector.NAME.`.
+    /// Names of the correctors. Their tensor names begin with `corrector.NAME.`.
     #[serde(default)]
     pub correctors: Vec<String>,
-    /// The smallest stride, the largest stride and the number of pairs drawn; absent if all pairs
-    /// at one stride were used.
+    /// Smallest stride, largest stride and number of sampled pairs; absent if all pairs of one
+    /// stride were used.
     #[serde(default)]
     range: Option<(u32, u32, usize)>,
     seed: u64,
     pair_count: usize,
-    /// The test scores of each room, in the order of `rooms`.
+    /// Test scores of each room, in the order of `rooms`.
     #[serde(default)]
     room_tests: Vec<ScoresEntry>,
     test: ScoresEntry,
@@ -204,7 +203,7 @@ pub struct TrainingEntry {
     train_mean_r2: Option<f64>,
 }
 
-/// R² scores of predicted motions; null where a score is undefined because the targets do not vary.
+/// R² scores of predicted motions; null if undefined because the targets do not vary.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ScoresEntry {
     n: usize,
@@ -381,11 +380,10 @@ impl From<ScoresEntry> for MotionScores {
 }
 
 impl TrainingEntry {
-    /// The entry that is stored for an adapter and its training record.
+    /// The manifest entry of an adapter and its training record.
     pub fn new(record: &TrainingRecord, adapter: &Adapter) -> Self {
         // Destructured with no `..`, so that a new setting breaks the build here. The charts and
-        // their mixing are taken from the network instead, so that they describe the stored
-        // weights.
+        // their mixing are taken from the network, so that they describe the stored weights.
         let TrainConfig {
             epochs,
             batch,
@@ -452,12 +450,12 @@ impl TrainingEntry {
         }
     }
 
-    /// How the charts are mixed. The error is the value that this program does not know.
+    /// The mixing of the charts. The error is the unknown value.
     pub fn mixing(&self) -> Result<Mixing, String> {
         Mixing::from_name(&self.mixing).ok_or_else(|| format!("mixing '{}'", self.mixing))
     }
 
-    /// The training record. The error is the first value that this program does not know.
+    /// The training record. The error is the first unknown value.
     pub fn record(self) -> Result<TrainingRecord, String> {
         let split =
             Split::from_name(&self.split).ok_or_else(|| format!("split '{}'", self.split))?;

@@ -1,5 +1,4 @@
-//! Collecting what nothing needs: objects of publications that were interrupted or removed, and
-//! files that a write left unfinished.
+//! Garbage collection: objects of interrupted or removed publications, and unfinished writes.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -13,20 +12,20 @@ use tokio_stream::StreamExt;
 use super::format::{AdapterBody, RoomBody};
 use super::{Error, Kind, Store, gone_name, manifest};
 
-/// The folders of a store; what else is beside them belongs to somebody else.
+/// The top-level folders of a store. Other files in the same location are never touched.
 const STORE_FOLDERS: [&str; 3] = ["rooms", "adapters", "defaults"];
 
-/// What nothing in the store needs.
+/// Files that no revision references.
 #[derive(Debug, Clone, Default)]
 pub struct Garbage {
-    /// The files.
+    /// The unreferenced files.
     pub files: Vec<GarbageFile>,
-    /// Folders that were left alone, with the reason: a manifest in them cannot be read, so nobody
-    /// knows what it needs.
+    /// Skipped folders, each with the reason: one of their manifests cannot be read, so their
+    /// references are unknown.
     pub left_alone: Vec<String>,
 }
 
-/// A file that nothing needs.
+/// An unreferenced file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GarbageFile {
     /// Its path, relative to the root of the store.
@@ -43,8 +42,9 @@ impl Garbage {
 }
 
 impl Store {
-    /// Finds what nothing needs and nobody has written for `older_than`. A publication that is being
-    /// written has objects that no manifest names yet: give it the time that the longest one takes.
+    /// Finds unreferenced files that were last written at least `older_than` ago. During a
+    /// publication, objects are not yet referenced by a manifest: choose `older_than` above the
+    /// longest publication time.
     ///
     /// # Errors
     /// [`Error::Io`] if the store cannot be read.
@@ -63,7 +63,8 @@ impl Store {
         Ok(garbage)
     }
 
-    /// Removes what [`Store::find_garbage`] finds, and returns it.
+    /// Removes what [`Store::find_garbage`] finds, except files rewritten meanwhile; returns the
+    /// removed files.
     ///
     /// # Errors
     /// As [`Store::find_garbage`]; [`Error::Io`] if a file cannot be removed.
@@ -73,7 +74,7 @@ impl Store {
         let mut removed = Vec::with_capacity(garbage.files.len());
 
         for file in garbage.files {
-            // Somebody who publishes the same content again has written the object anew.
+            // A concurrent publication of the same content may have rewritten the object.
             let path = Path::from(file.path.as_str());
             let now = self.objects.head(&path).await;
             if now.is_ok_and(|now| now.last_modified > before) {
@@ -88,11 +89,12 @@ impl Store {
         Ok(garbage)
     }
 
-    /// Removes a file, unless it is gone already.
+    /// Removes a file. A missing file is not an error.
     async fn remove_file(&self, file: &str) -> Result<(), Error> {
         let path = Path::from(file);
 
-        // The names of unfinished files are none that the object store would accept.
+        // The object store does not accept the names of unfinished files, so local files are
+        // removed through the file system.
         if let Some(folder) = &self.folder {
             return match std::fs::remove_file(folder.join(file)) {
                 Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(Error::Io {
@@ -109,7 +111,7 @@ impl Store {
         }
     }
 
-    /// Finds the objects of one room or adapter that no manifest names.
+    /// Finds the objects of one room or adapter that no manifest references.
     async fn find_objects(
         &self,
         kind: Kind,
@@ -117,8 +119,8 @@ impl Store {
         before: DateTime<Utc>,
         garbage: &mut Garbage,
     ) -> Result<(), Error> {
-        // The objects are listed before the manifests are read. What is published in between finds
-        // its objects either too young or named.
+        // List objects before reading manifests: objects published in between are then either too
+        // young or referenced.
         let objects = self.listed(&folder.clone().join("objects")).await?;
         let needed = match self.needed(kind, folder, before).await {
             Ok(needed) => needed,
@@ -143,8 +145,8 @@ impl Store {
         Ok(())
     }
 
-    /// The names of the objects that the manifests of a folder need. Revisions that were removed
-    /// lately count: a publication may have begun from one of them.
+    /// The names of all objects that the manifests of a folder reference. Recently removed
+    /// revisions count, because a publication may be based on one.
     async fn needed(
         &self,
         kind: Kind,
@@ -166,7 +168,7 @@ impl Store {
             let file = self.shown(&entry.location);
             let bytes = match self.read(&entry.location).await {
                 Ok(bytes) => bytes,
-                // It was removed since it was listed.
+                // The revision was removed after it was listed.
                 Err(Error::Absent { .. }) => match self.read(&gone_path(&entry.location)).await {
                     Ok(bytes) => bytes,
                     Err(Error::Absent { .. }) => continue,
@@ -201,8 +203,8 @@ impl Store {
         Ok(entries)
     }
 
-    /// Finds files of a local store that were being written when the program ended. They are called
-    /// as what they were to become, with `#` and a number after it.
+    /// Finds unfinished writes of a local store, left by an interrupted program. Their names are
+    /// the final name, `#` and a number.
     fn find_unfinished(&self, before: DateTime<Utc>, garbage: &mut Garbage) -> Result<(), Error> {
         let Some(root) = &self.folder else {
             return Ok(());
@@ -212,7 +214,7 @@ impl Store {
             cause: error.into(),
         };
 
-        // Files that have got their name, or are gone, since they were listed need no care.
+        // Files that were renamed or removed after they were listed are skipped.
         let is_gone = |error: &std::io::Error| error.kind() == std::io::ErrorKind::NotFound;
 
         let mut folders: Vec<PathBuf> = STORE_FOLDERS.iter().map(|name| root.join(name)).collect();
@@ -253,14 +255,14 @@ impl Store {
     }
 }
 
-/// The time before which a file that is older than this was written.
+/// The latest modification time of a file that is at least this old.
 fn written_before(older_than: Duration) -> DateTime<Utc> {
     let age = chrono::TimeDelta::from_std(older_than).unwrap_or(chrono::TimeDelta::MAX);
     let before = Utc::now().checked_sub_signed(age);
     before.unwrap_or(DateTime::<Utc>::MIN_UTC)
 }
 
-/// Where the manifest is once its revision was removed.
+/// The path of the manifest after its revision is removed.
 fn gone_path(manifest: &Path) -> Path {
     let name = manifest.as_ref();
     Path::from(format!(

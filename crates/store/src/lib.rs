@@ -1,12 +1,12 @@
-//! The store: versioned, checksummed rooms and adapters, in a local folder or an object store.
+//! Versioned, checksummed storage of rooms and adapters, in a local folder or an object store.
 //!
 //! ```text
 //! rooms/NAME/objects/…               tensors and lists of names; the file name contains the hash
-//! rooms/NAME/revisions/000001.json   the manifest, written last: a revision is visible completely
-//!                                    or not at all
-//! rooms/NAME/revisions/000002.gone   a revision that was removed: its number is not given again
+//! rooms/NAME/revisions/000001.json   the manifest, written last, so that a revision appears
+//!                                    atomically
+//! rooms/NAME/revisions/000002.gone   a removed revision; its number is not reused
 //! adapters/NAME/…                    the same for an adapter
-//! defaults/000001.json               what an operator chose, see [`Defaults`]
+//! defaults/000001.json               the operator's defaults, see [`Defaults`]
 //! ```
 //!
 //! Tensors are safetensors files; Python reads them with `safetensors.numpy.load_file(path)`.
@@ -54,8 +54,8 @@ use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload}
 use sha2::{Digest, Sha256};
 use tokio_stream::StreamExt;
 
-/// Why the store could not be read or written. Each message names the file, room or adapter
-/// concerned; where there is a remedy, it says so.
+/// Errors of reading and writing the store. Each message names the file, room or adapter and, where
+/// there is a remedy, the remedy.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
@@ -112,7 +112,8 @@ pub enum Error {
     #[error("{file} is missing; restore it, or publish again")]
     Absent { file: String },
     #[error(
-        "could not publish '{name}': every number that was tried is taken, by other publishers or by something that is not a file"
+        "could not publish '{name}': every number tried is taken, by another publisher or by \
+         an entry that is not a file"
     )]
     Contended { name: String },
     #[error("features '{name}' have {rows} rows, room '{room}' has {frame_count} frames")]
@@ -125,7 +126,8 @@ pub enum Error {
     #[error("features '{name}' were given twice")]
     DuplicateFeatures { name: String },
     #[error(
-        "room '{room}' has other frames since revision {revision}; give another name, or replace it on purpose"
+        "room '{room}' has other frames since revision {revision}; use another name, or \
+         replace the room explicitly"
     )]
     OtherFrames { room: String, revision: u64 },
     #[error("frames cannot be added to room '{room}': {problem}")]
@@ -136,7 +138,7 @@ pub enum Error {
     },
     #[error("{resource} cannot be removed: {reason}")]
     InUse { resource: String, reason: String },
-    #[error("no default was ever chosen, so there is nothing to take back")]
+    #[error("there is no change of the defaults to roll back")]
     NothingToTakeBack,
 }
 
@@ -167,9 +169,10 @@ pub struct Published {
     pub manifest: String,
 }
 
-/// Larger numbers are never given, so that there is always a next one.
+/// Largest number of a revision or defaults file; files with larger numbers are ignored.
 const HIGHEST: u64 = 999_999_999_999;
-/// How many revision numbers publishing tries before it fails, each lost to a faster publisher.
+/// Number of attempts at publishing; each fails if another publisher took the revision number
+/// first.
 const ATTEMPTS: u64 = 16;
 
 /// An opened store.
@@ -184,14 +187,14 @@ pub struct Store {
 /// The numbers of the files in a folder of numbered files, such as `revisions/`.
 #[derive(Debug, Default)]
 struct Numbers {
-    /// Those that are there, in ascending order.
+    /// Numbers of the existing files, in ascending order.
     present: Vec<u64>,
-    /// The highest that was ever given, 0 if none was: the file may have been removed since.
+    /// The highest number ever assigned, including removed revisions; 0 if none.
     highest: u64,
 }
 
 impl Store {
-    /// Opens the store in a folder, which is created if necessary, or at an object-store URL.
+    /// Opens the store in a folder, creating the folder if necessary, or at an object-store URL.
     ///
     /// # Errors
     /// [`Error::Open`] if the folder cannot be created or the store cannot be opened.
@@ -271,13 +274,13 @@ impl Store {
         format!("{}/{path}", self.location.trim_end_matches('/'))
     }
 
-    /// Converts an error of the object store. A missing object gets a message of its own that says
-    /// what to do.
+    /// Converts an object-store error. A missing object becomes [`Error::Absent`], whose message
+    /// states the remedy.
     fn io(&self, path: &Path, error: object_store::Error) -> Error {
         let file = self.shown(path);
         match error {
             object_store::Error::NotFound { .. } => Error::Absent { file },
-            // What the file system said, without the name of the library's class of errors.
+            // Only the file system's message, without the prefix that the library adds.
             object_store::Error::Generic { source, .. } => Error::Io {
                 file,
                 cause: source,
@@ -290,7 +293,7 @@ impl Store {
     }
 
     async fn read(&self, path: &Path) -> Result<Vec<u8>, Error> {
-        // Opening a pipe would wait for someone to write into it.
+        // Opening a named pipe would block until another process writes to it.
         if let Some(folder) = &self.folder
             && std::fs::metadata(folder.join(path.as_ref())).is_ok_and(|found| !found.is_file())
         {
@@ -324,11 +327,10 @@ impl Store {
         let file = self.shown(&path);
         let bytes = self.read(&path).await?;
 
-        // The length is compared first: it needs no hashing, and its difference points to a
-        // truncated file.
+        // The length is compared first: it needs no hashing, and a difference indicates truncation.
         let problem = if bytes.len() as u64 != object.bytes {
             format!(
-                "is {} bytes long, its manifest says {}: it was truncated or altered",
+                "is {} bytes long but its manifest states {}: it was truncated or altered",
                 bytes.len(),
                 object.bytes
             )
@@ -355,8 +357,8 @@ impl Store {
     ) -> Result<manifest::ObjectRef, Error> {
         let sha256 = sha256(&bytes);
 
-        // 64 bits of the hash keep different contents apart: an existing object is only ever
-        // replaced by the same bytes.
+        // 64 bits of the hash identify the content: an existing object is only ever replaced by
+        // identical bytes.
         let file = format!("{stem}-{}.{extension}", &sha256[..16]);
         let path = folder.clone().join("objects").join(file.as_str());
         let size = bytes.len() as u64;
@@ -371,8 +373,8 @@ impl Store {
         })
     }
 
-    /// Whether an object that a revision needs is missing: somebody may have collected it as
-    /// garbage while the revision was being published.
+    /// Whether an object referenced by a revision is missing: a concurrent garbage collection may
+    /// have removed it during publication.
     async fn lacks<'a>(
         &self,
         folder: &Path,
@@ -401,10 +403,11 @@ impl Store {
             .await
     }
 
-    /// Writes a file unless it exists. Returns whether it was written.
+    /// Writes a file unless it exists. Returns whether it was written. Atomic, also between
+    /// concurrent writers.
     async fn write_new(&self, path: &Path, bytes: Vec<u8>) -> Result<bool, Error> {
-        // `Create` fails if the object exists. This one atomic write decides which of several
-        // concurrent writers gets the number.
+        // `Create` fails if the object exists, so exactly one of several concurrent writers gets
+        // the number.
         let options = PutOptions::from(PutMode::Create);
         match self
             .objects
@@ -423,7 +426,8 @@ impl Store {
         Ok(numbered.into_iter().map(|(name, _)| name).collect())
     }
 
-    /// The same, each with the revision that its name alone means by these choices.
+    /// Like `names`, each with its current revision under `defaults`: the chosen one, else the
+    /// newest.
     async fn current(&self, kind: Kind, defaults: &Defaults) -> Result<Vec<(String, u64)>, Error> {
         let current = |(name, numbers): (String, Numbers)| {
             let chosen = defaults.revision(kind, &name);
@@ -440,8 +444,8 @@ impl Store {
         let mut numbered = Vec::new();
 
         for (name, folder) in self.folders(kind).await? {
-            // A folder without a revision was left by an interrupted publication, since the
-            // manifest is written last, or by a removal. It does not count as published.
+            // A folder without a revision is left over from a removal or from an interrupted
+            // publication, since the manifest is written last. It does not count as published.
             let numbers = self.revisions(&folder).await?;
             if !numbers.present.is_empty() {
                 numbered.push((name, numbers));
@@ -451,7 +455,7 @@ impl Store {
         Ok(numbered)
     }
 
-    /// Whether there is, or ever was, a room or an adapter.
+    /// Whether the store has, or ever had, a room or adapter of this kind.
     ///
     /// # Errors
     /// [`Error::Io`] if the store cannot be listed.
@@ -464,8 +468,8 @@ impl Store {
         Ok(false)
     }
 
-    /// Refuses a path of a local store where there is something else than a folder: it would be
-    /// listed as an empty one.
+    /// Rejects a path of a local store that exists and is not a folder; it would be listed as an
+    /// empty folder.
     fn check_folder(&self, path: &Path) -> Result<(), Error> {
         let Some(root) = &self.folder else {
             return Ok(());
@@ -480,7 +484,7 @@ impl Store {
         Ok(())
     }
 
-    /// The folders of a kind, whether they have a revision or not, by name; sorted.
+    /// All folders of a kind, including those without a revision; sorted by name.
     async fn folders(&self, kind: Kind) -> Result<Vec<(String, Path)>, Error> {
         let folder = Path::from(kind.collection());
         self.check_folder(&folder)?;
@@ -522,7 +526,7 @@ impl Store {
                 continue;
             };
 
-            // Only names that this program gives count: a copy such as `2.json` is no revision.
+            // Only canonical names count: a copy such as `2.json` is not a revision.
             match extension {
                 "json" if name == manifest_name(number) => numbers.present.push(number),
                 "gone" if name == gone_name(number) => {}
@@ -535,8 +539,8 @@ impl Store {
         Ok(numbers)
     }
 
-    /// The folder of a room or an adapter, and the requested revision, or else the one that the
-    /// name alone means: that which an operator chose, or the newest.
+    /// The folder of a room or adapter, and the requested revision or else the current one: the
+    /// operator's default, or the newest.
     async fn resolve(
         &self,
         kind: Kind,
@@ -560,8 +564,8 @@ impl Store {
     ) -> Result<(Path, u64), Error> {
         let folder = folder_of(kind, name);
 
-        // A name that is not valid cannot have been published. It is treated like an unknown one
-        // and never listed as a path.
+        // An invalid name cannot have been published: treat it as unknown, and never use it as a
+        // path.
         let revisions = if seese3_core::room::is_plain_name(name) {
             self.revisions(&folder).await?.present
         } else {
@@ -605,7 +609,7 @@ fn manifest_name(revision: u64) -> String {
     format!("{revision:06}.json")
 }
 
-/// The file that stands for a removed revision.
+/// The file name that marks a removed revision.
 fn gone_name(revision: u64) -> String {
     format!("{revision:06}.gone")
 }

@@ -1,7 +1,7 @@
 //! The manifest of a revision: JSON that contains its own checksum.
 //!
-//! The form is `{"sha256": "…", "body": {…}}`. The checksum is that of the body's bytes exactly as
-//! they stand in the file.
+//! The format is `{"sha256": "…", "body": {…}}`. The checksum covers the body's bytes exactly as
+//! stored in the file.
 
 use object_store::path::Path;
 use seese3_core::Cause;
@@ -11,7 +11,7 @@ use serde_json::value::RawValue;
 
 use super::{Error, sha256};
 
-/// The version of the manifests that this program writes, and the newest that it reads.
+/// Manifest schema version that this program writes, and the newest that it reads.
 pub const SCHEMA: u64 = 1;
 
 /// A reference from a manifest to an object file.
@@ -37,7 +37,7 @@ struct Versioned {
     schema: u64,
 }
 
-/// Serialises a body together with its checksum. `file` is the name used in errors.
+/// Serializes a body with its checksum. `file` is the name used in errors.
 pub fn encode(file: &str, body: &impl Serialize) -> Result<Vec<u8>, Error> {
     let damaged = |error: serde_json::Error| Error::Damaged {
         file: file.to_owned(),
@@ -46,7 +46,7 @@ pub fn encode(file: &str, body: &impl Serialize) -> Result<Vec<u8>, Error> {
     let body = serde_json::to_string_pretty(body).map_err(damaged)?;
     let sha256 = sha256(body.as_bytes());
 
-    // A `RawValue` is written as it is, so the text in the file is the text that was hashed.
+    // A `RawValue` is written verbatim, so the text in the file is the text that was hashed.
     let body = RawValue::from_string(body).map_err(damaged)?;
     serde_json::to_vec_pretty(&Envelope {
         sha256,
@@ -55,20 +55,21 @@ pub fn encode(file: &str, body: &impl Serialize) -> Result<Vec<u8>, Error> {
     .map_err(damaged)
 }
 
-/// Refuses a manifest that was moved or copied from another room, adapter or revision.
+/// Rejects a manifest that was moved or copied from another room, adapter or revision. `says` is
+/// the name and revision in the manifest.
 pub fn check_place(
     file: &str,
     folder: &Path,
     says: (&str, u64),
     revision: u64,
 ) -> Result<(), Error> {
-    // The checksum does not reveal this case: a manifest that was copied as a whole is intact.
+    // The checksum cannot detect this: a copied manifest is intact.
     if says == (folder.filename().unwrap_or_default(), revision) {
         return Ok(());
     }
 
     let problem = format!(
-        "says it is revision {} of '{}': it was moved or copied; remove it",
+        "is the manifest of revision {} of '{}': it was moved or copied; remove it",
         says.1, says.0
     );
 
@@ -78,7 +79,7 @@ pub fn check_place(
     })
 }
 
-/// The body of a manifest, after its checksum and its schema version were checked.
+/// Reads the body of a manifest and checks its checksum and schema version.
 pub fn decode<T: DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, Error> {
     let damaged = |problem: Cause| Error::Damaged {
         file: file.to_owned(),
@@ -92,7 +93,7 @@ pub fn decode<T: DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, Error>
         ).into())
     })?;
 
-    // The checksum covers the raw text of the body, so it is compared before the body is parsed.
+    // The checksum covers the raw text of the body, so compare it before parsing.
     if sha256(envelope.body.get().as_bytes()) != envelope.sha256 {
         return Err(damaged(
             "does not have the checksum that it states: it was altered; restore it, or remove it \
@@ -101,8 +102,8 @@ pub fn decode<T: DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, Error>
         ));
     }
 
-    // The schema version is parsed on its own first. A body of a newer schema may not fit `T`, and
-    // the error should then ask for an update instead of reporting damage.
+    // Parse the schema version first. A body of a newer schema may not fit `T`, and the error
+    // should then request an update instead of reporting damage.
     let Versioned { schema } =
         serde_json::from_str(envelope.body.get()).map_err(|error| damaged(error.into()))?;
     if schema > SCHEMA {

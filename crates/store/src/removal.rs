@@ -1,23 +1,23 @@
 //! Removing revisions.
 //!
-//! A removed revision is out of sight at once: its manifest `000003.json` becomes `000003.gone`. The
-//! number is never given again, since servers and records tell revisions apart by it. The objects
-//! stay until [`Store::collect_garbage`] finds that nothing needs them.
+//! A removed revision disappears immediately: its manifest `000003.json` is renamed to
+//! `000003.gone`. The number is never reused, because servers and records identify revisions by it.
+//! The objects remain until [`Store::collect_garbage`] finds them unreferenced.
 
 use object_store::ObjectStoreExt;
 
 use super::defaults::{Choice, Defaults};
 use super::{Error, Kind, ResourceName, Store, folder_of, gone_name, revision_path};
 
-/// What a removal took out of sight.
+/// The result of a removal.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Removed {
-    /// The revisions, in ascending order.
+    /// The removed revisions, in ascending order.
     pub revisions: Vec<u64>,
 }
 
 impl Store {
-    /// What [`Store::remove`] would do.
+    /// Checks whether [`Store::remove`] would succeed, and returns what it would remove.
     ///
     /// # Errors
     /// As [`Store::remove`].
@@ -43,7 +43,7 @@ impl Store {
             let fitted = self.fitted_from(&resource.name, &revisions).await?;
             if let Some(fitted) = fitted.first() {
                 return Err(in_use(format!(
-                    "{fitted} was fitted from it and reads motions with it; remove that first"
+                    "{fitted} was fitted from it and still uses it; remove that first"
                 )));
             }
         }
@@ -51,30 +51,31 @@ impl Store {
         Ok(Removed { revisions })
     }
 
-    /// Removes a revision, or a whole room or adapter with all its revisions and what was chosen for
-    /// it. If the program stops in between, the newest revisions are still there.
+    /// Removes one revision, or a whole room or adapter with all its revisions and defaults. After
+    /// an interruption, the newest revisions still exist.
     ///
     /// # Errors
-    /// [`Error::Unknown`] or [`Error::UnknownRevision`] if it is not in the store, [`Error::InUse`]
-    /// if a default names it or a fitted adapter needs it, otherwise as [`Store::load_adapter`] if a
-    /// manifest cannot be read, or [`Error::Io`] if the store cannot be written.
+    /// [`Error::Unknown`] or [`Error::UnknownRevision`] if it is not in the store; [`Error::InUse`]
+    /// if a default refers to it or a fitted adapter needs it; [`Error::Io`] if the store cannot be
+    /// written; as [`Store::load_adapter`] if a manifest cannot be read.
     pub async fn remove(&self, resource: &ResourceName) -> Result<Removed, Error> {
         let removed = self.check_removable(resource).await?;
         let folder = folder_of(resource.kind, &resource.name);
 
-        // A default that named what is gone would hide what is still there.
+        // A default that refers to a removed revision would hide the remaining ones, so clear it
+        // first.
         if resource.revision.is_none() {
             self.choose(&Choice::Nothing(resource.clone())).await?;
         }
 
-        // The oldest first, so that no older revision is ever taken for the newest.
+        // Oldest first, so that an older revision never becomes the newest.
         for &revision in &removed.revisions {
             let manifest = revision_path(&folder, revision);
             let gone = folder.clone().join("revisions").join(gone_name(revision));
             let bytes = self.read(&manifest).await?;
             if let Err(error) = self.write_new(&gone, bytes).await {
-                // A full disk still takes a second name of the same file, and whoever removes wants
-                // to have room again.
+                // On a full disk, hard-linking the manifest still works, and removal must work
+                // there to free space.
                 match self.objects.copy_if_not_exists(&manifest, &gone).await {
                     Ok(()) | Err(object_store::Error::AlreadyExists { .. }) => {}
                     Err(_) => return Err(error),
@@ -88,7 +89,7 @@ impl Store {
         Ok(removed)
     }
 
-    /// The fitted adapters that read motions with one of these revisions of an adapter.
+    /// The fitted adapters whose base is one of these revisions of an adapter.
     async fn fitted_from(&self, base: &str, revisions: &[u64]) -> Result<Vec<ResourceName>, Error> {
         let mut fitted = Vec::new();
         for (name, numbers) in self.numbered(Kind::Adapter).await? {
@@ -110,7 +111,7 @@ impl Store {
     }
 }
 
-/// Why a default keeps this from being removed, if one does.
+/// The reason why a default prevents the removal, if one does.
 fn chosen(defaults: &Defaults, resource: &ResourceName) -> Option<String> {
     if let Some(revision) = resource.revision
         && defaults.revision(resource.kind, &resource.name) == Some(revision)

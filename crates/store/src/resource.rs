@@ -1,4 +1,4 @@
-//! Names of what is in a store: `rooms/kitchen`, `adapters/base`, `rooms/kitchen/revisions/3`.
+//! Resource names in a store: `rooms/kitchen`, `adapters/base`, `rooms/kitchen/revisions/3`.
 
 use std::fmt;
 use std::str::FromStr;
@@ -18,7 +18,7 @@ impl Kind {
     /// Every kind.
     pub const ALL: [Self; 2] = [Self::Room, Self::Adapter];
 
-    /// The word for one of this kind.
+    /// Singular name, for messages.
     pub fn name(self) -> &'static str {
         match self {
             Self::Room => "room",
@@ -26,7 +26,7 @@ impl Kind {
         }
     }
 
-    /// The collection that all of this kind are in, which is also their folder.
+    /// Collection name, which is also the folder name.
     pub fn collection(self) -> &'static str {
         match self {
             Self::Room => "rooms",
@@ -38,11 +38,11 @@ impl Kind {
 /// A room or an adapter, or one revision of it.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct ResourceName {
-    /// What it is.
+    /// Room or adapter.
     pub kind: Kind,
     /// The name within its collection.
     pub name: String,
-    /// A single revision; none for all of them.
+    /// One revision, or `None` for all.
     pub revision: Option<u64>,
 }
 
@@ -65,7 +65,7 @@ impl ResourceName {
         }
     }
 
-    /// One revision of the same.
+    /// This resource, limited to one revision.
     #[must_use]
     pub fn at(self, revision: u64) -> Self {
         Self {
@@ -85,7 +85,7 @@ impl fmt::Display for ResourceName {
     }
 }
 
-/// Text that names nothing in a store.
+/// Error: the text is not a valid resource name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "{text:?} is not a resource name; write rooms/NAME or adapters/NAME; add /revisions/NUMBER to \
@@ -107,7 +107,7 @@ impl FromStr for ResourceName {
         let (collection, name, revision) = match parts.as_slice() {
             [collection, name] => (*collection, *name, None),
             [collection, name, "revisions", number] => {
-                // Only the form in which numbers are printed: no sign, no leading zero.
+                // Accept only the printed form of a number: no sign, no leading zero.
                 let revision: u64 = number.parse().map_err(|_| unfit())?;
                 if revision == 0 || revision.to_string() != *number {
                     return Err(unfit());
@@ -137,7 +137,7 @@ impl FromStr for ResourceName {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand. What is printed is read back, and nothing else is read.
+    /// Oracle: by hand. Printed names parse back, and no other form parses.
     #[test]
     fn names_are_read_as_they_are_printed() {
         for name in [

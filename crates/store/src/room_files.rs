@@ -1,4 +1,4 @@
-//! The objects of a room as bytes: frames and features as safetensors, names as JSON.
+//! Serialization of a room's objects: frames and features as safetensors, names as JSON.
 
 use ndarray::Array2;
 
@@ -9,12 +9,12 @@ use seese3_core::features::Features;
 use seese3_core::geometry::{Pose, nearest_rotation};
 use seese3_core::room::{Frames, Room};
 
-/// The poses of a room, and the other columns of numbers that it has.
+/// Serializes the poses of a room and its other numeric columns.
 pub fn frames_file(room: &Room) -> Result<Vec<u8>, Error> {
     let n = room.frame_count();
     let mut tensors = TensorWriter::default();
 
-    // nalgebra stores a matrix by column; the transpose gives the rows that NumPy expects.
+    // nalgebra stores matrices in column-major order; the transpose gives NumPy's row-major order.
     let rows = room
         .poses()
         .iter()
@@ -27,7 +27,7 @@ pub fn frames_file(room: &Room) -> Result<Vec<u8>, Error> {
 
     let frames = room.frames();
 
-    // A column that the recording does not have is left out of the file and read back as empty.
+    // A column missing from the recording is omitted from the file and read back as empty.
     for (name, values) in [
         ("numbers", frames.numbers.clone()),
         (
@@ -55,7 +55,7 @@ pub fn frames_file(room: &Room) -> Result<Vec<u8>, Error> {
     tensors.finish("frames")
 }
 
-/// A list of names of frames or images.
+/// Serializes a list of frame or image names.
 pub fn names_file(names: &[String]) -> Result<Vec<u8>, Error> {
     serde_json::to_vec(names).map_err(|error| Error::Damaged {
         file: "frame-names".to_owned(),
@@ -63,7 +63,7 @@ pub fn names_file(names: &[String]) -> Result<Vec<u8>, Error> {
     })
 }
 
-/// The rows of one set of features.
+/// Serializes the rows of one feature set.
 pub fn features_file(features: &Features) -> Result<Vec<u8>, Error> {
     let rows = features.rows();
     let mut tensors = TensorWriter::default();
@@ -76,7 +76,7 @@ pub fn features_file(features: &Features) -> Result<Vec<u8>, Error> {
     tensors.finish("features")
 }
 
-/// The columns that [`frames_file`] wrote.
+/// Reads the columns written by [`frames_file`].
 pub fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
     let tensors = TensorReader::new(file, bytes)?;
 
@@ -90,8 +90,8 @@ pub fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
         return Err(damaged("'world_from_camera' is not (n, 4, 4)".into()));
     }
 
-    // The stored entries carry rounding errors. Projection onto SO(3) makes the rotation exact
-    // before it becomes a quaternion.
+    // The stored entries have rounding errors. Project them onto SO(3) before conversion to a
+    // quaternion.
     let pose = |(row, matrix): (usize, ndarray::ArrayView1<'_, f64>)| {
         let m = nalgebra::Matrix4::from_row_iterator(matrix.iter().copied());
         let rotation = nearest_rotation(&m.fixed_view::<3, 3>(0, 0).into_owned());
@@ -112,7 +112,7 @@ pub fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
         .map(pose)
         .collect::<Result<_, Error>>()?;
 
-    // These tensors are optional: a missing one means that the recording has no such data.
+    // Optional tensors: missing means that the recording has no such data.
     let column = |name: &str| -> Result<Vec<i64>, Error> {
         Ok(if tensors.has(name) {
             tensors.i64(name)?.iter().copied().collect()
@@ -137,18 +137,18 @@ pub fn read_frames(file: &str, bytes: &[u8]) -> Result<Frames, Error> {
             .into_iter()
             .map(|mark| mark != 0)
             .collect(),
-        // Names and images are JSON objects of their own, which `load` reads.
+        // Names and images are separate JSON objects, read by `load`.
         names: Vec::new(),
         images: Vec::new(),
     })
 }
 
-/// The rows that [`features_file`] wrote.
+/// Reads the rows written by [`features_file`].
 pub fn read_features(file: &str, bytes: &[u8]) -> Result<Array2<f32>, Error> {
     TensorReader::new(file, bytes)?.f32("features")
 }
 
-/// The names that [`names_file`] wrote.
+/// Reads the names written by [`names_file`].
 pub fn read_names(file: &str, bytes: &[u8]) -> Result<Vec<String>, Error> {
     serde_json::from_slice(bytes).map_err(|error| Error::Damaged {
         file: file.to_owned(),

@@ -1,4 +1,4 @@
-//! The rules of a fitted adapter, as a tensor in its weights file.
+//! Storage of a fitted adapter's reading rules, as a tensor in its weights file.
 
 use nalgebra::Matrix6;
 use ndarray::ArrayView1;
@@ -12,11 +12,11 @@ use seese3_core::Cause;
 use seese3_core::room::RoomId;
 use seese3_robot::fitting::{MotionReader, PartRule, ReadingRule, ReadingRules};
 
-/// One row per rule: the largest distance; the reader and the gain of the translation, then those
-/// of the rotation; the least disagreement; and the 36 entries of the covariance on (v, ω), row by
-/// row. A reader is its position in [`MotionReader::ALL`].
+/// One row per rule: the largest distance; the reader and gain for translation, then those for
+/// rotation; the minimum disagreement; and the covariance on (v, ω), 36 entries in row-major order.
+/// A reader is stored as its index in [`MotionReader::ALL`].
 const RULES: &str = "fit.rules";
-/// The columns of [`RULES`] before the covariance.
+/// Number of columns of [`RULES`] before the covariance.
 const COLUMNS_BEFORE_COVARIANCE: usize = 6;
 const COLUMNS: usize = COLUMNS_BEFORE_COVARIANCE + 36;
 
@@ -28,7 +28,7 @@ pub fn write(tensors: &mut TensorWriter, rules: &ReadingRules) {
         [position.unwrap_or_default() as f64, rule.gain]
     };
 
-    // nalgebra iterates over a matrix by column; the transpose gives the entries row by row.
+    // nalgebra iterates in column-major order; the transpose gives row-major entries.
     let row = |rule: &ReadingRule| {
         let covariance: Vec<f64> = rule.covariance.transpose().iter().copied().collect();
         [rule.up_to]
@@ -43,7 +43,7 @@ pub fn write(tensors: &mut TensorWriter, rules: &ReadingRules) {
     tensors.f64(RULES, &shape, rules.rules().iter().flat_map(row));
 }
 
-/// Reads what an adapter was fitted to.
+/// Reads the room fit of an adapter.
 pub fn read(entry: FittedEntry, tensors: &TensorReader<'_>, file: &str) -> Result<RoomFit, Error> {
     let damaged = |problem: Cause| Error::Damaged {
         file: file.to_owned(),

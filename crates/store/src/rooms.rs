@@ -16,21 +16,21 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::Pose;
 use seese3_core::room::{Frames, Provenance, Room, RoomId, is_plain_name};
 
-/// A room that was loaded from the store, with its features.
+/// A room loaded from the store, with its features.
 #[derive(Debug, Clone)]
 pub struct StoredRoom {
     /// The room.
     pub room: Room,
-    /// Counted from 1.
+    /// Revision number, from 1.
     pub revision: u64,
-    /// When it was published, RFC 3339.
+    /// Time of publication, RFC 3339.
     pub created: String,
-    /// All features of the room, or only those that were requested.
+    /// All feature sets of the room, or only the requested ones.
     pub features: Vec<Features>,
 }
 
 impl StoredRoom {
-    /// The set of features with this name, if it was loaded.
+    /// The feature set of this name, if loaded.
     pub fn features(&self, name: &str) -> Option<&Features> {
         self.features
             .iter()
@@ -41,21 +41,21 @@ impl StoredRoom {
 /// A summary of a room, read from its manifest alone.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RoomSummary {
-    /// Its name.
+    /// The room's name.
     pub room: String,
-    /// The revision: that which the name alone means, unless another was asked for.
+    /// The requested revision, or the current one.
     pub revision: u64,
-    /// When it was published, RFC 3339.
+    /// Time of publication, RFC 3339.
     pub created: String,
     /// The number of frames.
     pub frame_count: usize,
-    /// The source of each set of features.
+    /// The source of each feature set.
     pub features: Vec<FeatureSource>,
-    /// Where it came from.
+    /// Origin of the recording.
     pub provenance: Provenance,
 }
 
-/// The objects of a room that a manifest names.
+/// References to a room's objects, for its manifest.
 struct RoomObjects {
     frames: ObjectRef,
     frame_names: Option<ObjectRef>,
@@ -63,17 +63,16 @@ struct RoomObjects {
     features: Vec<FeaturesEntry>,
 }
 
-/// Which newest revision may be published over.
+/// Condition on the newest revision for publishing the next one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum PublishPolicy {
     AnyFrames,
     SameFrames,
-    /// The newest one has this number.
+    /// The newest revision has this number.
     Revision(u64),
 }
 
-/// The newest revision, if publishing `body` would change nothing: content that differs only in the
-/// revision number and the date is not published again.
+/// The newest revision, if it equals `body` except for the revision number and the date.
 fn unchanged(folder: &Path, body: &RoomBody, newest: Option<RoomBody>) -> Option<Published> {
     let newest = newest?;
     let same = RoomBody {
@@ -89,7 +88,7 @@ fn unchanged(folder: &Path, body: &RoomBody, newest: Option<RoomBody>) -> Option
     })
 }
 
-/// The features of the newest revision that are not published anew.
+/// The feature sets of the newest revision that this publication does not replace.
 fn features_to_keep(newest: &RoomBody, published: &[FeaturesEntry]) -> Vec<FeaturesEntry> {
     let is_published = |entry: &&FeaturesEntry| {
         published
@@ -108,15 +107,15 @@ fn features_to_keep(newest: &RoomBody, published: &[FeaturesEntry]) -> Vec<Featu
 impl Store {
     /// Publishes a room with features as a new revision.
     ///
-    /// If the newest revision has the same poses, everything in it that this call does not give
-    /// (features of other names, timestamps, images and the like) is carried over. Publishing the
-    /// same content again creates no revision.
+    /// If the newest revision has the same poses, whatever this call omits (other feature sets,
+    /// timestamps, images and so on) is carried over. Publishing the same content again creates no
+    /// revision.
     ///
     /// # Errors
     /// [`Error::FeatureRows`], [`Error::DuplicateFeatures`] or [`Error::Name`] if the features do
     /// not fit the room, see [`check_features`]; [`Error::Contended`] if other publishers took
-    /// every revision number that was tried; otherwise as [`Store::load_room`] if the newest
-    /// revision cannot be read, or [`Error::Io`] if the store cannot be written.
+    /// every revision number tried; [`Error::Io`] if the store cannot be written; as
+    /// [`Store::load_room`] if the newest revision cannot be read.
     pub async fn publish_room(
         &self,
         room: &Room,
@@ -126,8 +125,9 @@ impl Store {
             .await
     }
 
-    /// Publishes a room as [`Store::publish_room`] does, but not over other frames: of several who
-    /// publish different recordings under one name at the same time, one succeeds.
+    /// Publishes a room like [`Store::publish_room`], but not over a newest revision with different
+    /// frames. Of several concurrent publishers of different recordings under one name, one
+    /// succeeds.
     ///
     /// # Errors
     /// [`Error::OtherFrames`] if the newest revision has other frames, otherwise as
@@ -141,10 +141,10 @@ impl Store {
             .await
     }
 
-    /// Publishes a room as [`Store::publish_room`] does.
+    /// Publishes a room like [`Store::publish_room`], under the condition `over`.
     ///
     /// # Errors
-    /// [`Error::OtherFrames`] if the newest revision is not one that `over` allows, otherwise as
+    /// [`Error::OtherFrames`] if the newest revision does not satisfy `over`, otherwise as
     /// [`Store::publish_room`].
     pub(super) async fn publish_over(
         &self,
@@ -155,18 +155,18 @@ impl Store {
         check_features(room, features)?;
         let folder = folder_of(Kind::Room, room.id().as_str());
 
-        // A room that is imported again, for instance without its images, must not lose what was
-        // known of it. What it leaves empty is filled in from the newest revision.
+        // A repeated import, for instance without images, must not lose stored data: missing
+        // columns are filled in from the newest revision.
         let (room, known) = &self.with_what_is_known(&folder, room).await?;
 
-        // All objects are written before the manifest that names them. If the program stops in
-        // between, they are never read.
+        // All objects are written before the manifest that references them. After an interruption
+        // they are unreferenced.
         let objects = self
             .write_objects(&folder, room, known.as_ref(), features)
             .await?;
 
         // Optimistic concurrency: build the manifest on the newest revision and try to create the
-        // next one. If another publisher was faster, start again from its revision.
+        // next one. If another publisher was faster, retry from its revision.
         for _ in 0..ATTEMPTS {
             let numbers = self.revisions(&folder).await?;
             let newest = match numbers.present.last() {
@@ -187,8 +187,8 @@ impl Store {
                 provenance: room.provenance().into(),
             };
 
-            // Row i of the features belongs to frame i. Features published earlier therefore stay
-            // valid as long as the poses are the same.
+            // Row i of the features belongs to frame i, so earlier features remain valid while the
+            // poses are the same.
             let newest_revision = newest.as_ref().map(|newest| newest.revision);
             if matches!(over, PublishPolicy::Revision(base) if Some(base) != newest_revision) {
                 return Err(Error::OtherFrames {
@@ -209,7 +209,7 @@ impl Store {
                 }
             }
 
-            // In a fixed order the same content compares equal, whoever published it.
+            // A fixed order makes equal content compare equal.
             body.features
                 .sort_by(|a, b| a.source.name().cmp(b.source.name()));
 
@@ -241,9 +241,9 @@ impl Store {
         })
     }
 
-    /// Makes sure that a revision has its objects once its manifest is there, which keeps them from
-    /// being collected. What was collected before is written again. Features that were carried over
-    /// cannot be: then the manifest is removed again, and the answer is false.
+    /// Ensures that a new revision's objects exist; from now on its manifest protects them from
+    /// garbage collection. Objects collected before are written again. Carried-over features cannot
+    /// be: then the manifest is removed, and the result is false.
     async fn confirm(
         &self,
         folder: &Path,
@@ -267,8 +267,8 @@ impl Store {
         Ok(false)
     }
 
-    /// Writes the objects of a room. `known_frames` are those of the newest revision, if the room
-    /// has the same.
+    /// Writes the objects of a room. `known_frames` is the frames object of the newest revision, if
+    /// it can be reused.
     async fn write_objects(
         &self,
         folder: &Path,
@@ -288,8 +288,8 @@ impl Store {
             .await?;
         let images = self.write_names(folder, "images", room.images()).await?;
 
-        // Every set of features is an object of its own, so that a later revision can refer to it
-        // without copying.
+        // Each feature set is a separate object, so that later revisions can reference it without
+        // copying.
         let mut entries = Vec::with_capacity(features.len());
         for set in features {
             let stem = format!("features-{}", set.source().name);
@@ -327,25 +327,24 @@ impl Store {
         Ok(Some(object))
     }
 
-    /// Loads a room with all its features: the given revision, or the one that the name alone
-    /// means.
+    /// Loads a room with all its features: the given revision, or the current one.
     ///
     /// # Errors
-    /// [`Error::Unknown`] if there is no such room, [`Error::UnknownRevision`] if it has no such
-    /// revision, [`Error::Damaged`] if a file is truncated or altered, [`Error::Schema`] if a newer
-    /// program wrote it, [`Error::Io`] if a file cannot be read.
+    /// [`Error::Unknown`] or [`Error::UnknownRevision`] if the room or revision does not exist,
+    /// [`Error::Damaged`] if a file is truncated or altered, [`Error::Schema`] if a newer program
+    /// wrote it, [`Error::Absent`] or [`Error::Io`] if a file is missing or cannot be read.
     pub async fn load_room(&self, name: &str, revision: Option<u64>) -> Result<StoredRoom, Error> {
         self.load(name, revision, None).await
     }
 
-    /// Loads the revision that a room's name alone means, with one set of features: the named one,
-    /// or the only one if no name is given. The features are returned beside the room, whose own
-    /// list is empty.
+    /// Loads the current revision of a room with one feature set: the named one, or the only one if
+    /// `features` is `None`. The features are returned separately; the returned room's list is
+    /// empty.
     ///
     /// # Errors
     /// As [`Store::load_room`]; also [`Error::UnknownFeatures`] if the room has no features of this
     /// name, and [`Error::WhichFeatures`] if no name is given and the room does not have exactly
-    /// one set.
+    /// one feature set.
     pub async fn load_room_with(
         &self,
         name: &str,
@@ -378,16 +377,15 @@ impl Store {
             }
         };
 
-        // Load exactly the revision whose features were listed above: a newer one may have been
-        // published since.
+        // Load the revision whose features were listed above; a newer one may exist by now.
         let mut stored = self.load(name, Some(revision), Some(&wanted)).await?;
         let features = stored.features.pop().ok_or_else(|| unknown(&wanted))?;
 
         Ok((stored, features))
     }
 
-    /// What an adapter has seen of a revision of a room. A room imported again has a new revision
-    /// but often the same frames, so the frames are compared and not the numbers of the revisions.
+    /// Whether an adapter was trained on a revision of a room. Frames are compared, not revision
+    /// numbers, because a repeated import often creates a new revision with the same frames.
     ///
     /// # Errors
     /// As [`Store::same_frames`].
@@ -408,7 +406,8 @@ impl Store {
         }
     }
 
-    /// Whether two revisions of a room have the same frames. False if one of them no longer exists.
+    /// Whether two revisions of a room have the same frames. False if one of them does not exist
+    /// any more.
     ///
     /// # Errors
     /// [`Error::Damaged`] if a manifest is truncated or altered, [`Error::Schema`] if a newer
@@ -427,15 +426,15 @@ impl Store {
             return Ok(false);
         }
 
-        // The references contain checksums, so the frames themselves need not be read.
+        // The references contain checksums, so the frames need not be read.
         let one = self.room_body(&folder, one).await?;
         let other = self.room_body(&folder, other).await?;
 
         Ok(one.frames == other.frames)
     }
 
-    /// The names of all rooms, sorted, each with the revision that its name alone means by these
-    /// choices. No manifest is read.
+    /// The names of all rooms, sorted, each with its current revision under `defaults`. Reads no
+    /// manifest.
     ///
     /// # Errors
     /// [`Error::Io`] if the store cannot be listed.
@@ -443,7 +442,7 @@ impl Store {
         self.current(Kind::Room, defaults).await
     }
 
-    /// A summary of every room, of the revision that its name alone means; sorted by name.
+    /// Summaries of the current revisions of all rooms, sorted by name.
     ///
     /// # Errors
     /// [`Error::Damaged`] if a manifest is truncated or altered, [`Error::Schema`] if a newer
@@ -457,11 +456,10 @@ impl Store {
         Ok(summaries)
     }
 
-    /// A summary of a room: of the given revision, or of the one that its name alone means.
+    /// Summary of a room: of the given revision, or of the current one.
     ///
     /// # Errors
-    /// As [`Store::load_room`]. Whether the files that the manifest names are there and intact is
-    /// not looked at.
+    /// As [`Store::load_room`]. The manifest's objects are not checked.
     pub async fn room_summary(
         &self,
         name: &str,
@@ -481,9 +479,9 @@ impl Store {
         })
     }
 
-    /// Fills in what a room leaves empty from the newest revision, if that has the same poses. Also
-    /// returns that revision's frames object if it already holds every column of the result, so
-    /// that poses that differ only by rounding are not written again.
+    /// Fills in a room's empty columns from the newest revision, if that has the same poses. Also
+    /// returns that revision's frames object if it already has every column of the result; then
+    /// poses that differ only by rounding are not rewritten.
     async fn with_what_is_known(
         &self,
         folder: &Path,
@@ -494,12 +492,12 @@ impl Store {
         };
         let body = self.room_body(folder, newest).await?;
 
-        // Other poses mean another recording under the same name, so nothing is carried over.
+        // Different poses mean a different recording under the same name: carry over nothing.
         if !self.has_poses(folder, &body, room).await? {
             return Ok((room.clone(), None));
         }
 
-        // No set of features has an empty name: this loads the room without any features.
+        // No feature set has an empty name, so this loads the room without features.
         let known = self
             .load(room.id().as_str(), Some(newest), Some(""))
             .await?
@@ -516,7 +514,7 @@ impl Store {
         let given = room.frames();
         let before = known.frames();
 
-        // A column that is given takes precedence over the stored one.
+        // A given column takes precedence over the stored one.
         let frames = Frames {
             poses: given.poses.clone(),
             timestamps_ns: either(&given.timestamps_ns, &before.timestamps_ns),
@@ -527,8 +525,8 @@ impl Store {
             held_out: either(&given.held_out, &before.held_out),
         };
 
-        // Besides the poses, only these columns are in the frames object. Names and images are
-        // objects of their own.
+        // Besides the poses, the frames object has only these columns. Names and images are
+        // separate objects.
         let columns = |frames: &Frames| {
             let Frames {
                 timestamps_ns,
@@ -541,8 +539,8 @@ impl Store {
             (timestamps_ns, numbers, sequences, held_out)
         };
 
-        // The poses are known to agree up to rounding. If the other columns agree too, the stored
-        // object is kept, and comparing revisions by checksum still finds the same frames.
+        // The poses agree up to rounding. If the other columns are equal too, keep the stored
+        // object, so that comparing revisions by checksum still finds equal frames.
         let object = (columns(&frames) == columns(before)).then_some(body.frames);
         let mut provenance = room.provenance().clone();
         if provenance.licence.is_empty() {
@@ -551,7 +549,7 @@ impl Store {
 
         provenance.camera = provenance.camera.or(known.provenance().camera);
 
-        // Image paths are relative to the images root, so both come from the same revision.
+        // Image paths are relative to the images root, so both must come from the same revision.
         if given.images.is_empty() {
             provenance
                 .images_root
@@ -569,14 +567,14 @@ impl Store {
         ))
     }
 
-    /// Whether a stored revision has the poses of a room, up to rounding. Other columns are not
-    /// compared.
+    /// Whether a stored revision has the same poses as `room`, up to rounding. Other columns are
+    /// not compared.
     async fn has_poses(&self, folder: &Path, body: &RoomBody, room: &Room) -> Result<bool, Error> {
         let (file, bytes) = self.read_object(folder, &body.frames).await?;
         let stored = read_frames(&file, &bytes)?.poses;
 
-        // A stored rotation is projected and converted to a quaternion when it is read, so equal
-        // poses agree only up to rounding.
+        // Reading projects a stored rotation and converts it to a quaternion, so equal poses agree
+        // only up to rounding.
         let same =
             |(a, b): (&Pose, &Pose)| (a.to_homogeneous() - b.to_homogeneous()).amax() < 1e-12;
 
@@ -603,13 +601,13 @@ impl Store {
         };
         let id = RoomId::new(&body.room).map_err(|error| damaged(error.into()))?;
 
-        // The checksums show that the files are intact; `Room::new` checks that they form a room,
-        // for instance that all columns are equally long.
+        // The checksums prove that the files are intact; `Room::new` checks that they form a valid
+        // room, for instance that all columns have the same length.
         let room =
             Room::new(id, frames, body.provenance.into()).map_err(|error| damaged(error.into()))?;
         let mut features = Vec::new();
 
-        // `only` selects one set by its name. Without it, every set is loaded.
+        // `only` selects one feature set by name; without it, all are loaded.
         for entry in body
             .features
             .into_iter()
@@ -622,7 +620,7 @@ impl Store {
                 problem: error.into(),
             })?;
 
-            // The two objects are intact each by itself, but they must also belong together.
+            // Each object is intact by itself; they must also match each other.
             if set.rows().nrows() != room.frame_count() {
                 let problem = format!(
                     "has {} rows, the room {} frames",
@@ -669,17 +667,17 @@ impl Store {
     }
 }
 
-/// Checks that features can be published with a room, before anything is written.
+/// Checks that features can be published with a room. Reads and writes nothing.
 ///
 /// # Errors
-/// [`Error::Name`] if a name cannot be part of a file name, [`Error::DuplicateFeatures`] if two
-/// sets have the same name, [`Error::FeatureRows`] if a set does not have one row per frame.
+/// [`Error::Name`] if a name is not valid in a file name, [`Error::DuplicateFeatures`] if two sets
+/// have the same name, [`Error::FeatureRows`] if a set does not have one row per frame.
 pub fn check_features(room: &Room, features: &[Features]) -> Result<(), Error> {
     for (position, set) in features.iter().enumerate() {
         let name = set.source().name.clone();
         let rows = set.rows().nrows();
 
-        // The name becomes part of the name of a file in the store.
+        // The name becomes part of a file name in the store.
         if !is_plain_name(&name) {
             return Err(Error::Name {
                 what: "features",

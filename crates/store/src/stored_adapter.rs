@@ -1,4 +1,4 @@
-//! An adapter as it is read from the store.
+//! An adapter loaded from the store.
 
 use std::sync::Arc;
 
@@ -9,38 +9,39 @@ use seese3_robot::fitting::ReadingRules;
 /// An adapter that was loaded from the store and reproduced its golden outputs.
 #[derive(Debug, Clone)]
 pub struct StoredAdapter {
-    /// Its name.
+    /// The adapter's name.
     pub name: String,
-    /// Counted from 1.
+    /// Revision number, from 1.
     pub revision: u64,
-    /// When it was published, RFC 3339.
+    /// Time of publication, RFC 3339.
     pub created: String,
-    /// The adapter. All rooms share it: a tracker takes maps of several rooms only if their adapter
-    /// is the same `Arc`, compared by pointer.
+    /// The adapter, shared by all rooms. A tracker accepts maps of several rooms only if they use
+    /// the same `Arc`, compared by pointer.
     pub adapter: Arc<Adapter>,
-    /// How it was trained.
+    /// Training record.
     pub record: TrainingRecord,
-    /// The room that it was fitted to, and how far it may be believed there; none for an adapter
-    /// that is meant for any room.
+    /// The room it was fitted to, with the rules for using it there; `None` for an adapter for any
+    /// room.
     pub room_fit: Option<RoomFit>,
-    /// Whether it belongs to an experiment: it answers where it is named, or where no other does.
+    /// Whether it belongs to an experiment: used only when requested by name, or where no other
+    /// adapter fits.
     pub is_experiment: bool,
 }
 
-/// What makes an adapter one of a single room.
+/// The fit of an adapter to a single room.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RoomFit {
     /// The room.
     pub room: RoomId,
     /// The revision of the room whose frames it was fitted to.
     pub room_revision: u64,
-    /// The adapter of other rooms that reads motions beside it, if there is one.
+    /// The pre-trained base adapter, which predicts motions alongside the fitted one, if any.
     pub base: Option<BaseAdapter>,
-    /// Which reader is believed, by the distance of a view from the map.
+    /// Selection of the motion predictor, by the distance of a view from the map.
     pub rules: ReadingRules,
 }
 
-/// A published revision of an adapter, which never changes.
+/// Reference to a published revision of the base adapter; published revisions never change.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BaseAdapter {
     /// Its name.

@@ -9,7 +9,7 @@ use safetensors::tensor::{Dtype, TensorView};
 
 use super::Error;
 
-/// Collects named tensors and serialises them into one file.
+/// Collects named tensors and serializes them into one file.
 #[derive(Default)]
 pub struct TensorWriter(BTreeMap<String, (Dtype, Vec<usize>, Vec<u8>)>);
 
@@ -47,7 +47,7 @@ impl TensorWriter {
         );
     }
 
-    /// Serialises the collected tensors. `file` is the name used in errors.
+    /// Serializes the collected tensors. `file` is the name used in errors.
     pub fn finish(self, file: &str) -> Result<Vec<u8>, Error> {
         let damaged = |problem: Cause| Error::Damaged {
             file: file.to_owned(),
@@ -113,7 +113,7 @@ impl<'a> TensorReader<'a> {
             .tensor(name)
             .map_err(|_| damaged(format!("has no tensor '{name}'").into()))?;
 
-        // Every tensor of the schema has exactly one type. A file with another type is refused, not
+        // The schema defines one type per tensor. A file with another type is rejected, not
         // converted.
         if tensor.dtype() != dtype {
             return Err(damaged(
@@ -125,7 +125,7 @@ impl<'a> TensorReader<'a> {
             ));
         }
 
-        // The bytes are little-endian and need not be aligned, so each number is decoded from its
+        // The bytes are little-endian and possibly unaligned, so each number is decoded from its
         // own `N` bytes.
         let values = tensor
             .data()

@@ -1,26 +1,26 @@
-//! Checking that everything in a store can be read and belongs together.
+//! Verification of a store: every file is readable and intact, and references are valid.
 
 use std::collections::BTreeSet;
 
 use super::manifest::ObjectRef;
 use super::{Error, Kind, ResourceName, Store, folder_of};
 
-/// Something in a store that is not as it should be.
+/// A problem found in a store.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
-    /// What it concerns: a revision, or `defaults`.
+    /// The affected resource: a revision, or `defaults`.
     pub resource: String,
-    /// What is wrong, with the file where one is.
+    /// Description of the problem, with the file if there is one.
     pub problem: String,
 }
 
 impl Store {
-    /// Reads every revision of every room and adapter: manifests and objects against their
-    /// checksums, adapters against their golden vectors, and what refers to something else. `seen`
-    /// is called with each revision before it is read.
+    /// Verifies every revision of every room and adapter: checksums of manifests and objects,
+    /// golden vectors of adapters, and references to other resources. `seen` is called with each
+    /// revision before it is read.
     ///
     /// # Errors
-    /// [`Error::Io`] if the store cannot be listed. Everything else is a finding.
+    /// [`Error::Io`] if the store cannot be listed. Every other problem is returned as a finding.
     pub async fn verify(
         &self,
         seen: &(dyn Fn(&ResourceName) + Sync),
@@ -29,7 +29,8 @@ impl Store {
 
         for kind in Kind::ALL {
             for (name, numbers) in self.numbered(kind).await? {
-                // Revisions share objects: one that adds none to those before is not read again.
+                // Revisions share objects. A revision without new objects needs only its manifest
+                // checked.
                 let mut intact = BTreeSet::new();
 
                 for revision in numbers.present {
@@ -85,7 +86,7 @@ impl Store {
                     .cloned()
                     .collect();
 
-                // A revision all of whose objects were read adds only its manifest.
+                // Load the room only if it has objects that were not verified yet.
                 if !objects.is_empty() {
                     self.load_room(&resource.name, Some(revision)).await?;
                 }

@@ -1,4 +1,4 @@
-//! The file of credentials.
+//! The auth file.
 //!
 //! ```toml
 //! [[principal]]
@@ -6,13 +6,13 @@
 //! token_sha256 = "2bb80d537b1da3e38bd30361aa855686bde0eacd7162fef6a25fe97bf527a25b"
 //! verbs = ["navigate", "localize", "track"]
 //! rooms = ["kitchen", "lab-*"]
-//! streams = 4       # Track streams at a time; 4 if absent
-//! requests = 64     # requests and streams at a time; 64 if absent
+//! streams = 4       # concurrent Track streams; default 4
+//! requests = 64     # concurrent requests and streams; default 64
 //! ```
 //!
-//! The file has no secret in it: of a token it has the SHA-256 (`printf %s "$TOKEN" | sha256sum`),
-//! of a client's certificate the fingerprint (`certificate_sha256`, that of its DER). Tokens that
-//! others signed are taken by `[[issuer]]`, see [`super::issuers`].
+//! The file has no secrets: it has the SHA-256 of a token (`printf %s "$TOKEN" | sha256sum`) or the
+//! fingerprint of a client certificate (`certificate_sha256`, the SHA-256 of its DER). Tokens of
+//! external issuers are accepted by `[[issuer]]`, see [`super::issuers`].
 
 use seese3_core::Cause;
 use std::collections::BTreeSet;
@@ -30,15 +30,15 @@ use super::issuer_form::IssuerForm;
 use super::issuers::Issuer;
 use super::{Principal, Rights, RoomScope, Signed, Verb};
 
-/// The time between two looks at the file.
+/// Polling interval of the file.
 const LOOK: Duration = Duration::from_secs(5);
 
 const MOST_STREAMS: usize = 4;
 const MOST_REQUESTS: usize = 64;
-/// The largest limit that can be given.
+/// Maximum of `streams` and `requests`.
 const LARGEST_LIMIT: usize = 1_000_000;
 
-/// Why a file of credentials cannot be used.
+/// Errors of reading an auth file.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum AuthError {
@@ -89,30 +89,30 @@ struct PrincipalForm {
     requests: Option<usize>,
 }
 
-/// What proves who is calling.
+/// Proof of a caller's identity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Proof {
     /// SHA-256 of a bearer token.
     Token([u8; 32]),
-    /// SHA-256 of a client's certificate.
+    /// SHA-256 of a client certificate.
     Certificate([u8; 32]),
 }
 
-/// The principals of a server.
+/// The principals and issuers of an auth file.
 #[derive(Debug, Default)]
 pub struct Credentials {
     known: Vec<(Proof, Arc<Principal>)>,
     issuers: Vec<Arc<Issuer>>,
-    /// SHA-256 of all files that were read.
+    /// SHA-256 of the auth file and the key files, to detect changes.
     digest: [u8; 32],
 }
 
 impl Credentials {
-    /// Reads a file.
+    /// Reads an auth file and the key files it references.
     ///
     /// # Errors
-    /// [`AuthError`], naming the principal or issuer and the key. A file without any is refused: it
-    /// would lock everybody out.
+    /// [`AuthError`], which names the principal or issuer and the key. A file without principals
+    /// and issuers is rejected: it would lock out every caller.
     pub fn read(file: &Path) -> Result<Self, AuthError> {
         let text = std::fs::read_to_string(file).map_err(|problem| AuthError::Unreadable {
             file: file.to_owned(),
@@ -130,7 +130,7 @@ impl Credentials {
 
         let form: FileForm = toml::from_str(text).map_err(|error| syntax(error.into()))?;
         if form.principal.is_empty() && form.issuer.is_empty() {
-            let problem = "has no [[principal]] and no [[issuer]]: nobody could call";
+            let problem = "has no [[principal]] and no [[issuer]]: every call would be rejected";
             return Err(syntax(problem.into()));
         }
 
@@ -149,10 +149,10 @@ impl Credentials {
             }
             let (proof, principal) = principal(form).map_err(unfit)?;
 
-            // Two principals with one token would be one caller with an arbitrary choice of rights.
+            // Two principals with the same token would make the caller's rights ambiguous.
             if known.iter().any(|(other, _)| *other == proof) {
                 return Err(unfit(
-                    "has the token or certificate of another one".to_owned(),
+                    "has the token or certificate of another principal".to_owned(),
                 ));
             }
             known.push((proof, Arc::new(principal)));
@@ -183,8 +183,8 @@ impl Credentials {
         })
     }
 
-    /// The same, with what did not change taken over from `before`: a caller's open streams go on,
-    /// and count towards its limits as before.
+    /// Keeps the unchanged principals and issuers of `before`, so that their open streams continue
+    /// and still count toward their limits.
     fn taking_over(mut self, before: &Self) -> Self {
         for (proof, principal) in &mut self.known {
             let same = before
@@ -216,10 +216,10 @@ impl Credentials {
         }
     }
 
-    /// The principal with this token.
+    /// The principal of a token.
     ///
     /// # Errors
-    /// [`Error::Unauthenticated`] if nobody has it, or its issuer says that it is not good now.
+    /// [`Error::Unauthenticated`] if the token is unknown, or its issuer rejects it.
     pub fn by_token(&self, token: &[u8]) -> Result<Arc<Principal>, Error> {
         let known = self.by_proof(&Sha256::digest(token).into(), |proof| match proof {
             Proof::Token(digest) => Some(digest),
@@ -236,14 +236,14 @@ impl Credentials {
             match issuer.principal_of(token) {
                 Ok(Some(principal)) => return Ok(Arc::new(principal)),
                 Ok(None) => {}
-                // It may be for the audience of the next one.
+                // The token may be for the next issuer's audience.
                 Err(error) => refusal = error,
             }
         }
         Err(refusal)
     }
 
-    /// The principal with the certificate of this fingerprint.
+    /// The principal of a client certificate, by fingerprint.
     pub fn by_certificate(&self, fingerprint: &[u8; 32]) -> Option<Arc<Principal>> {
         self.by_proof(fingerprint, |proof| match proof {
             Proof::Certificate(digest) => Some(digest),
@@ -251,7 +251,8 @@ impl Credentials {
         })
     }
 
-    /// All digests are compared, each in constant time: how long it takes tells nothing of a token.
+    /// Compares all digests, each in constant time, so that the duration reveals nothing about a
+    /// token.
     fn by_proof(
         &self,
         given: &[u8; 32],
@@ -306,7 +307,7 @@ fn issuer(form: IssuerForm, file: &Path) -> Result<Issuer, String> {
     Issuer::new(form, rights, file.parent().unwrap_or(Path::new("")))
 }
 
-/// Rights as a file gives them; the limits are those of streams and of requests.
+/// Validates the rights of an entry; the limits are `streams` and `requests`.
 fn rights(
     name: String,
     verbs: Vec<Verb>,
@@ -314,7 +315,7 @@ fn rights(
     [streams, requests]: [Option<usize>; 2],
 ) -> Result<Rights, String> {
     if verbs.is_empty() {
-        return Err("verbs is empty: it could call nothing".to_owned());
+        return Err("verbs is empty: every call would be rejected".to_owned());
     }
     if rooms.is_empty() {
         return Err("rooms is empty; give names, or \"*\" for all".to_owned());
@@ -346,7 +347,7 @@ fn digest(key: &str, text: &str) -> Result<[u8; 32], String> {
         .ok_or_else(|| format!("{key} must be 64 hexadecimal digits"))
 }
 
-/// The credentials of a server, as their file is now.
+/// The server's current credentials, reloaded when their file changes.
 #[derive(Debug)]
 pub struct Keyring {
     file: PathBuf,
@@ -363,7 +364,7 @@ impl Keyring {
         Ok(Self { file, current })
     }
 
-    /// The credentials of now.
+    /// The current credentials.
     pub fn current(&self) -> Arc<Credentials> {
         self.current.borrow().clone()
     }
@@ -373,24 +374,24 @@ impl Keyring {
         self.current.send_replace(Arc::new(credentials));
     }
 
-    /// Completes once the principal has other rights than when it was admitted, or none, or its
-    /// token has expired.
+    /// Completes when the principal's rights have changed or been removed, or its token has
+    /// expired.
     pub async fn revoked(&self, principal: &Arc<Principal>) {
         let mut changes = self.current.subscribe();
         let changed = changes.wait_for(|credentials| !credentials.holds(principal));
         let until = principal.signed.as_ref().and_then(|signed| signed.until);
 
         tokio::select! {
-            // An error means that the server is gone.
+            // An error means that the server has stopped.
             _ = changed => {}
             () = passed(until) => {}
         }
     }
 
-    /// Looks from time to time whether the file has changed; never completes. A file that cannot be
-    /// used changes nothing.
+    /// Polls the file for changes; never completes. An invalid file is logged, and the current
+    /// credentials stay in effect.
     pub async fn follow_file(&self) {
-        // A file system that does not answer must hold up nothing but this.
+        // Blocking thread: a hanging file system must not block anything else.
         let read = || {
             let file = self.file.clone();
             tokio::task::spawn_blocking(move || Credentials::read(&file))
@@ -406,13 +407,13 @@ impl Keyring {
                     trouble.clear();
                     if credentials.digest != self.current().digest {
                         self.replace(credentials);
-                        tracing::info!("the credentials were replaced");
+                        tracing::info!("credentials reloaded");
                     }
                 }
-                // Trouble that lasts is logged once.
+                // Log a persistent error once.
                 Err(error) if error.to_string() == trouble => {}
                 Err(error) => {
-                    tracing::error!(%error, "the new credentials cannot be used; those before stay");
+                    tracing::error!(%error, "invalid --auth-file; the previous credentials remain");
                     trouble = error.to_string();
                 }
             }
@@ -421,13 +422,13 @@ impl Keyring {
     }
 }
 
-/// Completes at a time of the system's clock; never if there is none.
+/// Completes at a system time; never if `until` is `None`.
 async fn passed(until: Option<SystemTime>) {
     let Some(until) = until else {
         return std::future::pending().await;
     };
     while let Ok(left) = until.duration_since(SystemTime::now()) {
-        // The clock may be set while this waits.
+        // The clock may be adjusted during the wait, so wake up regularly.
         tokio::time::sleep(left.min(Duration::from_secs(60))).await;
     }
 }
@@ -463,12 +464,12 @@ mod tests {
         assert!(credentials.by_token(b"Secret").is_err());
         assert!(credentials.by_token(b"").is_err());
 
-        // A certificate with the digest of a token is no token.
+        // The digest of a token does not authenticate a certificate.
         let digest = hex::decode(SECRET).unwrap().try_into().unwrap();
         assert!(credentials.by_certificate(&digest).is_none());
     }
 
-    /// Oracle: the promise: what is wrong is refused, and the message has the key.
+    /// Oracle: the contract: an invalid file is rejected, and the message names the key.
     #[test]
     fn a_file_that_is_wrong_names_what_is() {
         let twice = principal("") + &principal("").replace("robot", "other");
@@ -491,8 +492,8 @@ mod tests {
         }
     }
 
-    /// Oracle: the promise: who keeps its rights keeps what it has open; who has others, or none,
-    /// is told so.
+    /// Oracle: the contract: callers with unchanged rights keep their open streams; `revoked`
+    /// completes for callers with changed or removed rights.
     #[tokio::test]
     async fn only_changed_rights_are_revoked() {
         let folder = tempfile::tempdir().unwrap();
@@ -516,7 +517,7 @@ mod tests {
         keyring.revoked(&other_one).await;
     }
 
-    /// Oracle: the clock: what ends when a token ends does not end before.
+    /// Oracle: the clock: streams of a token do not end before the token expires.
     #[tokio::test]
     async fn a_token_holds_until_it_ends() {
         let begun = SystemTime::now();

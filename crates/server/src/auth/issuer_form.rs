@@ -1,10 +1,10 @@
-//! An issuer of tokens, as it stands in the file of credentials.
+//! The `[[issuer]]` section of the auth file.
 
 use serde::Deserialize;
 
 use super::Verb;
 
-/// An issuer as it stands in the file of credentials.
+/// An `[[issuer]]` entry of the auth file.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct IssuerForm {
@@ -17,5 +17,5 @@ pub struct IssuerForm {
     pub requests: Option<usize>,
 }
 
-/// How far the clocks of an issuer and of this server may differ, seconds.
+/// Tolerated clock difference between an issuer and this server, seconds.
 pub const LEEWAY_S: u64 = 60;

@@ -1,20 +1,21 @@
-//! Tokens that others signed (JSON Web Tokens, RFC 7519): whose are taken, and what they may allow.
+//! Tokens signed by external issuers (JSON Web Tokens, RFC 7519): accepted issuers and the rights
+//! they grant.
 //!
 //! ```toml
 //! [[issuer]]
 //! issuer = "https://login.example.org"     # the token's `iss`
 //! audience = "seese3"                      # one of the token's `aud`
-//! public_keys = ["login.pem"]              # PEM files, beside the file of credentials
+//! public_keys = ["login.pem"]              # PEM files, relative to the auth file
 //! verbs = ["navigate", "localize", "track"]
 //! rooms = ["lab-*"]
 //! streams = 4                              # for each subject (`sub`)
 //! requests = 64
 //! ```
 //!
-//! A token never allows more than its issuer's verbs and rooms. It allows less where it has `scope`
-//! (verbs, separated by spaces; other words mean nothing here) or `seese3_rooms` (a list as
-//! `rooms`). It must have `sub` and `exp`. Keys are RSA of 2048 bits and more, P-256, P-384 or
-//! Ed25519.
+//! A token never grants more than its issuer's verbs and rooms. The optional claims `scope` (verbs,
+//! separated by spaces; other words are ignored) and `seese3_rooms` (a list like `rooms`) restrict
+//! it further. The claims `sub` and `exp` are required. Supported keys: RSA of at least 2048 bits,
+//! P-256, P-384 and Ed25519.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -26,18 +27,18 @@ use super::issuer_form::{IssuerForm, LEEWAY_S};
 use super::signed_tokens::{Claims, PublicKey};
 use super::{Places, Principal, Rights, RoomScope, Signed, Verb};
 
-/// The longest name of a subject, characters.
+/// Maximum length of a subject name, characters.
 const LONGEST_SUBJECT: usize = 200;
 
-/// Somebody whose tokens are taken.
+/// An accepted token issuer.
 pub struct Issuer {
     form: IssuerForm,
-    /// The content of the files of its keys.
+    /// Contents of the key files.
     pems: Vec<Vec<u8>>,
     keys: Vec<PublicKey>,
-    /// What every subject may at most.
+    /// Upper bound of every subject's rights.
     rights: Rights,
-    /// What is open of each subject that has anything open.
+    /// Concurrency limits of the subjects that have open requests or streams.
     subjects: Mutex<HashMap<String, Weak<Places>>>,
 }
 
@@ -51,11 +52,11 @@ impl std::fmt::Debug for Issuer {
 }
 
 impl Issuer {
-    /// Reads the keys of an issuer, which are in or below `folder` unless their paths are absolute.
-    /// `rights` is what every subject may at most.
+    /// Reads an issuer's keys; relative paths are relative to `folder`. `rights` is the upper bound
+    /// of every subject's rights.
     ///
     /// # Errors
-    /// In words: the key that is wrong, and how.
+    /// A message that names the invalid setting or key file.
     pub fn new(form: IssuerForm, rights: Rights, folder: &Path) -> Result<Self, String> {
         if form.issuer.is_empty() || form.audience.is_empty() {
             return Err("issuer and audience must not be empty".to_owned());
@@ -84,30 +85,31 @@ impl Issuer {
         })
     }
 
-    /// Whether both are for the same tokens, so that it would be by chance which of them decides.
+    /// Whether both have the same issuer and audience, which would be ambiguous.
     pub fn has_tokens_of(&self, other: &Self) -> bool {
         (&self.form.issuer, &self.form.audience) == (&other.form.issuer, &other.form.audience)
     }
 
-    /// Whether both take the same tokens for the same rights.
+    /// Whether both accept the same tokens with the same rights.
     pub fn is_like(&self, other: &Self) -> bool {
         (&self.form, &self.pems) == (&other.form, &other.pems)
     }
 
-    /// The files of the keys, as they were read.
+    /// Contents of the key files.
     pub fn pems(&self) -> &[Vec<u8>] {
         &self.pems
     }
 
-    /// The principal of a token; none if it is not one of this issuer.
+    /// The principal of a token; `None` if the token is not from this issuer.
     ///
     /// # Errors
-    /// [`Error::Unauthenticated`] if it is, and is not good any more, not yet, or not for us.
+    /// [`Error::Unauthenticated`] if the token is from this issuer but is expired, not valid yet,
+    /// malformed or for another audience.
     pub fn principal_of(self: &Arc<Self>, token: &[u8]) -> Result<Option<Principal>, Error> {
         for key in &self.keys {
             match key.claims(token) {
                 Ok(Some(claims)) => return self.principal(claims).map(Some),
-                // Another key or another issuer may know it.
+                // Another key or issuer may accept it.
                 Ok(None) => {}
                 Err(problem) => return Err(Error::Unauthenticated { problem }),
             }
@@ -155,14 +157,14 @@ impl Issuer {
         })
     }
 
-    /// What a subject has open, over all of its tokens.
+    /// The concurrency limits of a subject, shared by all its tokens.
     fn places(&self, name: &str) -> Arc<Places> {
         let mut subjects = self.subjects.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(known) = subjects.get(name).and_then(Weak::upgrade) {
             return known;
         }
 
-        // Those that have nothing open are forgotten before the map would grow.
+        // Before the map would grow, drop subjects without open requests.
         if subjects.len() == subjects.capacity() {
             subjects.retain(|_, places| places.strong_count() > 0);
         }
@@ -172,15 +174,15 @@ impl Issuer {
     }
 }
 
-/// When a token ends: at `exp`, and later by as much as clocks may differ. None if the system
-/// cannot represent that time.
+/// Expiry of a token: `exp` plus the clock tolerance. `None` if the system cannot represent that
+/// time.
 fn expiry(exp: f64) -> Option<SystemTime> {
     let since_1970 = Duration::try_from_secs_f64(exp + LEEWAY_S as f64).ok()?;
     SystemTime::UNIX_EPOCH.checked_add(since_1970)
 }
 
 impl RoomScope {
-    /// The rooms that are both in this and in a list.
+    /// The intersection of this scope and a list.
     fn and(&self, rooms: Vec<String>) -> Self {
         let mut lists = self.0.clone();
         lists.push(rooms);
@@ -193,7 +195,7 @@ mod tests {
     use super::super::credentials::Credentials;
     use super::*;
 
-    /// Tokens and keys that PyJWT made.
+    /// Folder with tokens and keys made by PyJWT.
     fn golden() -> std::path::PathBuf {
         Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/jwt")
     }
@@ -203,9 +205,9 @@ mod tests {
         serde_json::from_slice(&text).unwrap()
     }
 
-    /// The credentials of a server that takes the tokens of these keys.
+    /// Credentials with an issuer that has these keys.
     fn taking(keys: &[&str]) -> Result<Credentials, String> {
-        // Paths in quotes, as a list of TOML.
+        // Quoted paths, for a TOML list.
         let keys: Vec<String> = keys
             .iter()
             .map(|key| format!("{:?}", golden().join(key)))
@@ -247,14 +249,14 @@ mod tests {
             assert!(error.to_string().contains(word), "{what}: {error}");
         }
 
-        // A key that the issuer has no more takes its tokens with it.
+        // Tokens of a removed key are rejected.
         let fewer = taking(&["rsa.pem"]).unwrap();
         let token = |name: &str| tokens["good"][name].as_str().unwrap().as_bytes();
         assert!(fewer.by_token(token("RS256")).is_ok());
         assert!(fewer.by_token(token("ES256")).is_err());
     }
 
-    /// Oracle: the meaning of the claims: they take away, and never add.
+    /// Oracle: the definition of the claims: they restrict rights and never add any.
     #[test]
     fn a_token_allows_no_more_than_its_issuer() {
         let credentials = taking(&ALL).unwrap();
@@ -266,7 +268,7 @@ mod tests {
 
         let scoped = caller("scope");
         assert!(scoped.may(Verb::Navigate) && !scoped.may(Verb::Track));
-        assert!(!scoped.may(Verb::Write), "the issuer may not say so");
+        assert!(!scoped.may(Verb::Write), "the issuer does not grant it");
         let none = caller("no verb in scope");
         assert!(!none.may(Verb::Navigate) && !none.may(Verb::Track));
 
@@ -274,17 +276,17 @@ mod tests {
         assert!(rooms.rooms().contains("lab-2") && !rooms.rooms().contains("lab-1"));
         assert!(
             !rooms.rooms().contains("kitchen"),
-            "the issuer may not say so"
+            "the issuer does not grant it"
         );
 
-        // Its limits are those of the subject, whatever its token.
+        // Limits apply per subject, over all its tokens.
         let place = rooms.stream_place();
         assert!(place.is_some() && none.stream_place().is_none());
         drop(place);
         assert!(none.stream_place().is_some());
     }
 
-    /// Oracle: signatures: no altered token is good.
+    /// Oracle: the signature: no altered token is accepted.
     #[test]
     fn altered_tokens_are_not_known() {
         let credentials = taking(&ALL).unwrap();
@@ -303,7 +305,7 @@ mod tests {
         }
     }
 
-    /// Oracle: the promise: what is wrong in the file is named.
+    /// Oracle: the contract: the message names the invalid setting.
     #[test]
     fn an_issuer_that_cannot_be_used_is_named() {
         let error = taking(&["tokens.json"]).unwrap_err();

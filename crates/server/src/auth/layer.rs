@@ -1,4 +1,4 @@
-//! The check of every request, before any of it is decoded.
+//! Checks every request before decoding it.
 
 use std::future::Future;
 use std::pin::Pin;
@@ -18,9 +18,9 @@ use super::super::metrics::Metrics;
 use super::super::status::Full;
 use super::{Keyring, Principal, Verb};
 
-/// Which verb an RPC needs, by the beginning of its path.
+/// The verb that an RPC requires, by path prefix; the first match counts.
 const VERBS: [(&str, Need); 9] = [
-    // Probes of containers and load balancers carry no token.
+    // Container and load balancer probes have no token.
     ("/grpc.health.v1.Health/", Need::Nothing),
     ("/grpc.reflection.", Need::Verb(Verb::Catalog)),
     ("/seese3.v1.NavigationService/", Need::Verb(Verb::Navigate)),
@@ -32,32 +32,32 @@ const VERBS: [(&str, Need); 9] = [
     ("/seese3.v1.EvaluationService/", Need::Verb(Verb::Evaluate)),
     ("/seese3.v1.CatalogService/List", Need::Verb(Verb::Catalog)),
     ("/seese3.v1.CatalogService/Get", Need::Verb(Verb::Catalog)),
-    // Everything else in the catalog changes it.
+    // All other catalog RPCs are changes.
     ("/seese3.v1.CatalogService/", Need::Verb(Verb::Write)),
 ];
 
-/// What a caller has to have for an RPC.
+/// The permission that an RPC requires.
 #[derive(Debug, Clone, Copy)]
 enum Need {
     Nothing,
     Verb(Verb),
 }
 
-/// What is held until the answer to a request has ended.
+/// Resources held until the response has ended.
 struct Admitted {
-    /// One of the places of its caller.
+    /// The caller's request permit.
     _place: OwnedSemaphorePermit,
-    /// What the caller of a signed token has open is counted as long as any of its principals
-    /// lives.
+    /// Keeps the limits of a signed token's subject alive: they are dropped with its last
+    /// principal.
     _principal: Arc<Principal>,
 }
 
-/// Wraps a service so that only known callers reach it, if there are credentials.
+/// Middleware that admits only authenticated callers, if there are credentials.
 #[derive(Debug, Clone)]
 pub struct AuthLayer {
-    /// None to let everybody pass.
+    /// The credentials; `None` to admit every caller.
     pub keyring: Option<Arc<Keyring>>,
-    /// Counts what is refused because a caller has as many requests open as it may.
+    /// Counts requests rejected at a caller's concurrency limit.
     pub metrics: Metrics,
 }
 
@@ -72,7 +72,7 @@ impl<S> Layer<S> for AuthLayer {
     }
 }
 
-/// A service that only known callers reach.
+/// A service wrapped by [`AuthLayer`].
 #[derive(Debug, Clone)]
 pub struct Auth<S> {
     inner: S,
@@ -113,7 +113,8 @@ where
 }
 
 impl AuthLayer {
-    /// Checks a request and notes who it is from. None if nobody has to be known.
+    /// Authenticates and authorizes a request, and stores its principal in the request's
+    /// extensions. `None` if the RPC or the server requires no authentication.
     fn admit<B>(&self, request: &mut Request<B>) -> Result<Option<Admitted>, Error> {
         let Some(keyring) = &self.keyring else {
             return Ok(None);
@@ -126,7 +127,7 @@ impl AuthLayer {
         let verb = match need {
             Some((_, Need::Nothing)) => return Ok(None),
             Some((_, Need::Verb(verb))) => Some(*verb),
-            // A path that nobody answers: known callers are told so, others learn nothing.
+            // An unknown path: authenticated callers get "unimplemented", others "unauthenticated".
             None => None,
         };
 
@@ -151,8 +152,8 @@ impl AuthLayer {
     }
 }
 
-/// Who a request is from. A token goes before a certificate: the certificate may be that of a
-/// gateway that many callers share.
+/// The caller of a request. A token takes precedence over a certificate, because the certificate
+/// may belong to a gateway shared by many callers.
 fn caller<B>(keyring: &Keyring, request: &Request<B>) -> Result<Arc<Principal>, Error> {
     let credentials = keyring.current();
 
@@ -169,7 +170,7 @@ fn caller<B>(keyring: &Keyring, request: &Request<B>) -> Result<Arc<Principal>, 
         })
 }
 
-/// The bearer token of a request (RFC 6750, section 2.1), if it has any authorization.
+/// The bearer token of a request (RFC 6750, section 2.1); `None` without an `authorization` header.
 fn bearer(headers: &HeaderMap) -> Result<Option<&[u8]>, Error> {
     let Some(given) = headers.get(header::AUTHORIZATION) else {
         return Ok(None);
@@ -194,8 +195,8 @@ mod tests {
     use super::*;
     use std::convert::Infallible;
 
-    /// Oracle: the limit of the file. A token's calls count until they are answered, also when
-    /// their requests are gone before.
+    /// Oracle: the limit in the auth file. A token's calls count until they are answered, even
+    /// after the request body is dropped.
     #[tokio::test]
     async fn calls_of_one_subject_are_bounded() {
         let golden =
@@ -228,12 +229,12 @@ mod tests {
         let open = [call(), call()];
         let soon = std::time::Duration::from_millis(500);
         let refused = tokio::time::timeout(soon, call()).await;
-        let refused = refused.expect("it is refused at once").unwrap();
+        let refused = refused.expect("the call is rejected immediately").unwrap();
         assert_eq!(refused.headers()["grpc-status"], "8");
 
-        // Once they are given up, there are places again.
+        // Canceled calls free their permits.
         drop(open);
         let answered = tokio::time::timeout(soon, call()).await;
-        assert!(answered.is_err(), "it is admitted, and never answered");
+        assert!(answered.is_err(), "the call is admitted and never answered");
     }
 }

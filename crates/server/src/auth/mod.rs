@@ -1,14 +1,13 @@
-//! Who may call, and what for.
+//! Authentication and authorization.
 //!
-//! A server without credentials answers everybody. Once there are any, a call without one is
-//! refused, and a caller sees only the rooms of its own: for everything else, a room outside of
-//! them does not exist.
+//! Without an auth file, the server accepts every call. With one, a call without valid credentials
+//! is rejected, and a caller sees only its own rooms: other rooms are reported as nonexistent.
 //!
 //! | file | what |
 //! | --- | --- |
-//! | `credentials` | the file that an operator writes |
-//! | `issuers` | tokens that others signed (JWT) |
-//! | `layer` | the check of every request |
+//! | `credentials` | the operator's auth file |
+//! | `issuers` | tokens signed by external issuers (JWT) |
+//! | `layer` | checks every request |
 
 mod credentials;
 mod issuer_form;
@@ -26,7 +25,7 @@ use issuers::Issuer;
 use serde::Deserialize;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-/// What a call is for. Each RPC belongs to one verb.
+/// The permission that an RPC requires; each RPC requires one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Verb {
@@ -34,18 +33,18 @@ pub enum Verb {
     Navigate,
     /// LocalizationService.
     Localize,
-    /// OdometryService: the motion between views, and tracking.
+    /// OdometryService: two-view motion and tracking.
     Track,
     /// EvaluationService.
     Evaluate,
-    /// What CatalogService lists, and reflection.
+    /// Read access to CatalogService, and reflection.
     Catalog,
-    /// What CatalogService changes.
+    /// Write access to CatalogService.
     Write,
 }
 
 impl Verb {
-    /// The name in files and messages.
+    /// Name in auth files and messages.
     pub fn name(self) -> &'static str {
         match self {
             Self::Navigate => "navigate",
@@ -58,13 +57,13 @@ impl Verb {
     }
 }
 
-/// The rooms that a caller may see: those that are in each of these lists. A list has names, and
-/// beginnings of names with a `*` behind them.
+/// The rooms that a caller may access: those that match every list. A list has room names and
+/// prefixes ending in `*`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RoomScope(Vec<Vec<String>>);
 
 impl RoomScope {
-    /// Whether the room may be seen.
+    /// Whether the room may be accessed.
     pub fn contains(&self, room: &str) -> bool {
         let covers = |given: &String| match given.strip_suffix('*') {
             Some(beginning) => room.starts_with(beginning),
@@ -73,26 +72,26 @@ impl RoomScope {
         self.0.iter().all(|list| list.iter().any(covers))
     }
 
-    /// Whether every room may be seen, whatever its name.
+    /// Whether all rooms may be accessed.
     pub fn is_all(&self) -> bool {
         let is_all = |list: &Vec<String>| list.iter().any(|given| given == "*");
         self.0.iter().all(is_all)
     }
 }
 
-/// What a caller may do.
+/// The rights of a caller.
 #[derive(Debug, PartialEq, Eq)]
 struct Rights {
     name: String,
     verbs: Vec<Verb>,
     rooms: RoomScope,
-    /// Track streams at a time.
+    /// Maximum number of concurrent Track streams.
     streams: usize,
-    /// Requests and streams at a time.
+    /// Maximum number of concurrent requests and streams.
     requests: usize,
 }
 
-/// What a caller has open: the places that are left.
+/// Semaphores of a caller's concurrency limits.
 #[derive(Debug)]
 struct Places {
     streams: Arc<Semaphore>,
@@ -108,20 +107,20 @@ impl Places {
     }
 }
 
-/// By whose signature a caller is known.
+/// The issuer and expiry of a caller's signed token.
 #[derive(Debug)]
 struct Signed {
     issuer: Arc<Issuer>,
-    /// When the token ends, if ever.
+    /// Expiry time; `None` if it is too far in the future to represent.
     until: Option<SystemTime>,
 }
 
-/// A caller that is known.
+/// An authenticated caller.
 #[derive(Debug)]
 pub struct Principal {
     rights: Rights,
     places: Arc<Places>,
-    /// None if the file of credentials itself knows the caller.
+    /// `None` if the auth file lists the caller itself.
     signed: Option<Signed>,
 }
 
@@ -134,12 +133,12 @@ impl Principal {
         }
     }
 
-    /// Its name, for the log.
+    /// The caller's name, for the log.
     pub fn name(&self) -> &str {
         &self.rights.name
     }
 
-    /// The rooms that it may see.
+    /// The rooms that it may access.
     pub fn rooms(&self) -> &RoomScope {
         &self.rights.rooms
     }
@@ -148,12 +147,12 @@ impl Principal {
         self.rights.verbs.contains(&verb)
     }
 
-    /// A place for one more Track stream; none if it has as many as it may.
+    /// A permit for one more Track stream; `None` at the limit.
     pub fn stream_place(&self) -> Option<OwnedSemaphorePermit> {
         self.places.streams.clone().try_acquire_owned().ok()
     }
 
-    /// A place for one more request or stream of any kind; none if it has as many as it may.
+    /// A permit for one more request or stream of any kind; `None` at the limit.
     fn request_place(&self) -> Option<OwnedSemaphorePermit> {
         self.places.requests.clone().try_acquire_owned().ok()
     }

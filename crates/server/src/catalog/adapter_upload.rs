@@ -1,4 +1,4 @@
-//! Receiving an adapter.
+//! Adapter uploads.
 
 use std::sync::Arc;
 
@@ -34,13 +34,13 @@ impl Handlers {
         let name = name.map_err(|error| error.within("adapter"))?;
         check_right(caller.as_ref(), &name)?;
 
-        // The manifest says how much is coming, so that no more is ever held than that.
+        // The manifest states the size of the weights, so no more memory is reserved or accepted.
         let size = seese3_store::stated_weights_size(&upload.manifest).map_err(unfit)?;
         let size = usize::try_from(size).unwrap_or(usize::MAX);
         let memory = changes.upload_memory(size)?;
         let weights = weights(&mut messages, size).await?;
 
-        // Loading proves that the weights give their golden outputs on this machine.
+        // Loading verifies that the weights reproduce their golden outputs on this machine.
         let manifest = upload.manifest.clone();
         let checked = tokio::task::spawn_blocking(move || {
             seese3_store::check_adapter_files(&manifest, &weights).map(|_| weights)
@@ -60,7 +60,7 @@ impl Handlers {
         let store = changes.store.clone();
         let published_as = name.name.clone();
         let change = async move {
-            // What was uploaded counts until it is in the store.
+            // Uploaded data counts toward the limit until it is stored.
             let _memory = memory;
             store
                 .publish_adapter_files(&name.name, &upload.manifest, weights)
@@ -80,7 +80,7 @@ impl Handlers {
     }
 }
 
-/// The weights, of which the manifest states the size.
+/// Receives the weights, `size` bytes according to the manifest.
 async fn weights(
     messages: &mut Streaming<pb::PublishAdapterRequest>,
     size: usize,
@@ -110,7 +110,7 @@ async fn weights(
     Ok(weights)
 }
 
-/// What is wrong with an uploaded adapter is the caller's to mend.
+/// A defect of the uploaded files is the caller's error.
 fn unfit(error: seese3_store::Error) -> Error {
     match error {
         seese3_store::Error::Damaged { .. } | seese3_store::Error::Schema { .. } => {

@@ -1,5 +1,5 @@
-//! What every change of the catalog goes through: the caller's rights, the memory of what was
-//! answered, one change at a time, and a look at the store afterwards.
+//! Common steps of all catalog changes: authorization, stored responses for retries, one change at
+//! a time, and a reload of the store afterwards.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -20,19 +20,19 @@ use seese3_client::proto::v1 as pb;
 use seese3_store::fit_stored_room;
 use seese3_store::{Kind, Published, ResourceName, Store};
 
-/// Uploads are counted in pieces of this many bytes.
+/// Unit of upload memory, bytes.
 const PIECE: usize = 1_024;
-/// The largest number of changes that wait for their turn.
+/// Maximum number of queued or running changes.
 const MOST_WAITING: usize = 64;
 
-/// What changes of the catalog share.
+/// State shared by all catalog changes.
 pub struct Changes {
     pub store: Store,
     reload: ReloadHandle,
     recent: Arc<Mutex<Recent>>,
-    /// Changes that may wait for their turn.
+    /// Permits of queued and running changes.
     waiting: Arc<Semaphore>,
-    /// The pieces that uploads may hold in memory together.
+    /// Memory limit of all uploads together, in units of [`PIECE`].
     upload_pieces: usize,
     uploads: Arc<Semaphore>,
     fits: Arc<Semaphore>,
@@ -48,19 +48,19 @@ impl Changes {
             waiting: Arc::new(Semaphore::new(MOST_WAITING)),
             upload_pieces: config.upload_bytes / PIECE,
             uploads: Arc::new(Semaphore::new(config.upload_bytes / PIECE)),
-            // A fit takes all of the processor.
+            // One at a time, because a fit uses all processors.
             fits: Arc::new(Semaphore::new(1)),
             metrics: config.metrics.clone(),
         }
     }
 
-    /// Makes a change, lets the server look at its store, and then makes the answer; unless the
-    /// same change was made already, whose answer is given again. Changes are made one after
-    /// another. One that was admitted is finished even if the caller goes away.
+    /// Makes a change, reloads the store, and then builds the response. A retry of the same change
+    /// returns the stored response instead. Changes run one after another. An admitted change is
+    /// completed even if the caller disconnects.
     ///
     /// # Errors
-    /// Those of the change; [`Error::Invalid`] if the request id belongs to another one,
-    /// [`Error::Full`] if too many changes wait.
+    /// The errors of the change; [`Error::Invalid`] if the request id belongs to a different
+    /// change, [`Error::Full`] if too many changes are queued.
     pub async fn once<T: Send + 'static, A: Message + Default + 'static>(
         self: &Arc<Self>,
         identity: Identity,
@@ -80,7 +80,7 @@ impl Changes {
             async move {
                 let _waiting = waiting;
 
-                // A change waits here for its turn, and holds no thread while it does.
+                // Changes queue here without holding a thread.
                 let mut recent = changes.recent.lock().await;
                 if let Some(answer) = recent.answer(&identity)? {
                     return A::decode(answer).map_err(|_| Error::Internal);
@@ -101,10 +101,10 @@ impl Changes {
         })
     }
 
-    /// The answer to the same change, if it was made already.
+    /// The stored response to the same change, if it was made already.
     ///
     /// # Errors
-    /// [`Error::Invalid`] if the request id belongs to another change.
+    /// [`Error::Invalid`] if the request id is too long or belongs to a different change.
     pub async fn answered<A: Message + Default>(
         &self,
         identity: &Identity,
@@ -115,16 +115,16 @@ impl Changes {
         decoded.map_err(|_| Error::Internal)
     }
 
-    /// Memory for a part of an upload, to be held with it.
+    /// Reserves memory for a part of an upload; it is released when the permit is dropped.
     ///
     /// # Errors
-    /// [`Error::Invalid`] if it can never be held, [`Error::Full`] if the uploads in progress hold
-    /// as much as they may.
+    /// [`Error::Invalid`] if it exceeds the limit of all uploads together, [`Error::Full`] if the
+    /// uploads in progress leave too little.
     pub fn upload_memory(&self, bytes: usize) -> Result<OwnedSemaphorePermit, Error> {
         let pieces = bytes.div_ceil(PIECE);
         if pieces > self.upload_pieces {
             let problem =
-                "is larger than all uploads together may be; the operator sets --max-upload-bytes";
+                "exceeds the memory limit of all uploads; the operator sets --max-upload-bytes";
             return Err(Error::invalid("message", problem));
         }
 
@@ -138,13 +138,13 @@ impl Changes {
         })
     }
 
-    /// The place of a fit.
+    /// The permit for a fit; `None` if one is running.
     pub fn fit_place(&self) -> Option<OwnedSemaphorePermit> {
         self.fits.clone().try_acquire_owned().ok()
     }
 }
 
-/// Runs work on a blocking thread: writing a store mixes files with hashing.
+/// Runs work on a blocking thread, because writing a store mixes file access with hashing.
 pub async fn on_blocking_thread<T: Send + 'static>(
     work: impl Future<Output = T> + Send + 'static,
 ) -> Result<T, Error> {
@@ -159,11 +159,11 @@ pub async fn on_blocking_thread<T: Send + 'static>(
 }
 
 impl Handlers {
-    /// What changes go through.
+    /// The shared state of changes.
     ///
     /// # Errors
-    /// [`Error::Precondition`] if this server takes no changes, [`Error::Loading`] if it is not
-    /// serving: what is changed then would not be served.
+    /// [`Error::Precondition`] if this server is read-only, [`Error::Loading`] if it is not
+    /// serving, since it would not serve the change.
     pub(super) fn changes(&self) -> Result<&Arc<Changes>, Error> {
         if !matches!(&*self.phase.borrow(), Phase::Serving(_)) {
             return Err(Error::Loading);
@@ -171,13 +171,13 @@ impl Handlers {
 
         self.changes.as_ref().ok_or_else(|| {
             Error::Precondition(
-                "this server takes no changes; start it with --writable, or change its store"
+                "this server is read-only; start it with --writable, or change its store directly"
                     .to_owned(),
             )
         })
     }
 
-    /// Whether a room is answered with this revision of an adapter now.
+    /// Whether a room is currently served with this revision of an adapter.
     pub(super) fn serves_in(&self, room: &str, adapter: &pb::Revision) -> bool {
         match &*self.phase.borrow() {
             Phase::Serving(snapshot) | Phase::Draining(snapshot) => {
@@ -192,7 +192,7 @@ impl Handlers {
         }
     }
 
-    /// Whether requests are answered from this revision now.
+    /// Whether this revision is currently served.
     pub(super) fn serves(&self, kind: Kind, published: &pb::Revision) -> bool {
         let is_served = |snapshot: &Snapshot| match kind {
             Kind::Room => snapshot
@@ -212,7 +212,7 @@ impl Handlers {
     }
 }
 
-/// The identity of a change. `method` tells it from others with the same content.
+/// The identity of a change. `method` distinguishes RPCs with equal content.
 pub fn identity(
     caller: Option<&Arc<Principal>>,
     request_id: &str,
@@ -231,10 +231,10 @@ pub fn identity(
     }
 }
 
-/// The room or adapter that a change names.
+/// Parses the resource name of a change.
 ///
 /// # Errors
-/// [`Error::Invalid`] if it is none of this kind.
+/// [`Error::Invalid`] if it is not a name of this kind.
 pub fn named(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error> {
     let resource: ResourceName = text.parse().map_err(|error| Error::invalid(field, error))?;
     if resource.kind != kind {
@@ -245,10 +245,10 @@ pub fn named(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error>
     Ok(resource)
 }
 
-/// The same without a revision.
+/// Like [`named`], without a revision.
 ///
 /// # Errors
-/// [`Error::Invalid`] if it is none of this kind, or a revision.
+/// [`Error::Invalid`] if it is not a name of this kind, or has a revision.
 pub fn named_whole(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error> {
     let resource = named(field, text, kind)?;
     if resource.revision.is_some() {
@@ -258,11 +258,11 @@ pub fn named_whole(field: &str, text: &str, kind: Kind) -> Result<ResourceName, 
     Ok(resource)
 }
 
-/// Refuses a caller who may not change this. Adapters answer in every room, so only those who may
-/// see every room change them.
+/// Checks that the caller may change a resource. Adapters affect all rooms, so changing them
+/// requires access to all rooms.
 ///
 /// # Errors
-/// [`Error::OutOfScope`].
+/// [`Error::OutOfScope`] if not.
 pub fn check_right(caller: Option<&Arc<Principal>>, resource: &ResourceName) -> Result<(), Error> {
     let Some(scope) = caller.map(|caller| caller.rooms()) else {
         return Ok(());
@@ -276,7 +276,7 @@ pub fn check_right(caller: Option<&Arc<Principal>>, resource: &ResourceName) -> 
     }
 }
 
-/// A published revision on the wire.
+/// Converts a published revision to the wire type.
 pub fn revision_to_wire(name: &str, published: &Published) -> pb::Revision {
     pb::Revision {
         name: name.to_owned(),
@@ -306,20 +306,19 @@ impl From<seese3_store::Error> for Error {
             E::InUse { .. } | E::NothingToTakeBack => Self::Precondition(error.to_string()),
             E::Contended { name } => Self::Conflict {
                 name: name.clone(),
-                problem: "others changed it all the time; try again".to_owned(),
+                problem: "was changed concurrently by other writers; retry".to_owned(),
             },
             E::FeatureRows { .. } | E::DuplicateFeatures { .. } => Self::invalid("features", error),
             E::Name { .. } => Self::invalid("name", error),
             E::CannotAdd { .. } => Self::invalid("frames", error),
             E::Absent { .. } => Self::Conflict {
                 name: "the store".to_owned(),
-                problem: "was changed by somebody else meanwhile; try again".to_owned(),
+                problem: "was changed concurrently by another process; retry".to_owned(),
             },
             _ => {
                 tracing::error!(%error, "the store could not be changed");
                 Self::Precondition(
-                    "the store cannot be read or written, or is damaged where this belongs; the \
-                     server's log says why"
+                    "the store cannot be read or written, or is damaged there; see the server's log"
                         .to_owned(),
                 )
             }

@@ -1,4 +1,4 @@
-//! Choosing defaults and removing revisions.
+//! Sets and rolls back defaults, and removes rooms, adapters and revisions.
 
 use std::sync::Arc;
 
@@ -75,7 +75,7 @@ impl Handlers {
         caller: Option<Arc<Principal>>,
         request: pb::RollBackDefaultRequest,
     ) -> Result<pb::RollBackDefaultResponse, Error> {
-        // The last choice may be that of any room.
+        // The last change may concern any room.
         if scope(caller.as_ref()).is_some_and(|scope| !scope.is_all()) {
             return Err(Error::OutOfScope {
                 what: "the defaults of all rooms",
@@ -156,7 +156,7 @@ fn scope(caller: Option<&Arc<Principal>>) -> Option<&RoomScope> {
     caller.map(|caller| caller.rooms())
 }
 
-/// The defaults that a caller may see.
+/// Converts the defaults within the caller's scope to the wire type.
 fn defaults_to_wire(defaults: &Defaults, scope: Option<&RoomScope>) -> Vec<pb::Default> {
     let is_seen = |resource: &ResourceName| match resource.kind {
         Kind::Room => scope.is_none_or(|scope| scope.contains(&resource.name)),

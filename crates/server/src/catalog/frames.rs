@@ -1,4 +1,4 @@
-//! The frames of a room with their poses, and the pose graph that they make.
+//! Lists a room's frames with poses, pose-graph neighbors and thumbnails.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
@@ -16,13 +16,12 @@ use seese3_core::room::{FrameId, Room};
 use seese3_encoder::thumbnail;
 use seese3_robot::planning::PoseGraph;
 
-/// The most neighbours that a frame is given.
+/// Maximum number of neighbors per frame.
 const MOST_NEIGHBOURS: usize = 32;
 
-/// Widths of thumbnails, pixels.
+/// Allowed thumbnail widths, pixels.
 const THUMBNAIL_WIDTHS: RangeInclusive<u32> = 16..=512;
-/// A page ends once its thumbnails have so many bytes, so that it fits into the 4 MiB that clients
-/// of gRPC take if they are told nothing else.
+/// Thumbnail bytes after which a page ends, so that it fits gRPC's default message limit of 4 MiB.
 const THUMBNAILS_OF_A_PAGE: usize = 2 << 20;
 
 impl Handlers {
@@ -33,7 +32,7 @@ impl Handlers {
     ) -> Result<Response<pb::ListFramesResponse>, Status> {
         let with_thumbnails = request.get_ref().thumbnail_width.is_some();
         if with_thumbnails && !self.config.thumbnails {
-            return Err(no_thumbnails("this server shows no images (--thumbnails)").into());
+            return Err(no_thumbnails("this server provides no thumbnails (--thumbnails)").into());
         }
 
         let lane = if with_thumbnails {
@@ -119,8 +118,8 @@ fn answer(
     })
 }
 
-/// The first frame of the page that a token stands for: the token is the room's revision and the frame,
-/// so that pages of two revisions are never put together.
+/// First frame of a page. The token has the room's revision and the frame, so that pages of
+/// different revisions are never mixed.
 fn first_frame(token: &str, revision: u64) -> Result<usize, Error> {
     if token.is_empty() {
         return Ok(0);
@@ -164,12 +163,12 @@ fn picture(room: &Room, frame: FrameId, width: u32) -> Vec<u8> {
     let image = &room.images()[frame.row()];
 
     thumbnail(root, image, width as usize).unwrap_or_else(|error| {
-        // The paths are the operator's affair and stay in the log.
+        // Paths go only to the operator's log.
         tracing::warn!(room = %room.id(), frame = frame.0, %error, "no thumbnail");
         Vec::new()
     })
 }
 
 fn no_thumbnails(problem: &str) -> Error {
-    Error::Precondition(format!("thumbnail_width: {problem}; ask without it"))
+    Error::Precondition(format!("thumbnail_width: {problem}; leave it out"))
 }

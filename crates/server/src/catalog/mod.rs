@@ -1,15 +1,14 @@
-//! CatalogService: lists the rooms and adapters that the server has, page by page, and changes
-//! them.
+//! CatalogService: lists the server's rooms and adapters, in pages, and changes them.
 //!
 //! | file | what |
 //! | --- | --- |
-//! | `changes` | what every change goes through: rights, one at a time, a look at the store afterwards |
-//! | `recent` | answers that are given again when a change is sent again |
-//! | `room_upload` | a room, frame by frame |
-//! | `adapter_upload` | an adapter |
-//! | `frames` | the frames of a room, for those who plan or draw themselves |
-//! | `refits` | an adapter fitted to a room here |
-//! | `defaults` | defaults and removals |
+//! | `changes` | common steps of all changes: authorization, one at a time, reload of the store |
+//! | `recent` | stored responses to recent changes, for idempotent retries |
+//! | `room_upload` | uploads a room, frame by frame |
+//! | `adapter_upload` | uploads an adapter |
+//! | `frames` | lists the frames of a room, for clients that plan or draw |
+//! | `refits` | fits an adapter to a room on the server |
+//! | `defaults` | sets defaults and removes revisions |
 
 mod adapter_upload;
 mod changes;
@@ -39,7 +38,7 @@ use seese3_client::proto::v1::catalog_service_server::CatalogService;
 use seese3_core::geometry::Twist;
 use seese3_store::{RoomSummary, StoredAdapter};
 
-/// Entries of a page if the caller names no size, and the largest size of a page.
+/// Default and maximum number of entries per page.
 const PAGE: usize = 100;
 const LARGEST_PAGE: usize = 1_000;
 
@@ -195,7 +194,7 @@ impl CatalogService for Handlers {
     }
 }
 
-/// The entries of a page that a caller asks for; 0 is the server's choice.
+/// Page length for a requested size; 0 selects the default.
 fn page_length(size: i32) -> Result<usize, Error> {
     match usize::try_from(size) {
         Ok(0) => Ok(PAGE),
@@ -207,8 +206,8 @@ fn page_length(size: i32) -> Result<usize, Error> {
     }
 }
 
-/// One page of the entries in order of name, and the token of the next page: the last name of this
-/// page, or empty if this page is the last.
+/// One page of the entries, sorted by name, and the token of the next page: the last name of this
+/// page, or empty on the last page.
 fn page<'a, T>(
     all: &'a BTreeMap<String, T>,
     size: i32,
@@ -216,8 +215,8 @@ fn page<'a, T>(
 ) -> Result<(Vec<&'a T>, String), Error> {
     let size = page_length(size)?;
 
-    // The token is the last name that the caller has seen. It keeps its meaning when entries are
-    // added or removed, and the server stores nothing between pages.
+    // The token is the last name on the previous page. It stays valid when entries are added or
+    // removed, and the server stores no paging state.
     let after = if token.is_empty() {
         Bound::Unbounded
     } else if seese3_core::room::is_plain_name(token) {
@@ -229,7 +228,7 @@ fn page<'a, T>(
         ));
     };
 
-    // One entry is read beyond the page, only to learn whether another page follows.
+    // Read one more entry to find out whether another page follows.
     let mut rest = all.range::<str, _>((after, Bound::Unbounded));
     let page: Vec<(&String, &T)> = rest.by_ref().take(size).collect();
     let next = match (rest.next(), page.last()) {
@@ -270,7 +269,7 @@ fn room(snapshot: &Snapshot, served: &ServedRoom) -> pb::Room {
     }
 }
 
-/// Rooms and their revisions, of those that the caller may see.
+/// Rooms with their revisions, limited to the caller's scope.
 fn revisions(
     rooms: &[(seese3_core::room::RoomId, u64)],
     scope: Option<&RoomScope>,
@@ -323,7 +322,7 @@ fn adapter(stored: &StoredAdapter, scope: Option<&RoomScope>) -> pb::Adapter {
 mod tests {
     use super::*;
 
-    /// Oracle: walking the pages gives every entry once, in order, whatever the size of a page.
+    /// Oracle: paging through returns every entry once, in order, for any page size.
     #[test]
     fn pages_cover_everything_once() {
         let all: BTreeMap<String, usize> = (0..25).map(|i| (format!("{i:03}"), i)).collect();

@@ -1,25 +1,24 @@
-//! The answers to recent changes, so that a change that is sent again is not made again.
+//! Stored responses to recent changes, so that a retry does not repeat the change.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use super::super::Error;
 
-/// How long an answer is remembered.
+/// Retention time of a response.
 const KEPT_FOR: Duration = Duration::from_secs(3_600);
-/// How many answers are remembered. Beyond it, the caller who has the most loses the oldest:
-/// whoever makes very many changes makes the server forget its own, not those of callers who make
-/// few.
+/// Maximum number of stored responses. Above it, the caller with the most responses loses its
+/// oldest, so that heavy callers cannot evict those of others.
 const KEPT: usize = 1_000;
-/// The longest request id, characters.
+/// Maximum length of a request id, characters.
 const LONGEST_ID: usize = 100;
 
-/// What tells a change from others.
+/// Identity of a change, for idempotent retries.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Identity {
-    /// The caller; empty if the server does not know its callers.
+    /// The caller's name; empty without authentication.
     pub caller: String,
-    /// What the caller calls this change; empty if it will not send it again.
+    /// The caller's idempotency key; empty if it will not retry.
     pub request_id: String,
     /// SHA-256 of the request.
     pub content: [u8; 32],
@@ -31,15 +30,15 @@ struct Remembered {
     at: Instant,
 }
 
-/// The answers, the oldest first.
+/// The stored responses, oldest first.
 #[derive(Default)]
 pub struct Recent(VecDeque<Remembered>);
 
 impl Recent {
-    /// The answer to the same change, if it was made in the last hour.
+    /// The stored response to the same change, if it was made in the last hour.
     ///
     /// # Errors
-    /// [`Error::Invalid`] if the request id is too long, or was given to another change.
+    /// [`Error::Invalid`] if the request id is too long, or was used for a different change.
     pub fn answer(&mut self, identity: &Identity) -> Result<Option<&[u8]>, Error> {
         if identity.request_id.chars().count() > LONGEST_ID {
             let problem = format!("is longer than {LONGEST_ID} characters");
@@ -65,13 +64,13 @@ impl Recent {
             Some(known) if known.identity.content == identity.content => Ok(Some(&known.answer)),
             Some(_) => Err(Error::invalid(
                 "request_id",
-                "was given to another change in the last hour; give each change its own",
+                "was used for another change in the last hour; use a new id for each change",
             )),
             None => Ok(None),
         }
     }
 
-    /// Remembers the answer to a change.
+    /// Stores the response to a change.
     pub fn remember(&mut self, identity: Identity, answer: Vec<u8>) {
         if identity.request_id.is_empty() {
             return;
@@ -86,7 +85,7 @@ impl Recent {
         });
     }
 
-    /// Forgets the oldest answer to the caller who has the most.
+    /// Drops the oldest response of the caller with the most.
     fn forget_one(&mut self) {
         let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
         for known in &self.0 {
@@ -116,8 +115,8 @@ mod tests {
         }
     }
 
-    /// Oracle: the contract itself: the same caller, id and content get the first answer; another
-    /// content is refused; other callers and changes without an id are new.
+    /// Oracle: the contract: the same caller, id and content get the first response; different
+    /// content is rejected; other callers and changes without an id are new.
     #[test]
     fn a_change_that_is_sent_again_has_been_answered() {
         let mut recent = Recent::default();
@@ -131,8 +130,7 @@ mod tests {
         assert!(recent.answer(&identity("a", &"x".repeat(101), 7)).is_err());
     }
 
-    /// Oracle: the bound itself: the caller who changes most loses its oldest answer, and nobody
-    /// else loses one.
+    /// Oracle: the bound: only the caller with the most changes loses responses, its oldest first.
     #[test]
     fn memory_is_bounded() {
         let mut recent = Recent::default();

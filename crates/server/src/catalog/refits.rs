@@ -1,4 +1,4 @@
-//! Fitting an adapter to a room on the server.
+//! Fits an adapter to a room on the server.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -18,13 +18,13 @@ use seese3_robot::fitting::FITTING_EPOCHS;
 use seese3_store::fit_stored_room::{Refit, Request};
 use seese3_store::{Kind, Published};
 
-/// Where the events of a fit go.
+/// Sender of a fit's events.
 pub type Events = mpsc::Sender<Result<pb::RefitRoomResponse, Status>>;
 
-/// The largest seed, so that it means the same here and in other programs.
+/// Maximum seed: 32 bits, portable to other programs.
 const LARGEST_SEED: u64 = u32::MAX as u64;
 
-/// A fit that was admitted.
+/// A validated fit request.
 pub struct Admitted {
     request: Request,
     identity: Identity,
@@ -32,7 +32,7 @@ pub struct Admitted {
 }
 
 impl Handlers {
-    /// Checks a request, without reading the store.
+    /// Validates a request without reading the store.
     ///
     /// # Errors
     /// [`Error::Invalid`], naming the field; [`Error::OutOfScope`] if the caller may not change the
@@ -75,7 +75,7 @@ impl Handlers {
         let sees_all = caller.is_none_or(|caller| caller.rooms().is_all());
         if !sees_all && !fitted_adapter.as_ref().is_none_or(is_of_room) {
             let problem = format!(
-                "must begin with '{}.': other names are not this caller's",
+                "must begin with '{}.' for a caller without access to all rooms",
                 room.name
             );
             return Err(Error::invalid("fitted_adapter", problem));
@@ -96,18 +96,18 @@ impl Handlers {
         })
     }
 
-    /// Fits, publishes and sends the result. A caller who goes away does not stop it.
+    /// Fits, publishes and sends the result. Continues if the caller disconnects.
     pub(super) async fn run_refit(self, admitted: Admitted, events: Events) {
         let result = self.refit(admitted, &events).await;
         if let Err(error) = &result {
-            tracing::warn!(%error, "the fit ended without a result");
+            tracing::warn!(%error, "the fit failed");
         }
 
         let event = result.map(pb::refit_room_response::Event::Result);
         let last = event
             .map(|event| pb::RefitRoomResponse { event: Some(event) })
             .map_err(Status::from);
-        // If this fails, nobody waits for the result any more.
+        // This fails only if the caller has disconnected.
         let _ = events.send(last).await;
     }
 
@@ -122,8 +122,8 @@ impl Handlers {
             return Ok(answer);
         }
 
-        // Held until the adapter is published, so that a request that is sent again meanwhile is
-        // refused and not fitted again.
+        // Held until the adapter is published: a retry meanwhile is rejected instead of starting a
+        // second fit.
         let place = changes.fit_place();
         let place = place.ok_or_else(|| self.workers.full(Full::Fits))?;
 
@@ -142,7 +142,7 @@ impl Handlers {
                     total: FITTING_EPOCHS as u32,
                 };
                 let event = Some(pb::refit_room_response::Event::Progress(progress));
-                // A slow reader misses progress events; waiting for it would hold up the fit.
+                // A slow caller misses progress events; waiting for it would block the fit.
                 let _ = heard.try_send(Ok(pb::RefitRoomResponse { event }));
             });
             fitted.map(|fitted| (refit, fitted))

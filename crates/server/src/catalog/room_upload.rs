@@ -1,4 +1,4 @@
-//! Receiving a room, frame by frame.
+//! Room uploads, frame by frame.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -22,17 +22,18 @@ use seese3_core::room::{Frames, Provenance, Room, RoomId, is_plain_name};
 use seese3_data::pose_check::check_room;
 use seese3_store::{Kind, OtherFeatures, Published, ResourceName};
 
-/// How long an upload may send nothing.
+/// Idle timeout of an upload.
 const SILENCE: Duration = Duration::from_secs(30);
-/// The longest format and licence, characters.
+/// Maximum length of free-text fields, characters.
 const LONGEST_WORDS: usize = 1_000;
 /// A pose on the wire: 16 numbers of 8 bytes.
 const POSE_BYTES: usize = 128;
 
-/// The next message of an upload.
+/// Receives the next message of an upload.
 ///
 /// # Errors
-/// [`Error::Invalid`] if none comes, [`Error::Deadline`] if the caller is silent for too long.
+/// [`Error::Invalid`] if the stream has ended, [`Error::Deadline`] after the idle timeout,
+/// [`Error::Transport`] if the caller disconnected or the message cannot be decoded.
 pub async fn next<M>(messages: &mut Streaming<M>, field: &str) -> Result<M, Error> {
     let message = tokio::time::timeout(SILENCE, messages.message()).await;
     match message.map_err(|_| Error::Deadline)? {
@@ -41,7 +42,7 @@ pub async fn next<M>(messages: &mut Streaming<M>, field: &str) -> Result<M, Erro
             field,
             "is missing: the upload ended before it",
         )),
-        // The caller went away, or sent what cannot be decoded.
+        // The caller disconnected, or the message cannot be decoded.
         Err(status) => Err(Error::Transport {
             code: status.code(),
             problem: status.message().to_owned(),
@@ -49,31 +50,31 @@ pub async fn next<M>(messages: &mut Streaming<M>, field: &str) -> Result<M, Erro
     }
 }
 
-/// Refuses messages behind the last one.
+/// Checks that the stream has ended.
 ///
 /// # Errors
-/// [`Error::Invalid`] if there is one, otherwise as [`next`].
+/// [`Error::Invalid`] if another message follows, otherwise as [`next`].
 pub async fn expect_end<M>(messages: &mut Streaming<M>) -> Result<(), Error> {
     match next(messages, "message").await {
-        // Nothing more is what is wanted here.
+        // `next` reports the end of the stream as `Invalid`.
         Err(Error::Invalid { .. }) => Ok(()),
-        Ok(_) => Err(Error::invalid("message", "comes after the last one")),
+        Ok(_) => Err(Error::invalid("message", "follows the last message")),
         Err(error) => Err(error),
     }
 }
 
-/// A room that is being received.
+/// An upload in progress.
 struct Received {
     name: ResourceName,
     sources: Vec<FeatureSource>,
-    /// The adapter whose encoder makes the features from images.
+    /// The adapter whose encoder computes the features from images.
     encode_for: Option<String>,
     frames: Frames,
-    /// The numbers of each source, row by row.
+    /// The feature values of each source, row by row.
     rows: Vec<Vec<f32>>,
     worst_rotation_deviation: f64,
     digest: Sha256,
-    /// What arrived beside the bytes that the caller's checksum covers.
+    /// Hash of the columns that the caller's checksum does not cover.
     other_columns: Sha256,
     memory: Vec<OwnedSemaphorePermit>,
 }
@@ -95,7 +96,7 @@ impl Handlers {
         };
         let mut received = begun(&upload, caller.as_ref(), &snapshot)?;
         if upload.extend {
-            // The room is joined to the added frames in memory.
+            // The existing room and the added frames are joined in memory.
             let known = changes
                 .store
                 .newest_room_summary(&received.name.name)
@@ -138,7 +139,7 @@ impl Handlers {
 
         let extend = upload.extend;
         let change = async move {
-            // What was uploaded counts until it is in the store.
+            // Uploaded data counts toward the limit until it is stored.
             let _memory = memory;
             let published = if extend {
                 store.extend_room(&room, &features, others).await
@@ -159,7 +160,7 @@ impl Handlers {
         changes.once(identity, change, answer).await
     }
 
-    /// Receives the frames of an upload up to the message that ends it.
+    /// Receives the frames of an upload, up to its end message.
     async fn receive_frames(
         &self,
         received: &mut Received,
@@ -256,7 +257,7 @@ impl Handlers {
         received.take_columns(before, n, timestamps_ns, frame_names, sequences)
     }
 
-    /// The features of images, one after another, each on a thread of the images' lane.
+    /// Computes the features of images, one after another, on the image worker lane.
     async fn encoded(
         &self,
         snapshot: &Arc<Snapshot>,
@@ -278,7 +279,7 @@ impl Handlers {
     }
 }
 
-/// Checks what is going to be uploaded.
+/// Checks the first message of an upload.
 fn begun(
     upload: &pb::RoomUpload,
     caller: Option<&Arc<Principal>>,
@@ -331,7 +332,7 @@ fn begun(
     })
 }
 
-/// Checks what only an extension of a room may or may not state.
+/// Checks the fields whose validity depends on `extend`.
 fn check_extension(upload: &pb::RoomUpload) -> Result<(), Error> {
     if !upload.extend {
         return match upload.drop_other_features {
@@ -397,7 +398,7 @@ fn source(given: &pb::FeatureSource) -> Result<FeatureSource, Error> {
 }
 
 impl Received {
-    /// What is kept of a batch, bytes: of images only their features.
+    /// Memory kept for a batch, bytes; images are replaced by their features.
     fn kept_bytes(&self, batch: &pb::FrameBatch) -> usize {
         let images: usize = batch.images.iter().map(Vec::len).sum();
         let encoded = match self.encode_for {
@@ -439,7 +440,7 @@ impl Received {
         Ok(())
     }
 
-    /// Adds the columns that a recording need not have. `before` frames were received before these.
+    /// Adds the optional columns. `before` is the number of frames received earlier.
     fn take_columns(
         &mut self,
         before: usize,
@@ -457,12 +458,12 @@ impl Received {
             ("frame_names", frame_names.len(), self.frames.names.len()),
             ("sequences", sequences.len(), self.frames.sequences.len()),
         ] {
-            // A column is there for all frames or for none.
+            // A column has entries for all frames or for none.
             let is_for_all = given == n && known == before;
             let is_for_none = given == 0 && known == 0;
             if !is_for_all && !is_for_none {
                 let problem =
-                    format!("has {given} entries for {n} frames; all batches have them or none");
+                    format!("has {given} entries for {n} frames; all batches need them, or none");
                 return Err(Error::invalid(field, problem));
             }
         }
@@ -495,7 +496,8 @@ fn check_count(field: &str, given: usize, expected: usize) -> Result<(), Error> 
     ))
 }
 
-/// The room and its features, after everything was received.
+/// Builds the room and its features from a complete upload, after checking frame count and
+/// checksum.
 fn finished(
     received: Received,
     upload: &pb::RoomUpload,
@@ -503,11 +505,11 @@ fn finished(
 ) -> Result<(Room, Vec<Features>), Error> {
     let frame_count = received.frames.poses.len();
     if frame_count != end.frame_count as usize {
-        let problem = format!("says {}, but {frame_count} frames arrived", end.frame_count);
+        let problem = format!("is {}, but {frame_count} frames arrived", end.frame_count);
         return Err(Error::invalid("end.frame_count", problem));
     }
     if received.digest.finalize().as_slice() != end.sha256 {
-        let problem = "is not that of the bytes that arrived: poses, features and images of each \
+        let problem = "does not match the received bytes: poses, features and images of each \
                        batch, in this order";
         return Err(Error::invalid("end.sha256", problem));
     }

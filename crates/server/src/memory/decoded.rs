@@ -1,6 +1,6 @@
-//! How large a message becomes when it is decoded, computed from its bytes and the descriptors of
-//! the protocol without decoding it. Two bytes on the wire can become hundreds: an empty message in
-//! a list is a tag and a zero, and a whole struct in memory.
+//! Upper bound of a message's decoded size, computed from its bytes and the protocol descriptors
+//! without decoding it. Two bytes on the wire can become hundreds: an empty message in a list is a
+//! tag and a zero on the wire, and a whole struct in memory.
 
 use std::collections::HashMap;
 use std::sync::LazyLock;
@@ -10,40 +10,41 @@ use prost_types::field_descriptor_proto::{Label, Type};
 use prost_types::{DescriptorProto, FieldDescriptorProto, FileDescriptorSet};
 use seese3_client::proto::FILE_DESCRIPTOR_SET;
 
-/// A list has up to twice the room that its elements take, and is moved when it grows.
+/// Growth factor of a list: capacity up to twice its length, and the old buffer during
+/// reallocation.
 const GROWTH: usize = 3;
-/// A string, a list or bytes: address, length and room.
+/// Size of a string, list or bytes header: pointer, length and capacity, bytes.
 const LIST: usize = 24;
-/// A number that may be absent.
+/// Size of an optional number, bytes.
 const NUMBER: usize = 16;
-/// What may be absent: the word that says so.
+/// Size of an optional message's discriminant, bytes.
 const MARK: usize = 8;
 
-/// The messages of the protocol by their full names.
+/// Protocol messages by full name.
 static MESSAGES: LazyLock<HashMap<String, Shape>> = LazyLock::new(shapes);
-/// What requests consist of, by the path of the RPC.
+/// Request types by RPC path.
 static REQUESTS: LazyLock<HashMap<String, Request>> = LazyLock::new(requests);
-/// The end of the path of reflection, which has no descriptors here.
+/// Path suffix of server reflection, which has no descriptors here.
 const REFLECTION: &str = "/ServerReflectionInfo";
 
-/// The path of a check of health, which has no descriptors here.
+/// Path of health checks, which have no descriptors here.
 const HEALTH_CHECK: &str = "/grpc.health.v1.Health/Check";
 
-/// What a request consists of.
+/// The request type of an RPC.
 #[derive(Debug)]
 struct Request {
-    /// The full name of its messages.
+    /// Full name of the request message.
     message: String,
-    /// Whether it has several.
+    /// Whether the request is a stream.
     is_stream: bool,
-    /// Whether its answer has several.
+    /// Whether the response is a stream.
     is_answered_by_stream: bool,
 }
 
-/// What decoding needs to know of a message.
+/// Memory layout of a message.
 #[derive(Debug, Default)]
 struct Shape {
-    /// The size of the struct, with the messages in it that are no lists, bytes.
+    /// Size of the struct including its singular messages, bytes.
     size: usize,
     fields: HashMap<u64, Field>,
 }
@@ -51,7 +52,7 @@ struct Shape {
 #[derive(Debug, Clone)]
 struct Field {
     is_list: bool,
-    /// What the field holds, where its length is on the wire.
+    /// Content of a length-delimited field.
     content: Content,
 }
 
@@ -59,14 +60,15 @@ struct Field {
 enum Content {
     /// Text or bytes.
     Bytes,
-    /// Numbers that may be packed; how many bytes one byte on the wire becomes at most.
+    /// Numbers, possibly packed; `growth` is the maximum number of decoded bytes per byte on the
+    /// wire.
     Numbers { growth: usize },
-    /// A message, by its full name.
+    /// A message, by full name.
     Message(String),
 }
 
-/// An upper bound of the memory that the request of an RPC takes when it is decoded, bytes. For an
-/// RPC that is not ours it is the size of the message.
+/// Upper bound of a message's decoded size for an RPC, bytes. For an unknown RPC it is the size of
+/// the message.
 pub fn decoded_size(path: &str, message: &[u8]) -> usize {
     match REQUESTS.get(path) {
         Some(Request { message: name, .. }) => {
@@ -77,7 +79,7 @@ pub fn decoded_size(path: &str, message: &[u8]) -> usize {
     }
 }
 
-/// Whether the request of an RPC is a stream of messages.
+/// Whether the request of an RPC is a stream.
 pub fn is_stream(path: &str) -> bool {
     match REQUESTS.get(path) {
         Some(request) => request.is_stream,
@@ -85,7 +87,7 @@ pub fn is_stream(path: &str) -> bool {
     }
 }
 
-/// Whether the response is one message.
+/// Whether the response of an RPC is one message.
 pub fn has_unary_response(path: &str) -> bool {
     match REQUESTS.get(path) {
         Some(request) => !request.is_answered_by_stream,
@@ -93,19 +95,19 @@ pub fn has_unary_response(path: &str) -> bool {
     }
 }
 
-/// The memory that lists, texts and the messages in lists take.
+/// Heap memory of a message: lists, strings, bytes and the messages in lists.
 fn content_size(name: &str, mut bytes: &[u8]) -> usize {
     let Some(shape) = MESSAGES.get(name) else {
         return bytes.len();
     };
     let mut size = 0_usize;
 
-    // What ends here early is refused by the decoder, at the same place.
+    // Where this loop ends early, the decoder rejects the message.
     while let Some((tag, value)) = next_field(&mut bytes) {
         let known = shape.fields.get(&tag);
         let (field, value) = match (known, value) {
-            // The protocol has no groups, and the decoder would pass over one. What is behind it
-            // must not be missed.
+            // The protocol has no groups. The decoder skips them and reads the fields behind, so
+            // assume the maximum.
             (_, Value::Group) => return usize::MAX,
             (None, _) => continue,
             (Some(field), Value::Number) => {
@@ -137,12 +139,12 @@ fn content_size(name: &str, mut bytes: &[u8]) -> usize {
 
 enum Value<'a> {
     Number,
-    /// A form of messages that is no longer in use, and without a length.
+    /// Deprecated encoding of messages, without a length.
     Group,
     Bytes(&'a [u8]),
 }
 
-/// The next field: its number and its value. None at the end, and where the bytes are no message.
+/// The next field's number and value. `None` at the end or if the bytes are malformed.
 fn next_field<'a>(bytes: &mut &'a [u8]) -> Option<(u64, Value<'a>)> {
     let key = varint(bytes)?;
     let skip = |bytes: &mut &'a [u8], count: usize| -> Option<&'a [u8]> {
@@ -179,8 +181,8 @@ fn varint(bytes: &mut &[u8]) -> Option<u64> {
 }
 
 fn descriptors() -> FileDescriptorSet {
-    // These are the bytes that the build wrote; were they wrong, nothing would be known of any
-    // message, and each would count as its bytes.
+    // Generated by the build. If they were invalid, every message would count with its encoded
+    // size.
     FileDescriptorSet::decode(FILE_DESCRIPTOR_SET).unwrap_or_default()
 }
 
@@ -233,7 +235,7 @@ fn field_shape(field: &FieldDescriptorProto) -> Field {
             Content::Message(field.type_name().trim_start_matches('.').to_owned())
         }
         Type::String | Type::Bytes => Content::Bytes,
-        // A number of one byte on the wire, and of eight in memory.
+        // One byte on the wire, eight in memory.
         Type::Int64 | Type::Uint64 | Type::Sint64 => Content::Numbers { growth: 8 },
         Type::Int32 | Type::Uint32 | Type::Sint32 | Type::Enum => Content::Numbers { growth: 4 },
         _ => Content::Numbers { growth: 1 },
@@ -245,7 +247,7 @@ fn field_shape(field: &FieldDescriptorProto) -> Field {
     }
 }
 
-/// The size of a message's struct. Messages hold one another directly and never themselves.
+/// Size of a message's struct, bytes. Messages contain each other inline, never recursively.
 fn struct_size(
     message: &DescriptorProto,
     messages: &HashMap<String, DescriptorProto>,
@@ -273,7 +275,7 @@ mod tests {
     const NAVIGATE: &str = "/seese3.v1.NavigationService/Navigate";
     const BATCH: &str = "/seese3.v1.NavigationService/BatchNavigate";
 
-    /// Oracle: the sizes of the structs in this build. A struct is no larger than computed.
+    /// Oracle: the struct sizes in this build, which must not exceed the computed ones.
     #[test]
     fn structs_are_no_larger_than_computed() {
         for (name, size) in [
@@ -303,7 +305,7 @@ mod tests {
         assert_eq!(message.len(), 2_000);
         assert!(decoded_size(BATCH, &message) >= 1_000 * size_of::<pb::NavigateRequest>());
 
-        // Packed numbers of one byte become eight.
+        // 1,000 packed floats: 4 bytes each on the wire, times the list growth.
         let feature = pb::Feature {
             values: vec![1.0; 1_000],
             source_name: String::new(),
@@ -343,7 +345,7 @@ mod tests {
         assert!(!has_unary_response("/grpc.health.v1.Health/Watch"));
     }
 
-    /// Oracle: nothing that a caller can send may stop the computation.
+    /// Oracle: the contract: no input stops the computation.
     #[test]
     fn bytes_that_are_no_message_are_passed_over() {
         let twist = pb::Twist::default().encode_to_vec();
@@ -358,14 +360,13 @@ mod tests {
         assert_eq!(decoded_size("/other/Service", &[1, 2, 3]), 3);
     }
 
-    /// Oracle: the decoder: it passes over a group of an unknown field, and reads what is behind
-    /// it.
+    /// Oracle: the decoder: it skips a group of an unknown field and reads the fields behind it.
     #[test]
     fn nothing_hides_behind_a_group() {
         let batch = pb::BatchNavigateRequest {
             requests: vec![pb::NavigateRequest::default(); 1_000],
         };
-        // The beginning and the end of a group of field 99.
+        // Start and end of a group of field 99.
         let hidden = [&[0x9b, 0x06, 0x9c, 0x06], &batch.encode_to_vec()[..]].concat();
         let decoded = pb::BatchNavigateRequest::decode(hidden.as_slice()).unwrap();
         assert_eq!(decoded.requests.len(), 1_000);

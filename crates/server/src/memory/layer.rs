@@ -1,4 +1,4 @@
-//! Receives requests, as far as there is memory for them.
+//! Middleware that receives requests within the memory limit.
 
 use std::future::Future;
 use std::pin::Pin;
@@ -20,27 +20,27 @@ use super::decoded::{decoded_size, has_unary_response, is_stream};
 use super::response::{ResponseTimeout, in_pieces};
 use super::{MEMORY_LEASE, Memory, MemoryLease};
 
-/// The paths of the health service. Those who watch stay, and have memory of their own: else many
-/// of them would hold that of those who check, or of requests.
+/// Paths of the health service. Watch streams are long-lived, so they have a separate memory
+/// budget; otherwise they could block health checks or requests.
 const CHECK: &str = "/grpc.health.v1.Health/Check";
 const WATCH: &str = "/grpc.health.v1.Health/Watch";
-/// What stands before a message: whether it is compressed, and its length.
+/// Length of the gRPC message prefix: compression flag and message length.
 const PREFIX: usize = 5;
 
-/// Wraps a service so that its requests hold no more memory than they may.
+/// Middleware that bounds the memory held by requests.
 #[derive(Debug, Clone)]
 pub struct MemoryLayer {
-    /// The memory of all requests but those of health.
+    /// Budget of all requests except health requests.
     pub memory: Memory,
-    /// The memory of health checks, which are answered when the other memory is full.
+    /// Budget of health checks, which are answered even when the request budget is exhausted.
     pub probes: Memory,
-    /// The memory of those who watch health.
+    /// Budget of health watch streams.
     pub watchers: Memory,
-    /// The largest message, bytes.
+    /// Maximum message size, bytes.
     pub message_bytes: usize,
-    /// How long a request with one message may take to arrive.
+    /// Receive timeout of a request with one message.
     pub receive_within: Duration,
-    /// How long a caller may receive nothing of a unary response.
+    /// Timeout of a unary response that the caller does not receive.
     pub response_timeout: Duration,
 }
 
@@ -55,7 +55,7 @@ impl<S> Layer<S> for MemoryLayer {
     }
 }
 
-/// A service whose requests hold no more memory than they may.
+/// A service wrapped by [`MemoryLayer`].
 #[derive(Debug, Clone)]
 pub struct Bounded<S> {
     inner: S,
@@ -76,7 +76,7 @@ where
     }
 
     fn call(&mut self, request: Request<Body>) -> Self::Future {
-        // The service that was found ready is the one to call.
+        // Call the instance that `poll_ready` was called on.
         let waiting = self.inner.clone();
         let mut inner = std::mem::replace(&mut self.inner, waiting);
         let layer = self.layer.clone();
@@ -101,7 +101,8 @@ where
 }
 
 impl MemoryLayer {
-    /// Receives a request as far as it has to be before a handler sees it.
+    /// Receives a request for its handler: completely if it has one message, otherwise as a stream
+    /// whose messages are counted.
     async fn received(
         &self,
         request: Request<Body>,
@@ -135,8 +136,8 @@ impl MemoryLayer {
         Ok((held, Request::from_parts(head, body)))
     }
 
-    /// The bytes of the one message that a body has to consist of, without its prefix. A message
-    /// that is too long is passed on: the decoder refuses it by its prefix.
+    /// The single message of a body, without its prefix. An oversized message is passed on, because
+    /// the decoder rejects it by its prefix.
     fn one_message<'a>(&self, body: &'a [u8]) -> Result<&'a [u8], Error> {
         let Some((prefix, message)) = body.split_first_chunk::<PREFIX>() else {
             return Ok(&[]);
@@ -144,7 +145,7 @@ impl MemoryLayer {
         let [_, length @ ..] = *prefix;
         let length = u32::from_be_bytes(length) as usize;
 
-        // The decoder would read every further message before it refuses them.
+        // The decoder would read all further messages before rejecting them.
         if length <= self.message_bytes && length != message.len() {
             let problem = format!("has {} bytes where its prefix says {length}", message.len());
             return Err(Error::invalid("request", problem));
@@ -152,7 +153,7 @@ impl MemoryLayer {
         Ok(message)
     }
 
-    /// All bytes of a request.
+    /// Receives all bytes of a request.
     async fn whole(&self, mut body: Body, held: &MemoryLease) -> Result<Bytes, Error> {
         let mut whole = BytesMut::new();
         while let Some(frame) = body.frame().await {
@@ -164,7 +165,7 @@ impl MemoryLayer {
                 continue;
             };
 
-            // The decoder refuses a message that is too long by its prefix: no more is read of it.
+            // The decoder rejects an oversized message by its prefix, so stop reading.
             held.hold(data.len())?;
             whole.extend_from_slice(&data);
             if whole.len() > self.message_bytes + PREFIX {
@@ -176,7 +177,7 @@ impl MemoryLayer {
     }
 }
 
-/// The body of a request that is a stream. What counts is the largest message so far: the handler
+/// The body of a streaming request. Only the largest message so far counts, because the handler
 /// keeps one at a time.
 struct CountedBody {
     body: Body,
@@ -184,19 +185,19 @@ struct CountedBody {
     held: MemoryLease,
 }
 
-/// Finds the messages in the bytes of a stream.
+/// Finds message boundaries in the bytes of a stream.
 #[derive(Debug, Default)]
 struct Messages {
     /// The path of the RPC.
     path: String,
-    /// What has arrived of the prefix of the current message.
+    /// Received bytes of the current message's prefix.
     prefix: Vec<u8>,
-    /// How much of the current message is still to come, after its prefix.
+    /// Missing bytes of the current message, without its prefix.
     missing: usize,
-    /// What has arrived of the current message, after its prefix.
+    /// Received bytes of the current message, without its prefix.
     current: Vec<u8>,
-    /// The most that any message took: what had arrived of it, here and in the decoder, and what it
-    /// becomes when it is decoded.
+    /// Peak memory of any message so far, bytes: the received bytes, held here and in the decoder,
+    /// plus the decoded size.
     largest: usize,
 }
 
@@ -208,7 +209,7 @@ impl Messages {
         }
     }
 
-    /// Takes what arrived.
+    /// Processes received bytes.
     fn take(&mut self, mut bytes: &[u8]) {
         while !bytes.is_empty() {
             let wanted = match PREFIX - self.prefix.len() {
@@ -255,7 +256,7 @@ impl http_body::Body for CountedBody {
             return polled;
         };
 
-        // The decoder refuses a message that is too long as soon as its prefix has arrived.
+        // The decoder rejects an oversized message as soon as its prefix has arrived.
         if let Some(data) = frame.data_ref() {
             let before = self.messages.largest;
             self.messages.take(data);
@@ -288,7 +289,7 @@ mod tests {
         bytes
     }
 
-    /// Oracle: the lengths of the messages, however the stream is cut.
+    /// Oracle: the message lengths, for any chunking of the stream.
     #[test]
     fn a_stream_counts_for_its_largest_message() {
         let stream: Vec<u8> = [30, 0, 100, 7, 100, 99]
@@ -299,17 +300,18 @@ mod tests {
         for step in [1, 2, 5, 6, 64, stream.len()] {
             let mut messages = Messages::default();
             stream.chunks(step).for_each(|part| messages.take(part));
-            // Twice as it arrives, and once as it is decoded: an unknown RPC's as its bytes.
+            // Two copies of the received bytes and one decoded. The decoded size for an unknown RPC
+            // is the message size.
             let expected = 2 * (PREFIX + 100) + 100;
             assert_eq!(messages.largest, expected, "in parts of {step}");
         }
 
-        // A length that is only announced counts for nothing.
+        // An announced length does not count.
         let mut messages = Messages::default();
         messages.take(&[0, 0xff, 0xff, 0xff, 0xff, 1, 2]);
         assert_eq!(messages.largest, 14);
 
-        // What grows when it is decoded counts as grown, as soon as it is complete.
+        // A complete message counts with its decoded size.
         let config = pb::TrackConfig {
             rooms: vec![String::new(); 1_000],
             ..pb::TrackConfig::default()

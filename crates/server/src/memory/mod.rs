@@ -1,10 +1,10 @@
-//! A bound in bytes on what requests hold in memory: what has arrived of them, what it becomes when
-//! it is decoded, and answers that were not sent yet.
+//! Memory limit for requests, in bytes: received data, its decoded form, and responses not sent
+//! yet.
 //!
-//! A request with one message is received as a whole, within a time limit, before a handler sees
-//! it: a caller that sends slowly costs no more than the bytes that it has sent. How large the
-//! message becomes is computed before it is decoded, see [`decoded`]. Of a stream of messages, the
-//! largest one so far is counted, since a handler keeps one at a time.
+//! A request with one message is received completely, within a time limit, before its handler runs:
+//! a slow caller costs only the bytes it has sent. The decoded size is computed before decoding,
+//! see [`decoded`]. For a stream, the largest message so far counts, because a handler keeps one at
+//! a time.
 
 mod decoded;
 mod layer;
@@ -22,15 +22,15 @@ use super::Error;
 use super::metrics::Metrics;
 use super::status::Full;
 
-/// What every request is counted for at least: its headers, its task and its buffers.
+/// Minimum size of a request, bytes: its headers, task and buffers.
 const LEAST: usize = 16 << 10;
 
 tokio::task_local! {
-    /// What the request that is being answered holds.
+    /// The memory lease of the current request.
     static MEMORY_LEASE: MemoryLease;
 }
 
-/// The bytes that all requests hold together, and how many they may.
+/// A shared memory budget: bytes held by all requests, and their limit.
 #[derive(Debug, Clone)]
 pub struct Memory(Arc<Counter>);
 
@@ -38,12 +38,12 @@ pub struct Memory(Arc<Counter>);
 struct Counter {
     held: AtomicUsize,
     most: usize,
-    /// Counts what is refused.
+    /// Counts rejected requests.
     metrics: Metrics,
 }
 
 impl Memory {
-    /// Memory of which at most `most` bytes are held.
+    /// A budget of `most` bytes.
     pub fn new(most: usize, metrics: Metrics) -> Self {
         Self(Arc::new(Counter {
             held: AtomicUsize::new(0),
@@ -52,24 +52,24 @@ impl Memory {
         }))
     }
 
-    /// The refusal of a request for which there is no memory, which is counted.
+    /// Counts a rejection and returns its error.
     fn full(&self) -> Error {
         self.0.metrics.shed(Full::Memory);
         Error::Full { what: Full::Memory }
     }
 
-    /// The bytes that are held now.
+    /// Bytes currently held.
     pub fn held(&self) -> usize {
         self.0.held.load(Ordering::Relaxed)
     }
 
-    /// The largest size of one decoded request, bytes: a quarter of all, so that none is
-    /// everything.
+    /// Maximum decoded size of one request, bytes: a quarter of the budget, so that no single
+    /// request exhausts it.
     fn largest_request(&self) -> usize {
         self.0.most / 4
     }
 
-    /// What a new request holds.
+    /// Creates the lease of a new request.
     ///
     /// # Errors
     /// [`Error::Full`] if there is no memory for it.
@@ -83,7 +83,7 @@ impl Memory {
     }
 }
 
-/// What one request holds. It is free again when the last clone is dropped.
+/// The memory held by one request, released when the last clone is dropped.
 #[derive(Debug, Clone)]
 struct MemoryLease(Arc<Share>);
 
@@ -94,10 +94,10 @@ struct Share {
 }
 
 impl MemoryLease {
-    /// Holds more bytes.
+    /// Reserves more bytes.
     ///
     /// # Errors
-    /// [`Error::Full`] if there is no memory for them; then nothing changes.
+    /// [`Error::Full`] if the budget is exhausted; nothing is reserved then.
     fn hold(&self, bytes: usize) -> Result<(), Error> {
         let Share { memory, bytes: own } = &*self.0;
         let Counter { held, most, .. } = &*memory.0;
@@ -109,14 +109,14 @@ impl MemoryLease {
         Ok(())
     }
 
-    /// Holds what a message takes when it is decoded, bytes, of which some are held already.
+    /// Reserves the decoded size of a message, bytes, less `held_already`.
     ///
     /// # Errors
-    /// [`Error::Invalid`] if it takes more than one request may, [`Error::Full`] if there is no memory
-    /// for it now.
+    /// [`Error::Invalid`] if it exceeds the limit of one request, [`Error::Full`] if the budget is
+    /// exhausted.
     fn hold_message(&self, bytes: usize, held_already: usize) -> Result<(), Error> {
         if bytes > self.0.memory.largest_request() {
-            let problem = "takes more memory when it is decoded than one request may; send less";
+            let problem = "exceeds the memory limit of one request when decoded; send less";
             return Err(Error::invalid("request", problem));
         }
         self.hold(bytes.saturating_sub(held_already))
@@ -130,15 +130,15 @@ impl Drop for Share {
     }
 }
 
-/// The response with this answer, which counts as memory of the request until it is sent.
+/// Wraps a response message, which counts as memory of the request until it is sent.
 ///
 /// # Errors
 /// RESOURCE_EXHAUSTED if there is no memory for it.
 pub fn respond<A: Message>(answer: A) -> Result<Response<A>, Status> {
-    // In memory an answer is at most about twice as large as encoded, and it is both at once.
+    // A response takes up to about twice its encoded size, and exists in both forms at once.
     let bytes = 3 * answer.encoded_len();
 
-    // Outside of a request, as in a unit test, nothing is counted.
+    // Outside of a request, as in unit tests, nothing is counted.
     MEMORY_LEASE
         .try_with(|held| held.hold(bytes))
         .unwrap_or(Ok(()))?;
@@ -149,7 +149,7 @@ pub fn respond<A: Message>(answer: A) -> Result<Response<A>, Status> {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand: a message counts as a whole, in however many parts it arrives.
+    /// Oracle: by hand: a message counts with its total size, in however many parts it arrives.
     #[test]
     fn a_message_is_no_larger_than_a_quarter_of_all() {
         let memory = Memory::new(40 * LEAST, Metrics::default());

@@ -1,8 +1,8 @@
-//! Responses on their way to callers that may not receive them.
+//! Sending responses to slow callers.
 //!
-//! HTTP/2 sends as much as the caller has room for, and waits for ever with the rest. What the
-//! transport has taken over is not counted any more, and it takes a frame of data as a whole as
-//! soon as there is room for one byte of it: so frames are short here.
+//! HTTP/2 sends only what fits the caller's flow-control window and waits indefinitely with the
+//! rest. Data that the transport has accepted is no longer counted, and it accepts a whole data
+//! frame as soon as one byte fits. Frames are therefore kept short.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -18,19 +18,19 @@ use tonic::body::Body;
 
 use super::super::connections::Peer;
 
-/// The longest frame of data, bytes; as long as the longest frame of HTTP/2 is by default.
+/// Maximum data frame size, bytes; HTTP/2's default.
 const PIECE: usize = 16 << 10;
 
-/// The time limit of a response: a caller that receives nothing of it for so long loses its
-/// connection, since what is on its way cannot be taken back otherwise.
+/// Progress timeout of a response. A caller that receives nothing for that time loses its
+/// connection, because data in flight cannot be withdrawn otherwise.
 pub struct ResponseTimeout {
-    /// Notified whenever the transport takes a piece.
+    /// Notified whenever the transport polls for a piece.
     taken: Arc<Notify>,
     waiting: JoinHandle<()>,
 }
 
 impl ResponseTimeout {
-    /// A limit that begins now.
+    /// Starts the timeout.
     pub fn new(peer: Peer, limit: Duration) -> Self {
         let taken = Arc::new(Notify::new());
         let progress = taken.clone();
@@ -41,7 +41,7 @@ impl ResponseTimeout {
             {}
             if peer.close() {
                 let address = peer.address;
-                tracing::warn!(%address, "a response was not received: its connection is closed");
+                tracing::warn!(%address, "response timeout: connection closed");
             }
         });
 
@@ -55,7 +55,7 @@ impl Drop for ResponseTimeout {
     }
 }
 
-/// The same body in short pieces.
+/// Splits a body into short data frames.
 pub fn in_pieces(body: Body, timeout: Option<ResponseTimeout>) -> Body {
     Body::new(Pieces {
         body,
@@ -66,7 +66,7 @@ pub fn in_pieces(body: Body, timeout: Option<ResponseTimeout>) -> Body {
 
 struct Pieces {
     body: Body,
-    /// What is left of the last frame of the body.
+    /// Remainder of the body's last frame.
     rest: Bytes,
     timeout: Option<ResponseTimeout>,
 }
@@ -113,7 +113,7 @@ mod tests {
     use super::*;
     use http_body_util::{BodyExt, Full};
 
-    /// Oracle: the definition: the same bytes, in pieces of the length and one that is shorter.
+    /// Oracle: the definition: the same bytes, in full pieces and a shorter last one.
     #[tokio::test]
     async fn a_body_is_the_same_in_pieces() {
         let bytes: Vec<u8> = (0..PIECE * 2 + 5).map(|at| at as u8).collect();

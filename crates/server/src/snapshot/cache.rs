@@ -1,4 +1,4 @@
-//! The rooms that are in memory, bounded in bytes. What was asked for the longest time ago goes first.
+//! LRU cache of loaded rooms, bounded in bytes.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -14,10 +14,10 @@ use super::room_loading::{RoomLoader, RoomToLoad, contained};
 /// Identifies a served room in the cache.
 pub type Key = u64;
 
-/// The cache weighs in units of this many bytes, since its weights have 32 bits.
+/// Unit of cache weights, bytes; needed because weights have 32 bits.
 const UNIT: usize = 1 << 10;
 
-/// Loaded rooms. One that is in use elsewhere lives on after it was dropped here.
+/// Loaded rooms. An evicted room stays in memory while it is in use.
 pub struct RoomCache {
     rooms: Cache<Key, Arc<LoadedRoom>>,
     loader: RoomLoader,
@@ -26,8 +26,8 @@ pub struct RoomCache {
 }
 
 impl RoomCache {
-    /// An empty cache of at most `bytes`; of any size if none is given. Called within a runtime, on
-    /// which the store is read.
+    /// Creates an empty cache of at most `bytes`, or unbounded if `None`. Must be called within the
+    /// runtime that reads the store.
     pub fn new(loader: RoomLoader, bytes: Option<usize>) -> Self {
         let weight = |_: &Key, room: &Arc<LoadedRoom>| {
             u32::try_from(room.memory_bytes().div_ceil(UNIT)).unwrap_or(u32::MAX)
@@ -51,13 +51,13 @@ impl RoomCache {
         self.keys.fetch_add(1, Ordering::Relaxed)
     }
 
-    /// A room if it is in memory.
+    /// The room, if it is in memory.
     pub(super) fn get(&self, key: Key) -> Option<Arc<LoadedRoom>> {
         self.rooms.get(&key)
     }
 
-    /// A room, loaded by `load` if it is not in memory. Whoever asks for it meanwhile waits for the
-    /// same loading. Blocks.
+    /// The room, loaded by `load` if it is not in memory. Concurrent callers share one load.
+    /// Blocks.
     pub(super) fn get_or_load(
         &self,
         key: Key,
@@ -72,14 +72,14 @@ impl RoomCache {
         self.rooms.insert(key, room);
     }
 
-    /// Loads a room; a panic there is its refusal.
+    /// Loads a room. A panic is returned as a refusal.
     pub(super) async fn load(&self, room: RoomToLoad<'_>) -> Result<LoadedRoom, Refusal> {
         let revision = room.revision;
         let loaded = contained(self.loader.load(room)).await;
         loaded.map_err(|problem| Refusal::new(revision, &problem))
     }
 
-    /// Runs to the end what loads a room. Blocks.
+    /// Runs a load to completion. Blocks.
     pub(super) fn block_on<T>(&self, work: impl Future<Output = T>) -> T {
         self.runtime.block_on(work)
     }
@@ -88,7 +88,7 @@ impl RoomCache {
         self.rooms.invalidate(&key);
     }
 
-    /// How many rooms are in memory, and about how many bytes they hold.
+    /// Number of rooms in memory, and their approximate size in bytes.
     pub fn size(&self) -> (u64, u64) {
         self.rooms.run_pending_tasks();
         let units = self.rooms.weighted_size();

@@ -1,4 +1,4 @@
-//! The identity of what the states of tracked streams are made of.
+//! Content hashes of a room and an adapter, which identify what tracking states are based on.
 
 use ndarray::s;
 use sha2::{Digest, Sha256};
@@ -6,18 +6,18 @@ use sha2::{Digest, Sha256};
 use seese3_core::adapter::{Adapter, ErrorStatistics, Network};
 use seese3_core::navigation::Navigator;
 
-/// The identity of a room under an adapter, as hashes. Name and revision are none: two stores may
+/// Content hashes of a room and an adapter. Names and revisions are not sufficient: two stores may
 /// use the same ones for different content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Content {
     /// SHA-256 of the adapter and its calibration.
     pub adapter: [u8; 32],
-    /// That of all frames, as [`frames_content`].
+    /// SHA-256 of all frames, as [`frames_content`].
     pub frames: [u8; 32],
 }
 
 impl Content {
-    /// Of a room under an adapter.
+    /// Computes the hashes for a room with an adapter.
     pub fn of(navigator: &Navigator) -> Self {
         Self {
             adapter: adapter_content(navigator.adapter()),
@@ -26,10 +26,11 @@ impl Content {
     }
 }
 
-/// SHA-256 of the poses and latents of a room's first frames. At least that many frames must exist.
+/// SHA-256 of the poses and latents of a room's first `frame_count` frames. The room must have at
+/// least that many.
 ///
-/// Rotations enter to a millionth: a revision that others are added to is published again, and its
-/// rotations are then projected to SO(3) once more, which may change their last digits.
+/// Rotations are rounded to 1e-6: extending a room republishes its frames and projects their
+/// rotations onto SO(3) again, which may change the last digits.
 pub fn frames_content(navigator: &Navigator, frame_count: usize) -> [u8; 32] {
     let mut digest = ContentDigest(Sha256::new());
 
@@ -56,7 +57,7 @@ fn adapter_content(adapter: &Adapter) -> [u8; 32] {
     digest.0.finalize().into()
 }
 
-/// A hash of numbers, in a fixed order.
+/// Incremental hash of numbers, in a fixed order.
 struct ContentDigest(Sha256);
 
 impl ContentDigest {

@@ -1,4 +1,4 @@
-//! A room in memory: what answers in it are computed from.
+//! A room loaded into memory.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -12,53 +12,53 @@ use seese3_robot::fitting::RoomReader;
 use seese3_robot::tracking::Map;
 use seese3_store::StoredAdapter;
 
-/// An adapter that fits a room by its features.
+/// An adapter whose features a room has.
 #[derive(Clone)]
 pub struct Candidate {
-    /// The revision that is to serve the room.
+    /// The revision to serve.
     pub adapter: Arc<StoredAdapter>,
-    /// The revision before, which goes on where the new one cannot serve the room.
+    /// The previously served revision, as a fallback if the new one cannot serve the room.
     pub earlier: Option<Arc<StoredAdapter>>,
 }
 
-/// What answers in a room are computed from.
+/// A room with its navigators, loaded into memory.
 pub struct LoadedRoom {
     /// One for each adapter that serves the room, in order of preference.
     pub navigators: Vec<Arc<ServedNavigator>>,
-    /// Adapters that fit by their features and still cannot serve the room, by name.
+    /// Adapters with matching features that cannot serve the room, by name.
     pub refused: BTreeMap<String, Refusal>,
 }
 
-/// A room under one adapter that fits it.
+/// A room with one adapter that serves it.
 pub struct ServedNavigator {
-    /// Retrieves frames and plans motions in the latents of this adapter.
+    /// Retrieves frames and plans motions in this adapter's latent space.
     pub navigator: Arc<Navigator>,
-    /// The map for tracking and relocalisation; none if the adapter is not calibrated or the room
+    /// The map for tracking and relocalization; `None` if the adapter is not calibrated or the room
     /// is too small.
     pub map: Option<Arc<Map>>,
-    /// The adapter as it is stored, with its training record.
+    /// The stored adapter with its training record.
     pub adapter: Arc<StoredAdapter>,
-    /// The identity of the adapter and the room's frames.
+    /// Content hashes of the adapter and the room's frames.
     pub content: Content,
     /// The room's revision.
     pub room_revision: u64,
-    /// What the adapter has seen of this room.
+    /// Whether the adapter was trained on this room.
     pub trained_on: TrainedOn,
-    /// Locates single views, where the adapter was fitted to these very frames.
+    /// Locates single views; only if the adapter was fitted to exactly these frames.
     pub reader: Option<Arc<RoomReader>>,
-    /// The reader of an adapter that comes before this one, from which the map takes its anchors.
+    /// The reader of a preferred adapter, which gives the map's anchors.
     pub(super) tracking_reader: Option<Arc<RoomReader>>,
 }
 
 impl LoadedRoom {
-    /// The room under an adapter of this name.
+    /// The navigator of the adapter of this name.
     pub fn under_any(&self, adapter: &str) -> Option<&Arc<ServedNavigator>> {
         self.navigators
             .iter()
             .find(|served| served.adapter.name == adapter)
     }
 
-    /// The room under this revision of an adapter, if trackers there take their anchors from
+    /// The navigator of this adapter revision, if its trackers take their anchors from
     /// `tracking_reader`.
     pub(super) fn under(
         &self,
@@ -77,7 +77,7 @@ impl LoadedRoom {
             .find(|served| served.is_of(adapter) && is_same_reader(served))
     }
 
-    /// About how much memory it holds, bytes.
+    /// Approximate memory use, bytes.
     pub(super) fn memory_bytes(&self) -> usize {
         let room = self.navigators.first();
         let room = room.map_or(0, |served| served.navigator.room().memory_bytes());
@@ -90,8 +90,8 @@ impl LoadedRoom {
 }
 
 impl ServedNavigator {
-    /// The reader of the adapter that was fitted to this room, if there is one for features of this
-    /// adapter's source; that of the newest of several.
+    /// The reader of an adapter fitted to this room, for features of this adapter's source, if
+    /// there is one; the most preferred if there are several.
     pub fn room_reader(&self) -> Option<&RoomReader> {
         let newest = self.tracking_reader.as_ref().or(self.reader.as_ref());
         newest.map(Arc::as_ref)
@@ -110,7 +110,7 @@ impl ServedNavigator {
     }
 }
 
-/// The reader of the first adapter for features of this source that has one.
+/// The reader of the most preferred adapter for features of this source, if any.
 pub(super) fn reader_of<'a>(
     navigators: &'a [Arc<ServedNavigator>],
     source: &FeatureSource,

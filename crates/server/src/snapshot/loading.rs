@@ -1,11 +1,10 @@
-//! Loading a store into a [`Snapshot`], once at the start and again whenever the store has changed.
+//! Loads a store into a [`Snapshot`], at the start and whenever the store changes.
 //!
-//! - What did not change is taken over from the snapshot before, so that a reload costs what
-//!   changed and no more.
-//! - A room or an adapter that cannot be loaded is refused by itself. If an older revision of it is
-//!   being served, that goes on; where rooms are not loaded ahead, as far as the manifest tells.
-//! - A revision that is damaged is not tried again, unless that is asked for. One that could not be
-//!   read is tried at every look.
+//! - Unchanged parts are reused from the previous snapshot, so that a reload costs only what
+//!   changed.
+//! - A room or adapter that cannot be loaded is refused individually, and its previously served
+//!   revision remains in use. Without preloading, only a room's manifest is checked at this point.
+//! - A damaged revision is retried only on request; an unreadable one is retried at every reload.
 
 use std::collections::BTreeMap;
 use std::num::NonZero;
@@ -27,20 +26,20 @@ use seese3_core::features::FeatureSource;
 use seese3_core::room::RoomId;
 use seese3_store::{Defaults, Kind, RoomFit, StandingDefaults, Store, StoredAdapter};
 
-/// Whether revisions that were refused before are tried again.
+/// Whether previously refused revisions are retried.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refused {
     TryAgain,
     LeaveOut,
 }
 
-/// Which rooms are in memory.
+/// Memory policy for rooms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RoomMemory {
-    /// Whether every room is loaded, and thereby verified, before it is served. Else a room is
-    /// loaded when it is first asked for.
+    /// Whether every room is loaded, and so verified, before it is served. Otherwise it is loaded
+    /// on its first request.
     pub preload: bool,
-    /// About how many bytes the rooms in memory may hold together; none for no bound.
+    /// Approximate memory limit of all loaded rooms, bytes; `None` for no limit.
     pub bytes: Option<usize>,
 }
 
@@ -53,14 +52,14 @@ impl Default for RoomMemory {
     }
 }
 
-/// What became of a room.
+/// Result of loading a room for a snapshot.
 struct TriedRoom {
     served: Option<Arc<ServedRoom>>,
-    /// Why its current revision is not what is served.
+    /// Why the current revision is not served, if so.
     refusal: Option<Refusal>,
 }
 
-/// Loads the snapshots of one server.
+/// Builds the snapshots of one server.
 #[derive(Clone)]
 pub struct Loader {
     store: Store,
@@ -72,7 +71,7 @@ pub struct Loader {
 }
 
 impl Loader {
-    /// A loader of `store`, on a blocking thread. The models of the operator are read now.
+    /// Creates a loader of `store`. Reads the operator's models, on a blocking thread.
     ///
     /// # Errors
     /// [`RunError::Model`] or [`RunError::TwoView`] if a model cannot be used.
@@ -110,8 +109,8 @@ impl Loader {
         .await
     }
 
-    /// Loads every room and adapter for the first time. A store without a room is refused unless
-    /// rooms can be added to it through this server.
+    /// Builds the first snapshot. A store without rooms is an error unless this server can add
+    /// rooms.
     ///
     /// # Errors
     /// [`RunError::Store`] if the store cannot be listed, [`RunError::NoRoom`] if it has no room,
@@ -138,23 +137,24 @@ impl Loader {
         }
     }
 
-    /// Whether the store has rooms, or had some that were removed from it. One that has vanished,
-    /// for instance with its disk, has neither.
+    /// Whether the store has, or ever had, rooms. False for a store that has disappeared, for
+    /// instance with its disk.
     pub async fn remembers_rooms(&self) -> bool {
         self.store.remembers(Kind::Room).await.unwrap_or(false)
     }
 
-    /// Loads what differs from `before`, on a blocking thread.
+    /// Builds a snapshot on a blocking thread, loading only what differs from `before`.
     ///
     /// # Errors
-    /// [`RunError::Store`] if the store cannot be listed. Everything else is refused by itself.
+    /// [`RunError::Store`] if the store cannot be listed. Other problems are refusals in the
+    /// snapshot.
     pub async fn load(
         &self,
         before: Arc<Snapshot>,
         refused: Refused,
     ) -> Result<Snapshot, RunError> {
-        // Loading mixes reads with long computation (embedding, indexing). On an async thread it
-        // would hold up health checks and requests.
+        // Loading mixes file access with long computation (embedding, indexing), which would block
+        // health checks and requests on an async thread.
         let loader = self.clone();
         let runtime = Handle::current();
         blocking(move || runtime.block_on(loader.load_now(&before, refused))).await
@@ -189,8 +189,8 @@ impl Loader {
         Ok(loaded)
     }
 
-    /// Adds rooms, each in its current revision. While no room is served, they are loaded on all
-    /// processors at the same time; later one after another, because requests are answered.
+    /// Adds the current revisions of rooms. At the start, rooms are loaded in parallel on all
+    /// processors; later one by one, to leave processors for requests.
     async fn add_rooms(
         &self,
         loaded: &mut Snapshot,
@@ -224,7 +224,7 @@ impl Loader {
         Ok(())
     }
 
-    /// The choices of an operator. If the file of the newest ones is damaged, those before it hold.
+    /// The operator's defaults; if their newest file is damaged, the previous ones.
     async fn defaults(
         &self,
         loaded: &mut Snapshot,
@@ -238,8 +238,8 @@ impl Loader {
         {
             tracing::error!(
                 reason,
-                "the newest choices of defaults cannot be read: older ones hold, or none; take the \
-                 last change back with `seese3 store default --back`"
+                "the newest defaults file cannot be read: the previous defaults are in effect, if \
+                 any; roll back the last change with `seese3 store default --back`"
             );
         }
 
@@ -247,7 +247,7 @@ impl Loader {
         Ok(defaults)
     }
 
-    /// Adds the current revision of an adapter; if it is refused, the one that was served before.
+    /// Adds the current revision of an adapter or, if it is refused, the previously served one.
     async fn add_adapter(
         &self,
         loaded: &mut Snapshot,
@@ -294,15 +294,14 @@ impl Loader {
     }
 
     /// Adds the image encoders of all adapters. An adapter whose encoder cannot be used is served
-    /// without one: callers may still send features. One that failed before is tried again when
-    /// that is asked for.
+    /// without it: callers may still send features. A failed encoder is retried on request.
     fn add_image_encoders(&self, loaded: &mut Snapshot, before: &Snapshot, refused: Refused) {
         let Some(encoders) = &self.encoders else {
             return;
         };
 
-        // Adapters that were trained on features of the same source share one encoder, because
-        // loading a model is expensive.
+        // Adapters with the same feature source share one encoder, because loading a model is
+        // expensive.
         let mut opened: Vec<(FeatureSource, Option<Arc<ImageEncoder>>)> = Vec::new();
         for (name, adapter) in &before.adapters {
             let encoder = before.image_encoders.get(name).cloned();
@@ -328,7 +327,7 @@ impl Loader {
         }
     }
 
-    /// The current revision of a room; if it is refused, the one that was served before.
+    /// Loads the current revision of a room; if it is refused, the previously served one remains.
     async fn tried_room(
         &self,
         name: &str,
@@ -370,8 +369,8 @@ impl Loader {
         }
     }
 
-    /// A room that is to be served. `known` is the room as it was served before: what is in memory
-    /// of it is loaded anew now, so that no request has to wait for it.
+    /// Builds a room to serve. `known` is the previously served room: if it is in memory, the new
+    /// one is loaded now, so that no request has to wait.
     async fn room(
         &self,
         name: &str,
@@ -413,7 +412,7 @@ impl Loader {
     }
 }
 
-/// Counts the rooms that are in memory.
+/// Registers gauges of the rooms in memory.
 fn count_rooms(rooms: &Arc<RoomCache>, metrics: &Metrics) {
     let counted = rooms.clone();
     metrics.gauge_elsewhere(
@@ -425,12 +424,12 @@ fn count_rooms(rooms: &Arc<RoomCache>, metrics: &Metrics) {
     let counted = rooms.clone();
     metrics.gauge_elsewhere(
         "rooms_in_memory_bytes",
-        "About what the rooms in memory hold",
+        "Approximate size of the rooms in memory",
         move || counted.size().1,
     );
 }
 
-/// Whether a room is served as it would be if it were made anew.
+/// Whether the room need not be rebuilt.
 fn is_up_to_date(
     room: &ServedRoom,
     adapters: &BTreeMap<String, Arc<StoredAdapter>>,
@@ -463,14 +462,14 @@ async fn blocking<T: Send + 'static>(
         .map_err(RunError::Loading)?
 }
 
-/// Logs why a revision is refused, unless that has been logged.
+/// Logs a refusal, unless it is already known.
 fn log_refusal(kind: &str, name: &str, known: Option<&Refusal>, refusal: &Refusal) {
     if known != Some(refusal) {
         refusal.log(kind, name);
     }
 }
 
-/// The refusal of a revision that is not to be tried again.
+/// The previous refusal of this revision, if it is not to be retried.
 fn kept(
     before: &BTreeMap<String, Refusal>,
     name: &str,
@@ -484,8 +483,8 @@ fn kept(
         .cloned()
 }
 
-/// The image encoder of an adapter; none if it is not at hand or cannot be used, which the log
-/// says.
+/// Opens the image encoder of an adapter; `None` if it is not available or cannot be used, which is
+/// logged.
 fn opened_for(
     adapter: &str,
     source: &FeatureSource,
@@ -494,21 +493,21 @@ fn opened_for(
     let opened: Result<_, seese3_encoder::Error> =
         image_encoder::open_for(adapter, source, encoders);
     opened.unwrap_or_else(|problem| {
-        tracing::error!(adapter, %problem, "the adapter is served without images");
+        tracing::error!(adapter, %problem, "no image encoder; the adapter takes only features");
         None
     })
 }
 
-/// The adapters that fit a room with features of these sources, in order of preference: those
-/// fitted to this room, then those trained in it, then the newest, and behind all of them those of
-/// experiments. The first is the room's default where an operator chose none.
+/// The adapters compatible with a room that has features of these sources, in order of preference:
+/// fitted to this room, then trained in it, then newest; adapters of experiments last. The first is
+/// the room's default unless the operator chose one.
 fn fitting(
     adapters: &BTreeMap<String, Arc<StoredAdapter>>,
     room: &RoomId,
     sources: &[FeatureSource],
 ) -> Vec<Arc<StoredAdapter>> {
-    // An adapter fits a room that has features made as its training features were. One that was
-    // fitted to a room serves that room alone.
+    // An adapter is compatible with a room that has features of its source settings. A fitted
+    // adapter serves only its own room.
     let fits = |adapter: &&Arc<StoredAdapter>| {
         let has_features = sources
             .iter()

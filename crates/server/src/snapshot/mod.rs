@@ -1,6 +1,5 @@
-//! The rooms, adapters and image encoders that a server answers from, loaded, verified and
-//! immutable. [`Loader`] makes a new snapshot when the store has changed; requests in flight keep
-//! the one that they began with.
+//! An immutable, verified snapshot of the rooms, adapters and image encoders that a server uses.
+//! [`Loader`] builds a new snapshot when the store changes; requests in flight keep theirs.
 
 mod cache;
 mod content;
@@ -25,15 +24,14 @@ use super::metrics::ServedCounts;
 use super::two_views::TwoViewReader;
 use seese3_store::StoredAdapter;
 
-/// A revision that is in the store and cannot be served.
+/// A stored revision that cannot be served.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Refusal {
-    /// The revision.
+    /// The revision number.
     pub revision: u64,
-    /// Why, in words; it may name files of the store.
+    /// The reason, as text; it may name files of the store.
     pub reason: String,
-    /// Whether it may be different next time: a file that could not be read, not one that is
-    /// damaged.
+    /// Whether the problem may be temporary: an unreadable file, as opposed to a damaged one.
     pub may_pass: bool,
 }
 
@@ -54,20 +52,20 @@ impl Refusal {
     }
 }
 
-/// What is refused, by name.
+/// Everything in the store that cannot be served, by name.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Refusals {
-    /// Why the newest choices of defaults do not hold, and older ones do.
+    /// Why the newest defaults file is not in effect; an older one is used instead.
     pub defaults: Option<String>,
     pub rooms: BTreeMap<String, Refusal>,
     pub adapters: BTreeMap<String, Refusal>,
 }
 
-/// The current revision of every room and adapter of a store that can be served.
+/// The served rooms and adapters of a store.
 #[derive(Default)]
 pub struct Snapshot {
     rooms: BTreeMap<String, Arc<ServedRoom>>,
-    /// The adapters that an operator chose, by room.
+    /// The operator's default adapters, by room.
     default_adapters: BTreeMap<String, String>,
     adapters: BTreeMap<String, Arc<StoredAdapter>>,
     image_encoders: BTreeMap<String, Arc<ImageEncoder>>,
@@ -76,13 +74,12 @@ pub struct Snapshot {
 }
 
 impl Snapshot {
-    /// What was found to be unfit to be served when this snapshot was made. An older revision of it
-    /// may be served instead.
+    /// Refusals found when this snapshot was made. An older revision may be served instead.
     pub fn refused(&self) -> &Refusals {
         &self.refused
     }
 
-    /// The same with the rooms of `scope` alone, and without adapters that were fitted to others.
+    /// This snapshot limited to the rooms of `scope`, without adapters fitted to other rooms.
     pub fn seen_by(&self, scope: &RoomScope) -> Self {
         let rooms = self.rooms.iter().filter(|(name, _)| scope.contains(name));
         let is_seen = |(_, adapter): &(&String, &Arc<StoredAdapter>)| {
@@ -108,7 +105,7 @@ impl Snapshot {
         }
     }
 
-    /// The image encoders alone.
+    /// A snapshot with only the image encoders.
     pub fn without_rooms(&self) -> Self {
         Self {
             image_encoders: self.image_encoders.clone(),
@@ -116,14 +113,13 @@ impl Snapshot {
         }
     }
 
-    /// How many adapters are refused in one of their rooms, over all rooms.
+    /// Number of adapters refused in a room, summed over all rooms.
     pub fn refused_in_rooms(&self) -> usize {
         let rooms = self.rooms.values();
         rooms.map(|room| room.refused_adapters().len()).sum()
     }
 
-    /// How many rooms are refused, those included that turned out to be damaged when they were
-    /// first asked for.
+    /// Number of refused rooms, including those that failed to load on their first request.
     pub fn refused_rooms(&self) -> usize {
         let later = |(name, room): &(&String, &Arc<ServedRoom>)| {
             room.refusal().is_some() && !self.refused.rooms.contains_key(*name)
@@ -131,7 +127,7 @@ impl Snapshot {
         self.refused.rooms.len() + self.rooms.iter().filter(later).count()
     }
 
-    /// What is served and what is refused, for metrics.
+    /// Counts of served and refused resources, for metrics.
     pub(super) fn counts(&self) -> ServedCounts {
         ServedCounts {
             rooms: self.rooms.len(),
@@ -145,13 +141,13 @@ impl Snapshot {
         }
     }
 
-    /// Whether requests for a room are answered, as far as is known.
+    /// Whether the room is served and no load of it has failed.
     pub fn answers_in(&self, room: &str) -> bool {
         let room = self.rooms.get(room);
         room.is_some_and(|room| room.refusal().is_none())
     }
 
-    /// Whether both snapshots answer alike: every room and adapter was taken over unchanged.
+    /// Whether both snapshots are equivalent: all their rooms, adapters and encoders are identical.
     pub fn is_like(&self, other: &Self) -> bool {
         fn same<T>(ours: &BTreeMap<String, Arc<T>>, theirs: &BTreeMap<String, Arc<T>>) -> bool {
             let is_same = |((name, ours), (other, theirs)): ((&String, &Arc<T>), _)| {
@@ -168,7 +164,7 @@ impl Snapshot {
             && self.refused == other.refused
     }
 
-    /// The reader of motions between two images, if this server has one.
+    /// The two-view motion estimator, if this server has one.
     pub fn two_views(&self) -> Option<&TwoViewReader> {
         self.two_views.as_deref()
     }
@@ -181,19 +177,19 @@ impl Snapshot {
         self.image_encoders.get(&adapter.name).map(AsRef::as_ref).ok_or_else(|| {
             let encoder = &adapter.adapter.source().encoder;
             Error::Precondition(format!(
-                "images cannot be sent for adapter '{}': this server has no encoder '{encoder}'; start it with \
-                 --encoder, name another adapter, or send the feature",
+                "adapter '{}' cannot be used with images: this server has no encoder '{encoder}'; \
+                 start it with --encoder, use another adapter, or send the feature",
                 adapter.name
             ))
         })
     }
 
-    /// How many rooms it has.
+    /// Number of rooms.
     pub fn room_count(&self) -> usize {
         self.rooms.len()
     }
 
-    /// How many adapters it has.
+    /// Number of adapters.
     pub fn adapter_count(&self) -> usize {
         self.adapters.len()
     }
@@ -244,27 +240,27 @@ impl Snapshot {
             })
     }
 
-    /// The adapters that serve a room, the default first.
+    /// The adapters that serve a room, default first.
     pub fn adapters_of(&self, room: &ServedRoom) -> Vec<Arc<StoredAdapter>> {
         let chosen = self.default_adapters.get(room.id.as_str());
         let mut adapters = room.adapters();
 
-        // Stable, so that the others keep their order.
+        // Stable sort: the others keep their order.
         adapters.sort_by_key(|adapter| chosen != Some(&adapter.name));
         adapters
     }
 
-    /// The default adapter of a room: the one that an operator chose, or the one that is preferred.
+    /// The default adapter of a room: the operator's choice, or else the most preferred one.
     fn default_adapter(&self, room: &ServedRoom) -> Result<Arc<StoredAdapter>, Error> {
         let id = &room.id;
         let first = self.adapters_of(room).into_iter().next();
 
-        // Another adapter in place of the one that was chosen would be a silent change of answers.
+        // Falling back to another adapter would silently change the results.
         match (self.default_adapters.get(id.as_str()), first) {
             (Some(chosen), first) if first.as_ref().is_none_or(|first| first.name != *chosen) => {
                 Err(Error::Precondition(format!(
-                    "adapter '{chosen}' was chosen as the default of room '{id}' and does not serve \
-                     it; name another, or choose another"
+                    "adapter '{chosen}' is the default of room '{id}' but does not serve it; name \
+                     another adapter, or change the default"
                 )))
             }
             (_, Some(first)) => Ok(first),
@@ -274,16 +270,16 @@ impl Snapshot {
         }
     }
 
-    /// A room under the adapter of that name, or under the room's default adapter if the name is
-    /// empty. Loads the room if it is not in memory: only for threads that may block.
+    /// The navigator of a room and an adapter; the room's default adapter if the name is empty.
+    /// Loads the room if it is not in memory: call only on threads that may block.
     ///
     /// # Errors
     /// As [`Snapshot::room`] and [`Snapshot::adapter`]; [`Error::Precondition`] if the room cannot
-    /// be loaded, the adapter does not fit it, or none does.
+    /// be loaded, or no adapter, or not the requested one, serves it.
     pub fn navigator(&self, room: &str, adapter: &str) -> Result<Arc<ServedNavigator>, Error> {
         let served = self.room(room)?;
 
-        // What is wrong with a name costs no loading.
+        // Check the name before loading the room.
         if !adapter.is_empty() {
             self.adapter(adapter)?;
         }
@@ -300,14 +296,14 @@ impl Snapshot {
     }
 }
 
-/// Why an adapter does not serve a room.
+/// The error for an adapter that does not serve a room.
 fn does_not_serve(room: &ServedRoom, adapter: &StoredAdapter) -> Error {
     let name = &adapter.name;
     if let Some(fit) = &adapter.room_fit
         && fit.room != room.id
     {
         return Error::Precondition(format!(
-            "adapter '{name}' was fitted to room '{}' and serves no other",
+            "adapter '{name}' was fitted to room '{}' and serves only that room",
             fit.room
         ));
     }
@@ -331,11 +327,11 @@ fn owned<'a, T: Clone + 'a>(
         .collect()
 }
 
-/// The caller learns that it is the operator's turn. The reason stays in the log: it may name
-/// files.
+/// The error for the caller, who must ask the operator. The reason is only logged, since it may
+/// name files.
 fn refused_error(kind: &str, name: &str, refusal: &Refusal) -> Error {
     Error::Precondition(format!(
-        "{kind} '{name}' cannot be served: its revision {} was refused, and the server's log says why",
+        "{kind} '{name}' cannot be served: its revision {} was refused; see the server's log",
         refusal.revision
     ))
 }

@@ -1,4 +1,4 @@
-//! Loading one room under every adapter that fits it.
+//! Loads one room with every compatible adapter.
 
 use std::collections::BTreeMap;
 use std::panic::AssertUnwindSafe;
@@ -18,19 +18,19 @@ use seese3_robot::fitting::{Localizer, RoomReader};
 use seese3_robot::tracking::Map;
 use seese3_store::{RoomFit, Store, StoredAdapter, StoredRoom};
 
-/// Why a room, or a room under an adapter, cannot be served.
+/// Errors of loading a room, or one of its adapters.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum Problem {
     #[error(transparent)]
     Store(#[from] seese3_store::Error),
-    #[error("adapter '{adapter}' does not serve it: {problem}")]
+    #[error("adapter '{adapter}' cannot serve it: {problem}")]
     Navigator {
         adapter: String,
         problem: seese3_core::navigation::Error,
     },
     #[error(
         "adapter '{adapter}' was fitted from revision {revision} of adapter '{base}', which cannot be read: {problem}; \
-         publish that again, or fit anew"
+         publish the base again, or repeat the fit"
     )]
     Base {
         adapter: String,
@@ -38,17 +38,17 @@ pub(super) enum Problem {
         revision: u64,
         problem: Box<seese3_store::Error>,
     },
-    #[error("adapter '{adapter}' does not locate views in it: {problem}")]
+    #[error("adapter '{adapter}' cannot locate views in it: {problem}")]
     Localizer {
         adapter: String,
         problem: Box<seese3_robot::fitting::Error>,
     },
-    #[error("loading it panicked, which is a defect of this program; the server's log says where")]
+    #[error("loading it panicked, which is a bug in this program; see the server's log")]
     Panicked,
 }
 
 impl Problem {
-    /// Whether it may be gone at the next look.
+    /// Whether the problem may be temporary.
     pub(super) fn may_pass(&self) -> bool {
         match self {
             Self::Store(error) => may_pass(error),
@@ -67,11 +67,11 @@ fn may_pass(error: &seese3_store::Error) -> bool {
     )
 }
 
-/// Loads one thing such that a panic refuses it alone.
+/// Runs a load and converts a panic to [`Problem::Panicked`].
 pub(super) async fn contained<T>(
     loading: impl Future<Output = Result<T, Problem>>,
 ) -> Result<T, Problem> {
-    // What the loading had begun is dropped with it.
+    // Unwind safe: partial state of the load is dropped with it.
     let loaded = AssertUnwindSafe(loading).catch_unwind().await;
     loaded.unwrap_or(Err(Problem::Panicked))
 }
@@ -83,23 +83,23 @@ pub struct RoomLoader {
     pub index: IndexKind,
 }
 
-/// A room that is to be loaded, and what is known of it from before.
+/// A room to load, with its state in the previous snapshot.
 pub struct RoomToLoad<'a> {
     pub id: &'a RoomId,
     pub revision: u64,
     pub candidates: &'a [Candidate],
-    /// Adapters that were refused when the room was loaded before.
+    /// Adapters that were refused in the previous load.
     pub refused_before: BTreeMap<String, Refusal>,
-    /// The same revision of the room, if it is in memory.
+    /// The previously loaded room, if it is in memory.
     pub loaded_before: Option<&'a LoadedRoom>,
 }
 
 impl RoomLoader {
-    /// A room under its adapters. What did not change since it was served before is taken over.
+    /// Loads a room with its adapters, reusing unchanged parts of the previous load.
     ///
     /// # Errors
-    /// [`Problem`] if the room itself cannot be loaded. An adapter that cannot serve it is refused
-    /// by itself, and its revision before serves on.
+    /// [`Problem`] if the room itself cannot be loaded. An adapter that cannot serve it is only
+    /// listed as refused, and its previous revision remains in use.
     pub async fn load(&self, room: RoomToLoad<'_>) -> Result<LoadedRoom, Problem> {
         let stored = self.store.load_room(room.id.as_str(), Some(room.revision));
         let stored = stored.await?;
@@ -123,13 +123,13 @@ impl RoomLoader {
             };
 
             let refusal = Refusal::new(adapter.revision, &problem);
-            // What was refused before has been logged.
+            // Known refusals were logged before.
             if room.refused_before.get(&adapter.name) != Some(&refusal) {
                 refusal.log("adapter", &adapter.name);
             }
             refused.insert(adapter.name.clone(), refusal);
 
-            // A failure of the revision before is no news: it served until now.
+            // A failure of the previous revision is not logged: it served until now.
             if let Some(earlier) = &candidate.earlier {
                 let served = self
                     .under(&stored, &frames, earlier, &navigators, before)
@@ -144,7 +144,8 @@ impl RoomLoader {
         })
     }
 
-    /// The room under one adapter, after those that come `first`.
+    /// Loads the room with one adapter, or reuses it from `before`. `first` has the navigators of
+    /// preferred adapters.
     async fn under(
         &self,
         stored: &StoredRoom,
@@ -153,7 +154,7 @@ impl RoomLoader {
         first: &[Arc<ServedNavigator>],
         before: Option<&LoadedRoom>,
     ) -> Result<Arc<ServedNavigator>, Problem> {
-        // Fitted adapters come first, so that the reader that trackers are to use is known.
+        // Fitted adapters come first, so the trackers' reader is already loaded.
         let tracking_reader = reader_of(first, adapter.adapter.source()).cloned();
 
         let known = before.and_then(|before| before.under(adapter, tracking_reader.as_ref()));
@@ -166,8 +167,8 @@ impl RoomLoader {
         }
     }
 
-    /// A room under one adapter. `tracking_reader` gives the anchors of trackers, where an adapter
-    /// was fitted to the room.
+    /// Loads the room with one adapter. `tracking_reader` gives the trackers' anchors, if an
+    /// adapter was fitted to the room.
     async fn navigator(
         &self,
         stored: &StoredRoom,
@@ -199,7 +200,7 @@ impl RoomLoader {
             .trained_on(&adapter.record, room.id(), stored.revision)
             .await?;
 
-        // Rules that were measured on other frames say nothing of these.
+        // Rules measured on other frames are not valid for these.
         let room_data = RoomData {
             room,
             revision: stored.revision,
@@ -224,7 +225,7 @@ impl RoomLoader {
         })
     }
 
-    /// The reader of a fitted adapter, with the adapter that it began from as a second one.
+    /// The reader of a fitted adapter, with its base as the second predictor.
     async fn room_reader(
         &self,
         adapter: &StoredAdapter,
@@ -272,9 +273,9 @@ fn log_audit(navigator: &Navigator, adapter: &str) {
     }
 }
 
-/// The map of all frames of a room; none if the adapter is not calibrated. A room that is too small
-/// to track in also gives none, which is logged. Where an adapter was fitted to the room, its
-/// reader gives the anchors.
+/// Builds the map of all frames of a room; `None` if the adapter is not calibrated, or, with a
+/// warning, if the room is too small for tracking. If an adapter was fitted to the room, its reader
+/// gives the anchors.
 fn map(
     navigator: &Arc<Navigator>,
     features: &Features,
@@ -294,7 +295,7 @@ fn map(
             }))
         }
         Err(error) => {
-            tracing::warn!(room = %navigator.room().id(), %error, "the room cannot be tracked in");
+            tracing::warn!(room = %navigator.room().id(), %error, "tracking is unavailable");
             None
         }
     }
@@ -304,7 +305,7 @@ fn map(
 mod tests {
     use super::*;
 
-    /// Oracle: the promise itself: what panics is refused, and tried again only when that is asked for.
+    /// Oracle: the contract: a panic is a permanent refusal of one resource.
     #[tokio::test]
     async fn a_panic_refuses_one_thing() {
         let panicked: Result<(), Problem> = contained(async { panic!("on purpose") }).await;

@@ -1,5 +1,5 @@
-//! A room that is served. What its manifest says is always at hand; frames, latents and indexes are
-//! loaded when they are asked for, and may be dropped and loaded again.
+//! A served room. Its manifest summary is always in memory; frames, latents and indexes are loaded
+//! on demand, and may be evicted and reloaded.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -12,21 +12,21 @@ use super::{Refusal, refused_error};
 use seese3_core::room::RoomId;
 use seese3_store::{RoomSummary, StoredAdapter};
 
-/// A revision of a room that is served.
+/// A served revision of a room.
 pub struct ServedRoom {
     /// The room's name.
     pub id: RoomId,
-    /// What its manifest says.
+    /// Summary of the manifest.
     pub summary: RoomSummary,
-    /// The adapters that fit the room, in order of preference.
+    /// The adapters compatible with the room, in order of preference.
     pub(super) candidates: Vec<Candidate>,
-    /// What the last loading has shown; none before the first.
+    /// Result of the last load; `None` before the first.
     load_state: Mutex<Option<LoadState>>,
     cache: Arc<RoomCache>,
     pub(super) key: Key,
 }
 
-/// What loading a room shows of it.
+/// Result of loading a room.
 enum LoadState {
     Loaded {
         adapters: Vec<Arc<StoredAdapter>>,
@@ -52,8 +52,8 @@ impl ServedRoom {
         }
     }
 
-    /// The adapters that serve the room, in order of preference. Before the room was loaded for the
-    /// first time: those that should.
+    /// The adapters that serve the room, in order of preference. Before the first load: the
+    /// candidates.
     pub fn adapters(&self) -> Vec<Arc<StoredAdapter>> {
         match &*self.load_state() {
             Some(LoadState::Loaded { adapters, .. }) => adapters.clone(),
@@ -65,12 +65,13 @@ impl ServedRoom {
         }
     }
 
-    /// Whether an adapter of this name serves the room, as far as is known.
+    /// Whether an adapter of this name serves the room; before the first load, whether it is a
+    /// candidate.
     pub fn is_served_by(&self, adapter: &str) -> bool {
         self.adapters().iter().any(|served| served.name == adapter)
     }
 
-    /// Why the room cannot be loaded, if that was tried.
+    /// Why the last load failed, if it did.
     pub fn refusal(&self) -> Option<Refusal> {
         match &*self.load_state() {
             Some(LoadState::Refused(refusal)) => Some(refusal.clone()),
@@ -78,7 +79,8 @@ impl ServedRoom {
         }
     }
 
-    /// Why an adapter that fits by its features does not serve the room, by name.
+    /// The adapters that have matching features but cannot serve the room, with the reason; by
+    /// name.
     pub fn refused_adapters(&self) -> BTreeMap<String, Refusal> {
         match &*self.load_state() {
             Some(LoadState::Loaded { refused, .. }) => refused.clone(),
@@ -86,13 +88,13 @@ impl ServedRoom {
         }
     }
 
-    /// Everything that answers are computed from. Reads the store if the room is not in memory:
-    /// only for threads that may block.
+    /// The loaded room. Reads the store if the room is not in memory: call only on threads that may
+    /// block.
     ///
     /// # Errors
     /// [`Error::Precondition`] if the room cannot be loaded. The log says why.
     pub fn load(&self) -> Result<Arc<LoadedRoom>, Error> {
-        // Damaged files do not heal. A file that could not be read is tried again.
+        // Damaged files are not read again; unreadable ones are retried.
         let refused = self.refusal().filter(|refusal| !refusal.may_pass);
         let loaded = match refused {
             Some(refusal) => Err(refusal),
@@ -115,11 +117,11 @@ impl ServedRoom {
         })
     }
 
-    /// Loads the room ahead of the first request for it. `before` is the same revision as it was
-    /// served before: what did not change is taken over from it.
+    /// Loads the room before its first request. `before` is the same revision in the previous
+    /// snapshot; its unchanged parts are reused.
     ///
     /// # Errors
-    /// Why the room cannot be loaded.
+    /// The reason why the room cannot be loaded.
     pub(super) async fn preload(&self, before: Option<&ServedRoom>) -> Result<(), Refusal> {
         let loaded = self.loaded(before).await?;
         self.cache.insert(self.key, loaded);
@@ -141,12 +143,12 @@ impl ServedRoom {
         loaded.map(Arc::new)
     }
 
-    /// What is in memory, if anything is.
+    /// The loaded room, if it is in memory.
     pub(super) fn in_memory(&self) -> Option<Arc<LoadedRoom>> {
         self.cache.get(self.key)
     }
 
-    /// Remembers what loading has shown.
+    /// Stores the result of a load.
     pub(super) fn remember(&self, loaded: Result<&LoadedRoom, &Refusal>) {
         let now = match loaded {
             Ok(loaded) => LoadState::Loaded {

@@ -1,4 +1,5 @@
-//! Checks the signature and the times of a JSON Web Token; without the feature `jwt`, refuses its keys.
+//! Verification of the signature and validity times of JSON Web Tokens. Without the feature `jwt`,
+//! every key is rejected.
 
 #[cfg_attr(not(feature = "jwt"), path = "not_built.rs")]
 mod public_key;
@@ -7,7 +8,7 @@ use serde::Deserialize;
 
 pub use public_key::PublicKey;
 
-/// The claims of a token that are read, besides `iss`, `aud` and `nbf`.
+/// The claims that are read, besides `iss`, `aud` and `nbf`.
 #[derive(Debug, Deserialize)]
 pub struct Claims {
     pub sub: String,

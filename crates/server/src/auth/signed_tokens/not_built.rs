@@ -1,16 +1,16 @@
-//! Public keys in a program without the feature `jwt`.
+//! Replacement for public keys in builds without the feature `jwt`.
 
 use super::Claims;
 use crate::auth::issuer_form::IssuerForm;
 
-/// No key: this program cannot check signatures.
+/// Uninhabited: this build cannot verify signatures.
 pub enum PublicKey {}
 
 impl PublicKey {
-    /// Refuses the key.
+    /// Rejects the key.
     ///
     /// # Errors
-    /// Always, in words.
+    /// Always: a message that names the feature.
     pub fn new(_: &[u8], _: &IssuerForm) -> Result<Self, String> {
         Err(
             "this program was built without the feature `jwt`; build it with \
@@ -19,7 +19,7 @@ impl PublicKey {
         )
     }
 
-    /// The claims of a token: there is no key that could check one.
+    /// Never called, since no key exists.
     pub fn claims(&self, _: &[u8]) -> Result<Option<Claims>, &'static str> {
         match *self {}
     }

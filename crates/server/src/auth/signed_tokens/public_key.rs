@@ -1,4 +1,4 @@
-//! Public keys of issuers, by the crate `jsonwebtoken`.
+//! Public keys of issuers, using the crate `jsonwebtoken`.
 
 use jsonwebtoken::errors::ErrorKind;
 use jsonwebtoken::{AlgorithmFamily, DecodingKey, DecodingKeyKind, Validation};
@@ -6,17 +6,17 @@ use jsonwebtoken::{AlgorithmFamily, DecodingKey, DecodingKeyKind, Validation};
 use super::Claims;
 use crate::auth::issuer_form::{IssuerForm, LEEWAY_S};
 
-/// A key that checks tokens of one issuer.
+/// A key that verifies the tokens of one issuer.
 pub struct PublicKey {
     key: DecodingKey,
     validation: Validation,
 }
 
 impl PublicKey {
-    /// Reads a key in PEM: RSA of 2048 bits and more, P-256, P-384 or Ed25519.
+    /// Reads a PEM key: RSA of at least 2048 bits, P-256, P-384 or Ed25519.
     ///
     /// # Errors
-    /// In words: what is wrong with the key.
+    /// A message that describes the problem.
     pub fn new(pem: &[u8], form: &IssuerForm) -> Result<Self, String> {
         let key = public_key(pem)?;
 
@@ -30,12 +30,13 @@ impl PublicKey {
         Ok(Self { key, validation })
     }
 
-    /// The claims of a token; none if another key or issuer may have signed it.
+    /// The claims of a token; `None` if another key or issuer may have signed it.
     ///
     /// # Errors
-    /// What is wrong with a token of this issuer: expired, not valid yet, for another audience.
+    /// The problem of a token of this issuer: expired, not valid yet, for another audience, or with
+    /// a missing or malformed claim.
     pub fn claims(&self, token: &[u8]) -> Result<Option<Claims>, &'static str> {
-        // Extensions that have to be understood (`crit`, RFC 7515, section 4.1.11) are not.
+        // Critical extensions (`crit`, RFC 7515, section 4.1.11) are not supported.
         match jsonwebtoken::decode_header(token) {
             Ok(header) if header.crit.is_none() => {}
             _ => return Ok(None),
@@ -50,7 +51,7 @@ impl PublicKey {
                 ErrorKind::MissingRequiredClaim(_)
                 | ErrorKind::InvalidClaimFormat(_)
                 | ErrorKind::Json(_) => {
-                    Err("the token must have iss, aud, sub and exp, each of its kind")
+                    Err("the token must have valid claims iss, aud, sub and exp")
                 }
                 _ => Ok(None),
             },
@@ -58,17 +59,16 @@ impl PublicKey {
     }
 }
 
-/// A public key in PEM. Keys that both sides share (HMAC) are not taken: who checks could also
-/// sign.
+/// Reads a PEM public key. Shared keys (HMAC) are rejected: the verifier could also sign.
 fn public_key(pem: &[u8]) -> Result<DecodingKey, String> {
     const KINDS: &str = "RSA of 2048 bits or more, P-256, P-384 or Ed25519";
 
     let text = String::from_utf8_lossy(pem);
     if text.contains("PRIVATE KEY") {
-        return Err("has a private key; give the public one alone".to_owned());
+        return Err("has a private key; give only the public key".to_owned());
     }
     if text.matches("-----BEGIN").count() > 1 {
-        return Err("has several keys; give a file to each".to_owned());
+        return Err("has several keys; use one file per key".to_owned());
     }
 
     let key = DecodingKey::from_rsa_pem(pem)
@@ -76,8 +76,8 @@ fn public_key(pem: &[u8]) -> Result<DecodingKey, String> {
         .or_else(|_| DecodingKey::from_ed_pem(pem))
         .map_err(|_| format!("is no public key in PEM ({KINDS})"))?;
 
-    // A key that no token can be checked with is found now, by its length. An RSA key has its
-    // modulus, a point on a curve two coordinates and a byte before them.
+    // Reject unsupported keys now, by length. For RSA it is the length of the modulus; for a curve
+    // point, two coordinates and a prefix byte.
     let length = match key.kind() {
         DecodingKeyKind::SecretOrDer(bytes) => bytes.len(),
         DecodingKeyKind::RsaModulusExponent { n, .. } => n.len(),
