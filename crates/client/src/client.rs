@@ -1,4 +1,4 @@
-//! A client of the service, in wire types. An error is one line that says what went wrong.
+//! A client of the service, in wire types. Error messages are one line.
 
 use std::time::Duration;
 
@@ -20,7 +20,7 @@ use crate::proto::v1::localization_service_client::LocalizationServiceClient;
 use crate::proto::v1::navigation_service_client::NavigationServiceClient;
 use crate::proto::v1::odometry_service_client::OdometryServiceClient;
 
-/// The largest answer that the client accepts, bytes.
+/// Maximum size of a response, bytes.
 const MESSAGE_BYTES: usize = 64 << 20;
 
 /// Why a call failed.
@@ -31,18 +31,18 @@ pub enum Error {
     Address { address: String, problem: String },
     #[error("cannot connect to {address}: {problem}")]
     Connect { address: String, problem: String },
-    #[error("the token cannot be sent: it has to be visible ASCII characters")]
+    #[error("the token must consist of visible ASCII characters")]
     Token,
     #[error("the server refused ({:?}): {}", .0.code(), .0.message())]
     Refused(Box<Status>),
-    #[error("no answer came before the deadline")]
+    #[error("no response before the deadline")]
     Deadline,
-    #[error("the server ended its answer without a result")]
+    #[error("the server ended the stream without a result")]
     NoReport,
 }
 
 impl Error {
-    /// The gRPC code of the server's answer; none if the server did not answer.
+    /// The gRPC code of the server's response; `None` if there was no response.
     pub fn code(&self) -> Option<Code> {
         match self {
             Self::Refused(status) => Some(status.code()),
@@ -50,14 +50,14 @@ impl Error {
         }
     }
 
-    /// The request field that the server names as the cause; none if it names none.
+    /// The invalid request field, if the server reports one.
     pub fn field(&self) -> Option<String> {
         let Self::Refused(status) = self else {
             return None;
         };
 
-        // An invalid field is reported as a bad request, a name that is not served as a resource
-        // whose type holds the field.
+        // An invalid value is reported in `BadRequest`, an unknown name in `ResourceInfo` with the
+        // field as its type.
         let details = status.get_error_details();
         let violation = details
             .bad_request()
@@ -75,7 +75,7 @@ impl Error {
 
 impl From<Status> for Error {
     fn from(status: Status) -> Self {
-        // The client's own transport reports a passed deadline as a cancellation with this text.
+        // The client's own transport reports an expired deadline as a cancellation with this text.
         if status.code() == Code::Cancelled && status.message() == "Timeout expired" {
             return Self::Deadline;
         }
@@ -84,30 +84,31 @@ impl From<Status> for Error {
     }
 }
 
-/// A connection to a server. Cloning it is cheap and shares the connection.
+/// A connection to a server. Clones are cheap and share the connection.
 #[derive(Debug, Clone)]
 pub struct Client {
     channel: InterceptedService<Channel, Token>,
     deadline: Duration,
 }
 
-/// How to connect to a server.
+/// Options of a connection.
 #[derive(Debug, Clone)]
 pub struct ConnectOptions {
-    /// The deadline of every call; of `track` only that of its opening.
+    /// Deadline of every call, except `create_room`, `publish_adapter` and `refit_room`, which have
+    /// none. For `track`, it limits only the opening of the stream.
     pub deadline: Duration,
-    /// The bearer token of every call, if the server asks for one.
+    /// Bearer token of every call, if the server requires one.
     pub token: Option<String>,
-    /// TLS, if the server speaks it.
+    /// TLS, if the server uses it.
     pub tls: Option<ClientTls>,
 }
 
-/// Certificates for a connection with TLS, in PEM.
+/// TLS certificates, PEM.
 #[derive(Debug, Clone)]
 pub struct ClientTls {
-    /// The authorities that the server's certificate must come from.
+    /// Certificate authorities for the server's certificate.
     pub authorities: Vec<u8>,
-    /// The client's certificate and its private key, if the server asks for one.
+    /// The client's certificate and private key, if the server requires one.
     pub identity: Option<(Vec<u8>, Vec<u8>)>,
 }
 
@@ -126,12 +127,11 @@ impl Interceptor for Token {
 }
 
 impl Client {
-    /// Connects to `address`, HOST:PORT or a URL. Every call gets `deadline`; of `track` only its
-    /// opening.
+    /// Connects to `address`, HOST:PORT or a URL. For `deadline` see [`ConnectOptions::deadline`].
     ///
     /// # Errors
-    /// [`Error::Address`] if the address cannot be parsed, [`Error::Connect`] if no connection is
-    /// made within the deadline or 10 s.
+    /// [`Error::Address`] if the address cannot be parsed, [`Error::Connect`] if there is no
+    /// connection within the deadline, at most 10 s.
     pub async fn connect(address: &str, deadline: Duration) -> Result<Self, Error> {
         let options = ConnectOptions {
             deadline,
@@ -144,8 +144,8 @@ impl Client {
     /// Connects to `address`, HOST:PORT or a URL, with a token or TLS.
     ///
     /// # Errors
-    /// As [`Client::connect`]; also [`Error::Token`] if the token cannot be sent, and
-    /// [`Error::Connect`] if the certificates cannot be used.
+    /// As [`Client::connect`]; also [`Error::Token`] for an invalid token and [`Error::Connect`]
+    /// for invalid certificates.
     pub async fn connect_with(address: &str, options: ConnectOptions) -> Result<Self, Error> {
         let ConnectOptions {
             deadline,
@@ -191,7 +191,7 @@ impl Client {
                 })?;
         }
 
-        // The error of tonic only says that the transport failed; its source has the reason.
+        // tonic's error is only "transport error"; its source has the cause.
         let channel = endpoint.connect().await.map_err(|error| {
             let cause =
                 std::error::Error::source(&error).map_or(error.to_string(), ToString::to_string);
@@ -210,8 +210,8 @@ impl Client {
     /// Navigates from a view by a motion.
     ///
     /// # Errors
-    /// [`Error::Refused`] if the server refuses the request, [`Error::Deadline`] if no answer comes
-    /// in time; so for every call.
+    /// [`Error::Refused`] if the server refuses the request, [`Error::Deadline`] without a response
+    /// in time. This holds for every call.
     pub async fn navigate(
         &self,
         request: pb::NavigateRequest,
@@ -221,11 +221,11 @@ impl Client {
         Ok(service.navigate(self.request(request)).await?.into_inner())
     }
 
-    /// Answers several navigation requests in one call; the results have the order of the requests.
+    /// Several navigation requests in one call. Results are in the order of the requests.
     ///
     /// # Errors
-    /// [`Error::Refused`] if the whole batch is refused. A single request that fails is a failure
-    /// within the results.
+    /// [`Error::Refused`] if the whole batch is refused. The failure of a single request is part of
+    /// the results.
     pub async fn batch_navigate(
         &self,
         requests: Vec<pb::NavigateRequest>,
@@ -239,7 +239,7 @@ impl Client {
             .results)
     }
 
-    /// Walks to a goal; `feedback` is called after each step.
+    /// Navigates to a goal. `feedback` is called for each feedback message.
     ///
     /// # Errors
     /// [`Error::Refused`], or [`Error::NoReport`] if the stream ends without a result.
@@ -265,7 +265,7 @@ impl Client {
         Err(Error::NoReport)
     }
 
-    /// The stored frames that look most like a view, with their poses.
+    /// The stored frames most similar to a view, with their poses.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -278,7 +278,7 @@ impl Client {
         Ok(service.localize(self.request(request)).await?.into_inner())
     }
 
-    /// The rooms ranked by how well they match some views, and the pose in each.
+    /// The rooms ranked by their match with the given views, and the pose in each.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -294,7 +294,7 @@ impl Client {
             .into_inner())
     }
 
-    /// The motion between two views.
+    /// Estimates the motion between two views.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -309,7 +309,7 @@ impl Client {
             .into_inner())
     }
 
-    /// The latents of some views.
+    /// Computes the latents of views.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -319,13 +319,14 @@ impl Client {
         Ok(service.encode(self.request(request)).await?.into_inner())
     }
 
-    /// Opens a tracking stream: sends `requests` as they are made and returns the stream of
-    /// answers. The deadline holds until the server accepts the configuration, the first of the
-    /// requests; the stream itself has none, because it lasts as long as the robot moves.
+    /// Opens a tracking stream: sends `requests` as they are produced and returns the stream of
+    /// responses. The deadline applies until the server accepts the first request, the
+    /// configuration. The stream itself has no deadline, because it lasts as long as the robot
+    /// moves.
     ///
     /// # Errors
-    /// [`Error::Refused`] if the stream cannot be opened, [`Error::Deadline`] if the server says
-    /// nothing; later errors are items of the stream.
+    /// [`Error::Refused`] if the stream cannot be opened, [`Error::Deadline`] without a response in
+    /// time. Later errors are items of the stream.
     pub async fn track(
         &self,
         requests: impl Stream<Item = pb::TrackRequest> + Send + 'static,
@@ -336,12 +337,12 @@ impl Client {
         Ok(opened.map_err(|_| Error::Deadline)??.into_inner())
     }
 
-    /// All frames of a room, page by page; with `neighbours_within` also those that a motion of at most
-    /// this norm leads to, metres and radians mixed; with `thumbnail_width` also a JPEG of each, so many
-    /// pixels wide, from a server that shows images.
+    /// All frames of a room, read page by page. `neighbours_within` adds to each frame its
+    /// neighbors within this motion norm, meters and radians mixed. `thumbnail_width` adds a JPEG
+    /// of this width, pixels, if the server provides images.
     ///
     /// # Errors
-    /// [`Error::Refused`]; also when the room changes between two pages.
+    /// [`Error::Refused`], also if the room changes between two pages.
     pub async fn frames(
         &self,
         room: &str,
@@ -370,7 +371,7 @@ impl Client {
         }
     }
 
-    /// All rooms, page by page.
+    /// All rooms, read page by page.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -393,7 +394,7 @@ impl Client {
         }
     }
 
-    /// A room of the catalog by name.
+    /// One room, by name.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -408,7 +409,7 @@ impl Client {
             .room)
     }
 
-    /// All adapters, page by page.
+    /// All adapters, read page by page.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -431,7 +432,7 @@ impl Client {
         }
     }
 
-    /// An adapter of the catalog by name.
+    /// One adapter, by name.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -444,8 +445,8 @@ impl Client {
         Ok(service.get_adapter(request).await?.into_inner().adapter)
     }
 
-    /// Publishes a room from uploaded frames: a `RoomUpload`, then batches of frames, then the
-    /// `UploadEnd`. It has no deadline but the server's.
+    /// Publishes a room from a `RoomUpload`, batches of frames and an `UploadEnd`, in this order.
+    /// The client sets no deadline.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -457,8 +458,8 @@ impl Client {
         Ok(service.create_room(messages).await?.into_inner())
     }
 
-    /// Publishes an adapter that was trained elsewhere: an `AdapterUpload`, then its weights. It has
-    /// no deadline but the server's.
+    /// Publishes an externally trained adapter from an `AdapterUpload` and its weights, in this
+    /// order. The client sets no deadline.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -470,8 +471,8 @@ impl Client {
         Ok(service.publish_adapter(messages).await?.into_inner())
     }
 
-    /// Fits an adapter to a room on the server; `progress` is called from time to time. It has no
-    /// deadline: a fit takes minutes.
+    /// Fits an adapter to a room on the server. `progress` is called for each progress message. The
+    /// client sets no deadline: a fit takes minutes.
     ///
     /// # Errors
     /// [`Error::Refused`], or [`Error::NoReport`] if the stream ends without a result.
@@ -493,7 +494,8 @@ impl Client {
         Err(Error::NoReport)
     }
 
-    /// Chooses what a name alone means. Returns all defaults that hold now.
+    /// Sets or clears the default revision of a name or the default adapter of a room. Returns all
+    /// current defaults.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -506,7 +508,7 @@ impl Client {
         Ok(answer.into_inner().defaults)
     }
 
-    /// Takes the last choice of a default back. Returns all defaults that hold now.
+    /// Undoes the last change of a default. Returns all current defaults.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -519,7 +521,7 @@ impl Client {
         Ok(answer.into_inner().defaults)
     }
 
-    /// Removes a room or one revision of it. Returns the revisions that were removed.
+    /// Deletes a room or one of its revisions. Returns the deleted revisions.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -529,7 +531,7 @@ impl Client {
         Ok(answer.into_inner().revisions)
     }
 
-    /// Removes an adapter or one revision of it. Returns the revisions that were removed.
+    /// Deletes an adapter or one of its revisions. Returns the deleted revisions.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -542,8 +544,8 @@ impl Client {
         Ok(answer.into_inner().revisions)
     }
 
-    /// Evaluates navigators on a room's test pairs; `progress` is called when each navigator
-    /// begins.
+    /// Evaluates navigators on a room's test pairs. `progress` is called at the start of each
+    /// navigator.
     ///
     /// # Errors
     /// [`Error::Refused`], or [`Error::NoReport`] if the stream ends without a report.
@@ -566,7 +568,7 @@ impl Client {
         Err(Error::NoReport)
     }
 
-    /// Scores predictions that were made elsewhere.
+    /// Scores external predictions.
     ///
     /// # Errors
     /// [`Error::Refused`].
@@ -581,11 +583,11 @@ impl Client {
             .into_inner())
     }
 
-    /// Whether `name` is SERVING: `""` is the whole server, otherwise the full name of a service or
-    /// `rooms/NAME`.
+    /// Health check: whether `name` is SERVING. `name` is `""` for the whole server, the full name
+    /// of a service, or `rooms/NAME`.
     ///
     /// # Errors
-    /// [`Error::Refused`], also for a name that the server does not know.
+    /// [`Error::Refused`], also for an unknown name.
     pub async fn serves(&self, name: &str) -> Result<bool, Error> {
         let mut health = HealthClient::new(self.channel.clone());
         let request = self.request(HealthCheckRequest {

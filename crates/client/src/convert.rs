@@ -1,21 +1,21 @@
-//! Poses and motions from the wire and to it, as nalgebra's types.
+//! Conversion of poses and motions between wire types and nalgebra types.
 //!
-//! A wire pose is `parent_from_child`: it takes coordinates of the child frame to those of the
-//! parent frame, metres. A wire twist is in se(3): v in metres and ω in radians, in the body frame
-//! of the camera that the motion starts from.
+//! A wire pose is `parent_from_child`: it maps coordinates of the child frame to the parent frame,
+//! meters. A wire twist is in se(3): v in meters and ω in radians, in the body frame of the camera
+//! at the start of the motion.
 
 use nalgebra::{Isometry3, Quaternion, UnitQuaternion, Vector3};
 
 use crate::proto::v1 as pb;
 
-/// How far from 1 a quaternion's norm may be: more is no rounding, and so no rotation.
+/// Tolerance of a quaternion's norm: the largest deviation from 1 that counts as rounding.
 const QUATERNION_TOLERANCE: f64 = 1e-3;
 
-/// What is wrong with a message that should be a pose or a motion.
+/// Why a wire pose or twist is invalid.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{field} {problem}")]
 pub struct ConvertError {
-    /// The field to change.
+    /// The invalid field.
     pub field: &'static str,
     /// What is wrong with it.
     pub problem: String,
@@ -30,19 +30,19 @@ impl ConvertError {
     }
 }
 
-/// A camera motion in se(3), in the body frame of the camera that it starts from.
+/// A camera motion in se(3), in the body frame of the camera at its start.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Twist {
-    /// v, metres.
+    /// v, meters.
     pub linear: Vector3<f64>,
     /// ω, the rotation axis times the angle, radians.
     pub angular: Vector3<f64>,
 }
 
-/// `parent_from_child` of a wire pose. The names of its frames are not looked at.
+/// `parent_from_child` of a wire pose. Frame names are ignored.
 ///
 /// # Errors
-/// [`ConvertError`] if a part is missing, is not finite, or is no rotation.
+/// [`ConvertError`] if a part is missing or not finite, or the quaternion does not have norm 1.
 pub fn pose(pose: &pb::Pose) -> Result<Isometry3<f64>, ConvertError> {
     let orientation = pose
         .orientation
@@ -51,8 +51,8 @@ pub fn pose(pose: &pb::Pose) -> Result<Isometry3<f64>, ConvertError> {
     let quaternion = Quaternion::new(orientation.w, orientation.x, orientation.y, orientation.z);
     let norm = quaternion.norm();
 
-    // A small deviation is the sender's rounding, which `UnitQuaternion` normalises away below; a
-    // large one means that the four numbers are no rotation.
+    // A small deviation is rounding, removed by `UnitQuaternion` below; a large one means that the
+    // numbers are not a rotation.
     if norm.is_nan() || (norm - 1.0).abs() > QUATERNION_TOLERANCE {
         let problem = format!("has norm {norm}, a rotation has 1");
         return Err(ConvertError::new("orientation", problem));
@@ -65,7 +65,7 @@ pub fn pose(pose: &pb::Pose) -> Result<Isometry3<f64>, ConvertError> {
     ))
 }
 
-/// A wire pose of `parent_from_child` with the names of both frames.
+/// The wire pose of `parent_from_child`, with the names of both frames.
 pub fn pose_to_wire(
     parent_from_child: &Isometry3<f64>,
     parent_frame: &str,
@@ -96,7 +96,7 @@ pub fn twist(twist: &pb::Twist) -> Result<Twist, ConvertError> {
     })
 }
 
-/// A motion on the wire.
+/// The wire twist of a motion.
 pub fn twist_to_wire(twist: &Twist) -> pb::Twist {
     pb::Twist {
         linear: Some(vector_to_wire(&twist.linear)),
@@ -128,7 +128,7 @@ fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
 mod tests {
     use super::*;
 
-    /// Oracle: the definitions: what goes out comes back, and names are kept.
+    /// Oracle: the definition: a round trip preserves values and names.
     #[test]
     fn poses_and_twists_come_back() {
         let parent_from_child =

@@ -1,5 +1,5 @@
-//! A client of [seese3](https://docs.rs/seese3), latent navigation over gRPC: all that a robot's
-//! program has to link.
+//! A client of [seese3](https://docs.rs/seese3), latent navigation over gRPC, for use in a robot's
+//! program.
 //!
 //! ```no_run
 //! use std::time::Duration;
@@ -31,22 +31,22 @@
 //!
 //! | module | what |
 //! | --- | --- |
-//! | [`Client`] | a connection; one method per call of the service |
-//! | [`proto::v1`] | the wire types, generated from `proto/seese3/v1`, where every field is explained |
-//! | [`convert`] | poses and motions as nalgebra's types |
+//! | [`Client`] | a connection, with one method per RPC |
+//! | [`proto::v1`] | wire types, generated from `proto/seese3/v1`, which documents every field |
+//! | [`convert`] | conversion of poses and motions to nalgebra types |
 //!
-//! Conventions: metres, radians, seconds; camera axes x right, y down, z forward; poses are
-//! `parent_from_child`; twists are (v, ω) in the body frame of the camera that a motion starts
-//! from.
+//! Conventions: meters, radians, seconds; camera axes x right, y down, z forward; poses are
+//! `parent_from_child`; twists are (v, ω) in the body frame of the camera at the start of the
+//! motion.
 //!
-//! The feature `server` adds the server's side of the protocol; a robot does not need it.
+//! The feature `server` adds the server side of the protocol; clients do not need it.
 
 pub mod proto;
 pub mod convert;
 mod client;
 
 pub use client::{Client, ClientTls, ConnectOptions, Error};
-/// The types that [`convert`] speaks.
+/// The types used by [`convert`].
 pub use nalgebra;
-/// The types that streams and statuses are made of.
+/// The types of streams and statuses.
 pub use tonic;

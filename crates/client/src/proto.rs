@@ -1,4 +1,4 @@
-//! The generated wire types of `proto/seese3/v1` and their descriptors.
+//! Generated wire types of `proto/seese3/v1`, and their descriptors.
 
 /// Package `seese3.v1`.
 #[allow(missing_docs, clippy::all, clippy::pedantic, reason = "generated; the documentation is in the protos")]

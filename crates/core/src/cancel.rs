@@ -1,26 +1,26 @@
-//! A flag with which a caller asks long work to stop, because nobody waits for its result any more.
+//! A cancellation flag for long computations.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Set once by the caller; the work reads it between its steps.
+/// Set by the caller; checked by the computation between steps.
 #[derive(Debug, Default)]
 pub struct Cancellation(AtomicBool);
 
-/// The work was abandoned before it was complete.
+/// The computation was cancelled.
 #[derive(Debug, thiserror::Error, Clone, Copy, PartialEq, Eq)]
-#[error("cancelled: the deadline passed or the caller went away")]
+#[error("cancelled: the deadline passed or the caller disconnected")]
 pub struct Cancelled;
 
 impl Cancellation {
-    /// Asks the work to stop.
+    /// Requests cancellation.
     pub fn cancel(&self) {
         self.0.store(true, Ordering::Relaxed);
     }
 
-    /// Returns an error if the work was asked to stop.
+    /// Returns an error if cancellation was requested.
     ///
     /// # Errors
-    /// [`Cancelled`] after [`Cancellation::cancel`] was called.
+    /// [`Cancelled`] after [`Cancellation::cancel`].
     pub fn check(&self) -> Result<(), Cancelled> {
         if self.0.load(Ordering::Relaxed) {
             Err(Cancelled)

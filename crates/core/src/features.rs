@@ -1,8 +1,8 @@
-//! Features: one row of encoder output per frame of a room, and a record of how they were made.
+//! Features: one row of encoder output per frame of a room, with their source.
 
 use ndarray::{Array2, ArrayView2};
 
-/// Why a matrix of features is refused.
+/// Why features are refused.
 #[derive(Debug, thiserror::Error, PartialEq)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
@@ -25,40 +25,38 @@ pub enum Error {
     TooWide { name: String, columns: usize },
 }
 
-/// The largest number of columns of a feature.
+/// Maximum number of columns of a feature.
 pub const MAX_COLUMNS: usize = 131_072;
 
-/// The word that a [`FeatureSource`] holds where the origin of its features is not known.
+/// Value of the fields of a [`FeatureSource`] that are not known.
 pub const UNSPECIFIED: &str = "unspecified";
 
-/// How a set of features was made. Features of different sources are never mixed: an adapter
-/// accepts only features of the source that it was trained on.
+/// The source of features: encoder, layer, pooling and preprocessing. Features of different sources
+/// are never mixed: an adapter accepts only those of its training source.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FeatureSource {
-    /// The short name under which a room holds the features, for instance `effnet-block14`.
+    /// Short name of the features in a room, for instance `effnet-block14`.
     pub name: String,
-    /// The identity of the encoder, or `unspecified` if the features were imported without one.
+    /// Identity of the encoder, or `unspecified` for features imported without one.
     pub encoder: String,
     /// The name of the layer in the model, for instance `block14`.
     pub layer: String,
-    /// Where the numbering of layers starts: `0` or `1`, or `name` if the layer has a name without
-    /// a number.
+    /// First number of the layer numbering: `0` or `1`, or `name` for a layer name without a number
+    ///
     pub base: String,
-    /// Whether the encoder's final normalisation layer was applied to the output: `none`, `final`
-    /// or `unspecified`.
+    /// Whether the encoder's final normalization layer was applied: `none`, `final` or
+    /// `unspecified`.
     pub norm: String,
-    /// How the layer's output was reduced to one row, for instance `cls`, `mean`, `grid2x2`.
+    /// Pooling of the layer's output to one row, for instance `cls`, `mean`, `grid2x2`.
     pub pooling: String,
-    /// How images were prepared for the encoder, as text that ends in its own hash, or
-    /// `unspecified`.
+    /// Image preprocessing, as text that ends in its hash, or `unspecified`.
     pub preprocess: String,
     /// The number of columns of a feature.
     pub dim: usize,
 }
 
 impl FeatureSource {
-    /// The source of features that were imported as bare numbers, so that only their name and width
-    /// are known.
+    /// The source of imported features of which only name and width are known.
     pub fn imported(name: &str, dim: usize) -> Self {
         let unspecified = || UNSPECIFIED.to_owned();
         Self {
@@ -73,11 +71,10 @@ impl FeatureSource {
         }
     }
 
-    /// Whether features of the two sources can be compared: every field but the name is equal.
-    /// Where the encoder is unspecified, only the name tells sources apart, so it must be equal
-    /// too.
+    /// Whether features of the two sources are comparable: all fields except the name are equal. If
+    /// the encoder is unspecified, the names must be equal too.
     pub fn is_like(&self, other: &Self) -> bool {
-        // Destructured with no `..`, so that a new field breaks the build here.
+        // Destructured without `..`, so that a new field is a compile error here.
         let Self {
             name,
             encoder,
@@ -89,7 +86,7 @@ impl FeatureSource {
             dim,
         } = self;
 
-        // The name is left out: it is a label, and does not change the numbers.
+        // The name is only a label and does not affect the numbers.
         let alike = (encoder, layer, base, norm, pooling, preprocess, dim)
             == (
                 &other.encoder,
@@ -105,7 +102,7 @@ impl FeatureSource {
     }
 }
 
-/// Finite features of one room: shape (n, d), row i belongs to frame i.
+/// Features of one room, finite: shape (n, d), row i belongs to frame i.
 #[derive(Debug, Clone)]
 pub struct Features {
     source: FeatureSource,
@@ -113,7 +110,7 @@ pub struct Features {
 }
 
 impl Features {
-    /// Checks the numbers. `source.dim` is set to their number of columns.
+    /// Validates the numbers. Sets `source.dim` to the number of columns.
     ///
     /// # Errors
     /// [`Error::Empty`] if there is no row or no column, [`Error::TooWide`] if there are more than
@@ -157,7 +154,7 @@ impl Features {
         }
     }
 
-    /// How the features were made.
+    /// The source of the features.
     pub fn source(&self) -> &FeatureSource {
         &self.source
     }
@@ -172,8 +169,8 @@ impl Features {
 mod tests {
     use super::*;
 
-    /// Oracle: the definition. Sources are compared by how the features were made, and by their
-    /// name only if the encoder is not known.
+    /// Oracle: the definition. All fields except the name are compared; the name only if the
+    /// encoder is unspecified.
     #[test]
     fn sources_are_alike_by_their_making() {
         let made = |name: &str, layer: &str| FeatureSource {
@@ -188,7 +185,7 @@ mod tests {
         assert!(!FeatureSource::imported("a", 3).is_like(&FeatureSource::imported("b", 3)));
     }
 
-    /// Oracle: IEEE 754's own list of what is not finite.
+    /// Oracle: IEEE 754's values that are not finite.
     #[test]
     fn one_nan_or_infinity_is_found_and_named() {
         for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {

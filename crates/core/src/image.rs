@@ -1,31 +1,32 @@
 //! 8-bit RGB images in memory, row by row from the top left.
 
-/// The columns and rows of parts whose brightness is compared.
+/// Columns and rows of the grid cells for the blank check.
 const BLANK_GRID: (usize, usize) = (16, 12);
-/// Parts whose means deviate by less than this, of 255, are equally bright.
+/// An image is blank if the standard deviation of the cell means is below this, on the scale 0 to
+/// 255.
 const BLANK_DEVIATION: f64 = 2.0;
 
-/// An image of `width` × `height` pixels, three bytes each: red, green, blue.
+/// An image of `width` × `height` pixels, three bytes per pixel: red, green, blue.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RgbImage {
-    /// Pixels from left to right.
+    /// Number of pixel columns.
     pub width: usize,
-    /// Pixels from top to bottom.
+    /// Number of pixel rows.
     pub height: usize,
     /// `width * height * 3` bytes.
     pub bytes: Vec<u8>,
 }
 
 impl RgbImage {
-    /// The colour at column `x` and row `y`, which must lie inside the image.
+    /// The color at column `x` and row `y`, which must be inside the image.
     pub fn pixel(&self, x: usize, y: usize) -> [u8; 3] {
         let at = (y * self.width + x) * 3;
         [self.bytes[at], self.bytes[at + 1], self.bytes[at + 2]]
     }
 
-    /// Whether the image shows nothing: its parts, 16 × 12 of them, are all about equally bright, as
-    /// those of a covered lens, a blinded sensor or a wall without any texture are. Noise does not
-    /// count.
+    /// Whether the image is blank, for instance from a covered lens, a saturated sensor or a wall
+    /// without texture: the cells of a 16 × 12 grid have nearly equal mean brightness. Pixel noise
+    /// is averaged out.
     pub fn is_blank(&self) -> bool {
         let mut parts = [(0_u64, 0_u64); BLANK_GRID.0 * BLANK_GRID.1];
         for y in 0..self.height {
@@ -38,7 +39,7 @@ impl RgbImage {
             }
         }
 
-        // An image smaller than the grid leaves some parts without a pixel.
+        // In an image smaller than the grid, some cells have no pixel.
         let known = parts.iter().filter(|(_, count)| *count > 0);
         let means: Vec<f64> = known
             .map(|(sum, count)| *sum as f64 / *count as f64)
@@ -64,10 +65,10 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand: constants and noise around one show nothing, a step and a gradient do.
+    /// Oracle: by hand: a constant, with or without noise, is blank; a step and a gradient are not.
     #[test]
     fn blank_images_show_nothing() {
-        // A fixed pattern of one pixel each way averages out in every part.
+        // A fixed noise pattern that averages out in every cell.
         let noise = |x: usize, y: usize| 5 + ((x * 7 + y * 13) % 8) as u8;
         assert!(image(|_, _| 0).is_blank());
         assert!(image(|_, _| 255).is_blank());

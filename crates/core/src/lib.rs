@@ -1,10 +1,10 @@
-//! The paper SeeSE3 as computations: latent navigation with Poincaré adapters. Part of
+//! The computations of the paper SeeSE3: latent navigation with Poincaré adapters. Part of
 //! [seese3](https://docs.rs/seese3).
 //!
 //! An encoder turns an image into a feature z. A small trained network φ, the *Poincaré adapter*,
-//! turns features into latents in which camera motion is linear: ΔP ≈ W(φ(z₂) − φ(z₁)), with
-//! ΔP = log(P₁⁻¹P₂) ∈ se(3). Inverted, a motion can be imagined: ĝ = φ(z) + W⁺ΔP, and the stored
-//! frame nearest to ĝ shows where it leads.
+//! turns features into latents in which camera motion is linear: ΔP ≈ W(φ(z₂) − φ(z₁)), with ΔP =
+//! log(P₁⁻¹P₂) ∈ se(3). The inverse predicts the latent after a motion, ĝ = φ(z) + W⁺ΔP; the stored
+//! frame nearest to ĝ is the predicted view.
 //!
 //! ```
 //! use std::sync::Arc;
@@ -41,7 +41,7 @@
 //! let (adapter, record) = train_adapter(&[data], &plan, &mut |_| ())?;
 //! assert!(record.pair_count > 0);
 //!
-//! // Read the motion between two frames, and find the frames that look like one.
+//! // Predict the motion between two frames, and find the frames most similar to one.
 //! let navigator = Navigator::new(Arc::new(room), &features, Arc::new(adapter), IndexKind::Exact)?;
 //! let latents = navigator.latents();
 //! let motion = navigator.adapter().motion(latents.row(10), latents.row(15));
@@ -52,38 +52,36 @@
 //!
 //! # Conventions
 //!
-//! A [`geometry::Pose`] is `world_from_camera`, metres. A [`geometry::Twist`] is ordered (v, ω), in
-//! the body frame of the camera that a motion starts from; |ω| ≤ π. Camera axes are x right, y down,
-//! z forward. Weights are f32 as trained; answers are computed in f64. The numbers A-nn are those
-//! of the ambiguities in `docs/paper.md`.
+//! A [`geometry::Pose`] is `world_from_camera`, meters. A [`geometry::Twist`] is ordered (v, ω), in
+//! the body frame of the camera at the start of the motion; |ω| ≤ π. Camera axes are x right, y
+//! down, z forward. Weights are f32 as trained; inference is in f64. A-nn refers to the ambiguities
+//! in `docs/paper.md`.
 //!
 //! # The map
 //!
-//! The modules are listed from the lowest layer up: each uses only those listed before it, and a test
-//! enforces it.
+//! Modules from the lowest layer up. Each uses only those listed before it; a test enforces it.
 //!
 //! | module | what |
 //! | --- | --- |
-//! | [`cancel`] | a flag that says that nobody waits for the result any more |
+//! | [`cancel`] | a cancellation flag for long computations |
 //! | [`geometry`] | SE(3): poses, twists, errors between poses |
-//! | [`matrices`] | between ndarray and nalgebra |
+//! | [`matrices`] | conversion between ndarray and nalgebra |
 //! | [`room`] | a recording: frames with poses, times and image names |
-//! | [`image`] | 8-bit RGB pictures |
-//! | [`features`] | one row of encoder output per frame, and what made it |
-//! | [`index`] | nearest neighbours: the exact scan, HNSW |
+//! | [`image`] | 8-bit RGB images |
+//! | [`features`] | one row of encoder output per frame, with its source |
+//! | [`index`] | nearest-neighbor search: exact scan, HNSW |
 //! | [`ridge`] | ridge regression in closed form |
-//! | [`splits`] | which pairs of frames train and which test; which frames a map holds |
+//! | [`splits`] | train/test splits of frame pairs; hold-outs of mapped frames |
 //! | [`statistics`] | means, quantiles, rates, the bootstrap over rooms, coverage of covariances |
 //! | [`motion_scores`] | R² of predicted motions |
-//! | [`trajectory`] | paths against the true ones: association, alignment, APE, RPE |
+//! | [`trajectory`] | trajectory evaluation: association, alignment, APE, RPE |
 //! | [`adapter`] | features to latents, latents to motions and back; networks and their training |
-//! | [`training`] | from rooms to an adapter and its scores |
-//! | [`navigation`] | from a frame and a motion to the frames that follow |
-//! | [`localization`] | from a view to the frames that look like it |
-//! | [`eval`] | Hit@ε on held-out motions, and whether a score leaks |
+//! | [`training`] | trains and scores an adapter on rooms |
+//! | [`navigation`] | retrieves the frames after a motion |
+//! | [`localization`] | retrieves the frames most similar to a view |
+//! | [`eval`] | Hit@ε on held-out motions, and data-leak checks |
 //!
-//! Nothing here reads files, the network, the clock or the environment; randomness enters as a
-//! seed.
+//! The crate does not use files, the network, the clock or the environment. Randomness is seeded.
 
 pub mod cancel;
 pub mod geometry;

@@ -1,6 +1,7 @@
-//! From a feature to a pose: the nearest frames in one room or in all, by latent distance.
+//! Place recognition: the frames nearest to a view, in one or several rooms, by latent distance.
 //!
-//! Latent distances are comparable only under one adapter, so all rooms of a query must share it.
+//! Latent distances are comparable only under one adapter, so all rooms of a query must use the
+//! same adapter.
 
 use ndarray::ArrayView1;
 
@@ -8,7 +9,7 @@ use crate::cancel::{Cancellation, Cancelled};
 use crate::navigation::{Navigator, RetrievedFrame};
 use crate::room::RoomId;
 
-/// A stored frame that matches the query, and the room it belongs to.
+/// A retrieved frame and its room.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Place {
     /// The room.
@@ -17,10 +18,10 @@ pub struct Place {
     pub frame: RetrievedFrame,
 }
 
-/// The `k` nearest frames of all `rooms`, by distance, then room, then frame.
+/// The `k` nearest frames of all `rooms`, ordered by distance, then room, then frame.
 ///
 /// # Errors
-/// [`Cancelled`] between two rooms.
+/// [`Cancelled`] when the request was cancelled; checked before each room.
 pub fn localize<'a>(
     rooms: impl IntoIterator<Item = &'a Navigator>,
     latent: ArrayView1<'_, f64>,
@@ -36,7 +37,7 @@ pub fn localize<'a>(
             frame,
         }));
 
-        // Sorted and cut after every room, so that the list never holds more than 2k frames.
+        // Sort and truncate after every room, so that the list has at most 2k frames.
         places.sort_by(|a, b| {
             let distance = a
                 .frame

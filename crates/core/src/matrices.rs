@@ -1,4 +1,4 @@
-//! Matrices between the two libraries: ndarray holds features and latents, nalgebra decomposes.
+//! Conversion of matrices between ndarray (features, latents) and nalgebra (decompositions).
 
 use nalgebra::DMatrix;
 use ndarray::{Array2, ArrayView2};
@@ -15,7 +15,7 @@ pub fn to_ndarray(matrix: &DMatrix<f64>) -> Array2<f64> {
     Array2::from_shape_fn(matrix.shape(), |at| matrix[at])
 }
 
-/// Serializes a symmetric matrix as its upper triangle, row by row, for `#[serde(with)]`.
+/// Serialization of a symmetric matrix as its upper triangle, row by row, for `#[serde(with)]`.
 #[cfg(feature = "serde")]
 pub mod upper_triangle {
     use nalgebra::SMatrix;
@@ -26,10 +26,10 @@ pub mod upper_triangle {
         (0..N).flat_map(|row| (row..N).map(move |column| (row, column)))
     }
 
-    /// Writes N(N + 1)/2 numbers; the lower triangle is not read.
+    /// Writes the N(N + 1)/2 numbers of the upper triangle.
     ///
     /// # Errors
-    /// Those of the serializer.
+    /// Errors of the serializer.
     pub fn serialize<S: Serializer, const N: usize>(
         matrix: &SMatrix<f64, N, N>,
         serializer: S,
@@ -41,7 +41,7 @@ pub mod upper_triangle {
     /// Reads N(N + 1)/2 numbers.
     ///
     /// # Errors
-    /// If the count differs, or those of the deserializer.
+    /// A wrong count, and errors of the deserializer.
     pub fn deserialize<'de, D: Deserializer<'de>, const N: usize>(
         deserializer: D,
     ) -> Result<SMatrix<f64, N, N>, D::Error> {
@@ -66,8 +66,7 @@ pub mod upper_triangle {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand; the libraries order their entries differently in memory, by column and by
-    /// row.
+    /// Oracle: by hand; nalgebra is column-major, ndarray row-major.
     #[test]
     fn entries_keep_their_places() {
         let matrix = ndarray::array![[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]];

@@ -1,22 +1,23 @@
-//! Scores of predicted motions: R² by component, and hit rates with confidence intervals.
+//! Scores of predicted motions: R² per component.
 
 use nalgebra::{Vector3, Vector6};
 
 use crate::geometry::Twist;
 use crate::statistics::mean_of_known;
 
-/// Motions whose true translation |v| is shorter, metres, have no direction to score.
+/// Minimum true translation |v| for a direction score, meters.
 pub const LEAST_DIRECTED_M: f64 = 1e-3;
 
-/// R² of predicted twists. A component whose targets do not vary has no R² and is left out of the
-/// means; a mean over no component is NaN.
+/// R² of predicted twists. A component with constant targets has no R² and is excluded from the
+/// means; a mean without components is NaN.
 ///
-/// R² = 1 − Σ(y − ŷ)² / Σ(y − ȳ)², ȳ the mean of the evaluated targets (scikit-learn's `r2_score`).
+/// R² = 1 − Σ(y − ŷ)² / Σ(y − ȳ)², with ȳ the mean of the evaluated targets (scikit-learn's
+/// `r2_score`).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionScores {
-    /// Pairs scored.
+    /// Number of pairs.
     pub n: usize,
-    /// R² of each component, (v, ω); NaN when it does not vary.
+    /// R² of each component, (v, ω); NaN for a constant component.
     pub components: [f64; 6],
     /// Mean of the components' R².
     pub overall: f64,
@@ -28,24 +29,23 @@ pub struct MotionScores {
     pub direction: f64,
     /// R² of |v|.
     pub magnitude: f64,
-    /// Pairs left out of `direction` because the camera hardly moves.
+    /// Number of pairs excluded from `direction`, with |v| of at most 1 mm.
     pub direction_pairs_dropped: usize,
 }
 
 impl MotionScores {
-    /// Scores predictions against truths, pair by pair; both must be equally long.
+    /// Scores predictions against true motions, pair by pair. Both must have the same length.
     pub fn of(truth: &[Twist], predicted: &[Twist]) -> Self {
         let components: [f64; 6] =
             std::array::from_fn(|c| r2(pairs_of(truth, predicted, |twist| twist.to_vector()[c])));
 
-        // The direction of a camera that hardly moves is noise, so such pairs are left out.
+        // Without translation the direction is noise: exclude such pairs.
         let moving: Vec<(Vector3<f64>, Vector3<f64>)> = truth
             .iter()
             .zip(predicted)
             .filter(|(truth, _)| truth.linear.norm() > LEAST_DIRECTED_M)
             .map(|(truth, predicted)| {
-                // A predicted translation of zero has no direction; it stays zero instead of
-                // becoming NaN.
+                // A predicted translation of zero stays zero instead of NaN.
                 let length = predicted.linear.norm().max(1e-12);
                 (truth.linear.normalize(), predicted.linear / length)
             })
@@ -69,7 +69,7 @@ impl MotionScores {
 }
 
 impl MotionScores {
-    /// The mean of several scores, field by field, leaving out NaN; counts are summed.
+    /// Mean of several scores, field by field, ignoring NaN; counts are summed.
     pub fn mean(scores: &[Self]) -> Self {
         let of = |figure: fn(&Self) -> f64| {
             mean_of_known(&scores.iter().map(figure).collect::<Vec<_>>())
@@ -99,26 +99,25 @@ impl MotionScores {
         }
     }
 
-    /// How many components do not vary, and so have no R².
+    /// Number of constant components, which have no R².
     pub fn still_components(&self) -> usize {
         self.components.iter().filter(|r2| r2.is_nan()).count()
     }
 }
 
-/// The motions of the test pairs of a room: true, as read, and as the mean of the training motions,
-/// pair by pair.
+/// Motions of the test pairs of a room: true, predicted, and the constant baseline.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ReadMotions {
-    /// The true motions.
+    /// True motions.
     pub truth: Vec<Twist>,
-    /// The motions as read.
+    /// Predicted motions.
     pub read: Vec<Twist>,
-    /// The mean training motion, repeated.
+    /// Constant baseline: the mean training motion, for each pair.
     pub constant: Vec<Twist>,
 }
 
 impl ReadMotions {
-    /// True motions beside those that were read, and the mean training motion.
+    /// Motions from the true and the predicted ones, and the mean training motion.
     pub fn new(truth: Vec<Twist>, read: Vec<Twist>, mean: &Vector6<f64>) -> Self {
         let constant = vec![Twist::from_vector(mean); truth.len()];
         Self {
@@ -135,28 +134,27 @@ impl ReadMotions {
         self.constant.append(&mut other.constant);
     }
 
-    /// R² of the motions as read.
+    /// R² of the predicted motions.
     pub fn scores(&self) -> MotionScores {
         MotionScores::of(&self.truth, &self.read)
     }
 
-    /// R² of always answering the mean training motion.
+    /// R² of the constant baseline.
     pub fn constant_r2(&self) -> f64 {
         MotionScores::of(&self.truth, &self.constant).overall
     }
 }
 
-/// Mean of R² over the components when `constant` is predicted for every pair.
+/// Mean R² over the components of the constant prediction `constant`.
 pub fn constant_r2(truth: &[Twist], constant: &Vector6<f64>) -> f64 {
     let predicted = vec![Twist::from_vector(constant); truth.len()];
     MotionScores::of(truth, &predicted).overall
 }
 
-/// True values with a standard deviation below this, in their own unit, count as constant: what
-/// varies is rounding.
+/// Standard deviation below which true values count as constant up to rounding, in their unit.
 const STILL: f64 = 1e-9;
 
-/// R² of (truth, prediction) pairs; NaN when the truths do not vary.
+/// R² of (truth, prediction) pairs; NaN when the true values are constant.
 pub fn r2(pairs: Vec<(f64, f64)>) -> f64 {
     let mean = pairs.iter().map(|(truth, _)| truth).sum::<f64>() / pairs.len() as f64;
     let total: f64 = pairs.iter().map(|(truth, _)| (truth - mean).powi(2)).sum();

@@ -1,5 +1,5 @@
 //! Ridge regression in closed form, with scikit-learn's objective ‖Y − XB‖² + α‖B‖² (a sum, not a
-//! mean); the intercept is not penalised.
+//! mean). The intercept is not penalized.
 
 use nalgebra::Cholesky;
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis};
@@ -11,7 +11,7 @@ use crate::matrices::{to_nalgebra, to_ndarray};
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
     #[error(
-        "ridge regression needs as many inputs as targets and at least one, got {inputs} and {targets}"
+        "ridge regression needs the same number of inputs and targets, at least one; got {inputs} and {targets}"
     )]
     Rows { inputs: usize, targets: usize },
     #[error("the penalty α must be finite and positive, got {alpha}")]
@@ -22,12 +22,12 @@ pub enum Error {
     NotPositiveDefinite,
 }
 
-/// Whether a constant is fitted in addition to the coefficients.
+/// Whether an intercept is fitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Intercept {
     /// Y ≈ X B + b.
     Fitted,
-    /// Y ≈ X B: a zero input predicts zero.
+    /// Y ≈ X B: the prediction for a zero input is zero.
     None,
 }
 
@@ -36,7 +36,7 @@ pub enum Intercept {
 pub struct Ridge {
     /// Coefficients, shape (targets, inputs), as scikit-learn's `coef_`.
     pub coefficients: Array2<f64>,
-    /// Shape (targets,); zero without an intercept.
+    /// Intercept, shape (targets,); zero if not fitted.
     pub intercept: Array1<f64>,
 }
 
@@ -44,9 +44,9 @@ impl Ridge {
     /// Fits `targets` (n, t) on `inputs` (n, d) with penalty `alpha` > 0.
     ///
     /// # Errors
-    /// [`Error::Rows`] when inputs and targets differ in number or there are none;
-    /// [`Error::Penalty`] when α is not finite and positive; [`Error::NotPositiveDefinite`] when an
-    /// input is not finite or α is too small for the inputs.
+    /// [`Error::Rows`] when the numbers of inputs and targets differ or are 0; [`Error::Penalty`]
+    /// when α is not finite and positive; [`Error::NotPositiveDefinite`] when an input is not
+    /// finite or α is too small for the inputs.
     ///
     /// Source: SeeSE3, Sec. A.2, M3; equal to scikit-learn's `Ridge`.
     pub fn fit(
@@ -66,7 +66,7 @@ impl Ridge {
             return Err(Error::Penalty { alpha });
         }
 
-        // Centring inputs and targets fits the intercept without penalising it.
+        // Centering inputs and targets fits the intercept without a penalty.
         let centre = |rows: ArrayView2<'_, f64>| match intercept {
             Intercept::Fitted => rows.sum_axis(Axis(0)) / rows.nrows() as f64,
             Intercept::None => Array1::zeros(rows.ncols()),
@@ -77,7 +77,7 @@ impl Ridge {
         let x = &inputs - &input_mean;
         let y = &targets - &target_mean;
 
-        // (XᵀX + αI)⁻¹XᵀY = Xᵀ(XXᵀ + αI)⁻¹Y: the smaller of the two systems is solved.
+        // (XᵀX + αI)⁻¹XᵀY = Xᵀ(XXᵀ + αI)⁻¹Y: solve the smaller system.
         let coefficients = if x.nrows() < x.ncols() {
             solved(x.dot(&x.t()), alpha, &y)?.reversed_axes().dot(&x)
         } else {
@@ -126,7 +126,7 @@ mod tests {
         assert_eq!(fit.intercept[0], 0.0);
     }
 
-    /// Oracle: a constant target is the intercept, which is not penalised.
+    /// Oracle: a constant target is the intercept, which is not penalized.
     #[test]
     fn a_constant_is_the_intercept() {
         let inputs = array![[1.0], [2.0], [4.0]];

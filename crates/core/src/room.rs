@@ -1,7 +1,7 @@
-//! A room: the frames of one recording, each with the pose of its camera.
+//! A room: the frames of a recording, with camera poses.
 //!
-//! - Frames are ordered by capture; a [`FrameId`] is the row of a frame in every array of its room.
-//! - Poses are `world_from_camera`, metres. Timestamps are nanoseconds.
+//! - Frames are in capture order; a [`FrameId`] is the row of a frame in all arrays of its room.
+//! - Poses are `world_from_camera`, meters. Timestamps are nanoseconds.
 
 use std::fmt;
 
@@ -32,7 +32,7 @@ pub enum Error {
     #[error("room '{room}' has {frame_count} frames, over the limit of {MAX_FRAMES}")]
     TooManyFrames { room: RoomId, frame_count: usize },
     #[error(
-        "room '{room}', frame {frame}: image '{image}' must be a path below the recording's folder, without '..'"
+        "room '{room}', frame {frame}: image '{image}' must be a path inside the recording's folder, without '..'"
     )]
     ImagePath {
         room: RoomId,
@@ -47,10 +47,10 @@ pub enum Error {
     },
 }
 
-/// The largest distance of a camera from the origin of its world frame, metres.
+/// Maximum distance of a camera from the origin of its world frame, meters.
 pub const MAX_DISTANCE_M: f64 = 1e6;
 
-/// The largest number of frames in a room.
+/// Maximum number of frames in a room.
 pub const MAX_FRAMES: usize = 10_000_000;
 
 /// The name of a room, which is also the name of its folder in the store.
@@ -58,7 +58,7 @@ pub const MAX_FRAMES: usize = 10_000_000;
 pub struct RoomId(String);
 
 impl RoomId {
-    /// Checks a name.
+    /// Validates a name.
     ///
     /// # Errors
     /// [`Error::Name`] if it is not a valid folder name on every system.
@@ -111,25 +111,25 @@ impl fmt::Display for FrameId {
     }
 }
 
-/// Where a room came from.
+/// Origin of a room.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Provenance {
-    /// The format it was read from, for instance `7scenes`.
+    /// Source format, for instance `7scenes`.
     pub format: String,
-    /// The terms under which its data may be used, if stated.
+    /// License of the data, if stated.
     pub licence: String,
-    /// The folder that the paths of images are relative to; empty if the room has no images.
+    /// Base folder of the image paths; empty if the room has no images.
     pub images_root: String,
-    /// The largest entry of |RRᵀ − I| over all rotations, before they were projected to SO(3).
+    /// Largest entry of |RRᵀ − I| over all rotations, before the projection onto SO(3).
     pub worst_rotation_deviation: f64,
     /// The camera that took the images, if known.
     pub camera: Option<Pinhole>,
 }
 
-/// The data of a room's frames, column by column. [`Room::new`] checks them.
+/// The frames of a room as columns, one entry per frame. [`Room::new`] validates them.
 #[derive(Debug, Clone, Default)]
 pub struct Frames {
-    /// `world_from_camera`, metres, in order of capture.
+    /// `world_from_camera`, meters, in order of capture.
     pub poses: Vec<Pose>,
     /// Nanoseconds on the recorder's clock, one per frame, or empty if unknown.
     pub timestamps_ns: Vec<i64>,
@@ -190,7 +190,7 @@ impl Frames {
     }
 }
 
-/// The order of a room's frames without their contents: all that a train/test split needs.
+/// The sequence structure of a room's frames, as needed for a train/test split.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Timeline {
     /// The number of frames.
@@ -204,7 +204,7 @@ pub struct Timeline {
 }
 
 impl Timeline {
-    /// One uninterrupted sequence, from a recording without a train/test split of its own.
+    /// A timeline of one uninterrupted sequence, without a train/test split.
     pub fn unbroken(frame_count: usize) -> Self {
         Self {
             frame_count,
@@ -218,7 +218,7 @@ impl Timeline {
     }
 }
 
-/// A room with checked frames. It is immutable.
+/// A room with validated frames. Immutable.
 #[derive(Debug, Clone)]
 pub struct Room {
     id: RoomId,
@@ -228,7 +228,7 @@ pub struct Room {
 }
 
 impl Room {
-    /// Checks the frames and makes the room.
+    /// Validates the frames.
     ///
     /// # Errors
     /// Checked in this order: [`Error::Empty`] if there are no poses, [`Error::TooManyFrames`] over
@@ -257,7 +257,7 @@ impl Room {
             });
         }
 
-        // A comparison with NaN is false, so `near` also refuses a translation that is not finite.
+        // Comparisons with NaN are false, so `near` also refuses a translation with NaN.
         let near = |pose: &Pose| pose.translation.vector.norm() <= MAX_DISTANCE_M;
         let finite =
             |pose: &Pose| near(pose) && pose.to_homogeneous().iter().all(|x| x.is_finite());
@@ -265,7 +265,7 @@ impl Room {
             return Err(Error::PoseNotFinite { room: id, frame });
         }
 
-        // Images are opened by these paths later, so none may lead out of the recording's folder.
+        // These paths are opened later, so none may leave the recording's folder.
         if let Some(frame) = frames.images.iter().position(|image| !stays_below(image)) {
             return Err(Error::ImagePath {
                 room: id,
@@ -274,8 +274,8 @@ impl Room {
             });
         }
 
-        // The timeline repeats two of the columns, so that splits can be made without the poses and
-        // the paths of images.
+        // The timeline is a copy of two columns, so that splits do not need the poses and image
+        // paths.
         let sequences = frames.sequences.clone();
         let held_out = frames.held_out.clone();
         let timeline = Timeline {
@@ -297,7 +297,7 @@ impl Room {
         &self.id
     }
 
-    /// About how much memory it holds, bytes.
+    /// Approximate memory use, bytes.
     pub fn memory_bytes(&self) -> usize {
         let Frames {
             poses,
@@ -313,7 +313,7 @@ impl Room {
             .map(|text| size_of::<String>() + text.capacity())
             .sum();
 
-        // The timeline repeats the last two columns.
+        // The timeline has a copy of the last two columns.
         size_of_val(poses.as_slice())
             + size_of_val(timestamps_ns.as_slice())
             + size_of_val(numbers.as_slice())
@@ -327,7 +327,7 @@ impl Room {
         self.frames.poses.len()
     }
 
-    /// The poses of all frames, `world_from_camera`, metres.
+    /// The poses of all frames, `world_from_camera`, meters.
     pub fn poses(&self) -> &[Pose] {
         &self.frames.poses
     }
@@ -368,7 +368,7 @@ impl Room {
         &self.provenance
     }
 
-    /// The pose of a frame, `world_from_camera`, metres.
+    /// The pose of a frame, `world_from_camera`, meters.
     ///
     /// # Errors
     /// [`Error::UnknownFrame`] if the room has no such frame.
@@ -384,7 +384,7 @@ impl Room {
     }
 }
 
-/// Whether a relative path cannot leave the folder it starts from.
+/// Whether a relative path stays inside its base folder.
 fn stays_below(path: &str) -> bool {
     !path.is_empty()
         && !path.contains(['\\', ':', '\0'])
@@ -414,8 +414,8 @@ mod tests {
         assert_eq!(message, "room 'r' has no frame 2; it has frames 0 to 1");
     }
 
-    /// Oracle: the definition of a room: it has frames, finite poses, columns of equal length, and
-    /// image paths that stay below its folder. Each case breaks one of these.
+    /// Oracle: the definition of a room: frames, finite poses, columns of equal length, image paths
+    /// inside its folder. Each case violates one of these.
     #[test]
     fn bad_frames_are_refused() {
         assert!(matches!(room(Frames::default()), Err(Error::Empty { .. })));
@@ -458,7 +458,7 @@ mod tests {
         }
     }
 
-    /// Oracle: what a path traversal or a hidden file looks like.
+    /// Oracle: typical names of path traversals and hidden files.
     #[test]
     fn names_that_could_escape_their_folder_are_refused() {
         for name in [

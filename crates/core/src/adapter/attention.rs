@@ -1,10 +1,9 @@
-//! The attention corrector. Its two tokens, one of the latent and one of the motion, pass through
-//! one pre-norm transformer block (4 heads, feed-forward width 256); their mean passes through a
-//! linear layer.
+//! The attention corrector. A latent token and a motion token pass through one pre-norm transformer
+//! block (4 heads, feed-forward width 256). A linear layer maps their mean to the output.
 //!
 //! The block is PyTorch's `TransformerEncoderLayer(64, 4, 256, activation="gelu", norm_first=True)`
-//! without dropout. The two tokens of n samples are kept as 2n rows: the n tokens of the latents
-//! first, the n tokens of the motions below.
+//! without dropout. The two tokens of n samples are stored as 2n rows: first the n latent tokens,
+//! then the n motion tokens.
 
 use ndarray::{Array2, ArrayView2, Axis, concatenate, s};
 
@@ -22,7 +21,7 @@ const HEAD: usize = WIDTH / HEADS;
 /// Width of the feed-forward layer.
 const INNER: usize = 256;
 
-/// Positions of the weights in [`Attention::tensors`]; each bias follows its weight.
+/// Index of each weight in [`Attention::tensors`]; its bias is at the next index.
 const TOKEN_G: usize = 0;
 const TOKEN_P: usize = 2;
 const OUT: usize = 4;
@@ -71,7 +70,7 @@ struct Normed<T> {
     output: Array2<T>,
 }
 
-/// What the backward pass needs of the forward pass.
+/// Intermediate values of the forward pass that the backward pass uses.
 pub(super) struct Activations<T> {
     latents: Array2<T>,
     motions: Array2<T>,
@@ -90,19 +89,18 @@ pub(super) struct Activations<T> {
 }
 
 impl<T: Real> Attention<T> {
-    /// Initial weights, drawn in the order in which PyTorch draws them when it constructs the
-    /// modules.
+    /// Initial weights, drawn in the order of PyTorch's module constructors.
     pub fn random(coordinates: usize, random: &mut Seeded) -> Self {
         let [token_g, token_g_bias] = linear_initial(coordinates, WIDTH, random);
         let [token_p, token_p_bias] = linear_initial(6, WIDTH, random);
         let [out, out_bias] = linear_initial(WIDTH, coordinates, random);
 
-        // PyTorch draws this bias and then sets it to zero. The draw is made here too, so that all
-        // later draws stay the same.
+        // PyTorch draws this bias and then sets it to zero. It is drawn here too, to keep the
+        // random stream aligned.
         let [out_projection, _] = linear_initial(WIDTH, WIDTH, random);
 
-        // Xavier-uniform initialisation, ±√(6 / (fan_in + fan_out)) with fan_out = 3 · WIDTH,
-        // since the projections to queries, keys and values are stacked in one tensor.
+        // Xavier-uniform initialization, ±√(6 / (fan_in + fan_out)). The query, key and value
+        // projections are stacked in one tensor, so fan_out = 3 · WIDTH.
         let in_projection = within(3 * WIDTH, WIDTH, (6.0 / (4 * WIDTH) as f64).sqrt(), random);
         let [first, first_bias] = linear_initial(WIDTH, INNER, random);
         let [second, second_bias] = linear_initial(INNER, WIDTH, random);
@@ -155,7 +153,7 @@ impl<T: Real> Attention<T> {
         }
     }
 
-    /// Columns of the latents that it corrects.
+    /// Number of coordinates of a latent.
     pub fn coordinates(&self) -> usize {
         self.tensors[OUT].nrows()
     }
@@ -180,7 +178,7 @@ impl<T: Real> Attention<T> {
         let n = latents.nrows();
         let half = T::of(0.5);
 
-        // The latent and the motion become a token each.
+        // One token for the latent, one for the motion.
         let tokens = stacked(
             self.linear(&latents, TOKEN_G).view(),
             self.linear(&motions, TOKEN_P).view(),
@@ -189,8 +187,8 @@ impl<T: Real> Attention<T> {
         let projected = self.linear(&before.output, IN_PROJECTION);
         let (looks, seen) = attend(&projected, n);
 
-        // Pre-norm block: attention and feed-forward layer read the normalised tokens, and their
-        // outputs are added to the tokens as they were before the norm.
+        // Pre-norm block: the inputs of attention and feed-forward layer are normalized; the
+        // residual connections bypass the norm.
         let middle = tokens + self.linear(&seen, OUT_PROJECTION);
         let between = self.norm(&middle, NORM_2);
         let inner = self.linear(&between.output, FIRST);
@@ -221,15 +219,15 @@ impl<T: Real> Attention<T> {
     pub fn backward(&self, forward: &Activations<T>, d_output: &Array2<T>, gradient: &mut Self) {
         let n = d_output.nrows();
 
-        // The steps of `forward` in reverse. Both tokens share the gradient of their mean
-        // equally, hence the factor of one half.
+        // The steps of `forward` in reverse. The output reads the mean of both tokens, hence the
+        // factor 1/2.
         let d_mean = self.linear_backward(OUT, &forward.mean, d_output, gradient) * T::of(0.5);
         let mut d_rows = stacked(d_mean.view(), d_mean.view());
         let mut d_inner = self.linear_backward(SECOND, &forward.inner_passed, &d_rows, gradient);
         gelu_backward(&mut d_inner, &forward.inner, &forward.inner_cumulative);
 
-        // `d_rows` is the gradient along the residual connections; the feed-forward layer and the
-        // attention each add theirs to it.
+        // `d_rows` is the gradient along the residual connections. The feed-forward layer and the
+        // attention add their gradients to it.
         let d_between = self.linear_backward(FIRST, &forward.between.output, &d_inner, gradient);
         d_rows += &self.norm_backward(NORM_2, &forward.between, d_between, gradient);
         let d_seen = self.linear_backward(OUT_PROJECTION, &forward.seen, &d_rows, gradient);
@@ -243,7 +241,7 @@ impl<T: Real> Attention<T> {
         );
         d_rows += &self.norm_backward(NORM_1, &forward.before, d_before, gradient);
 
-        // The upper n rows are the tokens of the latents, the lower n those of the motions.
+        // The upper n rows are latent tokens, the lower n are motion tokens.
         let d_g = d_rows.slice(s![..n, ..]).to_owned();
         let d_p = d_rows.slice(s![n.., ..]).to_owned();
         self.linear_backward(TOKEN_G, &forward.latents, &d_g, gradient);
@@ -289,15 +287,14 @@ fn columns(part: usize, head: usize) -> std::ops::Range<usize> {
     first..first + HEAD
 }
 
-/// Scaled dot-product attention between the two tokens of each sample: the attention weights, and
-/// for each token the mean of the values under its weights.
+/// Scaled dot-product attention between the two tokens of each sample. Returns the attention
+/// weights and, for each token, the weighted mean of the values.
 fn attend<T: Real>(projected: &Array2<T>, n: usize) -> (Vec<AttentionWeights<T>>, Array2<T>) {
     let scale = T::of((HEAD as f64).sqrt().recip());
     let mut seen = Array2::zeros((2 * n, WIDTH));
     let mut looks = Vec::with_capacity(n);
     for sample in 0..n {
-        // The token of the latent is in the upper half of the rows, that of the motion in the
-        // lower.
+        // The latent token is in the upper half of the rows, the motion token in the lower half.
         let rows = [sample, sample + n];
         let mut of_sample = [[[T::zero(); 2]; 2]; HEADS];
         for (head, of_head) in of_sample.iter_mut().enumerate() {
@@ -306,8 +303,7 @@ fn attend<T: Real>(projected: &Array2<T>, n: usize) -> (Vec<AttentionWeights<T>>
             for (token, look) in of_head.iter_mut().enumerate() {
                 let scores = [0, 1].map(|other| part(0, token).dot(&part(1, other)) * scale);
 
-                // Softmax over the two keys. Without the subtraction of the largest score the
-                // exponential could overflow.
+                // Softmax over the two keys. The largest score is subtracted to avoid overflow.
                 let largest = scores[0].max(scores[1]);
                 let shares = scores.map(|score| (score - largest).exp());
                 *look = shares.map(|share| share / (shares[0] + shares[1]));
@@ -324,7 +320,7 @@ fn attend<T: Real>(projected: &Array2<T>, n: usize) -> (Vec<AttentionWeights<T>>
     (looks, seen)
 }
 
-/// The gradient with respect to the projection, given the gradient `d_seen` with respect to the
+/// Gradient with respect to `projected`, from `d_seen`, the gradient with respect to the
 /// attention's output.
 fn attend_backward<T: Real>(
     projected: &Array2<T>,
@@ -341,8 +337,8 @@ fn attend_backward<T: Real>(
             for (token, look) in of_head.iter().enumerate() {
                 let d = d_seen.slice(s![rows[token], head * HEAD..(head + 1) * HEAD]);
 
-                // Through the softmax, with weights a and scores s:
-                // ds_j = a_j (da_j − Σ_i a_i da_i). `mean` is the sum.
+                // Softmax backward, with weights a and scores s: ds_j = a_j (da_j − Σ_i a_i da_i).
+                // `mean` is the sum over i.
                 let d_look = [0, 1].map(|other| d.dot(&part(2, other)));
                 let mean = look[0] * d_look[0] + look[1] * d_look[1];
                 for other in 0..2 {
@@ -350,8 +346,8 @@ fn attend_backward<T: Real>(
                         .slice_mut(s![rows[other], columns(2, head)])
                         .scaled_add(look[other], &d);
 
-                    // A score is q·k/√HEAD: its gradient reaches the query along the key, and the
-                    // key along the query.
+                    // The score is q·k/√HEAD: its gradient is along k for the query and along q for
+                    // the key.
                     let d_score = look[other] * (d_look[other] - mean) * scale;
                     d_projected
                         .slice_mut(s![rows[token], columns(0, head)])

@@ -1,9 +1,8 @@
-//! Correctors: small networks that predict the latent to which a motion leads. They are trained
-//! with φ and W frozen.
+//! Correctors: small networks that predict the latent after a motion, trained with φ and W frozen.
 //!
-//! Their input is \[g; (ΔP − μ)/σ\]. The linear corrector predicts ĝ itself; the others predict the
-//! residual that is missing from g + W⁺ΔP (Sec. A.9). The widths, the number of heads and the
-//! z-scored input are our choice, since the paper does not give them.
+//! Their input is \[g; (ΔP − μ)/σ\]. The linear corrector predicts ĝ itself; the others predict a
+//! residual that is added to g + W⁺ΔP (Sec. A.9). The paper does not give the widths, the number of
+//! heads or the scaling of the input; they are our choice.
 
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis, concatenate};
 
@@ -19,11 +18,11 @@ use super::{Adapter, At, Error, Network, Objective, Reading, Real, Samples, Trai
 pub enum CorrectorKind {
     /// One linear layer.
     Linear,
-    /// One hidden layer of 64.
+    /// One hidden layer of width 64.
     Mlp2,
-    /// Two hidden layers of 128.
+    /// Two hidden layers of width 128.
     Mlp3,
-    /// One block of attention over two tokens, the latent and the motion.
+    /// One attention block over two tokens, the latent and the motion.
     Attention,
 }
 
@@ -46,8 +45,7 @@ impl CorrectorKind {
         Self::ALL.into_iter().find(|kind| kind.name() == name)
     }
 
-    /// Whether its output is a residual that is added to g + W⁺ΔP; otherwise the output is ĝ
-    /// itself.
+    /// Whether the output is a residual, added to g + W⁺ΔP. Otherwise it is ĝ itself.
     pub fn has_residual(self) -> bool {
         self != Self::Linear
     }
@@ -66,7 +64,7 @@ impl CorrectorKind {
     }
 }
 
-/// A corrector's network.
+/// Parameters of a corrector.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Corrector<T> {
     kind: CorrectorKind,
@@ -131,12 +129,12 @@ impl<T: Real> Corrector<T> {
         Ok(corrector)
     }
 
-    /// Which corrector it is.
+    /// The architecture.
     pub fn kind(&self) -> CorrectorKind {
         self.kind
     }
 
-    /// The same numbers in another precision.
+    /// The same weights in another precision.
     pub fn cast<U: Real>(&self) -> Corrector<U> {
         let body = match &self.body {
             Body::Dense(dense) => {
@@ -179,7 +177,7 @@ impl<T: Real> Corrector<T> {
         }
     }
 
-    /// What the network gives for latents (n, k) and z-scored motions (n, 6): shape (n, k).
+    /// The network's output for latents (n, k) and z-scored motions (n, 6), shape (n, k).
     pub fn output(&self, latents: ArrayView2<'_, T>, motions: ArrayView2<'_, T>) -> Array2<T> {
         match &self.body {
             Body::Dense(dense) => dense.forward(side_by_side(latents, motions)).output,
@@ -191,7 +189,7 @@ impl<T: Real> Corrector<T> {
         }
     }
 
-    /// As [`Corrector::output`], for one latent.
+    /// [`Corrector::output`] for one latent and motion.
     pub(super) fn added(
         &self,
         latent: ArrayView1<'_, T>,
@@ -231,7 +229,7 @@ impl<T: Real> Network<T> for Corrector<T> {
     }
 }
 
-/// Training data of a corrector, one row for each pair.
+/// Training data of a corrector, one row per pair.
 #[derive(Debug, Clone)]
 pub struct CorrectorSamples<T> {
     /// Latents g of the source frames, shape (n, k).
@@ -257,8 +255,8 @@ impl<T: Real> Objective<T> for Corrector<T> {
         let motions = take(&samples.motions);
         let targets = take(&samples.targets);
 
-        // A corrector with a residual is trained on what the inverse step misses; the linear one
-        // has no base and is trained on the target latent itself.
+        // The target of a residual corrector is the error of the inverse step; that of the linear
+        // corrector is the target latent itself.
         let base = if self.kind.has_residual() {
             take(&samples.imagined)
         } else {
@@ -294,7 +292,7 @@ impl<T: Real> Objective<T> for Corrector<T> {
 /// Trains a corrector on an adapter's own training pairs, with φ and W frozen.
 ///
 /// # Errors
-/// [`Error::Diverged`] when the loss stops being finite, and the errors of [`Adapter::embed`].
+/// [`Error::Diverged`] when the loss is not finite, and the errors of [`Adapter::embed`].
 pub fn train_corrector(
     kind: CorrectorKind,
     adapter: &Adapter,
@@ -321,8 +319,8 @@ fn corrector_samples(
         let here = latents.row(samples.pair(pair)[0]);
         let there = &here + &adapter.step(here, twist, Reading::Affine, 1.0);
 
-        // A mixture's latents end with the shares of its gate, which are not corrected: `zip`
-        // stops at the k coordinates.
+        // A mixture's latents end with gate weights, which are not corrected: `zip` stops after the
+        // k coordinates.
         imagined
             .row_mut(pair)
             .iter_mut()

@@ -1,36 +1,36 @@
-//! An adapter's error model: how large its errors are in rooms that it did not learn from. It is
-//! measured once, by [`crate::calibration`], and kept with the adapter; without one nothing is
-//! tracked.
+//! An adapter's error model: the size of its errors in rooms outside its training set. It is
+//! measured once, by the calibration in `seese3-robot`, and stored with the adapter. Tracking
+//! requires it.
 //!
-//! Start reading at [`ErrorStatistics`], which lists everything that is measured.
+//! Start reading at [`ErrorStatistics`], which lists all measured quantities.
 
 use nalgebra::{Cholesky, Matrix6};
 use ndarray::{Array2, ArrayView1};
 
 use super::{Error, Whitener};
 
-/// Rows to each side of a frame that are near it because the camera had no time to move away, and
-/// not because it came back.
+/// Rows to each side of a frame that count as its temporal neighbors. They are near it because
+/// little time has passed, not because the camera revisits a place.
 pub const TEMPORAL_NEIGHBOURS: u32 = 10;
-/// How many of the last frames a jump of the view is told by.
+/// Number of previous frames that a view is compared with to detect a jump.
 pub const JUMP_WINDOW: usize = 5;
 
-/// Covariances of errors, tabulated by one number that predicts how large they are: the distance of
-/// a match, or the frames that a motion takes.
+/// Error covariances, tabulated by one predictor of their size: the distance of a match, or the
+/// number of frames of a motion.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ErrorTable {
     strata: Vec<Stratum>,
 }
 
-/// Errors where the predicting number is about `at`.
+/// Errors at one value of the predictor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Stratum {
-    /// The predicting number, above 0.
+    /// The value of the predictor, above 0.
     pub at: f64,
-    /// The share of a reading to be believed, from 0 to 1: the slope of the regression of truth on
-    /// reading.
+    /// Shrinkage factor of an estimate, from 0 to 1: the slope of the regression of the true value
+    /// on the estimate.
     pub gain: f64,
-    /// The covariance of errors on (v, ω), metres and radians; positive definite.
+    /// Covariance of the errors on (v, ω), meters and radians; positive definite.
     pub covariance: Matrix6<f64>,
 }
 
@@ -48,10 +48,11 @@ impl Stratum {
 }
 
 impl ErrorTable {
-    /// A table of strata, from the smallest predicting number to the largest.
+    /// A table of strata, in ascending order of the predictor.
     ///
     /// # Errors
-    /// [`Error::ErrorModel`] when there is no stratum, one is not sound, or they do not rise.
+    /// [`Error::ErrorModel`] when there is no stratum, one is invalid, or they are not in ascending
+    /// order.
     pub fn new(strata: Vec<Stratum>) -> Result<Self, Error> {
         let is_rising = strata.windows(2).all(|pair| pair[0].at < pair[1].at);
         if strata.is_empty() || !is_rising || !strata.iter().all(Stratum::is_sound) {
@@ -63,18 +64,18 @@ impl ErrorTable {
         Ok(Self { strata })
     }
 
-    /// The strata, from the smallest predicting number to the largest.
+    /// The strata, in ascending order of the predictor.
     pub fn strata(&self) -> &[Stratum] {
         &self.strata
     }
 
-    /// The errors where the predicting number is `at`: interpolated by its logarithm between two
-    /// strata, and the outermost stratum's outside of them.
+    /// Errors at the predictor value `at`: interpolated in its logarithm between two strata,
+    /// constant outside the table.
     pub fn at(&self, at: f64) -> Stratum {
         let first = self.strata[0];
         let last = self.strata[self.strata.len() - 1];
 
-        // A number that is not one is answered with the largest errors, the safe answer.
+        // NaN gets the last stratum, the safe choice.
         if at.is_nan() || at >= last.at {
             return last;
         }
@@ -96,71 +97,71 @@ impl ErrorTable {
     }
 }
 
-/// Covariances of read motions, Σ = (u + u₀) S(n).
+/// Covariances of predicted motions, Σ = (u + u₀) S(n).
 ///
-/// They grow with the squared length u of the latents' difference (fitted exponents are 1 within a
-/// few hundredths), and with the number n of frames that the motion takes, since over few frames u
+/// Σ grows linearly with u, the squared length of the difference of latents (fitted exponents are 1
+/// within a few hundredths). S depends on n, the number of frames of the motion: over few frames, u
 /// is mostly noise.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionErrors {
-    /// S by the number of frames, 1 or more; on (v, ω), metres and radians.
+    /// S by the number of frames, 1 or more; on (v, ω), meters and radians.
     pub shapes: ErrorTable,
-    /// u₀, above 0, in the unit of u: what is added so that a camera that stands still has errors
-    /// too.
+    /// u₀, above 0, in the unit of u. It keeps the covariance of a stationary camera above zero.
     pub floor: f64,
 }
 
 impl MotionErrors {
-    /// The covariance of a motion over `frames` frames, read from latents whose difference has the
-    /// squared length `squared_length` (u).
+    /// Covariance of a motion over `frames` frames; `squared_length` is u, the squared length of
+    /// the difference of latents.
     pub fn at(&self, squared_length: f64, frames: u64) -> Matrix6<f64> {
         let shape = self.shapes.at(frames.max(1) as f64).covariance;
         shape * (squared_length + self.floor)
     }
 
-    /// The share of a motion over `frames` frames to be believed as it was read.
+    /// Shrinkage factor of a predicted motion over `frames` frames.
     pub fn gain(&self, frames: u64) -> f64 {
         self.shapes.at(frames.max(1) as f64).gain
     }
 
-    /// The covariance of a motion over as many frames as were measured at most.
+    /// Covariance of a motion over the largest measured number of frames.
     fn over_longest(&self, squared_length: f64) -> Matrix6<f64> {
         self.shapes.at(f64::INFINITY).covariance * (squared_length + self.floor)
     }
 }
 
-/// Everything that calibration measures of an adapter's errors, in rooms that it did not learn
-/// from.
+/// The error statistics that calibration measures, in rooms outside the adapter's training set.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ErrorStatistics {
-    /// The time from one frame to the next in the rooms that this was measured in, seconds: the mean of
-    /// their medians. What is said of a number of frames holds for so many times this time.
+    /// Frame period of the calibration rooms, seconds: the mean over rooms of the median period.
+    /// All frame counts below are multiples of it.
     pub frame_period_s: f64,
-    /// Frame noise: half the second moment of the differences of latents from one frame to the
-    /// next, shape (c, c). It holds the camera's own motion over one frame as well as noise.
+    /// Frame noise: half the second moment of the latent differences between successive frames,
+    /// shape (c, c). It includes the camera's motion over one frame.
     pub frame_noise: Array2<f64>,
-    /// Motion spread: the second moment of the differences of latents over motions of one frame up
-    /// to the longest stride that the adapter was trained on, shape (c, c).
+    /// Motion spread: the second moment of latent differences over motions from one frame to the
+    /// longest trained stride, shape (c, c).
     pub motion_spread: Array2<f64>,
-    /// Errors of read motions; u is measured in `motion_spread`.
+    /// Errors of predicted motions; u is measured in `motion_spread`.
     pub motion_errors: MotionErrors,
-    /// Errors of a pose read from a matching frame, by the match's distance in `frame_noise`.
+    /// Errors of a pose estimated from a matched frame, by the distance of the match in
+    /// `frame_noise`.
     pub anchor_errors: ErrorTable,
-    /// A match whose distance is more than this many times the room's typical distance shows
-    /// another place.
+    /// Out-of-distribution limit of the match distance, as a multiple of the room's typical
+    /// distance. Above it, the view counts as another place.
     pub out_of_distribution_ratio: f64,
-    /// A match whose distance is at most this many times the room's typical distance certainly
-    /// shows this room: hardly any frame of another room comes so near.
+    /// Limit of the match distance for a certain match, as a multiple of the room's typical
+    /// distance. Hardly any frame of another room is below it.
     pub certain_match_ratio: f64,
-    /// A view further than this, in `frame_noise`, from each of the last [`JUMP_WINDOW`] frames has
-    /// jumped; where more time has passed than `frame_period_s`, than this times the cube root of how
-    /// many times that is.
+    /// Distance limit for jump detection, in `frame_noise`: a view farther than this from each of
+    /// the last [`JUMP_WINDOW`] frames is a jump. If the last frame is n frame periods old, the
+    /// limit is multiplied by ∛n.
     pub jump_distance: f64,
-    /// The reported covariance of a corrected map pose is that of its anchor times this factor.
+    /// Inflation factor of map poses: the reported covariance is the filter's times this factor,
+    /// plus the correlated part of the anchor errors.
     pub map_pose_factor: f64,
 }
 
-/// An adapter's error model, checked and ready to be asked.
+/// A validated error model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ErrorModel {
     statistics: ErrorStatistics,
@@ -169,10 +170,10 @@ pub struct ErrorModel {
 }
 
 impl ErrorModel {
-    /// Checks what was measured.
+    /// Validates the statistics.
     ///
     /// # Errors
-    /// [`Error::ErrorModel`], which names what is not sound.
+    /// [`Error::ErrorModel`], which names the invalid quantity.
     pub fn new(statistics: ErrorStatistics) -> Result<Self, Error> {
         let frame_noise = Whitener::new(statistics.frame_noise.view())?;
         let motion_spread = Whitener::new(statistics.motion_spread.view())?;
@@ -183,18 +184,15 @@ impl ErrorModel {
         }
 
         let positive = [
-            ("the time between frames", statistics.frame_period_s),
-            ("the floor of motions", statistics.motion_errors.floor),
-            ("the factor of map poses", statistics.map_pose_factor),
+            ("the frame period", statistics.frame_period_s),
+            ("the motion-error floor", statistics.motion_errors.floor),
+            ("the map-pose factor", statistics.map_pose_factor),
             (
                 "the out-of-distribution limit",
                 statistics.out_of_distribution_ratio,
             ),
-            (
-                "the limit of certain matches",
-                statistics.certain_match_ratio,
-            ),
-            ("the distance of a jump", statistics.jump_distance),
+            ("the certain-match limit", statistics.certain_match_ratio),
+            ("the jump distance", statistics.jump_distance),
         ];
         for (what, value) in positive {
             if !(value.is_finite() && value > 0.0) {
@@ -209,17 +207,17 @@ impl ErrorModel {
         })
     }
 
-    /// What was measured.
+    /// The measured statistics.
     pub fn statistics(&self) -> &ErrorStatistics {
         &self.statistics
     }
 
-    /// The whitener of frame noise: distances of matches are taken in it.
+    /// Whitener of the frame noise, the unit of match distances.
     pub fn frame_noise(&self) -> &Whitener {
         &self.frame_noise
     }
 
-    /// The covariance of a motion over `frames` frames, read from a difference of latents, shape
+    /// Covariance of a motion over `frames` frames, predicted from a difference of latents, shape
     /// (c,).
     pub fn motion_errors(&self, difference: ArrayView1<'_, f64>, frames: u64) -> Matrix6<f64> {
         self.statistics
@@ -227,33 +225,32 @@ impl ErrorModel {
             .at(self.motion_spread.squared_length(difference), frames)
     }
 
-    /// The squared length u of a difference of latents, shape (c,), in the motion spread.
+    /// Squared length u of a difference of latents, shape (c,), in the motion spread.
     pub fn spread_length(&self, difference: ArrayView1<'_, f64>) -> f64 {
         self.motion_spread.squared_length(difference)
     }
 
-    /// How many frames of the rooms that this was measured in a time takes, seconds; at least 1.
+    /// Number of calibration frame periods in `seconds`, rounded; at least 1.
     pub fn frames_in(&self, seconds: f64) -> u64 {
         (seconds / self.statistics.frame_period_s).round().max(1.0) as u64
     }
 
-    /// The most frames that the errors of motions were measured over.
+    /// Largest number of frames for which motion errors were measured.
     pub fn longest_frames(&self) -> f64 {
         let strata = self.statistics.motion_errors.shapes.strata();
         strata[strata.len() - 1].at
     }
 
-    /// The covariance of a motion of which nothing is known but that the adapter was trained for
-    /// such motions.
+    /// Covariance of an unknown motion within the trained range.
     pub fn unread_errors(&self) -> Matrix6<f64> {
-        // The mean squared length of a difference under its own second moment is the number of its
+        // Under its own second moment, a difference has the mean squared length c, its number of
         // columns.
         self.statistics
             .motion_errors
             .over_longest(self.motion_spread.size() as f64)
     }
 
-    /// Errors of a pose read from a match at a distance in frame noise.
+    /// Errors of a pose estimated from a match at `distance`, in frame noise.
     pub fn anchor_errors(&self, distance: f64) -> Stratum {
         self.statistics.anchor_errors.at(distance)
     }
@@ -271,7 +268,7 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand: half way between 1 and 100 by the logarithm is 10.
+    /// Oracle: by hand; 10 is halfway between 1 and 100 on a logarithmic scale.
     #[test]
     fn errors_between_strata_are_between_theirs() {
         let table = ErrorTable::new(vec![stratum(1.0, 2.0), stratum(100.0, 4.0)]).unwrap();

@@ -1,4 +1,4 @@
-//! The inverse Poincaré step: from a wanted motion to a step in latent space, ĝ − g = W⁺ΔP.
+//! The inverse Poincaré step: a motion as a step in latent space, ĝ − g = W⁺ΔP.
 
 use nalgebra::{DMatrix, Vector6};
 use ndarray::{Array1, Array2, ArrayView2};
@@ -7,10 +7,11 @@ use super::{Error, TargetScale};
 use crate::geometry::Twist;
 use crate::matrices::to_nalgebra;
 
-/// Singular values up to this fraction of the largest one count as zero.
+/// Relative tolerance of the rank: singular values up to this fraction of the largest count as zero
+///
 const RANK_TOLERANCE: f64 = 1e-5;
 
-/// How μ and σ, by which the training targets were z-scored, enter the inverse.
+/// How μ and σ, the z-scoring of the training targets, enter the inverse.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reading {
     /// W⁺((ΔP − μ)/σ): the exact inverse of the trained predictor. Unless μ is zero, a zero motion
@@ -24,10 +25,10 @@ pub enum Reading {
 }
 
 impl Reading {
-    /// Every reading.
+    /// All readings.
     pub const ALL: [Self; 3] = [Self::Affine, Self::Homogeneous, Self::Literal];
 
-    /// The word for it on the command line and in reports.
+    /// Name on the command line and in reports.
     pub fn name(self) -> &'static str {
         match self {
             Self::Affine => "affine",
@@ -51,8 +52,7 @@ impl Inverse {
     /// Inverts `motion`, W of shape (6, k).
     ///
     /// # Errors
-    /// [`Error::RankDeficient`] when W has fewer than six singular values that do not count as
-    /// zero.
+    /// [`Error::RankDeficient`] when the numerical rank of W is below 6.
     pub fn new(motion: ArrayView2<'_, f64>, scale: &TargetScale) -> Result<Self, Error> {
         let (pseudo_inverse, singular_values, rank) = pseudo_inverse(motion);
         let [largest, .., smallest] = singular_values;
@@ -82,8 +82,8 @@ impl Inverse {
     }
 
     /// The latent step of a motion. `mean_share` is the fraction of μ that the affine reading
-    /// subtracts: 1 for a whole motion and 1/S for one of S equal parts, so that the steps of the
-    /// parts add up to the step of the whole.
+    /// subtracts: 1 for a whole motion, 1/S for one of S equal parts. The steps of the parts then
+    /// add up to the step of the whole.
     ///
     /// Source: SeeSE3, ĝ = φ(z) + W⁺ΔP.
     pub fn step(&self, twist: Twist, reading: Reading, mean_share: f64) -> Array1<f64> {
@@ -92,7 +92,7 @@ impl Inverse {
     }
 }
 
-/// The vector that W has to map the latent step of a motion to, in a given reading.
+/// The vector that W⁺ is applied to, in the given reading.
 pub(super) fn target(
     scale: &TargetScale,
     twist: Twist,
@@ -109,10 +109,10 @@ pub(super) fn target(
     Array1::from_iter(target.iter().copied())
 }
 
-/// The pseudo-inverse (k, 6) of a (6, k) matrix, its singular values in descending order, and its
-/// numerical rank. Singular values that count as zero are left out of the inverse.
+/// The pseudo-inverse (k, 6) of a (6, k) matrix by truncated SVD, the singular values in descending
+/// order, and the numerical rank.
 pub(super) fn pseudo_inverse(motion: ArrayView2<'_, f64>) -> (Array2<f64>, [f64; 6], usize) {
-    // The tall transpose has the thin SVD with six columns: Wᵀ = U S Vᵀ, so W⁺ = U S⁻¹ Vᵀ.
+    // Thin SVD of the tall transpose: Wᵀ = U S Vᵀ, so W⁺ = U S⁻¹ Vᵀ.
     let columns = motion.ncols();
     let svd = to_nalgebra(motion.t()).svd(true, true);
     let mut sorted: Vec<f64> = svd.singular_values.iter().copied().collect();
@@ -149,8 +149,8 @@ mod tests {
         }
     }
 
-    /// Oracle: the definition of a right inverse, W W⁺ = I for a W of full row rank, and Moore and
-    /// Penrose's symmetry of W⁺W, which singles out the shortest step.
+    /// Oracle: the definition of a right inverse, W W⁺ = I for a W of full row rank, and the
+    /// Moore–Penrose condition that W⁺W is symmetric, which selects the shortest step.
     #[test]
     fn the_pseudo_inverse_is_the_shortest_right_inverse() {
         let w = Array2::from_shape_fn((6, 20), |(row, column)| {

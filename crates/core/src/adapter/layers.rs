@@ -6,7 +6,7 @@ use ndarray::{Array2, Axis, Zip};
 use super::Real;
 use super::seeded::Seeded;
 
-/// Added to a LayerNorm's variance, PyTorch's default.
+/// Added to the variance in LayerNorm; PyTorch's default.
 const LAYER_NORM_EPS: f64 = 1e-5;
 
 /// A weight and a bias uniform in ±1/√fan_in, as PyTorch draws a `Linear`.
@@ -49,7 +49,8 @@ pub(super) fn linear<T: Real>(
     weight: &Array2<T>,
     bias: &Array2<T>,
 ) -> Array2<T> {
-    // A product of matrices first copies the weight into blocks, which a single row does not repay.
+    // For a single row, matrix-vector is faster: a matrix product first copies the weight into
+    // blocks.
     if input.nrows() == 1 {
         return weight.dot(&input.row(0)).insert_axis(Axis(0)) + bias;
     }
@@ -57,8 +58,8 @@ pub(super) fn linear<T: Real>(
     input.dot(&weight.t()) + bias
 }
 
-/// Subtracts the mean from every row and divides the row by its standard deviation. Returns the
-/// reciprocals of the standard deviations, shape (n, 1).
+/// Normalizes every row to mean 0 and standard deviation 1. Returns the reciprocals of the standard
+/// deviations, shape (n, 1).
 pub(super) fn normalise<T: Real>(rows: &mut Array2<T>) -> Array2<T> {
     let width = T::of(rows.ncols() as f64);
     let mut inverse_deviation = Array2::zeros((rows.nrows(), 1));
@@ -90,8 +91,7 @@ pub(super) fn normalise_backward<T: Real>(
         .zip(normalised.outer_iter())
         .zip(inverse_deviation.iter())
     {
-        // Every number of a row takes part in its mean and its deviation, so the gradient of
-        // y = (x − mean)/deviation, which is `normalised`, is
+        // With y = (x − mean)/deviation (`normalised`), where mean and deviation depend on x too:
         // dx = (dy − mean(dy) − y · mean(dy ⊙ y)) / deviation.
         let mean = row.sum() / width;
 
@@ -106,8 +106,8 @@ pub(super) fn normalise_backward<T: Real>(
     }
 }
 
-/// Φ(x), the cumulative distribution function of the standard normal distribution. GELU in its
-/// exact form is x Φ(x).
+/// Φ(x), the cumulative distribution function of the standard normal distribution. Exact GELU is x
+/// Φ(x).
 pub(super) fn cumulative<T: Real>(input: &Array2<T>) -> Array2<T> {
     input.mapv(|x| T::of(0.5) * (T::one() + (x * T::of(std::f64::consts::FRAC_1_SQRT_2)).erf()))
 }
@@ -134,7 +134,7 @@ pub struct Dense<T> {
     pub(super) layers: Vec<[Array2<T>; 2]>,
 }
 
-/// What [`Dense::backward`] needs of the forward pass.
+/// Intermediate values of the forward pass that [`Dense::backward`] uses.
 pub struct DenseActivations<T> {
     /// The input of each layer.
     inputs: Vec<Array2<T>>,
@@ -168,7 +168,7 @@ impl<T: Real> Dense<T> {
     /// PyTorch's names of the tensors: in a `Sequential` called `prefix`, or for a single layer in
     /// a `Linear` of that name.
     pub fn names(&self, prefix: &str) -> Vec<String> {
-        // In a `Sequential` the GELUs between the linear layers take the odd numbers.
+        // In a `Sequential`, the GELUs have the odd indices.
         let name = |place: usize| match self.layers.len() {
             1 => prefix.to_owned(),
             _ => format!("{prefix}.{}", 2 * place),
@@ -183,7 +183,7 @@ impl<T: Real> Dense<T> {
         self.layers.iter().flatten().collect()
     }
 
-    /// As [`Dense::parameters`], to be changed.
+    /// [`Dense::parameters`], mutable.
     pub fn parameters_mut(&mut self) -> Vec<&mut Array2<T>> {
         self.layers.iter_mut().flatten().collect()
     }
@@ -194,8 +194,8 @@ impl<T: Real> Dense<T> {
         let mut gelus = Vec::new();
         let mut output = input;
         for (place, [weight, bias]) in self.layers.iter().enumerate() {
-            // Each layer but the first reads its input through a GELU, whose input and Φ are kept
-            // for the backward pass.
+            // A GELU precedes each layer but the first. Its input and Φ are kept for the backward
+            // pass.
             if place > 0 {
                 let cumulative = cumulative(&output);
                 let passed = &output * &cumulative;

@@ -4,10 +4,10 @@ use ndarray::{Array2, ArrayView2, Axis, Zip, s};
 
 use super::Real;
 
-/// Vector lengths below this are replaced by it, as in PyTorch's `cosine_similarity`.
+/// Lower bound on vector lengths, as in PyTorch's `cosine_similarity`.
 const COSINE_EPS: f64 = 1e-8;
 
-/// The training loss. Source: SeeSE3, Sec. A.6, the sweep.
+/// The training loss. Source: SeeSE3, Sec. A.6.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Loss {
     /// The mean over batch and components of (y − t)², the paper's default.
@@ -20,10 +20,10 @@ pub enum Loss {
 }
 
 impl Loss {
-    /// Every loss.
+    /// All losses.
     pub const ALL: [Self; 3] = [Self::MeanSquaredError, Self::Cosine, Self::Rotation];
 
-    /// The word for it on the command line and in a manifest.
+    /// Name on the command line and in a manifest.
     pub fn name(self) -> &'static str {
         match self {
             Self::MeanSquaredError => "mse",
@@ -98,7 +98,7 @@ fn cosine<T: Real>(predicted: ArrayView2<'_, T>, target: ArrayView2<'_, T>) -> (
             / (a * c);
         loss += 1.0 - cosine;
 
-        // ∂cos/∂y = t/(|y||t|) − cos(y, t) · y/|y|²; the loss is one minus the cosine.
+        // ∂cos/∂y = t/(|y||t|) − cos(y, t) · y/|y|²; the loss is 1 − cos.
         Zip::from(&mut d).and(&y).and(&t).for_each(|d, &y, &t| {
             *d = T::of(-(t.f64() / (a * c) - cosine * y.f64() / (a * a)) / n);
         });

@@ -1,11 +1,11 @@
-//! Mixtures of charts, and the gate that weighs them: ΔP ≈ Σ_k α_k(z₁) W_k(φ_k(z₂) − φ_k(z₁)).
+//! Mixtures of charts with a gating network: ΔP ≈ Σ_k α_k(z₁) W_k(φ_k(z₂) − φ_k(z₁)).
 //!
 //! - α = softmax_k((W_route z)·p_k / e^τ). The gate depends on the source frame alone (Sec. A.11).
 //!   A single chart has no gate.
-//! - Charts that were trained separately can be mixed evenly, as an ensemble; then W̄ = \[W_1, …,
+//! - Separately trained charts can form an ensemble with equal weights; then W̄ = \[W_1, …,
 //!   W_K\]/K.
-//! - Each φ_k is an MLP of its own. A latent of K > 1 charts holds their K·k coordinates,
-//!   followed by the K shares α of the gate.
+//! - Each φ_k is a separate MLP. For K > 1 charts, a latent has K·k coordinates, followed by
+//!   the K gate weights α.
 
 use ndarray::{Array1, Array2, ArrayView1, Axis, concatenate, s};
 
@@ -13,7 +13,7 @@ use super::phi::Widths;
 use super::seeded::Seeded;
 use super::{At, Error, MAX_CHARTS, Network, Objective, Real, Samples, Siamese, TENSOR_NAMES};
 
-/// Columns of a prototype, r. The paper does not give a value.
+/// Dimension r of a prototype. The paper does not give a value.
 pub const ROUTE_DIM: usize = 16;
 /// PyTorch's names of the gate's tensors.
 const GATE_NAMES: [&str; 3] = ["route.weight", "prototypes", "log_tau"];
@@ -27,19 +27,19 @@ struct Gate<T> {
 /// How charts are mixed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Mixing {
-    /// By a gate that is trained together with the charts, as in the paper. A single chart needs no
-    /// gate.
+    /// Weights from a gate that is trained together with the charts, as in the paper. A single
+    /// chart has no gate.
     #[default]
     Gate,
-    /// Evenly, as an ensemble of charts that were trained separately.
+    /// Equal weights: an ensemble of separately trained charts.
     Even,
 }
 
 impl Mixing {
-    /// Every way of mixing.
+    /// All kinds of mixing.
     pub const ALL: [Self; 2] = [Self::Gate, Self::Even];
 
-    /// The word for it on the command line and in a manifest.
+    /// Name on the command line and in a manifest.
     pub fn name(self) -> &'static str {
         match self {
             Self::Gate => "gate",
@@ -47,7 +47,7 @@ impl Mixing {
         }
     }
 
-    /// The way of mixing with this [`Mixing::name`].
+    /// The mixing with this [`Mixing::name`].
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|mixing| mixing.name() == name)
     }
@@ -57,7 +57,7 @@ impl Mixing {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mixture<T> {
     charts: Vec<Siamese<T>>,
-    /// `None` for a single chart, and for charts that are mixed evenly.
+    /// `None` for a single chart and for an ensemble.
     gate: Option<Gate<T>>,
 }
 
@@ -124,24 +124,24 @@ impl<T: Real> Mixture<T> {
         Self { charts, gate }
     }
 
-    /// An ensemble of charts of equal shape, mixed evenly.
+    /// An ensemble of charts of equal shape, with equal weights.
     ///
     /// # Errors
-    /// [`Error::WeightShape`] when the charts differ in shape, [`Error::Charts`] when there are
-    /// none or more than [`MAX_CHARTS`].
+    /// [`Error::WeightShape`] when the charts differ in shape, [`Error::Charts`] when their number
+    /// is 0 or above [`MAX_CHARTS`].
     pub fn even(charts: Vec<Siamese<T>>) -> Result<Self, Error> {
         let mixture = Self { charts, gate: None };
         mixture.check_shapes()?;
         Ok(mixture)
     }
 
-    /// Builds a mixture from the tensors that `tensor` returns for PyTorch's names: those of
-    /// [`TENSOR_NAMES`] for a single chart, else `experts.0.phi.0.weight`, …, and with a gate
-    /// `route.weight`, `prototypes` and `log_tau`.
+    /// Builds a mixture from tensors by their PyTorch names: [`TENSOR_NAMES`] for a single chart,
+    /// else `experts.0.phi.0.weight`, …, and with a gate `route.weight`, `prototypes` and
+    /// `log_tau`.
     ///
     /// # Errors
     /// The errors of `tensor`, [`Error::Charts`] when `charts` is 0 or above [`MAX_CHARTS`], and
-    /// [`Error::WeightShape`] when the tensors do not fit one another.
+    /// [`Error::WeightShape`] when the shapes of the tensors are inconsistent.
     pub fn from_tensors<E: From<Error>>(
         charts: usize,
         mixing: Mixing,
@@ -163,7 +163,7 @@ impl<T: Real> Mixture<T> {
             read.push(Siamese::from_tensors(arrays)?);
         }
 
-        // Only charts that were trained together have a gate.
+        // A single chart and an ensemble have no gate.
         let gate = match (charts, mixing) {
             (0 | 1, _) | (_, Mixing::Even) => None,
             _ => {
@@ -189,8 +189,7 @@ impl<T: Real> Mixture<T> {
 
         let latent = first.latent_dim();
 
-        // The layout of a latent is computed from the first chart's width, so all charts must
-        // share it.
+        // The layout of a latent assumes that all charts have the first chart's width.
         for (position, chart) in self.charts.iter().enumerate() {
             if (chart.feature_dim(), chart.latent_dim()) != (feature, latent) {
                 let tensor = chart_name(self.charts.len(), position, "phi");
@@ -208,8 +207,7 @@ impl<T: Real> Mixture<T> {
             return Ok(());
         };
 
-        // The number of rows of W_route sets r; the prototypes must lie in the same r dimensions,
-        // one for each chart.
+        // r is the number of rows of W_route; there is one prototype of dimension r per chart.
         let route = tensors[0].nrows();
         let expected = [(route, feature), (self.charts.len(), route), (1, 1)];
 
@@ -229,9 +227,9 @@ impl<T: Real> Mixture<T> {
         Ok(())
     }
 
-    /// Turns charts that were trained on (z − mean)/deviation, each (1, d), into charts that take z
-    /// itself. A gate has no bias that could absorb the mean, so training refuses this combination
-    /// with [`Error::GatedStandardised`].
+    /// Converts charts trained on (z − mean)/deviation, each (1, d), to charts for z. A gate has no
+    /// bias that could absorb the mean, so training refuses this combination with
+    /// [`Error::GatedStandardised`].
     pub(super) fn fold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
         for chart in &mut self.charts {
             chart.phi.fold_standardisation(mean, deviation);
@@ -254,7 +252,7 @@ impl<T: Real> Mixture<T> {
         }
     }
 
-    /// How many charts there are, K.
+    /// Number of charts, K.
     pub fn chart_count(&self) -> usize {
         self.charts.len()
     }
@@ -269,12 +267,12 @@ impl<T: Real> Mixture<T> {
         self.charts[0].feature_dim()
     }
 
-    /// Number of coordinates in a latent, K·k: the columns on which distances are computed.
+    /// Number of coordinates of a latent, K·k: the columns that distances are computed on.
     pub fn coordinate_count(&self) -> usize {
         self.charts.len() * self.charts[0].latent_dim()
     }
 
-    /// Columns of a latent: the coordinates, and with several charts the share of each chart.
+    /// Columns of a latent: the coordinates and, with several charts, one gate weight per chart.
     pub fn latent_dim(&self) -> usize {
         self.coordinate_count()
             + if self.charts.len() > 1 {
@@ -284,7 +282,7 @@ impl<T: Real> Mixture<T> {
             }
     }
 
-    /// The same numbers in another precision.
+    /// The same weights in another precision.
     pub fn cast<U: Real>(&self) -> Mixture<U> {
         let cast = |tensor: &Array2<T>| tensor.mapv(|x| U::of(x.f64()));
         Mixture {
@@ -306,8 +304,7 @@ impl<T: Real> Mixture<T> {
             None => Array2::from_elem((features.nrows(), self.charts.len()), self.even_share()),
         };
 
-        // A latent is laid out as the coordinates of one chart after another, and then the
-        // shares.
+        // Layout of a latent: the coordinates, chart by chart, then the gate weights.
         let coordinates: Vec<_> = self
             .charts
             .iter()
@@ -323,7 +320,7 @@ impl<T: Real> Mixture<T> {
         concatenate(Axis(1), &parts).unwrap_or(alpha)
     }
 
-    /// The charts' shares that a latent carries; a single 1 when there is one chart.
+    /// Gate weights of a latent; a single 1 for a single chart.
     pub fn gate_of(&self, latent: ArrayView1<'_, T>) -> Array1<T> {
         match self.charts.len() {
             1 => Array1::ones(1),
@@ -331,7 +328,7 @@ impl<T: Real> Mixture<T> {
         }
     }
 
-    /// Equal shares for all charts, 1/K each.
+    /// Equal gate weights, 1/K each.
     pub fn even_gate(&self) -> Array1<T> {
         Array1::from_elem(self.charts.len(), self.even_share())
     }
@@ -340,7 +337,7 @@ impl<T: Real> Mixture<T> {
         T::of((self.charts.len() as f64).recip())
     }
 
-    /// The mixture's W under the shares `gate`, \[α_1 W_1, …, α_K W_K\], shape (6, K·k).
+    /// W of the mixture for the weights `gate`: \[α_1 W_1, …, α_K W_K\], shape (6, K·k).
     pub fn motion_matrix(&self, gate: ArrayView1<'_, T>) -> Array2<T> {
         let parts: Vec<_> = self
             .charts
@@ -398,8 +395,8 @@ impl<T: Real> Objective<T> for Mixture<T> {
     fn gradient(&self, samples: &Samples<T>, batch: &[usize], at: At<'_>) -> (f64, Self) {
         let batch = samples.batch(batch, at);
 
-        // Shares are computed for every distinct frame of the batch, but only those of the source
-        // frames enter the prediction.
+        // Gate weights are computed for every distinct frame of the batch; the prediction uses
+        // those of the source frames.
         let alpha = self.gate.as_ref().map(|gate| {
             let (routed, scores) = gate.scores(&batch.features);
             (routed, softmax(scores.clone()), scores)
@@ -412,8 +409,7 @@ impl<T: Real> Objective<T> for Mixture<T> {
             alpha.as_ref().map(column)
         };
 
-        // Each chart reads the z-scored motion of every pair from the difference of its own
-        // latents.
+        // Each chart predicts the z-scored motion of every pair from the difference of its latents.
         let forward: Vec<_> = self
             .charts
             .iter()
@@ -431,7 +427,7 @@ impl<T: Real> Objective<T> for Mixture<T> {
             .map(|(chart, steps)| steps.dot(&chart.motion.t()))
             .collect();
 
-        // The prediction is the mean of the charts' motions, weighed by the gate or equally.
+        // The prediction is the mean of the charts' motions, weighted by the gate or equally.
         let mut predicted = Array2::zeros(batch.targets.dim());
         for (chart, motion) in motions.iter().enumerate() {
             match gate_at_source(chart) {
@@ -444,8 +440,9 @@ impl<T: Real> Objective<T> for Mixture<T> {
         let mut gradient = self.zeros_like();
         let mut d_alpha = Array2::zeros((batch.targets.nrows(), self.charts.len()));
 
-        // A chart receives the gradient of the prediction times its share. The gradient of the
-        // share itself is the inner product of the prediction's gradient with the chart's motion.
+        // The gradient of a chart's motion is the gradient of the prediction times the chart's
+        // weight. The gradient of the weight is the inner product of the prediction's gradient and
+        // the chart's motion.
         for (position, chart) in self.charts.iter().enumerate() {
             let d_motion = match gate_at_source(position) {
                 Some(alpha) => {
@@ -468,7 +465,7 @@ impl<T: Real> Objective<T> for Mixture<T> {
         if let (Some(gate), Some((routed, alpha, scores)), Some(into)) =
             (&self.gate, &alpha, &mut gradient.gate)
         {
-            // Through the softmax: ds_k = α_k (dα_k − Σ_j α_j dα_j).
+            // Softmax backward: ds_k = α_k (dα_k − Σ_j α_j dα_j).
             let at_source = batch.sources(alpha);
             let mean = (&at_source * &d_alpha)
                 .sum_axis(Axis(1))

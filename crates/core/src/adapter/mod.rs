@@ -1,8 +1,8 @@
-//! Poincaré adapters map features to latents, pairs of latents to camera motions, and camera
-//! motions back to steps in latent space.
+//! Poincaré adapters: features to latents, pairs of latents to camera motions, and camera motions
+//! to steps in latent space.
 //!
-//! - φ is a small network (d → 64 → 20) and W (6×20) a matrix without bias:
-//!   ΔP ≈ σ ⊙ W(φ(z₂) − φ(z₁)) + μ. A mixture has several such charts and a gate that weighs them.
+//! - φ is a small network (d → 64 → 20) and W (6×20) a matrix without bias: ΔP ≈ σ ⊙ W(φ(z₂) −
+//!   φ(z₁)) + μ. A mixture has several such charts and a gating network.
 //! - μ and σ are the mean and the population standard deviation (ddof 0, A-11) of the training
 //!   twists, for each component of (v, ω).
 //! - Weights are trained and stored in f32; every answer is computed in f64.
@@ -45,8 +45,7 @@ pub use train::{EpochProgress, StepReport, TrainConfig, Trainer, train, train_fu
 pub use trained::Adapter;
 pub use whitener::Whitener;
 
-/// What networks beside the adapter's own are built and trained from: the laboratory compares the
-/// adapter with them.
+/// Layers and training loop for the comparison networks of `seese3-lab`.
 pub mod building_blocks {
     pub use super::layers::{Dense, DenseActivations};
     pub use super::phi::Activations as PhiActivations;
@@ -59,17 +58,17 @@ use nalgebra::Vector6;
 
 use crate::geometry::Twist;
 
-/// The largest magnitude of a number in a latent that is accepted: far above anything that an
-/// adapter produces, and far below anything that overflows.
+/// Largest accepted magnitude of a number in a latent: far above what adapters produce and far
+/// below overflow.
 pub const MAX_LATENT: f64 = 1e6;
 
-/// The largest number of charts in an adapter.
+/// Maximum number of charts in an adapter.
 pub const MAX_CHARTS: usize = 16;
 
 /// Default width of a chart's latent, the paper's geo_dim.
 pub const LATENT_DIM: usize = 20;
 
-/// What is wrong with an adapter, its input or its training.
+/// Errors of an adapter, its input or its training.
 #[derive(Debug, Clone, thiserror::Error, PartialEq)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
@@ -88,8 +87,8 @@ pub enum Error {
         value: f64,
     },
     #[error(
-        "latent: the gate's share of chart {chart} is {value}; shares must lie between 0 and 1, \
-        add up to 1, and be equal when charts are mixed evenly"
+        "latent: the gate weight of chart {chart} is {value}; gate weights must lie between 0 and 1, \
+        add up to 1, and be equal in an ensemble"
     )]
     Gate { chart: usize, value: f64 },
     #[error("an adapter has 1 to {MAX_CHARTS} charts, not {count}")]
@@ -144,19 +143,18 @@ pub enum Error {
     #[error("no training pairs")]
     NoPairs,
     #[error(
-        "all training pairs have the same camera motion, so that no motion can be learned from them"
+        "all training pairs have the same camera motion; training needs pairs with different motions"
     )]
     NoMotion,
     #[error("training diverged in epoch {epoch}: the loss is {loss}; lower the learning rate")]
     Diverged { epoch: usize, loss: f64 },
 }
 
-/// A twist component whose standard deviation is below this (metres or radians) does not move: what
-/// is left of it is rounding.
+/// A twist component with a standard deviation below this (meters or radians) is constant up to
+/// rounding.
 const STILL: f64 = 1e-9;
 
-/// Mean and standard deviation of the training twists, for each component of (v, ω), in metres and
-/// radians.
+/// Mean and standard deviation of the training twists, per component of (v, ω), meters and radians.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TargetScale {
     /// μ, zero under [`TargetScale::about_zero`].
@@ -167,8 +165,8 @@ pub struct TargetScale {
 }
 
 impl TargetScale {
-    /// Mean and standard deviation of `twists`. A component that varies by no more than rounding
-    /// gets deviation 1, so that normalisation does not amplify the rounding.
+    /// Mean and standard deviation of `twists`. A component that is constant up to rounding gets
+    /// deviation 1, so that z-scoring does not amplify rounding errors.
     pub fn of(twists: &[Twist]) -> Self {
         let n = twists.len().max(1) as f64;
         let mean = twists
@@ -185,8 +183,8 @@ impl TargetScale {
         }
     }
 
-    /// μ = 0 and σ the root mean square of `twists`, so that zero motion normalises to zero. A
-    /// component within rounding of zero gets σ = 1.
+    /// μ = 0 and σ the root mean square of `twists`, so that the z-score of zero motion is zero. A
+    /// component that is zero up to rounding gets σ = 1.
     pub fn about_zero(twists: &[Twist]) -> Self {
         let n = twists.len().max(1) as f64;
         let square = twists
@@ -206,7 +204,7 @@ impl TargetScale {
         (twist.to_vector() - self.mean).component_div(&self.deviation)
     }
 
-    /// The motion of z-scored components y, σ ⊙ y + μ.
+    /// The motion with the z-score y, σ ⊙ y + μ.
     pub fn twist(&self, normalised: &Vector6<f64>) -> Twist {
         Twist::from_vector(&(normalised.component_mul(&self.deviation) + self.mean))
     }
@@ -216,8 +214,8 @@ impl TargetScale {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand. A wheeled robot moves in x, z and about y; what rounding leaves of the rest
-    /// is no motion.
+    /// Oracle: by hand. A wheeled robot moves in x and z and turns about y; the other components
+    /// are rounding errors.
     #[test]
     fn a_planar_robots_rounding_is_not_blown_up_to_motion() {
         let step = |i: f64| Twist {

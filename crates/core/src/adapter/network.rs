@@ -1,4 +1,4 @@
-//! What every trained network has in common: named tensors, and AdamW over them.
+//! Common parts of all trained networks: named tensors and the AdamW optimizer.
 //!
 //! Tensors have the names of PyTorch's state dicts. Vectors are stored as (1, n) and scalars as (1,
 //! 1).
@@ -12,7 +12,7 @@ const BETA_2: f64 = 0.999;
 const ADAM_EPS: f64 = 1e-8;
 const CLIP_EPS: f64 = 1e-6;
 
-/// Parameters that are trained together, or anything of the same shape, such as their gradients.
+/// Parameters that are trained together, or values of the same shape, such as their gradients.
 pub trait Network<T: Real>: Clone {
     /// PyTorch's names of the tensors.
     fn names(&self) -> Vec<String>;
@@ -20,7 +20,7 @@ pub trait Network<T: Real>: Clone {
     /// The tensors, in the order of the names.
     fn parameters(&self) -> Vec<&Array2<T>>;
 
-    /// The tensors for modification, in the order of the names.
+    /// The tensors, mutable, in the order of the names.
     fn parameters_mut(&mut self) -> Vec<&mut Array2<T>>;
 
     /// A network of the same shape in which every number is zero.
@@ -34,7 +34,7 @@ pub trait Network<T: Real>: Clone {
         zeros
     }
 
-    /// The name of the first tensor that holds a number that is not finite.
+    /// Name of the first tensor with a number that is not finite, if any.
     fn not_finite(&self) -> Option<String> {
         let bad = |tensor: &&Array2<T>| tensor.iter().any(|x| !x.is_finite());
         self.names()
@@ -45,29 +45,29 @@ pub trait Network<T: Real>: Clone {
     }
 }
 
-/// A network that can be trained: it has a loss and the loss's gradient.
+/// A trainable network: a loss and its gradient.
 pub trait Objective<T: Real>: Network<T> {
     /// The training data.
     type Data;
 
-    /// How many samples there are.
+    /// Number of samples.
     fn count(data: &Self::Data) -> usize;
 
     /// The loss on a batch of samples, and its gradient with respect to every parameter.
     fn gradient(&self, data: &Self::Data, batch: &[usize], at: At<'_>) -> (f64, Self);
 }
 
-/// The settings of a training run and how far it has come.
+/// Settings and progress of a training run.
 #[derive(Debug, Clone, Copy)]
 pub struct At<'a> {
     /// The settings.
     pub config: &'a TrainConfig,
-    /// Optimiser steps taken so far.
+    /// Optimizer steps taken so far.
     pub step: u64,
 }
 
-/// AdamW with clipping of the gradient's global norm. Weight decay is decoupled and applies to
-/// every parameter.
+/// AdamW with global-norm gradient clipping. Weight decay is decoupled and applies to every
+/// parameter.
 pub(super) struct AdamW<T> {
     first_moments: Vec<Array2<T>>,
     second_moments: Vec<Array2<T>>,
@@ -91,7 +91,7 @@ impl<T: Real> AdamW<T> {
         }
     }
 
-    /// Takes one optimiser step and returns the global norm of the gradient before clipping.
+    /// Takes one optimizer step. Returns the global norm of the gradient before clipping.
     pub fn step<N: Network<T>>(
         &mut self,
         weights: &mut N,
@@ -106,15 +106,14 @@ impl<T: Real> AdamW<T> {
             .sum();
         let gradient_norm = squares.sqrt();
 
-        // A gradient longer than `clip_norm` is scaled down to that length, over all tensors
-        // together.
+        // Clip the gradient to the global norm `clip_norm`, over all tensors together.
         let clip = T::of((config.clip_norm / (gradient_norm + CLIP_EPS)).min(1.0));
         self.steps += 1;
         let beta_1 = T::of(BETA_1);
         let beta_2 = T::of(BETA_2);
 
-        // Adam's moments start at zero and are too small at first: `rate` corrects the first
-        // moment for it, `root` the second.
+        // Bias correction of Adam's moments, which start at zero: `rate` for the first moment,
+        // `root` for the second.
         let decay = T::of(1.0 - config.learning_rate * config.weight_decay);
         let rate = T::of(config.learning_rate / (1.0 - BETA_1.powi(self.steps)));
         let root = T::of((1.0 - BETA_2.powi(self.steps)).sqrt());

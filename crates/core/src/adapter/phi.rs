@@ -1,5 +1,5 @@
-//! The network φ: Linear(d, 64) → LayerNorm(64) → GELU (erf) → Linear(64, 20), with its forward
-//! pass and a backward pass written by hand.
+//! The network φ: Linear(d, 64) → LayerNorm(64) → GELU (erf) → Linear(64, 20), with hand-written
+//! forward and backward passes.
 
 use ndarray::{Array2, Axis};
 
@@ -12,11 +12,11 @@ use super::seeded::Seeded;
 /// Sizes of φ.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Widths {
-    /// d, columns of a feature.
+    /// Columns of a feature, d.
     pub feature: usize,
-    /// Columns between the two linear layers.
+    /// Width of the hidden layer.
     pub hidden: usize,
-    /// k, columns of a latent.
+    /// Columns of a latent, k.
     pub latent: usize,
 }
 
@@ -27,7 +27,7 @@ pub struct Phi<T> {
     pub(super) tensors: [Array2<T>; 6],
 }
 
-/// What the backward pass needs of the forward pass.
+/// Intermediate values of the forward pass that the backward pass uses.
 pub struct Activations<T> {
     input: Array2<T>,
     normalised: Array2<T>,
@@ -45,8 +45,8 @@ impl<T: Real> Phi<T> {
         "0.weight", "0.bias", "1.weight", "1.bias", "3.weight", "3.bias",
     ];
 
-    /// Initial weights as PyTorch draws them: weights and biases of linear layers uniform in
-    /// ±1/√fan_in, LayerNorm weights 1 and biases 0.
+    /// Initial weights, drawn as in PyTorch: linear layers uniform in ±1/√fan_in, LayerNorm weights
+    /// 1 and biases 0.
     pub fn random(widths: Widths, random: &mut Seeded) -> Self {
         let Widths {
             feature,
@@ -71,7 +71,7 @@ impl<T: Real> Phi<T> {
         }
     }
 
-    /// The shapes that the tensors must have to fit the weights of the two linear layers.
+    /// Shapes of all tensors, from the weights of the two linear layers.
     pub(super) fn expected_shapes(&self) -> [(usize, usize); 6] {
         let (hidden, feature) = self.tensors[0].dim();
         let latent = self.tensors[4].nrows();
@@ -106,12 +106,12 @@ impl<T: Real> Phi<T> {
         self.tensors.iter().collect()
     }
 
-    /// As [`Phi::parameters`], to be changed.
+    /// [`Phi::parameters`], mutable.
     pub fn parameters_mut(&mut self) -> Vec<&mut Array2<T>> {
         self.tensors.iter_mut().collect()
     }
 
-    /// A φ of the same shape in which every number is zero.
+    /// A φ of the same shape, all zeros.
     pub fn zeros(&self) -> Self {
         Self {
             tensors: self
@@ -121,7 +121,7 @@ impl<T: Real> Phi<T> {
         }
     }
 
-    /// The same numbers in another precision.
+    /// The same weights in another precision.
     pub(super) fn cast<U: Real>(&self) -> Phi<U> {
         Phi {
             tensors: self
@@ -131,13 +131,12 @@ impl<T: Real> Phi<T> {
         }
     }
 
-    /// Folds the standardisation of features into the first layer:
-    /// W₁(z − m)/s + b₁ = (W₁/s) z + (b₁ − (W₁/s) m).
+    /// Folds the z-scoring of features into the first layer: W₁(z − m)/s + b₁ = (W₁/s) z + (b₁ −
+    /// (W₁/s) m).
     pub(super) fn fold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
         let [first_weight, first_bias, ..] = &mut self.tensors;
 
-        // Computed in f64, since (W₁/s) m can be far larger than the bias that it is subtracted
-        // from.
+        // In f64, because (W₁/s) m can be far larger than b₁.
         let wide = |tensor: &Array2<T>| tensor.mapv(|x| x.f64());
         let weight = wide(first_weight) / &wide(deviation);
         let bias = wide(first_bias) - wide(mean).dot(&weight.t());
@@ -146,7 +145,7 @@ impl<T: Real> Phi<T> {
         *first_bias = bias.mapv(T::of);
     }
 
-    /// Undoes [`Phi::fold_standardisation`]: a φ of features z becomes one of (z − m)/s.
+    /// Undoes [`Phi::fold_standardisation`]: converts a φ for z to a φ for (z − m)/s.
     pub(super) fn unfold_standardisation(&mut self, mean: &Array2<T>, deviation: &Array2<T>) {
         let [first_weight, first_bias, ..] = &mut self.tensors;
 
@@ -172,7 +171,7 @@ impl<T: Real> Phi<T> {
         let inverse_deviation = normalise(&mut normalised);
         let scaled = &normalised * norm_weight + norm_bias;
 
-        // GELU(x) = x Φ(x). Φ(x) is kept, since GELU's derivative needs it again.
+        // GELU(x) = x Φ(x). Φ(x) is kept for the derivative.
         let cumulative = cumulative(&scaled);
         let hidden = &scaled * &cumulative;
         let latents = linear(&hidden, last_weight, last_bias);
@@ -191,16 +190,16 @@ impl<T: Real> Phi<T> {
     /// Adds the gradient of the parameters to `gradient`; `d_latents` is the gradient with respect
     /// to the latents, shape (n, k).
     ///
-    /// The last bias is left alone. It cancels in the difference of two latents, so its gradient is
-    /// exactly zero, and Adam would amplify the rounding noise in its place to the full learning
-    /// rate. [`Phi::backward_whole`] includes it.
+    /// The last bias is skipped. It cancels in the difference of two latents, so its gradient is
+    /// exactly zero; Adam would amplify the rounding errors to the full learning rate.
+    /// [`Phi::backward_whole`] includes it.
     pub fn backward(&self, forward: &Activations<T>, d_latents: &Array2<T>, gradient: &mut Self) {
         let [_, _, norm_weight, _, last_weight, _] = &self.tensors;
         gradient.tensors[4] += &d_latents.t().dot(&forward.hidden);
         let mut d_scaled = d_latents.dot(last_weight);
         gelu_backward(&mut d_scaled, &forward.scaled, &forward.cumulative);
 
-        // LayerNorm in reverse: first its weight and bias, then the normalisation itself.
+        // LayerNorm backward: first weight and bias, then the normalization.
         gradient.tensors[2] += &(&d_scaled * &forward.normalised).sum_axis(Axis(0));
         gradient.tensors[3] += &d_scaled.sum_axis(Axis(0));
         let mut d_first = d_scaled * norm_weight;
@@ -214,8 +213,8 @@ impl<T: Real> Phi<T> {
         gradient.tensors[1] += &d_first.sum_axis(Axis(0));
     }
 
-    /// [`Phi::backward`] for latents that are not subtracted from one another, so that the last
-    /// bias has a gradient.
+    /// [`Phi::backward`] for latents that are used directly, not as differences: the last bias has
+    /// a gradient.
     pub fn backward_whole(
         &self,
         forward: &Activations<T>,

@@ -1,4 +1,4 @@
-//! Named training protocols: the paper's two, and two of ours.
+//! Named training protocols: two of the paper and two of ours.
 
 use super::TrainConfig;
 use crate::room::Timeline;
@@ -7,20 +7,20 @@ use crate::splits::{Error as PairError, Pair, Split, StrideRange};
 /// A training protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Preset {
-    /// As the paper's base protocol, but for as many epochs as 400 optimiser steps take: ten epochs
-    /// of a short recording are ten steps, after which nothing is learned.
+    /// The paper's base protocol with at least 400 optimizer steps. In a short recording, ten
+    /// epochs can be only ten steps, which is too few.
     Base,
     /// All training pairs at one stride, for 10 epochs.
     PaperBase,
     /// 30,000 pairs with strides 10 to 40, for 200 epochs: the paper's "optimal config".
     PaperRange,
-    /// Ours, for adapters that are used in rooms outside their training set: 17 epochs of 30,000
-    /// pairs with strides 1 to 40, about 1,000 steps, on standardised features with added noise,
-    /// with averaged weights and μ = 0.
+    /// Ours, for adapters that are used outside their training rooms: 30,000 pairs with strides 1
+    /// to 40, 17 epochs (about 1,000 steps). Features are z-scored with added noise, weights are
+    /// averaged, μ = 0.
     Steady,
 }
 
-/// Which training pairs are used.
+/// Selection of the training pairs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum PairPlan {
     /// Every training pair at one stride, in frames.
@@ -30,10 +30,10 @@ pub enum PairPlan {
 }
 
 impl Preset {
-    /// Every preset.
+    /// All presets.
     pub const ALL: [Self; 4] = [Self::Base, Self::PaperBase, Self::PaperRange, Self::Steady];
 
-    /// The word for it on the command line and in a manifest.
+    /// Name on the command line and in a manifest.
     pub fn name(self) -> &'static str {
         match self {
             Self::Base => "base",
@@ -43,7 +43,7 @@ impl Preset {
         }
     }
 
-    /// The settings of the optimiser, with the given seed.
+    /// Optimizer settings, with the given seed.
     pub fn config(self, seed: u64) -> TrainConfig {
         let plain = TrainConfig {
             seed,
@@ -71,7 +71,7 @@ impl Preset {
         }
     }
 
-    /// The fewest optimiser steps: epochs are added until they are reached.
+    /// Minimum number of optimizer steps; epochs are added until it is reached.
     pub fn least_steps(self) -> usize {
         match self {
             Self::Base => 400,
@@ -98,7 +98,7 @@ impl Preset {
 }
 
 impl PairPlan {
-    /// The training pairs of several rooms, each with the position of its room in `rooms`.
+    /// The training pairs of several rooms, each with the index of its room in `rooms`.
     ///
     /// # Errors
     /// The errors of [`Split::train_pairs`] for a single stride, and of [`Split::sampled_range`]

@@ -1,7 +1,7 @@
-//! The two precisions of the networks: f32 for training, f64 for answers and for comparison with
-//! reference implementations.
+//! Precision of the networks: f32 for training, f64 for inference and for comparison with reference
+//! implementations.
 
-/// A floating-point type that networks can be computed in: f32 or f64.
+/// A floating-point type of network parameters: f32 or f64.
 pub trait Real: ndarray::NdFloat + Default {
     /// The error function.
     fn erf(self) -> Self;

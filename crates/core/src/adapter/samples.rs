@@ -8,11 +8,11 @@ use super::{At, Error, Real, STILL, TargetScale};
 use crate::geometry::{Pose, Twist, body_twist};
 use crate::statistics::{median, normal_deviates};
 
-/// Lower bound on the standard deviation by which a column is divided, as a fraction of the
-/// columns' median.
+/// Lower bound on a column's standard deviation in z-scoring, as a fraction of the median over
+/// columns.
 const LEAST_SPREAD: f64 = 1e-3;
 
-/// Training data: the features of any number of rooms one below the other, and pairs of their rows.
+/// Training data: the stacked features of one or more rooms, and pairs of rows.
 #[derive(Debug, Clone)]
 pub struct Samples<T> {
     features: Array2<T>,
@@ -23,23 +23,23 @@ pub struct Samples<T> {
     scale: TargetScale,
 }
 
-/// A batch of pairs, and the distinct frames at their ends.
+/// A batch of pairs, and the distinct frames in it.
 pub struct Batch<T> {
     /// Features of the distinct frames, shape (m, d).
     pub features: Array2<T>,
-    /// For each pair the rows of its frames in `features`, source first.
+    /// Rows of each pair's frames in `features`, source first.
     slots: Vec<[usize; 2]>,
     /// Z-scored twists of the pairs, shape (n, 6).
     pub targets: Array2<T>,
 }
 
 impl<T: Real> Samples<T> {
-    /// Training data from `features` (n, d), the `poses` of their rows as `world_from_camera`, and
-    /// `pairs` of rows, source first. Both ends of a pair must be in the same world frame.
+    /// Training data from `features` (n, d), one pose per row (`world_from_camera`), and `pairs` of
+    /// rows, source first. Both poses of a pair must be in the same world frame.
     ///
     /// # Errors
-    /// [`Error::NoPairs`] when there is no pair or a pair names a row that does not exist;
-    /// [`Error::NoMotion`] when the camera moves the same way in all pairs.
+    /// [`Error::NoPairs`] when there is no pair or a pair has a row that does not exist;
+    /// [`Error::NoMotion`] when all pairs have the same motion.
     pub fn new(
         features: ArrayView2<'_, f32>,
         poses: Vec<Pose>,
@@ -60,10 +60,10 @@ impl<T: Real> Samples<T> {
         Self::scaled(features, poses, pairs, twists, scale)
     }
 
-    /// The same samples with targets scaled by μ = 0 and σ the root mean square.
+    /// The same samples with targets scaled by μ = 0 and σ = root mean square.
     ///
     /// # Errors
-    /// [`Error::NoMotion`] when the camera does not move in any pair.
+    /// [`Error::NoMotion`] when no pair has motion.
     pub fn through_zero(self) -> Result<Self, Error> {
         let scale = TargetScale::about_zero(&self.twists);
 
@@ -78,10 +78,10 @@ impl<T: Real> Samples<T> {
         Self::scaled(features, poses, pairs, twists, scale)
     }
 
-    /// The same samples with targets of another scale, that of a network which goes on learning.
+    /// The same samples with the target scale of an existing network, for further training.
     ///
     /// # Errors
-    /// [`Error::NoMotion`] when the camera moves by the scale's mean in every pair.
+    /// [`Error::NoMotion`] when the motion of every pair equals the scale's mean.
     pub fn with_scale(self, scale: TargetScale) -> Result<Self, Error> {
         let Self {
             features,
@@ -126,12 +126,12 @@ impl<T: Real> Samples<T> {
         })
     }
 
-    /// μ and σ by which the twists are z-scored.
+    /// μ and σ of the z-scored twists.
     pub fn scale(&self) -> &TargetScale {
         &self.scale
     }
 
-    /// How many pairs there are.
+    /// Number of pairs.
     pub fn pair_count(&self) -> usize {
         self.pairs.len()
     }
@@ -141,7 +141,7 @@ impl<T: Real> Samples<T> {
         self.features.ncols()
     }
 
-    /// The true motions of the pairs, each in its source's body frame.
+    /// True motions of the pairs, in the body frame of the source.
     pub fn twists(&self) -> &[Twist] {
         &self.twists
     }
@@ -156,11 +156,9 @@ impl<T: Real> Samples<T> {
         &self.poses[row]
     }
 
-    /// The pairs whose indices are in `batch`, with noise on the features if the settings ask for
-    /// it.
+    /// The pairs with the indices `batch`, with feature noise if configured.
     pub fn batch(&self, batch: &[usize], at: At<'_>) -> Batch<T> {
-        // A frame that occurs in several pairs gets a single row, so that φ runs once for each
-        // distinct frame.
+        // One row per distinct frame, so that φ runs once per frame.
         let mut places = vec![usize::MAX; self.features.nrows()];
         let mut frames = Vec::new();
 
@@ -180,8 +178,7 @@ impl<T: Real> Samples<T> {
 
         let mut features = self.features.select(Axis(0), &frames);
 
-        // Each step has a random stream of its own, so that its noise depends on the seed and the
-        // step alone.
+        // Each step has its own random stream: the noise depends only on the seed and the step.
         if at.config.noise > 0.0 {
             let mut random = ChaCha8Rng::seed_from_u64(at.config.seed);
             random.set_stream(at.step);
@@ -201,12 +198,11 @@ impl<T: Real> Samples<T> {
 }
 
 impl Samples<f32> {
-    /// The same samples with z-scored features, and the mean and the population standard deviation
-    /// that were used, each (1, d). The statistics are those of the rows that occur in pairs. A
-    /// column that hardly varies there is divided by a thousandth of the median deviation instead.
+    /// The same samples with z-scored features, and the mean and population standard deviation
+    /// used, each (1, d). The statistics are those of the rows that occur in pairs, with the lower
+    /// bound of [`column_scale`].
     pub(super) fn standardised(&self) -> (Self, [Array2<f32>; 2]) {
-        // The statistics leave out frames that occur in no training pair, such as a room's test
-        // frames.
+        // Frames in no training pair, such as test frames, are excluded from the statistics.
         let mut used = vec![false; self.features.nrows()];
         self.pairs
             .iter()
@@ -238,18 +234,17 @@ impl Samples<f32> {
 }
 
 impl<T: Real> Batch<T> {
-    /// For each pair the rows of its frames in `features`, source first.
+    /// Rows of each pair's frames in `features`, source first.
     pub fn slots(&self) -> impl Iterator<Item = [usize; 2]> + '_ {
         self.slots.iter().copied()
     }
 
-    /// From `rows`, one for each distinct frame, those of the pairs' sources, one for each pair.
+    /// The source row of each pair; `rows` has one row per distinct frame.
     pub fn sources<S: Data<Elem = T>>(&self, rows: &ArrayBase<S, Ix2>) -> Array2<T> {
         self.end(rows, 0)
     }
 
-    /// From `rows`, one for each distinct frame, the differences target minus source, one for each
-    /// pair.
+    /// Target row minus source row of each pair; `rows` has one row per distinct frame.
     pub fn differences(&self, rows: &Array2<T>) -> Array2<T> {
         self.end(rows, 1) - self.end(rows, 0)
     }
@@ -265,9 +260,8 @@ impl<T: Real> Batch<T> {
         )
     }
 
-    /// The backward pass of [`Batch::differences`]: the gradient with respect to its `rows`, from
-    /// the gradient with respect to the differences. Contributions of several pairs to one frame
-    /// add up.
+    /// Backward pass of [`Batch::differences`]: the gradient with respect to `rows`, from the
+    /// gradient with respect to the differences. It is summed over all pairs of a frame.
     pub fn scattered(&self, d_differences: &Array2<T>) -> Array2<T> {
         let mut d_rows = Array2::zeros((self.features.nrows(), d_differences.ncols()));
         for (slots, d) in self.slots.iter().zip(d_differences.outer_iter()) {
@@ -280,8 +274,8 @@ impl<T: Real> Batch<T> {
         d_rows
     }
 
-    /// The backward pass of [`Batch::sources`]: the gradient with respect to its `rows`, from the
-    /// gradient with respect to its result.
+    /// Backward pass of [`Batch::sources`]: the gradient with respect to `rows`, from the gradient
+    /// with respect to the result.
     pub fn scattered_to_sources(&self, d_sources: &Array2<T>) -> Array2<T> {
         let mut d_rows = Array2::zeros((self.features.nrows(), d_sources.ncols()));
         for (slots, d) in self.slots.iter().zip(d_sources.outer_iter()) {
@@ -293,12 +287,10 @@ impl<T: Real> Batch<T> {
     }
 }
 
-/// The mean and the deviation of each column of `rows` (n, d), by which features are z-scored, each
-/// (d,).
+/// Mean and standard deviation of each column of `rows` (n, d) for z-scoring, each (d,).
 ///
-/// A column that hardly varies in these rows holds rounding errors. Scaled up to unit variance, it
-/// would dominate the others in a room in which it does vary: its deviation is a thousandth of the
-/// median of the columns'.
+/// The deviation is at least a thousandth of the median over columns. Otherwise a column that is
+/// constant in these rows would dominate in a room where it varies.
 pub fn column_scale(rows: ArrayView2<'_, f64>) -> (Array1<f64>, Array1<f64>) {
     let count = rows.nrows().max(1) as f64;
     let mean = rows.sum_axis(Axis(0)) / count;
@@ -306,7 +298,7 @@ pub fn column_scale(rows: ArrayView2<'_, f64>) -> (Array1<f64>, Array1<f64>) {
 
     let spreads: Vec<f64> = variance.iter().map(|x| x.sqrt()).collect();
     let middle = match median(&spreads) {
-        // Most columns are constant: the median of the others has to do, if there are any.
+        // Most columns are constant: use the median of the others, or 1 if all are constant.
         0.0 => {
             let known: Vec<f64> = spreads.iter().copied().filter(|&x| x > 0.0).collect();
             if known.is_empty() {
@@ -328,8 +320,8 @@ mod tests {
     use crate::adapter::TrainConfig;
     use crate::geometry::exp;
 
-    /// Oracle: the definition of a normal deviate: mean 0 and the deviation asked for, other
-    /// numbers at every step, the same at the same step of the same seed.
+    /// Oracle: the definition of normal noise: mean 0 and the configured deviation; different at
+    /// every step, reproducible for the same seed and step.
     #[test]
     fn noise_has_the_deviation_asked_for() {
         let features = Array2::<f32>::zeros((3, 20_000));

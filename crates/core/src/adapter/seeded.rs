@@ -1,22 +1,22 @@
-//! Random numbers as PyTorch draws them on the CPU, so that a seed gives the same training run here
-//! and in PyTorch.
+//! Random numbers identical to PyTorch's on the CPU, so that a seed gives the same training run as
+//! in PyTorch.
 //!
-//! The generator is MT19937, seeded as by `torch.manual_seed(seed)`. A float takes the low 24 bits
-//! of a draw; `torch.randperm` takes one draw for each position. The tests compare initial weights
-//! with PyTorch's bit by bit.
+//! The generator is MT19937, seeded as by `torch.manual_seed(seed)`. A float uses the low 24 bits
+//! of a draw; `torch.randperm` uses one draw per position. The tests compare initial weights with
+//! PyTorch's bit by bit.
 
 use rand_mt::Mt;
 
-/// The state of `torch.manual_seed`'s generator.
+/// A random generator, equal to PyTorch's CPU generator.
 pub struct Seeded(Mt);
 
 impl Seeded {
-    /// The state after `torch.manual_seed(seed)`, which uses the low 32 bits of the seed.
+    /// The generator after `torch.manual_seed(seed)`; uses the low 32 bits of the seed.
     pub fn new(seed: u64) -> Self {
         Self(Mt::new(seed as u32))
     }
 
-    /// One number as `uniform_(-bound, bound)` draws it on a float tensor.
+    /// One number of `uniform_(-bound, bound)` on a float tensor.
     pub fn symmetric(&mut self, bound: f64) -> f32 {
         let low = -bound as f32;
         let high = bound as f32;
@@ -24,12 +24,12 @@ impl Seeded {
     }
 
     /// `torch.randn(count)` on a float tensor, for a count that is a multiple of 16. The last bits
-    /// may differ, since PyTorch uses its own vectorised sine and logarithm.
+    /// may differ, because PyTorch uses its own vectorized sine and logarithm.
     pub fn normal(&mut self, count: usize) -> Vec<f32> {
         let mut values: Vec<f32> = (0..count).map(|_| self.unit()).collect();
 
-        // The Box–Muller transform in PyTorch's arrangement: in each block of 16 the first eight
-        // draws give the radii and the last eight the angles.
+        // Box–Muller transform in PyTorch's layout: in each block of 16, the first eight draws are
+        // radii, the last eight angles.
         for block in values.chunks_exact_mut(16) {
             for place in 0..8 {
                 let radius = (-2.0 * (1.0 - block[place]).ln()).sqrt();

@@ -17,19 +17,18 @@ pub const TENSOR_NAMES: [&str; 7] = [
     "W.weight",
 ];
 
-/// Parameters of φ and W, or anything of the same shape, such as their gradients. Tensors are
-/// shaped as in PyTorch: `phi.0.weight` (64, d), …, `W.weight` (6, 20); but vectors are (1, n)
-/// here.
+/// Parameters of φ and W, or values of the same shape, such as gradients. Shapes are those of
+/// PyTorch (`phi.0.weight` (64, d), …, `W.weight` (6, 20)), but vectors are (1, n).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Siamese<T> {
-    /// φ, from features to latents.
+    /// φ: features to latents.
     pub phi: Phi<T>,
-    /// W, shape (6, k), from differences of latents to z-scored motions.
+    /// W, shape (6, k): differences of latents to z-scored motions.
     pub motion: Array2<T>,
 }
 
 impl<T: Real> Siamese<T> {
-    /// A chart drawn as PyTorch draws it.
+    /// Random initial weights, drawn as in PyTorch.
     pub fn random(widths: Widths, random: &mut Seeded) -> Self {
         Self {
             phi: Phi::random(widths, random),
@@ -37,16 +36,15 @@ impl<T: Real> Siamese<T> {
         }
     }
 
-    /// The initial weights of a seed: those that PyTorch gives the same network after
-    /// `torch.manual_seed(seed)`.
+    /// Initial weights of a seed, equal to PyTorch's after `torch.manual_seed(seed)`.
     pub fn initial(widths: Widths, seed: u64) -> Self {
         Self::random(widths, &mut Seeded::new(seed))
     }
 
-    /// Takes the seven tensors in the order of [`TENSOR_NAMES`], vectors as (1, n).
+    /// A chart from its seven tensors in the order of [`TENSOR_NAMES`], vectors as (1, n).
     ///
     /// # Errors
-    /// [`Error::WeightShape`] when they do not fit one another.
+    /// [`Error::WeightShape`] when the shapes are inconsistent.
     pub fn from_tensors(tensors: [Array2<T>; 7]) -> Result<Self, Error> {
         let [
             first_weight,
@@ -69,8 +67,7 @@ impl<T: Real> Siamese<T> {
             ],
         };
 
-        // The weights of φ's two linear layers set the widths; every other tensor has to fit
-        // them.
+        // The weights of φ's two linear layers set the widths; the other tensors must match.
         let expected = phi
             .expected_shapes()
             .into_iter()
@@ -101,7 +98,7 @@ impl<T: Real> Siamese<T> {
         [a, b, c, d, e, f, &self.motion]
     }
 
-    /// The same numbers in another precision.
+    /// The same weights in another precision.
     pub fn cast<U: Real>(&self) -> Siamese<U> {
         Siamese {
             phi: self.phi.cast(),

@@ -1,27 +1,27 @@
-//! Training of any network, with the order of the samples drawn from a seed.
+//! Training of any network, reproducible from a seed.
 //!
-//! A frame occurs in many pairs, so φ runs once for each distinct frame of a batch, and the
-//! gradient of a frame's latent is the sum over its pairs. On one machine the same seed gives the
-//! same bits. A seed gives the initial weights and the orders that PyTorch draws from it by
-//! `torch.manual_seed`, the construction of the module, and one `torch.randperm` for each epoch.
+//! A frame occurs in many pairs: φ runs once per distinct frame of a batch, and the gradient of a
+//! latent is summed over the frame's pairs. On one machine, the same seed gives identical bits.
+//! Initial weights and sample orders equal PyTorch's after `torch.manual_seed`, construction of the
+//! module, and one `torch.randperm` per epoch.
 
 use super::network::AdamW;
 use super::phi::Widths;
 use super::seeded::Seeded;
 use super::{At, Error, LATENT_DIM, Loss, Mixing, Mixture, Objective, Real, Samples};
 
-/// Settings that change the trained weights. They are recorded with the adapter.
+/// Training settings. They are recorded with the adapter.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainConfig {
-    /// Passes over the pairs.
+    /// Number of passes over the pairs.
     pub epochs: usize,
-    /// Pairs in one step. The last batch of an epoch may be shorter; it is not dropped.
+    /// Pairs per optimizer step. The last batch of an epoch may be smaller; it is not dropped.
     pub batch: usize,
     /// The learning rate, constant over the run.
     pub learning_rate: f64,
     /// Decoupled weight decay, applied to every parameter.
     pub weight_decay: f64,
-    /// The largest global norm of a gradient; a longer gradient is scaled down to it.
+    /// Gradient clipping: the maximum global norm.
     pub clip_norm: f64,
     /// Width of φ's hidden layer.
     pub hidden: usize,
@@ -29,24 +29,24 @@ pub struct TrainConfig {
     pub latent: usize,
     /// Number of charts, the paper's K.
     pub charts: usize,
-    /// How the charts are mixed. Charts that are mixed evenly are trained separately, each for its
-    /// share of the epochs.
+    /// How the charts are mixed. The charts of an ensemble are trained separately, each for 1/K of
+    /// the epochs.
     pub mixing: Mixing,
-    /// The loss that is minimised.
+    /// Training loss.
     pub loss: Loss,
-    /// Whether features are z-scored by the training frames' statistics. After training, the
-    /// scaling is folded into the weights of the first layer.
+    /// Whether features are z-scored by the statistics of the training frames. After training, the
+    /// scaling is folded into the first layer.
     pub standardise: bool,
-    /// Standard deviation of the Gaussian noise that is added to every feature at every step, in
-    /// the units of the features in training: z-scored ones if `standardise` is set.
+    /// Standard deviation of the Gaussian noise added to the features at every step. The unit is
+    /// that of the features after z-scoring, if `standardise` is set.
     pub noise: f64,
-    /// Decay of a running average of the weights, which is returned instead of the last weights. At
-    /// 0 there is no averaging.
+    /// Decay of the exponential moving average of the weights, which replaces the last weights; 0
+    /// for no averaging.
     pub average: f64,
-    /// Whether targets are scaled with μ = 0 and σ the root mean square, so that zero motion leaves
-    /// the latent unchanged in every reading.
+    /// Whether targets are scaled with μ = 0 and σ = root mean square. Zero motion then leaves the
+    /// latent unchanged in every reading.
     pub through_zero: bool,
-    /// Seed of the initial weights, of the order of the pairs and of the noise.
+    /// Seed of the initial weights, the order of the pairs and the noise.
     pub seed: u64,
 }
 
@@ -72,7 +72,7 @@ impl Default for TrainConfig {
     }
 }
 
-/// Loss and gradient of one optimiser step, both before the weights changed.
+/// Loss and gradient norm of one optimizer step, before the update of the weights.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepReport {
     /// Loss of the batch.
@@ -103,7 +103,7 @@ impl<'a, T: Real, N: Objective<T>> Trainer<'a, T, N> {
         }
     }
 
-    /// The weights as they are now.
+    /// The current weights.
     pub fn weights(&self) -> &N {
         &self.weights
     }
@@ -120,7 +120,7 @@ impl<'a, T: Real, N: Objective<T>> Trainer<'a, T, N> {
         )
     }
 
-    /// Takes one optimiser step on the samples whose indices are in `batch`.
+    /// Takes one optimizer step on the samples with the indices `batch`.
     pub fn step(&mut self, batch: &[usize]) -> StepReport {
         let (loss, gradient) = self.gradient(batch);
         self.steps += 1;
@@ -138,7 +138,7 @@ impl<'a, T: Real, N: Objective<T>> Trainer<'a, T, N> {
 /// The state of a training run at the end of an epoch.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EpochProgress {
-    /// Epochs done, including this one.
+    /// Completed epochs, including this one.
     pub done: usize,
     /// Number of epochs in the whole run.
     pub epochs: usize,
@@ -146,11 +146,11 @@ pub struct EpochProgress {
     pub loss: f64,
 }
 
-/// Trains from `start`. Returns the running average of the weights if the settings ask for one,
-/// else the last weights.
+/// Trains from `start`. Returns the averaged weights if `config.average` is above 0, else the last
+/// weights.
 ///
 /// # Errors
-/// [`Error::Diverged`] when the loss stops being finite.
+/// [`Error::Diverged`] when the loss is not finite.
 pub fn fit<T: Real, N: Objective<T>>(
     data: &N::Data,
     start: N,
@@ -167,8 +167,8 @@ pub fn fit<T: Real, N: Objective<T>>(
             losses.push(trainer.step(batch).loss);
 
             if let Some(average) = &mut average {
-                // The averaging window is shorter in the first steps; otherwise the random initial
-                // weights would still dominate the average at the end of a short run.
+                // A shorter averaging window in the first steps; otherwise the initial weights
+                // would dominate the average of a short run.
                 let steps = trainer.steps as f64;
                 let decay = config.average.min((1.0 + steps) / (10.0 + steps));
                 move_towards(average, &trainer.weights, 1.0 - decay);
@@ -190,8 +190,7 @@ pub fn fit<T: Real, N: Objective<T>>(
     Ok(average.unwrap_or(trainer.weights))
 }
 
-/// Moves every number of `average` by the fraction `share` of the way to its counterpart in
-/// `weights`.
+/// Moves `average` toward `weights` by the fraction `share` of their difference.
 fn move_towards<T: Real, N: Objective<T>>(average: &mut N, weights: &N, share: f64) {
     for (into, weight) in average
         .parameters_mut()
@@ -204,12 +203,12 @@ fn move_towards<T: Real, N: Objective<T>>(average: &mut N, weights: &N, share: f
     }
 }
 
-/// Trains an adapter's network from weights drawn from the seed.
+/// Trains an adapter's network from random initial weights.
 ///
 /// # Errors
-/// [`Error::Diverged`] when the loss stops being finite, [`Error::Charts`] when the number of
-/// charts is 0 or above [`super::MAX_CHARTS`], [`Error::GatedStandardised`] when features are to be
-/// standardised for charts under a gate.
+/// [`Error::Diverged`] when the loss is not finite, [`Error::Charts`] when the number of charts is
+/// 0 or above [`super::MAX_CHARTS`], [`Error::GatedStandardised`] for z-scored features with a
+/// gate.
 ///
 /// Source: SeeSE3, Sec. A.2; mixtures Sec. A.11.
 pub fn train(
@@ -227,19 +226,19 @@ pub fn train(
         return Err(Error::GatedStandardised);
     }
 
-    // A single chart, or charts with their gate, are one network. Only an ensemble is trained in
-    // parts.
+    // A single chart, or charts with a gate, are one network; the charts of an ensemble are trained
+    // separately.
     if config.charts == 1 || config.mixing == Mixing::Gate {
         return train_together(samples, config, progress);
     }
 
-    // The members of an ensemble share the epochs, so that it takes about as many steps as a
+    // The epochs are divided among the charts, so that an ensemble takes about as many steps as a
     // single adapter.
     let epochs = config.epochs.div_ceil(config.charts);
     let mut charts = Vec::with_capacity(config.charts);
     for member in 0..config.charts {
-        // Runs with several seeds count them up by one; the wide spacing of the members' seeds
-        // keeps one run's members from repeating another's.
+        // Experiments use consecutive seeds; the wide spacing of the members' seeds avoids
+        // collisions between runs.
         let seed = u64::from(
             (config.seed as u32).wrapping_add((member as u32).wrapping_mul(MEMBER_SEED_STEP)),
         );
@@ -266,12 +265,13 @@ pub fn train(
     Mixture::even(charts)
 }
 
-/// Goes on training a network of one chart, on samples whose targets have the network's own scale.
-/// The settings' widths, charts and seed of weights play no role.
+/// Continues the training of a single-chart network; the targets of `samples` must have the
+/// network's scale. Widths and charts of `config` are ignored; the seed sets the sample order and
+/// the noise.
 ///
 /// # Errors
-/// [`Error::Diverged`] when the loss stops being finite, [`Error::Charts`] when the network has
-/// more than one chart.
+/// [`Error::Diverged`] when the loss is not finite, [`Error::Charts`] when the network has more
+/// than one chart.
 pub fn train_further(
     samples: &Samples<f32>,
     start: &Mixture<f32>,
@@ -289,8 +289,8 @@ pub fn train_further(
         return fit(samples, start.clone(), config, &mut random, progress);
     }
 
-    // The network takes features as the encoder gives them: it is turned into one of z-scored
-    // features, trained, and turned back.
+    // The network takes raw features: it is converted for z-scored features, trained, and converted
+    // back.
     let (standardised, [mean, deviation]) = samples.standardised();
     let mut unfolded = start.clone();
     unfolded.unfold_standardisation(&mean, &deviation);
@@ -320,8 +320,8 @@ fn train_together(
         return fit(samples, start, config, &mut random, progress);
     }
 
-    // Fit on z-scored features, and then fold the scaling into the first layer, so that the
-    // trained network takes features as the encoder gives them.
+    // Train on z-scored features, then fold the scaling into the first layer, so that the network
+    // takes raw features.
     let (standardised, [mean, deviation]) = samples.standardised();
     let mut network = fit(&standardised, start, config, &mut random, progress)?;
     network.fold_standardisation(&mean, &deviation);

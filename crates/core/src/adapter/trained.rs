@@ -1,4 +1,4 @@
-//! A trained adapter: what answers are computed with.
+//! A trained adapter.
 
 use std::sync::Arc;
 
@@ -13,13 +13,12 @@ use super::{
 use crate::features::FeatureSource;
 use crate::geometry::Twist;
 
-/// Rows embedded at a time, so that memory stays flat with the size of a room.
+/// Rows embedded at a time, so that memory use does not grow with the room.
 const EMBED_ROWS: usize = 1_024;
-/// The largest accepted deviation of a gate's sum of shares from 1, and of each share of an
-/// ensemble from 1/K.
+/// Tolerance of the gate weights: of their sum from 1, and of each weight of an ensemble from 1/K.
 const GATE_TOLERANCE: f64 = 1e-6;
 
-/// A trained adapter. It is immutable and is meant for features of one source only.
+/// A trained adapter for features of one source. Immutable.
 #[derive(Debug, Clone)]
 pub struct Adapter {
     source: FeatureSource,
@@ -33,12 +32,12 @@ pub struct Adapter {
 }
 
 impl Adapter {
-    /// Checks trained weights and prepares W⁺.
+    /// Validates trained weights and computes W⁺.
     ///
     /// # Errors
-    /// [`Error::FeatureDim`] when network and source differ in width, [`Error::WeightsNotFinite`]
-    /// or [`Error::NotFinite`] when a weight or a component of μ is not finite,
-    /// [`Error::Deviation`] when a component of σ is not finite and positive, and
+    /// [`Error::FeatureDim`] when the widths of network and source differ,
+    /// [`Error::WeightsNotFinite`] or [`Error::NotFinite`] when a weight or a component of μ is not
+    /// finite, [`Error::Deviation`] when a component of σ is not finite and positive, and
     /// [`Error::RankDeficient`] when a chart's W does not have rank 6.
     pub fn new(
         source: FeatureSource,
@@ -73,14 +72,13 @@ impl Adapter {
 
         let network_f64 = network.cast::<f64>();
 
-        // A gate can give nearly the whole weight to one chart, so each chart's W must have rank
-        // 6 by itself.
+        // A gate can give nearly all weight to one chart, so each chart's W must have rank 6.
         for chart in network_f64.charts() {
             Inverse::new(chart.motion_matrix(), &scale)?;
         }
 
-        // For charts under a gate this is the inverse at equal shares; `step` computes the one
-        // for the source's gate.
+        // With a gate, this is the inverse at equal weights; `step` computes the one at the
+        // source's gate weights.
         let inverse = Inverse::new(
             network_f64
                 .motion_matrix(network_f64.even_gate().view())
@@ -121,8 +119,8 @@ impl Adapter {
         Ok(self)
     }
 
-    /// The same adapter with the second moment of its errors on (v, ω), Σ = mean r rᵀ with
-    /// r = ΔP − σ⊙W(g₂ − g₁), in metres and radians, measured in rooms outside its training set.
+    /// The same adapter with its error covariance: the second moment Σ = mean r rᵀ of r = ΔP −
+    /// σ⊙W(g₂ − g₁) on (v, ω), meters and radians, measured in rooms outside the training set.
     ///
     /// # Errors
     /// [`Error::ErrorCovariance`] when Σ is not symmetric and positive definite.
@@ -136,16 +134,16 @@ impl Adapter {
         Ok(self)
     }
 
-    /// The second moment of the adapter's errors on (v, ω), in metres and radians, if it was
-    /// measured.
+    /// The error covariance on (v, ω), meters and radians, if measured: the second moment of the
+    /// errors.
     pub fn error_covariance(&self) -> Option<Matrix6<f64>> {
         self.error_covariance
     }
 
-    /// The same adapter with its calibration, the error statistics that a tracker needs.
+    /// The same adapter with the error model that a tracker needs.
     ///
     /// # Errors
-    /// [`Error::ErrorModel`] when the calibration was made for latents of another width.
+    /// [`Error::ErrorModel`] when the error model is for latents of another width.
     pub fn with_error_model(mut self, error_model: ErrorModel) -> Result<Self, Error> {
         if error_model.frame_noise().size() != self.coordinate_count() {
             return Err(Error::ErrorModel {
@@ -157,7 +155,7 @@ impl Adapter {
         Ok(self)
     }
 
-    /// The calibration, if the adapter has one.
+    /// The error model, if the adapter has one.
     pub fn error_model(&self) -> Option<&Arc<ErrorModel>> {
         self.error_model.as_ref()
     }
@@ -182,17 +180,17 @@ impl Adapter {
         &self.scale
     }
 
-    /// W⁺ in its three readings; for a mixture, at equal shares of all charts.
+    /// W⁺ in its three readings; for a mixture, at equal gate weights.
     pub fn inverse(&self) -> &Inverse {
         &self.inverse
     }
 
-    /// Columns of a latent: the coordinates, and with several charts the share of each chart.
+    /// Columns of a latent: the coordinates and, with several charts, one gate weight per chart.
     pub fn latent_dim(&self) -> usize {
         self.network.latent_dim()
     }
 
-    /// Number of coordinates in a latent, the columns on which distances are computed.
+    /// Number of coordinates of a latent: the columns that distances are computed on.
     pub fn coordinate_count(&self) -> usize {
         self.network.coordinate_count()
     }
@@ -206,12 +204,11 @@ impl Adapter {
             .collect()
     }
 
-    /// σ ⊙ W, shape (6, [`Adapter::coordinate_count`]), which maps a difference of latents to the
-    /// motion without μ. For an ensemble it is σ ⊙ W̄.
+    /// σ ⊙ W, shape (6, [`Adapter::coordinate_count`]): maps a difference of latents to the motion
+    /// without μ. For an ensemble it is σ ⊙ W̄.
     ///
     /// # Errors
-    /// [`Error::GatedMotion`] for charts under a gate, since their matrix changes with the source
-    /// frame.
+    /// [`Error::GatedMotion`] for charts with a gate: their matrix depends on the source frame.
     pub fn motion_of_coordinates(&self) -> Result<Array2<f64>, Error> {
         if self.network.chart_count() > 1 && self.network.mixing() == Mixing::Gate {
             return Err(Error::GatedMotion);
@@ -227,11 +224,11 @@ impl Adapter {
         Ok(matrix)
     }
 
-    /// Refuses features of a source other than the one the adapter was trained on.
+    /// Refuses features from a source that differs from the training source.
     ///
     /// # Errors
-    /// [`Error::FeatureDim`] when the widths differ, [`Error::FeatureSource`] when the features
-    /// were made in another way.
+    /// [`Error::FeatureDim`] when the widths differ, [`Error::FeatureSource`] when any other part
+    /// of the source differs.
     pub fn check_source(&self, source: &FeatureSource) -> Result<(), Error> {
         if source.dim != self.source.dim {
             return Err(Error::FeatureDim {
@@ -253,8 +250,8 @@ impl Adapter {
     /// Latents φ(z) of feature rows: shape (n, d) in, (n, [`Adapter::latent_dim`]) out.
     ///
     /// # Errors
-    /// [`Error::FeatureDim`] when the features have another width than the adapter was trained on,
-    /// [`Error::NotFinite`] when a number in them is not finite.
+    /// [`Error::FeatureDim`] when the width is not the trained one, [`Error::NotFinite`] when a
+    /// number is not finite.
     ///
     /// Source: SeeSE3, Eq. 3.
     pub fn embed(&self, features: ArrayView2<'_, f32>) -> Result<Array2<f64>, Error> {
@@ -294,8 +291,8 @@ impl Adapter {
         Ok(self.embed(row.insert_axis(Axis(0)))?.row(0).to_owned())
     }
 
-    /// The camera's motion between two latents, ΔP = σ ⊙ W(g₂ − g₁) + μ, in the body frame of the
-    /// first camera. For a mixture, the gate of the first latent weighs the charts.
+    /// Predicted camera motion between two latents, ΔP = σ ⊙ W(g₂ − g₁) + μ, in the body frame of
+    /// the first camera. A mixture uses the gate weights of the first latent.
     ///
     /// Source: SeeSE3, Eq. 3, with the z-scoring of the targets undone.
     pub fn motion(&self, from: ArrayView1<'_, f64>, to: ArrayView1<'_, f64>) -> Twist {
@@ -315,13 +312,13 @@ impl Adapter {
             .twist(&Vector6::from_fn(|row, _| normalised[row]))
     }
 
-    /// [`Adapter::motion`] without μ, so that equal latents give zero motion (A-16, homogeneous).
+    /// [`Adapter::motion`] without μ: equal latents give zero motion (A-16, homogeneous).
     pub fn motion_without_mean(&self, from: ArrayView1<'_, f64>, to: ArrayView1<'_, f64>) -> Twist {
         Twist::from_vector(&(self.motion(from, to).to_vector() - self.scale.mean))
     }
 
-    /// The latent step of a motion from `latent`, ĝ − g = W⁺ΔP. A mixture's gate stays as it is at
-    /// the source. `mean_share` is explained at [`Inverse::step`].
+    /// The latent step of a motion from `latent`, ĝ − g = W⁺ΔP. A mixture keeps the gate weights of
+    /// the source. For `mean_share` see [`Inverse::step`].
     ///
     /// Source: SeeSE3, ĝ = φ(z) + W⁺ΔP.
     pub fn step(
@@ -335,8 +332,8 @@ impl Adapter {
             return self.widened(self.inverse.step(twist, reading, mean_share));
         }
 
-        // The gate depends on the source, so the mixed matrix has to be inverted for each query.
-        // It has rank 6, since each chart's W has.
+        // The gate weights depend on the source, so the mixed matrix is inverted per query. It has
+        // rank 6, because each chart's W has rank 6.
         let mixed = self
             .network_f64
             .motion_matrix(self.network_f64.gate_of(latent).view());
@@ -345,10 +342,10 @@ impl Adapter {
         self.widened(inverse.dot(&target(&self.scale, twist, reading, mean_share)))
     }
 
-    /// The latent step of a motion from `latent` by a corrector. A corrector with a residual adds
-    /// its output to W⁺ΔP in the affine reading; the linear one predicts the target latent, from
-    /// which the source is subtracted. A part of a longer motion is treated as a motion of its own:
-    /// μ only scales the corrector's input, and cannot be shared among parts.
+    /// The latent step of a motion from `latent` by a corrector. A residual corrector adds its
+    /// output to W⁺ΔP in the affine reading; the linear one predicts the target latent, and the
+    /// source latent is subtracted. Each part of a longer motion is treated as a whole motion,
+    /// because μ is part of the corrector's input and cannot be divided among parts.
     ///
     /// # Errors
     /// [`Error::NoCorrector`] when the adapter has no corrector of this kind.
@@ -372,12 +369,12 @@ impl Adapter {
         }
     }
 
-    /// Refuses a latent whose width, numbers or shares of the charts are invalid.
+    /// Validates a latent: its width, its numbers and its gate weights.
     ///
     /// # Errors
     /// [`Error::LatentDim`] when its width is wrong, [`Error::NotFinite`] when a number is not
     /// finite, [`Error::LatentRange`] when one exceeds [`MAX_LATENT`] in magnitude, or
-    /// [`Error::Gate`] when its last columns are not valid shares of the charts.
+    /// [`Error::Gate`] when the gate weights are invalid.
     pub fn check_latent(&self, latent: &[f64]) -> Result<(), Error> {
         if latent.len() != self.latent_dim() {
             return Err(Error::LatentDim {
@@ -401,14 +398,14 @@ impl Adapter {
             });
         }
 
-        // Shares of the charts lie between 0 and 1 and add up to 1. If only the sum is wrong, no
-        // single chart is at fault, and the first one is reported.
+        // Gate weights lie between 0 and 1 and add up to 1. If only the sum is wrong, the first
+        // chart is reported.
         let gate = &latent[self.coordinate_count()..];
         let sum: f64 = gate.iter().sum();
         let off = gate.iter().position(|share| !(0.0..=1.0).contains(share));
         let off = off.or((!gate.is_empty() && (sum - 1.0).abs() > GATE_TOLERANCE).then_some(0));
 
-        // An ensemble has no gate to vary the shares, so each of them is 1/K.
+        // In an ensemble every weight is 1/K.
         let even = (gate.len() as f64).recip();
         let uneven = |share: &f64| {
             self.network.mixing() == Mixing::Even && (share - even).abs() > GATE_TOLERANCE
@@ -424,8 +421,7 @@ impl Adapter {
         }
     }
 
-    /// Extends a step of the coordinates to a step of the whole latent, which leaves the shares of
-    /// the charts as they are.
+    /// Extends a step of the coordinates to the whole latent; the gate weights do not change.
     fn widened(&self, coordinates: Array1<f64>) -> Array1<f64> {
         if coordinates.len() == self.latent_dim() {
             return coordinates;
@@ -464,7 +460,7 @@ impl Adapter {
     }
 }
 
-/// A source in words, enough to see which of its parts differ.
+/// A source as text, with all its parts.
 fn describe(source: &FeatureSource) -> String {
     let FeatureSource {
         name,

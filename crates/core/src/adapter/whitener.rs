@@ -1,4 +1,4 @@
-//! Whitening: coordinates in which distances are standard deviations of a covariance.
+//! Whitening: coordinates in which Euclidean distance is Mahalanobis distance.
 
 use nalgebra::Cholesky;
 use ndarray::{Array2, ArrayView1, ArrayView2};
@@ -6,10 +6,10 @@ use ndarray::{Array2, ArrayView1, ArrayView2};
 use super::Error;
 use crate::matrices::{to_nalgebra, to_ndarray};
 
-/// A covariance may differ from its transpose by this share of its largest entry.
+/// Symmetry tolerance of a covariance, as a fraction of its largest entry.
 const SYMMETRY_TOLERANCE: f64 = 1e-9;
 
-/// Measures differences of latents in standard deviations of a covariance Σ: √(dᵀ Σ⁻¹ d).
+/// Mahalanobis distance of latents under a covariance Σ: √(dᵀ Σ⁻¹ d).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Whitener {
     /// L⁻¹ with Σ = L Lᵀ, shape (c, c).
@@ -44,17 +44,17 @@ impl Whitener {
         })
     }
 
-    /// The number of columns of the latents it measures.
+    /// Number of columns of a latent, c.
     pub fn size(&self) -> usize {
         self.matrix.nrows()
     }
 
-    /// Rows (n, c) in coordinates whose L2 distance is in standard deviations.
+    /// The whitened rows, shape (n, c); their L2 distance is the Mahalanobis distance.
     pub fn whitened(&self, rows: ArrayView2<'_, f64>) -> Array2<f64> {
         rows.dot(&self.matrix.t())
     }
 
-    /// The squared length of a difference of latents, shape (c,), in variances.
+    /// Squared Mahalanobis length of a difference of latents, shape (c,).
     pub fn squared_length(&self, difference: ArrayView1<'_, f64>) -> f64 {
         self.matrix.dot(&difference).mapv(|x| x * x).sum()
     }
@@ -66,7 +66,7 @@ mod tests {
 
     use super::*;
 
-    /// Oracle: by hand: variances 4 and 9, a difference of (2, 3) is √2 long.
+    /// Oracle: by hand; with variances 4 and 9, a difference of (2, 3) has length √2.
     #[test]
     fn a_whitener_measures_in_deviations() {
         let whitener = Whitener::new(array![[4.0, 0.0], [0.0, 9.0]].view()).unwrap();

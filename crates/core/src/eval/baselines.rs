@@ -1,5 +1,5 @@
-//! What an R² of motions has to be read beside: it divides by the variance of the tested motions,
-//! so that it says as much of the recording as of the adapter.
+//! Baselines for R² of motions. R² is relative to the variance of the tested motions, so it depends
+//! on the recording as much as on the adapter.
 
 use nalgebra::Vector6;
 
@@ -11,29 +11,27 @@ use crate::splits::{self, Pair, Split};
 use crate::statistics::{mean_of_known, median};
 use crate::training::motions;
 
-/// A constant that scores below this leaves an adapter no chance: its R² is not informative.
+/// Below this R² of the constant baseline, the R² of an adapter is not informative.
 pub const LEAST_CONSTANT_R2: f64 = -1.0;
 
-/// What an R² of motions has to be read beside.
+/// Baselines for R² of motions on the test pairs of a room.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Baselines {
-    /// R² of answering the mean training motion μ for every pair. Far below zero the tested motions
-    /// are unlike the trained ones, and no adapter can do well.
+    /// R² of the constant prediction μ, the mean training motion. Far below zero, the tested
+    /// motions differ so much from the trained ones that no adapter can score well.
     pub constant_r2: f64,
-    /// The variance of the tested motions over that of the trained ones, mean over the components
-    /// that move.
+    /// Variance of the tested motions divided by σ² of the trained ones, mean over the components.
     pub variance_ratio: f64,
-    /// Median distance and angle from a tested frame to the training frame whose pose is nearest
-    /// (metres and radians alike); none where the adapter did not learn from these frames.
+    /// Median distance and angle from a tested frame to the nearest training pose (nearest in
+    /// meters plus radians). `None` if the adapter was not trained on these frames.
     pub nearest_pose: Option<PoseError>,
-    /// How many steps the optimiser took; 0 for a fit in closed form.
+    /// Number of optimizer steps; 0 for a closed-form fit.
     pub optimiser_steps: u64,
 }
 
 impl Baselines {
-    /// The baselines of scores on the test pairs of a room, by an adapter that learned from motions
-    /// of this scale in so many optimiser steps; `learned_here` says whether it learned from these
-    /// very frames.
+    /// Baselines for an adapter with the target scale `scale`, trained in `optimiser_steps`.
+    /// `learned_here` is true if it was trained on these frames.
     ///
     /// # Errors
     /// [`splits::Error`] when the room has no test pairs.
@@ -75,8 +73,7 @@ impl Baselines {
         })
     }
 
-    /// The baselines of scores on the test pairs of a room, by what learned from its training pairs
-    /// at the same stride.
+    /// Baselines for a model that was trained on the room's own training pairs, at the same stride.
     ///
     /// # Errors
     /// [`splits::Error`] when the room has no training or no test pairs.
@@ -91,22 +88,24 @@ impl Baselines {
         Self::of(&scale, optimiser_steps, room, test, true)
     }
 
-    /// Whether the recording can tell a good adapter from a bad one at all.
+    /// Whether R² is informative in this recording: the constant baseline is at least
+    /// [`LEAST_CONSTANT_R2`].
     pub fn can_tell(&self) -> bool {
         self.constant_r2 >= LEAST_CONSTANT_R2
     }
 }
 
-/// Which pairs of a room are tested.
+/// Selection of the test pairs of a room.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TestPairs {
-    /// How training and test are kept apart.
+    /// Split into training and test.
     pub split: Split,
     /// Frames from source to target.
     pub stride: u32,
 }
 
-/// Medians over the tested frames; none without training frames.
+/// Median distance and angle from tested frames to the nearest training pose; `None` without
+/// frames.
 fn nearest_pose(poses: &[Pose], training: &[Pair], tested: &[Pair]) -> Option<PoseError> {
     let known = frames(training);
     let apart = |error: &PoseError| error.translation_m + error.rotation_rad;
@@ -132,7 +131,7 @@ fn nearest_pose(poses: &[Pose], training: &[Pair], tested: &[Pair]) -> Option<Po
     })
 }
 
-/// The frames at the ends of pairs, each once.
+/// The distinct frames of the pairs, sorted.
 fn frames(pairs: &[Pair]) -> Vec<FrameId> {
     let mut frames: Vec<FrameId> = pairs
         .iter()
@@ -147,8 +146,8 @@ fn frames(pairs: &[Pair]) -> Vec<FrameId> {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand: of a camera that walks on by a metre a frame, tested frames 8 and 9 are one
-    /// and two metres from the last training frame.
+    /// Oracle: by hand. The camera moves one meter per frame: the tested frames 8 and 9 are one and
+    /// two meters from the last training frame.
     #[test]
     fn the_nearest_training_pose_is_found() {
         let poses: Vec<Pose> = (0..10)

@@ -1,36 +1,35 @@
-//! Whether a score leaks: whether an adapter may have trained on the very pairs that it is tested
-//! on. This is the one place that decides it; commands, the service and reports ask here.
+//! Data leakage: whether an adapter may have been trained on its test pairs. Commands, the service
+//! and reports all use this check.
 
 use crate::adapter::TrainingRecord;
 use crate::room::RoomId;
 use crate::splits::Split;
 
-/// What an adapter has seen of a room.
+/// Overlap of an adapter's training data with a room.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TrainedOn {
-    /// Nothing: the room is new to it.
+    /// None: the room is not in the training set.
     Nothing,
-    /// The frames that it is tested on were among those it could be trained on.
+    /// The training set contains the room with the same frames.
     TheseFrames,
-    /// The room, but other frames of it: an earlier import under the same name.
+    /// The training set contains the room with other frames: an earlier import under the same name.
     OtherFrames,
 }
 
-/// Why a score must not be taken for one on held-out pairs.
+/// Why a score is not a held-out score.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Leak {
-    /// The adapter was trained under another split, or under one that keeps no frames apart.
+    /// The adapter was trained with another split, or with one that holds out no frames.
     Split,
-    /// The adapter was trained on other frames of the room, so its split says nothing of these.
+    /// The adapter was trained on other frames of the room, so its split does not apply to these.
     OtherFrames,
 }
 
 impl Leak {
-    /// The leak of testing under `split` in a room of which the adapter has seen `trained_on`; none
-    /// if the test pairs are held out.
+    /// The leak of a test with `split` in a room with the overlap `trained_on`; `None` if the test
+    /// pairs are held out.
     pub fn of(record: &TrainingRecord, trained_on: TrainedOn, split: Split) -> Option<Self> {
-        // Under `whole` every pair is trained on; under `pairs` the pairs differ, but their frames
-        // were all seen.
+        // `whole` trains on every pair; `pairs` holds out pairs, but trains on all frames.
         let keeps_frames_apart = !matches!(record.split, Split::Whole | Split::Pairs);
 
         match trained_on {
@@ -42,8 +41,8 @@ impl Leak {
     }
 }
 
-/// Whether the adapter's errors were measured in a room, so that calibrated navigators and trackers
-/// have seen its poses.
+/// Whether the adapter was calibrated in a room: calibrated navigators and trackers then depend on
+/// its poses.
 pub fn is_calibrated_in(record: &TrainingRecord, room: &RoomId) -> bool {
     record.calibrated_on.iter().any(|(name, _)| name == room)
 }

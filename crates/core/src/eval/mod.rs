@@ -1,4 +1,4 @@
-//! Hit@ε on held-out pairs: every navigator beside baselines that put its numbers into perspective.
+//! Hit@ε on held-out pairs, for navigators and baselines.
 
 mod baselines;
 mod leak;
@@ -33,8 +33,8 @@ pub enum Error {
     #[error("{count} thresholds were given; give 1 to {most}")]
     ThresholdCount { count: usize, most: usize },
     #[error(
-        "'{navigator}' is fitted on pairs that are not tested, and the split '{split}' leaves none here; \
-         take its in-sample variant, or another split"
+        "'{navigator}' is fitted on training pairs, and the split '{split}' leaves none in this room; \
+         use the in-sample variant or another split"
     )]
     NothingToFitOn {
         navigator: String,
@@ -55,10 +55,10 @@ pub enum Error {
         split: splits::Split,
     },
     #[error(
-        "the retrieved frame {frame} is excluded: it is the source or the frame that the last step started from, or near to it"
+        "the retrieved frame {frame} is excluded: it is too close to the source, or to the frame that the last step started from"
     )]
     Excluded { frame: room::FrameId },
-    #[error("({source_frame}, {target_frame}) is no test pair under the split '{split}'")]
+    #[error("({source_frame}, {target_frame}) is not a test pair under the split '{split}'")]
     NotATestPair {
         source_frame: room::FrameId,
         target_frame: room::FrameId,
@@ -68,17 +68,17 @@ pub enum Error {
     MixedPredictions,
 }
 
-/// The largest ε of Hit@ε that is accepted.
+/// Maximum ε of Hit@ε.
 pub const MAX_THRESHOLD: f64 = 1e6;
 
-/// The largest number of thresholds in one report.
+/// Maximum number of thresholds in one report.
 pub const MAX_THRESHOLDS: usize = 256;
 
-/// Checks the thresholds ε of Hit@ε.
+/// Validates the thresholds ε of Hit@ε.
 ///
 /// # Errors
-/// [`Error::ThresholdCount`] when there is none or more than [`MAX_THRESHOLDS`];
-/// [`Error::Threshold`] for one that is not a number, not above 0, or above [`MAX_THRESHOLD`].
+/// [`Error::ThresholdCount`] for no threshold or more than [`MAX_THRESHOLDS`]; [`Error::Threshold`]
+/// for one that is NaN, not above 0, or above [`MAX_THRESHOLD`].
 pub fn check_thresholds(thresholds: &[f64]) -> Result<(), Error> {
     if thresholds.is_empty() || thresholds.len() > MAX_THRESHOLDS {
         return Err(Error::ThresholdCount {

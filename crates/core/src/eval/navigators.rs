@@ -17,34 +17,35 @@ use crate::navigation::{
 use crate::room::{FrameId, Timeline};
 use crate::splits::{Pair, Split};
 
-/// Everything that decides the numbers of a report, besides the room and the adapter.
+/// All settings of an evaluation except the room and the adapter.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Protocol {
-    /// How frames are split into training and test.
+    /// Split of the frames into training and test.
     pub split: Split,
     /// Frames from source to target.
     pub stride: u32,
-    /// If given, the source frame and this many rows to each side of it may not be retrieved
-    ///
+    /// Excludes the source frame and this many rows to each side from retrieval; `None`
+    /// excludes nothing.
     pub exclude_source: Option<u32>,
     /// ε of Hit@ε.
     pub thresholds: Vec<f64>,
     /// Seed of the random navigator.
     pub seed: u64,
-    /// Number of equal steps that each motion is cut into, at least 1.
+    /// Number of equal steps per motion, at least 1.
     pub steps: u32,
     /// How these steps are chained.
     pub mode: Mode,
-    /// Rows of the table; if empty, those of [`NavigatorKind::table`].
+    /// Rows of the table; if empty, those of [`NavigatorKind::table`] that can be fitted in the
+    /// room.
     pub navigators: Vec<NavigatorKind>,
 }
 
 impl Protocol {
-    /// The rows that the table has in a room: those that were asked for, or else the adapter's
-    /// default rows that can be fitted there.
+    /// The rows of the table in a room: the requested ones, or else the adapter's default rows that
+    /// can be fitted there.
     ///
     /// # Errors
-    /// [`Error::NothingToFitOn`] when a refit was asked for that has no training pairs,
+    /// [`Error::NothingToFitOn`] when a requested refit has no training pairs,
     /// [`Error::Navigation`] when `steps` is 0.
     pub fn rows(&self, navigator: &Navigator) -> Result<Vec<NavigatorKind>, Error> {
         if self.steps == 0 {
@@ -61,8 +62,8 @@ impl Protocol {
                 && !can_fit
         };
 
-        // Default rows that cannot be fitted are left out; a row that was asked for must not
-        // vanish.
+        // Default rows that cannot be fitted are omitted; a requested row that cannot be fitted is
+        // an error.
         if self.navigators.is_empty() {
             let table = NavigatorKind::table(navigator.adapter());
             return Ok(table.into_iter().filter(|kind| !unfitted(kind)).collect());
@@ -77,14 +78,13 @@ impl Protocol {
         }
     }
 
-    /// Whether the split leaves training pairs apart from the tested ones: a refit that is not in
-    /// sample is fitted on them.
+    /// Whether the split has training pairs that are not tested, as an out-of-sample refit needs.
     fn can_fit(&self, timeline: &Timeline) -> bool {
         self.split != Split::Whole && self.split.train_pairs(timeline, self.stride).is_ok()
     }
 
-    /// The paper's protocol at a stride: time split, source included, one step, ε of 0.1, 0.2, 0.3
-    /// and 0.5.
+    /// The paper's protocol at a stride: time split, source not excluded, one step, ε = 0.1, 0.2,
+    /// 0.3, 0.5.
     pub fn paper(stride: u32) -> Self {
         Self {
             split: Split::Time,
@@ -106,9 +106,9 @@ pub struct Row {
     pub name: String,
     /// Pairs scored.
     pub n: usize,
-    /// How close the predicted latents are; none when only frames were predicted.
+    /// Scores of the predicted latents; `None` when only frames were predicted.
     pub latent: Option<LatentScores>,
-    /// How close the retrieved frames are.
+    /// Scores of the retrieved frames.
     pub retrieval: RetrievalScores,
 }
 
@@ -125,8 +125,8 @@ pub struct Report {
     pub protocol: Protocol,
 }
 
-/// Evaluates every navigator of the protocol on the room's test pairs. Before each one, `progress`
-/// is called with its position and its kind.
+/// Evaluates the navigators of the protocol on the room's test pairs. `progress` is called before
+/// each, with its index and kind.
 ///
 /// # Errors
 /// [`Error`] when the room is too short for the protocol, a threshold is out of range, the adapter
@@ -148,8 +148,7 @@ pub fn evaluate(
         adapter: navigator.adapter(),
         latents: navigator.latents(),
         test: protocol.split.test_pairs(timeline, protocol.stride)?,
-        // Only refits need training pairs, and `Protocol::rows` has refused those that would have
-        // none.
+        // Only refits use training pairs; `Protocol::rows` has refused a refit without any.
         train: protocol
             .split
             .train_pairs(timeline, protocol.stride)
@@ -180,7 +179,7 @@ pub fn evaluate(
     })
 }
 
-/// The inputs that all rows of the table share.
+/// Common inputs of all rows of the table.
 struct TableInputs<'a> {
     poses: &'a [Pose],
     adapter: &'a Adapter,
@@ -199,7 +198,7 @@ impl TableInputs<'_> {
             NavigatorKind::Random => Ok(self.row_of_frames(kind, &self.random_frames()?)),
             NavigatorKind::Oracle => Ok(self.row_of_frames(kind, &self.nearest_poses()?)),
             NavigatorKind::Step(step, metric) => {
-                // A step may have to be fitted first; every pair then uses the same fit.
+                // A refit is fitted once, for all pairs.
                 let ground = RefitData {
                     latents: self.latents,
                     poses: self.poses,
@@ -221,13 +220,12 @@ impl TableInputs<'_> {
                     Array2::zeros((self.test.len(), self.adapter.coordinate_count()));
                 let mut retrieved = Vec::with_capacity(self.test.len());
                 for (&pair, mut row) in self.test.iter().zip(predicted.outer_iter_mut()) {
-                    // A walk of several steps is scored by its last step.
+                    // Only the last step of a walk is scored.
                     let Some(end) = self.walked(space, pair)?.pop() else {
                         continue;
                     };
 
-                    // Latents are scored by their coordinates, without the gate shares of a
-                    // mixture.
+                    // Only coordinates are scored, not the gate weights of a mixture.
                     row.assign(&end.latent.slice(s![..self.adapter.coordinate_count()]));
 
                     retrieved.push(end.neighbours[0].frame);
@@ -254,7 +252,7 @@ impl TableInputs<'_> {
             pose: Some(source),
         };
 
-        // The wanted motion is the true one from the source to the target.
+        // The requested motion is the true one from source to target.
         let leg = Leg {
             motion: body_twist(&source, &target),
             goal: Some(target),
@@ -267,7 +265,7 @@ impl TableInputs<'_> {
             exclude_source,
         };
 
-        // The caller needs to know at which pair no candidate was left.
+        // Report the pair for which no candidate was left.
         walk(space, &start, leg, plan, self.cancel).map_err(|error| match error {
             navigation::Error::NoCandidates { .. } => Error::NoCandidates {
                 source_frame: pair.source,
@@ -277,7 +275,7 @@ impl TableInputs<'_> {
     }
 
     fn identity(&self) -> Result<Row, Error> {
-        // Not by a search: another frame with the same latent must not take the source's place.
+        // No search: another frame with the same latent could be returned instead of the source.
         if self.protocol.exclude_source.is_none() {
             let sources: Vec<FrameId> = self.test.iter().map(|pair| pair.source).collect();
             return Ok(self.row_of_frames(NavigatorKind::Identity, &sources));
@@ -305,7 +303,7 @@ impl TableInputs<'_> {
             retrieved.push(found.frame);
         }
 
-        // The prediction is the source's own latent, whichever frame was retrieved.
+        // The predicted latent is the source's, whatever frame was retrieved.
         let here = self.coordinates_of(self.test.iter().map(|pair| pair.source));
         Ok(self.scored(NavigatorKind::Identity, &here, &retrieved))
     }
@@ -338,7 +336,7 @@ impl TableInputs<'_> {
         let draw = |pair: &Pair| {
             self.cancel.check()?;
 
-            // Drawn anew for each pair, among the candidates that its source leaves.
+            // One draw per pair, among the candidates that are not excluded.
             let allowed = self.allowed(pair.source)?;
             Ok(allowed[random.random_range(0..allowed.len())])
         };
@@ -356,8 +354,7 @@ impl TableInputs<'_> {
                 .into_iter()
                 .map(|f| (twist_error(pair, f, self.poses), f));
 
-            // Among equally near poses the smaller frame number wins, so that the row is
-            // reproducible.
+            // Ties are broken by the smaller frame number, so that the row is reproducible.
             let best = errors.min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
 
             nearest.push(
@@ -371,7 +368,7 @@ impl TableInputs<'_> {
         Ok(nearest)
     }
 
-    /// Candidates that may be retrieved from a source; at least one.
+    /// Candidates for a source that are not excluded; at least one.
     fn allowed(&self, source: FrameId) -> Result<Vec<FrameId>, Error> {
         let exclusion = self.exclusion(source);
         let open = |frame: &FrameId| !exclusion.is_some_and(|exclusion| exclusion.covers(*frame));

@@ -1,4 +1,4 @@
-//! Scores of predictions made elsewhere, by a client that brings its own navigator.
+//! Scores of external predictions, from a client with its own navigator.
 
 use ndarray::{Array2, Axis, s};
 
@@ -12,45 +12,44 @@ use crate::splits::{Pair, Split};
 /// A client's prediction for one pair.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Prediction {
-    /// The latent that it expects at the target, shape (k,).
+    /// The predicted latent at the target, shape (k,).
     Latent(Vec<f64>),
-    /// The frame that it retrieved.
+    /// The retrieved frame.
     Frame(FrameId),
 }
 
-/// A client's prediction, and the pair that it is for.
+/// A pair and a client's prediction for it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PredictedPair {
     /// The source and the target.
     pub pair: Pair,
-    /// What is expected at the target.
+    /// The prediction for the target.
     pub prediction: Prediction,
-    /// The frame that the last step started from, where the motion was divided into steps that each
-    /// went on from a frame: the exclusion is around it, as it is in `evaluate`. None for the
-    /// source.
+    /// The frame that the last step started from, for a motion of several steps. The exclusion is
+    /// centered on it, as in `evaluate`. `None` for the source.
     pub last_step_from: Option<FrameId>,
 }
 
-/// Which pairs and frames are allowed, and the thresholds by which they are scored.
+/// Allowed pairs and frames, and the thresholds of the scores.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PredictionScope {
-    /// Pairs must be test pairs of this split, and candidates are as in [`Split::candidates`]. If
-    /// none is given, any pair is scored and all frames are candidates.
+    /// Pairs must be test pairs of this split, and candidates are those of [`Split::candidates`].
+    /// `None` allows any pair and all frames.
     pub split: Option<Split>,
-    /// If given, the source frame and this many rows to each side of it may not be retrieved; see
+    /// Excludes the source frame and this many rows to each side from retrieval; see
     /// [`PredictedPair::last_step_from`].
     pub exclude_source: Option<u32>,
     /// ε of Hit@ε.
     pub thresholds: Vec<f64>,
 }
 
-/// Scores one prediction per pair: a latent by the frame nearest to it, a frame as it is.
+/// Scores one prediction per pair: a latent by its nearest frame, a frame directly.
 ///
 /// # Errors
-/// [`Error::NoPredictions`] without any, [`Error::MixedPredictions`] when some are latents and some
-/// frames, [`Error::Threshold`] or [`Error::ThresholdCount`] as [`check_thresholds`],
-/// [`Error::Cancelled`], and [`Error::Prediction`] for the first pair or prediction that does not
-/// fit the room, the scope or the adapter.
+/// [`Error::NoPredictions`] for an empty list, [`Error::MixedPredictions`] for latents and frames
+/// in one list, [`Error::Threshold`] or [`Error::ThresholdCount`] as [`check_thresholds`],
+/// [`Error::Cancelled`], and [`Error::Prediction`] for the first pair or prediction that is invalid
+/// for the room, the scope or the adapter.
 pub fn score_predictions(
     navigator: &Navigator,
     predictions: &[PredictedPair],
@@ -68,7 +67,7 @@ pub fn score_predictions(
         None => (0..room.frame_count() as u32).map(FrameId).collect(),
     };
 
-    // The search is exact: scores must not depend on an approximate index.
+    // Exact search: scores must not depend on an approximate index.
     let search = Search::exact(
         RetrievalMetric::Full,
         navigator.adapter(),
@@ -88,7 +87,7 @@ pub fn score_predictions(
     for (position, predicted) in predictions.iter().enumerate() {
         cancel.check()?;
 
-        // Errors name the prediction by its position, since the client sees only its own list.
+        // Errors give the position in the client's list.
         let frame = scoring
             .retrieved_frame(predicted)
             .map_err(|problem| Error::Prediction {
@@ -96,8 +95,7 @@ pub fn score_predictions(
                 problem: Box::new(problem),
             })?;
 
-        // Predicted latents are collected in one row; whether every pair has one is checked at the
-        // end.
+        // Predicted latents are concatenated; `latent_scores` checks that every pair has one.
         if let Prediction::Latent(latent) = &predicted.prediction {
             latents.extend(latent);
         }
@@ -105,7 +103,7 @@ pub fn score_predictions(
         retrieved.push(frame);
     }
 
-    // A client that predicted frames has no latents to score.
+    // `None` if the predictions are frames.
     let latent = latent_scores(navigator, &pairs, &latents)?;
     let retrieval = RetrievalScores::of(&pairs, &retrieved, room.poses(), &scope.thresholds);
 
@@ -117,7 +115,7 @@ pub fn score_predictions(
     })
 }
 
-/// What every prediction is checked against.
+/// Context in which predictions are checked.
 struct Scoring<'a> {
     navigator: &'a Navigator,
     scope: &'a PredictionScope,
@@ -126,8 +124,8 @@ struct Scoring<'a> {
 }
 
 impl Scoring<'_> {
-    /// The frame that a prediction retrieves: a frame as it is, if it may be retrieved, and for a
-    /// latent its nearest candidate.
+    /// The retrieved frame of a prediction: the given frame, if it is allowed, or the nearest
+    /// candidate of the latent.
     fn retrieved_frame(&self, predicted: &PredictedPair) -> Result<FrameId, Error> {
         let PredictedPair {
             pair,
@@ -141,7 +139,7 @@ impl Scoring<'_> {
             room.pose(frame)?;
         }
 
-        // Pairs that were trained on would flatter the scores.
+        // Training pairs would make the scores too optimistic.
         if let Some(split) = self.scope.split
             && !split.tests(room.timeline(), pair)
         {
@@ -190,8 +188,7 @@ impl Scoring<'_> {
     }
 }
 
-/// Scores of predicted latents, which lie one after the other in `latents`; none when only frames
-/// were predicted.
+/// Scores of predicted latents, concatenated in `latents`; `None` if it is empty.
 fn latent_scores(
     navigator: &Navigator,
     pairs: &[Pair],
@@ -200,7 +197,7 @@ fn latent_scores(
     let targets: Vec<usize> = pairs.iter().map(|pair| pair.target.row()).collect();
     let targets = navigator.latents().select(Axis(0), &targets);
 
-    // Scores are of the coordinates; the gate shares of a mixture are not compared.
+    // Only coordinates are scored, not the gate weights of a mixture.
     let coordinates = s![.., ..navigator.adapter().coordinate_count()];
     match latents.len() {
         0 => Ok(None),
@@ -214,7 +211,7 @@ fn latent_scores(
             )))
         }
 
-        // Fewer numbers than the targets have: some predictions were frames.
+        // Too few numbers: some predictions were frames.
         _ => Err(Error::MixedPredictions),
     }
 }

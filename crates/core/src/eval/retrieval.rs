@@ -7,7 +7,7 @@ use crate::room::FrameId;
 use crate::splits::Pair;
 use crate::statistics::{Rate, mean, median};
 
-/// Joint bounds on translation (metres) and rotation (degrees), as hloc and ACE report them.
+/// Joint bounds on translation (meters) and rotation (degrees), as in hloc and ACE.
 const POSE_BARS: [(f64, f64); 7] = [
     (0.01, 1.0),
     (0.02, 2.0),
@@ -18,51 +18,51 @@ const POSE_BARS: [(f64, f64); 7] = [
     (5.0, 10.0),
 ];
 
-/// The share of pairs whose retrieved pose is within a distance and an angle of the target's.
+/// Fraction of pairs with the retrieved pose within a distance and an angle of the target pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseRecall {
-    /// The bound on the distance, metres.
+    /// Bound on the distance, meters.
     pub translation_m: f64,
-    /// The bound on the angle, degrees.
+    /// Bound on the angle, degrees.
     pub rotation_deg: f64,
-    /// The share of pairs strictly within both bounds.
+    /// Fraction of pairs strictly within both bounds.
     pub rate: Rate,
 }
 
-/// How close the retrieved frames are to the target frames.
+/// Scores of retrieved frames against the target frames.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RetrievalScores {
-    /// The share of pairs whose retrieved frame is the target frame itself.
+    /// Fraction of pairs for which the target frame itself was retrieved.
     pub top1: Rate,
-    /// ε and the share of pairs with ‖ΔP_target − ΔP_retrieved‖₂ < ε, both twists from the source
-    /// and not normalised: metres and radians count alike.
+    /// Hit@ε: ε and the fraction of pairs with ‖ΔP_target − ΔP_retrieved‖₂ < ε. Both twists start
+    /// at the source and are unscaled: meters and radians have equal weight.
     pub hits: Vec<(f64, Rate)>,
     /// Mean of ‖ΔP_target − ΔP_retrieved‖₂ over the pairs.
     pub twist_error_mean: f64,
     /// Median of ‖ΔP_target − ΔP_retrieved‖₂ over the pairs.
     pub twist_error_median: f64,
-    /// Median distance between the retrieved and the target camera, metres.
+    /// Median distance between the retrieved and the target camera, meters.
     pub translation_m_median: f64,
     /// Median angle between the retrieved and the target camera, radians.
     pub rotation_rad_median: f64,
-    /// Joint recalls of translation and rotation, one per pair of bounds.
+    /// Joint recall of translation and rotation, one per pair of bounds.
     pub pose_recalls: Vec<PoseRecall>,
 }
 
 impl RetrievalScores {
-    /// Scores one retrieved frame per pair; `poses` are those of the pairs' room,
-    /// `world_from_camera`, row by frame.
+    /// Scores one retrieved frame per pair; `poses` has one pose per frame of the room,
+    /// `world_from_camera`.
     pub fn of(pairs: &[Pair], retrieved: &[FrameId], poses: &[Pose], thresholds: &[f64]) -> Self {
         let n = pairs.len();
 
-        // Hit@ε compares two motions from the source.
+        // Hit@ε compares motions from the source.
         let twist_errors: Vec<f64> = pairs
             .iter()
             .zip(retrieved)
             .map(|(&pair, &frame)| twist_error(pair, frame, poses))
             .collect();
 
-        // Recalls and medians compare the retrieved camera with the target camera directly.
+        // Recalls and medians compare the retrieved pose with the target pose.
         let pose_errors: Vec<PoseError> = pairs
             .iter()
             .zip(retrieved)
@@ -73,7 +73,7 @@ impl RetrievalScores {
         let recall = |(translation_m, rotation_deg): (f64, f64)| PoseRecall {
             translation_m,
             rotation_deg,
-            // Strictly below both bounds, as Hit@ε is strictly below ε.
+            // Strict, like Hit@ε.
             rate: rate(
                 pose_errors
                     .iter()
@@ -126,7 +126,7 @@ impl RetrievalScores {
     }
 }
 
-/// ‖ΔP_target − ΔP_frame‖₂ with both motions taken from the pair's source.
+/// ‖ΔP_target − ΔP_frame‖₂, both motions from the pair's source.
 ///
 /// Source: SeeSE3, Sec. 4.1.
 pub fn twist_error(pair: Pair, frame: FrameId, poses: &[Pose]) -> f64 {
@@ -135,13 +135,13 @@ pub fn twist_error(pair: Pair, frame: FrameId, poses: &[Pose]) -> f64 {
     (to(pair.target) - to(frame)).norm()
 }
 
-/// How close predicted latents are to the latents of the target frames.
+/// Scores of predicted latents against the latents of the target frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LatentScores {
     /// Mean squared error over pairs and columns.
     pub mse: f64,
-    /// R² over all columns together, weighted by their variance; the paper's figures are consistent
-    /// with this definition.
+    /// Variance-weighted R² over all columns. The paper's figures are consistent with this
+    /// definition.
     pub r2: f64,
     /// The unweighted mean of the columns' R².
     pub r2_uniform: f64,
@@ -150,13 +150,13 @@ pub struct LatentScores {
 impl LatentScores {
     /// Scores predicted latents (n, k) against the targets' latents (n, k).
     pub fn of(targets: ArrayView2<'_, f64>, predicted: ArrayView2<'_, f64>) -> Self {
-        // A standard deviation under 1e-9 is rounding: such a column is constant and has no R².
+        // A column with a standard deviation below 1e-9 is constant up to rounding and has no R².
         let still = targets.nrows() as f64 * 1e-18;
         let mut column_r2 = Vec::with_capacity(targets.ncols());
         let mut residual = 0.0;
         let mut total = 0.0;
 
-        // Column by column for the uniform mean; the sums over all columns weight by variance.
+        // Per column for the uniform mean; the sums over all columns give the variance-weighted R².
         for (target, predicted) in targets.axis_iter(Axis(1)).zip(predicted.axis_iter(Axis(1))) {
             let mean = target.sum() / target.len() as f64;
 

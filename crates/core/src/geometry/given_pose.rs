@@ -1,29 +1,29 @@
-//! Poses from matrices and quaternions that another program wrote.
+//! Poses from external matrices and quaternions.
 
 use nalgebra::{Matrix4, Quaternion, RowVector4, UnitQuaternion};
 
 use super::{Pose, nearest_rotation};
 
-/// Largest entry of |RRᵀ − I| that counts as rounding. The rotation is then projected onto SO(3);
-/// above it, the matrix is refused.
+/// Tolerance of a rotation matrix, the largest entry of |RRᵀ − I|. Within it, the matrix is
+/// projected onto SO(3); above it, the matrix is refused.
 pub const MAX_ROTATION_DEVIATION: f64 = 1e-2;
 
-/// Largest deviation of a quaternion's norm from 1 that counts as rounding.
+/// Tolerance of a quaternion's norm.
 const NORM_TOLERANCE: f64 = 1e-2;
 
-/// Why numbers are not a rigid transform.
+/// Why a matrix or a quaternion is not a rigid transform.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum GivenPoseError {
-    /// A number is infinite or not a number.
+    /// A number is infinite or NaN.
     #[error("is not finite")]
     NotFinite,
     /// The upper left 3×3 block is singular or mirrored.
-    #[error("has no rotation: its matrix is singular")]
+    #[error("has no rotation: its matrix is singular or mirrored")]
     Singular,
     /// The last row is not (0, 0, 0, 1): the matrix is transposed, or is not a pose.
     #[error("the last row is not 0 0 0 1; is the matrix transposed?")]
     NotHomogeneous,
-    /// The upper left 3×3 block is too far from SO(3) for rounding.
+    /// The upper left 3×3 block is too far from SO(3) for a rounding error.
     #[error(
         "the rotation is {deviation:.1e} off SO(3), over the limit of {MAX_ROTATION_DEVIATION:.0e}; \
          is this a rotation matrix, row by row?"
@@ -32,7 +32,7 @@ pub enum GivenPoseError {
         /// Largest entry of |RRᵀ − I|.
         deviation: f64,
     },
-    /// The quaternion's norm is too far from 1 for rounding, or the position is not finite.
+    /// The quaternion's norm is too far from 1 for a rounding error, or the position is not finite.
     #[error("the quaternion has norm {norm}, or the position is not finite")]
     NotUnit {
         /// Norm of the quaternion.
@@ -40,8 +40,8 @@ pub enum GivenPoseError {
     },
 }
 
-/// A rigid transform, such as `world_from_camera`, from a homogeneous matrix; and the largest entry
-/// of |RRᵀ − I| of its rotation R before R was projected onto SO(3).
+/// A rigid transform, such as `world_from_camera`, from a homogeneous matrix. Also returns the
+/// largest entry of |RRᵀ − I| of the rotation R before its projection onto SO(3).
 ///
 /// # Errors
 /// [`GivenPoseError`] if the matrix is not a rigid transform up to rounding.
@@ -53,7 +53,7 @@ pub fn pose_from_matrix(matrix: &Matrix4<f64>) -> Result<(Pose, f64), GivenPoseE
         return Err(GivenPoseError::NotHomogeneous);
     }
 
-    // Published rotations carry rounding errors. The nearest rotation replaces them.
+    // Published rotations have rounding errors: use the nearest rotation.
     let block = matrix.fixed_view::<3, 3>(0, 0).into_owned();
     let nearest = nearest_rotation(&block).ok_or(GivenPoseError::Singular)?;
     let deviation = nearest.deviation;
@@ -66,7 +66,7 @@ pub fn pose_from_matrix(matrix: &Matrix4<f64>) -> Result<(Pose, f64), GivenPoseE
     Ok((Pose::from_parts(translation.into(), rotation), deviation))
 }
 
-/// A pose from a position, metres, and a quaternion whose norm is 1 up to rounding.
+/// A pose from a position, meters, and a quaternion of norm 1 up to rounding.
 ///
 /// # Errors
 /// [`GivenPoseError::NotUnit`] if the norm is not 1 or a number is not finite.

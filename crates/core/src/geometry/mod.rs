@@ -1,12 +1,11 @@
 //! Rigid motions of a camera: SE(3), its Lie algebra se(3), and pose errors.
 //!
-//! The conventions of the whole crate, fixed here once:
-//! - A [`Pose`] is `world_from_camera`: it takes camera coordinates to world coordinates. Metres.
+//! Conventions of the crate:
+//! - A [`Pose`] is `world_from_camera`: it maps camera coordinates to world coordinates. Meters.
 //! - Camera axes: x right, y down, z forward.
-//! - A [`Twist`] is ordered (v, ω), the paper's order. GTSAM and sophus-rs use (ω, v): swap when
-//!   borrowing.
+//! - A [`Twist`] is ordered (v, ω), the paper's order. GTSAM and sophus-rs use (ω, v).
 //! - The motion between two frames is the twist in the body frame of the first camera: ΔP =
-//!   log(P₁⁻¹ P₂), v in metres, ω in radians with |ω| ≤ π.
+//!   log(P₁⁻¹ P₂), v in meters, ω in radians, |ω| ≤ π.
 //! - v is the translation part of the logarithm, V(ω)⁻¹ t, not the translation t itself.
 
 mod given_pose;
@@ -23,8 +22,9 @@ pub use pose_error::PoseError;
 pub use rotation::{NearestRotation, nearest_rotation};
 pub use se3::{Twist, adjoint, body_twist, exp, left_jacobian_inverse, log};
 
-/// A camera's position and orientation, `world_from_camera`, metres.
+/// A camera's position and orientation, `world_from_camera`, meters.
 pub type Pose = nalgebra::Isometry3<f64>;
 
-/// Rotations this close to π, radians, have two logarithms that rounding cannot tell apart.
+/// Margin below a rotation of π, radians, within which the logarithm is ambiguous up to rounding
+///
 pub const PI_MARGIN_RAD: f64 = 1e-6;

@@ -1,4 +1,4 @@
-//! The pinhole camera: which direction a point of an image is seen in.
+//! The pinhole camera model.
 
 use nalgebra::Vector2;
 
@@ -7,11 +7,11 @@ use nalgebra::Vector2;
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum PinholeError {
     #[error(
-        "images are {width} by {height} pixels; both must be above 0, and neither ten times the other"
+        "images are {width} by {height} pixels; both must be above 0, and the aspect ratio at most 10"
     )]
     Size { width: f64, height: f64 },
     #[error(
-        "the focal length is {focal} pixels in images {width} wide; it must be a tenth of that to ten times that"
+        "the focal length is {focal} pixels; for images {width} pixels wide it must be 0.1 to 10 times the width"
     )]
     Focal { focal: f64, width: f64 },
     #[error("the principal point ({x}, {y}) lies outside images of {width} by {height} pixels")]
@@ -23,24 +23,23 @@ pub enum PinholeError {
     },
 }
 
-/// By what share the fields of view of two cameras may differ that count as alike.
+/// Maximum relative difference between the fields of view of compatible cameras.
 const OTHER_VIEW: f64 = 0.1;
 
-/// A pinhole camera as its calibration states it, in pixels of its images.
+/// A pinhole camera in pixels, as in its calibration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PixelCamera {
-    /// The size of the images.
+    /// Width of the images.
     pub width: f64,
-    /// The size of the images.
+    /// Height of the images.
     pub height: f64,
-    /// The focal length, the same along both axes.
+    /// Focal length, equal along both axes.
     pub focal: f64,
-    /// The principal point from the image's top left corner; the middle if `None`.
+    /// Principal point from the top left corner; `None` is the image center.
     pub centre: Option<Vector2<f64>>,
 }
 
-/// A pinhole camera with square pixels. Lengths are in image widths, so that they stay when the
-/// image is resized.
+/// A pinhole camera with square pixels. Lengths are in image widths, independent of the image size.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pinhole {
     focal: f64,
@@ -49,7 +48,7 @@ pub struct Pinhole {
 }
 
 impl Pinhole {
-    /// Checks a camera.
+    /// Validates a camera.
     ///
     /// # Errors
     /// [`PinholeError`] if a number is out of its range.
@@ -61,7 +60,7 @@ impl Pinhole {
             centre,
         } = camera;
 
-        // Not a number is outside every range.
+        // NaN is outside every range.
         if !(width.is_finite() && width > 0.0 && (0.1..=10.0).contains(&(height / width))) {
             return Err(PinholeError::Size { width, height });
         }
@@ -87,23 +86,23 @@ impl Pinhole {
         })
     }
 
-    /// The focal length, image widths.
+    /// Focal length, image widths.
     pub fn focal(&self) -> f64 {
         self.focal
     }
 
-    /// The height of the images, image widths.
+    /// Height of the images, image widths.
     pub fn height(&self) -> f64 {
         self.height
     }
 
-    /// The principal point from the top left corner, image widths.
+    /// Principal point from the top left corner, image widths.
     pub fn centre(&self) -> Vector2<f64> {
         self.centre
     }
 
-    /// In what another camera sees so much more or less that places look different through it, in
-    /// words; none if it does not.
+    /// A description of the first field of view of `other` that differs by more than 10 % from this
+    /// camera's; `None` if the cameras are compatible.
     pub fn difference(&self, other: &Self) -> Option<String> {
         [
             ("across", self.degrees_across(), other.degrees_across()),
@@ -112,30 +111,30 @@ impl Pinhole {
         .into_iter()
         .find(|(_, ours, theirs)| (theirs / ours - 1.0).abs() > OTHER_VIEW)
         .map(|(side, ours, theirs)| {
-            format!("sees {theirs:.1} degrees {side}, and the one that mapped the room {ours:.1}")
+            format!("sees {theirs:.1} degrees {side}, but the camera of the room {ours:.1}")
         })
     }
 
-    /// How far it sees from left to right, degrees.
+    /// Horizontal field of view, degrees.
     pub fn degrees_across(&self) -> f64 {
         self.degrees(self.centre.x, 1.0)
     }
 
-    /// How far it sees from top to bottom, degrees.
+    /// Vertical field of view, degrees.
     pub fn degrees_down(&self) -> f64 {
         self.degrees(self.centre.y, self.height)
     }
 
-    /// The angle between the two edges of an image whose length is given, with the principal point
-    /// somewhere between them.
+    /// Angle between the two edges of an image along one axis; `centre` is the principal point on
+    /// it.
     fn degrees(&self, centre: f64, length: f64) -> f64 {
         let to_one = (centre / self.focal).atan();
         let to_other = ((length - centre) / self.focal).atan();
         (to_one + to_other).to_degrees()
     }
 
-    /// Where a point of the image, image widths from its top left corner, lies on the plane at
-    /// distance 1 before the camera.
+    /// Projection onto the plane at depth 1 of an image point, given in image widths from the top
+    /// left corner.
     pub fn to_image_plane(&self, point: Vector2<f64>) -> Vector2<f64> {
         (point - self.centre) / self.focal
     }
@@ -152,8 +151,8 @@ mod tests {
         centre: None,
     };
 
-    /// Oracle: by hand. A camera that sees 90° across has a focal length of half a width: the edge
-    /// of its image is 45° from the middle.
+    /// Oracle: by hand. A horizontal field of view of 90° has a focal length of half a width: the
+    /// edge of the image is 45° from the center.
     #[test]
     fn the_edge_of_a_right_angle_is_one_away_on_the_plane() {
         let camera = Pinhole::new(PixelCamera {
@@ -167,8 +166,8 @@ mod tests {
         );
     }
 
-    /// Oracle: by hand. 320 pixels before the middle of 640 are 45° to each side; an edge that lies
-    /// at the principal point itself adds nothing.
+    /// Oracle: by hand. A focal length of 320 pixels at a width of 640 gives 45° to each side; an
+    /// edge at the principal point adds 0°.
     #[test]
     fn the_field_of_view_is_the_angle_between_the_edges() {
         let half = PixelCamera {
@@ -189,8 +188,8 @@ mod tests {
         assert!((camera.degrees_across() - 45.0).abs() < 1e-12);
     }
 
-    /// Oracle: a focal length in image widths, none, or a principal point of other images is a
-    /// mistake of the caller.
+    /// Oracle: the definition. A focal length in image widths, a missing one, or a principal point
+    /// for another image size is invalid.
     #[test]
     fn what_no_camera_has_is_refused() {
         for focal in [0.9, 0.0, -585.0, f64::NAN, f64::INFINITY] {

@@ -1,18 +1,18 @@
-//! How far one pose is from another, as a distance and an angle.
+//! Pose errors: distance and angle between two poses.
 
 use super::Pose;
 
-/// The error of a found pose against the true one, from E = found⁻¹ · true.
+/// Error of an estimated pose against the true one, from E = found⁻¹ · true.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseError {
-    /// Distance between the camera centres, metres.
+    /// Distance between the camera centers, meters.
     pub translation_m: f64,
-    /// Angle of the rotation between them, radians, in \[0, π\].
+    /// Rotation angle between them, radians, in \[0, π\].
     pub rotation_rad: f64,
 }
 
 impl PoseError {
-    /// The error of `world_from_found` where `world_from_true` was wanted.
+    /// Error of the estimate `world_from_found` against `world_from_true`.
     pub fn between(world_from_found: &Pose, world_from_true: &Pose) -> Self {
         let found_from_true = world_from_found.inv_mul(world_from_true);
 

@@ -1,19 +1,18 @@
-//! The rotation nearest to a matrix that measurement or rounding has moved off SO(3).
+//! Projection of a matrix onto SO(3).
 
 use nalgebra::{Matrix3, Rotation3};
 
-/// What [`nearest_rotation`] found.
+/// Result of [`nearest_rotation`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct NearestRotation {
     /// The nearest rotation in the Frobenius norm.
     pub rotation: Rotation3<f64>,
-    /// How far the matrix R was from SO(3): the largest absolute entry of RRᵀ − I.
+    /// Deviation of the matrix R from SO(3): the largest absolute entry of RRᵀ − I.
     pub deviation: f64,
 }
 
 /// The rotation nearest to `matrix` in the Frobenius norm: the orthogonal factor of its polar
-/// decomposition. `None` when the matrix is not finite, is singular or contains a reflection; then
-/// it is not a rotation with a small error.
+/// decomposition. `None` when the matrix is not finite, is singular or contains a reflection.
 pub fn nearest_rotation(matrix: &Matrix3<f64>) -> Option<NearestRotation> {
     if !matrix.iter().all(|x| x.is_finite()) || matrix.determinant() <= 1e-9 {
         return None;

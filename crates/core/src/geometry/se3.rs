@@ -1,20 +1,20 @@
 //! The exponential, the logarithm and the adjoint of SE(3).
 //!
-//! This is the one file that knows the order of the six numbers of a twist: (v, ω).
+//! The order of the six numbers of a twist, (v, ω), is defined only in this file.
 
 use nalgebra::{Isometry3, Matrix3, Matrix6, Translation3, UnitQuaternion, Vector3, Vector6};
 
 use super::{PI_MARGIN_RAD, Pose};
 
-/// Below this angle, radians, coefficients with a removable singularity are evaluated by their
-/// Taylor series.
+/// Angle, radians, below which coefficients with a removable singularity are evaluated by Taylor
+/// series.
 const SERIES_ANGLE_RAD: f64 = 0.2;
 
 /// An element of se(3): a camera motion, in the body frame of the camera it starts from.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Twist {
-    /// v, metres.
+    /// v, meters.
     pub linear: Vector3<f64>,
     /// ω, rotation axis times angle, radians.
     pub angular: Vector3<f64>,
@@ -28,7 +28,7 @@ impl Twist {
         Vector6::new(v.x, v.y, v.z, w.x, w.y, w.z)
     }
 
-    /// The twist of six numbers ordered (v, ω).
+    /// The twist from six numbers, ordered (v, ω).
     pub fn from_vector(xi: &Vector6<f64>) -> Self {
         Self {
             linear: xi.fixed_rows::<3>(0).into(),
@@ -36,7 +36,7 @@ impl Twist {
         }
     }
 
-    /// ‖(v, ω)‖₂, metres and radians mixed as in the paper's Hit@ε.
+    /// ‖(v, ω)‖₂, meters and radians mixed as in the paper's Hit@ε.
     pub fn norm(self) -> f64 {
         self.to_vector().norm()
     }
@@ -49,7 +49,7 @@ impl Twist {
         }
     }
 
-    /// This motion cut into `parts` equal ones: exp(ξ/n)ⁿ = exp(ξ).
+    /// One of `parts` equal parts of this motion: exp(ξ/n)ⁿ = exp(ξ).
     pub fn divided(self, parts: u32) -> Self {
         let share = f64::from(parts).recip();
         Self {
@@ -58,7 +58,7 @@ impl Twist {
         }
     }
 
-    /// A share of this motion: exp(sξ).
+    /// A fraction of this motion: exp(sξ).
     pub fn scaled(self, share: f64) -> Self {
         Self {
             linear: self.linear * share,
@@ -66,7 +66,7 @@ impl Twist {
         }
     }
 
-    /// The motion back: exp(−ξ) = exp(ξ)⁻¹.
+    /// The inverse motion: exp(−ξ) = exp(ξ)⁻¹.
     pub fn reversed(self) -> Self {
         Self {
             linear: -self.linear,
@@ -79,21 +79,21 @@ impl Twist {
         self.to_vector().iter().all(|x| x.is_finite())
     }
 
-    /// Whether this twist is the only logarithm of its motion: |ω| < π, with the margin of A-3.
+    /// Whether this twist is the unique logarithm of its motion: |ω| < π, with the margin
+    /// [`PI_MARGIN_RAD`].
     pub fn is_unique_logarithm(self) -> bool {
         self.angular.norm() < std::f64::consts::PI - PI_MARGIN_RAD
     }
 }
 
-/// The motion that a twist generates in unit time, exp: se(3) → SE(3). Any length of twist is
-/// allowed.
+/// The exponential map exp: se(3) → SE(3). The twist may have any length.
 ///
-/// Source: SeeSE3, Eq. 1 read backwards; t = V(ω) v with V = I + b ω̂ + c ω̂².
+/// Source: SeeSE3, Eq. 1, inverted; t = V(ω) v with V = I + b ω̂ + c ω̂².
 pub fn exp(twist: &Twist) -> Pose {
     let angle = twist.angular.norm();
 
-    // b = (1 − cos θ)/θ² and c = (θ − sin θ)/θ³ of V. Both numerators cancel near θ = 0, where the
-    // series are used instead.
+    // b = (1 − cos θ)/θ² and c = (θ − sin θ)/θ³ of V. Both suffer cancellation near θ = 0, where
+    // the series are used.
     let (b, c) = if angle < SERIES_ANGLE_RAD {
         let x = angle * angle;
         (
@@ -134,9 +134,9 @@ pub fn exp(twist: &Twist) -> Pose {
     )
 }
 
-/// The shortest twist that generates a motion, log: SE(3) → se(3), |ω| ≤ π.
+/// The logarithm log: SE(3) → se(3), with |ω| ≤ π.
 ///
-/// At exactly π the sign of ω is free; see [`Twist::is_unique_logarithm`].
+/// At |ω| = π the sign of ω is arbitrary; see [`Twist::is_unique_logarithm`].
 ///
 /// Source: SeeSE3, Eq. 1; v = V(ω)⁻¹ t with V⁻¹ = I − ω̂/2 + c ω̂².
 pub fn log(motion: &Pose) -> Twist {
@@ -169,7 +169,7 @@ pub fn log(motion: &Pose) -> Twist {
     }
 }
 
-/// The motion from the first camera to the second in the first one's body frame, log(P₁⁻¹ P₂).
+/// Motion from the first camera to the second, in the body frame of the first, log(P₁⁻¹ P₂).
 ///
 /// Source: SeeSE3, Eq. 1.
 pub fn body_twist(world_from_first: &Pose, world_from_second: &Pose) -> Twist {
@@ -203,7 +203,7 @@ pub fn left_jacobian_inverse(twist: &Twist) -> Matrix6<f64> {
     let x = angle * angle;
 
     // The three coefficients of Barfoot's Q and the φ̂² coefficient of J⁻¹, the inverse left
-    // Jacobian of SO(3). Near θ = 0 all four are taken from their series.
+    // Jacobian of SO(3). Near θ = 0 all four are evaluated by series.
     let (first, second, third, inverse) = if angle < SERIES_ANGLE_RAD {
         (
             series(
@@ -268,7 +268,7 @@ pub fn left_jacobian_inverse(twist: &Twist) -> Matrix6<f64> {
     jacobian
 }
 
-/// Axis times angle, radians, |ω| ≤ π. Accurate at every angle because atan2 never cancels.
+/// Axis times angle, radians, |ω| ≤ π. Accurate at every angle: atan2 has no cancellation.
 fn rotation_vector(rotation: &UnitQuaternion<f64>) -> Vector3<f64> {
     let w = rotation.w;
     let v = rotation.imag();
@@ -325,7 +325,7 @@ mod tests {
     }
 
     proptest! {
-        /// Oracle: the general matrix exponential, which knows nothing of rotations.
+        /// Oracle: the general matrix exponential.
         #[test]
         fn exp_is_the_matrix_exponential(xi in twists(6.0)) {
             prop_assert!((exp(&xi).to_homogeneous() - hat(&xi).exp()).norm() < 1e-9);
@@ -355,8 +355,8 @@ mod tests {
         }
     }
 
-    /// Oracle: a half turn about z that ends two metres up y comes from v = V⁻¹t = (π/2)·(2, 0, 0)
-    /// by hand: the camera runs along a half circle of radius 1, whose length is π.
+    /// Oracle: by hand. A half turn about z with t = (0, 2, 0) has v = V⁻¹t = (π, 0, 0): the camera
+    /// moves along a half circle of radius 1 and length π.
     #[test]
     fn a_half_turn_has_the_half_circle_as_its_logarithm() {
         let motion = Isometry3::from_parts(

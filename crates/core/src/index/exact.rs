@@ -1,4 +1,4 @@
-//! The exact scan of all frames: the reference for any other index, and the fastest up to some
+//! Exact scan of all frames: the reference for other indexes, and the fastest index up to about
 //! 10,000 frames.
 
 use ndarray::ArrayView2;
@@ -6,7 +6,7 @@ use ndarray::ArrayView2;
 use super::{Exclusion, Index, Nearest, Neighbour, distance};
 use crate::room::FrameId;
 
-/// Latents, row by row, with the frame that each belongs to.
+/// Latents by row, and the frame of each row.
 #[derive(Debug, Clone)]
 pub struct ExactIndex {
     width: usize,
@@ -15,7 +15,7 @@ pub struct ExactIndex {
 }
 
 impl ExactIndex {
-    /// Indexes the rows of `latents` (n, k) that belong to `frames`; no other row can be found.
+    /// Indexes the rows of `latents` (n, k) that belong to `frames`.
     pub fn new(latents: ArrayView2<'_, f64>, frames: &[FrameId]) -> Self {
         let values = frames
             .iter()

@@ -1,10 +1,9 @@
-//! The approximate index of the crate `hnsw_rs`, under the same contract as the exact index.
+//! Approximate index based on the crate `hnsw_rs`, with the contract of the exact index.
 //!
-//! - Built serially: a parallel build differs from run to run and loses points.
-//! - Even a serial build leaves some points that no search reaches. They are identified when the
-//!   index is built and scanned exactly in every query.
-//! - Distances are computed again in f64 from the latents, so an answer's numbers do not depend on
-//!   the index.
+//! - The build is serial: a parallel build is not deterministic and loses points.
+//! - Even a serial build leaves some points unreachable. They are detected after the build and
+//!   scanned in every query.
+//! - Distances are recomputed in f64 from the latents, so they do not depend on the kind of index.
 
 use std::collections::BTreeSet;
 
@@ -15,19 +14,19 @@ use super::{Audit, ExactIndex, Exclusion, Index, Neighbour, by_distance_then_fra
 use crate::room::FrameId;
 
 const MOST_LAYERS: usize = 16;
-/// About what one link of a point takes in the graph, bytes.
+/// Approximate memory of one link in the graph, bytes.
 const LINK_BYTES: usize = 48;
 
-/// How an [`HnswIndex`] is built and searched.
+/// Build and search parameters of an [`HnswIndex`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct HnswParameters {
-    /// Links of a point in a layer, M, 2 to 255.
+    /// M, links per point and layer, 2 to 255.
     pub links: u8,
-    /// Candidates kept while building.
+    /// ef_construction, candidates kept during the build.
     pub build_effort: usize,
-    /// Candidates kept while searching. A wanted latent lies off the path of the frames' latents;
-    /// there, 64 candidates missed one nearest frame in ten that 256 found (on the 900 synthetic
-    /// latents of `tests/index_contract.rs`).
+    /// ef_search, candidates kept during a search. Predicted latents lie off the path of the stored
+    /// ones: with 64 candidates, 1 in 10 of the nearest frames found with 256 is missed (900
+    /// synthetic latents, `tests/index_contract.rs`).
     pub search_effort: usize,
 }
 
@@ -41,7 +40,7 @@ impl Default for HnswParameters {
     }
 }
 
-/// Latents in a navigable small-world graph. Building and searching are deterministic.
+/// Latents in a hierarchical navigable small-world graph. Build and search are deterministic.
 pub struct HnswIndex {
     graph: Hnsw<'static, f32, DistL2>,
     exact: ExactIndex,
@@ -52,7 +51,7 @@ pub struct HnswIndex {
 }
 
 impl HnswIndex {
-    /// Indexes the rows of `latents` (n, k) that `frames` names.
+    /// Indexes the rows of `latents` (n, k) that belong to `frames`.
     pub fn new(
         latents: ArrayView2<'_, f64>,
         frames: &[FrameId],
@@ -71,7 +70,7 @@ impl HnswIndex {
             .map(|frame| latents.row(frame.row()).to_vec())
             .collect();
 
-        // Inserted one after another, so that the same rows always give the same graph.
+        // Serial insertion, so that the same rows always give the same graph.
         for (position, row) in rows.iter().enumerate() {
             graph.insert((&single(row), position));
         }
@@ -85,8 +84,7 @@ impl HnswIndex {
             parameters,
         };
 
-        // A search for a point's own latent must find the point. Those that it misses are scanned
-        // in every query.
+        // A point is reachable if a search for its latent finds it.
         index.unreachable = (0..index.latents.len())
             .filter(|&position| !index.reaches(position))
             .collect();
@@ -94,13 +92,12 @@ impl HnswIndex {
         index
     }
 
-    /// Measures the recall of the `k` nearest frames against the exact scan. Every `stride`-th
-    /// latent of the index gives one query, see [`Audit::queries`].
+    /// Measures the recall of the `k` nearest frames against the exact scan, with one query per
+    /// `stride` latents; see [`Audit::queries`].
     pub fn audit(&self, k: usize, stride: usize) -> Audit {
         let count = self.latents.len();
 
-        // Queries at the index's own latents would be too easy: a wanted latent lies off the
-        // frames' path.
+        // Queries at stored latents would be too easy: predicted latents lie off the frames' path.
         let halfway = |position: usize| -> Vec<f64> {
             let far = &self.latents[(position + count / 2) % count];
             self.latents[position]
@@ -115,7 +112,7 @@ impl HnswIndex {
         let share = |query: &Vec<f64>| {
             let truth = self.exact.nearest(query, k, None);
 
-            // Ties count as found: any frame as near as the k-th nearest is a right answer.
+            // Ties count as found: any frame at most as far as the k-th nearest is correct.
             let limit = truth.last().map_or(0.0, |last| last.distance);
             let found = self
                 .nearest(query, k, None)
@@ -147,8 +144,7 @@ impl HnswIndex {
 
 impl Index for HnswIndex {
     fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbour> {
-        // The graph knows no exclusion, so the search asks for as many more frames as may be
-        // excluded.
+        // The graph does not support exclusions: search for as many more frames as can be excluded.
         let wanted = k
             .saturating_add(exclusion.map_or(0, |exclusion| exclusion.most()))
             .min(self.frames.len());
@@ -164,7 +160,7 @@ impl Index for HnswIndex {
             .chain(self.unreachable.iter().copied())
             .collect();
 
-        // The graph's distances are f32; the answer's are computed again in f64 from the latents.
+        // Replace the graph's f32 distances by f64 distances from the latents.
         let mut neighbours: Vec<Neighbour> = positions
             .into_iter()
             .filter(|&position| {
@@ -180,9 +176,8 @@ impl Index for HnswIndex {
         neighbours.truncate(k);
 
         if neighbours.len() < k.min(self.frames.len()) {
-            // Too few are left, as when the search ended in a part of the graph that is cut off
-            // from the rest. The contract promises every remaining frame up to k, so all are
-            // scanned.
+            // Too few frames, for instance from a disconnected part of the graph. The contract
+            // requires all remaining frames up to k: fall back to the exact scan.
             return self.exact.nearest(query, k, exclusion);
         }
 
@@ -190,8 +185,8 @@ impl Index for HnswIndex {
     }
 
     fn memory_bytes(&self) -> usize {
-        // The graph keeps each row once more, in single precision, and up to twice `links` neighbours
-        // of each point in the lowest layer, every one with its distance behind a counted pointer.
+        // The graph holds a copy of each row in f32, and in the lowest layer up to 2 · `links`
+        // neighbors per point, each with its distance in an `Arc`.
         let links = 2 * usize::from(self.parameters.links) * LINK_BYTES;
         let row = self.latents.first().map_or(0, Vec::len) * (size_of::<f64>() + size_of::<f32>());
 

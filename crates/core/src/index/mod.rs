@@ -1,8 +1,8 @@
-//! Nearest neighbours of a latent among a room's frames: exact by default, HNSW as an option.
+//! Nearest-neighbor search among the latents of a room's frames: exact by default, HNSW as an
+//! option.
 //!
-//! Every index keeps one contract (`tests/index_contract.rs`): answers are ordered by L2 distance,
-//! then by frame; an excluded frame is never returned; fewer than `k` are returned only when fewer
-//! are left.
+//! Contract of every index (`tests/index_contract.rs`): results are ordered by L2 distance, then by
+//! frame; excluded frames are never returned; fewer than `k` are returned only when fewer remain.
 
 mod exact;
 #[cfg(feature = "hnsw")]
@@ -14,7 +14,7 @@ pub use hnsw::{HnswIndex, HnswParameters};
 
 use crate::room::FrameId;
 
-/// One frame and how far its latent is from the query.
+/// A frame and the distance of its latent from the query.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Neighbour {
     /// The frame.
@@ -23,71 +23,70 @@ pub struct Neighbour {
     pub distance: f64,
 }
 
-/// How an approximate index compares with the exact scan.
+/// Recall of an approximate index against the exact scan.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Audit {
-    /// Points that no search of the graph reaches; they are scanned instead.
+    /// Points that are unreachable in the graph; they are scanned in every query.
     pub unreachable: usize,
-    /// Points in the index.
+    /// Number of points in the index.
     pub frame_count: usize,
-    /// Share of the exact `k` nearest frames that the index also returns, averaged over the
-    /// queries.
+    /// Fraction of the exact `k` nearest frames that the index returns, averaged over the queries.
     pub recall: f64,
-    /// How many neighbours were asked for.
+    /// Number of neighbors per query.
     pub k: usize,
-    /// How many queries were asked. Each is the midpoint of two latents half the room apart, off
-    /// the frames' path as wanted latents are.
+    /// Number of queries. Each is the midpoint of two latents half the room apart: off the frames'
+    /// path, like predicted latents.
     pub queries: usize,
 }
 
-/// Frames that must not be returned: all within `radius` rows of `centre`.
+/// Frames that are excluded from retrieval: all within `radius` rows of `centre`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Exclusion {
-    /// The frame in the middle.
+    /// The center frame.
     pub centre: FrameId,
-    /// How many rows to each side are left out with it; 0 leaves out the centre alone.
+    /// Number of rows excluded to each side; 0 excludes the center only.
     pub radius: u32,
 }
 
 impl Exclusion {
-    /// Whether a frame is left out.
+    /// Whether a frame is excluded.
     pub fn covers(&self, frame: FrameId) -> bool {
         frame.0.abs_diff(self.centre.0) <= self.radius
     }
 
-    /// The most frames that are left out.
+    /// Maximum number of excluded frames.
     #[cfg(feature = "hnsw")]
     fn most(&self) -> usize {
         (self.radius as usize).saturating_mul(2).saturating_add(1)
     }
 }
 
-/// Finds the frames whose latents are nearest to a query.
+/// Nearest-neighbor search among the latents of frames.
 pub trait Index: Send + Sync {
-    /// The `k` nearest frames to `query`, by distance and then by frame.
+    /// The `k` nearest frames to `query`, ordered by distance, then by frame.
     fn nearest(&self, query: &[f64], k: usize, exclusion: Option<Exclusion>) -> Vec<Neighbour>;
 
-    /// How many frames can be found.
+    /// Number of indexed frames.
     fn len(&self) -> usize;
 
-    /// About how much memory it holds, bytes: what grows with the number of frames.
+    /// Approximate memory use, bytes; only the part that grows with the number of frames.
     fn memory_bytes(&self) -> usize;
 
-    /// Whether no frame can be found.
+    /// Whether there are no indexed frames.
     fn is_empty(&self) -> bool {
         self.len() == 0
     }
 }
 
-/// Orders neighbours as every answer is ordered.
+/// The order of results: by distance, then by frame.
 fn by_distance_then_frame(a: &Neighbour, b: &Neighbour) -> std::cmp::Ordering {
     a.distance
         .total_cmp(&b.distance)
         .then(a.frame.cmp(&b.frame))
 }
 
-/// L2 distance. Columns are summed in four lanes, which a processor adds at the same time; the
-/// order is always the same, so that equal rows have equal distances.
+/// L2 distance. Columns are summed in four SIMD lanes in a fixed order, so that equal rows have
+/// equal distances.
 pub fn distance(a: &[f64], b: &[f64]) -> f64 {
     let ((a_lanes, a_rest), (b_lanes, b_rest)) = (a.as_chunks::<4>(), b.as_chunks::<4>());
 
@@ -103,16 +102,16 @@ pub fn distance(a: &[f64], b: &[f64]) -> f64 {
     sum.sqrt()
 }
 
-/// The nearest of all neighbours that are offered, by distance and then by frame.
+/// Collects the `count` nearest neighbors, ordered by distance, then by frame.
 #[derive(Debug)]
 pub struct Nearest {
     count: usize,
-    /// Always sorted and never longer than `count`, so that nothing has to be sorted at the end.
+    /// Always sorted, with at most `count` entries.
     best: Vec<Neighbour>,
 }
 
 impl Nearest {
-    /// None yet, and never more than `count`.
+    /// An empty collection of at most `count` neighbors.
     pub fn new(count: usize) -> Self {
         Self {
             count,
@@ -120,10 +119,10 @@ impl Nearest {
         }
     }
 
-    /// Takes a neighbor if it is among the nearest so far.
+    /// Adds a neighbor if it is among the nearest so far.
     #[inline]
     pub fn offer(&mut self, found: Neighbour) {
-        // Most are no better than the worst so far and are dropped here.
+        // Fast path: most neighbors are farther than the worst so far.
         let is_full = self.best.len() == self.count;
         let worst = self.best.last();
         if is_full && worst.is_none_or(|worst| found.distance > worst.distance) {
@@ -139,7 +138,7 @@ impl Nearest {
         self.best.truncate(self.count);
     }
 
-    /// The nearest that were offered, sorted.
+    /// The collected neighbors, sorted.
     pub fn found(self) -> Vec<Neighbour> {
         self.best
     }

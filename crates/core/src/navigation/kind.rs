@@ -1,32 +1,31 @@
-//! The name of a navigator: the one place that writes and reads it. Tables, JSON, the command line
-//! and the wire all use it.
+//! Names of navigators, as used in tables, JSON, the command line and the wire.
 
 use super::{Refit, RetrievalMetric, StepKind};
 use crate::adapter::{Adapter, CorrectorKind, Reading};
 
-/// One way to choose the next frame.
+/// A navigator: a method to choose the next frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NavigatorKind {
-    /// ĝ = g: the camera stays. It retrieves the source frame itself, even if another frame has the
-    /// same latent, so that its Hit@ε is P(‖ΔP‖ < ε) whatever the encoder. With the source
-    /// excluded, it retrieves the frame whose latent is nearest to the source's.
+    /// Baseline ĝ = g: the camera does not move. Retrieves the source frame, even if another frame
+    /// has the same latent, so that Hit@ε is P(‖ΔP‖ < ε) for every encoder. With the source
+    /// excluded, retrieves the frame with the nearest latent.
     Identity,
-    /// A candidate drawn at random.
+    /// Baseline: a random candidate.
     Random,
-    /// The candidate whose pose is nearest to the target's: the best that retrieval can reach.
+    /// Upper bound of retrieval: the candidate with the pose nearest to the target's.
     Oracle,
-    /// Predicts the latent that a motion leads to, and retrieves the nearest frame under a metric.
+    /// Predicts the latent after a motion and retrieves the nearest frame under a metric.
     Step(StepKind, RetrievalMetric),
 }
 
-/// Stands between the step and the metric in a navigator's name, unless the metric is the paper's.
+/// Separator between step and metric in a navigator's name.
 const UNDER: char = '+';
 
 impl NavigatorKind {
-    /// Every navigator.
+    /// All navigators.
     pub fn all() -> Vec<Self> {
-        // The calibrated metric belongs to the homogeneous reading: only there is the predicted
-        // latent ΔP away from the source under W.
+        // The calibrated metric applies only to the homogeneous reading, where W maps the predicted
+        // latent step exactly to ΔP.
         let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
         let steps = StepKind::all().into_iter();
         let steps = steps.flat_map(|step| RetrievalMetric::ALL.map(|metric| (step, metric)));
@@ -40,9 +39,9 @@ impl NavigatorKind {
             .collect()
     }
 
-    /// The default rows of the table for an adapter: the baselines, the three readings of inverse
-    /// Poincaré, the adapter's correctors, the refits on z-scored and on unscaled motions, and inverse Poincaré
-    /// under the other metrics that the adapter supports.
+    /// Default rows of the table for an adapter: baselines, the three readings of inverse Poincaré,
+    /// the adapter's correctors, refits on z-scored and on unscaled motions, and inverse Poincaré
+    /// under the other supported metrics.
     pub fn table(adapter: &Adapter) -> Vec<Self> {
         let full = |step: StepKind| Self::Step(step, RetrievalMetric::Full);
         let corrector = |kind: CorrectorKind| full(StepKind::Corrector(kind));
@@ -57,8 +56,8 @@ impl NavigatorKind {
 
         let affine = StepKind::InversePoincare(Reading::Affine);
 
-        // The metrics motion and calibrated measure σ ⊙ W g. Under a gate, W changes with the
-        // source and these metrics do not exist.
+        // The metrics `motion` and `calibrated` measure σ ⊙ W g. With a gate, W depends on the
+        // source, so they are not available.
         let gated = adapter.motion_of_coordinates().is_err();
         let others = [
             RetrievalMetric::RowSpace,
@@ -81,7 +80,7 @@ impl NavigatorKind {
 
         rows.extend(others.map(|metric| Self::Step(affine, metric)));
 
-        // Only an adapter with calibration rooms knows the covariance of its errors.
+        // Only a calibrated adapter has an error covariance.
         let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
         let calibrated = adapter.error_covariance().filter(|_| !gated);
         rows.extend(calibrated.map(|_| Self::Step(homogeneous, RetrievalMetric::Calibrated)));
@@ -89,8 +88,8 @@ impl NavigatorKind {
         rows
     }
 
-    /// Its name in tables, JSON and on the wire: that of the step, and `+METRIC` unless the metric
-    /// is the paper's.
+    /// Name in tables, JSON and on the wire: the step, and `+METRIC` unless the metric is the
+    /// paper's, `full`.
     pub fn name(self) -> String {
         match self {
             Self::Identity => "identity".to_owned(),
@@ -106,7 +105,7 @@ impl NavigatorKind {
         Self::all().into_iter().find(|kind| kind.name() == name)
     }
 
-    /// All names in one sentence, for the message about an unknown one.
+    /// All names in one sentence, for error messages about an unknown name.
     pub fn known_names() -> String {
         let steps: Vec<&str> = StepKind::all().into_iter().map(StepKind::name).collect();
         format!(

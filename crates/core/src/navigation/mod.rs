@@ -1,12 +1,12 @@
-//! Inverse Poincaré navigation: from a frame and a wanted camera motion to the frames that the
-//! camera would see, in one step or several.
+//! Inverse Poincaré navigation: for a frame and a requested camera motion, retrieve the frames that
+//! the camera would see, in one step or several.
 //!
-//! - One step in latent space is ĝ = g + W⁺ΔP in one of three readings ([`Reading`], A-16), or what
-//!   another [`Stepper`] gives. The stored frames nearest to ĝ under a [`RetrievalMetric`] are
+//! - A step in latent space is ĝ = g + W⁺ΔP in one of three readings ([`Reading`], A-16), or the
+//!   step of another [`Stepper`]. The stored frames nearest to ĝ under a [`RetrievalMetric`] are
 //!   retrieved.
-//! - Steps are chained in one of three ways (A-22): open loop adds all steps up in latent space;
-//!   snap continues from the latent of each retrieved frame; closed loop does so too, and also
-//!   plans the remaining motion anew from that frame's pose.
+//! - Steps are chained in one of three modes (A-22). Open loop adds all steps in latent space. Snap
+//!   continues from the latent of each retrieved frame. Closed loop also recomputes the remaining
+//!   motion from that frame's pose.
 //! - Start reading at [`Navigator::answer`]; [`walk`] is the loop inside it.
 
 mod kind;
@@ -28,11 +28,11 @@ pub use stepper::{Refit, RefitData, StepKind, Stepper};
 
 use crate::{adapter, cancel, features, geometry, ridge, room, splits};
 
-/// Thresholds ε of the paper's Hit@ε, compared with ‖ΔP_target − ΔP_retrieved‖₂, in which metres
-/// and radians are mixed.
+/// Thresholds ε of the paper's Hit@ε, compared with ‖ΔP_target − ΔP_retrieved‖₂, meters and radians
+/// mixed.
 pub const HIT_THRESHOLDS: [f64; 4] = [0.1, 0.2, 0.3, 0.5];
 
-/// The longest translation of one motion, metres.
+/// Maximum translation of one motion, meters.
 pub const MAX_TRANSLATION_M: f64 = 1e6;
 
 /// Why a query cannot be answered.
@@ -75,20 +75,20 @@ pub enum Error {
     TwistNotFinite { position: usize },
     #[error(
         "displacement {position} turns by {angle_rad:.6} rad; a motion must turn by less than π ({:.6}), \
-         or its logarithm is not unique: cut it in parts",
+         or its logarithm is not unique: divide it into parts",
         std::f64::consts::PI
     )]
     TwistBeyondPi { position: usize, angle_rad: f64 },
     #[error(
-        "{what} needs a source whose pose is known: use a frame of the room, or give source_pose"
+        "{what} needs a source with a known pose: use a frame of the room, or give source_pose"
     )]
     PoseNeeded { what: &'static str },
     #[error("no frame is left to retrieve: all {frame_count} frames are excluded")]
     NoCandidates { frame_count: usize },
 }
 
-/// Refuses a motion with a number that is not finite, a translation over [`MAX_TRANSLATION_M`] or a
-/// rotation of π or more.
+/// Checks that a motion is finite, its translation is at most [`MAX_TRANSLATION_M`] and its
+/// rotation is below π.
 fn check_twist(twist: geometry::Twist, position: usize) -> Result<(), Error> {
     if !twist.is_finite() || twist.linear.norm() > MAX_TRANSLATION_M {
         return Err(Error::TwistNotFinite { position });

@@ -1,5 +1,4 @@
-//! The walk itself: one motion is cut into equal parts, which are taken one after another in latent
-//! space.
+//! The walk: one motion, divided into equal steps in latent space.
 
 use ndarray::{Array1, ArrayView2};
 
@@ -13,18 +12,18 @@ use crate::room::FrameId;
 /// How the steps of one motion are chained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mode {
-    /// All steps are added up in latent space; frames are retrieved only to be shown. This is the
-    /// paper's mode.
+    /// All steps are added in latent space; retrieved frames do not affect later steps. The paper's
+    /// mode.
     OpenLoop,
     /// Each step starts from the latent of the frame that the previous step retrieved.
     Snap,
-    /// As [`Mode::Snap`], but the motion that remains to the goal is computed anew from the
-    /// retrieved frame's pose.
+    /// Like [`Mode::Snap`], but the remaining motion to the goal is recomputed from the retrieved
+    /// frame's pose.
     ClosedLoop,
 }
 
 impl Mode {
-    /// Its name on the command line and in reports.
+    /// Name on the command line and in reports.
     pub fn name(self) -> &'static str {
         match self {
             Self::OpenLoop => "open-loop",
@@ -34,7 +33,7 @@ impl Mode {
     }
 }
 
-/// How a motion is cut into steps, and how each step retrieves frames.
+/// Settings of a walk: division into steps and retrieval.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Plan {
     /// How the steps are chained.
@@ -48,8 +47,8 @@ pub struct Plan {
     pub exclude_source: Option<u32>,
 }
 
-/// What a walk takes place in: the latents (n, k) and the poses of a room's frames, and the search
-/// over the candidates.
+/// The data of a walk: latents (n, k) and poses of a room's frames, and the search over the
+/// candidates.
 #[derive(Clone, Copy)]
 pub struct Space<'a> {
     /// The adapter that the latents belong to.
@@ -60,16 +59,16 @@ pub struct Space<'a> {
     pub latents: ArrayView2<'a, f64>,
     /// `world_from_camera`, one per frame.
     pub poses: &'a [Pose],
-    /// Nearest-neighbour search over the candidate frames.
+    /// Nearest-neighbor search over the candidate frames.
     pub search: &'a Search,
 }
 
-/// Where a walk begins.
+/// Start of a walk.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Start {
-    /// The latent there.
+    /// The latent.
     pub latent: Array1<f64>,
-    /// The frame, if the walk starts at a frame of the room.
+    /// The frame, if the start is a frame of the room.
     pub frame: Option<FrameId>,
     /// `world_from_camera`, if known.
     pub pose: Option<Pose>,
@@ -78,27 +77,26 @@ pub struct Start {
 /// One step of a walk.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Step {
-    /// ĝ, the latent that the step aims at.
+    /// ĝ, the predicted latent.
     pub latent: Array1<f64>,
-    /// The frames nearest to it; at least one.
+    /// The frames nearest to ĝ; at least one.
     pub neighbours: Vec<Neighbour>,
 }
 
-/// A motion to walk.
+/// One motion of a query.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Leg {
     /// The whole motion, in the body frame of the start.
     pub motion: Twist,
-    /// The pose where the motion should end, `world_from_camera`, if known; a closed loop steers to
-    /// it.
+    /// The goal pose, `world_from_camera`, if known. Only a closed loop uses it.
     pub goal: Option<Pose>,
 }
 
 impl Mode {
-    /// Where the step after one that aimed at `latent` and retrieved `frame` begins.
+    /// Start of the next step, after a step that predicted `latent` and retrieved `frame`.
     ///
-    /// An open loop never re-anchors: frame and pose stay those of the start, so that the excluded
-    /// frame stays the source too. The other modes continue from the nearest retrieved frame.
+    /// An open loop keeps the frame and the pose of the start, so the excluded frame stays the
+    /// source. The other modes continue from the nearest retrieved frame.
     pub fn next_start(
         self,
         from: &Start,
@@ -120,13 +118,13 @@ impl Mode {
     }
 }
 
-/// Walks a leg in `plan.steps` steps and returns what each step aimed at and retrieved.
+/// Walks a leg in `plan.steps` steps. Returns the predicted latent and the retrieved frames of each
+/// step.
 ///
 /// # Errors
-/// [`Error::PoseNeeded`] for a closed loop whose goal is not known, as when the start has no pose;
-/// [`Error::NoCandidates`] when the exclusion leaves no frame to retrieve; [`Error::Adapter`] when
-/// the adapter lacks what the stepper needs; [`Error::Cancelled`] when nobody waits for the answer
-/// any more.
+/// [`Error::PoseNeeded`] for a closed loop without a goal, as when the start has no pose;
+/// [`Error::NoCandidates`] when all frames are excluded; [`Error::Adapter`] when the adapter does
+/// not support the stepper; [`Error::Cancelled`] when the request was cancelled.
 ///
 /// Source: SeeSE3, Sec. A.12, multi-step navigation.
 pub fn walk(
@@ -136,8 +134,8 @@ pub fn walk(
     plan: Plan,
     cancel: &Cancellation,
 ) -> Result<Vec<Step>, Error> {
-    // Only a closed loop steers by poses. The other modes ignore the goal and take equal parts of
-    // the leg's motion.
+    // Only a closed loop uses poses. The other modes ignore the goal and take equal parts of the
+    // motion.
     let goal = match (plan.mode, leg.goal) {
         (Mode::ClosedLoop, None) => {
             return Err(Error::PoseNeeded {
@@ -153,15 +151,15 @@ pub fn walk(
     for done in 0..plan.steps {
         cancel.check()?;
 
-        // A closed loop divides the motion that remains among the steps that remain; the other
-        // modes always take the same share of the whole motion.
+        // A closed loop divides the remaining motion by the remaining steps; the other modes always
+        // take the same part of the whole motion.
         let (remaining, steps_left) = match (goal, at.pose) {
             (Some(goal), Some(pose)) => (body_twist(&pose, &goal), plan.steps - done),
             _ => (leg.motion, plan.steps),
         };
 
-        // The share of μ, or of a refit's intercept, that this step takes: the shares of all steps
-        // add up to one.
+        // The fraction of μ, or of a refit's intercept, in this step; the fractions of all steps
+        // add up to 1.
         let mean_share = f64::from(plan.steps).recip();
         let step = space.stepper.step(
             space.adapter,

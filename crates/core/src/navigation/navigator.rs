@@ -1,4 +1,4 @@
-//! A [`Navigator`]: one room, embedded by one adapter and indexed, ready to answer queries.
+//! A [`Navigator`]: one room, embedded by one adapter and indexed for queries.
 
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
@@ -16,13 +16,13 @@ use crate::index::{Audit, Neighbour};
 use crate::room::Room;
 use crate::splits::Pair;
 
-/// The most fitted refits that a navigator keeps; the one fitted first is dropped for another.
+/// Maximum number of cached refits; the oldest is dropped first.
 const MOST_REFITS: usize = 32;
 
 /// A retrieved frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RetrievedFrame {
-    /// The frame and its distance to the latent that was searched for.
+    /// The frame and its distance to the query latent.
     pub neighbour: Neighbour,
     /// Its pose, `world_from_camera`.
     pub pose: Pose,
@@ -31,28 +31,28 @@ pub struct RetrievedFrame {
 /// One step of an answer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AnswerStep {
-    /// ĝ, the latent that the step aimed at.
+    /// ĝ, the predicted latent.
     pub latent: Array1<f64>,
-    /// The frames nearest to it; at least one.
+    /// The frames nearest to ĝ; at least one.
     pub frames: Vec<RetrievedFrame>,
-    /// Where the step should have arrived, `world_from_camera`, if the source's pose is known.
+    /// The requested pose after the step, `world_from_camera`, if the source's pose is known.
     pub requested_pose: Option<Pose>,
-    /// The error of the nearest frame against `requested_pose`, if that is known.
+    /// Error of the nearest frame against `requested_pose`, if known.
     pub error: Option<StepError>,
 }
 
-/// How far a step's nearest frame is from where it should have arrived.
+/// Error of a step's nearest frame against the requested pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepError {
-    /// As distance and angle.
+    /// Distance and angle.
     pub pose: PoseError,
-    /// ‖ΔP_requested − ΔP_retrieved‖₂, both from the source: what Hit@ε compares with ε.
+    /// ‖ΔP_requested − ΔP_retrieved‖₂, both from the source, as compared with ε in Hit@ε.
     pub twist: f64,
 }
 
 impl StepError {
-    /// The error of a found pose against the wanted one, for a camera that started at `source`; all
-    /// three are `world_from_camera`.
+    /// Error of the pose `found` against `wanted`, with the twists from `source`. All three are
+    /// `world_from_camera`.
     pub fn of(source: &Pose, found: &Pose, wanted: &Pose) -> Self {
         let difference =
             body_twist(source, wanted).to_vector() - body_twist(source, found).to_vector();
@@ -68,11 +68,13 @@ impl StepError {
 pub struct Answer {
     /// All steps in order.
     pub steps: Vec<AnswerStep>,
-    /// The whole motion that was asked for, in the source's body frame, if its logarithm is unique.
+    /// The whole requested motion in the source's body frame, if the source's pose is known and the
+    /// logarithm is unique.
     pub displacement: Option<Twist>,
 }
 
-/// One room under one adapter: latents of all frames and an index over them. Immutable.
+/// One room under one adapter: the latents of all frames and an index over them. Immutable, except
+/// for caches.
 pub struct Navigator {
     room: Arc<Room>,
     adapter: Arc<Adapter>,
@@ -80,12 +82,11 @@ pub struct Navigator {
     kind: IndexKind,
     /// The search under [`RetrievalMetric::Full`].
     search: Search,
-    /// The searches under the other metrics, indexed by `metric as usize`, each built when it is
-    /// first asked for.
+    /// Searches under the other metrics, indexed by `metric as usize`, built on first use.
     other_searches: [OnceLock<Search>; RetrievalMetric::ALL.len()],
-    /// Fitted refits by variant and pairs: fitting one takes all pairs of the room.
+    /// Cache of fitted refits, by variant and pairs.
     refits: Mutex<Vec<(Refit, FitOn, Arc<Stepper>)>>,
-    /// Held while a search is built, so that no two threads build the same one.
+    /// Held while a search is built, so that no two threads build the same search.
     building: Mutex<()>,
 }
 
@@ -93,8 +94,8 @@ impl Navigator {
     /// Embeds a room's features and indexes them.
     ///
     /// # Errors
-    /// [`Error::FeatureRows`] when there is not one feature row per frame; [`Error::Adapter`] when
-    /// the features are not from the source that the adapter was trained on.
+    /// [`Error::FeatureRows`] unless there is one feature row per frame; [`Error::Adapter`] when
+    /// the source of the features is not the adapter's.
     pub fn new(
         room: Arc<Room>,
         features: &Features,
@@ -142,18 +143,18 @@ impl Navigator {
         self.latents.view()
     }
 
-    /// About how much memory it holds, bytes, besides the room and the adapter. What is built when it
-    /// is first asked for (searches under other metrics, refits) is not counted.
+    /// Approximate memory use, bytes, without the room, the adapter and the caches (searches under
+    /// other metrics, refits).
     pub fn memory_bytes(&self) -> usize {
         self.latents.len() * size_of::<f64>() + self.search.memory_bytes()
     }
 
-    /// How an approximate index compares with the exact scan; `None` if the index is exact.
+    /// Recall of an approximate index against the exact scan; `None` if the index is exact.
     pub fn audit(&self) -> Option<Audit> {
         self.search.audit()
     }
 
-    /// The `k` frames nearest to a latent, by all its coordinates.
+    /// The `k` frames nearest to a latent under [`RetrievalMetric::Full`].
     pub fn nearest(&self, latent: ArrayView1<'_, f64>, k: usize) -> Vec<RetrievedFrame> {
         self.retrieved(&self.search.nearest(latent, k, None))
     }
@@ -161,7 +162,8 @@ impl Navigator {
     /// The search over all frames under a metric.
     ///
     /// # Errors
-    /// [`Error::Adapter`] when the adapter lacks what the metric needs, such as calibrated errors.
+    /// [`Error::Adapter`] when the adapter does not support the metric, for instance without an
+    /// error covariance.
     pub fn search(&self, metric: RetrievalMetric) -> Result<&Search, Error> {
         if metric == RetrievalMetric::Full {
             return Ok(&self.search);
@@ -172,8 +174,8 @@ impl Navigator {
             return Ok(search);
         }
 
-        // Checked again under the lock, because another thread may have built the search meanwhile.
-        // The lock guards no data, so a poisoned one is safe to take.
+        // Check again under the lock: another thread may have built the search meanwhile. The lock
+        // guards no data, so poisoning is harmless.
         let _building = self.building.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(search) = cell.get() {
             return Ok(search);
@@ -183,7 +185,7 @@ impl Navigator {
         Ok(cell.get_or_init(|| search))
     }
 
-    /// A method of stepping in this room. A refit is fitted to the room when it is first asked for.
+    /// A stepper for this room. A refit is fitted on first use and cached.
     ///
     /// # Errors
     /// As [`Stepper::new`]; [`Error::Pairs`] when the room has no pairs to fit a refit on.
@@ -231,8 +233,8 @@ impl Navigator {
     /// The latent, the frame and the pose of a source.
     ///
     /// # Errors
-    /// [`Error::SourceFrame`] for an unknown frame, [`Error::Adapter`] for a feature or latent that
-    /// does not fit.
+    /// [`Error::SourceFrame`] for an unknown frame, [`Error::Adapter`] for an invalid feature or
+    /// latent.
     pub fn start(&self, source: &Source, pose: Option<Pose>) -> Result<Start, Error> {
         match source {
             Source::Frame(frame) => {
@@ -262,12 +264,10 @@ impl Navigator {
         }
     }
 
-    /// Answers a query: walks its motions one after another and returns the frames retrieved at
-    /// every step.
+    /// Answers a query: walks its motions in order and returns the frames retrieved at every step.
     ///
     /// # Errors
-    /// When the query is over a limit, does not fit the room or the adapter, or is cancelled;
-    /// [`Error`] says what to change.
+    /// [`Error`] when the query is over a limit, invalid for the room or the adapter, or cancelled.
     pub fn answer(
         &self,
         query: &Query,
@@ -295,9 +295,8 @@ impl Navigator {
         let mut from = start.clone();
         let mut wanted = start.pose;
 
-        // Each motion is one leg. A leg starts where the previous one arrived, but its goal
-        // continues from where the previous one should have arrived, so that a closed loop corrects
-        // the error of earlier legs.
+        // Each motion is one leg. A leg starts at the end of the previous one, but its goal is
+        // relative to the previous goal, so that a closed loop corrects the error of earlier legs.
         for twist in twists {
             let begun_at = wanted;
             let leg = Leg {
@@ -307,7 +306,8 @@ impl Navigator {
             let walked = walk(space, &from, leg, plan, cancel)?;
 
             for (done, step) in (1usize..).zip(walked) {
-                // After step n of S the camera should stand at begun_at · exp(n ξ / S), ξ the motion.
+                // The requested pose after step n of S is begun_at · exp(n ξ / S), with ξ the
+                // motion.
                 let walked_so_far = twist.times(done).divided(query.steps);
                 wanted = begun_at.map(|pose| pose * exp(&walked_so_far));
 
@@ -318,7 +318,7 @@ impl Navigator {
             }
         }
 
-        // All motions composed into one twist, from the source to where the last should have ended.
+        // All motions as one twist, from the source to the last requested pose.
         let displacement = start
             .pose
             .zip(wanted)
@@ -330,7 +330,7 @@ impl Navigator {
         })
     }
 
-    /// The space of a walk over all frames of the room, searched under [`RetrievalMetric::Full`].
+    /// The data of a walk over all frames of the room, with search under [`RetrievalMetric::Full`].
     pub fn space<'a>(&'a self, stepper: &'a Stepper) -> Space<'a> {
         Space {
             adapter: &self.adapter,

@@ -1,5 +1,4 @@
-//! Closed-loop navigation to a goal pose, frame by frame, with feedback after each step: what a
-//! robot's planner asks for.
+//! Closed-loop navigation to a goal pose, frame by frame, with feedback after each step.
 
 use std::collections::BTreeSet;
 
@@ -10,41 +9,42 @@ use crate::cancel::Cancellation;
 use crate::geometry::{Pose, PoseError, Twist, body_twist};
 use crate::room::FrameId;
 
-/// Frames retrieved in each step, from which one is chosen.
+/// Number of candidate frames retrieved per step.
 const CHOICE: usize = 16;
 
-/// How many times in a row a motion is halved while no retrieved frame is nearer to the goal.
+/// Maximum number of consecutive halvings of a motion while no retrieved frame is nearer to the
+/// goal.
 const HALVINGS: u32 = 4;
 
-/// How a goal is pursued.
+/// Settings of a pursuit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pursuit {
-    /// The longest motion of one step, ‖(v, ω)‖ with metres and radians mixed; above 0.
+    /// Maximum motion of one step, ‖(v, ω)‖ with meters and radians mixed; above 0.
     pub step: f64,
-    /// Distance from the goal, metres, within which it counts as reached.
+    /// Distance tolerance at the goal, meters.
     pub tolerance_m: f64,
-    /// Angle from the goal, radians, within which it counts as reached.
+    /// Angle tolerance at the goal, radians.
     pub tolerance_rad: f64,
-    /// The most steps, recoveries included.
+    /// Maximum number of steps, including recoveries.
     pub steps: u32,
-    /// The most recoveries.
+    /// Maximum number of recoveries.
     pub recoveries: u32,
 }
 
-/// What is reported before the first step and after each one.
+/// Feedback before the first step and after each step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Feedback {
     /// Number of the step, counted from 1; 0 before the first.
     pub step: u32,
-    /// The frame chosen last, which is what the camera would see; `None` until a step has chosen
-    /// one.
+    /// The last chosen frame, the one that the camera would see; `None` before the first.
     pub frame: Option<RetrievedFrame>,
-    /// The motion of the step, in the body frame of the camera before it; zero if it found no frame.
+    /// The motion of the step, in the body frame of the camera before it; zero if no frame was
+    /// chosen.
     pub motion: Twist,
-    /// The error that remains between the camera's pose and the goal.
+    /// Remaining error between the camera's pose and the goal.
     pub remaining: PoseError,
-    /// Steps so far whose nearest frame was no progress, so that another frame or a shorter motion
-    /// was tried.
+    /// Number of recoveries so far: steps in which the nearest frame was no progress, so that
+    /// another frame or a shorter motion was tried.
     pub recoveries: u32,
 }
 
@@ -53,22 +53,22 @@ pub struct Feedback {
 pub enum Outcome {
     /// The pose is within the tolerance of the goal.
     Reached,
-    /// No retrieved frame is nearer to the goal even for the shortest motion, too many steps had to
-    /// recover, or the steps ran out while a motion was being halved.
+    /// No retrieved frame is nearer to the goal even for the shortest motion, the recoveries are
+    /// over the limit, or the steps ran out during halvings.
     Stuck,
     /// The steps are used up.
     Spent,
 }
 
-/// Walks from `start`, whose pose must be known, to a goal pose in the room's world. Each step aims
-/// at a part of the motion that remains, retrieves the frames nearest to the latent it aims at, and
+/// Walks from `start`, which must have a pose, to a goal pose in the room's world. Each step
+/// predicts the latent after a part of the remaining motion, retrieves the nearest frames, and
 /// continues from the nearest one. If that frame is not nearer to the goal, or was visited before,
-/// the step recovers: among the retrieved frames that are nearer and not yet visited it takes the
-/// one nearest to the goal, and if there is none, the next step tries half the motion.
+/// the step recovers. It takes the unvisited retrieved frame that is nearest to the goal, if any is
+/// nearer than the camera; otherwise the next step tries half the motion.
 ///
 /// # Errors
-/// [`Error::PoseNeeded`] for a start without a pose; [`Error::Adapter`] when the adapter lacks what
-/// the stepper needs; [`Error::Cancelled`] when nobody waits for the answer any more.
+/// [`Error::PoseNeeded`] for a start without a pose; [`Error::Adapter`] when the adapter does not
+/// support the stepper; [`Error::Cancelled`] when the request was cancelled.
 ///
 /// Source: the closed loop of SeeSE3, Sec. A.12, with the feedback of Nav2's NavigateToPose.
 pub fn pursue(
@@ -87,7 +87,7 @@ pub fn pursue(
 
     let mut at = None;
 
-    // Visited frames are never chosen again, so that the walk cannot go round in circles.
+    // Visited frames are never chosen again, so that the walk cannot loop.
     let mut seen: BTreeSet<FrameId> = start.frame.into_iter().collect();
 
     each(Feedback {
@@ -116,8 +116,8 @@ pub fn pursue(
 
         cancel.check()?;
 
-        // The remaining motion is divided into parts no longer than the longest step, and each
-        // failed attempt in a row halves the part once more.
+        // The remaining motion is divided into parts of at most `pursuit.step`; each consecutive
+        // failed attempt halves the part.
         let left = body_twist(&pose, goal);
         let parts = (left.norm() / pursuit.step).ceil().max(1.0) * f64::from(1u32 << halvings);
         let wanted = wanted_latent(navigator, stepper, &latent, left, parts)?;
@@ -130,8 +130,7 @@ pub fn pursue(
             }
         };
 
-        // With a frame the camera moves to its pose. Without one it stays where it is, and the next
-        // attempt asks for half the motion.
+        // Move to the pose of the chosen frame; without one, stay and try half the motion next.
         match chosen {
             Some(frame) => {
                 let motion = body_twist(&pose, &frame.pose);
@@ -170,8 +169,8 @@ pub fn pursue(
     }
 }
 
-/// If the last attempts were halved motions, there was no way on; otherwise the goal is only too far
-/// for so many steps.
+/// The outcome when the steps are used up: stuck during halvings, otherwise the goal is too far for
+/// the steps.
 fn out_of_steps(halvings: u32) -> Outcome {
     if halvings > 0 {
         Outcome::Stuck
@@ -180,7 +179,7 @@ fn out_of_steps(halvings: u32) -> Outcome {
     }
 }
 
-/// The latent that one of `parts` equal parts of a motion leads to.
+/// The predicted latent after one of `parts` equal parts of a motion.
 fn wanted_latent(
     navigator: &Navigator,
     stepper: &Stepper,
@@ -198,17 +197,17 @@ fn wanted_latent(
     Ok(latent + &step)
 }
 
-/// Which of the retrieved frames brings the camera nearer to the goal.
+/// The retrieved frame that brings the camera nearer to the goal.
 enum Progress<'a> {
     /// The nearest frame in latent space.
     Nearest(&'a RetrievedFrame),
-    /// Not that one; another one, or none.
+    /// Another retrieved frame, or `None` if no frame is progress.
     Recovered(Option<&'a RetrievedFrame>),
 }
 
-/// The latent proposes frames; their stored poses decide. The nearest frame in latent space is
-/// taken if it is progress. Otherwise the step recovers with the retrieved frame that is nearest to
-/// the goal, if any is nearer than the camera now.
+/// Selects a retrieved frame by its stored pose. The nearest frame in latent space is taken if it
+/// is nearer to the goal than the camera and unvisited; otherwise the frame nearest to the goal
+/// among those that are.
 fn progress<'a>(
     frames: &'a [RetrievedFrame],
     goal: &Pose,
@@ -232,13 +231,13 @@ fn progress<'a>(
 }
 
 impl Pursuit {
-    /// Whether a camera this far from the goal has reached it.
+    /// Whether the remaining error is within the tolerances.
     pub fn is_reached(&self, remaining: &PoseError) -> bool {
         remaining.translation_m <= self.tolerance_m && remaining.rotation_rad <= self.tolerance_rad
     }
 
-    /// Default settings for a room; a step is as long as the root mean square of the motions that
-    /// the adapter was trained on.
+    /// Default settings for a room; the step is the root mean square of the adapter's training
+    /// motions.
     pub fn of(navigator: &Navigator) -> Self {
         let scale = navigator.adapter().scale();
 

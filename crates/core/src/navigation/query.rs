@@ -1,22 +1,22 @@
-//! The query that a navigator answers, and the limits on it.
+//! Queries to a navigator, and their limits.
 
 use super::{Error, Mode, RetrievalMetric, StepKind, check_twist};
 use crate::geometry::{Pose, Twist};
 use crate::room::FrameId;
 use crate::splits::Split;
 
-/// What a query starts from.
+/// The source of a query.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Source {
     /// A frame of the room.
     Frame(FrameId),
-    /// An encoder's feature, from the source that the adapter was trained on, shape (d,).
+    /// A feature, shape (d,), from the adapter's feature source.
     Feature(Vec<f32>),
     /// A latent of the adapter, shape (k,).
     Latent(Vec<f64>),
 }
 
-/// A source together with its pose, if known; the pose of a frame is taken from the room.
+/// A source and its pose, if known. For a frame, the pose in the room is used.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SourceAt {
     /// The frame, feature or latent.
@@ -25,10 +25,10 @@ pub struct SourceAt {
     pub pose: Option<Pose>,
 }
 
-/// Which motion is wanted.
+/// The requested motion.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Displacement {
-    /// Motions one after another, each in the body frame where it begins; one is the usual case.
+    /// Consecutive motions, each in the body frame at its start; usually one.
     Twists(Vec<Twist>),
     /// The motion to a frame of the room.
     TargetFrame(FrameId),
@@ -36,32 +36,32 @@ pub enum Displacement {
     TargetPose(Pose),
 }
 
-/// Which pairs of the room a refit is fitted on: the training pairs, or the test pairs for an
-/// in-sample refit.
+/// Pairs of the room for fitting a refit: the training pairs, or the test pairs for an in-sample
+/// refit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FitOn {
-    /// How frames are divided into training and test frames.
+    /// Split into training and test frames.
     pub split: Split,
     /// Frames from source to target.
     pub stride: u32,
 }
 
-/// A question to a navigator.
+/// A query to a navigator.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Query {
-    /// Where it starts.
+    /// The source.
     pub source: SourceAt,
-    /// The motion that is wanted.
+    /// The requested motion.
     pub displacement: Displacement,
-    /// How many equal steps each motion is cut into.
+    /// Number of equal steps per motion.
     pub steps: u32,
     /// How the steps are chained.
     pub mode: Mode,
-    /// How a motion becomes a latent step.
+    /// The method that turns a motion into a latent step.
     pub step: StepKind,
-    /// The distance by which frames are retrieved.
+    /// Distance for the retrieval of frames.
     pub metric: RetrievalMetric,
-    /// What a refit is fitted on.
+    /// Pairs for fitting a refit.
     pub fit_on: FitOn,
     /// Frames retrieved for each step.
     pub top_k: u32,
@@ -73,12 +73,12 @@ pub struct Query {
 /// Upper limits on one query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Steps of all motions together.
+    /// Steps of all motions in total.
     pub steps: u32,
-    /// Frames for each step.
+    /// Frames per step.
     pub top_k: u32,
-    /// Frames in the whole answer: this keeps it under the 4 MiB that gRPC clients accept by
-    /// default.
+    /// Frames in the whole answer. The default keeps it under 4 MiB, the default message limit of
+    /// gRPC clients.
     pub frames_in_answer: u64,
 }
 
@@ -93,12 +93,12 @@ impl Default for Limits {
 }
 
 impl Query {
-    /// Checks everything that can be checked without a room.
+    /// Validates everything that does not depend on a room.
     ///
     /// # Errors
     /// [`Error::NoTwist`] for an empty list of motions; [`Error::TwistNotFinite`] or
-    /// [`Error::TwistBeyondPi`] for a motion that cannot be planned; [`Error::Steps`],
-    /// [`Error::TopK`] or [`Error::FramesInAnswer`] for a count that is zero or over its limit.
+    /// [`Error::TwistBeyondPi`] for an invalid motion; [`Error::Steps`], [`Error::TopK`] or
+    /// [`Error::FramesInAnswer`] for a count that is zero or over its limit.
     pub fn check(&self, limits: Limits) -> Result<(), Error> {
         let motions = match &self.displacement {
             Displacement::Twists(twists) => {
@@ -116,7 +116,7 @@ impl Query {
             Displacement::TargetFrame(_) | Displacement::TargetPose(_) => 1,
         };
 
-        // The limits bound the work and the size of the answer, so the steps of all motions count.
+        // The limits apply to the sum over all motions.
         let actual = u64::from(self.steps).saturating_mul(motions);
         if actual == 0 || actual > u64::from(limits.steps) {
             return Err(Error::Steps {

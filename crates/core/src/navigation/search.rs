@@ -1,4 +1,4 @@
-//! Retrieval of the frames nearest to a wanted latent, under one of five distances.
+//! Nearest-frame search for a latent, under one of five distances.
 
 use nalgebra::{DMatrix, SymmetricEigen};
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
@@ -10,36 +10,35 @@ use crate::index::{HnswIndex, HnswParameters};
 use crate::matrices::{to_nalgebra, to_ndarray};
 use crate::room::FrameId;
 
-/// Singular values below this share of the largest count as zero, as in W⁺.
+/// Singular values below this fraction of the largest count as zero, as in W⁺.
 const RANK_TOLERANCE: f64 = 1e-5;
 
-/// The most latent columns that can be whitened: the work grows with their cube.
+/// Maximum number of coordinates for whitening, which takes cubic time.
 const MOST_WHITENED: usize = 512;
 
-/// The distance by which frames are retrieved.
+/// Distance for the retrieval of frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum RetrievalMetric {
     /// Euclidean distance over all coordinates, as in the paper.
     #[default]
     Full,
-    /// Euclidean distance in the row space of W, chart by chart: only the directions that W maps to
-    /// motion count.
+    /// Euclidean distance in the row space of W, chart by chart: ignores directions that W maps to
+    /// zero motion.
     RowSpace,
     /// Mahalanobis distance under the covariance of the room's latents.
     Whitened,
-    /// Euclidean norm of σ ⊙ W g: the length of the motion that the adapter reads between two
-    /// latents, in the metres and radians of Hit@ε. Not available for charts under a gate.
+    /// Euclidean distance of σ ⊙ W g: the length of the predicted motion between two latents,
+    /// meters and radians mixed as in Hit@ε. Not available for charts with a gate.
     Motion,
-    /// Mahalanobis distance of σ ⊙ W g under the second moment of the adapter's errors in rooms
-    /// that it was not trained on: the nearest candidate is the one for which the error of the
-    /// wanted motion is least surprising. It belongs to the homogeneous reading, in which W reads
-    /// exactly ΔP between the source and the imagined latent. Ours, not the paper's. Not available
-    /// for charts under a gate.
+    /// Mahalanobis distance of σ ⊙ W g under the adapter's error covariance, measured in rooms
+    /// outside its training set. For use with the homogeneous reading, where the predicted motion
+    /// from the source to ĝ is exactly ΔP. Ours, not the paper's. Not available for charts with a
+    /// gate.
     Calibrated,
 }
 
 impl RetrievalMetric {
-    /// Every metric.
+    /// All metrics.
     pub const ALL: [Self; 5] = [
         Self::Full,
         Self::RowSpace,
@@ -48,7 +47,7 @@ impl RetrievalMetric {
         Self::Calibrated,
     ];
 
-    /// Its name in tables and on the wire.
+    /// Name in tables and on the wire.
     pub fn name(self) -> &'static str {
         match self {
             Self::Full => "full",
@@ -65,18 +64,18 @@ impl RetrievalMetric {
     }
 }
 
-/// Which kind of index is searched.
+/// Kind of the nearest-neighbor index.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum IndexKind {
-    /// An exact scan of every frame.
+    /// Exact scan of all frames.
     #[default]
     Exact,
-    /// The approximate graph of `hnsw_rs`.
+    /// Approximate search in an HNSW graph (`hnsw_rs`).
     #[cfg(feature = "hnsw")]
     Hnsw(HnswParameters),
 }
 
-/// A linear map of latents after which the metric is the Euclidean distance.
+/// A linear map of latents that turns the metric into Euclidean distance.
 #[derive(Debug, Clone)]
 struct Projection {
     coordinates: usize,
@@ -93,8 +92,7 @@ impl Projection {
         let coordinates = adapter.coordinate_count();
         let matrix = match metric {
             RetrievalMetric::Full => None,
-            // A mixture's coordinates are one block per chart, so the charts' bases stand on a
-            // block diagonal.
+            // A mixture has one block of coordinates per chart, so the bases form a block diagonal.
             RetrievalMetric::RowSpace => Some(blocks(
                 &adapter
                     .motion_matrices()
@@ -106,7 +104,7 @@ impl Projection {
             RetrievalMetric::Calibrated => {
                 let covariance = adapter.error_covariance().ok_or(Error::NoErrorCovariance)?;
 
-                // Σ = L Lᵀ, so ‖L⁻¹x‖ is the Mahalanobis norm of x.
+                // With Σ = L Lᵀ, ‖L⁻¹x‖ is the Mahalanobis norm of x.
                 let lower = covariance.cholesky().ok_or(Error::ErrorCovariance)?.l();
                 let inverse = lower.try_inverse().ok_or(Error::ErrorCovariance)?;
 
@@ -180,8 +178,8 @@ fn blocks(parts: &[Array2<f64>]) -> Array2<f64> {
     matrix
 }
 
-/// The whitening matrix Λ^(−1/2) Qᵀ of the rows' population covariance Q Λ Qᵀ. Directions in which
-/// the rows do not vary get weight zero.
+/// The whitening matrix Λ^(−1/2) Qᵀ of the rows' population covariance Q Λ Qᵀ. Directions without
+/// variance get weight zero.
 fn whitening(rows: ArrayView2<'_, f64>) -> Array2<f64> {
     let count = rows.nrows().max(1) as f64;
     let centred = &rows - &(rows.sum_axis(Axis(0)) / count);
@@ -189,8 +187,7 @@ fn whitening(rows: ArrayView2<'_, f64>) -> Array2<f64> {
     let eigen = SymmetricEigen::new(to_nalgebra(covariance.view()));
     let largest = eigen.eigenvalues.iter().copied().fold(0.0, f64::max);
 
-    // The eigenvalues of a covariance are squares of singular values, so the tolerance is squared
-    // too.
+    // Eigenvalues of a covariance are squared singular values, so the tolerance is squared.
     let weight = |value: f64| match value > largest * RANK_TOLERANCE * RANK_TOLERANCE {
         true => value.sqrt().recip(),
         false => 0.0,
@@ -209,13 +206,13 @@ pub struct Search {
 }
 
 impl Search {
-    /// An exact search among `candidates`, frames whose latents are rows of `latents`.
+    /// Exact search among the frames `candidates`; `latents` has one row per frame of the room.
     ///
     /// # Errors
-    /// [`Error::NoErrorCovariance`] or [`Error::ErrorCovariance`] when the metric needs calibrated
-    /// errors and the adapter has none that can be used; [`Error::GatedMotion`] when it needs a
-    /// fixed W and the adapter has charts under a gate; [`Error::WhitenedColumns`] when the latents
-    /// are too wide to whiten.
+    /// [`Error::NoErrorCovariance`] or [`Error::ErrorCovariance`] when the metric needs an error
+    /// covariance and the adapter has no valid one; [`Error::GatedMotion`] when it needs a fixed W
+    /// and the adapter has a gate; [`Error::WhitenedColumns`] when there are too many coordinates
+    /// to whiten.
     pub fn exact(
         metric: RetrievalMetric,
         adapter: &Adapter,
@@ -232,7 +229,7 @@ impl Search {
         })
     }
 
-    /// A search among all frames.
+    /// Search among all frames.
     ///
     /// # Errors
     /// As [`Search::exact`].
@@ -250,8 +247,7 @@ impl Search {
                 let projection = Projection::new(metric, adapter, latents)?;
                 let index = HnswIndex::new(projection.rows(latents).view(), &frames, parameters);
 
-                // The recall of this very graph is measured on at most 200 queries, so that it can
-                // be reported.
+                // Measure the recall of this graph on at most 200 queries, for the reports.
                 let audit = Some(index.audit(10, frames.len().div_ceil(200)));
 
                 Ok(Self {
@@ -274,12 +270,12 @@ impl Search {
             .nearest(&self.projection.one(latent), k, exclusion)
     }
 
-    /// About how much memory it holds, bytes.
+    /// Approximate memory use, bytes.
     pub fn memory_bytes(&self) -> usize {
         self.index.memory_bytes()
     }
 
-    /// How an approximate index compares with the exact scan; `None` if the index is exact.
+    /// Recall of an approximate index against the exact scan; `None` if the index is exact.
     pub fn audit(&self) -> Option<Audit> {
         self.audit
     }
@@ -295,8 +291,8 @@ mod tests {
         })
     }
 
-    /// Oracle: the definition of Mahalanobis' distance, (a − b)ᵀ C⁻¹ (a − b), by nalgebra's general
-    /// inverse.
+    /// Oracle: the definition of the Mahalanobis distance, (a − b)ᵀ C⁻¹ (a − b), with nalgebra's
+    /// general inverse.
     #[test]
     fn whitened_distances_are_mahalanobis() {
         let rows = wave(40, 5);
@@ -319,7 +315,7 @@ mod tests {
         }
     }
 
-    /// Oracle: the projector W⁺W, whose distances are those in the basis.
+    /// Oracle: distances after the projection W⁺W equal distances in the basis.
     #[test]
     fn row_space_distances_are_those_of_the_projector() {
         let w = wave(6, 20);

@@ -1,4 +1,4 @@
-//! How a motion becomes a step in latent space.
+//! Steppers: methods that turn a motion into a step in latent space.
 
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2, s};
 
@@ -16,27 +16,27 @@ const REFIT_ALPHA: f64 = 1.0;
 pub enum StepKind {
     /// W⁺ΔP, as in the paper.
     InversePoincare(Reading),
-    /// A corrector that was trained together with the adapter.
+    /// A corrector of the adapter.
     Corrector(CorrectorKind),
-    /// B ΔP, with B fitted by ridge regression in the room itself while φ stays frozen.
+    /// B ΔP, with B fitted by ridge regression in the room itself, φ frozen.
     Refit(Refit),
 }
 
 /// A variant of the refit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Refit {
-    /// Whether motions are first z-scored by the adapter's μ and σ, which changes the effect of the
+    /// Whether motions are z-scored by the adapter's μ and σ, which changes the effect of the
     /// penalty.
     pub z_scored: bool,
-    /// Whether a constant step is fitted too; with one, zero motion moves the latent.
+    /// Whether an intercept is fitted; with one, zero motion moves the latent.
     pub intercept: bool,
-    /// Whether it is fitted on the very pairs that it is tested on: a leak, and the likely protocol
-    /// of the paper. Otherwise it is fitted on the room's training pairs.
+    /// Whether the refit is fitted on the test pairs: a leak, and probably the paper's protocol.
+    /// Otherwise it is fitted on the room's training pairs.
     pub in_sample: bool,
 }
 
 impl StepKind {
-    /// Every method, inverse Poincaré first.
+    /// All methods, inverse Poincaré first.
     pub fn all() -> Vec<Self> {
         let readings = Reading::ALL.map(Self::InversePoincare);
         let correctors = CorrectorKind::ALL.map(Self::Corrector);
@@ -54,7 +54,7 @@ impl StepKind {
             .collect()
     }
 
-    /// Its name in tables, JSON and on the wire.
+    /// Name in tables, JSON and on the wire.
     pub fn name(self) -> &'static str {
         match self {
             Self::InversePoincare(Reading::Affine) => "inverse-poincare-affine",
@@ -87,27 +87,27 @@ impl StepKind {
     }
 }
 
-/// The data of one room that a refit is fitted to.
+/// Data of one room for fitting a refit.
 #[derive(Debug, Clone, Copy)]
 pub struct RefitData<'a> {
     /// Latents, one row per frame.
     pub latents: ArrayView2<'a, f64>,
     /// `world_from_camera`, one per frame.
     pub poses: &'a [Pose],
-    /// Pairs to fit on, unless the refit is in-sample.
+    /// Training pairs, for a refit that is not in-sample.
     pub train: &'a [Pair],
-    /// Test pairs, on which an in-sample refit is fitted.
+    /// Test pairs, for an in-sample refit.
     pub test: &'a [Pair],
 }
 
-/// A method of stepping, fitted and ready to use.
+/// A fitted stepper.
 #[derive(Debug, Clone)]
 pub enum Stepper {
     /// W⁺ΔP.
     InversePoincare(Reading),
-    /// By a corrector.
+    /// A corrector.
     Corrector(CorrectorKind),
-    /// By a fitted linear map.
+    /// A fitted linear map.
     Refit {
         /// The map from motions to steps of the latent coordinates.
         fit: Ridge,
@@ -117,17 +117,17 @@ pub enum Stepper {
 }
 
 impl Stepper {
-    /// Prepares a method of stepping; a refit is fitted here.
+    /// Builds a stepper; fits a refit.
     ///
     /// # Errors
-    /// [`Error::Adapter`] when the adapter lacks the corrector, [`Error::Refit`] without a pair to
-    /// fit on.
+    /// [`Error::Adapter`] when the adapter does not have the corrector, [`Error::Refit`] without
+    /// pairs for the fit.
     pub fn new(kind: StepKind, adapter: &Adapter, ground: RefitData<'_>) -> Result<Self, Error> {
         match kind {
             StepKind::InversePoincare(reading) => Ok(Self::InversePoincare(reading)),
             StepKind::Corrector(kind) => {
-                // A trial step: an adapter without this corrector is refused now, not in the middle
-                // of a walk.
+                // Trial step: fail now if the adapter does not have this corrector, not during a
+                // walk.
                 let still = Array1::zeros(adapter.latent_dim());
                 adapter.corrected_step(kind, still.view(), Twist::default())?;
                 Ok(Self::Corrector(kind))
@@ -145,8 +145,8 @@ impl Stepper {
                     Intercept::None
                 };
 
-                // The fit is the reverse of the adapter's training: motions are the inputs, and the
-                // latent differences of the same pairs are the targets.
+                // Reverse of the adapter's training: motions are the inputs, latent differences the
+                // targets.
                 let twists: Vec<Array1<f64>> = pairs
                     .iter()
                     .map(|pair| {
@@ -160,8 +160,7 @@ impl Stepper {
 
                 let inputs = Array2::from_shape_fn((twists.len(), 6), |at| twists[at.0][at.1]);
 
-                // Only the coordinates are fitted; the gate columns of a mixture's latents are left
-                // out.
+                // Only coordinates are fitted, not the gate weights of a mixture.
                 let steps = Array2::from_shape_fn(
                     (pairs.len(), adapter.coordinate_count()),
                     |(row, column)| {
@@ -177,13 +176,13 @@ impl Stepper {
         }
     }
 
-    /// The latent step for a motion from `latent`. `mean_share` is the share that this step takes
-    /// of what does not depend on the motion (μ in the affine reading, the intercept of a refit): 1
-    /// for a whole motion, 1/S for one of S equal parts. A corrector ignores it and treats each
-    /// part as a whole motion.
+    /// The latent step for a motion from `latent`. `mean_share` is the fraction of the constant
+    /// terms (μ in the affine reading, the intercept of a refit) in this step: 1 for a whole
+    /// motion, 1/S for one of S equal parts. A corrector ignores it and treats each part as a whole
+    /// motion.
     ///
     /// # Errors
-    /// [`Error::Adapter`] when the adapter lacks the corrector.
+    /// [`Error::Adapter`] when the adapter does not have the corrector.
     pub fn step(
         &self,
         adapter: &Adapter,
@@ -199,7 +198,7 @@ impl Stepper {
                     .coefficients
                     .dot(&input(adapter, twist, *z_scored, mean_share));
 
-                // The fit covers the coordinates only, so a mixture's gate does not move.
+                // Only coordinates are fitted, so a mixture's gate weights do not change.
                 let mut step = Array1::zeros(adapter.latent_dim());
                 step.slice_mut(s![..moved.len()])
                     .assign(&(moved + &fit.intercept * mean_share));

@@ -1,4 +1,4 @@
-//! The contiguous fifths of a recording.
+//! Contiguous fifths of a recording.
 
 use crate::room::FrameId;
 
@@ -18,7 +18,7 @@ pub enum Fifth {
 }
 
 impl Fifth {
-    /// The name of the fold that tests this fifth.
+    /// Name of the fold with this fifth as test set.
     pub(super) fn fold_name(self) -> &'static str {
         match self {
             Self::First => "fold1",
@@ -29,7 +29,7 @@ impl Fifth {
         }
     }
 
-    /// Whether a frame of a recording with `frame_count` frames lies in this fifth.
+    /// Whether a frame is in this fifth of a recording with `frame_count` frames.
     pub(super) fn holds(self, frame: FrameId, frame_count: usize) -> bool {
         let k = self as usize;
         let begin = frame_count * k / 5;

@@ -1,30 +1,30 @@
-//! Which frames of a recording make up the map of a tracker, and which are tracked against it.
+//! Splits of a recording into mapped frames and frames that are tracked against the map.
 
 use crate::room::FrameId;
 
-/// Blocks that a recording is cut into, of which every fifth is left out of a map.
+/// Number of blocks of a recording for [`HoldOut::Blocks`].
 const BLOCKS: usize = 20;
-/// Every so many blocks one is left out.
+/// One of this many consecutive blocks is held out.
 const BLOCK_PERIOD: usize = 5;
-/// The place of the block that is left out in its period, so that a recording begins mapped.
+/// Index of the held-out block in its period; not 0, so that the start of a recording is mapped.
 const LEFT_OUT_BLOCK: usize = 2;
 
-/// How the frames of a recording are divided into mapped and tracked ones.
+/// Split of a recording into mapped and tracked frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum HoldOut {
     /// Mapped: every second frame. Tracked: the others, from first to last.
     Interleaved,
-    /// As interleaved, but every fifth of twenty blocks of the recording is not mapped at all.
+    /// As interleaved, but 4 of 20 blocks of the recording (every fifth) have no mapped frames.
     Blocks,
     /// Mapped: the first four fifths of the recording. Tracked: the last fifth.
     Time,
 }
 
 impl HoldOut {
-    /// Every hold-out.
+    /// All hold-outs.
     pub const ALL: [Self; 3] = [Self::Interleaved, Self::Blocks, Self::Time];
 
-    /// Its name on the command line and in reports.
+    /// Name on the command line and in reports.
     pub fn name(self) -> &'static str {
         match self {
             Self::Interleaved => "interleaved",
@@ -44,8 +44,8 @@ impl HoldOut {
         frames_where(frame_count, is_mapped)
     }
 
-    /// The tracked frames of a recording with `frame_count` frames, in order; none of them is
-    /// mapped.
+    /// The tracked frames of a recording with `frame_count` frames, in order; disjoint from the
+    /// mapped ones.
     pub fn tracked(self, frame_count: usize) -> Vec<FrameId> {
         let is_tracked = |row: &usize| match self {
             Self::Interleaved | Self::Blocks => row % 2 == 1,
@@ -65,7 +65,7 @@ impl HoldOut {
     }
 }
 
-/// Whether a row lies in one of the blocks that [`HoldOut::Blocks`] leaves out of the map.
+/// Whether a row is in a held-out block of [`HoldOut::Blocks`].
 pub fn is_in_left_out_block(row: usize, frame_count: usize) -> bool {
     let block_length = frame_count.div_ceil(BLOCKS).max(1);
     (row / block_length) % BLOCK_PERIOD == LEFT_OUT_BLOCK
@@ -82,7 +82,7 @@ fn frames_where(frame_count: usize, keep: impl Fn(&usize) -> bool) -> Vec<FrameI
 mod tests {
     use super::*;
 
-    /// Oracle: the definition: no frame is both mapped and tracked.
+    /// Oracle: the definition: mapped and tracked frames are disjoint.
     #[test]
     fn what_is_tracked_is_not_mapped() {
         for hold_out in HoldOut::ALL {
@@ -97,7 +97,7 @@ mod tests {
             assert!(mapped.len() >= 160 && tracked.len() >= 80, "{name}");
         }
 
-        // Of 400 frames a block has 20; the third one is rows 40 to 59.
+        // With 400 frames a block has 20; the third block is rows 40 to 59.
         let mapped = HoldOut::Blocks.mapped(400);
         assert!(!mapped.contains(&FrameId(40)) && mapped.contains(&FrameId(38)));
     }

@@ -1,8 +1,6 @@
-//! Splits: which pairs of frames are trained on, which are tested, and among which frames an answer
-//! is searched for.
+//! Train/test splits of frame pairs, and the candidate frames for retrieval.
 //!
-//! A pair (i, j) is two frames of one room, j = i + stride. Frame i is the source, frame j the
-//! target.
+//! A pair (i, j) is two frames of one room, j = i + stride: the source i and the target j.
 
 mod fifth;
 mod hold_out;
@@ -18,7 +16,7 @@ use crate::room::{FrameId, Timeline};
 /// Number of frames in a block of [`Split::Blocks`].
 const BLOCK_FRAMES: usize = 50;
 
-/// Why a room gives no pairs.
+/// Why a room has no pairs.
 #[derive(Debug, thiserror::Error, PartialEq)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
@@ -34,47 +32,47 @@ pub enum Error {
         side: &'static str,
     },
     #[error(
-        "the split 'dataset' is the recording's own, and this room has none; use time or blocks"
+        "the split 'dataset' needs a split in the recording, and this room has none; use time or blocks"
     )]
     NoDatasetSplit,
-    #[error("strides {low} to {high} are not a range: low must be 1 or more and at most high")]
+    #[error("strides {low} to {high} are not a range: low must be at least 1 and at most high")]
     EmptyRange { low: u32, high: u32 },
 }
 
 /// Two frames of one room.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pair {
-    /// The frame the motion starts from.
+    /// The frame at the start of the motion.
     pub source: FrameId,
-    /// The frame it ends at.
+    /// The frame at the end of the motion.
     pub target: FrameId,
 }
 
-/// How frames or pairs are divided into a training side and a test side.
+/// Split of frames or pairs into a training side and a test side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Split {
-    /// The first 80 % of the frames are for training, the rest for testing; both ends of a pair lie
-    /// on the same side. The paper's split.
+    /// The first 80 % of the frames train, the rest test; both frames of a pair are on the same
+    /// side. The paper's split.
     Time,
-    /// A contiguous fifth of the frames is for testing, the others for training; both ends of a pair
-    /// lie on the same side. The last fifth is [`Split::Time`]'s.
+    /// One contiguous fifth of the frames tests, the others train; both frames of a pair are on the
+    /// same side. The last fold equals [`Split::Time`].
     Fold(Fifth),
-    /// Blocks of 50 frames, of which block b is for testing when b mod 5 = 2. A test pair lies
-    /// within one block; both ends of a training pair lie outside the test blocks.
+    /// Blocks of 50 frames; block b tests if b mod 5 = 2. A test pair lies within one block; both
+    /// frames of a training pair lie outside the test blocks.
     Blocks,
-    /// The pair (i, j) is for testing when i mod 5 = 2. The sides share frames: this leaks on
-    /// purpose, to check an implementation, and does not measure generalisation.
+    /// The pair (i, j) tests if i mod 5 = 2. Both sides share frames: a deliberate leak for checks
+    /// of an implementation, not a measure of generalization.
     Pairs,
-    /// The recording's own split: 7-Scenes' TestSplit, 12-Scenes' first sequence. Both ends of a
-    /// pair lie on the same side.
+    /// The recording's own split: 7-Scenes' TestSplit, 12-Scenes' first sequence. Both frames of a
+    /// pair are on the same side.
     Dataset,
-    /// Every pair is for training and for testing: for rooms that are trained on, or held out, as a
-    /// whole.
+    /// Every pair is both a training and a test pair: for rooms that are trained on, or held out,
+    /// as a whole.
     Whole,
 }
 
 impl Split {
-    /// Every split.
+    /// All splits.
     pub const ALL: [Self; 10] = [
         Self::Time,
         Self::FOLDS[0],
@@ -88,7 +86,7 @@ impl Split {
         Self::Whole,
     ];
 
-    /// The five folds of a recording: each frame is tested in one of them.
+    /// The five folds of a recording; each frame is tested in exactly one.
     pub const FOLDS: [Self; 5] = [
         Self::Fold(Fifth::First),
         Self::Fold(Fifth::Second),
@@ -97,7 +95,7 @@ impl Split {
         Self::Fold(Fifth::Last),
     ];
 
-    /// Its name on the command line, on the wire and in a manifest.
+    /// Name on the command line, on the wire and in a manifest.
     pub fn name(self) -> &'static str {
         match self {
             Self::Time => "time",
@@ -114,16 +112,16 @@ impl Split {
         Self::ALL.into_iter().find(|split| split.name() == name)
     }
 
-    /// Training pairs at one stride, by source frame.
+    /// Training pairs at one stride, ordered by source frame.
     ///
     /// # Errors
     /// [`Error::ZeroStride`] for a stride of 0; [`Error::NoDatasetSplit`] under [`Split::Dataset`]
-    /// when the room has no split of its own; [`Error::NoPairs`] when no pair is left.
+    /// when the recording has no split; [`Error::NoPairs`] when there are no pairs.
     pub fn train_pairs(self, timeline: &Timeline, stride: u32) -> Result<Vec<Pair>, Error> {
         self.pairs(timeline, stride, Side::Train)
     }
 
-    /// Test pairs at one stride, by source frame.
+    /// Test pairs at one stride, ordered by source frame.
     ///
     /// # Errors
     /// As [`Split::train_pairs`].
@@ -131,26 +129,26 @@ impl Split {
         self.pairs(timeline, stride, Side::Test)
     }
 
-    /// Whether a pair of any stride is a test pair.
+    /// Whether a pair is a test pair, at any stride.
     pub fn tests(self, timeline: &Timeline, pair: Pair) -> bool {
         self.is_on(timeline, pair, Side::Test)
     }
 
-    /// The frames among which the answer to a test query is searched for: the test frames,
-    /// or all frames under [`Split::Pairs`] and [`Split::Whole`], which hold no frames out.
+    /// Candidate frames for a test query: the test frames, or all frames under
+    /// [`Split::Pairs`] and [`Split::Whole`], which hold out no frames.
     pub fn candidates(self, timeline: &Timeline) -> Vec<FrameId> {
         let all = matches!(self, Self::Pairs | Self::Whole);
         let candidate = |&frame: &FrameId| all || self.tests_frame(timeline, frame);
         frames(timeline.frame_count).filter(candidate).collect()
     }
 
-    /// Draws `count` training pairs with replacement from the pairs of all rooms whose stride lies
-    /// in `low..=high`; each comes with the index of its room. This is the paper's range pairing
-    /// with replacement because its 30,000 pairs exceed the distinct pairs of a room.
+    /// Draws `count` training pairs, with replacement, from all pairs of all rooms with a stride in
+    /// `low..=high`. Each is returned with the index of its room. This is the paper's range pairing
+    /// with replacement, because its 30,000 pairs exceed the distinct pairs of a room.
     ///
     /// # Errors
     /// [`Error::EmptyRange`] when `low` is 0 or above `high`; [`Error::NoPairs`] when a room has no
-    /// pair at any stride of the range.
+    /// pair in the range.
     pub fn sampled_range(
         self,
         timelines: &[&Timeline],
@@ -162,22 +160,21 @@ impl Split {
             return Err(Error::EmptyRange { low, high });
         }
 
-        // The pool holds every distinct pair of every stride, and each is equally likely to be
-        // drawn.
+        // The pool has all distinct pairs, drawn with equal probability.
         let mut pool: Vec<(usize, Pair)> = Vec::new();
         for (room, timeline) in timelines.iter().enumerate() {
             let before = pool.len();
 
-            // Strides longer than the room have no pairs; they are cut off, so that a huge `high`
-            // costs nothing.
+            // Strides longer than the room have no pairs; skip them, so that a huge `high` costs
+            // nothing.
             let longest = u32::try_from(timeline.frame_count).unwrap_or(u32::MAX);
             let pairs = (low..=high.min(longest))
                 .filter_map(|stride| self.train_pairs(timeline, stride).ok())
                 .flatten();
             pool.extend(pairs.map(|pair| (room, pair)));
 
-            // A room without any pair is an error; otherwise it would silently be left out of the
-            // training.
+            // A room without pairs is an error; otherwise it would be missing from the training
+            // without notice.
             if pool.len() == before {
                 let frame_count = timeline.frame_count;
                 return Err(Error::NoPairs {
@@ -233,8 +230,7 @@ impl Split {
         }
     }
 
-    /// The side that a pair belongs to; `None` when its ends lie on different sides or in different
-    /// sequences.
+    /// The side of a pair; `None` when its frames are on different sides or in different sequences.
     fn side(self, timeline: &Timeline, pair: Pair) -> Option<Side> {
         if !timeline.joins(pair.source, pair.target) {
             return None;
@@ -251,8 +247,8 @@ impl Split {
             Self::Time | Self::Fold(_) | Self::Blocks | Self::Dataset | Self::Whole => {
                 match (tested(pair.source), tested(pair.target)) {
                     (false, false) => Some(Side::Train),
-                    // Two different test blocks have training blocks between them, so a test pair
-                    // must stay in one.
+                    // Training blocks lie between test blocks, so a test pair must stay within one
+                    // block.
                     (true, true)
                         if self != Self::Blocks || block(pair.source) == block(pair.target) =>
                     {
@@ -281,14 +277,14 @@ impl std::fmt::Display for Split {
     }
 }
 
-/// Strides to draw training pairs from, and how many pairs to draw.
+/// Range of strides for sampled training pairs, and their number.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StrideRange {
     /// The smallest stride.
     pub low: u32,
     /// The largest stride.
     pub high: u32,
-    /// Pairs drawn.
+    /// Number of pairs.
     pub count: usize,
 }
 
@@ -378,8 +374,8 @@ mod tests {
         );
     }
 
-    /// Oracle: the definition: every frame is tested in one fold, and in no fold do a training and a
-    /// test pair share a frame; a pair of test frames has both ends in one fifth.
+    /// Oracle: the definition: every frame is tested in one fold; training and test pairs of a fold
+    /// share no frame; both frames of a test pair are in one fifth.
     #[test]
     fn each_frame_is_tested_in_one_fold() {
         let room = Timeline::unbroken(503);
@@ -411,8 +407,8 @@ mod tests {
         );
     }
 
-    /// Oracle: by hand: Σ (320 − s) over the strides s from 10 to 40 is 9,145, the distinct pairs
-    /// among 320 training frames.
+    /// Oracle: by hand. 320 training frames have Σ (320 − s) = 9,145 distinct pairs over the
+    /// strides s from 10 to 40.
     #[test]
     fn range_pairing_draws_from_the_papers_pool() {
         let distinct: usize = (10..=40)
@@ -488,7 +484,7 @@ mod tests {
         );
     }
 
-    /// Oracle: by hand. Two sequences of four frames, the second held out: no pair joins them, and
+    /// Oracle: by hand. Two sequences of four frames, the second held out: no pair spans both, and
     /// the recording's own split tests the second.
     #[test]
     fn pairs_stay_in_their_sequence_and_the_datasets_own_split_is_kept() {

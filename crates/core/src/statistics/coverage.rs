@@ -1,21 +1,21 @@
-//! Whether stated covariances hold: the shares of errors inside their ellipsoids, and the factor
-//! that would make them hold.
+//! Coverage of covariances: the fractions of errors inside their confidence ellipsoids, and the
+//! factor that calibrates them.
 //!
-//! An error e with a stated covariance Σ has the squared Mahalanobis length eᵀ Σ⁻¹ e. If e is
-//! normal with six degrees of freedom, these lengths follow χ² with six degrees of freedom.
+//! An error e with covariance Σ has the squared Mahalanobis length eᵀ Σ⁻¹ e. For normal errors in
+//! six dimensions it follows χ² with six degrees of freedom.
 
-/// 68 % of χ² with six degrees of freedom lies below.
+/// 68 % quantile of χ² with six degrees of freedom.
 pub const CHI_SQUARED_68: f64 = 7.012;
-/// 95 % of χ² with six degrees of freedom lies below.
+/// 95 % quantile of χ² with six degrees of freedom.
 pub const CHI_SQUARED_95: f64 = 12.592;
 
-/// A share of errors that is wanted inside an ellipsoid.
+/// A target coverage of one ellipsoid.
 struct Wanted {
     /// The ellipsoid's squared Mahalanobis radius.
     radius: f64,
-    /// The wanted share.
+    /// The target fraction of errors inside.
     share: f64,
-    /// A deviation from the share that counts as 1, so that both shares weigh alike.
+    /// Unit of the deviation from `share`, so that both targets have equal weight.
     tolerance: f64,
 }
 
@@ -25,8 +25,8 @@ const WANTED: [Wanted; 2] = [
         share: 0.68,
         tolerance: 0.08,
     },
-    // The errors' tails are heavier than a normal distribution's: a little below 95 % is wanted, so
-    // that the inner ellipsoid does not have to be far too large for the outer one to hold.
+    // The target is slightly below 95 %, because the tails of the errors are heavier than normal.
+    // Otherwise the inner ellipsoid would become far too large.
     Wanted {
         radius: CHI_SQUARED_95,
         share: 0.945,
@@ -34,23 +34,23 @@ const WANTED: [Wanted; 2] = [
     },
 ];
 
-/// The smallest factor that [`balancing_factor`] tries.
+/// Smallest factor that [`balancing_factor`] tries.
 const SMALLEST_FACTOR: f64 = 0.01;
-/// The ratio of each tried factor to the one before.
+/// Ratio of successive tried factors.
 const FACTOR_RATIO: f64 = 1.015;
-/// How many factors are tried: the last is about 100.
+/// Number of tried factors; the last is about 100.
 const FACTOR_COUNT: i32 = 620;
 
-/// Shares of errors inside the ellipsoids of their stated covariances.
+/// Fractions of errors inside the confidence ellipsoids of their covariances.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Coverage {
-    /// The share inside the 68 % ellipsoid.
+    /// Fraction inside the 68 % ellipsoid.
     pub within_68: f64,
-    /// The share inside the 95 % ellipsoid.
+    /// Fraction inside the 95 % ellipsoid.
     pub within_95: f64,
 }
 
-/// The coverage of errors with these squared Mahalanobis lengths; NaN without errors.
+/// Coverage of errors with these squared Mahalanobis lengths; NaN without errors.
 pub fn coverage(squared_lengths: &[f64]) -> Coverage {
     let share = |radius: f64| {
         let inside = squared_lengths.iter().filter(|&&x| x <= radius).count();
@@ -63,9 +63,8 @@ pub fn coverage(squared_lengths: &[f64]) -> Coverage {
     }
 }
 
-/// The factor by which covariances have to be multiplied so that both shares of errors come nearest
-/// to what is wanted; of equally good factors the smallest. Sorts `squared_lengths`; `None` if
-/// there are none.
+/// The covariance factor that brings both coverages closest to their targets; the smallest on ties.
+/// Sorts `squared_lengths`; `None` if empty.
 pub fn balancing_factor(squared_lengths: &mut [f64]) -> Option<f64> {
     if squared_lengths.is_empty() {
         return None;
@@ -79,14 +78,14 @@ pub fn balancing_factor(squared_lengths: &mut [f64]) -> Option<f64> {
         .min_by(|a, b| deviation(*a).total_cmp(&deviation(*b)))
 }
 
-/// How far the coverage of errors is from what is wanted: the larger deviation of the two shares,
-/// in tolerances. Sorts `squared_lengths`; `None` if there are none.
+/// Deviation of the coverage from its targets: the larger of the two, in units of their tolerances.
+/// Sorts `squared_lengths`; `None` if empty.
 pub fn coverage_deviation(squared_lengths: &mut [f64]) -> Option<f64> {
     squared_lengths.sort_by(f64::total_cmp);
     (!squared_lengths.is_empty()).then(|| deviation_of_sorted(squared_lengths, 1.0))
 }
 
-/// The deviation of sorted squared lengths, if covariances were multiplied by `factor`.
+/// [`coverage_deviation`] of sorted squared lengths, with covariances multiplied by `factor`.
 fn deviation_of_sorted(sorted: &[f64], factor: f64) -> f64 {
     let share_below =
         |limit: f64| sorted.partition_point(|&length| length <= limit) as f64 / sorted.len() as f64;
@@ -114,8 +113,8 @@ mod tests {
         );
     }
 
-    /// Oracle: by hand: two of three errors have to be inside the inner ellipsoid and all inside
-    /// the outer one, which a factor of 4 does for lengths of 4·7 and 4·12.
+    /// Oracle: by hand. A factor of 4 brings two of three errors (4·7) inside the inner ellipsoid
+    /// and all (4·12) inside the outer one.
     #[test]
     fn the_balancing_factor_brings_errors_inside() {
         let mut lengths = vec![4.0 * 7.0, 4.0 * 7.0, 4.0 * 12.0];

@@ -1,9 +1,8 @@
-//! Statistics that more than one module reports: means, quantiles, rates with their intervals, the
-//! bootstrap over rooms and over parts of a recording, and the coverage of stated covariances.
+//! Common statistics: means, quantiles, rates with confidence intervals, bootstraps over rooms and
+//! over blocks of a recording, and the coverage of covariances.
 //!
-//! Pairs of frames from one room resemble each other, so an interval over many rooms resamples the
-//! rooms ([`bootstrap_mean`]); the interval of a count of independent trials is Wilson's
-//! ([`Rate`]).
+//! Pairs of frames from one room are correlated, so intervals over many rooms resample the rooms
+//! ([`bootstrap_mean`]). Rates of independent trials have Wilson intervals ([`Rate`]).
 
 mod coverage;
 mod robust_covariance;
@@ -16,10 +15,10 @@ pub use robust_covariance::robust_covariance;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// How many times [`bootstrap_mean`] resamples.
+/// Number of resamples of [`bootstrap_mean`].
 const RESAMPLES: usize = 10_000;
 
-/// A rate with its count and its 95 % interval.
+/// A success rate with its 95 % interval.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rate {
     /// Successes over `n`.
@@ -44,7 +43,7 @@ impl Rate {
         let centre = rate + Z * Z / (2.0 * count);
         let scale = 1.0 + Z * Z / count;
 
-        // At 0 and n the ends are exact; computed, they would be off by rounding.
+        // Exact bounds at 0 and n, without rounding errors.
         let low = if successes == 0 {
             0.0
         } else {
@@ -65,7 +64,7 @@ impl Rate {
     }
 }
 
-/// The median; of an even count, the mean of the two middle values. NaN without values.
+/// The median; for an even count, the mean of the two middle values. NaN without values.
 pub fn median(values: &[f64]) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -76,7 +75,7 @@ pub fn median(values: &[f64]) -> f64 {
     }
 }
 
-/// The value at a `share` of the sorted values, 0 to 1, by the nearest rank. `None` without values.
+/// The quantile at `share`, 0 to 1, by the nearest rank. `None` without values.
 pub fn quantile(values: &[f64], share: f64) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -96,7 +95,7 @@ pub fn root_mean_square(values: &[f64]) -> f64 {
     (squares / values.len() as f64).sqrt()
 }
 
-/// The arithmetic mean of the values that are not NaN; NaN if none is left.
+/// The arithmetic mean of the values that are not NaN; NaN if there are none.
 pub fn mean_of_known(values: &[f64]) -> f64 {
     let known: Vec<f64> = values.iter().copied().filter(|x| !x.is_nan()).collect();
     mean(&known)
@@ -138,7 +137,7 @@ pub struct RoomMean {
     pub rooms: usize,
 }
 
-/// The mean of one value per room, with a percentile bootstrap over the rooms; NaN without values.
+/// Mean of one value per room, with a percentile bootstrap over the rooms; NaN without values.
 pub fn bootstrap_mean(values: &[f64], seed: u64) -> RoomMean {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut means: Vec<f64> = (0..RESAMPLES)
@@ -159,8 +158,8 @@ pub fn bootstrap_mean(values: &[f64], seed: u64) -> RoomMean {
     }
 }
 
-/// The mean of the differences `ours − theirs`, paired room by room: both lists hold the same rooms
-/// in the same order.
+/// Mean of the differences `ours − theirs`, paired by room: both lists have the same rooms in the
+/// same order.
 pub fn paired_difference(ours: &[f64], theirs: &[f64], seed: u64) -> RoomMean {
     let differences: Vec<f64> = ours.iter().zip(theirs).map(|(a, b)| a - b).collect();
     bootstrap_mean(&differences, seed)
@@ -177,9 +176,9 @@ pub struct RecordedMedian {
     pub high: f64,
 }
 
-/// The median of values in the order of a recording, with a percentile bootstrap over at most
-/// twenty contiguous blocks, equally long but for the last, since values of neighbouring frames are
-/// alike; NaN without values.
+/// Median of values in recording order, with a percentile bootstrap over at most 20 contiguous
+/// blocks of equal length (the last may be shorter), because values of neighboring frames are
+/// correlated. NaN without values.
 pub fn median_of_recording(values: &[f64], seed: u64) -> RecordedMedian {
     const BLOCKS: usize = 20;
     const MEDIANS: usize = 2_000;
@@ -218,9 +217,9 @@ pub fn median_of_recording(values: &[f64], seed: u64) -> RecordedMedian {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand. Of ten blocks of zeros and ten of ones a draw has more of the one or of the
-    /// other about as often, so that the interval is [0, 1]. Blocks within which 0 and 1 alternate
-    /// are all alike: whatever is drawn, the median is a half.
+    /// Oracle: by hand. From ten blocks of zeros and ten of ones, resamples have a majority of
+    /// either with equal probability, so the interval is [0, 1]. If 0 and 1 alternate within the
+    /// blocks, every resample has the median 0.5.
     #[test]
     fn medians_of_a_recording_are_resampled_by_blocks() {
         let stays: Vec<f64> = (0..1_000).map(|i| f64::from(i / 500)).collect();
@@ -255,7 +254,7 @@ mod tests {
         assert_eq!(median(&[4.0, 1.0, 2.0, 3.0]), 2.5);
     }
 
-    /// Oracle: NumPy's `quantile(method="nearest")` of 0, 1, …, 10 at .97, .02 and .5.
+    /// Oracle: NumPy's `quantile(method="nearest")` of 0, 1, …, 10 at 0.97, 0.02 and 0.5.
     #[test]
     fn quantiles_are_of_the_nearest_rank() {
         let values: Vec<f64> = (0..11).rev().map(f64::from).collect();
@@ -265,8 +264,7 @@ mod tests {
         assert_eq!(quantile(&[], 0.5), None);
     }
 
-    /// Oracle: the normal approximation, mean ± 1.96 standard errors, which is near for a hundred
-    /// even values.
+    /// Oracle: the normal approximation, mean ± 1.96 standard errors, for 100 evenly spaced values.
     #[test]
     fn the_bootstrap_interval_is_near_the_normal_one() {
         let values: Vec<f64> = (0..100).map(|i| f64::from(i) / 99.0).collect();
@@ -280,8 +278,8 @@ mod tests {
         );
     }
 
-    /// Oracle: by hand. A difference that is the same in every room has no spread, however the
-    /// rooms differ.
+    /// Oracle: by hand. A constant difference has an interval of width zero, even if the rooms
+    /// differ.
     #[test]
     fn differences_are_paired_by_room() {
         let found = paired_difference(&[0.9, 0.5, 0.1], &[0.8, 0.4, 0.0], 1);

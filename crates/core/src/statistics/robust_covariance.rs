@@ -4,20 +4,21 @@ use nalgebra::{Matrix6, Vector6};
 
 use super::balancing_factor;
 
-/// Degrees of freedom of the Student's t that shapes are fitted with.
+/// Degrees of freedom of the fitted Student's t distribution.
 const DEGREES_OF_FREEDOM: f64 = 4.0;
-/// Components of an error.
+/// Number of components of an error.
 const DIMENSIONS: f64 = 6.0;
-/// Reweighting steps of the fit; it converges linearly, and thirty leave no visible change.
+/// Number of reweighting steps; the fit converges linearly, and after 30 steps changes are
+/// negligible.
 const ITERATIONS: usize = 30;
 
-/// The covariance of errors: the shape of a Student's t, fitted by reweighting, times the factor
-/// that balances the shares of errors inside the 68 % and the 95 % ellipsoid. None when the errors do
-/// not span six dimensions.
+/// Robust covariance of errors: the shape of a Student's t, fitted by iterative reweighting, times
+/// the [`balancing_factor`] of the 68 % and 95 % ellipsoids. `None` when the errors do not span six
+/// dimensions.
 pub fn robust_covariance(residuals: &[Vector6<f64>]) -> Option<Matrix6<f64>> {
     let mut shape = weighted_moment(residuals, |_| 1.0);
     for _ in 0..ITERATIONS {
-        // An error far out in the tail gets a small weight; the t's own likelihood says how small.
+        // Weights of the maximum-likelihood fit of a t distribution: small in the tails.
         let inverse = shape.cholesky()?.inverse();
         shape = weighted_moment(residuals, |residual| {
             let squared_length = residual.dot(&(inverse * residual));
@@ -54,8 +55,7 @@ mod tests {
     use super::super::normal_deviates;
     use super::*;
 
-    /// Oracle: the definition of a covariance: of normal errors it is their own, and both shares
-    /// are near what is wanted.
+    /// Oracle: the definition: for normal errors, the result is their covariance.
     #[test]
     fn the_shape_of_normal_errors_is_theirs() {
         let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(4);

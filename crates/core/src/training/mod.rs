@@ -1,4 +1,4 @@
-//! Training: from the features and poses of rooms to an adapter and its scores.
+//! Training: features and poses of rooms in, an adapter and its scores out.
 
 use ndarray::{Array2, ArrayView2, s};
 
@@ -33,17 +33,17 @@ pub enum Error {
         features: String,
         rows: usize,
     },
-    #[error("features '{features}' of rooms '{first}' and '{room}' were not encoded alike")]
+    #[error("features '{features}' of rooms '{first}' and '{room}' come from different sources")]
     UnlikeFeatures {
         features: String,
         first: RoomId,
         room: RoomId,
     },
     #[error(
-        "alternatives need one chart, mean squared error and unscaled features; take a paper preset"
+        "alternative formulations need one chart, mean squared error and unscaled features; use a paper preset"
     )]
     NotPlain,
-    #[error("no room was given to train on")]
+    #[error("training needs at least one room")]
     NoRoom,
     #[error("{what} must be {least} to {most}, got {given}")]
     Setting {
@@ -60,38 +60,38 @@ pub enum Error {
     },
 }
 
-/// The largest number of epochs.
+/// Maximum number of epochs.
 pub const MAX_EPOCHS: usize = 100_000;
-/// The largest number of columns of a chart's latent.
+/// Maximum number of columns of a chart's latent.
 pub const MAX_LATENT_DIM: usize = 4_096;
-/// The most pairs in one step.
+/// Maximum number of pairs per optimizer step.
 const MAX_BATCH: usize = 1 << 20;
 /// Epochs of a corrector; the paper does not state them.
 pub const CORRECTOR_EPOCHS: usize = 200;
 
-/// What decides the numbers of a training run, besides its rooms.
+/// All settings of a training run except its rooms.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingPlan {
     /// The preset that the settings started from.
     pub preset: Preset,
-    /// How frames are split into training and test.
+    /// Split of the frames into training and test.
     pub split: Split,
     /// Frames from source to target in the test pairs.
     pub stride: u32,
-    /// Which training pairs are used.
+    /// Selection of the training pairs.
     pub pairs: PairPlan,
-    /// The optimiser's settings, and the seed of the weights, of the order of pairs, and of drawn
-    /// pairs.
+    /// Optimizer settings, and the seed of the weights, the order of pairs and the sampled pairs.
     pub config: TrainConfig,
-    /// The fewest optimiser steps: where the epochs of `config` are fewer, there are more of them.
+    /// Minimum number of optimizer steps; epochs are added to those of `config` until it is
+    /// reached.
     pub least_steps: usize,
-    /// Correctors to train after the adapter for [`CORRECTOR_EPOCHS`] epochs, by mean squared error
-    /// on its latents, with the adapter's learning rate, weight decay, batch size and seed.
+    /// Correctors to train after the adapter: [`CORRECTOR_EPOCHS`] epochs of mean squared error on
+    /// its latents, with the other optimizer settings and the seed of `config`.
     pub correctors: Vec<CorrectorKind>,
 }
 
 impl TrainingPlan {
-    /// A preset's own pairs and settings, without correctors.
+    /// The pairs and settings of a preset, without correctors.
     pub fn of(preset: Preset, split: Split, stride: u32, seed: u64) -> Self {
         let pairs = preset.plan(stride);
         let config = preset.config(seed);
@@ -115,7 +115,8 @@ impl TrainingPlan {
         plan
     }
 
-    /// The optimiser's settings for so many pairs: with the epochs that the fewest steps take.
+    /// Optimizer settings for `pair_count` pairs, with enough epochs for the minimum number of
+    /// steps.
     pub fn config_for(&self, pair_count: usize) -> TrainConfig {
         let batches = pair_count.div_ceil(self.config.batch.max(1)).max(1);
         TrainConfig {
@@ -124,11 +125,11 @@ impl TrainingPlan {
         }
     }
 
-    /// Checks that the settings are in range and fit together.
+    /// Validates the settings.
     ///
     /// # Errors
     /// [`Error::Setting`] or [`Error::Rate`] for a number out of range, [`Error::Adapter`] for a
-    /// corrector given twice and for z-scored features under a gate.
+    /// duplicate corrector and for z-scored features with a gate.
     pub fn check(&self) -> Result<(), Error> {
         self.check_counts()?;
         self.check_rates()?;
@@ -175,7 +176,7 @@ impl TrainingPlan {
         Ok(())
     }
 
-    /// A NaN or an infinity would otherwise come to light only in the training.
+    /// Otherwise NaN or infinity would only be detected during training.
     fn check_rates(&self) -> Result<(), Error> {
         let config = &self.config;
         let is_positive = |value: f64| value.is_finite() && value > 0.0;
@@ -211,7 +212,7 @@ impl TrainingPlan {
     }
 }
 
-/// A room to train or evaluate on, with one of its feature sets.
+/// A room for training or evaluation, with one of its feature sets.
 #[derive(Debug, Clone, Copy)]
 pub struct RoomData<'a> {
     /// The room: its frames and their poses.
@@ -222,11 +223,11 @@ pub struct RoomData<'a> {
     pub features: &'a Features,
 }
 
-/// Trains one adapter on all rooms together, and scores it on each room's test pairs.
+/// Trains one adapter on all rooms and scores it on each room's test pairs.
 ///
 /// # Errors
-/// [`Error`] when there is no room, a room is too short for the split, the rooms' features do not
-/// fit together, a setting is out of range, or training diverges.
+/// [`Error`] when there is no room, a room is too short for the split, the features of the rooms
+/// differ in source, a setting is out of range, or training diverges.
 ///
 /// Source: SeeSE3, M4 (Eq. 3, Sec. A.2); cross-room training Sec. A.10.
 pub fn train_adapter(
@@ -237,7 +238,7 @@ pub fn train_adapter(
     plan.check()?;
     check_rooms(room_data)?;
 
-    // Test pairs are taken before training, so that a room that is too short is refused at once.
+    // Test pairs are selected before training, so that a room that is too short fails early.
     let tests = test_pairs(room_data, plan)?;
     let samples = samples(room_data, plan)?;
     let trained_with = plan.config_for(samples.pair_count());
@@ -250,7 +251,7 @@ pub fn train_adapter(
 
     let mut correctors = Vec::with_capacity(plan.correctors.len());
 
-    // Correctors differ from the adapter in their epochs alone.
+    // Only the number of epochs differs from the adapter's settings.
     let config = TrainConfig {
         epochs: CORRECTOR_EPOCHS,
         ..plan.config.clone()
@@ -270,7 +271,7 @@ pub fn train_adapter(
     let mut room_tests = Vec::with_capacity(room_data.len());
     let mut train_mean_r2 = Vec::with_capacity(room_data.len());
 
-    // Every room is scored by itself: in the mean, rooms count alike, not pairs.
+    // Each room is scored separately: in the mean, rooms have equal weight, not pairs.
     for (data, pairs) in room_data.iter().zip(&tests) {
         let truth = motions(data.room.poses(), pairs);
         room_tests.push(MotionScores::of(
@@ -278,7 +279,7 @@ pub fn train_adapter(
             &predictions(&adapter, data.features.rows(), pairs)?,
         ));
 
-        // The baseline: R² of predicting the mean training motion μ for every test pair.
+        // Baseline: R² of predicting the mean training motion μ for every test pair.
         train_mean_r2.push(constant_r2(&truth, &samples.scale().mean));
     }
 
@@ -303,16 +304,16 @@ pub fn train_adapter(
     Ok((adapter, record))
 }
 
-/// The training pairs of the rooms, with the features of all rooms stacked below one another.
+/// Training pairs of the rooms, with the features of all rooms stacked.
 ///
 /// # Errors
-/// [`Error::Pairs`] when the plan gives no pair of some room, [`Error::Adapter`] when the pairs do
-/// not differ in their motions.
+/// [`Error::Pairs`] when a room has no training pair under the plan, [`Error::Adapter`] when all
+/// pairs have the same motion.
 pub fn samples(room_data: &[RoomData<'_>], plan: &TrainingPlan) -> Result<Samples<f32>, Error> {
     let timelines: Vec<_> = room_data.iter().map(|data| data.room.timeline()).collect();
     let drawn = plan.pairs.pairs(plan.split, &timelines, plan.config.seed)?;
 
-    // The frames of all rooms stand one below the other; each room begins at its first row.
+    // The rooms are stacked; `first_rows` holds the first row of each room.
     let mut first_rows = Vec::with_capacity(room_data.len());
     let mut count = 0;
     for data in room_data {
@@ -333,7 +334,7 @@ pub fn samples(room_data: &[RoomData<'_>], plan: &TrainingPlan) -> Result<Sample
         poses.extend_from_slice(data.room.poses());
     }
 
-    // Pairs number frames within a room; samples number rows of the stack.
+    // Pairs index frames of a room; samples index rows of the stack.
     let rows = |(room, pair): (usize, Pair)| {
         [pair.source, pair.target].map(|frame| first_rows[room] + frame.row())
     };
@@ -343,8 +344,8 @@ pub fn samples(room_data: &[RoomData<'_>], plan: &TrainingPlan) -> Result<Sample
         drawn.into_iter().map(rows).collect(),
     )?;
 
-    // Around zero, σ is the root mean square, and zero motion leaves the latent where it is, in
-    // every reading.
+    // With μ = 0 and σ the root mean square, zero motion leaves the latent unchanged in every
+    // reading.
     Ok(if plan.config.through_zero {
         samples.through_zero()?
     } else {
@@ -352,7 +353,7 @@ pub fn samples(room_data: &[RoomData<'_>], plan: &TrainingPlan) -> Result<Sample
     })
 }
 
-/// The test pairs of each room; empty under [`Split::Whole`], which keeps no pairs for testing.
+/// Test pairs of each room; empty under [`Split::Whole`], which holds out no pairs.
 pub fn test_pairs(
     room_data: &[RoomData<'_>],
     plan: &TrainingPlan,
@@ -364,7 +365,7 @@ pub fn test_pairs(
 
         let pairs = plan.split.test_pairs(data.room.timeline(), plan.stride);
 
-        // With several rooms, the error has to name the one without test pairs.
+        // With several rooms, the error names the room without test pairs.
         pairs.map_err(|problem| match room_data.len() {
             1 => Error::Pairs(problem),
             _ => Error::RoomPairs {
@@ -377,7 +378,7 @@ pub fn test_pairs(
     room_data.iter().map(of).collect()
 }
 
-/// Refuses rooms whose features do not fit their frames, or one another.
+/// Checks that every room has one feature row per frame and that all features have the same source.
 ///
 /// # Errors
 /// [`Error::NoRoom`], [`Error::FeatureRows`] or [`Error::UnlikeFeatures`].
@@ -396,7 +397,7 @@ pub fn check_rooms(room_data: &[RoomData<'_>]) -> Result<(), Error> {
             });
         }
 
-        // One adapter can only be trained on features of one encoder, layer and pooling.
+        // An adapter is trained on features of a single encoder, layer and pooling.
         let source = first.features.source();
         let own = data.features.source();
         if !own.is_like(source) || own.dim != source.dim {
@@ -414,7 +415,7 @@ pub fn check_rooms(room_data: &[RoomData<'_>]) -> Result<(), Error> {
     Ok(())
 }
 
-/// The true motions of pairs, each in the body frame of its source camera.
+/// True motions of pairs, in the body frame of the source camera.
 pub fn motions(poses: &[Pose], pairs: &[Pair]) -> Vec<Twist> {
     pairs
         .iter()
@@ -422,7 +423,7 @@ pub fn motions(poses: &[Pose], pairs: &[Pair]) -> Vec<Twist> {
         .collect()
 }
 
-/// The motions that an adapter predicts for pairs from the features of their two frames.
+/// Predicted motions of pairs, from the features of their two frames.
 ///
 /// # Errors
 /// As [`Adapter::embed`].

@@ -5,25 +5,25 @@ use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use super::{Error, Trajectory};
 use crate::geometry::Pose;
 
-/// How an estimated trajectory is aligned with the reference before the two are compared.
+/// Alignment of an estimated trajectory with the reference before the comparison.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Alignment {
-    /// No alignment: both trajectories are in the same world frame.
+    /// None: both trajectories are in the same world frame.
     None,
-    /// The first poses are made equal.
+    /// Makes the first poses equal.
     Origin,
-    /// The rotation and translation that bring the positions nearest. Orientations do not enter, so
-    /// they may keep a constant offset.
+    /// Least-squares rotation and translation of the positions. Orientations are ignored and may
+    /// keep a constant offset.
     Se3,
-    /// As [`Alignment::Se3`], with a scale as well.
+    /// [`Alignment::Se3`] with a scale.
     Sim3,
 }
 
 impl Alignment {
-    /// Every alignment.
+    /// All alignments.
     pub const ALL: [Self; 4] = [Self::None, Self::Origin, Self::Se3, Self::Sim3];
 
-    /// Its name.
+    /// Name.
     pub fn name(self) -> &'static str {
         match self {
             Self::None => "none",
@@ -37,8 +37,8 @@ impl Alignment {
     /// of the other.
     ///
     /// # Errors
-    /// [`Error::Unequal`] when the lengths differ and [`Error::Degenerate`] when the positions lie
-    /// on a line, both under [`Alignment::Se3`] and [`Alignment::Sim3`] only.
+    /// Only for [`Alignment::Se3`] and [`Alignment::Sim3`]: [`Error::Unequal`] when the lengths
+    /// differ, [`Error::Degenerate`] when the positions lie on a line.
     pub fn apply(self, reference: &Trajectory, estimate: &Trajectory) -> Result<Trajectory, Error> {
         let similarity = match self {
             Self::None => return Ok(estimate.clone()),
@@ -68,18 +68,17 @@ impl Alignment {
     }
 }
 
-/// A scale about the origin, then a rigid motion.
+/// A similarity: a scale about the origin, then a rigid motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Similarity {
-    /// Dimensionless.
+    /// Scale, dimensionless.
     pub scale: f64,
-    /// Takes scaled coordinates of the estimate's world to the reference's.
+    /// Maps scaled coordinates of the estimate's world to the reference's.
     pub reference_from_estimate: Pose,
 }
 
 impl Similarity {
-    /// The similarity that minimises the sum of squared distances between the positions of the
-    /// estimate and those of the reference.
+    /// Least-squares similarity from the positions of the estimate to those of the reference.
     ///
     /// # Errors
     /// [`Error::Unequal`] when the lengths differ; [`Error::Degenerate`] when the positions lie on
@@ -124,8 +123,8 @@ impl Similarity {
         let svd = covariance.svd(true, true);
         let degenerate = Error::Degenerate { have: count };
 
-        // Rank below 2 leaves the rotation about a line undetermined. The tolerance is that of
-        // numpy.linalg.matrix_rank, which evo uses.
+        // With a rank below 2, the rotation about the line is undetermined. The tolerance is that
+        // of numpy.linalg.matrix_rank, as in evo.
         let least = svd.singular_values.max() * 3.0 * f64::EPSILON;
         if svd
             .singular_values
@@ -141,8 +140,8 @@ impl Similarity {
             return Err(degenerate);
         };
 
-        // S is the identity, unless U Vᵀ would be a reflection: then the direction of the smallest
-        // singular value is flipped.
+        // S is the identity. If U Vᵀ is a reflection, the direction of the smallest singular value
+        // is flipped.
         let mut signs = Vector3::repeat(1.0);
         if u.determinant() * v_t.determinant() < 0.0 {
             signs[svd.singular_values.imin()] = -1.0;

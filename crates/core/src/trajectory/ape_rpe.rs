@@ -6,22 +6,22 @@ use super::{Error, Trajectory};
 use crate::geometry::{Pose, PoseError};
 use crate::statistics::{mean, median};
 
-/// Which part of a pose error is measured.
+/// Measure of a pose error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Relation {
-    /// The distance, metres.
+    /// The distance, meters.
     Translation,
     /// The angle, radians.
     Rotation,
-    /// The Frobenius norm of the matrix E − I, which mixes metres and rotation.
+    /// The Frobenius norm of the matrix E − I, which mixes meters and rotation.
     Full,
 }
 
 impl Relation {
-    /// Every relation.
+    /// All relations.
     pub const ALL: [Self; 3] = [Self::Translation, Self::Rotation, Self::Full];
 
-    /// Its name.
+    /// Name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Translation => "translation",
@@ -30,7 +30,7 @@ impl Relation {
         }
     }
 
-    /// The measure of an error E.
+    /// The measure of a pose error E.
     fn of(self, error: &Pose) -> f64 {
         let parts = PoseError::between(&Pose::identity(), error);
         match self {
@@ -41,16 +41,16 @@ impl Relation {
     }
 }
 
-/// Which pairs of poses a relative error is computed over.
+/// Pairs of poses for relative errors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RpePairs {
     /// Consecutive intervals: 0 to Δ, Δ to 2Δ, ...
     Consecutive,
-    /// Every two poses that are Δ apart.
+    /// All pairs of poses that are Δ apart.
     All,
 }
 
-/// The absolute pose errors, one per pose: E = est⁻¹ ref, both `world_from_camera`.
+/// Absolute pose errors (APE), one per pose: E = est⁻¹ ref, both `world_from_camera`.
 ///
 /// # Errors
 /// [`Error::Unequal`] when the lengths differ.
@@ -69,12 +69,12 @@ pub fn ape(
         .collect())
 }
 
-/// The relative pose errors, E = (ref_i⁻¹ ref_j)⁻¹ (est_i⁻¹ est_j) with j = i + Δ, of the motions
-/// over `delta` poses.
+/// Relative pose errors (RPE): E = (ref_i⁻¹ ref_j)⁻¹ (est_i⁻¹ est_j) with j = i + Δ, Δ = `delta`
+/// poses.
 ///
 /// # Errors
-/// [`Error::Unequal`] when the lengths differ; [`Error::NoPairs`] when `delta` is 0 or the
-/// trajectories are not longer than it.
+/// [`Error::Unequal`] when the lengths differ; [`Error::NoPairs`] when `delta` is 0 or not below
+/// the number of poses.
 ///
 /// Source: evo's `RPE`.
 pub fn rpe(
@@ -135,8 +135,8 @@ pub struct Statistics {
 }
 
 impl Statistics {
-    /// The statistics of `errors`. Of an empty slice the count and the sum of squares are 0, and
-    /// everything else is NaN.
+    /// Statistics of `errors`. For an empty slice, the count and the sum of squares are 0 and all
+    /// others NaN.
     pub fn of(errors: &[f64]) -> Self {
         let count = errors.len();
         let sum_of_squares = errors.iter().map(|x| x * x).sum::<f64>();
@@ -147,8 +147,7 @@ impl Statistics {
             .sum::<f64>()
             / count as f64;
 
-        // The extremes of an empty slice would be ±∞; adding NaN makes them NaN like the other
-        // figures.
+        // For an empty slice the extremes would be ±∞; adding NaN makes them NaN.
         let none = if count == 0 { f64::NAN } else { 0.0 };
         Self {
             rmse: (sum_of_squares / count as f64).sqrt(),

@@ -2,7 +2,7 @@
 
 use super::{Error, Trajectory};
 
-/// Matched poses: entry i of one list belongs to entry i of the other.
+/// Matched poses: entries i of both lists are a match.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Matches {
     /// Indices into the reference.
@@ -11,12 +11,12 @@ pub struct Matches {
     pub estimate: Vec<usize>,
 }
 
-/// Matches each pose of the shorter trajectory with the pose of the longer one that is nearest in
-/// time, if it is at most `max_difference_ns` away; of two equally near, the earlier. If both are
-/// equally long, the reference counts as the longer.
+/// Matches each pose of the shorter trajectory with the nearest pose in time of the longer one, if
+/// at most `max_difference_ns` away. Ties go to the earlier pose. At equal lengths, the reference
+/// counts as the longer.
 ///
 /// # Errors
-/// [`Error::NothingMatches`] when no two poses are near enough in time.
+/// [`Error::NothingMatches`] when there is no match.
 ///
 /// Source: evo's `associate_trajectories`.
 pub fn associate(
@@ -51,7 +51,7 @@ pub fn associate(
         return Err(Error::NothingMatches { max_difference_ns });
     }
 
-    // Back from shorter and longer to reference and estimate.
+    // Convert from shorter and longer to reference and estimate.
     let (reference, estimate) = if estimate_is_longer {
         (of_short, of_long)
     } else {

@@ -16,7 +16,7 @@ use crate::geometry::Pose;
 pub struct Trajectory {
     /// Nanoseconds, ascending.
     pub times_ns: Vec<i64>,
-    /// `world_from_camera`, metres, one per time.
+    /// `world_from_camera`, meters, one per time.
     pub poses: Vec<Pose>,
 }
 
@@ -45,12 +45,12 @@ impl Trajectory {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
-    #[error("the paths have {reference} and {estimate} poses; associate them first")]
+    #[error("the trajectories have {reference} and {estimate} poses; associate them first")]
     Unequal { reference: usize, estimate: usize },
-    #[error("no pose of one path is within {} ms of one of the other", *max_difference_ns as f64 * 1e-6)]
+    #[error("no two poses of the trajectories are within {} ms", *max_difference_ns as f64 * 1e-6)]
     NothingMatches { max_difference_ns: u64 },
     #[error("the {have} poses cannot be aligned: their positions must span at least a plane")]
     Degenerate { have: usize },
-    #[error("{have} poses have no pair {delta} apart")]
+    #[error("{have} poses contain no pair {delta} apart")]
     NoPairs { have: usize, delta: usize },
 }
