@@ -1,35 +1,35 @@
-//! How an image moved between two views: the similarity that lays one view over the next.
+//! Image motion between two views: the similarity transform that aligns one view with the next.
 //!
-//! Where things go in an image tells how the camera turned and moved, up to the unknown distance of
-//! the things. One similarity (a shift, a turn, a growth) for the whole image is coarse: a scene
-//! has depth, and its near parts move further. It needs no model and no camera, and it is enough to
-//! tell whether poses follow their images ([`crate::pose_check`]).
+//! Image motion depends on the camera's rotation and translation and on the unknown scene depth.
+//! One similarity (shift, turn, growth) for the whole image is coarse: near parts of a scene move
+//! further. But it needs no model and no intrinsics, and suffices to check whether poses match
+//! their images ([`crate::pose_check`]).
 //!
-//! The alignment is that of Lucas and Kanade: Gauss-Newton on the difference of brightness, from a
-//! coarse image to a fine one.
+//! The alignment is Lucas-Kanade: Gauss-Newton on brightness differences, coarse to fine.
 
 use nalgebra::{Matrix4, Vector2, Vector4};
 
 use seese3_core::image::RgbImage;
 
-/// The width to which images are reduced, pixels. A wider image tells hardly more.
+/// Maximum width of reduced images, pixels. Wider images hardly improve the alignment.
 const WIDTH: usize = 160;
-/// Images with a shorter side than this, pixels, show too little.
+/// Minimum shorter side of a reduced image, pixels.
 const LEAST_SIDE: usize = 32;
-/// Sizes in which images are laid over one another; each has half the width of the one after it.
+/// Number of pyramid levels. Each level halves the width of the previous one.
 const LEVELS: usize = 3;
 const STEPS_PER_LEVEL: usize = 12;
-/// A level is done when a step shifts by less than this, pixels.
+/// A level has converged when a step shifts by less than this, pixels.
 const SMALL_STEP_PX: f64 = 0.02;
-/// The images have to overlap by this share.
+/// Minimum overlap, as a fraction of the first image.
 const LEAST_OVERLAP: f64 = 0.3;
-/// Differences of brightness beyond this many standard deviations count for less and less: things
-/// that are hidden in one of the images, or that moved.
+/// Scale of the Cauchy weight of brightness differences, in standard deviations. It reduces the
+/// influence of occluded and moving objects.
 const ROBUST_DEVIATIONS: f64 = 0.5;
-/// Turn and growth are held back by this, per pixel, so that an image without texture stays.
+/// Damping of turn and growth in a Gauss-Newton step, per pixel. Without texture, they stay
+/// unchanged.
 const HELD_BACK: f64 = 1e-3;
 
-/// A brightness image, reduced to a small size.
+/// A grayscale image, reduced to a small size.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SmallImage {
     width: usize,
@@ -38,28 +38,28 @@ pub struct SmallImage {
     brightness: Vec<f64>,
 }
 
-/// Where the contents of an image went in the next one.
+/// The motion of an image's content from one image to the next.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ImageMotion {
-    /// The shift of the middle, right and down, image widths.
+    /// Shift of the image center, right and down, image widths.
     pub shift: Vector2<f64>,
-    /// The turn about the middle from right to down, which looks clockwise, radians.
+    /// Rotation about the image center, from right to down (clockwise), radians.
     pub turn: f64,
-    /// The growth: 0.1 means that things look a tenth larger.
+    /// Relative growth: 0.1 means that content looks 10 % larger.
     pub growth: f64,
 }
 
-/// A motion, and how well it explains the next image.
+/// An estimated image motion and its quality.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Alignment {
-    /// Where the contents went.
+    /// The estimated motion.
     pub motion: ImageMotion,
-    /// The correlation of the brightness where both images overlap, -1 to 1.
+    /// The correlation of brightness in the overlap, -1 to 1.
     pub correlation: f64,
 }
 
 impl SmallImage {
-    /// The image with its pixels averaged; `None` if it is too small to tell anything.
+    /// Reduces an image by averaging pixels; `None` if it is too small to align.
     pub fn of(image: &RgbImage) -> Option<Self> {
         let width = image.width.min(WIDTH);
         let height = image.height * width / image.width.max(1);
@@ -86,7 +86,7 @@ impl SmallImage {
         })
     }
 
-    /// The brightness of a pixel; outside of the image, that of the nearest one inside.
+    /// The brightness of a pixel; outside the image, of the nearest pixel inside.
     fn at(&self, x: isize, y: isize) -> f64 {
         let column = x.clamp(0, self.width as isize - 1) as usize;
         let row = y.clamp(0, self.height as isize - 1) as usize;
@@ -128,14 +128,14 @@ impl SmallImage {
         }
     }
 
-    /// Brightness, and its slope to the right and down, between the pixels.
+    /// Brightness and its gradient (right, down) at a sub-pixel position, bilinearly interpolated.
     fn sample(&self, x: f64, y: f64) -> Sample {
         let column = (x.floor() as isize).min(self.width as isize - 2);
         let row = (y.floor() as isize).min(self.height as isize - 2);
         let right = x - column as f64;
         let down = y - row as f64;
 
-        // The slope at a pixel is that between its neighbours.
+        // The gradient at a pixel is the central difference.
         let slope_x = |x: isize, y: isize| (self.at(x + 1, y) - self.at(x - 1, y)) / 2.0;
         let slope_y = |x: isize, y: isize| (self.at(x, y + 1) - self.at(x, y - 1)) / 2.0;
         let between = |value: &dyn Fn(isize, isize) -> f64| {
@@ -156,28 +156,29 @@ struct Sample {
     slope: Vector2<f64>,
 }
 
-/// Brightness at the same thing in both images.
+/// A pixel of the first image with the second image's brightness at the warped position.
 struct Overlap {
-    /// From the middle of the first image, pixels.
+    /// Position relative to the center of the first image, pixels.
     place: Vector2<f64>,
     first: f64,
     second: Sample,
 }
 
-/// Lays `first` over `second`. `None` if the two do not overlap, or if one has no texture.
+/// Aligns `first` with `second`. `None` if their sizes differ, they overlap too little, or one has
+/// no texture.
 pub fn align(first: &SmallImage, second: &SmallImage) -> Option<Alignment> {
     if (first.width, first.height) != (second.width, second.height) {
         return None;
     }
 
-    // From the finest size to the coarsest.
+    // The pyramid, finest level first.
     let mut sizes = vec![[first.blurred(), second.blurred()]];
     while sizes.len() < LEVELS {
         let [first, second] = &sizes[sizes.len() - 1];
         sizes.push([first.halved().blurred(), second.halved().blurred()]);
     }
 
-    // Growth, turn, and the shift in pixels of the size at hand.
+    // Growth, turn, and the shift in pixels of the current level.
     let mut warp = Vector4::zeros();
     let mut correlation = 0.0;
     for [first, second] in sizes.iter().rev() {
@@ -198,7 +199,7 @@ pub fn align(first: &SmallImage, second: &SmallImage) -> Option<Alignment> {
     })
 }
 
-/// Improves a warp at one size. The correlation of the overlap that it ends with.
+/// Refines a warp at one level, and returns the final correlation of the overlap.
 fn refine(first: &SmallImage, second: &SmallImage, warp: &mut Vector4<f64>) -> Option<f64> {
     for _ in 0..STEPS_PER_LEVEL {
         let step = step(&overlap(first, second, warp)?)?;
@@ -214,7 +215,7 @@ fn refine(first: &SmallImage, second: &SmallImage, warp: &mut Vector4<f64>) -> O
     Some(products.sum::<f64>() / overlap.len() as f64)
 }
 
-/// What both images show under a warp.
+/// The pixels that both images show under a warp; `None` if they are too few.
 fn overlap(first: &SmallImage, second: &SmallImage, warp: &Vector4<f64>) -> Option<Vec<Overlap>> {
     let last = Vector2::new(first.width as f64 - 1.0, first.height as f64 - 1.0);
     let middle = last / 2.0;
@@ -243,7 +244,8 @@ fn overlap(first: &SmallImage, second: &SmallImage, warp: &Vector4<f64>) -> Opti
     is_enough.then_some(overlap)
 }
 
-/// The brightness of both, with mean 0 and standard deviation 1, so that exposure does not count.
+/// The brightness of both images, standardized to mean 0 and deviation 1 to cancel exposure. `None`
+/// if one of them is uniform.
 fn standardised(overlap: &[Overlap]) -> Option<[Vec<f64>; 2]> {
     let values = [
         overlap.iter().map(|both| both.first).collect(),
@@ -268,14 +270,14 @@ fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
     (mean, variance.sqrt())
 }
 
-/// One step of Gauss and Newton: what is to be added to the warp.
+/// One Gauss-Newton step, to be added to the warp.
 fn step(overlap: &[Overlap]) -> Option<Vector4<f64>> {
     let [first, second] = standardised(overlap)?;
     let brightness: Vec<f64> = overlap.iter().map(|both| both.second.brightness).collect();
     let (_, deviation) = mean_and_deviation(&brightness);
 
-    // How the standardised brightness of the second image changes with growth, turn and shift. The
-    // mean is taken off as it is from the brightness.
+    // The Jacobian of the second image's standardized brightness by growth, turn and shift. Its
+    // mean is subtracted, as from the brightness.
     let slopes = overlap.iter().map(|both| {
         let slope = both.second.slope / deviation;
         let across = Vector2::new(-both.place.y, both.place.x);
@@ -304,7 +306,7 @@ fn step(overlap: &[Overlap]) -> Option<Vector4<f64>> {
 mod tests {
     use super::*;
 
-    /// A texture of waves, seen through a similarity: what is at `place` in the plain image is at
+    /// A wave texture, warped by a similarity: the content at `place` in the plain image is at
     /// (1 + growth) · turned `place` + shift in this one. Lengths in pixels of an image 160 wide.
     fn image(growth: f64, turn: f64, shift: [f64; 2], exposure: f64) -> RgbImage {
         let (width, height) = (160, 120);
@@ -355,7 +357,7 @@ mod tests {
         }
     }
 
-    /// Oracle: the definition: nothing can be laid over what shows nothing, or has another size.
+    /// Oracle: the definition. An image without texture or of another size cannot be aligned.
     #[test]
     fn images_that_tell_nothing_are_not_aligned() {
         let textured = image(0.0, 0.0, [0.0, 0.0], 1.0);

@@ -1,4 +1,4 @@
-//! Recordings on disk to rooms and back, and a check of poses against images. Part of
+//! Import and export of recordings, and a check of poses against images. Part of
 //! [seese3](https://docs.rs/seese3).
 //!
 //! # The map
@@ -8,10 +8,10 @@
 //!
 //! | module | what |
 //! | --- | --- |
-//! | [`image_motion`] | how an image moved between two views |
-//! | [`pose_check`] | whether poses can be those of a recording's images |
-//! | [`datasets`] | recordings on disk to rooms |
-//! | [`export`] | paths and streams for other programs: TUM, KITTI, MCAP |
+//! | [`image_motion`] | estimates how an image moved between two views |
+//! | [`pose_check`] | checks whether poses match a recording's images |
+//! | [`datasets`] | reads recordings from disk |
+//! | [`export`] | writes trajectories and streams for other programs: TUM, KITTI, MCAP |
 
 pub mod export;
 pub mod image_motion;

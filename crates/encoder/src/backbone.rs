@@ -1,5 +1,5 @@
-//! The network that turns prepared images into the outputs of layers: one of the built-in ones, or
-//! an ONNX model in one of two runtimes.
+//! Backbones compute the outputs of layers from prepared images: built in, or an ONNX model in one
+//! of two runtimes.
 
 use seese3_core::Cause;
 use std::path::Path;
@@ -19,8 +19,7 @@ pub(super) enum Backbone {
     Model {
         runner: Box<dyn Runner>,
         kind: RuntimeKind,
-        /// The axis of the model's input along which the images of a clip lie; `None` for a model
-        /// of single images.
+        /// The clip axis of the model's input; `None` for a model of single images.
         clip_axis: Option<usize>,
     },
 }
@@ -34,7 +33,7 @@ impl Backbone {
     }
 }
 
-/// A model, its identity, and the size (width, height) of its images if that is fixed.
+/// A model, its identity, and the size (width, height) of its images if it is fixed.
 pub(super) type Opened = (Backbone, String, Option<(usize, usize)>);
 
 /// Opens a model after checking that its file has the layers, the clip length and the image size.
@@ -55,7 +54,7 @@ pub(super) fn open(
 
     let names: Vec<String> = layers.iter().map(|layer| layer.name.clone()).collect();
     if names.is_empty() {
-        return Err(wrong("no layer was asked for".into()));
+        return Err(wrong("no layer was requested".into()));
     }
 
     // A layer may be a declared output or any other value that the graph computes.
@@ -68,13 +67,13 @@ pub(super) fn open(
         }
 
         if names[..position].contains(name) {
-            return Err(wrong(format!("layer '{name}' was asked for twice").into()));
+            return Err(wrong(format!("layer '{name}' was requested twice").into()));
         }
     }
 
     let clip_axis = clip_axis(&model.input, window).map_err(|problem| wrong(problem.into()))?;
 
-    // A room is no multiple of such a batch, and a server's image is a batch of one.
+    // A room need not be a multiple of such a batch, and a server encodes batches of one image.
     if let Some(batch) = model.input[0].filter(|&batch| batch > 1) {
         return Err(wrong(format!(
             "takes batches of exactly {batch} images; export it with an example of one image, or with \
@@ -82,8 +81,8 @@ pub(super) fn open(
         ).into()));
     }
 
-    // The shape of the model's input. Axes that the file leaves open get the sizes of the prepared
-    // images and of the clips, because tract needs all but the first.
+    // The shape of the model's input. Dynamic axes get the sizes of the prepared images and of the
+    // clips, because tract needs all but the first.
     let mut shape = model.input.clone();
 
     if let (Some(wanted), Some(given)) = (model.image_size(), preparation.size())
@@ -155,12 +154,12 @@ fn runner(
     }
 }
 
-/// The axis along which a model's input counts the images of a clip. An input (batch, 3, height,
-/// width) has none; (batch, 3, clip, height, width) and (batch, clip, 3, height, width) have one.
+/// The clip axis of a model's input. An input (batch, 3, height, width) has none; (batch, 3, clip,
+/// height, width) and (batch, clip, 3, height, width) have one.
 fn clip_axis(input: &[Option<usize>], window: usize) -> Result<Option<usize>, String> {
     let colours = |axis: usize| matches!(input[axis], None | Some(3));
 
-    // With five axes, the one of size 3 is the channels and the other one before the height is the
+    // With five axes, the one of size 3 is the channels; the other one before the height is the
     // clip. `fixed` is the length of a clip, if the file states it.
     let (axis, fixed) = match input.len() {
         4 if colours(1) && window == 1 => return Ok(None),

@@ -1,9 +1,9 @@
-//! The built-in encoder without weights: histograms of gradient orientations, and coarse colour.
+//! The built-in encoder without weights: histograms of gradient orientations, and coarse color.
 //!
-//! It stands in for a real encoder, so that the whole pipeline can be shown without a model. The
-//! image is divided into 8×6 cells; each cell gives a histogram of 8 gradient orientations and its
-//! mean colour. A pixel votes for all neighbouring cells and orientations in proportion to how near
-//! they are, so that features change smoothly as the camera moves.
+//! It replaces a real encoder in demonstrations without a model. The image is divided into 8×6
+//! cells; each cell gives a histogram of 8 gradient orientations and its mean color. A pixel's vote
+//! is interpolated between neighboring cells and orientations, so that features change smoothly as
+//! the camera moves.
 
 use std::f32::consts::TAU;
 
@@ -73,8 +73,8 @@ pub fn encode_builtin(image: &RgbImage) -> Vec<f32> {
                 }
             }
 
-            // A central difference needs a neighbour on every side, so pixels at the border give
-            // their colour only.
+            // A central difference needs a neighbor on every side, so border pixels contribute only
+            // their color.
             if x == 0 || y == 0 || x + 1 == width || y + 1 == height {
                 continue;
             }
@@ -118,9 +118,8 @@ pub fn encode_builtin(image: &RgbImage) -> Vec<f32> {
 /// bilinear interpolation between the centres of the cells, and add up to 1.
 fn cells_of(x: usize, y: usize, width: usize, height: usize) -> [(usize, f32); 4] {
     let place = |pixel: usize, pixels: usize, cells: usize| {
-        // The pixel's centre in units of cells, counted from the centre
-        // of the first cell. It is clamped, so that a pixel outside the
-        // outermost centres counts for the outermost cell alone.
+        // The pixel's center in units of cells, relative to the center of the first cell. It is
+        // clamped, so that a pixel beyond the outermost centers counts only for the outermost cell.
         let at = ((pixel as f32 + 0.5) * cells as f32 / pixels as f32 - 0.5)
             .clamp(0.0, cells as f32 - 1.0);
         let low = (at.floor() as usize).min(cells - 1);
@@ -147,7 +146,7 @@ mod tests {
     use super::*;
 
     /// Oracle: by hand. Brightness that grows to the right has its gradient at angle 0, the first
-    /// orientation, in every cell, and none elsewhere.
+    /// orientation, in every cell; all other orientations are empty.
     #[test]
     fn a_ramp_votes_for_one_orientation() {
         let width = 64;
@@ -169,7 +168,7 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand. A uniform image has no gradient, and its own colour in every cell.
+    /// Oracle: by hand. A uniform image has no gradient, and its own color in every cell.
     #[test]
     fn a_uniform_image_is_its_colour() {
         let image = RgbImage {

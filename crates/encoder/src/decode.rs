@@ -1,7 +1,7 @@
 //! Decodes JPEG and PNG files to 8-bit RGB, within limits on their size.
 //!
-//! Images are turned upright as their EXIF orientation says, as every viewer shows them: a phone stores
-//! what its sensor saw, however it was held.
+//! Images are rotated upright by their EXIF orientation, as in every viewer: a phone stores the
+//! sensor's image, however it was held.
 
 use std::fs::File;
 use std::io::{Cursor, Read, Seek, SeekFrom};
@@ -39,11 +39,11 @@ const LONGEST_SIDE: usize = 16_384;
 const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];
 /// The code of the marker that begins the compressed pixels of a JPEG.
 const START_OF_SCAN: u8 = 0xda;
-/// The most bytes that may be allocated to read the header of a PNG: a colour profile in it is
-/// compressed, and may be a decompression bomb.
+/// Allocation limit for reading the header of a PNG, bytes. A color profile in it is compressed,
+/// and may be a decompression bomb.
 const HEADER_ALLOC: u64 = 16 << 20;
-/// The most bytes that are read to find an image's size. A header with a thumbnail and a colour
-/// profile is well below.
+/// Maximum number of bytes read to find an image's size. A header with a thumbnail and a color
+/// profile is much smaller.
 const HEADER_BYTES: u64 = 1 << 20;
 
 impl Bounds {
@@ -54,14 +54,14 @@ impl Bounds {
     };
 }
 
-/// Decodes a JPEG or PNG to 8-bit RGB. Alpha is dropped, grey is repeated in all three channels,
+/// Decodes a JPEG or PNG to 8-bit RGB. Alpha is dropped, gray is repeated in all three channels,
 /// and 16 bits are reduced to 8. `name` identifies the image in error messages.
 ///
 /// # Errors
-/// [`Error::BadImage`] if the format is another one, the file is incomplete or damaged, or the
-/// image is over `bounds`.
+/// [`Error::BadImage`] if the format is not JPEG or PNG, the file is incomplete or damaged, or the
+/// image exceeds `bounds`.
 pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Error> {
-    // Messages of the decoders may contain line breaks; an error of ours is one line.
+    // Messages of the decoders may contain line breaks; our errors are one line.
     let one_line = |problem: Cause| {
         problem
             .to_string()
@@ -121,7 +121,7 @@ pub fn decode(name: &str, bytes: &[u8], bounds: Bounds) -> Result<RgbImage, Erro
     Ok(upright(decoded.into_rgb8(), orientation))
 }
 
-/// Turns an image as its orientation says.
+/// Applies an EXIF orientation to an image.
 fn upright(image: image::RgbImage, orientation: Orientation) -> RgbImage {
     let mut image = DynamicImage::ImageRgb8(image);
     image.apply_orientation(orientation);
@@ -151,7 +151,7 @@ fn check_size(width: usize, height: usize, bounds: Bounds) -> Result<(), String>
     Ok(())
 }
 
-/// Decodes a JPEG strictly: a truncated image is an error and is not filled up with grey.
+/// Decodes a JPEG strictly: a truncated image is an error and is not filled with gray.
 fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
     let rest = after_header(bytes).unwrap_or_default();
     if !rest.windows(2).rev().any(|marker| marker == END_OF_IMAGE) {
@@ -182,11 +182,11 @@ fn decode_jpeg(bytes: &[u8], bounds: Bounds) -> Result<RgbImage, String> {
     Ok(upright(image, exif.unwrap_or(Orientation::NoTransforms)))
 }
 
-/// What follows the header of a JPEG: an end-of-image marker before it belongs to a thumbnail. None
-/// if the header does not end.
+/// The bytes after the header of a JPEG; `None` if the header is incomplete. An end-of-image marker
+/// within the header belongs to a thumbnail.
 fn after_header(bytes: &[u8]) -> Option<&[u8]> {
-    // A header is a list of segments: 0xff, a code, the length in two bytes, which it includes, and
-    // as much content. Only the start of the image, at the beginning, has no length.
+    // A header is a list of segments: 0xff, a code, a two-byte length that includes itself, and the
+    // content. Only the start-of-image marker, the first two bytes, has no length.
     let mut rest = bytes.get(2..)?;
     loop {
         let &[0xff, code, ..] = rest else {
@@ -241,8 +241,7 @@ pub fn read_image(root: &Path, image: &str) -> Result<RgbImage, Error> {
 /// The width and height of a room's image, upright, in pixels, from its header alone.
 ///
 /// # Errors
-/// [`Error::Io`] if the file cannot be read, [`Error::BadImage`] if it has no header of a JPEG or a
-/// PNG.
+/// [`Error::Io`] if the file cannot be read, [`Error::BadImage`] if it has no JPEG or PNG header.
 pub fn image_size(root: &Path, image: &str) -> Result<(u32, u32), Error> {
     let ImagePart { path, file, length } = open_part(root, image)?;
     let io = |cause| Error::Io {
@@ -268,25 +267,25 @@ pub fn image_size(root: &Path, image: &str) -> Result<(u32, u32), Error> {
 
     let mut decoder = reader.into_decoder().map_err(bad)?;
     let (width, height) = decoder.dimensions();
-    let is_lying = matches!(
+    let is_rotated = matches!(
         decoder.orientation(),
         Ok(Orientation::Rotate90
             | Orientation::Rotate270
             | Orientation::Rotate90FlipH
             | Orientation::Rotate270FlipH)
     );
-    Ok(if is_lying {
+    Ok(if is_rotated {
         (height, width)
     } else {
         (width, height)
     })
 }
 
-/// An image's file, at the image's first byte.
+/// An open file, positioned at the first byte of an image.
 struct ImagePart {
     path: PathBuf,
     file: File,
-    /// Of the image, bytes.
+    /// The length of the image, bytes.
     length: u64,
 }
 
@@ -381,9 +380,9 @@ mod tests {
         assert!(read_image(folder.path(), "p.bin@4+99999").is_err());
     }
 
-    /// Oracle: the photograph of a tiny recording, whole and under every cut, as it is and with a
-    /// thumbnail, which is a whole JPEG within the header: a JPEG that ends early is no image,
-    /// whatever a lenient decoder would make of it.
+    /// Oracle: the definition. A photograph of a tiny recording decodes whole and fails under every
+    /// cut, with and without a thumbnail (a whole JPEG within the header). A lenient decoder would
+    /// accept some cuts.
     #[test]
     fn a_jpeg_that_ends_early_is_refused() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -408,8 +407,8 @@ mod tests {
         }
     }
 
-    /// Oracle: EXIF's definition: orientation 6 means that what lies right in the file is the bottom of
-    /// the upright image, that is, the file has to be turned clockwise by a quarter.
+    /// Oracle: EXIF's definition. With orientation 6, the right side of the stored image is the
+    /// bottom of the upright one: the image must be rotated clockwise by a quarter turn.
     #[test]
     fn an_image_is_turned_upright() {
         // EXIF in its shortest form: little-endian, one entry: orientation (0x112), one short, 6.

@@ -1,5 +1,5 @@
-//! A journal: a file to which rows are appended as they are encoded, so that an interrupted run
-//! continues where it stopped.
+//! A journal of encoded rows: a file to which rows are appended as they are computed, so that an
+//! interrupted run can resume.
 //!
 //! A record is the row's number (u32), its numbers (f32), and the first 8 bytes of the SHA-256 of
 //! both, little-endian. Reading ends at the first record that is truncated or altered: that row and
@@ -73,8 +73,7 @@ impl Journal {
         let mut found = vec![0; HEADER_BYTES];
         let is_ours = journal.file.read_exact(&mut found).is_ok() && found == header;
 
-        // The file is new, belongs to another task, or was truncated within its header: start
-        // empty.
+        // The file is new, belongs to another task, or is truncated within its header: start empty.
         if !is_ours {
             journal.file.set_len(0).map_err(io)?;
             journal.file.rewind().map_err(io)?;
@@ -116,7 +115,7 @@ impl Journal {
         })
     }
 
-    /// Removes the file. To be called once its rows are stored elsewhere.
+    /// Removes the file. Call it once the rows are stored elsewhere.
     ///
     /// # Errors
     /// [`Error::Io`] if the file cannot be removed.
@@ -136,7 +135,7 @@ impl Journal {
         let mut record = vec![0; self.record_bytes()];
         let mut rows = Vec::new();
         loop {
-            // A file that ends within a record was interrupted while it was written.
+            // A file that ends within a record: its writer was interrupted.
             match reader.read_exact(&mut record) {
                 Ok(()) => {}
                 Err(error) if error.kind() == std::io::ErrorKind::UnexpectedEof => return Ok(rows),

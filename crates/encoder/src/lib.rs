@@ -2,8 +2,8 @@
 //!
 //! - An image is decoded, resized and cropped in 8 bit, normalised, and run through a network; the
 //!   output of each layer is pooled to one row.
-//! - All that decides the output of an [`Encoder`] is written into the [`FeatureSource`] of its
-//!   features, so that the encoder can be rebuilt from a source and the model's file alone.
+//! - The [`FeatureSource`] of features records everything that determines them, so that the
+//!   [`Encoder`] can be rebuilt from a source and the model's file alone.
 
 mod builtin;
 mod decode;
@@ -104,16 +104,16 @@ pub enum Error {
 pub struct Layer {
     /// The output's name in the model.
     pub name: String,
-    /// Where the numbering of layers starts: `0` or `1`, or `name` if the name has no number.
+    /// The number of the first layer, `0` or `1`, or `name` if the name has no number.
     pub base: String,
-    /// Whether the encoder's final normalisation layer is included: `none`, `final` or
+    /// Whether the encoder's final normalization layer is included: `none`, `final` or
     /// `unspecified`.
     pub norm: String,
     /// How the output is reduced to one row.
     pub pooling: Pooling,
 }
 
-/// A model, and what an encoder needs to know to run it.
+/// A model and the settings with which an encoder runs it.
 #[derive(Debug, Clone)]
 pub struct ModelTask {
     /// The ONNX file.
@@ -124,8 +124,8 @@ pub struct ModelTask {
     pub layers: Vec<Layer>,
     /// The number of images in a clip; 1 for a model of single images.
     pub window: usize,
-    /// Whether somebody said how many tokens stand before the patches. If nobody did, a mean over
-    /// tokens of which some are no patches is refused.
+    /// Whether the number of prefix tokens was given explicitly. If not, a mean or grid that would
+    /// include prefix tokens is an error.
     pub is_prefix_stated: bool,
 }
 
@@ -196,13 +196,13 @@ impl Encoder {
         }
     }
 
-    /// Opens an ONNX model. It is run once on two clips of grey images, so that wrong names and
-    /// shapes are found before a room is encoded.
+    /// Opens an ONNX model and runs it once on two clips of gray images, to find wrong names and
+    /// shapes before a room is encoded.
     ///
     /// # Errors
-    /// [`Error::Io`] if the file cannot be read, [`Error::Option`] if no image can be prepared with
-    /// the numbers given, [`Error::Model`] if the file does not fit the task, [`Error::NotBuilt`]
-    /// if this program lacks the runtime, [`Error::Runtime`] if the trial run fails.
+    /// [`Error::Io`] if the file cannot be read, [`Error::Option`] if the preparation's numbers are
+    /// invalid, [`Error::Model`] if the file does not fit the task, [`Error::NotBuilt`] if this
+    /// program lacks the runtime, [`Error::Runtime`] if the trial run fails.
     pub fn model(task: ModelTask, runtime: &Runtime) -> Result<Self, Error> {
         let ModelTask {
             file,
@@ -223,8 +223,8 @@ impl Encoder {
             size,
         };
 
-        // The trial run gives the rank and width of each output. Where no size is fixed, a small
-        // image is tried.
+        // The trial run gives the rank and width of each output. If no size is fixed, it uses a
+        // small image.
         let (width, height) = size.unwrap_or((64, 64));
         let grey = RgbImage {
             width,
@@ -232,7 +232,7 @@ impl Encoder {
             bytes: vec![127; width * height * 3],
         };
 
-        // With two clips in it, an output whose first axis is not the batch is noticed.
+        // Two clips reveal an output whose first axis is not the batch.
         let outputs = encoder.outputs(&[vec![&grey; window], vec![&grey; window]])?;
 
         let seen = pooling::InputSize {
@@ -249,7 +249,7 @@ impl Encoder {
 
             let one = output.index_axis(Axis(0), 0);
 
-            // An output that is a vector already is not pooled, whatever was asked for.
+            // A vector output is not pooled, whatever pooling was requested.
             layer.pooling = layer.pooling.for_rank(one.ndim());
             if !is_prefix_stated {
                 let checked = layer.pooling.check_prefix(one.shape(), seen);
@@ -270,8 +270,8 @@ impl Encoder {
     /// or paths of ONNX files. Returns `None` if none of them is that encoder.
     ///
     /// # Errors
-    /// As [`Encoder::model`], and [`Error::Option`] if the source does not say how images were
-    /// prepared or how the layer was pooled.
+    /// As [`Encoder::model`], and [`Error::Option`] if the source's preparation or pooling cannot
+    /// be parsed.
     pub fn of_source(
         source: &FeatureSource,
         models: &[String],
@@ -323,9 +323,8 @@ impl Encoder {
         Ok(None)
     }
 
-    /// The sources of the features that its layers give, in order. Each is named
-    /// `PREFIX-LAYER-POOLING`, or `PREFIX-LAYER` if the output is a vector. The encoders without a
-    /// model give the prefix alone.
+    /// The sources of its layers' features, in order. Each is named `PREFIX-LAYER-POOLING`, or
+    /// `PREFIX-LAYER` if the output is a vector. Encoders without a model use the prefix alone.
     pub fn sources(&self, prefix: &str) -> Vec<FeatureSource> {
         let made = |(layer, &dim): (&Layer, &usize)| FeatureSource {
             name: feature_name(prefix, layer, &self.backbone),
@@ -341,7 +340,7 @@ impl Encoder {
         self.layers.iter().zip(&self.dims).map(made).collect()
     }
 
-    /// The name of the runtime that runs it; `none` for the encoders without a model.
+    /// The name of its runtime; `none` for the encoders without a model.
     pub fn runtime(&self) -> &'static str {
         self.backbone.runtime()
     }
@@ -492,8 +491,8 @@ impl Encoder {
             }
         }
 
-        // Axes: clip, image of the clip, channel, row, column. Models with another order get it
-        // below.
+        // Axes: clip, image of the clip, channel, row, column. They are reordered below for models
+        // with another order.
         let shape = IxDyn(&[clips.len(), self.window, 3, height, width]);
         let frames = ArrayD::from_shape_vec(shape, numbers).map_err(|error| Error::Runtime {
             runtime: self.runtime(),
@@ -510,12 +509,12 @@ impl Encoder {
             } => runner.run(backbone::laid_out(frames, *clip_axis))?,
         };
 
-        // Rows are read along the first axis; if that is another one, they would belong to no clip.
+        // The first axis must be the clips, because one row per clip is read along it.
         for (layer, output) in self.layers.iter().zip(&outputs) {
             if output.shape().first() != Some(&clips.len()) {
                 let problem = format!(
-                    "layer '{}' gave an output of shape {:?} for {} images: its first axis does not count them; name \
-                     another layer, or transpose it in the export",
+                    "layer '{}' gave an output of shape {:?} for a batch of {}: its first axis is not the batch; \
+                     choose another layer, or transpose it in the export",
                     layer.name,
                     output.shape(),
                     clips.len()
@@ -543,7 +542,7 @@ fn feature_name(prefix: &str, layer: &Layer, backbone: &Backbone) -> String {
         Backbone::Model { .. } => format!("{prefix}-{}-{}", layer.name, layer.pooling.short()),
     };
 
-    // A name must begin with a letter or digit; the `a` in front leaves only the character to be
+    // A name must begin with a letter or digit. With `a` in front, only the character itself is
     // tested.
     let plain: String = name
         .chars()

@@ -1,8 +1,8 @@
 //! Reads an ONNX file: its input, its outputs, the names of its inner values, and its identity.
 //!
-//! - Only those few fields of ONNX's protobuf messages are declared here that are needed.
-//! - Weights may lie in other files of the same folder, as `torch.onnx.export` writes them. The identity
-//!   covers them too: the same graph with other weights is another encoder.
+//! - Only the needed fields of ONNX's protobuf messages are declared here.
+//! - Weights may be in other files of the same folder, as `torch.onnx.export` writes them. The
+//!   identity covers them too: the same graph with other weights is another encoder.
 
 use seese3_core::Cause;
 use std::collections::{BTreeSet, HashSet};
@@ -50,7 +50,7 @@ struct AttributeProto {
 struct TensorProto {
     #[prost(string, tag = "8")]
     name: String,
-    /// Where the numbers are in another file: among others, its name as `location`.
+    /// The position of the numbers in another file; the entry `location` is that file's name.
     #[prost(message, repeated, tag = "13")]
     external: Vec<EntryProto>,
     /// 1 if the weights are stored in another file.
@@ -101,17 +101,17 @@ struct DimProto {
     value: i64,
 }
 
-/// The number by which ONNX denotes the element type f32.
+/// ONNX's code for the element type f32.
 const FLOAT: i32 = 1;
 
-/// An ONNX file that was read and checked: it has one input, and its weights are there.
+/// A checked ONNX file: it has one input, and its weight files can be read.
 pub(super) struct ModelFile {
-    /// The file's name without extension, `@`, and the first 8 bytes of the SHA-256, in hexadecimal, of
-    /// the file and of those that hold its weights.
+    /// The file's name without extension, `@`, and the first 8 bytes, in hexadecimal, of the
+    /// SHA-256 of the file and its weight files.
     pub id: String,
     /// The whole file.
     pub bytes: Vec<u8>,
-    /// The shape of its only input; `None` for an axis whose size is open.
+    /// The shape of its only input; `None` for a dynamic axis.
     pub input: Vec<Option<usize>>,
     /// The names of its declared outputs.
     pub outputs: Vec<String>,
@@ -161,8 +161,8 @@ impl ModelFile {
             ));
         }
 
-        // An axis of open size has a name in place of a number, which `DimProto` leaves out: it is
-        // read as 0 and becomes `None`.
+        // A dynamic axis has a name instead of a number. `DimProto` does not declare it, so the
+        // size is read as 0 and becomes `None`.
         let shape = tensor.and_then(|tensor| tensor.shape.as_ref());
         let input = shape.map_or_else(Vec::new, |shape| {
             shape
@@ -189,7 +189,7 @@ impl ModelFile {
         })
     }
 
-    /// The size (width, height) of the images that it takes, if the file fixes it.
+    /// The size (width, height) of its input images, if the file fixes it.
     pub fn image_size(&self) -> Option<(usize, usize)> {
         match self.input.as_slice() {
             [.., Some(height), Some(width)] if self.input.len() >= 4 => Some((*width, *height)),
@@ -199,8 +199,8 @@ impl ModelFile {
 
     /// The file with `names` declared as outputs, for a runtime that returns declared outputs only.
     ///
-    /// When a protobuf message is written in several parts, a reader merges them. The further
-    /// outputs are therefore appended to the file as it is.
+    /// Protobuf readers merge concatenated messages, so the additional outputs are appended to the
+    /// unchanged file.
     #[cfg_attr(
         not(feature = "onnxruntime"),
         allow(dead_code, reason = "only that runtime needs it")
@@ -242,13 +242,13 @@ fn read_graph(file: &Path) -> Result<(Vec<u8>, GraphProto), Error> {
     let graph = model.ok().and_then(|model| model.graph);
     let graph = graph.ok_or_else(|| Error::Model {
         file: file.to_owned(),
-        problem: "is not an ONNX model; is it cut off?".into(),
+        problem: "is not an ONNX model; is it truncated?".into(),
     })?;
 
     Ok((bytes, graph))
 }
 
-/// The names of the files that hold the graph's weights, besides the model's own.
+/// The names of the external files with the graph's weights.
 fn weight_files(graph: &GraphProto) -> BTreeSet<&str> {
     let constants = graph.node.iter().flat_map(|node| &node.attribute);
     let constants = constants.filter_map(|attribute| attribute.tensor.as_ref());
@@ -265,7 +265,7 @@ fn weight_files(graph: &GraphProto) -> BTreeSet<&str> {
         .collect()
 }
 
-/// The name of the file, and a digest of all that decides what the model computes.
+/// The file's name and a digest of the model and its weights.
 fn id_of(file: &Path, bytes: &[u8], graph: &GraphProto) -> Result<String, Error> {
     let stem = file
         .file_stem()
@@ -280,7 +280,7 @@ fn id_of(file: &Path, bytes: &[u8], graph: &GraphProto) -> Result<String, Error>
             problem,
         };
 
-        // A model from elsewhere must not make this program read whatever file it names.
+        // An untrusted model must not make this program read files outside its folder.
         let is_beside = Path::new(name)
             .components()
             .all(|part| matches!(part, Component::Normal(_) | Component::CurDir));

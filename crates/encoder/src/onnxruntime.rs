@@ -14,7 +14,7 @@ use super::runtime::{Runner, Runtime};
 use super::{Error, RuntimeKind};
 
 const NAME: &str = "onnxruntime";
-/// The setting of a session that names the folder of weights in files of their own.
+/// The session option for the folder of external weight files.
 const WEIGHTS_FOLDER: &str = "session.model_external_initializers_file_folder_path";
 
 /// The loaded library, or why it could not be loaded. It is loaded once per process.
@@ -22,9 +22,9 @@ static LOADED: OnceLock<Result<Environment, String>> = OnceLock::new();
 
 pub(super) struct OnnxRuntime {
     session: Mutex<Session>,
-    /// The outputs that were asked for, in that order.
+    /// The requested outputs, in order.
     names: Vec<String>,
-    /// Whether the model takes one clip in a run, and not as many as come.
+    /// Whether the model has a fixed batch size of 1.
     is_of_one: bool,
 }
 
@@ -47,7 +47,7 @@ impl OnnxRuntime {
             .with_intra_threads(runtime.threads)
             .map_err(|error| failed(&error))?;
 
-        // A copy in memory finds the files of its weights by the folder of the model.
+        // A model opened from memory needs this folder to find its external weights.
         let folder = file
             .parent()
             .filter(|folder| !folder.as_os_str().is_empty());
@@ -56,8 +56,8 @@ impl OnnxRuntime {
             .with_config_entry(WEIGHTS_FOLDER, folder)
             .map_err(|error| failed(&error))?;
 
-        // onnxruntime returns declared outputs only. For an inner value,
-        // the model is opened from a copy in memory that declares it.
+        // onnxruntime returns declared outputs only. For an inner value, the model is opened from a
+        // copy in memory that declares it as an output.
         let session = if names.iter().all(|name| model.outputs.contains(name)) {
             builder.commit_from_file(file)
         } else {
@@ -79,7 +79,7 @@ impl OnnxRuntime {
         let input = input.as_standard_layout();
         let tensor = TensorRef::from_array_view(&input).map_err(|error| failed(&error))?;
 
-        // A poisoned lock is no reason to stop: a run does not change the session.
+        // A poisoned lock is safe to use: a run does not change the session.
         let mut session = self.session.lock().unwrap_or_else(PoisonError::into_inner);
         let outputs = session
             .run(ort::inputs![tensor])
@@ -131,15 +131,15 @@ impl Runner for OnnxRuntime {
 }
 
 fn environment(library: Option<&Path>) -> Result<&'static Environment, Error> {
-    let help = "`pip install onnxruntime` brings the library, onnxruntime/capi/libonnxruntime.so.*; name it with \
-                --onnxruntime FILE or ORT_DYLIB_PATH";
+    let help = "`pip install onnxruntime` installs the library, onnxruntime/capi/libonnxruntime.so.*; give its \
+                path with --onnxruntime FILE or ORT_DYLIB_PATH";
 
     let failed = |problem: Cause| Error::Runtime {
         runtime: RuntimeKind::OnnxRuntime.name(),
         problem,
     };
     let library = library
-        .ok_or_else(|| failed(format!("its shared library was not named; {help}").into()))?;
+        .ok_or_else(|| failed(format!("its shared library was not given; {help}").into()))?;
 
     if !library.is_file() {
         return Err(failed(

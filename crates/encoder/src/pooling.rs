@@ -23,8 +23,8 @@ pub enum Pooling {
         /// The number of tokens before the patches: the class token and registers.
         skip: usize,
     },
-    /// Means over the cells of a map, or of the patch tokens after the first `skip`, which are put
-    /// in rows and columns as the patches lie in the image.
+    /// Means over the cells of a map, or of the patch tokens after the first `skip`, arranged in
+    /// the rows and columns of the image's patches.
     Grid {
         /// Cells across.
         columns: usize,
@@ -39,13 +39,13 @@ pub enum Pooling {
 const MOST_CELLS: usize = 64;
 
 impl Pooling {
-    /// The pooling for an output with `rank` axes: one with a single axis is never pooled.
+    /// The pooling for an output with `rank` axes. An output with a single axis is never pooled.
     pub(super) fn for_rank(self, rank: usize) -> Self {
         if rank == 1 { Self::Vector } else { self }
     }
 
-    /// Refuses a mean or a grid over all tokens of an output whose first tokens are no patches: a
-    /// class token or registers, by the number of tokens.
+    /// Refuses a mean or grid over all tokens if their number shows that prefix tokens (class
+    /// token, registers) come before the patches.
     pub(super) fn check_prefix(self, shape: &[usize], seen: InputSize) -> Result<(), Problem> {
         let is_over_all = matches!(self, Self::Mean { skip: 0 } | Self::Grid { skip: 0, .. });
 
@@ -102,8 +102,8 @@ impl Pooling {
             shape: shape.clone(),
         };
 
-        // If all tokens fill the image's grid of patches, and without the first `skip` they do not,
-        // then the model has no tokens before its patches, and a patch would be taken for one.
+        // If all tokens fill the image's patch grid, but not without the first `skip`, the model
+        // has no prefix tokens: a patch would be mistaken for one.
         if let (2, Self::Cls | Self::Mean { skip: 1.. } | Self::Grid { skip: 1.., .. }) =
             (output.ndim(), self)
         {
@@ -187,13 +187,12 @@ pub(super) struct InputSize {
     pub window: usize,
 }
 
-/// The largest number of tokens before the patches that is looked for: a class token, a token of
-/// distillation, and registers.
+/// Maximum number of prefix tokens that is detected: class token, distillation token, registers.
 const MOST_PREFIX_TOKENS: usize = 8;
 
 impl InputSize {
-    /// The number of tokens before the patches, where `tokens` are too many for the patches of the
-    /// image alone, and a few of them fewer are not.
+    /// The smallest number of prefix tokens without which `tokens` fill the image's patch grid;
+    /// `None` if all tokens are patches, or no number up to [`MOST_PREFIX_TOKENS`] fits.
     fn prefix(self, tokens: usize) -> Option<usize> {
         if self.patches(tokens).is_some() {
             return None;
@@ -248,16 +247,16 @@ fn grid(map: ArrayView3<'_, f32>, columns: usize, rows: usize) -> Vec<f32> {
     row
 }
 
-/// Why an output cannot be pooled as asked.
+/// Why an output cannot be pooled as requested.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum Problem {
     #[error(
-        "its output of shape {shape:?} cannot be pooled by '{pooling}': cls wants tokens (n, c); grids want a map (c, h, w), \
-         or patch tokens as many across and down as the image's shape says, after the prefix tokens"
+        "its output of shape {shape:?} cannot be pooled by '{pooling}': cls needs tokens (n, c); grids need a map (c, h, w), \
+         or patch tokens in the rows and columns of the image's aspect ratio, after the prefix tokens"
     )]
     Shape { pooling: Pooling, shape: Vec<usize> },
     #[error(
-        "its {tokens} tokens are all patches of the image, there is no class token before them; give --prefix-tokens 0 and \
+        "all its {tokens} tokens are patches of the image, with no class token before them; give --prefix-tokens 0 and \
          --pool mean or a grid"
     )]
     NoPrefix { tokens: usize },
@@ -454,7 +453,7 @@ mod tests {
         );
     }
 
-    /// Oracle: the words of the documentation.
+    /// Oracle: the syntax in the documentation.
     #[test]
     fn words_are_read_and_written() {
         for word in ["vector", "cls", "mean", "mean@5", "grid2x2", "grid16x12@1"] {

@@ -1,7 +1,7 @@
-//! What is done to an image before a network sees it: resize, crop, normalise.
+//! Image preparation for a network: resize, crop, normalize.
 //!
 //! Resizing is an antialiased convolution in 8 bit, as in Pillow; the crop is central. Then each
-//! channel is normalised in f32 to (v / divisor − mean) / deviation, with v from 0 to 255.
+//! channel is normalized in f32 to (v / divisor − mean) / deviation, with v from 0 to 255.
 
 use fast_image_resize::images::{Image, ImageRef};
 use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
@@ -47,11 +47,11 @@ pub struct Preparation {
     pub filter: Filter,
     /// The width and height of the central crop after the resize, if there is one.
     pub crop: Option<(usize, usize)>,
-    /// 8-bit values are first divided by this.
+    /// Divisor of the 8-bit values, applied first.
     pub divisor: f32,
-    /// Then this is subtracted, for each channel: red, green, blue.
+    /// Mean that is subtracted next, per channel: red, green, blue.
     pub mean: [f32; 3],
-    /// Then they are divided by this, for each channel.
+    /// Standard deviation that the values are divided by last, per channel.
     pub deviation: [f32; 3],
 }
 
@@ -171,7 +171,7 @@ impl Preparation {
         for word in text.split(' ') {
             let (key, value) = word
                 .split_once('=')
-                .ok_or_else(|| wrong("does not say how images were prepared"))?;
+                .ok_or_else(|| wrong("is not a description of image preparation"))?;
             match key {
                 "resize" => preparation.resize = value.parse()?,
                 "filter" => preparation.filter = value.parse()?,
@@ -186,14 +186,14 @@ impl Preparation {
                 "std" => preparation.deviation = three("std", value)?,
                 "window" => window = value.parse().ok(),
                 "sha256" => {}
-                _ => return Err(wrong("has a key that this program does not know")),
+                _ => return Err(wrong("has an unknown key")),
             }
         }
 
-        let window = window.ok_or_else(|| wrong("does not say how many images a clip has"))?;
+        let window = window.ok_or_else(|| wrong("has no number of images in a clip (window)"))?;
 
-        // Writing the result again checks the hash. It also refuses a text in
-        // which a key is missing, since the values of all keys are written.
+        // Writing the result again checks the hash. It also refuses a text with a missing key,
+        // since all keys are written.
         if preparation.describe(window) != text {
             return Err(wrong("does not match its own hash; it was altered"));
         }
@@ -201,7 +201,7 @@ impl Preparation {
         Ok((preparation, window))
     }
 
-    /// Refuses numbers with which no image can be normalised.
+    /// Checks that the numbers can normalize an image.
     ///
     /// # Errors
     /// [`Error::Option`] if a number is not finite, or if the divisor or a deviation is 0.
@@ -305,7 +305,7 @@ pub(super) fn size(what: &'static str, text: &str) -> Result<(usize, usize), Err
     })
 }
 
-/// Reads three numbers separated by commas, or one that stands for all three.
+/// Reads three numbers separated by commas, or one number for all three.
 pub(super) fn three(what: &'static str, text: &str) -> Result<[f32; 3], Error> {
     let numbers: Option<Vec<f32>> = text.split(',').map(|word| word.parse().ok()).collect();
     match numbers.as_deref() {
@@ -385,7 +385,7 @@ fn cropped(image: &RgbImage, width: usize, height: usize) -> Result<RgbImage, Er
     })
 }
 
-/// Appends the normalised values of an image to `numbers`, plane by plane: red, green, blue.
+/// Appends the normalized values of an image to `numbers`, plane by plane: red, green, blue.
 pub fn normalised(preparation: &Preparation, image: &RgbImage, numbers: &mut Vec<f32>) {
     let Preparation {
         divisor,
@@ -398,7 +398,7 @@ pub fn normalised(preparation: &Preparation, image: &RgbImage, numbers: &mut Vec
         let mean = mean[channel];
         let deviation = deviation[channel];
 
-        // An 8-bit channel has only 256 values, so each of them is normalised once.
+        // An 8-bit channel has only 256 values, so each value is normalized once.
         let table: [f32; 256] =
             std::array::from_fn(|value| (value as f32 / divisor - mean) / deviation);
 
@@ -459,8 +459,8 @@ mod tests {
         assert_eq!((tall.width, tall.height), (10, 22));
     }
 
-    /// Oracle: an image that has the size already is not touched, and one too small for its crop is
-    /// refused.
+    /// Oracle: the definition. An image of the right size is unchanged; one too small for its crop
+    /// is refused.
     #[test]
     fn nothing_is_done_that_need_not_be() {
         let preparation = Preparation {

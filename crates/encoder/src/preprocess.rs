@@ -1,25 +1,26 @@
-//! How images are prepared for the large families of encoders, by the names that their authors use.
+//! Image preparations of the common encoder families, by name.
 
 use super::{Error, Filter, Preparation, Resize};
 
-/// A family of encoders that prepare images alike.
+/// A family of encoders with the same image preparation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Preprocess {
-    /// torchvision and most of timm: ImageNet's mean and deviation, the middle 7/8 of the image.
+    /// torchvision and most of timm: ImageNet's mean and deviation, a central crop of 7/8.
     Imagenet,
-    /// CLIP, OpenCLIP and their descendants: CLIP's mean and deviation, the middle square, bicubic.
+    /// CLIP, OpenCLIP and their descendants: CLIP's mean and deviation, the central square,
+    /// bicubic.
     Clip,
-    /// SigLIP, Inception and many of Google's: -1 to 1, the whole image.
+    /// SigLIP, Inception and many Google models: values from -1 to 1, the whole image.
     Half,
-    /// 0 to 1, the whole image.
+    /// Values from 0 to 1, the whole image.
     Unit,
 }
 
-/// The side of the images that a model takes if it does not say.
+/// The image side for a model of unknown input size, pixels.
 const USUAL_SIDE: usize = 224;
 
 impl Preprocess {
-    /// All of them.
+    /// All families.
     pub const ALL: [Self; 4] = [Self::Imagenet, Self::Clip, Self::Half, Self::Unit];
 
     /// Its name.
@@ -32,11 +33,10 @@ impl Preprocess {
         }
     }
 
-    /// How images are prepared for a model that takes images of this width and height.
+    /// The preparation for a model with input images of this size (width, height).
     ///
     /// # Errors
-    /// [`Error::Option`] for a model of images that are not square, where the middle of the image would
-    /// have to be.
+    /// [`Error::Option`] if the size is not square, but the family crops a central square.
     pub fn preparation(self, size: Option<(usize, usize)>) -> Result<Preparation, Error> {
         let (width, height) = size.unwrap_or((USUAL_SIDE, USUAL_SIDE));
         let whole = Resize::Whole { width, height };
@@ -52,7 +52,7 @@ impl Preprocess {
                 what: "--preprocess",
                 given: self.name().to_owned(),
                 problem: format!(
-                    "takes the middle square of an image, and the model takes {width}x{height}; give \
+                    "crops the central square of an image, but the model takes {width}x{height}; give \
                      --divisor, --mean, --std and --resize {width}x{height} instead"
                 ).into(),
             });

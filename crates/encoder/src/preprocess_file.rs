@@ -1,6 +1,6 @@
-//! Reads how images are prepared for a model from the JSON file that its authors publish beside it:
+//! Reads a model's image preparation from the JSON file that its authors publish with it:
 //! `preprocessor_config.json` of transformers, or `config.json` of timm. timm's data configuration,
-//! written as JSON, has the fields of the latter without the object `pretrained_cfg` around them.
+//! written as JSON, has the fields of the latter without the enclosing object `pretrained_cfg`.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -9,10 +9,11 @@ use serde::Deserialize;
 
 use super::{Error, Filter, Preparation, Resize};
 
-/// The fields that decide how images are prepared. Those of the two libraries do not overlap, but for `crop_pct`.
+/// The fields that determine the preparation. Those of the two libraries overlap only in
+/// `crop_pct`.
 #[derive(Deserialize)]
 struct PreprocessFile {
-    // timm's hub writes its fields into an object of their own.
+    // Files of timm's hub have their fields in this object.
     pretrained_cfg: Option<TimmConfig>,
     #[serde(flatten)]
     timm: TimmConfig,
@@ -27,7 +28,7 @@ struct TimmConfig {
     interpolation: Option<String>,
     mean: Option<[f32; 3]>,
     std: Option<[f32; 3]>,
-    /// The edge of the crop, as a share of the edge of the resized image.
+    /// The edge of the crop, as a fraction of the resized image's edge.
     crop_pct: Option<f64>,
     crop_mode: Option<String>,
 }
@@ -35,11 +36,11 @@ struct TimmConfig {
 #[derive(Deserialize)]
 struct TransformersConfig {
     image_processor_type: Option<String>,
-    /// What older files call it.
+    /// The same field in older files.
     feature_extractor_type: Option<String>,
     do_resize: Option<bool>,
     size: Option<Size>,
-    /// Pillow's number of the filter.
+    /// Pillow's code of the filter.
     resample: Option<u8>,
     do_center_crop: Option<bool>,
     crop_size: Option<Size>,
@@ -48,19 +49,19 @@ struct TransformersConfig {
     do_normalize: Option<bool>,
     image_mean: Option<[f32; 3]>,
     image_std: Option<[f32; 3]>,
-    /// The rest of the file, in which nothing may change the image.
+    /// All other fields. A processing step among them is an error.
     #[serde(flatten)]
     others: BTreeMap<String, serde_json::Value>,
 }
 
-/// Steps of processors that are not supported, beside those whose names begin with `do_`.
+/// Unsupported processing steps whose names do not begin with `do_`.
 const OTHER_STEPS: [&str; 4] = [
     "rescale_offset",
     "include_top",
     "offset",
     "keep_aspect_ratio",
 ];
-/// Conversion to three channels, which is done with every image.
+/// Steps that may be requested: the conversion to three channels, which every image undergoes.
 const HARMLESS_STEPS: [&str; 1] = ["do_convert_rgb"];
 
 /// A size as transformers write it: older files have one number for both edges.
@@ -72,11 +73,11 @@ enum Size {
     Whole { height: usize, width: usize },
 }
 
-/// Reads how images are prepared from a JSON file of timm or transformers.
+/// Reads the image preparation from a JSON file of timm or transformers.
 ///
 /// # Errors
-/// [`Error::Io`] if the file cannot be read, [`Error::Model`] if it is not such a file or asks for
-/// something that [`Preparation`] does not have.
+/// [`Error::Io`] if the file cannot be read, [`Error::Model`] if it is not such a file or requests
+/// a step that [`Preparation`] does not support.
 pub fn read_preprocess_file(file: &Path) -> Result<Preparation, Error> {
     let text = std::fs::read(file).map_err(|cause| Error::Io {
         file: file.to_owned(),
@@ -98,7 +99,7 @@ fn parse(text: &[u8]) -> Result<Preparation, String> {
     let preparation = if read.transformers.image_mean.is_some() || read.transformers.size.is_some()
     {
         if read.timm.crop_pct.is_some() {
-            return Err("has a `crop_pct`, which is supported for timm alone".to_owned());
+            return Err("has a `crop_pct`, which is supported only for timm".to_owned());
         }
         of_transformers(&read.transformers)?
     } else {
@@ -109,8 +110,8 @@ fn parse(text: &[u8]) -> Result<Preparation, String> {
     Ok(preparation)
 }
 
-/// timm's evaluation transform: the shorter edge becomes the input's over `crop_pct`, rounded down,
-/// and the middle of the input's size is kept.
+/// timm's evaluation transform: the shorter edge is resized to the input's edge divided by
+/// `crop_pct`, rounded down, and the center is cropped to the input's size.
 fn of_timm(config: &TimmConfig) -> Result<Preparation, String> {
     let [channels, height, width] = config
         .input_size
@@ -121,14 +122,14 @@ fn of_timm(config: &TimmConfig) -> Result<Preparation, String> {
 
     let share = config.crop_pct.unwrap_or(0.875);
     if !(share > 0.0 && share <= 1.0) {
-        return Err("has a `crop_pct` that is not above 0 and at most 1".to_owned());
+        return Err("has a `crop_pct` that is not in (0, 1]".to_owned());
     }
     let scaled = |edge: usize| (edge as f64 / share).floor() as usize;
 
     let resize = match config.crop_mode.as_deref().unwrap_or("center") {
         "center" if height == width => Resize::Shortest(scaled(height)),
         "center" => {
-            return Err("crops the middle of an input that is not square".to_owned());
+            return Err("crops the center of an input that is not square".to_owned());
         }
         "squash" => Resize::Whole {
             width: scaled(width),
@@ -159,7 +160,7 @@ fn of_transformers(config: &TransformersConfig) -> Result<Preparation, String> {
     };
     if let Some((step, _)) = config.others.iter().find(asks_for) {
         return Err(format!(
-            "asks for a step that is not supported (`{step}`: true)"
+            "requests a step that is not supported (`{step}`: true)"
         ));
     }
 
@@ -176,30 +177,28 @@ fn of_transformers(config: &TransformersConfig) -> Result<Preparation, String> {
 
     let is_cropped = match (config.do_center_crop, &config.crop_size) {
         (Some(is_cropped), _) => is_cropped,
-        // These processors crop unless they are told not to.
+        // These processors crop by default.
         (None, _) if is_of_family(processor, &["CLIP", "Bit"]) => true,
         (None, None) => false,
         (None, Some(_)) => {
-            return Err(
-                "has `crop_size`, and no `do_center_crop` to say whether it is used".to_owned(),
-            );
+            return Err("has `crop_size`, but no `do_center_crop` that enables it".to_owned());
         }
     };
     let crop = match (is_cropped, config.crop_size) {
         (false, _) => None,
         (true, Some(Size::Edge(edge))) => Some((edge, edge)),
         (true, Some(Size::Whole { height, width })) => Some((width, height)),
-        (true, _) => return Err("crops, and has no `crop_size` of both edges".to_owned()),
+        (true, _) => return Err("crops, but has no `crop_size` with both edges".to_owned()),
     };
 
-    // Pillow numbers its filters.
+    // Pillow's codes of its filters.
     let filter = match config.resample {
         Some(1) => Filter::Lanczos3,
         Some(2) => Filter::Bilinear,
         Some(3) => Filter::Bicubic,
         other => {
             return Err(format!(
-                "has `resample` {}, which is none of 1 (Lanczos), 2 (bilinear), 3 (bicubic)",
+                "has `resample` {}, expected 1 (Lanczos), 2 (bilinear) or 3 (bicubic)",
                 other.map_or("missing".to_owned(), |number| number.to_string())
             ));
         }
@@ -229,11 +228,12 @@ fn of_transformers(config: &TransformersConfig) -> Result<Preparation, String> {
     })
 }
 
-/// What a size means. One number is the shorter edge for some processors, and both edges for others.
+/// The resize to a size. One number is the shorter edge for some processors, and both edges for
+/// others.
 fn resize_of(size: Size, processor: &str) -> Result<Resize, String> {
     let is_of = |families: &[&str]| is_of_family(processor, families);
 
-    // ConvNeXt's processor crops by a share that this program does not read.
+    // ConvNeXt's processor crops by a fraction that is not supported.
     if is_of(&["ConvNext"]) {
         return Err(
             "was written for ConvNextImageProcessor, whose crop_pct is not supported".to_owned(),
@@ -249,7 +249,7 @@ fn resize_of(size: Size, processor: &str) -> Result<Resize, String> {
             height: edge,
         }),
         Size::Edge(edge) => Err(format!(
-            "has `size` {edge}, and does not say whether that is the shorter edge or both"
+            "has `size` {edge}, which may be the shorter edge or both edges"
         )),
     }
 }
@@ -338,8 +338,8 @@ mod tests {
         }
     }
 
-    /// Oracle: one number is what the processor's own default makes of it; what cannot be done, or is
-    /// not said, is refused by its field.
+    /// Oracle: the defaults of each processor. An unsupported or ambiguous field is refused by
+    /// name.
     #[test]
     fn what_a_file_of_transformers_leaves_open_is_not_guessed() {
         let of = |processor: &str, more: &str| {
@@ -370,7 +370,7 @@ mod tests {
             let problem = result.unwrap_err();
             assert!(problem.contains(field), "{field}: {problem}");
         };
-        // CLIP's processor crops unless it is told not to, and older files name it otherwise.
+        // CLIP's processor crops by default; older files name it differently.
         let older = "{\"feature_extractor_type\": \"CLIPFeatureExtractor\", \"size\": 224, \"crop_size\": 224, \
                      \"resample\": 3, \"do_normalize\": false}";
         assert_eq!(parse(older.as_bytes()).unwrap().crop, Some((224, 224)));

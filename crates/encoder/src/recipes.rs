@@ -1,5 +1,5 @@
-//! Encoder recipes: how images are prepared for well-known encoders, and which of their layers are
-//! used. The recipes themselves are data, in `recipes.toml`.
+//! Encoder recipes: image preparation and layers of well-known encoders. The recipes themselves are
+//! data, in `recipes.toml`.
 
 use std::sync::LazyLock;
 
@@ -8,32 +8,32 @@ use serde::Deserialize;
 use super::preparation::size;
 use super::{Error, Preparation};
 
-/// How to use a well-known encoder, whose model the user has to bring.
+/// Settings for a well-known encoder. The user provides the model.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EncoderRecipe {
-    /// The value of `--recipe` that chooses it.
+    /// The value of `--recipe` that selects it.
     pub name: String,
-    /// The model in one line.
+    /// A one-line description of the model.
     pub about: String,
-    /// How its images are prepared.
+    /// The preparation of its images.
     pub preparation: Preparation,
     /// The number of images in a clip.
     pub window: usize,
-    /// The layers that can be used, by the names that the export gives them.
+    /// The layers that can be used, by their names in the export.
     pub layers: String,
-    /// Where the numbering of layers starts, `0` or `1`, or `name` where layers have names.
+    /// The number of the first layer, `0` or `1`, or `name` if layers have names.
     pub base: String,
-    /// Whether the encoder's final normalisation layer is included in the outputs: `final` or `none`
-    ///
+    /// Whether the encoder's final normalization layer is included in the outputs: `final` or
+    /// `none`.
     pub norm: String,
     /// The number of tokens before the patches.
     pub prefix_tokens: usize,
-    /// How the output of a layer is reduced to one row, unless `--pool` says otherwise.
+    /// The default pooling of a layer's output to one row; `--pool` overrides it.
     pub pooling: String,
-    /// What the paper says about its use.
+    /// Its use in the paper.
     pub paper: String,
-    /// Whether it was run for this project, and where the numbers of the recipe come from.
+    /// Whether it was run in this project, and the sources of the recipe's numbers.
     pub checked: String,
     /// Python code that exports it to an ONNX file.
     pub export: String,
@@ -62,7 +62,7 @@ fn parse(text: &str) -> Result<Vec<EncoderRecipe>, toml::de::Error> {
     Ok(toml::from_str::<File>(text)?.recipe)
 }
 
-/// A preparation in the words of the command line's options.
+/// A preparation in the syntax of the command-line options.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct PreparationEntry {
@@ -102,8 +102,8 @@ mod tests {
     use super::*;
     use crate::Pooling;
 
-    /// Oracle: what it takes to open a model: every value of a recipe can be parsed, and the size
-    /// of its images is fixed.
+    /// Oracle: the requirements for opening a model. Every value of a recipe can be parsed, and the
+    /// size of its images is fixed.
     #[test]
     fn every_recipe_can_be_followed() {
         for recipe in RECIPES.iter() {

@@ -1,6 +1,6 @@
-//! Encodes a whole room. While the network runs on one batch, the images of the next are decoded;
-//! rows are written to a journal as soon as they are computed. Memory holds the rows of the whole
-//! room, but images of two batches only.
+//! Encodes a whole room. While the network runs on one batch, the images of the next one are
+//! decoded. Rows are written to a journal as soon as they are computed. Memory holds all rows of
+//! the room, but the images of only two batches.
 
 use std::collections::BTreeMap;
 
@@ -16,9 +16,9 @@ use seese3_core::room::{FrameId, Timeline};
 /// What to do with a frame whose image cannot be read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OnBadImage {
-    /// End the run with an error that names it.
+    /// End the run with an error that names the image.
     Stop,
-    /// Leave the frame out, and list it in [`Encoded::bad`].
+    /// Skip the frame, and list it in [`Encoded::bad`].
     Skip,
 }
 
@@ -44,7 +44,7 @@ pub struct Encoded {
     pub rows: Array2<f32>,
     /// For each row of features, the row of its frame in the room, ascending.
     pub good: Vec<usize>,
-    /// The frames that were left out, each with the reason.
+    /// The skipped frames, each with the reason.
     pub bad: Vec<(usize, String)>,
     /// The number of frames that an earlier run had already encoded.
     pub resumed: usize,
@@ -204,7 +204,7 @@ fn prepare(task: &Task<'_>, encoder: &Encoder, anchors: &[usize]) -> Result<Clip
         bad: Vec::new(),
     };
 
-    // Only a fault of the image itself may be skipped. A failing disk would otherwise leave out the
+    // Only a fault of the image itself may be skipped. Otherwise, a failing disk would skip the
     // rest of the room.
     let mut problems = BTreeMap::new();
     for (row, image) in read {
@@ -216,7 +216,7 @@ fn prepare(task: &Task<'_>, encoder: &Encoder, anchors: &[usize]) -> Result<Clip
         }
     }
 
-    // A frame is left out only if its own image is bad.
+    // A frame is skipped only if its own image is bad.
     for (&anchor, frames) in anchors.iter().zip(frames) {
         match problems.get(&anchor) {
             Some(problem) => clips.bad.push((anchor, problem.clone())),
@@ -255,8 +255,8 @@ fn is_of_the_image(error: &Error) -> bool {
     }
 }
 
-/// The frames of the clip around an anchor, which has position ⌊`window` / 2⌋ in it. Where the
-/// sequence begins or ends within the clip, its first or last frame is repeated.
+/// The frames of the clip around an anchor. The anchor has position ⌊`window` / 2⌋. Beyond the ends
+/// of the sequence, its first or last frame is repeated.
 fn clip(timeline: &Timeline, anchor: usize, window: usize) -> Vec<usize> {
     let joined = |row: usize| timeline.joins(FrameId(anchor as u32), FrameId(row as u32));
     let mut frames = Vec::with_capacity(window);
@@ -329,8 +329,8 @@ mod tests {
         })
     }
 
-    /// Oracle: the encoder called on each image alone; and that a second run asks only for what the
-    /// first had not done.
+    /// Oracle: the encoder called on each image alone. A second run requests only the images that
+    /// the first one did not finish.
     #[test]
     fn an_interrupted_run_goes_on_and_gives_the_same_rows() {
         let timeline = Timeline::unbroken(8);
@@ -408,7 +408,7 @@ mod tests {
     }
 
     /// Oracle: by hand. Of clips of three around frames 2, 3 and 4, with frame 3 bad, only frame 3
-    /// is left out.
+    /// is skipped.
     #[test]
     fn a_bad_image_costs_its_own_frame_alone() {
         let timeline = Timeline::unbroken(8);
@@ -429,7 +429,8 @@ mod tests {
         assert_eq!(clips.frames, [[1, 2, 2], [4, 4, 5]]);
     }
 
-    /// Oracle: the definition of stopping at a bad image: it is named, and nothing is given.
+    /// Oracle: the definition of [`OnBadImage::Stop`]: the error names the image, and no rows are
+    /// returned.
     #[test]
     fn a_bad_image_stops_the_run_by_name() {
         let timeline = Timeline::unbroken(8);

@@ -1,4 +1,4 @@
-//! The libraries that can run a model, and what each of them implements.
+//! The runtimes that can run a model, and their common interface.
 
 use std::path::PathBuf;
 
@@ -38,7 +38,7 @@ impl RuntimeKind {
 pub struct Runtime {
     /// The library that runs it.
     pub kind: RuntimeKind,
-    /// The number of threads, for a library that keeps threads of its own.
+    /// The number of threads, for a library with its own threads.
     pub threads: usize,
     /// The path of onnxruntime's shared library.
     pub library: Option<PathBuf>,
@@ -46,6 +46,6 @@ pub struct Runtime {
 
 /// A model that is ready to run.
 pub(super) trait Runner: Send + Sync {
-    /// The outputs of the layers that were asked for, clips along the first axis of each.
+    /// The outputs of the requested layers, each with the clips along its first axis.
     fn run(&self, input: ArrayD<f32>) -> Result<Vec<ArrayD<f32>>, Error>;
 }

@@ -1,4 +1,4 @@
-//! Small pictures of a room's images, for people and maps.
+//! JPEG thumbnails of a room's images.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use image::{ExtendedColorType, ImageEncoder};
 use super::preparation::resized;
 use super::{Error, Filter, read_image};
 
-/// The quality of the JPEG, 1 to 100: at 160 pixels in width a picture of a room has about 5 kB.
+/// The quality of the JPEG, 1 to 100. A thumbnail 160 pixels wide has about 5 kB.
 const QUALITY: u8 = 80;
 
 /// A JPEG of an image of a room, `width` pixels wide and of the same proportions; a narrower image
@@ -32,7 +32,7 @@ pub fn thumbnail(root: &Path, image: &str, width: usize) -> Result<Vec<u8>, Erro
         )
         .map_err(|error| Error::BadImage {
             image: root.join(image).display().to_string(),
-            problem: format!("cannot be made a thumbnail of: {error}").into(),
+            problem: format!("cannot be encoded as a thumbnail: {error}").into(),
         })?;
 
     Ok(bytes)

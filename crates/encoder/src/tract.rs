@@ -1,6 +1,6 @@
 //! Models in tract, which is pure Rust. The execution plan is made for a batch of one clip, since a
-//! plan for an open batch size is 2 to 6 times slower. The clips of a batch are spread over the
-//! threads of the calling rayon pool.
+//! plan for a dynamic batch size is 2 to 6 times slower. The clips of a batch are distributed over
+//! the threads of the calling rayon pool.
 
 use seese3_core::Cause;
 use std::path::Path;
@@ -18,7 +18,7 @@ use super::runtime::Runner;
 
 pub(super) struct Tract {
     model: Arc<TypedRunnableModel>,
-    /// The outputs that were asked for, in that order.
+    /// The requested outputs, in order.
     names: Vec<String>,
 }
 
@@ -30,18 +30,18 @@ impl Tract {
         };
 
         let open = || {
-            "has an open input size; give --resize WIDTHxHEIGHT, which this runtime needs"
+            "has a dynamic input size; give --resize WIDTHxHEIGHT, which this runtime needs"
                 .to_owned()
         };
 
-        // The plan is made for one exact shape: a batch of 1, and every other axis as it is known.
+        // The plan is made for one exact shape: a batch of 1, and all other axes of known size.
         let fixed: Option<Vec<usize>> = shape.iter().skip(1).copied().collect();
         let fixed = fixed.ok_or_else(|| wrong(open().into()))?;
         let shape: Vec<usize> = std::iter::once(1).chain(fixed).collect();
 
         let plan = || {
-            // What a file says of the shapes of inner values is left over from its export, and wrong
-            // where the batch was open then: tract derives them itself.
+            // The file's shapes of inner values are left over from its export, and wrong if the
+            // batch was dynamic: let tract infer them.
             tract_onnx::onnx()
                 .with_ignore_value_info(true)
                 .with_ignore_output_shapes(true)
@@ -58,10 +58,10 @@ impl Tract {
                 })
         };
 
-        // tract panics at some models that are damaged, and leaves nothing behind that anybody else
-        // could see.
+        // tract panics on some damaged models. The panic can be caught, because no shared state
+        // remains.
         let model = std::panic::catch_unwind(plan).map_err(|_| {
-            wrong("cannot be run by tract, which stopped while it planned the model".into())
+            wrong("cannot be run by tract, which panicked while planning the model".into())
         })?;
         let model = model.map_err(|error| {
             wrong(
@@ -81,7 +81,7 @@ impl Tract {
             problem,
         };
 
-        // The clip is a view into the batch, while tract takes a tensor of its own.
+        // The clip is a view into the batch, but tract needs an owned tensor.
         let numbers: Vec<f32> = clip.iter().copied().collect();
         let input = Tensor::from_shape(clip.shape(), &numbers)
             .map_err(|error| failed(format!("{error:#}").into()))?;
@@ -113,7 +113,7 @@ impl Runner for Tract {
 
         let count = self.names.len();
 
-        // Each run gave a batch of one; a batch axis is needed to put them together again.
+        // Each run gave a batch of one. The outputs are joined along the batch axis.
         let joined = |output: usize| {
             let parts: Vec<_> = each.iter().map(|outputs| outputs[output].view()).collect();
             ndarray::concatenate(Axis(0), &parts).map_err(|_| {

@@ -1,8 +1,9 @@
-//! The connections of a server: how many there may be, and how long one may take to begin.
+//! Accepts connections, with a limit on their number and on the time to open one.
 //!
-//! tonic accepts connections without a bound, and keeps one that never says a word. Here each takes
-//! a place as soon as it is accepted, and has to finish its TLS handshake and send as many bytes as
-//! the preface of HTTP/2 has in time; only then does tonic see it, and check them.
+//! tonic accepts any number of connections and keeps those that never send a byte. Here each
+//! accepted connection takes a permit. Within a time limit it must finish the TLS handshake and
+//! send as many bytes as the HTTP/2 preface has. Only then is it passed to tonic, which checks the
+//! bytes.
 
 use std::future::Future;
 use std::io;
@@ -28,45 +29,43 @@ use super::metrics::Metrics;
 use super::status::Full;
 use super::tls::Tls;
 
-/// What every HTTP/2 connection begins with (RFC 9113, section 3.4), bytes.
+/// Length of the HTTP/2 connection preface (RFC 9113, section 3.4), bytes.
 const PREFACE: usize = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n".len();
-/// How long a connection may take until it has sent that.
+/// Time limit for the TLS handshake and the preface.
 const OPENING: Duration = Duration::from_secs(10);
-/// The pause after the system refused to accept a connection, for instance because the process has
-/// as many files open as it may.
+/// Pause after `accept` failed, for instance because the process reached its limit of open files.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
 
-/// Who is at the other end of a connection.
+/// The client side of a connection.
 #[derive(Debug, Clone)]
 pub struct Peer {
-    /// Where it comes from.
+    /// The remote address.
     pub address: SocketAddr,
-    /// SHA-256 of the certificate that it proved to have, if it was asked for one.
+    /// SHA-256 of the verified client certificate, if the server requires one.
     pub certificate: Option<[u8; 32]>,
     closing: Arc<Closing>,
 }
 
-/// What closes a connection.
+/// The close signal of a connection.
 #[derive(Debug, Default)]
 struct Closing {
     asked: AtomicBool,
-    /// Notified once that is asked for.
+    /// Notified when the connection is to be closed.
     now: Arc<Notify>,
 }
 
 impl Peer {
-    /// Closes the connection, with everything that is open on it. Returns whether nobody asked for
-    /// that before.
+    /// Closes the connection and all its streams. Returns true on the first call only.
     pub fn close(&self) -> bool {
         self.closing.now.notify_one();
         !self.closing.asked.swap(true, Ordering::Relaxed)
     }
 }
 
-/// An open connection; its place is free again when it is dropped.
+/// An open connection. Dropping it releases its permit.
 pub struct Connection {
     transport: Transport,
-    /// What was read while the connection was opened, and how much of it has been handed on.
+    /// The bytes read while the connection was opened; the cursor is how many tonic has read.
     preface: io::Cursor<[u8; PREFACE]>,
     peer: Peer,
     /// Completes when the connection is to be closed.
@@ -79,7 +78,7 @@ enum Transport {
     Tls(Box<TlsStream<TcpStream>>),
 }
 
-/// What opening a connection needs.
+/// The shared state for opening connections.
 #[derive(Clone)]
 struct Opener {
     places: Arc<Semaphore>,
@@ -87,8 +86,8 @@ struct Opener {
     metrics: Metrics,
 }
 
-/// The connections that `listener` accepts, at most `most` at a time; a further one is closed at
-/// once. When the stream is dropped, so are the listener and connections that are being opened.
+/// Stream of the connections that `listener` accepts, at most `most` at a time; further ones are
+/// closed at once. Dropping the stream drops the listener and the connections being opened.
 pub fn incoming(
     listener: TcpListener,
     most: usize,
@@ -113,7 +112,7 @@ async fn accept_all(
 ) {
     let mut opening = JoinSet::new();
 
-    // Trouble that lasts is logged once.
+    // A condition that persists is logged once.
     let mut is_refused = false;
     let mut is_full = false;
 
@@ -128,7 +127,7 @@ async fn accept_all(
             Ok(accepted) => accepted,
             Err(error) => {
                 if !is_refused {
-                    tracing::error!(%error, "no connection can be accepted");
+                    tracing::error!(%error, "cannot accept connections");
                 }
                 is_refused = true;
                 tokio::time::sleep(ACCEPT_PAUSE).await;
@@ -140,7 +139,7 @@ async fn accept_all(
         let Ok(place) = opener.places.clone().try_acquire_owned() else {
             opener.metrics.shed(Full::Connections);
             if !is_full {
-                tracing::warn!("all connections are taken; further ones are closed at once");
+                tracing::warn!("connection limit reached; further connections are closed at once");
             }
             is_full = true;
             continue;
@@ -151,17 +150,17 @@ async fn accept_all(
         let opened = opened.clone();
         opening.spawn(async move {
             match tokio::time::timeout(OPENING, opener.open(tcp, address, place)).await {
-                // An error means that the server stops.
+                // `send` fails if the server is stopping.
                 Ok(Ok(connection)) => drop(opened.send(Ok(connection)).await),
-                Ok(Err(error)) => tracing::debug!(%address, %error, "a connection was not opened"),
-                Err(_) => tracing::debug!(%address, "a connection was not opened in time"),
+                Ok(Err(error)) => tracing::debug!(%address, %error, "opening a connection failed"),
+                Err(_) => tracing::debug!(%address, "opening a connection timed out"),
             }
         });
     }
 }
 
 impl Opener {
-    /// Opens a connection, as far as its first words.
+    /// Performs the TLS handshake, if any, and reads the preface.
     async fn open(
         &self,
         tcp: TcpStream,
@@ -213,8 +212,7 @@ impl Connected for Connection {
 }
 
 impl Connection {
-    /// Fails once the connection is to be closed, whether its caller lets it read or write or
-    /// neither.
+    /// Fails once the connection is to be closed, even if the peer blocks reads and writes.
     fn check_open(&mut self, context: &mut Context<'_>) -> io::Result<()> {
         match self.closed.as_mut().poll(context) {
             Poll::Ready(()) => Err(io::ErrorKind::ConnectionAborted.into()),

@@ -1,4 +1,5 @@
-//! OdometryService.Encode: views to latents, so that a robot sends twenty numbers a frame and no image.
+//! OdometryService.Encode: views to latents. A robot can then send some twenty numbers per frame
+//! instead of an image.
 
 use tonic::{Request, Response, Status};
 

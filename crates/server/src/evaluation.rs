@@ -1,4 +1,4 @@
-//! EvaluationService: Hit@ε of the server's navigators, or of predictions that a client sends.
+//! EvaluationService: Hit@ε of the server's navigators or of a client's predictions.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -41,8 +41,7 @@ impl EvaluationService for Handlers {
             })
             .await?;
 
-        // The evaluation runs as its own task; the caller receives the stream of its events at
-        // once.
+        // The evaluation runs in its own task; the caller gets the event stream at once.
         let (events, stream) = mpsc::channel(16);
         let run = self
             .clone()
@@ -67,8 +66,7 @@ impl EvaluationService for Handlers {
 }
 
 impl Handlers {
-    /// Sends progress events and then the report, or the error. Stops when the caller has gone
-    /// away.
+    /// Sends progress events, then the report or the error. Stops if the caller closes the stream.
     async fn run_evaluation(
         self,
         served: Arc<ServedNavigator>,
@@ -76,7 +74,7 @@ impl Handlers {
         budget: Duration,
         events: Events,
     ) {
-        let heard = events.clone();
+        let caller = events.clone();
         let total = protocol.navigators.len() as u32;
 
         let work = move |cancel: &Cancellation| {
@@ -88,7 +86,7 @@ impl Handlers {
                 };
                 let event = pb::evaluate_response::Event::Progress(progress);
 
-                // A slow reader misses progress events; waiting for it would block a worker thread.
+                // A slow reader misses progress events: waiting would block a worker thread.
                 let _ = events.try_send(Ok(pb::EvaluateResponse { event: Some(event) }));
             })?;
 
@@ -98,7 +96,7 @@ impl Handlers {
         // If the caller closes the stream, `run` is dropped, which cancels the computation.
         let finished = tokio::select! {
             finished = self.workers.run(Lane::Long, budget, work) => finished,
-            () = heard.closed() => return,
+            () = caller.closed() => return,
         };
 
         if let Err(error) = &finished {
@@ -111,8 +109,8 @@ impl Handlers {
             })
             .map_err(Status::from);
 
-        // If this fails, the caller has gone away and nobody needs the result.
-        let _ = heard.send(last).await;
+        // `send` fails if the caller closed the stream.
+        let _ = caller.send(last).await;
     }
 }
 
@@ -135,8 +133,7 @@ fn protocol(
         mode,
     } = request;
 
-    // By default the adapter's own split and stride are used, so that the test pairs are those
-    // that were held out when it was trained.
+    // The defaults are the adapter's split and stride: its test pairs were held out in training.
     let served = snapshot.navigator(&room, &adapter)?;
     let record = &served.adapter.record;
     let split = convert::split(&split)?.unwrap_or(record.split);
@@ -161,8 +158,8 @@ fn protocol(
         ));
     }
 
-    // The rows of the table are resolved before the stream begins, so that a request that cannot
-    // be evaluated is refused at once and progress knows its total.
+    // Resolve the navigators before the stream begins: an invalid request is refused at once, and
+    // progress events can state the total.
     let navigators = protocol.rows(&served.navigator)?;
     Ok((
         served,
@@ -229,8 +226,8 @@ fn score(
         thresholds: convert::thresholds(thresholds)?,
     };
 
-    // An error of the conversion names the position of the prediction. That there is at least one
-    // is checked by `score_predictions`.
+    // A conversion error names the position of the prediction. `score_predictions` refuses an empty
+    // list.
     let predictions = predictions
         .into_iter()
         .enumerate()
@@ -238,7 +235,7 @@ fn score(
         .collect::<Result<Vec<_>, _>>()?;
     let row = score_predictions(&served.navigator, &predictions, &scope, cancel)?;
 
-    // Without a split the whole room is searched, so that every frame is a candidate.
+    // Without a split, every frame of the room is a candidate.
     let frame_count = served.navigator.room().frame_count();
     let candidate_count = scope.split.map_or(frame_count, |split| {
         split.candidates(served.navigator.room().timeline()).len()

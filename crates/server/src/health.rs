@@ -30,24 +30,24 @@ const SERVICES: [&str; 6] = [
     <EvaluationServiceServer<Handlers> as NamedService>::NAME,
 ];
 
-/// The phase, and whether rooms have a status of their own: not where callers need credentials,
-/// which health does not ask for.
+/// The health service: the server's phase, and whether rooms have a status. Health asks for no
+/// credentials, so rooms are hidden where other calls need them.
 pub struct HealthOf(watch::Receiver<Phase>, RoomHealth);
 
-/// Whether health knows rooms by name.
+/// Whether health checks of rooms are answered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RoomHealth {
     Shown,
     Hidden,
 }
 
-/// The health service of a server whose phase this channel carries.
+/// The health service for the phase in this channel.
 pub fn service(phase: watch::Receiver<Phase>, rooms: RoomHealth) -> HealthServer<HealthOf> {
     HealthServer::new(HealthOf(phase, rooms))
 }
 
-/// The status of the service or room `name`; none if the name is unknown. Rooms are unknown until
-/// the store is loaded; one that is in the store and cannot be served is NOT_SERVING.
+/// The status of the service or room `name`; `None` if the name is unknown. Rooms are unknown until
+/// the store is loaded. A room that is in the store but cannot be served is NOT_SERVING.
 fn status(phase: &Phase, rooms: RoomHealth, name: &str) -> Option<ServingStatus> {
     if SERVICES.contains(&name) {
         return Some(match phase {
@@ -103,8 +103,8 @@ impl Health for HealthOf {
         tokio::spawn(async move {
             let mut last = None;
             loop {
-                // The read guard is dropped before the awaits below: while it lives, `run` cannot
-                // change the phase.
+                // Drop the read guard before the awaits below: it blocks `run` from changing the
+                // phase.
                 let (now, stopping) = {
                     let phase = phase.borrow_and_update();
                     let stopping = matches!(*phase, Phase::Draining(_) | Phase::Stopping);
@@ -115,8 +115,7 @@ impl Health for HealthOf {
                     )
                 };
 
-                // The first status is always sent, later ones only when they differ from the one
-                // before.
+                // The first status is always sent, later ones only if the status changed.
                 if last.replace(now) != Some(now)
                     && changes
                         .send(Ok(HealthCheckResponse { status: now.into() }))
@@ -126,7 +125,7 @@ impl Health for HealthOf {
                     return;
                 }
 
-                // A stopping server waits for its open calls to end, so this one ends by itself.
+                // A stopping server waits for open calls, so this stream must end.
                 if stopping {
                     return;
                 }

@@ -1,4 +1,4 @@
-//! The body of an answer that holds something until it has been sent: a caller's place, memory.
+//! Response bodies that hold a resource, such as a permit or a memory lease, until they are sent.
 
 use std::pin::Pin;
 use std::task::{Context, Poll};
@@ -6,13 +6,13 @@ use std::task::{Context, Poll};
 use http_body::{Frame, SizeHint};
 use tonic::body::Body;
 
-/// A body, and what is dropped with it.
+/// A body and a value that is dropped with it.
 struct HoldingBody<H> {
     body: Body,
     _held: H,
 }
 
-/// The same body, which holds `held` until it has ended.
+/// Wraps `body` so that `held` is dropped with it.
 pub fn holding<H: Send + Unpin + 'static>(body: Body, held: H) -> Body {
     Body::new(HoldingBody { body, _held: held })
 }

@@ -1,5 +1,5 @@
-//! Images that callers send instead of features. They are decoded within size limits and encoded by
-//! the same encoder that made the adapter's features.
+//! Encodes images that callers send instead of features, within size limits, with the encoder that
+//! made the adapter's features.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -13,13 +13,12 @@ use seese3_core::image::RgbImage;
 use seese3_encoder::{Bounds, Encoder, Runtime, decode};
 use seese3_store::StoredAdapter;
 
-/// The encoders that a server may use for images.
+/// Configuration of the image encoders.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImageEncoders {
-    /// `builtin`, `pixels`, or paths of ONNX files: the encoders that made the adapters' features.
+    /// The encoders of the adapters' features: `builtin`, `pixels`, or paths of ONNX files.
     pub models: Vec<String>,
-    /// XFeat's ONNX file, whose feature maps tell the motion between two images; none if the server
-    /// does not read it.
+    /// XFeat's ONNX file, for the motion between two images; `None` disables that.
     pub two_view: Option<PathBuf>,
     /// The runtime that executes ONNX models.
     pub runtime: Runtime,
@@ -35,7 +34,7 @@ pub struct ImageEncoder {
 }
 
 impl ImageEncoder {
-    /// Encodes images of at most the size of `bounds` by `encoder`.
+    /// Encodes with `encoder`, and refuses images larger than `bounds`.
     pub fn new(encoder: Encoder, bounds: Bounds) -> Self {
         Self {
             encoder,
@@ -44,7 +43,7 @@ impl ImageEncoder {
         }
     }
 
-    /// The same, with the time of each image counted.
+    /// Records the encoding time of each image in `metrics`.
     pub fn counted_in(self, metrics: Metrics) -> Self {
         Self {
             metrics: Some(metrics),
@@ -68,7 +67,7 @@ impl ImageEncoder {
     /// # Errors
     /// As [`ImageEncoder::feature`].
     pub fn decoded(&self, field: &str, image: &[u8]) -> Result<RgbImage, Error> {
-        decode("image", image, self.bounds).map_err(|error| told(field, error))
+        decode("image", image, self.bounds).map_err(|error| request_error(field, error))
     }
 
     /// The feature of decoded pixels.
@@ -86,24 +85,23 @@ impl ImageEncoder {
             metrics.image_encoded(began.elapsed());
         }
         rows.map(|rows| rows.row(0).to_vec())
-            .map_err(|error| told(field, error))
+            .map_err(|error| request_error(field, error))
     }
 }
 
-/// A bad image is the caller's error and names the field. Anything else is a failure of this server,
-/// which only its log explains.
-fn told(field: &str, error: seese3_encoder::Error) -> Error {
+/// A bad image is the caller's error, on `field`. Any other error is internal and only logged.
+fn request_error(field: &str, error: seese3_encoder::Error) -> Error {
     match error {
         seese3_encoder::Error::BadImage { problem, .. } => Error::invalid(field, problem),
         error @ seese3_encoder::Error::NotFinite { .. } => Error::invalid(field, error),
         error => {
-            tracing::error!(%error, "an image could not be encoded");
+            tracing::error!(%error, "encoding an image failed");
             Error::Internal
         }
     }
 }
 
-/// Reads every model before any adapter is looked at, so that a wrong path ends the server at once.
+/// Checks that every model can be read, so that a wrong path fails at startup.
 ///
 /// # Errors
 /// [`RunError::Model`] if a model cannot be read.
@@ -118,10 +116,10 @@ pub fn check_models(models: &[String]) -> Result<(), RunError> {
     Ok(())
 }
 
-/// Warns of models that no adapter needs: probably a mistake of the operator.
+/// Warns about models that no adapter uses: probably a configuration mistake.
 pub fn warn_of_unneeded(models: &[String], adapters: &BTreeMap<String, Arc<StoredAdapter>>) {
     for model in models {
-        // Every model was read before, by `check_models`.
+        // `check_models` has reported unreadable models.
         let Ok(id) = seese3_encoder::identity(model) else {
             continue;
         };
@@ -130,16 +128,16 @@ pub fn warn_of_unneeded(models: &[String], adapters: &BTreeMap<String, Arc<Store
             .values()
             .any(|adapter| adapter.adapter.source().encoder == id);
         if !is_needed {
-            tracing::warn!(model, id, "no adapter's features were made by this encoder");
+            tracing::warn!(model, id, "no adapter uses this encoder");
         }
     }
 }
 
-/// The encoder that made an adapter's features; none if it is not at hand or takes clips, which the
-/// log says.
+/// The encoder of an adapter's features. `None`, with a log line, if it is not configured or takes
+/// clips instead of single images.
 ///
 /// # Errors
-/// [`seese3_encoder::Error`] if it cannot be built or gives features of another width.
+/// [`seese3_encoder::Error`] if it cannot be built or its features have another width.
 pub fn open_for(
     adapter: &str,
     source: &FeatureSource,
@@ -150,7 +148,7 @@ pub fn open_for(
         tracing::warn!(
             adapter,
             encoder = source.encoder,
-            "no --encoder made the adapter's features; images cannot be sent for it"
+            "no --encoder matches the adapter's features; it accepts no images"
         );
         return Ok(None);
     };
@@ -158,18 +156,18 @@ pub fn open_for(
     if encoder.window() > 1 {
         tracing::warn!(
             adapter,
-            "the adapter's features are made from clips; it takes no single images"
+            "the adapter's features are made from clips; it accepts no single images"
         );
         return Ok(None);
     }
 
-    // One layer, as wide as the adapter's input.
+    // The encoder must give one layer of the adapter's input width.
     if encoder.dims() != [source.dim] {
         return Err(seese3_encoder::Error::Option {
             what: "encoder",
             given: encoder.id().to_owned(),
             problem: format!(
-                "gives {:?} columns, the adapter takes {}",
+                "gives {:?} columns, but the adapter needs {}",
                 encoder.dims(),
                 source.dim
             )
@@ -181,7 +179,7 @@ pub fn open_for(
         adapter,
         encoder = encoder.id(),
         runtime = encoder.runtime(),
-        "takes images"
+        "image encoder ready"
     );
     Ok(Some(ImageEncoder::new(encoder, encoders.bounds)))
 }

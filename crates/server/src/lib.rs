@@ -1,11 +1,10 @@
 //! The gRPC service: package `seese3.v1`, standard health and reflection.
 //!
-//! - A request answers from the [`Snapshot`] that was current when it began; a snapshot never
-//!   changes. When the store has, a new one takes its place.
-//! - Computation runs on blocking threads, a bounded number at a time; a panic there fails only
-//!   that one request.
-//! - Long work checks between its pieces whether the deadline passed or the caller went away, and
-//!   stops if so.
+//! - A request is answered from the [`Snapshot`] that was current when it began. Snapshots are
+//!   immutable; when the store changes, a new one replaces the old.
+//! - Computation runs on a bounded number of blocking threads. A panic fails only its request.
+//! - Long work regularly checks for cancellation: it stops after the deadline, or when the caller
+//!   has gone.
 
 mod health;
 mod holding_body;
@@ -84,67 +83,69 @@ use seese3_store::Store;
 use snapshot::Loader;
 use workers::{Lane, Workers};
 
-/// What those may hold in memory who watch health: this part of what requests may.
+/// Divisor for the memory budget of health watchers: 1/8 of the request budget.
 const WATCHERS: usize = 8;
-/// What health checks may hold in memory, bytes.
+/// Memory budget of health checks, bytes.
 const PROBES: usize = 16 << 20;
-/// After the drain time, how long the server still waits for callers to receive the error of their
-/// abandoned requests.
+/// Time after draining in which callers can still receive their last responses or errors.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
-/// The configuration and the limits of a server.
+/// Configuration and limits of a server.
 #[derive(Debug, Clone)]
 pub struct Config {
-    /// The index in which navigators search for the nearest frames.
+    /// Index for nearest-frame search.
     pub index: IndexKind,
-    /// Which rooms are in memory.
+    /// When rooms are loaded into memory, and how much they may hold.
     pub rooms: RoomMemory,
-    /// The limits of one request: steps, hits, and frames in the whole answer.
+    /// Limits of one request: steps, frames per step (`top_k`), and frames in the whole answer.
     pub limits: Limits,
-    /// The encoders for images that callers send; none if the server takes no images.
+    /// Encoders for images from callers; `None` if the server accepts no images.
     pub encoders: Option<ImageEncoders>,
-    /// The largest number of requests in one BatchNavigate.
+    /// Maximum number of requests in one BatchNavigate.
     pub batch: usize,
-    /// The largest number of predictions in one ScorePredictions.
+    /// Maximum number of predictions in one ScorePredictions.
     pub predictions: usize,
-    /// What all requests in progress may hold in memory together, bytes.
+    /// Memory budget of all requests in progress together, bytes.
     pub memory_bytes: usize,
-    /// How long a request with one message may take to arrive.
+    /// Time limit for receiving a request that has one message.
     pub receive_within: Duration,
-    /// How long a caller may receive nothing of a unary response, before its connection is closed.
+    /// Idle timeout of a unary response: its connection is closed if the caller receives nothing
+    /// for this long.
     pub response_timeout: Duration,
     /// Whether callers may change the catalog.
     pub writable: bool,
-    /// Whether callers may see the images of rooms, as thumbnails.
+    /// Whether callers may get the rooms' images as thumbnails.
     pub thumbnails: bool,
-    /// What all uploads in progress may hold in memory together, bytes.
+    /// Memory budget of all uploads in progress together, bytes.
     pub upload_bytes: usize,
-    /// The largest message that is received, bytes.
+    /// Maximum size of a received message, bytes.
     pub message_bytes: usize,
-    /// The largest number of requests computed at the same time.
+    /// Worker threads for short requests, and as many for requests with images. Batches and
+    /// evaluations get half as many, rounded up.
     pub threads: usize,
-    /// The largest number of requests that wait for a thread; a further one is refused.
+    /// Maximum number of requests that wait for a thread, for each of these kinds; further ones are
+    /// refused.
     pub queue: usize,
-    /// The longest time for one request; a caller's own deadline can only shorten it.
+    /// Time limit of one request. A caller's deadline can only shorten it.
     pub longest: Duration,
-    /// The largest number of Track streams open at the same time; a further one is refused.
+    /// Maximum number of open Track streams; further ones are refused.
     pub streams: usize,
-    /// The key that authenticates resume tokens. Servers that share it accept one another's tokens.
+    /// Key that authenticates resume tokens. Servers with the same key accept each other's tokens.
     pub token_key: TokenKey,
-    /// How long the server still accepts requests after the shutdown signal, while health says
+    /// Time after the shutdown signal in which requests are still accepted while health reports
     /// NOT_SERVING.
     pub lame_duck: Duration,
-    /// How long requests in flight may continue after that.
+    /// Time after `lame_duck` in which requests in flight may finish.
     pub drain: Duration,
-    /// When the server looks for changes of its store.
+    /// When the server checks its store for changes.
     pub reload: Reload,
-    /// What the server counts.
+    /// The server's metrics.
     pub metrics: Metrics,
-    /// The largest number of connections at a time; a further one is closed at once.
+    /// Maximum number of connections; further ones are closed at once.
     pub connections: usize,
-    /// The server's certificate; none to speak plain text.
+    /// The server's certificate; `None` for plain text.
     pub tls: Option<Arc<Tls>>,
-    /// Who may call; none to answer everybody.
+    /// The callers' credentials; `None` to accept any caller.
     pub keyring: Option<Arc<Keyring>>,
 }
 
@@ -204,18 +205,18 @@ pub enum RunError {
     },
     #[error("the server failed: {0}")]
     Transport(#[from] tonic::transport::Error),
-    #[error("the reflection service cannot be made: {0}")]
+    #[error("cannot build the reflection service: {0}")]
     Reflection(#[source] tonic_reflection::server::Error),
     #[error("loading the store failed: {0}")]
     Loading(#[source] tokio::task::JoinError),
 }
 
-/// Where a server listens.
+/// Listening sockets of a server.
 #[derive(Debug)]
 pub struct Listeners {
     /// For gRPC.
     pub grpc: TcpListener,
-    /// For `/metrics`, `/livez` and `/readyz` over HTTP, if anywhere.
+    /// For `/metrics`, `/livez` and `/readyz` over HTTP; `None` disables them.
     pub operations: Option<TcpListener>,
 }
 
@@ -228,7 +229,7 @@ impl From<TcpListener> for Listeners {
     }
 }
 
-/// The stage of a server's life, which health and every handler read.
+/// Lifecycle phase of the server, read by health and all handlers.
 #[derive(Clone)]
 enum Phase {
     Loading,
@@ -238,19 +239,19 @@ enum Phase {
     Stopping,
 }
 
-/// The state that all handlers share.
+/// State shared by all handlers.
 #[derive(Clone)]
 struct Handlers {
     phase: watch::Receiver<Phase>,
     workers: Workers,
     config: Arc<Config>,
     streams: Arc<Semaphore>,
-    /// What changes of the catalog go through; none if this server takes no changes.
+    /// Applies changes of the catalog; `None` if the server is read-only.
     changes: Option<Arc<Changes>>,
 }
 
 impl Handlers {
-    /// What is served now, as far as the caller of the request may see it.
+    /// The current snapshot, limited to the rooms that the caller may see.
     fn snapshot<T>(&self, request: &Request<T>) -> Result<Arc<Snapshot>, Error> {
         let snapshot = match &*self.phase.borrow() {
             Phase::Serving(snapshot) | Phase::Draining(snapshot) => snapshot.clone(),
@@ -266,8 +267,8 @@ impl Handlers {
 }
 
 impl Handlers {
-    /// Answers a unary request from the current snapshot: `work` runs on a worker thread of the lane,
-    /// within the caller's deadline.
+    /// Answers a unary request from the current snapshot. Runs `work` on a worker thread of the
+    /// lane, within the caller's deadline.
     async fn unary<Q, A>(
         &self,
         request: Request<Q>,
@@ -288,26 +289,26 @@ impl Handlers {
     }
 }
 
-/// Who a request is from; none if the server answers everybody.
+/// The authenticated caller; `None` if the server has no keyring.
 fn principal<T>(request: &Request<T>) -> Option<&Arc<Principal>> {
     request.extensions().get()
 }
 
-/// Serves a store until `shutdown` completes. The health service answers from the first moment,
-/// with NOT_SERVING until the whole store is loaded.
+/// Serves a store until `shutdown` completes. Health checks are answered at once, with NOT_SERVING
+/// until the store is loaded.
 ///
 /// # Errors
-/// [`RunError`] if the store cannot be read, or none of its rooms can be served, in which case the
-/// server ends before it serves; or if the transport fails. A single room or adapter that cannot be
-/// served is refused by itself.
+/// [`RunError`] if the store cannot be read, no room can be served, or the transport fails. A
+/// single room or adapter that cannot be served does not stop the server: only its own requests are
+/// refused.
 pub async fn run(
     listeners: impl Into<Listeners>,
     store: Store,
     config: Config,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), RunError> {
-    // Health, reflection and the other services listen at once and read the phase from this
-    // channel. Until the store is loaded, requests are refused as UNAVAILABLE.
+    // All services listen at once and read the phase from this channel. Until the store is loaded,
+    // requests are refused with UNAVAILABLE.
     let Listeners { grpc, operations } = listeners.into();
     let (phase, watched) = watch::channel(Phase::Loading);
     let metrics = config.metrics.clone();
@@ -324,7 +325,7 @@ pub async fn run(
         changes: config.writable.then(|| Arc::new(changes)),
     };
     let answering = server(handlers, watched.clone(), grpc, async {
-        // An error means that `run` was dropped; the server must stop then, too.
+        // An error means that `run` was dropped; the server must stop then too.
         let _ = stopped.await;
     })?;
     let operating = operate(operations, metrics.clone(), watched);
@@ -344,8 +345,7 @@ pub async fn run(
         Ok::<_, RunError>((loader, first))
     };
 
-    // The server future has to be polled while the store loads, or no health check would be
-    // answered.
+    // Poll the server while the store loads, so that health checks are answered.
     let (loader, first) = tokio::select! {
         loaded = loading => loaded?,
         ended = &mut server => return ended,
@@ -365,8 +365,7 @@ pub async fn run(
 
     metrics.serving(first.counts());
 
-    // From here on requests are answered. The function waits for the shutdown signal or for a
-    // failure of the server.
+    // Requests are answered from here on, until the shutdown signal or a failure of the server.
     phase.send_replace(Phase::Serving(Arc::new(first)));
 
     tokio::select! {
@@ -377,25 +376,25 @@ pub async fn run(
 
     tracing::info!(bound_s = config.drain.as_secs_f64(), "draining");
 
-    // Health turns to NOT_SERVING and open Track streams end, so that load balancers and robots
-    // move to another server while short requests finish here.
+    // Health changes to NOT_SERVING and open Track streams end: load balancers and robots move to
+    // another server while short requests finish here.
     phase.send_modify(|phase| {
         if let Phase::Serving(snapshot) = phase {
             *phase = Phase::Draining(snapshot.clone());
         }
     });
 
-    // Load balancers need a moment to notice; until then they still send requests here.
+    // Load balancers still send requests here until they notice.
     if let Ok(ended) = tokio::time::timeout(config.lame_duck, &mut server).await {
         return ended;
     }
 
-    // An error means the server has ended already.
+    // `send` fails if the server has already ended.
     let _ = stop.send(());
     drained(server, config.drain, &workers, &metrics).await
 }
 
-/// Waits until a server that was told to stop has ended: at most `bound`, and then a moment.
+/// Waits for a stopping server to end, at most `bound` plus [`LAST_WORDS`].
 async fn drained(
     mut server: Pin<&mut impl Future<Output = Result<(), RunError>>>,
     bound: Duration,
@@ -404,30 +403,28 @@ async fn drained(
 ) -> Result<(), RunError> {
     tokio::select! {
         ended = &mut server => return ended,
-        // Callers that answer nothing keep their connections open. Without a request they are not
-        // waited for.
+        // Idle connections without a request are not waited for.
         () = idle(metrics) => {}
         () = tokio::time::sleep(bound) => {
-            tracing::warn!("the drain bound passed; requests still in flight are given up");
+            tracing::warn!("drain timeout passed; requests in flight are abandoned");
             workers.halt();
         }
     }
 
-    // Wait a moment for callers to read their last answers; of abandoned requests that is
-    // UNAVAILABLE.
+    // Give callers time to read their last responses; abandoned requests end with UNAVAILABLE.
     tokio::time::timeout(LAST_WORDS, server)
         .await
         .unwrap_or(Ok(()))
 }
 
-/// Completes when no request is being answered.
+/// Completes when no request is in flight.
 async fn idle(metrics: &Metrics) {
     while metrics.in_flight() > 0 {
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
 }
 
-/// Notices new certificates and credentials; never completes.
+/// Reloads changed certificate and credential files; never completes.
 async fn follow_files(tls: Option<Arc<Tls>>, keyring: Option<Arc<Keyring>>) -> Infallible {
     let of_tls = async {
         if let Some(tls) = &tls {
@@ -444,7 +441,7 @@ async fn follow_files(tls: Option<Arc<Tls>>, keyring: Option<Arc<Keyring>>) -> I
     std::future::pending().await
 }
 
-/// Answers those who operate the server, if there is a listener for them; never completes.
+/// Serves metrics and probes if there is a listener for them; never completes.
 async fn operate(
     listener: Option<TcpListener>,
     metrics: Metrics,
@@ -461,7 +458,7 @@ fn memory_layer(config: &Config) -> MemoryLayer {
     let counted = memory.clone();
     config.metrics.gauge_elsewhere(
         "memory_held_bytes",
-        "What requests in progress are counted to hold in memory",
+        "Memory accounted to requests in progress, bytes",
         move || counted.held() as u64,
     );
 
@@ -497,7 +494,7 @@ fn server(
         None => RoomHealth::Shown,
     };
 
-    // Reflection is offered in both versions, because some clients speak only v1alpha.
+    // Offer reflection in both versions: some clients support only v1alpha.
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
@@ -508,8 +505,8 @@ fn server(
     let v1 = reflection().build_v1().map_err(failed)?;
     let v1alpha = reflection().build_v1alpha().map_err(failed)?;
 
-    // Keep-alive pings detect clients that vanished without closing their connection; when it is
-    // closed their requests are cancelled.
+    // Keep-alive pings detect clients that vanished without closing their connection. Closing it
+    // cancels their requests.
     let router = Server::builder()
         .http2_keepalive_interval(Some(Duration::from_secs(30)))
         .http2_keepalive_timeout(Some(Duration::from_secs(20)))

@@ -1,5 +1,5 @@
-//! LocalizationService: Localize, by retrieval of the nearest frames. Relocalize is in
-//! `relocalization`.
+//! LocalizationService: Localize, which retrieves the nearest frames and estimates the pose.
+//! Relocalize is in `relocalization`.
 
 use std::sync::Arc;
 
@@ -69,8 +69,8 @@ fn answer(
     let thresholds = convert::thresholds(thresholds)?;
     let k = checked_count(top_k, most)?;
 
-    // All rooms share one adapter, so that the view is embedded once and its distances compare
-    // between rooms.
+    // All rooms share one adapter: the view is embedded once, and distances are comparable between
+    // rooms.
     let served = rooms_under(snapshot, &rooms, &adapter)?;
     let first = &served[0];
     let source = convert::source("view", view, &first.adapter, snapshot)?;
@@ -81,7 +81,7 @@ fn answer(
         ));
     }
 
-    // A frame has a recorded pose, which serves as ground truth below; other views have none.
+    // A stored frame has a recorded pose, used as ground truth below.
     let start = first
         .navigator
         .start(&source, None)
@@ -110,8 +110,7 @@ fn answer(
                 &place.frame,
                 served.navigator.room(),
             )),
-            // The error is taken from the true pose itself, so that its twist is log(true⁻¹ ·
-            // found).
+            // The source of the error is the true pose itself, so its twist is log(true⁻¹ · found).
             error: start.pose.map(|truth| {
                 convert::error_to_wire(
                     &StepError::of(&truth, &place.frame.pose, &truth),
@@ -121,7 +120,7 @@ fn answer(
         })
     };
 
-    // In one room a view that is no stored frame is also located.
+    // If one room is searched, also estimate the pose of a view that is not a stored frame.
     let (located, believed) = match (served.as_slice(), &source) {
         (_, Source::Frame(_)) => (None, None),
         ([only], Source::Feature(feature)) => (
@@ -152,7 +151,7 @@ fn checked_count(top_k: Option<u32>, most: u32) -> Result<u32, Error> {
     }
 }
 
-/// Where the camera of a view is believed to be, and whether the view looks like the room.
+/// Estimated camera pose of a view, and its out-of-distribution score for the room.
 fn believed(
     served: &ServedNavigator,
     latent: ArrayView1<'_, f64>,
@@ -182,7 +181,8 @@ fn believed(
     }
 }
 
-/// Where the camera of a feature is, if the adapter was fitted to the room.
+/// Camera pose of a feature from the fitted adapter; `None` if the adapter is not fitted to the
+/// room.
 fn located(served: &ServedNavigator, feature: &[f32]) -> Result<Option<pb::LocatedPose>, Error> {
     let room = served.navigator.room().id();
     let located = served.reader.as_ref();
@@ -191,13 +191,13 @@ fn located(served: &ServedNavigator, feature: &[f32]) -> Result<Option<pb::Locat
         .transpose()
 }
 
-/// Where the camera of a feature, which was embedded before, is in a room.
+/// Camera pose in a room from the fitted adapter. The feature must already fit the adapter.
 pub(super) fn located_by(
     reader: &RoomReader,
     feature: &[f32],
     room: &room::RoomId,
 ) -> Result<pb::LocatedPose, Error> {
-    // The feature fits the adapter's, so that nothing can be wrong with it.
+    // The feature was checked against the adapter, so an error here is internal.
     let view = reader.locate(feature).map_err(|_| Error::Internal)?;
     let room = room.as_str();
 
@@ -213,9 +213,9 @@ pub(super) fn located_by(
     })
 }
 
-/// The rooms to search, all under one adapter; at least one. An empty `rooms` means every room that
-/// the adapter fits; an empty `adapter` means the default of a single room, or the only one that
-/// fits all rooms.
+/// The rooms to search, all under one adapter; at least one. An empty `rooms` selects every room
+/// that the adapter fits. An empty `adapter` selects the default of a single room, or the only
+/// adapter that fits all rooms.
 ///
 /// # Errors
 /// [`Error::NotFound`] for an unknown room or adapter, [`Error::Invalid`] if a room is named twice
@@ -235,8 +235,8 @@ pub(super) fn rooms_under(
         }
     }
 
-    // Without the name of an adapter, one named room answers by its default adapter; several
-    // rooms need one adapter that fits them all.
+    // If no adapter is named, use the default of a single named room, or the only adapter that fits
+    // all rooms.
     let adapter = match (adapter, rooms) {
         ("", [room]) => snapshot.navigator(room, "")?.adapter.name.clone(),
         ("", _) => only_adapter_of(snapshot, rooms)?,
@@ -250,8 +250,8 @@ pub(super) fn rooms_under(
             .collect();
     }
 
-    // Where all rooms are searched, one that turns out to be damaged is left out, as one that was
-    // refused from the beginning is. The log and the health of the room say so.
+    // In a search of all rooms, skip damaged rooms, like those refused at loading. The log and the
+    // rooms' health report them.
     let fitting = snapshot
         .rooms()
         .iter()
@@ -270,11 +270,11 @@ pub(super) fn rooms_under(
     Ok(served)
 }
 
-/// The only adapter that fits all the rooms, since distances under two adapters do not compare. It
-/// is an error if none or several fit.
+/// The only adapter that fits all the rooms; distances under different adapters are not comparable.
+/// It is an error if none or several fit.
 fn only_adapter_of(snapshot: &Snapshot, rooms: &[String]) -> Result<String, Error> {
-    // Where all rooms are searched, those that no adapter fits are left out; otherwise one of
-    // them would rule out every adapter.
+    // In a search of all rooms, skip those without a fitting adapter: one of them would rule out
+    // every adapter.
     let answered = snapshot
         .rooms()
         .iter()
@@ -286,7 +286,7 @@ fn only_adapter_of(snapshot: &Snapshot, rooms: &[String]) -> Result<String, Erro
         rooms.iter().collect()
     };
 
-    // Each room rules out the adapters that do not fit it.
+    // Keep the adapters that fit every room.
     let mut fitting: Vec<&String> = snapshot.adapters().keys().collect();
     for room in asked {
         let served = snapshot.room(room)?;

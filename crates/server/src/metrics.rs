@@ -1,7 +1,7 @@
-//! What a server counts, in the format of Prometheus.
+//! Prometheus metrics of a server.
 //!
-//! Every name begins with `seese3_`. Labels come from closed sets: nothing that a caller sends
-//! becomes a label, so that no caller can make the answer grow.
+//! Every name begins with `seese3_`. Label values come from closed sets, never from requests, so
+//! that callers cannot create new time series.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -21,14 +21,14 @@ use prost_types::FileDescriptorSet;
 use super::status::Full;
 use seese3_client::proto::v1::TrackStatus;
 
-/// The metrics of one server; clones count into the same numbers.
+/// The metrics of one server. Clones share the same counters.
 #[derive(Debug, Clone)]
 pub struct Metrics(Arc<Inner>);
 
 #[derive(Debug)]
 struct Inner {
     registry: Mutex<Registry>,
-    /// The paths of all RPCs: no other path becomes a label.
+    /// The paths of all RPCs. Any other path is labeled "unknown".
     methods: BTreeSet<String>,
     requests: Family<RequestLabels, Histogram>,
     in_flight: Gauge,
@@ -68,7 +68,7 @@ struct OutcomeLabels {
     outcome: &'static str,
 }
 
-/// How a look for changes of the store ended.
+/// Outcome of checking the store for changes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ReloadOutcome {
     Changed,
@@ -88,17 +88,17 @@ impl ReloadOutcome {
     }
 }
 
-/// From a quarter of a millisecond to four minutes.
+/// Buckets from 0.25 ms to 131 s.
 fn request_seconds() -> Histogram {
     Histogram::new(exponential_buckets(0.000_25, 2.0, 20))
 }
 
-/// From a tenth of a millisecond to three seconds: a camera sends a frame every 16 to 200 ms.
+/// Buckets from 0.1 ms to 3.3 s; a camera sends a frame every 16 to 200 ms.
 fn frame_seconds() -> Histogram {
     Histogram::new(exponential_buckets(0.000_1, 2.0, 16))
 }
 
-/// Distances between latents have no unit; those of neighbours lie between 0.01 and 10.
+/// Buckets from 0.01 to 82. Latent distances have no unit; those of neighbors are 0.01 to 10.
 fn latent_distance() -> Histogram {
     Histogram::new(exponential_buckets(0.01, 2.0, 14))
 }
@@ -139,7 +139,7 @@ impl Default for Metrics {
 }
 
 impl Inner {
-    /// Makes the counts that alerts watch, so that the first event is seen as a change from zero.
+    /// Creates the counters that alerts watch, so that the first event is a change from zero.
     fn begin_at_zero(&self) {
         for full in Full::ALL {
             let full = full.words();
@@ -160,17 +160,17 @@ impl Inner {
         }
     }
 
-    /// Registers every metric under its name, with a sentence of help.
+    /// Registers every metric with its name and help text.
     fn describe(&self, registry: &mut Registry) {
         registry.register_with_unit(
             "request",
-            "Time from a request's arrival to the end of its answer, streams included, by RPC and gRPC code",
+            "Time from a request's arrival to the end of its response, streams included, by RPC and gRPC code",
             Unit::Seconds,
             self.requests.clone(),
         );
         registry.register(
             "requests_in_flight",
-            "Requests and streams that are being answered",
+            "Requests and streams in flight",
             self.in_flight.clone(),
         );
         registry.register_with_unit(
@@ -187,12 +187,12 @@ impl Inner {
         );
         registry.register(
             "retrieval_distance",
-            "Latent distance from what was searched for to the nearest frame that was found",
+            "Latent distance from the query to the nearest retrieved frame",
             self.retrieval_distance.clone(),
         );
         registry.register(
             "requests_shed",
-            "Requests refused because something was full, by what",
+            "Requests refused because a limit was reached, by limit",
             self.refusals.clone(),
         );
         registry.register("rooms", "Rooms that are served", self.rooms.clone());
@@ -204,27 +204,27 @@ impl Inner {
         registry.register(
             "refused",
             "Newest revisions in the store that cannot be served: rooms, adapters, adapters in one of \
-             their rooms, and choices of defaults",
+             their rooms, and chosen defaults",
             self.refused.clone(),
         );
         registry.register(
             "reloads",
-            "Looks for changes of the store, by outcome: changed, unchanged or failed",
+            "Checks of the store for changes, by outcome: changed, unchanged or failed",
             self.reloads.clone(),
         );
     }
 }
 
-/// What a snapshot serves and refuses.
+/// Numbers of served and refused items in a snapshot.
 pub(super) struct ServedCounts {
     pub rooms: usize,
     pub adapters: usize,
-    /// Number of refused things by kind.
+    /// Number of refused items by kind.
     pub refused: [(&'static str, usize); 4],
 }
 
 impl Metrics {
-    /// The metrics as text, for a scrape.
+    /// The metrics in the text format, for a scrape.
     pub fn text(&self) -> String {
         let registry = self.0.registry.lock();
         let registry = registry.unwrap_or_else(PoisonError::into_inner);
@@ -235,7 +235,7 @@ impl Metrics {
         text
     }
 
-    /// Adds a count that is kept elsewhere and read at every scrape.
+    /// Registers an external counter, read by `count` at every scrape.
     pub fn count_elsewhere(
         &self,
         name: &'static str,
@@ -250,7 +250,7 @@ impl Metrics {
         });
     }
 
-    /// Adds a value that is kept elsewhere and read at every scrape; it may fall again.
+    /// Registers an external gauge, read by `value` at every scrape.
     pub(super) fn gauge_elsewhere(
         &self,
         name: &'static str,
@@ -271,12 +271,12 @@ impl Metrics {
         registry.register_collector(Box::new(collector));
     }
 
-    /// A request or stream began.
+    /// Counts the start of a request or stream.
     pub(super) fn request_began(&self) {
         self.0.in_flight.inc();
     }
 
-    /// A request or stream ended.
+    /// Records the end of a request or stream.
     pub(super) fn request_ended(&self, method: &str, code: tonic::Code, took: Duration) {
         self.0.in_flight.dec();
 
@@ -289,34 +289,34 @@ impl Metrics {
         requests.observe(took.as_secs_f64());
     }
 
-    /// How many requests and streams are being answered.
+    /// Number of requests and streams in flight.
     pub(super) fn in_flight(&self) -> i64 {
         self.0.in_flight.get()
     }
 
-    /// A frame of a Track stream was answered.
+    /// Records the answer to a Track frame.
     pub(super) fn frame_answered(&self, outcome: &'static str, took: Duration) {
         let frames = self.0.frames.get_or_create(&FrameLabels { outcome });
         frames.observe(took.as_secs_f64());
     }
 
-    /// An image was encoded.
+    /// Records the encoding of an image.
     pub(super) fn image_encoded(&self, took: Duration) {
         self.0.encodings.observe(took.as_secs_f64());
     }
 
-    /// A frame was retrieved at this distance between latents.
+    /// Records the latent distance of a retrieved frame.
     pub(super) fn retrieved(&self, distance: f64) {
         self.0.retrieval_distance.observe(distance);
     }
 
-    /// A request was refused because something was full.
+    /// Counts a request refused because of this limit.
     pub(super) fn shed(&self, full: Full) {
         let full = full.words();
         self.0.refusals.get_or_create(&FullLabels { full }).inc();
     }
 
-    /// A snapshot is served from now on.
+    /// Sets the gauges of a newly served snapshot.
     pub(super) fn serving(&self, counts: ServedCounts) {
         let count = |count: usize| i64::try_from(count).unwrap_or(i64::MAX);
         self.0.rooms.set(count(counts.rooms));
@@ -328,7 +328,7 @@ impl Metrics {
         }
     }
 
-    /// A look for changes of the store ended.
+    /// Counts a check of the store for changes.
     pub(super) fn reloaded(&self, outcome: ReloadOutcome) {
         let outcome = outcome.name();
         self.0
@@ -338,7 +338,7 @@ impl Metrics {
     }
 }
 
-/// A count that is kept elsewhere.
+/// A collector that reads an external value.
 struct Elsewhere {
     name: &'static str,
     help: &'static str,
@@ -346,7 +346,7 @@ struct Elsewhere {
     kind: Kind,
 }
 
-/// Whether a value only grows.
+/// Metric type of an external value.
 #[derive(Debug, Clone, Copy)]
 enum Kind {
     Counter,
@@ -377,11 +377,11 @@ impl Collector for Elsewhere {
     }
 }
 
-/// The paths of the RPCs that descriptors describe.
+/// The paths of all RPCs in these file descriptor sets.
 fn methods(descriptors: &[&[u8]]) -> BTreeSet<String> {
     let mut paths = BTreeSet::new();
     for bytes in descriptors {
-        // The descriptors are compiled in: one that cannot be read leaves its RPCs "unknown".
+        // The descriptors are compiled in. The RPCs of an unreadable one are labeled "unknown".
         let Ok(set) = FileDescriptorSet::decode(*bytes) else {
             continue;
         };
@@ -403,7 +403,7 @@ fn methods(descriptors: &[&[u8]]) -> BTreeSet<String> {
     paths
 }
 
-/// The name of a code, as the gRPC specification writes it.
+/// The name of a code in the gRPC specification.
 fn code_name(code: tonic::Code) -> &'static str {
     use tonic::Code;
 
@@ -432,8 +432,8 @@ fn code_name(code: tonic::Code) -> &'static str {
 mod tests {
     use super::*;
 
-    /// Oracle: Prometheus' text format: a counter ends in `_total`, a histogram has a bucket for
-    /// every bound, a count and a sum; an unknown path is no label.
+    /// Oracle: the Prometheus text format. A counter ends in `_total`; a histogram has buckets, a
+    /// count and a sum. An unknown path is never a label.
     #[test]
     fn what_is_counted_is_in_the_text() {
         let metrics = Metrics::default();

@@ -1,7 +1,8 @@
-//! NavigationService.NavigateTo: plans a way to a goal, frame by frame, and sends feedback after each
-//! step.
+//! NavigationService.NavigateTo: plans a route of stored frames to a goal and streams feedback for
+//! each step.
 //!
-//! The default is the shortest way over the room's poses; the paper's latent way is on request.
+//! The default planner finds the shortest path in the pose graph. The paper's latent planner is
+//! optional.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -33,17 +34,17 @@ use seese3_robot::planning::{
 };
 use seese3_robot::tracking::{PoseReader, PoseWithCovariance};
 
-/// The stream of feedback events and the final result.
+/// Stream of feedback events and the final result.
 pub type Events = Pin<Box<dyn Stream<Item = Result<pb::NavigateToResponse, Status>> + Send>>;
 
-/// In rooms of more frames than this, ways are planned beside batches and evaluations: a plan takes
-/// some ten milliseconds there.
+/// In rooms with more frames than this, planning runs in the lane of batches and evaluations. It
+/// takes some 10 ms at this size.
 const MOST_SHORT_FRAMES: usize = 5_000;
 
-/// A checked request: everything that a pursuit needs.
+/// A validated request, with everything that planning needs.
 struct CheckedRequest {
     served: Arc<ServedNavigator>,
-    /// The view, with the pose that it is believed to have.
+    /// The source view with its estimated pose.
     view: Start,
     start: BelievedStart,
     goal: Pose,
@@ -53,16 +54,16 @@ struct CheckedRequest {
     planner: pb::Planner,
 }
 
-/// How a planning ended.
+/// Outcome of planning.
 enum Ended {
-    /// A walk in latent space.
+    /// By the latent planner.
     Walked(Outcome),
-    /// A way over poses; of its hops as many were sent as are allowed.
+    /// By the pose-graph planner. At most `max_steps` hops were sent.
     Planned(Planned),
 }
 
 impl Handlers {
-    /// Checks a request on a worker thread and starts its pursuit.
+    /// Validates a request on a worker thread and starts planning.
     pub(super) async fn begin_pursuit(
         &self,
         request: tonic::Request<pb::NavigateToRequest>,
@@ -75,15 +76,14 @@ impl Handlers {
 
         let begun = Instant::now();
 
-        // Checking may encode an image, so it runs on a worker thread and uses up part of the
-        // request's time.
+        // Validation may encode an image: it runs on a worker thread and uses part of the budget.
         let ready = self
             .workers
             .run(lane, budget, move |_| ready(&snapshot, request, most))
             .await?;
 
-        // One feedback event before the first step, one after each, and the result all fit in the
-        // channel: none is lost, and no worker thread waits for a slow reader.
+        // The channel holds all events: feedback before the first step and after each step, and the
+        // result. No event is lost, and no worker thread waits for a slow reader.
         let (events, stream) = mpsc::channel(ready.pursuit.steps as usize + 2);
         let left = budget.saturating_sub(begun.elapsed());
         tokio::spawn(
@@ -95,14 +95,14 @@ impl Handlers {
         Ok(Box::pin(ReceiverStream::new(stream)))
     }
 
-    /// Sends feedback and then the result, or the error. Stops when the caller has gone away.
+    /// Sends feedback, then the result or the error. Stops if the caller closes the stream.
     async fn pursue(
         self,
         ready: CheckedRequest,
         budget: Duration,
         events: mpsc::Sender<Result<pb::NavigateToResponse, Status>>,
     ) {
-        let heard = events.clone();
+        let caller = events.clone();
         let begun = Instant::now();
         let frame_count = ready.served.navigator.room().frame_count();
         let is_graph = ready.planner != pb::Planner::Latent;
@@ -115,8 +115,8 @@ impl Handlers {
                     feedback.start = Some(start.clone());
                 }
 
-                // An error means that the caller has gone away; the `select!` below then cancels
-                // the work.
+                // `try_send` fails if the caller closed the stream; the `select!` below then
+                // cancels the work.
                 let _ = events.try_send(Ok(pb::NavigateToResponse {
                     event: Some(Event::Feedback(feedback)),
                 }));
@@ -126,17 +126,17 @@ impl Handlers {
             Ok(result_to_wire(&ended, &ready))
         };
 
-        // The work of planning grows with the square of the number of frames.
+        // Planning time grows with the square of the number of frames.
         let lane = if is_graph && frame_count > MOST_SHORT_FRAMES {
             Lane::Long
         } else {
             Lane::Short
         };
 
-        // If the caller closes the stream, `run` is dropped, which cancels the pursuit.
+        // If the caller closes the stream, `run` is dropped, which cancels planning.
         let finished = tokio::select! {
             finished = self.workers.run(lane, budget, work) => finished,
-            () = heard.closed() => return,
+            () = caller.closed() => return,
         };
         let last = finished
             .map(|result| pb::NavigateToResponse {
@@ -144,13 +144,13 @@ impl Handlers {
             })
             .map_err(Status::from);
 
-        // If this fails, the caller has gone away and nobody needs the result.
-        let _ = heard.send(last).await;
+        // `send` fails if the caller closed the stream.
+        let _ = caller.send(last).await;
     }
 }
 
 impl CheckedRequest {
-    /// Whether the last of some frames is within the tolerance of the goal.
+    /// Whether the last of these frames is within the tolerances of the goal.
     fn ends_within(&self, frames: &[FrameId]) -> bool {
         let poses = self.served.navigator.room().poses();
         frames.last().is_some_and(|frame| {
@@ -159,7 +159,7 @@ impl CheckedRequest {
         })
     }
 
-    /// Plans the way; `each` hears of every step.
+    /// Plans the route; calls `each` with the feedback before the first step and after each step.
     fn plan(&self, cancel: &Cancellation, each: &mut dyn FnMut(Feedback)) -> Result<Ended, Error> {
         if self.planner == pb::Planner::Latent {
             let stepper = Stepper::InversePoincare(Reading::Homogeneous);
@@ -185,7 +185,7 @@ impl CheckedRequest {
         };
         let planned = plan(navigator, &self.start, &self.goal, bounds, cancel).map_err(E::from)?;
 
-        // Where nothing is planned, it is still told where the camera is believed to be.
+        // Without a route, still send the feedback of the start.
         let nowhere = Route::default();
         let route = match &planned {
             Planned::Way { route, .. } => route,
@@ -207,7 +207,7 @@ fn ready(
     request: pb::NavigateToRequest,
     most_steps: u32,
 ) -> Result<CheckedRequest, Error> {
-    // Destructured with no `..`, so that a new field breaks the build here.
+    // Destructured without `..`, so that a new field fails to compile here.
     let pb::NavigateToRequest {
         room,
         adapter,
@@ -236,7 +236,7 @@ fn ready(
         .transpose();
     let pose = pose.map_err(|error| error.within("source_pose"))?;
 
-    // A frame's pose is recorded in the room, so that a second one could only contradict it.
+    // The pose of a stored frame is recorded in the room; a second one could only contradict it.
     if matches!(source, Source::Frame(_)) && pose.is_some() {
         return Err(Error::invalid(
             "source_pose",
@@ -281,7 +281,7 @@ fn ready(
     })
 }
 
-/// Where the camera is believed to be: at its recorded or given pose, else where the view tells.
+/// The start pose: recorded or given by the caller, else estimated from the view.
 fn believed_start(served: &ServedNavigator, source: &Source, view: &Start) -> BelievedStart {
     let reader = served.room_reader().map(|reader| reader as &dyn PoseReader);
     let room = KnownRoom {
@@ -310,7 +310,7 @@ fn least_probability(given: Option<f64>) -> Result<f64, Error> {
     Err(Error::invalid("least_arrival_probability", problem))
 }
 
-/// Both kinds of goal, as one pose in the room's world.
+/// The goal frame or goal pose as a pose in the room's world frame.
 fn goal_pose(goal: Option<Goal>, navigator: &Navigator, room: &str) -> Result<Pose, Error> {
     match goal {
         Some(Goal::GoalFrameId(frame)) => {
@@ -327,7 +327,7 @@ fn goal_pose(goal: Option<Goal>, navigator: &Navigator, room: &str) -> Result<Po
     }
 }
 
-/// What a request says of the bounds of its pursuit.
+/// Bounds given in the request; `None` selects the default.
 struct PursuitOverrides {
     step: Option<f64>,
     tolerance_m: Option<f64>,
@@ -336,7 +336,7 @@ struct PursuitOverrides {
     max_recoveries: Option<u32>,
 }
 
-/// The bounds of a pursuit: what was asked for, and the room's own where nothing was.
+/// The bounds of planning: the request's overrides, else the defaults in `own`.
 fn bounds(own: Pursuit, asked: PursuitOverrides, most_steps: u32) -> Result<Pursuit, Error> {
     let positive_or = |field: &str, given: Option<f64>, own: f64| match given {
         None => Ok(own),
@@ -347,8 +347,7 @@ fn bounds(own: Pursuit, asked: PursuitOverrides, most_steps: u32) -> Result<Purs
         )),
     };
 
-    // The default is lowered to the server's limit; a number that the caller asks for is refused
-    // above it.
+    // The default is clamped to the server's limit; a request above the limit is refused.
     let steps = match asked.max_steps {
         None => own.steps.min(most_steps),
         Some(steps) if (1..=most_steps).contains(&steps) => steps,
@@ -425,11 +424,11 @@ fn result_to_wire(ended: &Ended, ready: &CheckedRequest) -> pb::NavigateToResult
         Ended::Walked(Outcome::Reached) => reached(),
         Ended::Walked(Outcome::Spent) => (
             pb::NavigateToOutcome::StepsSpent,
-            "the limit of steps was reached; allow more with max_steps".to_owned(),
+            "max_steps was reached before the goal; raise max_steps".to_owned(),
         ),
         Ended::Walked(Outcome::Stuck) => (
             pb::NavigateToOutcome::Stuck,
-            "no matching frame is nearer to the goal; PLANNER_POSE_GRAPH may find a way".to_owned(),
+            "no matching frame is nearer to the goal; try PLANNER_POSE_GRAPH".to_owned(),
         ),
         Ended::Planned(Planned::Way { route, .. })
             if route.frames.len() > most && !ready.ends_within(&route.frames[..most]) =>
@@ -437,7 +436,7 @@ fn result_to_wire(ended: &Ended, ready: &CheckedRequest) -> pb::NavigateToResult
             (
                 pb::NavigateToOutcome::StepsSpent,
                 format!(
-                    "the way has {} hops, max_steps is {most}; allow more, or longer ones with step",
+                    "the route has {} hops, max_steps is {most}; raise max_steps, or step for longer hops",
                     route.frames.len()
                 ),
             )
@@ -466,7 +465,7 @@ fn result_to_wire(ended: &Ended, ready: &CheckedRequest) -> pb::NavigateToResult
             (
                 pb::NavigateToOutcome::Stuck,
                 format!(
-                    "every way has a hop longer than step, {:.3}; with {needed:.3} there is one",
+                    "every route has a hop longer than step, {:.3}; a route exists with step {needed:.3}",
                     ready.pursuit.step
                 ),
             )
@@ -474,7 +473,8 @@ fn result_to_wire(ended: &Ended, ready: &CheckedRequest) -> pb::NavigateToResult
         Ended::Planned(Planned::NoRoute(NoRoute::GoalNotMapped { nearest, off })) => (
             pb::NavigateToOutcome::GoalNotMapped,
             format!(
-                "frame {nearest} is nearest to the goal, {:.2} m and {:.1} degrees off",
+                "no frame is within the tolerances of the goal; frame {nearest} is nearest to the goal, {:.2} m \
+                 and {:.1} degrees off",
                 off.translation_m,
                 off.rotation_rad.to_degrees()
             ),
@@ -489,7 +489,7 @@ fn result_to_wire(ended: &Ended, ready: &CheckedRequest) -> pb::NavigateToResult
 fn reached() -> (pb::NavigateToOutcome, String) {
     (
         pb::NavigateToOutcome::Reached,
-        "the way ends within the tolerance".to_owned(),
+        "the route ends within the tolerances of the goal".to_owned(),
     )
 }
 
@@ -498,15 +498,15 @@ fn start_unknown(why: &StartUnknown) -> String {
         StartUnknown::FarFromRoom {
             out_of_distribution,
         } => format!(
-            "the source is {out_of_distribution:.2} times as far from the room as its limit; \
-             send another view, or source_pose"
+            "the source looks like another place: out_of_distribution is {out_of_distribution:.2}, the \
+             limit is 1; send another view, or source_pose"
         ),
         StartUnknown::Unsure {
             arrival_probability,
         } => format!(
-            "the source does not tell well enough where the camera is: it would arrive with a \
-             probability of {arrival_probability:.2}; send another view or source_pose, or allow more with \
-             tolerance_m and tolerance_rad"
+            "the pose estimated from the source is too uncertain: the arrival probability is \
+             {arrival_probability:.2}; send another view or source_pose, or raise tolerance_m and \
+             tolerance_rad"
         ),
     }
 }

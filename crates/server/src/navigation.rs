@@ -57,7 +57,7 @@ impl NavigationService for Handlers {
     }
 }
 
-/// The lane of a batch: that of images if any view is one.
+/// The lane of a batch: [`Lane::Images`] if any view is an image, else [`Lane::Long`].
 fn batch_lane(batch: &pb::BatchNavigateRequest) -> Lane {
     let sources = batch
         .requests
@@ -77,8 +77,8 @@ fn check_batch(requests: &[pb::NavigateRequest], most: usize, limits: Limits) ->
         ));
     }
 
-    // The limit on retrieved frames bounds the size of one answer, so in a batch it holds for all
-    // requests together.
+    // The limit on retrieved frames bounds the size of the answer, so it applies to the whole
+    // batch.
     let in_all = requests
         .iter()
         .map(hits_asked_for)
@@ -106,8 +106,7 @@ fn answer_batch(
 
         let result = match navigate(snapshot, request, limits, cancel) {
             Ok(response) => pb::batch_navigate_result::Result::Response(response),
-            // Cancellation ends the whole batch; any other error belongs to the one request that
-            // caused it.
+            // Cancellation ends the batch; any other error fails only its own request.
             Err(Error::Cancelled) => return Err(Error::Cancelled),
             Err(error) => pb::batch_navigate_result::Result::Failure(pb::Failure {
                 code: error.code().into(),
@@ -122,8 +121,8 @@ fn answer_batch(
     Ok(pb::BatchNavigateResponse { results })
 }
 
-/// How many frames a request asks for: motions times steps times frames. It only serves the sum over
-/// a batch; each request is checked in full when it is answered.
+/// Number of frames that a request asks for: motions × steps × top_k. Used only for the batch
+/// limit; each request is validated when it is answered.
 fn hits_asked_for(request: &pb::NavigateRequest) -> u64 {
     let motions = match request
         .displacement
@@ -148,8 +147,8 @@ fn navigate(
     let (query, thresholds) = convert::query(request, &served.adapter, snapshot)?;
     let answer = served.navigator.answer(&query, limits, cancel)?;
 
-    // The answer repeats what was chosen by default (mode, reading, navigator), so that a caller
-    // sees how its numbers came about. Without an audit the index is the exact scan.
+    // The answer states the mode, reading and navigator in effect, including defaults. An index
+    // without an audit is the exact scan.
     let room = served.navigator.room();
 
     Ok(pb::NavigateResponse {

@@ -1,5 +1,5 @@
-//! OdometryService: EstimateMotion, the motion between two views. Track is in `track`, Encode in
-//! `encoding`.
+//! OdometryService: EstimateMotion, which estimates the motion between two views. Track is in
+//! `track`, Encode in `encoding`.
 
 use std::sync::Arc;
 
@@ -54,28 +54,29 @@ fn answer(
     request: pb::EstimateMotionRequest,
     cancel: &Cancellation,
 ) -> Result<pb::EstimateMotionResponse, Error> {
-    // Thresholds are checked whoever reads the motion.
+    // Check the thresholds for both estimators.
     convert::thresholds(request.thresholds.clone())?;
 
     if let Some(answer) = by_two_views(snapshot, &request, cancel)? {
         return Ok(answer);
     }
 
-    // Whoever sends two images to a server that compares images may have forgotten their camera.
+    // Two images and no adapter: the caller may have forgotten the camera. Extend the error
+    // message.
     let lacks_camera = snapshot.two_views().is_some()
         && request.adapter.is_empty()
         && image(request.first.as_ref()).is_some()
         && image(request.second.as_ref()).is_some();
     by_adapter(snapshot, request, cancel).map_err(|error| match error {
         Error::Precondition(problem) if lacks_camera => Error::Precondition(format!(
-            "{problem}; or give `camera`, or a room whose camera is known: this server then compares the images \
-             themselves"
+            "{problem}; or give `camera`, or a room whose camera is known: the two-view model of this server then \
+             needs no adapter"
         )),
         other => other,
     })
 }
 
-/// The motion that an adapter reads from two latents.
+/// Estimates the motion with an adapter, from two latents.
 fn by_adapter(
     snapshot: &Snapshot,
     request: pb::EstimateMotionRequest,
@@ -95,8 +96,7 @@ fn by_adapter(
     let reader = ViewReader::of(snapshot, &room, &adapter)?;
     let stored = reader.stored.clone();
 
-    // If both views are frames of the room, the true motion between them is recorded and is
-    // reported with the estimate.
+    // If both views are stored frames, the recorded motion between them is reported too.
     let frame_of =
         |given: &Option<pb::View>| match given.as_ref().and_then(|view| view.view.as_ref()) {
             Some(pb::view::View::FrameId(frame)) => Some(FrameId(*frame)),
@@ -113,7 +113,7 @@ fn by_adapter(
     let second = latent("second", second)?;
     let twist = stored.adapter.motion(first.view(), second.view());
 
-    // `latent` has found both frames in the room, so their poses exist.
+    // `latent` has checked that both frames exist.
     let truth = reader
         .served
         .as_ref()
@@ -143,14 +143,14 @@ fn by_adapter(
     })
 }
 
-/// The answer of the two-view reader; none if the request names an adapter, this server has no
-/// reader, a view is not an image, or the camera is not known.
+/// Estimates the motion with the two-view model. `None` if the request names an adapter, this
+/// server has no such model, a view is not an image, or the camera is unknown.
 fn by_two_views(
     snapshot: &Snapshot,
     request: &pb::EstimateMotionRequest,
     cancel: &Cancellation,
 ) -> Result<Option<pb::EstimateMotionResponse>, Error> {
-    // What is stated must hold, whoever reads the motion.
+    // Check a given camera for both estimators.
     let stated = request.camera.as_ref().map(convert::pinhole).transpose()?;
 
     let (Some(reader), Some(first), Some(second), "") = (
@@ -171,7 +171,7 @@ fn by_two_views(
         if request.room.is_empty() && snapshot.adapters().is_empty() {
             return Err(Error::invalid(
                 "camera",
-                "is required to compare two images: this server has no adapter to read them",
+                "is required for two images: this server has no adapter",
             ));
         }
 
@@ -202,24 +202,24 @@ fn image(view: Option<&pb::View>) -> Option<&[u8]> {
     }
 }
 
-/// Embeds views under one adapter, and knows the room that stored frames are of.
+/// Embeds views with one adapter. Stored frames are looked up in its room, if it has one.
 pub(super) struct ViewReader<'a> {
     snapshot: &'a Snapshot,
     served: Option<Arc<ServedNavigator>>,
     pub stored: Arc<StoredAdapter>,
 }
 
-/// A view under an adapter.
+/// A view embedded by an adapter.
 pub(super) struct EmbeddedView {
     /// Shape (k,).
     pub latent: Array1<f64>,
-    /// Shape (d,); of a view that was sent as a feature or an image.
+    /// The raw feature, shape (d,); `None` for a latent or a stored frame.
     pub feature: Option<Vec<f32>>,
 }
 
 impl<'a> ViewReader<'a> {
-    /// A room is only needed to look up views that are frames; features, latents and images need no
-    /// more than the adapter.
+    /// A reader for an adapter and, if `room` is not empty, that room. Only stored frames need a
+    /// room.
     pub fn of(snapshot: &'a Snapshot, room: &str, adapter: &str) -> Result<Self, Error> {
         if room.is_empty() {
             return Ok(Self {
@@ -237,7 +237,7 @@ impl<'a> ViewReader<'a> {
         })
     }
 
-    /// One view, by itself, so that an error names the view at fault.
+    /// Embeds one view. Errors name its `field`.
     pub fn embedded(&self, field: &str, view: Option<pb::View>) -> Result<EmbeddedView, Error> {
         let adapter = &self.stored.adapter;
         let source = convert::source(field, view, &self.stored, self.snapshot)?;
@@ -271,7 +271,7 @@ impl<'a> ViewReader<'a> {
     }
 }
 
-/// The adapter of a request that names no room: the one it names, or the only one.
+/// The adapter of a request without a room: the named one, or the only one.
 fn adapter_without_room<'a>(
     snapshot: &'a Snapshot,
     adapter: &str,
@@ -284,8 +284,8 @@ fn adapter_without_room<'a>(
         1 => snapshot.adapters().values().next().ok_or(Error::Internal),
         count => {
             let problem = format!(
-                "is required when no room is named: the server has {count} adapters; where it has a two-view model, a \
-                 camera does in its place, for two images"
+                "is required when no room is named: the server has {count} adapters; with a two-view model, two images \
+                 with `camera` need no adapter"
             );
             Err(Error::invalid("adapter", problem))
         }

@@ -1,7 +1,7 @@
-//! The second listener, for those who operate a server: metrics and probes over plain HTTP.
+//! The operations listener: metrics and probes over plain HTTP.
 //!
-//! It has connections of its own, so that it answers while the gRPC port is full; few of them, and
-//! none for long, because it asks for no credentials.
+//! It has its own connections, so that it answers while the gRPC port is at its limit. Their number
+//! and lifetime are small because no credentials are required.
 
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -31,14 +31,14 @@ struct Operated {
     phase: watch::Receiver<Phase>,
 }
 
-/// So many connections may be open; a further one takes the place of the oldest, so that whoever
-/// asks at once is answered however many stay silent.
+/// Maximum number of open connections. A further one replaces the oldest, so that idle connections
+/// cannot block a scrape.
 const CONNECTIONS: usize = 64;
-/// A connection that asks nothing for so long is closed.
+/// Timeout for receiving a request's headers; the connection is then closed.
 const SILENCE: Duration = Duration::from_secs(5);
-/// No connection lives longer; whoever scrapes opens the next one.
+/// Maximum lifetime of a connection.
 const LIFETIME: Duration = Duration::from_secs(60);
-/// The pause after the system refused to accept a connection.
+/// Pause after `accept` failed.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
 
 /// Answers `/metrics`, `/livez` and `/readyz` until it is dropped.
@@ -53,10 +53,10 @@ pub(super) async fn serve(
         .route("/readyz", get(ready))
         .with_state(Operated { metrics, phase });
 
-    // Trouble that lasts is logged once.
+    // A condition that persists is logged once.
     let mut is_refused = false;
 
-    // When the set is dropped, so are the connections.
+    // Dropping the set closes the connections.
     let mut connections = JoinSet::new();
     let mut open: VecDeque<AbortHandle> = VecDeque::new();
     loop {
@@ -73,7 +73,7 @@ pub(super) async fn serve(
             }
             Err(error) => {
                 if !is_refused {
-                    tracing::error!(%error, "no connection for metrics can be accepted");
+                    tracing::error!(%error, "cannot accept connections for metrics");
                 }
                 is_refused = true;
                 tokio::time::sleep(ACCEPT_PAUSE).await;
@@ -89,7 +89,7 @@ async fn answer(stream: TcpStream, router: Router) {
         .header_read_timeout(SILENCE)
         .serve_connection(TokioIo::new(stream), TowerToHyperService::new(router));
 
-    // However it ends, there is nobody left to tell.
+    // Errors and timeouts only close the connection.
     let _ = tokio::time::timeout(LIFETIME, connection).await;
 }
 
@@ -100,7 +100,7 @@ async fn scrape(State(operated): State<Operated>) -> impl IntoResponse {
     )
 }
 
-/// Ready as long as requests are answered: not while loading, and not while stopping.
+/// Readiness: 200 while serving, 503 while loading or stopping.
 async fn ready(State(operated): State<Operated>) -> (StatusCode, &'static str) {
     match *operated.phase.borrow() {
         Phase::Serving(_) => (StatusCode::OK, "serving\n"),

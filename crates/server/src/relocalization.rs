@@ -1,5 +1,5 @@
-//! LocalizationService.Relocalize: finds the room a camera is in, and its pose there, without any
-//! prior. Also chooses the rooms and maps for Track.
+//! LocalizationService.Relocalize: finds a camera's room and its pose there without a prior. Also
+//! selects the rooms and maps for Track.
 
 use std::sync::Arc;
 
@@ -18,7 +18,7 @@ use seese3_core::navigation::{RetrievedFrame, Source};
 use seese3_robot::tracking::{self, Map, MapQuery, RoomMatch, View, relocalize};
 use seese3_store::StoredAdapter;
 
-/// Rooms in an answer if the request does not say how many.
+/// Default number of rooms in an answer.
 const ROOMS: u32 = 3;
 /// The largest number of views in one request.
 const MAX_VIEWS: usize = 256;
@@ -61,7 +61,7 @@ fn answer(
         )),
     };
 
-    // All rooms are compared; `shown` only limits how many of them the answer lists.
+    // All rooms are compared; `shown` only limits the number of rooms in the answer.
     let shown = within("max_rooms", max_rooms, ROOMS)?;
     let top_k = within("top_k", top_k, 1)?;
 
@@ -102,15 +102,15 @@ fn answer(
     })
 }
 
-/// A view under the adapter.
+/// A view embedded by the adapter.
 struct EmbeddedView {
     latent: Array1<f64>,
-    /// Its raw feature, unless it came as a latent.
+    /// The raw feature; `None` if the view was a latent.
     feature: Option<Vec<f32>>,
 }
 
-/// Embeds the views of a request one by one, with a check for cancellation before each, since an
-/// image may have to be encoded.
+/// Embeds the views of a request. Checks for cancellation before each view, because encoding an
+/// image takes time.
 fn embedded(
     views: Vec<pb::View>,
     stored: &StoredAdapter,
@@ -146,9 +146,9 @@ fn embedded(
     Ok(embedded)
 }
 
-/// The rooms to track or relocalise in, all under one adapter; at least one. If no adapter is
-/// named, only those that can track in these rooms are considered: the first of a single room, else
-/// the only one. Where all rooms are searched, those that are too small to track in are left out.
+/// The rooms to track or relocalize in, all under one adapter; at least one. If no adapter is
+/// named, only adapters that can track in these rooms are considered: the first for a single room,
+/// else the only one. A search of all rooms skips those that are too small to track in.
 ///
 /// # Errors
 /// [`Error::Invalid`] on `adapter` if several can track; else as [`rooms_under`].
@@ -180,8 +180,8 @@ fn rooms_by_adapter(
         several => adapters_that_track_in_all(snapshot, several),
     };
 
-    // If no adapter can track here, `rooms_under` still chooses one: `maps` then says what that
-    // adapter or room lacks.
+    // If no adapter can track here, `rooms_under` still selects one; `maps` then reports why it
+    // cannot track.
     match fitting.as_slice() {
         [] => rooms_under(snapshot, rooms, ""),
         [only] => rooms_under(snapshot, rooms, only),
@@ -196,7 +196,8 @@ fn rooms_by_adapter(
     }
 }
 
-/// The names of the adapters that can track in a room, if it is large enough; its default first.
+/// Names of the room's calibrated adapters, the default first. They can track in the room if it is
+/// large enough.
 fn adapters_that_track(snapshot: &Snapshot, room: &ServedRoom) -> Vec<String> {
     let adapters = snapshot.adapters_of(room);
     let tracks = |adapter: &&Arc<StoredAdapter>| adapter.adapter.error_model().is_some();
@@ -208,7 +209,7 @@ fn adapters_that_track(snapshot: &Snapshot, room: &ServedRoom) -> Vec<String> {
         .collect()
 }
 
-/// Where no room is named, one room is enough: every adapter that can track in some room, by name.
+/// If no room is named: the adapters that can track in at least one room, sorted by name.
 fn adapters_that_track_anywhere(snapshot: &Snapshot) -> Vec<String> {
     let mut names: Vec<String> = snapshot
         .rooms()
@@ -220,7 +221,7 @@ fn adapters_that_track_anywhere(snapshot: &Snapshot) -> Vec<String> {
     names
 }
 
-/// In one room, its own default among the adapters that can track.
+/// The room's first adapter that can track, if any.
 fn default_that_tracks(snapshot: &Snapshot, room: &str) -> Vec<String> {
     let mut names = snapshot
         .rooms()
@@ -230,8 +231,8 @@ fn default_that_tracks(snapshot: &Snapshot, room: &str) -> Vec<String> {
     names
 }
 
-/// Several named rooms need an adapter that can track in every one of them; they have no common
-/// order of preference, so the names are sorted.
+/// The adapters that can track in all these rooms. Rooms have no common order of preference, so the
+/// names are sorted.
 fn adapters_that_track_in_all(snapshot: &Snapshot, rooms: &[String]) -> Vec<String> {
     let mut named = rooms.iter().filter_map(|room| snapshot.rooms().get(room));
     let mut names = named
@@ -247,11 +248,11 @@ fn adapters_that_track_in_all(snapshot: &Snapshot, rooms: &[String]) -> Vec<Stri
     names
 }
 
-/// The maps of these rooms, which trackers and relocalisation match against.
+/// The maps of these rooms, for tracking and relocalization.
 ///
 /// # Errors
-/// [`Error::Precondition`] if a room has no map, because its adapter is not calibrated or because
-/// the room is too small. The message says which.
+/// [`Error::Precondition`] if a room has no map: the adapter is not calibrated, or the room is too
+/// small. The message states which.
 pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
     let map = |served: &Arc<ServedNavigator>| {
         let name = &served.adapter.name;
@@ -260,8 +261,8 @@ pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
         served.map.clone().ok_or_else(|| {
             Error::Precondition(match served.adapter.adapter.error_model() {
                 None => format!(
-                    "adapter '{name}' neither tracks nor relocalises: its errors were not measured in two or more rooms that \
-                     it did not learn from; train it with --calibrate-on"
+                    "adapter '{name}' neither tracks nor relocalises: it is not calibrated in two or more rooms outside \
+                     its training set; train it with --calibrate-on"
                 ),
                 Some(_) => format!("room '{room}' has too few distinct frames to track in"),
             })
@@ -271,7 +272,7 @@ pub fn maps(served: &[Arc<ServedNavigator>]) -> Result<Vec<Arc<Map>>, Error> {
     served.iter().map(map).collect()
 }
 
-/// A room of the answer; `newest` is the feature of the newest view, if it has one.
+/// A room match as a wire message; `newest` is the raw feature of the newest view, if it has one.
 fn room_to_wire(
     found: &RoomMatch,
     served: &[Arc<ServedNavigator>],
@@ -280,14 +281,13 @@ fn room_to_wire(
     let served = &served[found.map];
     let room = served.navigator.room();
 
-    // An adapter that was fitted to the room reads it better than the one that tells rooms apart.
+    // An adapter fitted to the room locates views better than the adapter that compares rooms.
     let located = match (served.room_reader(), newest) {
         (Some(reader), Some(feature)) => Some(located_by(reader, feature, room.id())?),
         _ => None,
     };
 
-    // The distances of these frames are in standard deviations of frame noise, unlike those of
-    // Localize.
+    // Distances are in standard deviations of frame noise, unlike those of Localize.
     let retrieved = |neighbour: &seese3_core::index::Neighbour| {
         let retrieved = RetrievedFrame {
             neighbour: *neighbour,
@@ -296,8 +296,8 @@ fn room_to_wire(
         convert::retrieved_to_wire(&retrieved, room)
     };
 
-    // It is believed where the views look like the room. Else the pose and covariance are those of
-    // the newest view, read from its nearest frame.
+    // Use the fitted adapter's pose if the views are in distribution. Otherwise use the anchor pose
+    // of the newest view.
     let believed = located
         .as_ref()
         .filter(|_| found.out_of_distribution <= 1.0);

@@ -1,5 +1,4 @@
-//! Counts every request from its arrival to the last byte of its answer, with the code it ended
-//! with.
+//! Measures every request from its arrival to the last byte of its response, by final status code.
 
 use std::future::Future;
 use std::pin::Pin;
@@ -14,7 +13,7 @@ use tower::{Layer, Service};
 
 use super::metrics::Metrics;
 
-/// Wraps a service so that its requests are counted.
+/// Adds request metrics to a service.
 #[derive(Debug, Clone)]
 pub struct RequestMetricsLayer(pub Metrics);
 
@@ -29,7 +28,7 @@ impl<S> Layer<S> for RequestMetricsLayer {
     }
 }
 
-/// A service whose requests are counted.
+/// A service with request metrics.
 #[derive(Debug, Clone)]
 pub struct RequestMetrics<S> {
     inner: S,
@@ -57,14 +56,14 @@ where
             let response = answer.await?;
 
             // A request that is refused at once has its code in the headers.
-            open.hear(response.headers());
+            open.record_code(response.headers());
             Ok(response.map(|body| Body::new(MeasuredBody { body, open })))
         })
     }
 }
 
-/// A request that has not ended. Dropping it ends it: with the code that was heard, or as cancelled,
-/// since a caller that goes away hears none.
+/// A request in flight. Dropping it records its end, with the received status code or, if there is
+/// none because the caller has gone, with CANCELLED.
 struct OpenRequest {
     metrics: Metrics,
     method: String,
@@ -83,7 +82,7 @@ impl OpenRequest {
         }
     }
 
-    fn hear(&mut self, headers: &HeaderMap) {
+    fn record_code(&mut self, headers: &HeaderMap) {
         if let Some(code) = headers.get("grpc-status") {
             self.code = Some(Code::from_bytes(code.as_bytes()));
         }
@@ -98,7 +97,7 @@ impl Drop for OpenRequest {
     }
 }
 
-/// The body of an answer; its trailers have the code.
+/// A response body; its trailers hold the status code.
 struct MeasuredBody {
     body: Body,
     open: OpenRequest,
@@ -116,7 +115,7 @@ impl http_body::Body for MeasuredBody {
         if let Poll::Ready(Some(Ok(frame))) = &polled
             && let Some(trailers) = frame.trailers_ref()
         {
-            self.open.hear(trailers);
+            self.open.record_code(trailers);
         }
 
         polled

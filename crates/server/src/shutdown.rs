@@ -1,7 +1,7 @@
-//! The signals that ask a server to stop.
+//! Shutdown signals.
 
-/// Completes when the process receives SIGTERM or SIGINT (Ctrl-C). If a handler cannot be
-/// installed, that signal never completes it.
+/// Completes when the process receives SIGTERM or SIGINT (Ctrl-C). A signal for which no handler
+/// can be installed is ignored.
 pub async fn shutdown_signal() {
     let interrupted = async {
         if tokio::signal::ctrl_c().await.is_err() {

@@ -6,14 +6,13 @@ use tonic_types::{ErrorDetails, StatusExt};
 use seese3_core::room::FrameId;
 use seese3_core::{adapter, cancel, eval, navigation, room, splits};
 
-/// How like a served name one has to be to be taken for a misspelling of it, 0 to 1: one wrong letter
-/// in four.
+/// Minimum similarity, 0 to 1, for suggesting a served name: one wrong letter in four.
 const NEARLY: f64 = 0.75;
 
-/// The domain of this service's error reasons.
+/// Domain of the error reasons (`google.rpc.ErrorInfo.domain`).
 const DOMAIN: &str = "seese3.v1";
 
-/// What can be full, so that a request is refused.
+/// A limit that refuses requests when it is reached.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Full {
     /// The lane of short requests.
@@ -28,15 +27,15 @@ pub enum Full {
     CallersStreams,
     /// The requests and streams of one caller.
     CallersRequests,
-    /// The connections; who is refused hears nothing.
+    /// The connections. A refused connection is closed without an error message.
     Connections,
     /// The bytes of all uploads in progress.
     Uploads,
-    /// The fits in progress, of which there is one.
+    /// The fits in progress; only one runs at a time.
     Fits,
     /// The memory of requests in progress.
     Memory,
-    /// The changes of the catalog that wait for their turn.
+    /// The queued changes of the catalog.
     Changes,
 }
 
@@ -56,7 +55,7 @@ impl Full {
         Self::Changes,
     ];
 
-    /// The words of messages and metrics.
+    /// The name in messages and metrics.
     pub fn words(self) -> &'static str {
         match self {
             Self::ShortRequests => "short requests",
@@ -80,7 +79,7 @@ impl std::fmt::Display for Full {
     }
 }
 
-/// Why a request is refused or fails.
+/// An error of a request.
 #[derive(Debug, Clone, thiserror::Error, PartialEq)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
@@ -90,7 +89,7 @@ pub enum Error {
     NotFound {
         field: String,
         name: String,
-        /// The served name that is most like it, if one nearly is.
+        /// The most similar served name, if one is similar enough to suggest.
         nearest: Option<String>,
     },
     #[error("{field}: '{name}' is not in the store")]
@@ -99,7 +98,7 @@ pub enum Error {
     Precondition(String),
     #[error("the server is not ready: it is loading its store or stopping; try again")]
     Loading,
-    #[error("the server is busy: as many {what} as it takes are waiting or open; try again later")]
+    #[error("the server is busy: the limit of {what} is reached; try again later")]
     Full { what: Full },
     #[error("{problem}")]
     Unauthenticated { problem: &'static str },
@@ -107,9 +106,9 @@ pub enum Error {
     Conflict { name: String, problem: String },
     #[error("the request could not be received: {problem}")]
     Transport { code: Code, problem: String },
-    #[error("the caller has no right to {verb}: the operator gives it in the server's --auth-file")]
+    #[error("the caller lacks the verb '{verb}'; the operator grants it in --auth-file")]
     Forbidden { verb: &'static str },
-    #[error("the caller may not change {what}: its rooms stand in the server's --auth-file")]
+    #[error("the caller may not change {what}; its rooms are listed in --auth-file")]
     OutOfScope { what: &'static str },
     #[error("the deadline passed before the answer was ready")]
     Deadline,
@@ -128,7 +127,7 @@ impl Error {
         }
     }
 
-    /// A name that is none of the `served` ones.
+    /// An error for a name that is not among the `served` names.
     pub fn not_found<'a>(
         field: &str,
         name: &str,
@@ -148,7 +147,7 @@ impl Error {
         }
     }
 
-    /// A frame that the room does not have.
+    /// An error for a frame that the room does not have.
     pub fn no_frame(field: &str, frame: FrameId) -> Self {
         Self::NotFound {
             field: field.to_owned(),
@@ -250,8 +249,8 @@ impl From<Error> for Status {
         };
         details.set_error_info(error.reason(), DOMAIN, metadata);
 
-        // Details in the standard types of google.rpc, so that a client learns the field to
-        // change, the missing resource, or when to retry, without reading the message.
+        // Standard google.rpc details: a client gets the invalid field, the missing resource, or
+        // the retry delay without parsing the message.
         match &error {
             Error::Invalid { field, problem } => {
                 details.add_bad_request_violation(brief(field), brief(problem));
@@ -272,8 +271,8 @@ impl From<Error> for Status {
     }
 }
 
-/// The text as one line of at most 300 characters and an ellipsis: it may quote what a caller sent,
-/// and gRPC metadata must stay small.
+/// The text as one line of at most 300 characters, plus an ellipsis if it was cut. Messages may
+/// quote the request, and gRPC metadata must stay small.
 pub fn brief(text: &str) -> String {
     const MOST: usize = 300;
 
@@ -300,7 +299,7 @@ impl From<navigation::Error> for Error {
     fn from(error: navigation::Error) -> Self {
         use navigation::Error as E;
 
-        // The field that the caller has to change. Errors that no change of the request can cure
+        // The field that the caller has to change. Errors that no change of the request can fix
         // return early.
         let field = match &error {
             E::SourceFrame(room::Error::UnknownFrame { frame, .. }) => {
@@ -310,8 +309,7 @@ impl From<navigation::Error> for Error {
                 return Self::no_frame("displacement.target_frame_id", *frame);
             }
             E::Cancelled(_) => return Self::Cancelled,
-            // Features were checked when the store was loaded, so a misfit now is the server's
-            // own fault.
+            // Features were checked when the store was loaded, so a mismatch here is internal.
             E::FeatureRows { .. } | E::Features(_) => return Self::Internal,
             E::SourceFrame(_) => "source.frame_id",
             E::TargetFrame(_) => "displacement.target_frame_id",
@@ -334,8 +332,8 @@ impl From<navigation::Error> for Error {
     }
 }
 
-/// A feature or a latent that does not fit the adapter. The field is relative to the view that
-/// contains it.
+/// An error for a feature or latent that does not fit the adapter. Its field is relative to the
+/// view.
 pub fn view_error(error: &adapter::Error) -> Error {
     use adapter::Error as E;
 
@@ -403,8 +401,8 @@ impl From<eval::Error> for Error {
 mod tests {
     use super::*;
 
-    /// Oracle: the page of errors, which is written by hand: it has a row for each error, with its reason
-    /// and its code.
+    /// Oracle: the hand-written `docs/errors.md`, which has a row with reason and code for each
+    /// error.
     #[test]
     fn every_reason_is_documented() {
         let page =
@@ -450,8 +448,8 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand: a letter left out is one edit of seven, 0.86; another name shares hardly
-    /// a letter.
+    /// Oracle: by hand. One missing letter of seven gives a similarity of 0.86; another name shares
+    /// hardly a letter.
     #[test]
     fn a_name_that_is_nearly_right_is_suggested() {
         let served = ["kitchen".to_owned(), "office".to_owned()];

@@ -1,10 +1,9 @@
-//! One log line for each request when it ends, with a request id that the caller may choose and
-//! that the response returns.
+//! Writes one log line when a request ends. It has a request id that the caller may choose and that
+//! the response returns.
 //!
-//! Each request has a span of its own. Its gRPC status comes with the headers of a response that
-//! failed at once, and otherwise with the trailers, behind the last message of a stream; it is
-//! recorded in the span, and the line is written when the span closes. A request whose caller went
-//! away closes without a status.
+//! Each request has a span. The gRPC status is in the headers of a response that failed at once,
+//! and otherwise in the trailers after the last message. It is recorded in the span; closing the
+//! span writes the line. If the caller goes away, the span closes without a status.
 
 use std::time::Duration;
 
@@ -16,10 +15,10 @@ use super::connections::Peer;
 
 /// The metadata key of the request id, in requests and responses.
 pub const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
-/// The longest id that is accepted from a caller, bytes.
+/// Maximum length of a caller's request id, bytes.
 const LONGEST_ID: usize = 128;
 
-/// Removes an id that is too long or not printable, so that the request gets a new one.
+/// Removes a request id that is empty, too long or not printable, so that a new one is assigned.
 pub fn without_unfit_id<B>(mut request: Request<B>) -> Request<B> {
     if request.headers().get(REQUEST_ID).is_some_and(is_unfit) {
         request.headers_mut().remove(REQUEST_ID);
@@ -33,7 +32,7 @@ fn is_unfit(id: &HeaderValue) -> bool {
     id.is_empty() || id.len() > LONGEST_ID || !is_printable
 }
 
-/// Makes ids of 16 hexadecimal digits.
+/// Generates random request ids of 16 hexadecimal digits.
 #[derive(Debug, Clone, Copy)]
 pub struct RandomId;
 
@@ -44,7 +43,7 @@ impl MakeRequestId for RandomId {
     }
 }
 
-/// The span of a request; its status is recorded once it is known.
+/// The span of a request. Its status is recorded later.
 pub fn span<B>(request: &Request<B>) -> Span {
     let id = request.headers().get(REQUEST_ID);
     let peer = request.extensions().get::<Peer>();
@@ -57,7 +56,7 @@ pub fn span<B>(request: &Request<B>) -> Span {
         peer = peer.map(|peer| field::display(peer.address)),
         principal = field::Empty,
         grpc_status = field::Empty,
-        // Recorded where spans are exported; then lines of the log have them too.
+        // Recorded only where spans are exported; log lines then have them too.
         otel.name = field::Empty,
         otel.kind = field::Empty,
     );
@@ -67,8 +66,8 @@ pub fn span<B>(request: &Request<B>) -> Span {
     span
 }
 
-/// The number of the trace that a request is part of, if its caller says so (W3C Trace Context,
-/// `traceparent`): lines of the log and spans of other services are found by it.
+/// The trace id from `traceparent` (W3C Trace Context), if the caller sends one. It links log lines
+/// with the spans of other services.
 fn trace_id(headers: &HeaderMap) -> Option<&str> {
     let parts = headers.get("traceparent")?.to_str().ok()?;
     let id = parts.split('-').nth(1)?;
@@ -81,7 +80,7 @@ pub fn record_headers<B>(response: &Response<B>, _: Duration, span: &Span) {
     record_status(response.headers(), span);
 }
 
-/// Records the status behind the last message; without one the stream ended well.
+/// Records the status in the trailers; a stream that ends without trailers succeeded.
 pub fn record_trailers(trailers: Option<&HeaderMap>, _: Duration, span: &Span) {
     match trailers {
         Some(trailers) => record_status(trailers, span),
@@ -124,8 +123,8 @@ mod tests {
         assert_eq!(trace_id(&HeaderMap::new()), None);
     }
 
-    /// Oracle: the promise: ids of up to 128 printable characters are kept, others are replaced by
-    /// one of 16 digits that is new each time.
+    /// Oracle: the contract. Ids of up to 128 printable characters are kept; others are replaced by
+    /// a new random id of 16 digits.
     #[test]
     fn long_or_unprintable_ids_are_replaced() {
         let kept = |id: &str| {

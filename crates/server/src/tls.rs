@@ -1,4 +1,4 @@
-//! TLS: certificates from files, which may be replaced while the server runs.
+//! TLS with certificate files, which are reloaded when they change.
 
 use seese3_core::Cause;
 use std::path::{Path, PathBuf};
@@ -13,21 +13,21 @@ use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::server::WebPkiClientVerifier;
 use tokio_rustls::rustls::{RootCertStore, ServerConfig};
 
-/// The time between two looks at the files.
+/// Interval for checking the files for changes.
 const LOOK: Duration = Duration::from_secs(5);
 
 /// The files of a server's certificate, in PEM.
 #[derive(Debug, Clone)]
 pub struct TlsFiles {
-    /// The server's certificate, followed by those that lead to its authority.
+    /// The server's certificate chain, its own certificate first.
     pub cert: PathBuf,
     /// The private key of the first certificate.
     pub key: PathBuf,
-    /// The authorities that clients' certificates must come from; none if clients need none.
+    /// The authorities for client certificates; `None` if clients need no certificate.
     pub client_ca: Option<PathBuf>,
 }
 
-/// Why files give no TLS.
+/// An error in the TLS files.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum TlsError {
@@ -38,7 +38,7 @@ pub enum TlsError {
         #[source]
         problem: std::io::Error,
     },
-    #[error("{option}: {} holds no {what} in PEM", file.display())]
+    #[error("{option}: {} contains no {what} in PEM", file.display())]
     Empty {
         option: &'static str,
         file: PathBuf,
@@ -48,11 +48,11 @@ pub enum TlsError {
     Unfit(#[source] Cause),
 }
 
-/// The TLS of a server, as its files are now.
+/// The TLS configuration of a server, reloaded from its files.
 #[derive(Debug)]
 pub struct Tls {
     files: TlsFiles,
-    /// Digest of the files' content as it was first read.
+    /// SHA-256 of the files' content at startup.
     opened: [u8; 32],
     current: RwLock<Arc<ServerConfig>>,
 }
@@ -71,15 +71,15 @@ impl Tls {
         })
     }
 
-    /// Accepts connections with the certificate of now.
+    /// An acceptor with the current certificate.
     pub fn acceptor(&self) -> TlsAcceptor {
         let current = self.current.read();
         TlsAcceptor::from(current.unwrap_or_else(PoisonError::into_inner).clone())
     }
 
-    /// Looks from time to time whether the files have changed; never completes. New connections get
-    /// the new certificate. Files that do not fit together, as while they are being replaced, change
-    /// nothing.
+    /// Polls the files and reloads them when they change; never completes. New connections use the
+    /// new certificate. Inconsistent files, for instance during replacement, are logged and
+    /// ignored.
     pub async fn follow_files(&self) {
         let mut seen = Some(self.opened);
         let mut trouble = String::new();
@@ -87,7 +87,7 @@ impl Tls {
         loop {
             tokio::time::sleep(LOOK).await;
 
-            // A file system that does not answer must hold up nothing but this.
+            // Read on a blocking thread: a stalled file system must not block the runtime.
             let files = self.files.clone();
             let Ok(found) = tokio::task::spawn_blocking(move || read(&files)).await else {
                 return;
@@ -103,7 +103,7 @@ impl Tls {
                 }
                 Err(error) if error.to_string() != trouble => {
                     trouble = error.to_string();
-                    tracing::error!(%error, "the new certificate cannot be used; the one before stays");
+                    tracing::error!(%error, "the new certificate is not usable; the previous one stays in use");
                 }
                 Err(_) => {}
             }
@@ -111,7 +111,7 @@ impl Tls {
     }
 }
 
-/// The configuration that files give, and a digest of their content.
+/// Reads the files: the TLS configuration and a SHA-256 of their content.
 fn read(files: &TlsFiles) -> Result<(ServerConfig, [u8; 32]), TlsError> {
     let TlsFiles {
         cert,

@@ -1,9 +1,8 @@
-//! Spans of requests for a collector of OpenTelemetry (OTLP over gRPC).
+//! Exports request spans to an OpenTelemetry collector (OTLP over gRPC).
 //!
-//! A request whose caller sends `traceparent` (W3C Trace Context) is part of the caller's trace,
-//! and is exported if the caller's trace is; any other begins a trace of its own. Spans wait in a
-//! queue of bounded length for a thread that sends them: a collector that is slow or gone holds
-//! nobody up.
+//! A request with `traceparent` (W3C Trace Context) joins the caller's trace, and is exported if
+//! that trace is sampled. Any other request starts a new trace. A background thread sends spans
+//! from a bounded queue, so a slow or absent collector does not delay requests.
 
 use std::time::Duration;
 
@@ -22,19 +21,19 @@ use tracing_subscriber::Layer;
 use tracing_subscriber::filter::{FilterExt, LevelFilter, filter_fn};
 use tracing_subscriber::registry::LookupSpan;
 
-/// How long the collector may take for one export, and the end of the server waits for the last.
+/// Timeout of one export, and of the last export at shutdown.
 const EXPORT: Duration = Duration::from_secs(5);
 
-/// The way of spans to a collector. When it is dropped, those that wait are sent.
+/// A span exporter. Dropping it sends the queued spans.
 #[derive(Debug)]
 pub struct Traces(SdkTracerProvider);
 
 impl Traces {
-    /// Spans go to the collector at `endpoint`, such as `http://127.0.0.1:4317`. It need not be
-    /// there yet. This is called on a thread of an async runtime with several.
+    /// An exporter to the collector at `endpoint`, such as `http://127.0.0.1:4317`. The collector
+    /// need not be reachable yet. Must be called in a multi-threaded async runtime.
     ///
     /// # Errors
-    /// In words, if the endpoint is no URL of plain HTTP.
+    /// A message if the endpoint is not a plain-HTTP URL.
     pub fn open(endpoint: &str) -> Result<Self, String> {
         if !endpoint.starts_with("http://") {
             return Err("must begin with http://; spans are sent in plain text".to_owned());
@@ -59,7 +58,7 @@ impl Traces {
         Ok(Self(provider))
     }
 
-    /// The part of a subscriber that exports the spans of requests.
+    /// The subscriber layer that exports request spans.
     pub fn layer<S>(&self) -> impl Layer<S> + use<S>
     where
         S: Subscriber + for<'a> LookupSpan<'a>,
@@ -67,7 +66,7 @@ impl Traces {
         let layer: OpenTelemetryLayer<S, SdkTracer> =
             tracing_opentelemetry::layer().with_tracer(self.0.tracer("seese3"));
 
-        // Not what the exporter itself does, and no lines of the log for developers.
+        // Exclude the exporter's own spans, and levels below INFO.
         let filter = filter_fn(|metadata| metadata.target().starts_with("seese3"));
         layer.with_filter(
             filter
@@ -79,16 +78,16 @@ impl Traces {
 
 impl Drop for Traces {
     fn drop(&mut self) {
-        // Spans that cannot be sent are lost, as they are while the server runs.
+        // Spans that cannot be sent are dropped, as during operation.
         let _ = self.0.shutdown_with_timeout(EXPORT);
     }
 }
 
-/// Makes the span of a request part of the trace that its caller sends, if it sends one.
+/// Sets the caller's trace as the parent of the request span, if the caller sends one.
 pub(super) fn continue_trace(span: &Span, path: &str, headers: &HeaderMap) {
     let caller = TraceContextPropagator::new().extract(&Headers(headers));
     if span.set_parent(caller).is_err() {
-        // Nothing is exported in this process.
+        // Spans are not exported in this process.
         return;
     }
 
@@ -102,8 +101,8 @@ pub(super) fn continue_trace(span: &Span, path: &str, headers: &HeaderMap) {
     }
 }
 
-/// Notes the gRPC status of a request in its span. Of a server's spans, those are errors that the
-/// server is to blame for (OpenTelemetry's conventions for gRPC).
+/// Records the gRPC status in the request span. Only server faults mark a server span as an error
+/// (OpenTelemetry semantic conventions for gRPC).
 pub(super) fn record_status(span: &Span, status: &str) {
     let Ok(code) = status.parse::<i32>() else {
         return;

@@ -1,4 +1,4 @@
-//! The motion between two images that callers send, read from where things are in both.
+//! Estimates the motion between two images from matched image features (XFeat).
 
 use ndarray::Array3;
 
@@ -9,23 +9,23 @@ use seese3_core::geometry::Pinhole;
 use seese3_encoder::{Encoder, Layer, ModelTask, Pooling, recipe};
 use seese3_robot::two_view::{self, MotionEstimate};
 
-/// The layer of XFeat whose maps are compared, and its channels, rows and columns.
+/// The XFeat layer with the feature maps, and its shape (channels, rows, columns).
 const LAYER: &str = "fusion";
 const MAP: [usize; 3] = [64, 30, 40];
 
-/// How far the shape of an image may be from that of the camera's images, as a share.
+/// Maximum relative deviation of an image's aspect ratio from the camera's.
 const SHAPE_TOLERANCE: f64 = 0.02;
 
-/// Compares two images.
+/// Estimates the relative pose of two images.
 pub struct TwoViewReader {
     encoder: ImageEncoder,
 }
 
 impl TwoViewReader {
-    /// The reader of a server, if it was given the model.
+    /// Opens the model; `None` if none is configured.
     ///
     /// # Errors
-    /// [`RunError::TwoView`] if the file is not XFeat's.
+    /// [`RunError::TwoView`] if the file is not an XFeat model.
     pub fn open(encoders: Option<&ImageEncoders>) -> Result<Option<Self>, RunError> {
         let Some((encoders, file)) =
             encoders.and_then(|encoders| Some((encoders, encoders.two_view.as_ref()?)))
@@ -71,7 +71,7 @@ impl TwoViewReader {
         tracing::info!(
             encoder = encoder.id(),
             runtime = encoder.runtime(),
-            "reads the motion between two images"
+            "two-view model ready"
         );
 
         Ok(Some(Self {
@@ -79,11 +79,11 @@ impl TwoViewReader {
         }))
     }
 
-    /// The motion between two images of one camera.
+    /// Estimates the motion between two images of one camera.
     ///
     /// # Errors
-    /// [`Error::Invalid`] on the field of an image that cannot be decoded, or is not of the shape of
-    /// the camera's images.
+    /// [`Error::Invalid`] on the field of an image that cannot be decoded, or has another aspect
+    /// ratio than the camera's images.
     pub fn read(
         &self,
         first: &[u8],
@@ -107,7 +107,7 @@ impl TwoViewReader {
                 ));
             }
 
-            // The encoder's width was checked when it was opened.
+            // The encoder's output width was checked in `open`.
             let row = self.encoder.feature_of(field, image)?;
             Array3::from_shape_vec(MAP, row).map_err(|_| Error::Internal)
         };

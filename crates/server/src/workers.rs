@@ -1,9 +1,8 @@
-//! Where answers are computed: on blocking threads, a bounded number at a time, each within its
-//! caller's deadline.
+//! Computes answers on a bounded number of blocking threads, within the caller's deadline.
 //!
-//! Short answers, images and long work have lanes of their own, each with its threads and its queue,
-//! so that an evaluation of minutes, or a slow encoder, holds up nobody who asks for something short.
-//! The lanes share the processor by the operating system's rules.
+//! Short requests, images and long work have separate lanes, each with its own threads and queue. A
+//! long evaluation or a slow encoder therefore does not delay short requests. The operating system
+//! schedules the threads of all lanes.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -17,19 +16,19 @@ use super::{Config, Error};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
 
-/// What kind of work a request is, which decides the threads that compute it.
+/// Kind of work, which selects the threads and the queue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Lane {
-    /// Milliseconds at most: somebody waits for it in the middle of a motion.
+    /// Work of at most milliseconds, for instance in a robot's control loop.
     Short,
-    /// Images have to be decoded and encoded.
+    /// Requests with images to decode and encode.
     Images,
     /// Batches and evaluations.
     Long,
 }
 
 impl Lane {
-    /// The lane of a request with these views that is short but for its images.
+    /// [`Lane::Images`] if any of these views is an image, else [`Lane::Short`].
     pub fn of<'a>(views: impl IntoIterator<Item = &'a pb::View>) -> Self {
         let is_image = |view: &pb::View| matches!(view.view, Some(pb::view::View::Image(_)));
 
@@ -40,7 +39,7 @@ impl Lane {
         }
     }
 
-    /// What is full if this lane is.
+    /// The limit of this lane.
     fn full(self) -> Full {
         match self {
             Self::Short => Full::ShortRequests,
@@ -61,14 +60,14 @@ impl Pool {
     fn new(threads: usize, queue: usize) -> Self {
         Self {
             threads: Arc::new(Semaphore::new(threads)),
-            // A request holds this permit while it waits and while it is computed; `try_acquire`
-            // refuses it once threads and queue are full.
+            // A request holds this permit while it waits and runs. `try_acquire` fails once threads
+            // and queue are full.
             admitted: Arc::new(Semaphore::new(threads + queue)),
         }
     }
 }
 
-/// Runs the computation of requests on blocking threads, apart from the async ones.
+/// Runs computations on blocking threads, separate from the async threads.
 #[derive(Clone)]
 pub struct Workers {
     short: Pool,
@@ -79,7 +78,7 @@ pub struct Workers {
     metrics: Metrics,
 }
 
-/// Cancels the work when it is dropped: the future that waited for the result is gone.
+/// Cancels the work when dropped, that is, when nothing waits for the result any more.
 pub struct CancelOnDrop(pub Arc<Cancellation>);
 
 impl Drop for CancelOnDrop {
@@ -95,7 +94,7 @@ impl Workers {
         Self {
             short: pool(threads),
             images: pool(threads),
-            // Long work is content with half of the processor.
+            // Long work gets half as many threads.
             long: pool(threads.div_ceil(2)),
             longest: config.longest,
             halted: watch::Sender::new(false),
@@ -111,31 +110,29 @@ impl Workers {
         }
     }
 
-    /// The refusal of a request because `what` is full, which is counted.
+    /// The error for the reached limit `what`; also counts the refusal.
     pub fn full(&self, what: Full) -> Error {
         self.metrics.shed(what);
         Error::Full { what }
     }
 
-    /// Abandons all work, running and waiting. Its callers receive [`Error::Loading`], which is
-    /// UNAVAILABLE.
+    /// Abandons all running and queued work. The callers get [`Error::Loading`] (UNAVAILABLE).
     pub fn halt(&self) {
         self.halted.send_replace(true);
     }
 
-    /// How long a request may take: the caller's deadline, but at most the server's limit.
+    /// Time budget of a request: the caller's deadline, at most the server's limit.
     pub fn budget(&self, metadata: &MetadataMap) -> Duration {
         caller_deadline(metadata).map_or(self.longest, |deadline| deadline.min(self.longest))
     }
 
-    /// Runs `work` on a blocking thread. When the budget is spent or the caller goes away, the work
-    /// is asked to stop through its [`Cancellation`]; its thread is free for other requests only
-    /// when it has stopped.
+    /// Runs `work` on a blocking thread. If the budget is spent or the caller goes away, `work` is
+    /// cancelled through its [`Cancellation`]. Its thread becomes free when `work` returns.
     ///
     /// # Errors
-    /// [`Error::Full`] if too many requests of the lane wait, [`Error::Deadline`] if the budget is spent,
-    /// [`Error::Loading`] if the server abandoned the work while stopping, [`Error::Internal`] if
-    /// it panicked, or the error of the work itself.
+    /// [`Error::Full`] if the lane's queue is full, [`Error::Deadline`] if the budget is spent,
+    /// [`Error::Loading`] if the stopping server abandoned the work, [`Error::Internal`] if it
+    /// panicked, or the error of `work`.
     pub async fn run<T: Send + 'static>(
         &self,
         lane: Lane,
@@ -146,8 +143,7 @@ impl Workers {
         let admitted = pool.admitted.try_acquire_owned();
         let admitted = admitted.map_err(|_| self.full(lane.full()))?;
 
-        // The guard lives in this future. If the caller goes away the future is dropped, and the
-        // guard cancels the work that is still running on its thread.
+        // If the caller goes away, this future is dropped and the guard cancels the running work.
         let cancel = Arc::new(Cancellation::default());
         let guard = CancelOnDrop(cancel.clone());
 
@@ -155,8 +151,8 @@ impl Workers {
             let thread = pool.threads.acquire_owned().await;
             let thread = thread.map_err(|_| Error::Internal)?;
 
-            // Both permits move into the blocking task, because the task goes on when this future
-            // is dropped: they are free only when the computation has really ended.
+            // Both permits move into the blocking task: it outlives this future if that is dropped,
+            // and the permits must be held until the computation ends.
             let span = tracing::Span::current();
             let task = tokio::task::spawn_blocking(move || {
                 let _thread = thread;
@@ -172,7 +168,7 @@ impl Workers {
 
         let mut halted = self.halted.subscribe();
 
-        // Whichever comes first ends the wait. The budget includes the time in the queue.
+        // The budget includes the time in the queue.
         let result = tokio::select! {
             result = tokio::time::timeout(budget, computed) => result.unwrap_or(Err(Error::Deadline)),
             _ = halted.wait_for(|halted| *halted) => Err(Error::Loading),
@@ -182,12 +178,12 @@ impl Workers {
         result
     }
 
-    /// Runs a short piece of work of a stream on a blocking thread. The stream was admitted when it
-    /// began, so the work waits for a thread as long as necessary and is never refused.
+    /// Runs a short piece of a stream's work on a blocking thread. The stream was admitted when it
+    /// was opened, so its work waits for a thread without limit and is never refused.
     ///
     /// # Errors
-    /// [`Error::Loading`] if the server abandoned the work while stopping, [`Error::Internal`] if
-    /// it panicked.
+    /// [`Error::Loading`] if the stopping server abandoned the work, [`Error::Internal`] if it
+    /// panicked.
     pub async fn run_unbounded<T: Send + 'static>(
         &self,
         lane: Lane,
@@ -200,8 +196,7 @@ impl Workers {
             let thread = threads.acquire_owned().await;
             let thread = thread.map_err(|_| Error::Internal)?;
 
-            // There is no cancellation, because the work is short; a dropped future only discards
-            // its result.
+            // Short work is not cancelled; dropping the future only discards its result.
             let span = tracing::Span::current();
             let task = tokio::task::spawn_blocking(move || {
                 let _thread = thread;
@@ -221,12 +216,11 @@ impl Workers {
     }
 }
 
-/// The caller's deadline from the header `grpc-timeout`, less a tenth of it or 10 ms, whichever is
-/// less, so that DEADLINE_EXCEEDED arrives before the caller's transport gives up. None if the header is
+/// The caller's deadline from the header `grpc-timeout`, minus 10 % but at most 10 ms:
+/// DEADLINE_EXCEEDED must arrive before the caller's transport times out. `None` if the header is
 /// absent or malformed.
 fn caller_deadline(metadata: &MetadataMap) -> Option<Duration> {
-    // The format is up to eight digits and one letter for the unit, for instance `250m` for 250
-    // ms.
+    // The format is up to eight digits and a unit letter: `250m` is 250 ms.
     let text = metadata.get("grpc-timeout")?.to_str().ok()?;
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
     let count: u64 = digits.parse().ok().filter(|_| digits.len() <= 8)?;
@@ -258,7 +252,7 @@ mod tests {
 
     const LONG: Duration = Duration::from_secs(30);
 
-    /// Oracle: the promise itself: a panic costs one request, and the next is answered.
+    /// Oracle: the contract: a panic fails one request, and the next one succeeds.
     #[tokio::test]
     async fn a_panic_costs_one_request() {
         let workers = workers(1, 0);
@@ -272,19 +266,18 @@ mod tests {
         assert_eq!(workers.run(Lane::Short, LONG, |_| Ok(7)).await, Ok(7));
     }
 
-    /// Oracle: the contract itself. The work loops until it is cancelled, and it reports that it
-    /// was.
+    /// Oracle: the contract. The work loops until it is cancelled and then reports that.
     #[tokio::test]
     async fn a_deadline_stops_the_work() {
         let workers = workers(1, 1);
-        let (told, hears) = tokio::sync::oneshot::channel();
+        let (stopped, has_stopped) = tokio::sync::oneshot::channel();
 
         let work = move |cancel: &Cancellation| {
             while cancel.check().is_ok() {
                 std::thread::sleep(Duration::from_millis(1));
             }
 
-            let _ = told.send(());
+            let _ = stopped.send(());
             Ok(())
         };
 
@@ -297,7 +290,7 @@ mod tests {
             Err(Error::Deadline)
         );
 
-        hears.await.unwrap();
+        has_stopped.await.unwrap();
 
         assert!(
             begun.elapsed() < Duration::from_secs(2),
@@ -305,8 +298,8 @@ mod tests {
         );
     }
 
-    /// Oracle: the definition of a bounded queue. With one thread and no place in the queue, the
-    /// second request of the lane is refused; another lane has a thread of its own.
+    /// Oracle: the definition of a bounded queue. With one thread and no queue, the lane refuses a
+    /// second request; the other lanes have their own threads.
     #[tokio::test]
     async fn a_full_queue_refuses() {
         let workers = workers(1, 0);

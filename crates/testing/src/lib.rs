@@ -1,4 +1,4 @@
-//! Test support: where oracles are, how their files are read, and made-up rooms.
+//! Test support: oracle files and synthetic rooms.
 #![allow(
     missing_docs,
     clippy::unwrap_used,
@@ -21,7 +21,7 @@ use seese3_core::geometry::{Pose, nearest_rotation};
 /// The folder of large inputs outside the repository: `SEESE3_SHARED`, else `../shared`.
 ///
 /// # Panics
-/// When it is absent: tests that need it are ignored unless asked for.
+/// If the folder is absent. Tests that need it are ignored by default.
 pub fn shared() -> PathBuf {
     let given = std::env::var_os("SEESE3_SHARED").map(PathBuf::from);
     let folder =
@@ -34,7 +34,7 @@ pub fn shared() -> PathBuf {
     folder
 }
 
-/// The committed oracles.
+/// The folder of committed oracles.
 pub fn golden() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden")
 }
@@ -59,7 +59,7 @@ pub fn poses(path: &Path) -> Vec<Pose> {
         .collect()
 }
 
-/// The pose of sixteen numbers, row-major.
+/// A pose from a 4×4 matrix, 16 numbers, row-major.
 pub fn pose(matrix: &[f64]) -> Pose {
     let m = nalgebra::Matrix4::from_row_slice(matrix);
     let rotation = nearest_rotation(&m.fixed_view::<3, 3>(0, 0).into_owned())
@@ -131,7 +131,7 @@ pub fn number(value: &serde_json::Value) -> f64 {
         .unwrap_or_else(|| panic!("{value} is not a number"))
 }
 
-/// What oracles keep of a large tensor: sum, sum of squares, and sum weighted by cos k.
+/// Digest of a large tensor: sum, sum of squares, and sum weighted by cos k, k from 1.
 pub fn digest(tensor: &Array2<f64>) -> [f64; 3] {
     let numbered = tensor.iter().enumerate();
     numbered.fold([0.0; 3], |[a, b, c], (k, x)| {
@@ -158,8 +158,8 @@ pub fn near(what: &str, actual: f64, expected: f64, tolerance: f64) {
     );
 }
 
-/// Makes two tests of `fn name(room: &str, folder: PathBuf)`: with the oracles of the committed
-/// synthetic room, and with those of the real room, which need the folder of large inputs.
+/// Defines two tests of `fn name(room: &str, folder: PathBuf)`: on the committed synthetic room,
+/// and on the real room, which needs the folder of large inputs.
 #[macro_export]
 macro_rules! on_oracle_rooms {
     ($name:ident) => {

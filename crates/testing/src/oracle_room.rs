@@ -1,4 +1,4 @@
-//! Training pairs, adapter and navigator of an oracle room, and gradients against differences.
+//! Training pairs, adapter and navigator of an oracle room, and a gradient check.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -30,7 +30,7 @@ pub fn samples<T: Real>(folder: &Path, room: &str) -> Samples<T> {
     .unwrap()
 }
 
-/// The oracle's trained adapter of so many charts; μ and σ come from the training pairs.
+/// The oracle's trained adapter with `charts` charts; μ and σ are from the training pairs.
 pub fn adapter_of(folder: &Path, room: &str, charts: usize) -> Adapter {
     let tensors =
         Tensors::open(&folder.join(format!("m4_adapter/{room}_k{charts}_trained.safetensors")));
@@ -62,7 +62,7 @@ pub fn navigator(folder: &Path, room: &str, adapter: Arc<Adapter>) -> Navigator 
     Navigator::new(Arc::new(room), &features, adapter, IndexKind::Exact).unwrap()
 }
 
-/// Compares every tensor's gradient with central differences of the loss.
+/// Checks every tensor's gradient against central differences of the loss in one direction.
 pub fn slopes<N: Network<f64>>(start: &N, gradient: impl Fn(N) -> (f64, N)) {
     let (_, stated) = gradient(start.clone());
     for (tensor, name) in start.names().iter().enumerate() {

@@ -1,4 +1,4 @@
-//! A room, features and an adapter that are made of the synthetic oracle room.
+//! A room, features and an adapter derived from the synthetic oracle room.
 
 use seese3_core::adapter::{Adapter, Preset, TrainingRecord};
 use seese3_core::features::{FeatureSource, Features};
@@ -9,7 +9,7 @@ use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 
 use crate::{features, golden, poses};
 
-/// The first 300 frames of the synthetic room, with every column that a room can have.
+/// The first 300 frames of the synthetic room, with all optional columns.
 pub fn room(name: &str) -> Room {
     let mut poses = poses(&golden().join("rooms/synthetic/poses.npy"));
     poses.truncate(300);
@@ -50,7 +50,7 @@ pub fn room(name: &str) -> Room {
     .unwrap()
 }
 
-/// Features of the synthetic room times `scale`, imported as `name`.
+/// Features of the synthetic room, multiplied by `scale`, with the source name `name`.
 pub fn set(name: &str, scale: f32) -> Features {
     let rows = features(&golden(), "synthetic").slice_move(ndarray::s![..300, ..]) * scale;
     Features::new(FeatureSource::imported(name, 0), rows).unwrap()

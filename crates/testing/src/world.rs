@@ -1,5 +1,4 @@
-//! Made-up places that a camera sways in, and an adapter whose errors were measured there: what
-//! following is tested with.
+//! Synthetic rooms with a swaying camera, and a calibrated adapter, for tests of tracking.
 
 use std::sync::LazyLock;
 
@@ -14,7 +13,7 @@ use seese3_robot::calibration::calibrate;
 pub const FRAMES: usize = 300;
 const COLUMNS: usize = 48;
 
-/// A number between -1 and 1 that depends on nothing but its place.
+/// Deterministic noise in [-1, 1), from `seed` and `place`.
 fn noise(seed: u64, place: usize) -> f64 {
     let mixed = (seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ place as u64)
         .wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -22,8 +21,8 @@ fn noise(seed: u64, place: usize) -> f64 {
         - 1.0
 }
 
-/// A made-up place: a camera that sways and comes back, and features that tell where it is, with
-/// noise, and which place it is.
+/// A synthetic room: a camera that sways and returns. Features are a linear function of the pose,
+/// plus a constant for the room and noise.
 pub fn place(name: &str, seed: u64) -> (Room, Features) {
     let phase = |axis: usize| 3.0 * noise(seed, 1_000_000 + axis);
     let sway = |t: usize, axis: usize| (t as f64 / (18.0 + 3.0 * axis as f64) + phase(axis)).sin();
@@ -71,12 +70,12 @@ pub fn place(name: &str, seed: u64) -> (Room, Features) {
     )
 }
 
-/// The places that the adapter learned from.
+/// A training room of the adapter, by name ("hall" or any other for "attic").
 pub fn served(name: &str) -> (Room, Features) {
     place(name, if name == "hall" { 1 } else { 2 })
 }
 
-/// An adapter learned in both, its errors measured in four others. It is trained once per test
+/// An adapter trained in three rooms and calibrated in four others. It is trained once per test
 /// program.
 pub fn calibrated() -> (Adapter, TrainingRecord) {
     static CALIBRATED: LazyLock<(Adapter, TrainingRecord)> = LazyLock::new(train_and_calibrate);

@@ -17,14 +17,14 @@ use super::{DropReason, Error, Reader, Recording, entries, read_text};
 use seese3_core::geometry::Pose;
 
 const IMAGES: &str = "lowres_wide";
-/// The time between an image and its pose must be shorter than this.
+/// Exclusive limit of the time between an image and its pose, milliseconds.
 const TOLERANCE_MS: u64 = 5;
 
 /// Reads the folder of one video.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
-/// refuses unusable frames and there are some. The message names the file or folder.
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if a frame
+/// is unusable and `reader.unusable` is `Refuse`. The message names the file or folder.
 pub fn read_arkitscenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
     let poses = read_trajectory(&folder.join(format!("{IMAGES}.traj")))?;
     let mut images = Vec::new();
@@ -51,8 +51,7 @@ pub fn read_arkitscenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Record
         (reader.progress)(done, images.len());
         let key = milliseconds(*timestamp_ns);
 
-        // Both ends of the range lie just inside the tolerance: a pose exactly 5 ms away does not
-        // count.
+        // The limit is exclusive: a pose exactly 5 ms away is not used.
         let near = poses.range(key - TOLERANCE_MS as i64 + 1..key + TOLERANCE_MS as i64);
         let Some((_, pose)) = near.min_by_key(|(other, _)| other.abs_diff(key)) else {
             collected.drop(stem.clone(), DropReason::NoPoseWithinTolerance);
@@ -73,7 +72,7 @@ pub fn read_arkitscenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Record
     collected.finish(folder, reader)
 }
 
-/// The poses, `world_from_camera`, by their time in milliseconds.
+/// Reads the poses, `world_from_camera`, keyed by time in milliseconds.
 fn read_trajectory(file: &Path) -> Result<BTreeMap<i64, Pose>, Error> {
     let text = read_text(file)?;
     let mut poses = BTreeMap::new();
@@ -83,7 +82,7 @@ fn read_trajectory(file: &Path) -> Result<BTreeMap<i64, Pose>, Error> {
     {
         let [_, rx, ry, rz, x, y, z] = finite_row(file, line, row.trim_end())?;
 
-        // The time is taken from the text, because a double would be rounded.
+        // The time is parsed from the text, because a double would round it.
         let word = row.split(' ').next().unwrap_or_default();
         let time = nanoseconds(word).ok_or_else(|| {
             wrong(

@@ -3,12 +3,12 @@
 //!
 //! ```text
 //! poses.npy (n, 4, 4)   timestamps.npy (n,) ns   frame_ids.npy (n,)   features_NAME.npy (n, d)
-//! bundle.json           what arrays cannot hold: name, licence, images, sequences, split and the
-//!                       sources of the features
+//! bundle.json           the metadata: name, license, images, sequences, split and the sources of
+//!                       the features
 //! ```
 //!
-//! `import numpy` reads such a folder without its `bundle.json`; `import bundle` reads all of it,
-//! so that an exported room comes back complete.
+//! `import numpy` reads the arrays only; `import bundle` also reads `bundle.json`, which restores
+//! an exported room completely.
 
 use std::path::{Path, PathBuf};
 
@@ -71,8 +71,8 @@ struct Made {
 /// Reads a folder of NumPy files, of which only `poses.npy` is required.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read, has another shape or type, or if timestamps or frame numbers
-/// are not as many as the poses. The message names the file.
+/// [`Error`] if a file cannot be read or has another shape or type, or if the number of timestamps
+/// or frame numbers differs from the number of poses. The message names the file.
 pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
     let mut recording = read_poses(&folder.join("poses.npy"))?;
     let there = |name: &str| Some(folder.join(name)).filter(|file| file.is_file());
@@ -91,7 +91,7 @@ pub fn read_numpy(folder: &Path) -> Result<Recording, Error> {
             .and_then(|name| name.strip_suffix(".npy"));
         let Some(name) = name else { continue };
 
-        // The array does not say what made it, so its source has only a name and a width.
+        // The array does not record its encoder, so its source has only a name and a width.
         let file = folder.join(&file_name);
         let rows = read_features(&file)?;
         recording.features.push(checked(
@@ -193,15 +193,14 @@ pub fn read_bundle(folder: &Path) -> Result<Recording, Error> {
     Ok(recording)
 }
 
-/// A camera as `bundle.json` states it.
+/// The numbers of a camera in `bundle.json`, see [`Bundle::camera`].
 fn stated_camera(camera: Pinhole) -> [f64; 4] {
     let centre = camera.centre();
     [camera.focal(), camera.height(), centre.x, centre.y]
 }
 
-/// Replaces the placeholder source of every array by the one that `bundle.json` states. Arrays and
-/// list have to match: an array that is not listed is refused, and so is a listed one that is
-/// missing.
+/// Replaces the placeholder source of every array by the one in `bundle.json`. The arrays and the
+/// list must match: an unlisted array is an error, and so is a missing listed one.
 fn with_sources(read: Vec<Features>, stated: &[Made], file: &Path) -> Result<Vec<Features>, Error> {
     let malformed = |problem: Cause| Error::Malformed {
         file: file.to_owned(),
@@ -296,8 +295,8 @@ pub fn write_numpy(
         )?);
     }
 
-    // The array is always written; `numbered` in `bundle.json` says whether it holds more than row
-    // numbers.
+    // The array is always written; `numbered` in `bundle.json` is false if it holds row numbers
+    // only.
     let ids = if room.frame_numbers().is_empty() {
         (0..n as i64).collect()
     } else {
@@ -329,7 +328,7 @@ pub fn write_numpy(
     Ok(files)
 }
 
-/// What `bundle.json` says of a room.
+/// The content of `bundle.json` for a room.
 fn described(room: &Room, features: &[Features]) -> Bundle {
     let frames = room.frames();
     let provenance = room.provenance();

@@ -1,4 +1,4 @@
-//! Shared by the formats: checking a pose, and collecting the frames that are kept or dropped.
+//! Shared by all formats: checks poses, and collects kept and dropped frames.
 
 use std::path::Path;
 
@@ -25,8 +25,8 @@ pub(super) fn check_lengths(file: &Path, recording: &Recording) -> Result<(), Er
     }
 }
 
-/// What a format states about a frame besides its pose. Every field becomes a column, so within one
-/// recording it is set for all kept frames or for none.
+/// A frame's metadata, without its pose. Every field becomes a column, so within one recording it
+/// must be set for all kept frames or for none.
 #[derive(Debug, Clone, Default)]
 pub(super) struct About {
     pub name: String,
@@ -69,9 +69,9 @@ impl Collected {
     /// Keeps or drops a frame according to its matrix, `world_from_camera`. A matrix in another
     /// convention is an error that refuses the whole recording.
     pub fn take(&mut self, about: About, matrix: &Matrix4<f64>, file: &Path) -> Result<(), Error> {
-        // A pose that is not finite or is singular costs only its own frame. A wrong last row or a
-        // rotation far from SO(3) suggests another convention, for instance a transposed matrix,
-        // which would affect every frame.
+        // A non-finite or singular pose drops only its own frame. A wrong last row or a rotation
+        // far from SO(3) suggests another convention, for instance a transposed matrix, which would
+        // affect every frame.
         match pose_from_matrix(matrix) {
             Ok((pose, deviation)) => {
                 self.0.worst_rotation_deviation = self.0.worst_rotation_deviation.max(deviation);
@@ -90,12 +90,12 @@ impl Collected {
         Ok(())
     }
 
-    /// Records that a frame is left out.
+    /// Records a dropped frame.
     pub fn drop(&mut self, name: String, reason: DropReason) {
         self.drop_for(name, reason, String::new());
     }
 
-    /// The same, with what exactly is wrong.
+    /// Records a dropped frame with a detailed description of the problem.
     pub fn drop_for(&mut self, name: String, reason: DropReason, detail: String) {
         self.0.dropped.push(Dropped {
             name,
@@ -104,7 +104,7 @@ impl Collected {
         });
     }
 
-    /// Records that a frame is left out because a file of it is missing, which was looked for in vain.
+    /// Records a frame that is dropped because the file `looked_for` is missing.
     pub fn drop_without(&mut self, looked_for: String, name: String, reason: DropReason) {
         self.drop_for(name, reason, format!("looked for {looked_for}"));
     }

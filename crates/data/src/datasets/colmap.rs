@@ -1,9 +1,9 @@
-//! COLMAP models: `cameras`, `images` as `.bin` or `.txt`; poses are camera-from-world, along x right,
-//! y down, z forward, with the scalar of quaternions first.
+//! COLMAP models: `cameras` and `images` as `.bin` or `.txt`. Poses are camera-from-world with axes
+//! x right, y down, z forward; quaternions are (w, x, y, z).
 //!
 //! - The unit of translations is arbitrary, unless the model was aligned with known positions.
-//! - Images are sorted by the numbers in their names. Each folder of images is a sequence of its own.
-//! - COLMAP reads the pixels as they are stored, whatever their EXIF orientation says.
+//! - Images are sorted by the numbers in their names. With several folders, each is a sequence.
+//! - COLMAP ignores EXIF orientation: poses refer to the pixels as stored.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -17,11 +17,11 @@ use super::{DropReason, Error, Reader, Recording, read_bytes, read_text};
 use seese3_core::Cause;
 use seese3_core::geometry::{Pinhole, PixelCamera, Pose, pose_from_quaternion};
 
-/// Folders below a project in which models lie.
+/// Subfolders of a project that are searched for a model.
 const MODELS: [&str; 4] = ["", "sparse/0", "sparse", "0"];
-/// Folders in which images lie, from the folder of the model.
+/// Folders that are searched for the images, relative to the model's folder.
 const IMAGES: [&str; 4] = ["images", "../images", "../../images", "."];
-/// Bytes of a point of an image in `images.bin`: two coordinates and the number of a point in space.
+/// Bytes of an image point in `images.bin`: two coordinates and the id of a 3D point.
 const POINT_BYTES: u64 = 24;
 
 /// A camera of the model.
@@ -29,8 +29,8 @@ const POINT_BYTES: u64 = 24;
 struct Camera {
     width: f64,
     height: f64,
-    /// The focal lengths along x and y, and the principal point, pixels; none of a model with no such
-    /// numbers.
+    /// Focal lengths along x and y and principal point, pixels; `None` for fisheye and unknown
+    /// models.
     pinhole: Option<[f64; 4]>,
 }
 
@@ -42,12 +42,12 @@ struct Image {
     camera_from_world: Pose,
 }
 
-/// Reads a model, or the model of a project's folder. `images` is the folder of the images; if none,
-/// it is looked for beside the model.
+/// Reads a model, or the model in a project's folder. `images` is the folder of the images; if it
+/// is `None`, the usual folders near the model are searched.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
-/// refuses unusable frames and there are some.
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if a frame
+/// is unusable and `reader.unusable` is `Refuse`.
 pub fn read_colmap(
     path: &Path,
     images: Option<&Path>,
@@ -82,7 +82,7 @@ pub fn read_colmap(
 }
 
 fn collected(root: &Path, frames: &[Image], reader: &mut Reader<'_>) -> Result<Recording, Error> {
-    // Images of one folder follow one another; those of two folders do not.
+    // Only images of the same folder are consecutive frames.
     let folder = |name: &str| {
         name.rsplit_once('/')
             .map_or("", |(folder, _)| folder)
@@ -141,7 +141,7 @@ fn model_in(path: &Path) -> Result<PathBuf, Error> {
         })
 }
 
-/// The folder that the names of images start from.
+/// The folder that image names are relative to.
 fn images_root(model: &Path, given: Option<&Path>, frames: &[Image]) -> Result<PathBuf, Error> {
     if let Some(given) = given {
         return Ok(given.to_owned());
@@ -154,13 +154,13 @@ fn images_root(model: &Path, given: Option<&Path>, frames: &[Image]) -> Result<P
     let folders = IMAGES.map(|folder| model.join(folder));
     folders.into_iter().find(has_one).ok_or_else(|| Error::Malformed {
         file: model.to_owned(),
-        problem: "has no folder images beside it that holds the model's images; give it with --images DIR"
+        problem: "has no folder with the model's images nearby; give it with --images DIR"
             .into(),
     })
 }
 
-/// The camera of all images, if they have the same one and its focal lengths are about equal.
-/// Distortion is left out.
+/// The camera shared by all images, if its two focal lengths differ by less than 5 %. Distortion is
+/// ignored.
 fn one_camera(cameras: &BTreeMap<u32, Camera>, frames: &[Image]) -> Option<Pinhole> {
     let first = cameras.get(&frames.first()?.camera)?;
     let is_same = |frame: &Image| cameras.get(&frame.camera) == Some(first);
@@ -179,15 +179,16 @@ fn one_camera(cameras: &BTreeMap<u32, Camera>, frames: &[Image]) -> Option<Pinho
     is_square.then(|| Pinhole::new(camera).ok()).flatten()
 }
 
-/// The numbers of a camera model by which a pinhole is known, and how many numbers it has.
+/// The parameter layout of a COLMAP camera model.
 struct Model {
     name: &'static str,
-    /// Whether focal lengths along x and y are two numbers.
+    /// Whether the focal lengths along x and y are separate parameters.
     has_two_focals: bool,
+    /// The number of parameters.
     numbers: usize,
 }
 
-/// COLMAP's camera models by their numbers.
+/// COLMAP's camera models, indexed by model id.
 const CAMERA_MODELS: [Model; 11] = [
     model("SIMPLE_PINHOLE", false, 3),
     model("PINHOLE", true, 4),
@@ -212,7 +213,7 @@ const fn model(name: &'static str, has_two_focals: bool, numbers: usize) -> Mode
 
 impl Model {
     fn camera(&self, width: f64, height: f64, numbers: &[f64]) -> Camera {
-        // A fisheye is no pinhole, whatever its focal length.
+        // A fisheye camera is not a pinhole, although it has a focal length.
         let is_pinhole = !self.name.contains("FISHEYE") && self.name != "FOV";
         let pinhole = match *numbers {
             [x, y, cx, cy, ..] if is_pinhole && self.has_two_focals => Some([x, y, cx, cy]),
@@ -280,7 +281,7 @@ fn text_cameras(file: &Path) -> Result<BTreeMap<u32, Camera>, Error> {
                 ));
             }
             Some(model) => model.camera(*width, *height, parameters),
-            // A model of a newer COLMAP: its poses are read all the same.
+            // An unknown model, from a newer COLMAP: the poses can still be read.
             None => Camera {
                 width: *width,
                 height: *height,
@@ -322,7 +323,7 @@ fn text_images(file: &Path) -> Result<Vec<Image>, Error> {
         }
         let camera = camera
             .parse()
-            .map_err(|_| wrong(format!("'{camera}' is no number of a camera").into()))?;
+            .map_err(|_| wrong(format!("'{camera}' is not the id of a camera").into()))?;
         images.push(Image {
             camera_from_world: pose(file, name, numbers)?,
             name: name.trim().to_owned(),
@@ -346,7 +347,7 @@ fn text_images(file: &Path) -> Result<Vec<Image>, Error> {
     Ok(images)
 }
 
-/// The bytes of a file, read from the front.
+/// A little-endian reader over the bytes of a file.
 struct Bytes<'a> {
     file: &'a Path,
     left: &'a [u8],
@@ -356,7 +357,7 @@ impl Bytes<'_> {
     fn cut(&self) -> Error {
         Error::Malformed {
             file: self.file.to_owned(),
-            problem: "ends in the middle of a record: the file is truncated, or is not COLMAP's"
+            problem: "ends in the middle of a record: it is truncated, or is not a COLMAP file"
                 .into(),
         }
     }
@@ -379,7 +380,7 @@ impl Bytes<'_> {
         self.take().map(f64::from_le_bytes)
     }
 
-    /// Text that ends with a zero.
+    /// Reads zero-terminated UTF-8 text.
     fn text(&mut self) -> Result<String, Error> {
         let end = self.left.iter().position(|byte| *byte == 0);
         let end = end.ok_or_else(|| self.cut())?;
@@ -415,12 +416,12 @@ fn binary_cameras(file: &Path) -> Result<BTreeMap<u32, Camera>, Error> {
         let width = bytes.u64()? as f64;
         let height = bytes.u64()? as f64;
 
-        // Without its number of parameters the next camera cannot be found.
+        // The number of parameters is needed to find the next camera.
         let model = CAMERA_MODELS.get(kind as usize).ok_or_else(|| Error::Malformed {
             file: file.to_owned(),
             problem: format!(
-                "camera {id} has model {kind}, which is not known here; convert the model to text with \
-                 `colmap model_converter --output_type TXT`"
+                "camera {id} has the unknown model {kind}; convert the model to text with \
+                     `colmap model_converter --output_type TXT`"
             ).into(),
         })?;
         let numbers: Result<Vec<f64>, Error> = (0..model.numbers).map(|_| bytes.f64()).collect();

@@ -1,9 +1,9 @@
 //! EuRoC MAV: `mav0/cam0/{data.csv,sensor.yaml,data/*.png}` and
 //! `mav0/state_groundtruth_estimate0/data.csv`.
 //!
-//! The ground truth is the pose of the body, the IMU, with the scalar of quaternions first; the camera
-//! stands on the body as `T_BS` of its `sensor.yaml` says. Images take the ground truth nearest in
-//! time.
+//! The ground truth is `world_from_body`, where the body is the IMU; quaternions are (w, x, y, z).
+//! The camera's pose on the body is `T_BS` in its `sensor.yaml`. An image takes the ground truth
+//! nearest in time, at most 10 ms away.
 
 use std::path::Path;
 
@@ -18,11 +18,12 @@ use seese3_core::geometry::{Pinhole, PixelCamera, Pose, pose_from_matrix, pose_f
 /// The longest time between an image and its pose, nanoseconds.
 const MAX_DIFFERENCE_NS: u64 = 10_000_000;
 
-/// Reads a sequence's folder, with or without `mav0`. `camera` is the camera's folder, such as `cam0`.
+/// Reads a sequence's folder, with or without `mav0`. `camera` is the camera's subfolder, such as
+/// `cam0`.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
-/// refuses unusable frames and there are some.
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if a frame
+/// is unusable and `reader.unusable` is `Refuse`.
 pub fn read_euroc(
     folder: &Path,
     camera: &str,
@@ -73,15 +74,16 @@ pub fn read_euroc(
     Ok(recording)
 }
 
-/// The rows of a table: the line's number and its columns. Lines that begin with # are skipped.
+/// The rows of a CSV file: line number and columns. Empty lines and lines that begin with # are
+/// skipped.
 fn rows(file: &Path, text: &str) -> Result<Vec<(usize, Vec<String>)>, Error> {
     let lines = (1..).zip(text.lines());
-    let says = lines.filter(|(_, row)| !row.trim().is_empty() && !row.starts_with('#'));
+    let data_lines = lines.filter(|(_, row)| !row.trim().is_empty() && !row.starts_with('#'));
     let columns = |(line, row): (usize, &str)| {
         let columns = row.split(',').map(|word| word.trim().to_owned());
         (line, columns.collect::<Vec<_>>())
     };
-    let rows: Vec<_> = says.map(columns).collect();
+    let rows: Vec<_> = data_lines.map(columns).collect();
 
     match rows.iter().find(|(_, columns)| columns.len() < 2) {
         None => Ok(rows),
@@ -153,7 +155,7 @@ fn read_images(file: &Path) -> Result<Vec<(i64, String)>, Error> {
     Ok(images)
 }
 
-/// What is known of a camera.
+/// A camera's pose on the body, and its intrinsics if the file states them.
 struct Sensor {
     body_from_camera: Pose,
     camera: Option<Pinhole>,
@@ -192,7 +194,7 @@ fn read_sensor(file: &Path) -> Result<Sensor, Error> {
     })
 }
 
-/// The numbers between the first brackets after a key, in the one form of YAML that these files have.
+/// The numbers in the first brackets after a key: not general YAML, only the form of these files.
 fn list(text: &str, key: &str) -> Option<Vec<f64>> {
     let after = &text[text.find(key)? + key.len()..];
     let inside = after.split_once('[')?.1.split_once(']')?.0;

@@ -1,6 +1,6 @@
-//! A folder of one's own: `images/` and `poses.npy`, and the other arrays that `import numpy` reads.
+//! User-made folders: `images/`, `poses.npy`, and the other arrays that `import numpy` reads.
 //!
-//! The images belong to the poses by their order: that of the numbers in their names.
+//! Images are sorted by the numbers in their names and assigned to the poses in that order.
 
 use std::path::Path;
 
@@ -23,8 +23,8 @@ pub fn read_folder(folder: &Path) -> Result<Recording, Error> {
         return Err(Error::Malformed {
             file: folder.join(IMAGES),
             problem: format!(
-                "has {} images (.jpg, .jpeg, .png), and poses.npy {pose_count} poses; each image needs one, \
-                 in the order of the numbers in their names",
+                "has {} images (.jpg, .jpeg, .png), but poses.npy has {pose_count} poses; each image needs \
+                 a pose, in the order of the numbers in the images' names",
                 images.len()
             ).into(),
         });
@@ -39,10 +39,10 @@ pub fn read_folder(folder: &Path) -> Result<Recording, Error> {
     Ok(recording)
 }
 
-/// The names of the images in a folder, in the order of the numbers in them.
+/// The names of the images in a folder, sorted by the numbers in the names.
 pub(super) fn image_files(folder: &Path) -> Result<Vec<String>, Error> {
     let is_image = |name: &String| {
-        // Some systems put a file of their own beside each: ._0001.jpg.
+        // Some systems write a hidden metadata file for each image: ._0001.jpg.
         if name.starts_with('.') {
             return false;
         }
@@ -57,7 +57,7 @@ pub(super) fn image_files(folder: &Path) -> Result<Vec<String>, Error> {
     Ok(images)
 }
 
-/// A folder's path from the root of the file system: it is stored, and used from other folders.
+/// A folder's absolute path. It is stored, so it must not depend on the working directory.
 pub(super) fn resolved(folder: &Path) -> Result<String, Error> {
     let whole = folder.canonicalize().map_err(|cause| Error::Io {
         file: folder.to_owned(),

@@ -1,7 +1,7 @@
-//! KITTI odometry: a file of poses, twelve numbers a line, the first three rows of
-//! `world_from_camera`, metres; images in a folder, in the order of their numbers.
+//! KITTI odometry: a pose file with 12 numbers per line, the first three rows of
+//! `world_from_camera`, metres. Images are in a folder, sorted by the numbers in their names.
 //!
-//! The world is the first camera's. Times, if there are, are seconds, one a line.
+//! The world frame is the camera of the first frame. The optional times are seconds, one per line.
 
 use std::path::{Path, PathBuf};
 
@@ -15,17 +15,18 @@ use super::{Error, Reader, Recording, read_text};
 /// The files of one sequence.
 #[derive(Debug, Clone, Default)]
 pub struct Kitti {
-    /// The folder of the images; none for a room without images.
+    /// The folder of the images; `None` for a room without images.
     pub images: Option<PathBuf>,
-    /// The file of times, seconds; none if they are not known.
+    /// The file of times, seconds; `None` if they are not known.
     pub times: Option<PathBuf>,
 }
 
-/// Reads a file of poses with the images and times beside it.
+/// Reads a pose file with its optional images and times.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read or is malformed, or if there are not as many images or times as
-/// poses. The message names the file and the line.
+/// [`Error`] if a file cannot be read or is malformed, if the number of images or times differs
+/// from the number of poses, or if no usable frame is left. The message names the file and the
+/// line.
 pub fn read_kitti(
     poses: &Path,
     beside: &Kitti,
@@ -89,7 +90,7 @@ fn read_matrices(file: &Path) -> Result<Vec<Matrix4<f64>>, Error> {
             return Err(Error::Line {
                 file: file.to_owned(),
                 line,
-                problem: format!("has {} numbers, a pose has 12", numbers.len()).into(),
+                problem: format!("has {} numbers, expected 12", numbers.len()).into(),
             });
         }
         numbers.extend([0.0, 0.0, 0.0, 1.0]);

@@ -88,14 +88,14 @@ pub enum Error {
     },
 }
 
-/// A frame that was left out.
+/// A frame that was dropped.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Dropped {
     /// The name of the frame in the recording.
     pub name: String,
-    /// Why it was left out.
+    /// Why it was dropped.
     pub reason: DropReason,
-    /// What exactly is wrong, such as the file that was looked for; empty if the reason says it all.
+    /// Details, such as the path of the missing file; empty if the reason is enough.
     pub detail: String,
 }
 
@@ -116,7 +116,7 @@ impl std::fmt::Display for Dropped {
     }
 }
 
-/// Why a frame was left out.
+/// Why a frame was dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum DropReason {
@@ -135,12 +135,12 @@ pub enum DropReason {
     SuspectIdentityPose,
     #[error("no_pose_within_tolerance")]
     NoPoseWithinTolerance,
-    /// A message of a bag, of a pose or an image, that says nothing of use.
+    /// A pose or image message of a bag that cannot be decoded.
     #[error("malformed_message")]
     MalformedMessage,
 }
 
-/// What was read from a recording.
+/// The frames and metadata of a recording.
 #[derive(Debug, Clone, Default)]
 pub struct Recording {
     /// The frames that can be used.
@@ -153,20 +153,21 @@ pub struct Recording {
     pub images_root: String,
     /// Features that the recording contains.
     pub features: Vec<Features>,
-    /// Name, original format and terms of use, where the recording states them.
+    /// Name, original format, license and camera, as far as the recording states them.
     pub stated: Stated,
 }
 
-/// Metadata that only a bundle contains; empty for all other formats.
+/// Metadata stated by a recording. Only bundles state name, format and license; COLMAP, EuRoC and
+/// `transforms.json` also state the camera.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Stated {
     /// The room's name.
     pub name: String,
     /// The format that the room was first read from.
     pub format: String,
-    /// The terms under which it may be used.
+    /// The recording's license.
     pub licence: String,
-    /// The camera that took its images.
+    /// The pinhole camera of all images; `None` if unknown, or if images have different cameras.
     pub camera: Option<Pinhole>,
 }
 
@@ -182,7 +183,7 @@ impl Recording {
         Ok(self)
     }
 
-    /// The rows that remain when only every `step`-th frame of each sequence is kept.
+    /// The rows of every `step`-th frame of each sequence.
     pub fn every(&self, step: usize) -> Vec<usize> {
         let frame_count = self.frames.poses.len();
         let timeline = Timeline {
@@ -191,7 +192,7 @@ impl Recording {
             held_out: Vec::new(),
         };
 
-        // Counting starts again with every sequence, so that each one keeps its first frame.
+        // Counting restarts with every sequence, so that each one keeps its first frame.
         let mut start = 0;
         let mut rows = Vec::new();
         for row in 0..frame_count {
@@ -213,9 +214,9 @@ impl Recording {
 /// How frames that cannot be used are treated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unusable {
-    /// They are left out and listed in [`Recording::dropped`].
+    /// Drop them, and list them in [`Recording::dropped`].
     Drop,
-    /// The whole recording is refused.
+    /// Refuse the whole recording with [`Error::Strict`].
     Refuse,
 }
 
@@ -245,7 +246,7 @@ fn read_text(file: &Path) -> Result<String, Error> {
         file: file.to_owned(),
         problem: "is not UTF-8 text".into(),
     };
-    // Some editors put a byte order mark before the text.
+    // Some editors write a byte order mark before the text.
     let bytes = read_bytes(file)?;
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
     String::from_utf8(text.to_vec()).map_err(malformed)

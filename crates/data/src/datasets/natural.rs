@@ -1,14 +1,15 @@
-//! Names in the order that people count in: `frame_2` before `frame_10`.
+//! Natural sort order of names: `frame_2` before `frame_10`.
 
-/// Part of a name. Numbers come before words, as digits come before letters.
+/// A part of a name: a run of digits or of other characters. Numbers sort before words.
 #[derive(PartialEq, Eq, PartialOrd, Ord)]
 enum Part {
-    /// By value; digits that are equally many and equal in value are the same number.
+    /// Compared by value: leading zeros do not count.
     Number(u128),
     Word(String),
 }
 
-/// Sorts names by the numbers in them, and otherwise by their letters.
+/// Sorts by name, comparing numbers by value and other characters as text. Ties, such as `f2` and
+/// `f002`, are sorted as text.
 pub(super) fn sort_naturally<T>(items: &mut [T], name: impl Fn(&T) -> &str) {
     items.sort_by_cached_key(|item| (parts(name(item)), name(item).to_owned()));
 }
@@ -23,7 +24,7 @@ fn parts(name: &str) -> Vec<Part> {
             .unwrap_or(rest.len());
         let (part, after) = rest.split_at(end);
 
-        // A number too long for 128 bits is compared as a word.
+        // A number that does not fit into 128 bits is compared as a word.
         let number = is_digit.then(|| part.parse().ok()).flatten();
         parts.push(number.map_or_else(|| Part::Word(part.to_owned()), Part::Number));
         rest = after;

@@ -11,8 +11,8 @@ use seese3_core::Cause;
 use seese3_core::geometry::{GivenPoseError, pose_from_matrix};
 use seese3_core::room::Frames;
 
-/// The alignment of the numbers in memory, bytes: no type that is read here needs more. NumPy
-/// aligns them to 64 bytes in a file.
+/// The alignment of the numbers in memory, bytes. It is enough for every type read here; in a file,
+/// NumPy aligns them to 64 bytes.
 const ALIGNMENT: usize = 16;
 
 /// A `.npy` file in memory, placed so that its numbers are aligned. The array is viewed in place,
@@ -26,8 +26,8 @@ impl NpyFile {
     fn read(file: &Path) -> Result<Self, Error> {
         let content = read_bytes(file)?;
 
-        // The length of the header stands in bytes 8 and 9 in version 1 of the format, and in bytes
-        // 8 to 11 from version 2 on.
+        // The length of the header is in bytes 8 and 9 in version 1 of the format, and in bytes 8
+        // to 11 from version 2 on.
         let header = match content.get(6..12) {
             Some(&[1, _, low, high, _, _]) => 10 + usize::from(u16::from_le_bytes([low, high])),
             Some(&[_, _, a, b, c, d]) => {
@@ -233,8 +233,8 @@ mod tests {
         }
     }
 
-    /// Oracle: the NumPy format. A size that no file could hold, a truncated file, a wrong shape,
-    /// Python objects, and two files that are not NumPy at all.
+    /// Oracle: the NumPy format. Cases: a size larger than any file, a truncated file, a wrong
+    /// shape, Python objects, and two files that are not NumPy at all.
     #[test]
     fn hostile_files_are_refused_without_believing_their_sizes() {
         for bytes in [

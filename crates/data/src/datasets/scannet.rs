@@ -16,10 +16,10 @@ use super::{DropReason, Error, Reader, Recording, entries};
 /// Reads the folder of an exported scene.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
-/// refuses unusable frames and there are some. The message names the file or folder.
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if a frame
+/// is unusable and `reader.unusable` is `Refuse`. The message names the file or folder.
 pub fn read_scannet(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
-    // If there is no such subfolder, its files are in the scene's folder itself.
+    // Without the subfolder, the files are in the scene's folder itself.
     let below = |name: &'static str| {
         if folder.join(name).is_dir() {
             format!("{name}/")
@@ -33,7 +33,7 @@ pub fn read_scannet(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording,
     let images = numbered(&folder.join(&images_at), &["jpg", "png"])?;
     let poses = numbered(&folder.join(&poses_at), &["txt"])?;
 
-    // The numbers of both are needed, so that a frame with only an image or only a pose is reported
+    // All numbers of images and poses are needed, so that a frame with only one of them is reported
     // as dropped.
     let mut numbers: Vec<i64> = images.keys().chain(poses.keys()).copied().collect();
     numbers.sort_unstable();
@@ -83,13 +83,13 @@ pub fn read_scannet(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording,
     collected.finish(folder, reader)
 }
 
-/// Whether a pose is the identity matrix that stands for lost tracking. The first one is never
+/// Whether a pose is the identity matrix, which marks lost tracking. The first pose is never
 /// suspect, since a recording may start at its origin.
 pub(super) fn is_suspect(matrix: &Matrix4<f64>, is_first: bool) -> bool {
     !is_first && *matrix == Matrix4::identity()
 }
 
-/// Files `N.EXTENSION` of a folder, by number; the extension in capitals or not.
+/// Files `N.EXTENSION` of a folder, by number. Extensions are compared case-insensitively.
 fn numbered(folder: &Path, extensions: &[&str]) -> Result<BTreeMap<i64, String>, Error> {
     let number = |name: String| {
         let (stem, extension) = name.rsplit_once('.')?;

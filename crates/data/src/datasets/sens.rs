@@ -1,18 +1,18 @@
-//! ScanNet's `.sens`: one file with colour and depth images and camera-to-world poses, metres,
+//! ScanNet's `.sens`: one file with color and depth images and camera-to-world poses, metres,
 //! little-endian.
 //!
 //! ```text
 //! u32 version = 4, u64 length, name,
-//! 4 × (4×4 f32): intrinsics and extrinsics of colour and depth,
-//! i32 colour compression (1 png, 2 jpeg), i32 depth compression,
+//! 4 × (4×4 f32): intrinsics and extrinsics of color and depth,
+//! i32 color compression (1 png, 2 jpeg), i32 depth compression,
 //! 4 × u32 sizes, f32 depth shift, u64 number of frames;
-//! each frame: 4×4 f32 pose, u64 colour time, u64 depth time, u64 colour bytes, u64 depth bytes,
+//! each frame: 4×4 f32 pose, u64 color time, u64 depth time, u64 color bytes, u64 depth bytes,
 //! the bytes of both images
 //! ```
 //!
 //! Images are not extracted: the image of a frame is `FILE@OFFSET+LENGTH`, in bytes. Times are
 //! assumed to be microseconds, and are kept only if they increase from frame to frame. Every size
-//! in the file is compared with the bytes that are left before it is used.
+//! in the file is checked against the remaining bytes before it is used.
 
 use seese3_core::Cause;
 use std::fs::File;
@@ -82,7 +82,7 @@ pub fn read_sens(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, Erro
         .unwrap_or(Path::new("."));
     let mut recording = collected.finish(folder, reader)?;
 
-    // Times that do not increase are not a clock; the recording then counts as having none.
+    // Times that do not increase are not usable timestamps; the recording then has none.
     if !recording.frames.timestamps_ns.is_sorted_by(|a, b| a < b) {
         recording.frames.timestamps_ns.clear();
     }
@@ -93,7 +93,7 @@ pub fn read_sens(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, Erro
 struct Frame {
     pose: Matrix4<f64>,
     time_us: u64,
-    /// Where the colour image starts in the file, bytes.
+    /// The offset of the color image in the file, bytes.
     offset: u64,
     bytes: u64,
 }
@@ -178,7 +178,7 @@ impl<'a> Sens<'a> {
         let bytes = self.number(&what)?;
         let depth = self.number(&what)?;
 
-        // The images are skipped. Only the position of the colour image is kept.
+        // The images are skipped. Only the position of the color image is kept.
         let offset = self.at;
         self.skip(bytes, &what)?;
         self.skip(depth, &what)?;

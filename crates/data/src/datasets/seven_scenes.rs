@@ -1,7 +1,7 @@
 //! 7-Scenes: `SCENE/seq-XX/frame-XXXXXX.{color.*,pose.txt}`, poses camera-to-world, metres.
 //!
-//! - The published poses are those of the depth sensor. They are used as poses of the colour
-//!   camera, as by most users of the data set, unless a calibration is given.
+//! - The published poses are those of the depth sensor. They are used as poses of the color camera,
+//!   as by most users of the data set, unless a calibration is given.
 //! - All sequences of a scene form one room, but no pair of frames spans two sequences.
 //!   `TrainSplit.txt` and `TestSplit.txt` list the sequence `seq-0N` as `sequenceN`.
 
@@ -20,7 +20,7 @@ pub struct SevenScenes {
     /// A single sequence, for instance `seq-01`; all of them if `None`.
     pub sequence: Option<String>,
     /// A text file with the 4×4 matrix `rgb_from_depth`, metres. If it is given, the poses become
-    /// those of the colour camera.
+    /// those of the color camera.
     pub rgb_from_depth: Option<PathBuf>,
 }
 
@@ -28,8 +28,8 @@ pub struct SevenScenes {
 /// frames.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
-/// refuses unusable frames and there are some. The message names the file or folder.
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if a frame
+/// is unusable and `reader.unusable` is `Refuse`. The message names the file or folder.
 pub fn read_seven_scenes(
     folder: &Path,
     choice: &SevenScenes,
@@ -58,8 +58,8 @@ pub fn read_seven_scenes(
             Some(name.split('.').next()?.to_owned()).filter(|stem| stem.starts_with("frame-"))
         };
 
-        // A stem may have only an image or only a pose. All are collected, so that incomplete
-        // frames are reported as dropped.
+        // A frame may have only an image or only a pose. All stems are collected, so that
+        // incomplete frames are reported as dropped.
         let stems: BTreeSet<String> = files.iter().filter_map(stem).collect();
 
         let images: BTreeMap<&str, &String> = files
@@ -124,15 +124,15 @@ pub fn read_seven_scenes(
     Ok(recording)
 }
 
-/// Frame numbers form a column: if one frame has none, all go without.
+/// Clears all frame numbers if one frame has none, because they form a column.
 fn all_or_none_numbered(frames: &mut [About]) {
     if frames.iter().any(|about| about.number.is_none()) {
         frames.iter_mut().for_each(|about| about.number = None);
     }
 }
 
-/// The stem of the frame that a colour image belongs to; `None` for any other file. The extension may
-/// be in capitals.
+/// The frame stem of a color image's file name; `None` for any other file. Extensions are compared
+/// case-insensitively.
 fn image_stem(name: &str) -> Option<&str> {
     let (stem, extension) = name.rsplit_once('.')?;
     let is_image = ["png", "jpg"]

@@ -7,8 +7,8 @@ use nalgebra::Matrix4;
 
 use super::{DropReason, Error, read_text};
 
-/// The 4×4 matrix of a pose file, row by row. The inner error is a reason to drop the frame; the
-/// outer one refuses the recording.
+/// Reads the 4×4 matrix of a pose file, row by row. An inner error drops the frame; an outer error
+/// refuses the recording.
 pub(super) fn read_matrix(file: &Path) -> Result<Result<Matrix4<f64>, DropReason>, Error> {
     if !file.exists() {
         return Ok(Err(DropReason::MissingPoseFile));
@@ -22,7 +22,7 @@ pub(super) fn read_matrix(file: &Path) -> Result<Result<Matrix4<f64>, DropReason
         }
     }
 
-    // Too few numbers mean a truncated file, which costs one frame. Too many mean that this is not
+    // Too few numbers mean a truncated file, which drops one frame. Too many mean that this is not
     // a pose file.
     match numbers.len() {
         16 => Ok(Ok(Matrix4::from_row_slice(&numbers))),
@@ -67,7 +67,7 @@ pub(super) fn finite_row<const N: usize>(
     Ok(row)
 }
 
-/// Splits a line into words separated by single spaces; none may be empty.
+/// Splits a line into non-empty words separated by single spaces.
 pub(super) fn spaced<'a>(file: &Path, line: usize, text: &'a str) -> Result<Vec<&'a str>, Error> {
     let words: Vec<&str> = text.split(' ').collect();
     if words
@@ -86,8 +86,8 @@ pub(super) fn spaced<'a>(file: &Path, line: usize, text: &'a str) -> Result<Vec<
 
 /// The lines with data, numbered from 1. Empty lines and `#` comments are skipped.
 pub(super) fn data_lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
-    let says = |(_, line): &(usize, &str)| !line.is_empty() && !line.starts_with('#');
-    (1..).zip(text.lines()).filter(says)
+    let has_data = |(_, line): &(usize, &str)| !line.is_empty() && !line.starts_with('#');
+    (1..).zip(text.lines()).filter(has_data)
 }
 
 /// Nanoseconds from non-negative decimal seconds, exactly. Digits after the ninth are cut off.
@@ -98,8 +98,8 @@ pub(super) fn nanoseconds(seconds: &str) -> Option<i64> {
         return None;
     }
 
-    // The fraction is padded to nine digits and parsed as an integer: a double has steps of 2.4e-7
-    // s at times since 1970.
+    // The fraction is padded to nine digits and parsed as an integer. At today's Unix times, a
+    // double resolves only 2.4e-7 s.
     let fraction: String = part.chars().chain("000000000".chars()).take(9).collect();
     whole
         .parse::<i64>()

@@ -1,8 +1,8 @@
-//! `transforms.json` of NeRF, instant-ngp and nerfstudio: `transform_matrix` is camera-to-world along
-//! OpenGL's axes, and is turned to x right, y down, z forward here.
+//! `transforms.json` of NeRF, instant-ngp and nerfstudio. `transform_matrix` is camera-to-world
+//! with OpenGL axes; it is converted to x right, y down, z forward.
 //!
-//! Translations are in whatever unit the program had that wrote the file: those that come from COLMAP
-//! are not metres. Frames are sorted by the numbers in their names; the file often is not.
+//! Translations have the unit of the program that wrote the file; COLMAP's unit is arbitrary, not
+//! metres. Frames are sorted by the numbers in their names, because the file often is unsorted.
 
 use std::path::{Path, PathBuf};
 
@@ -24,10 +24,10 @@ struct Transforms {
     frames: Vec<Frame>,
 }
 
-/// A pinhole camera, pixels, as far as it is stated.
+/// The camera's parameters, pixels. Any of them may be missing.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 struct Camera {
-    /// Without it, OPENCV, which has no distortion either where its coefficients are left out.
+    /// If missing, the camera is taken as OPENCV. Distortion coefficients are ignored.
     camera_model: Option<String>,
     w: Option<f64>,
     h: Option<f64>,
@@ -35,7 +35,7 @@ struct Camera {
     fl_y: Option<f64>,
     cx: Option<f64>,
     cy: Option<f64>,
-    /// The horizontal field of view, radians: of NeRF's own files.
+    /// The horizontal field of view, radians. The original NeRF files have it in place of `fl_x`.
     camera_angle_x: Option<f64>,
 }
 
@@ -48,8 +48,8 @@ struct Frame {
 /// Reads a `transforms.json`, or the one in a folder.
 ///
 /// # Errors
-/// [`Error`] if the file cannot be read or is malformed, if no usable frame is left, or if `reader`
-/// refuses unusable frames and there are some.
+/// [`Error`] if the file cannot be read or is malformed, if no usable frame is left, or if a frame
+/// is unusable and `reader.unusable` is `Refuse`.
 pub fn read_transforms(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
     let file = if path.is_dir() {
         path.join("transforms.json")
@@ -62,7 +62,7 @@ pub fn read_transforms(path: &Path, reader: &mut Reader<'_>) -> Result<Recording
         problem,
     };
 
-    // Some editors put a byte order mark before the text.
+    // Some editors write a byte order mark before the text.
     let content = read_bytes(&file)?;
     let text = content.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&content);
     let transforms: Transforms =
@@ -107,7 +107,7 @@ pub fn read_transforms(path: &Path, reader: &mut Reader<'_>) -> Result<Recording
     Ok(recording)
 }
 
-/// The path of an image below the folder; NeRF's files leave out the ending.
+/// An image's path relative to the folder. The original NeRF files omit the extension.
 fn image_of(folder: &Path, name: &str) -> Option<String> {
     let endings = ["", ".png", ".jpg", ".jpeg"].map(|ending| format!("{name}{ending}"));
     endings
@@ -115,8 +115,8 @@ fn image_of(folder: &Path, name: &str) -> Option<String> {
         .find(|image| folder.join(image).is_file())
 }
 
-/// The camera, if all of it is stated once for all frames. None for cameras that are no pinhole, such as
-/// fisheyes, and for pixels that are not square.
+/// The pinhole camera, if the file states it once for all frames. `None` if size or focal length is
+/// missing, for other models such as fisheye, and if the two focal lengths differ by 2 % or more.
 fn pinhole(camera: Camera) -> Result<Option<Pinhole>, String> {
     let is_pinhole = match camera.camera_model.as_deref() {
         None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL") => true,

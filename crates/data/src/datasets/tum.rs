@@ -21,8 +21,8 @@ const MAX_DIFFERENCE_NS: u64 = 10_000_000;
 /// Reads the folder of one sequence.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
-/// refuses unusable frames and there are some. The message names the file and the line, or the
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if a frame
+/// is unusable and `reader.unusable` is `Refuse`. The message names the file and the line, or the
 /// folder.
 pub fn read_tum(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
     let poses = read_trajectory(&folder.join("groundtruth.txt"))?;
@@ -75,8 +75,8 @@ pub fn read_tum_trajectory(file: &Path) -> Result<Trajectory, Error> {
 fn nearest(poses: &[(i64, Pose)], timestamp_ns: i64) -> Option<Pose> {
     let after = poses.partition_point(|(time, _)| *time < timestamp_ns);
 
-    // The poses are sorted, so only the last one before the time and the first one from it on can
-    // be nearest.
+    // The poses are sorted, so only the last one before the time and the first one at or after it
+    // can be nearest.
     let around = poses[after.saturating_sub(1)..].iter().take(2);
     let (time, pose) = around.min_by_key(|(time, _)| time.abs_diff(timestamp_ns))?;
     (time.abs_diff(timestamp_ns) <= MAX_DIFFERENCE_NS).then_some(*pose)
@@ -121,8 +121,7 @@ fn read_images(file: &Path) -> Result<Vec<(i64, String)>, Error> {
     Ok(images)
 }
 
-/// Nanoseconds from seconds in scientific notation, as NumPy writes them; only as exact as a
-/// double.
+/// Nanoseconds from seconds in scientific notation, as NumPy writes them; rounded to a double.
 fn scientific(seconds: &str) -> Option<i64> {
     let seconds: f64 = seconds
         .contains(['e', 'E'])

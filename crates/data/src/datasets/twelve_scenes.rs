@@ -15,8 +15,8 @@ use super::{DropReason, Error, Reader, Recording, entries, read_text};
 /// Reads the folder of one room.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if `reader`
-/// refuses unusable frames and there are some. The message names the file or folder.
+/// [`Error`] if a file cannot be read or is malformed, if no usable frame is left, or if a frame
+/// is unusable and `reader.unusable` is `Refuse`. The message names the file or folder.
 pub fn read_twelve_scenes(folder: &Path, reader: &mut Reader<'_>) -> Result<Recording, Error> {
     let lengths = sequence_lengths(&folder.join("split.txt"))?;
     let names = entries(&folder.join("data"))?;

@@ -1,4 +1,4 @@
-//! Paths and streams as other programs read them: TUM, KITTI, MCAP.
+//! Export of trajectories and streams for other programs: TUM, KITTI, MCAP.
 
 #[cfg(feature = "bags")]
 mod recording;

@@ -1,5 +1,5 @@
-//! Poses, transforms and images as an MCAP file that Foxglove, Rerun and other viewers open. Messages
-//! are Protobuf in Foxglove's schemas, whose types and descriptors come with Foxglove's own library.
+//! MCAP files with poses, transforms and images, for Foxglove, Rerun and other viewers. Messages
+//! are Protobuf in Foxglove's schemas, taken from Foxglove's own library.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -13,14 +13,14 @@ use mcap::{McapError, WriteOptions, Writer};
 
 use seese3_core::geometry::{Pose, Twist};
 
-/// An MCAP recording that is being written, in memory.
+/// An MCAP recording under construction, in memory.
 pub struct McapRecording {
     writer: Writer<Cursor<Vec<u8>>>,
     channels: BTreeMap<String, u16>,
     sequence: u32,
 }
 
-/// Where a camera was and how it moved, by a tracker.
+/// A tracker's estimate of a camera's pose and velocity.
 #[derive(Debug, Clone)]
 pub struct RecordedOdometry<'a> {
     /// The frame of the pose, for instance `map`.
@@ -29,19 +29,19 @@ pub struct RecordedOdometry<'a> {
     pub child_frame: &'a str,
     /// `frame_from_camera`.
     pub pose: Pose,
-    /// The covariance of the pose's error, 6×6, row-major, in ROS's order; empty if it is not known.
+    /// The covariance of the pose, 6×6, row-major, in ROS order; empty if it is not known.
     pub covariance: &'a [f64],
-    /// In the camera's frame, metres and radians a second, if it is known.
+    /// The velocity in the camera's frame, m/s and rad/s, if it is known.
     pub velocity: Option<Twist>,
 }
 
 impl McapRecording {
-    /// A recording without messages.
+    /// Creates a recording without messages.
     ///
     /// # Errors
     /// [`McapError`] if the MCAP library cannot begin the file.
     pub fn new() -> Result<Self, McapError> {
-        // Not compressed, so that every viewer opens it; images are compressed by themselves.
+        // Not compressed, so that every viewer can open it; images are already compressed.
         let options = WriteOptions::new().compression(None).library("seese3");
         let writer = options.create(Cursor::new(Vec::new()))?;
 
@@ -200,11 +200,11 @@ impl McapRecording {
     }
 }
 
-/// A time of the message; what was before the epoch is the epoch.
+/// A message's timestamp. Times before the epoch are clamped to the epoch.
 fn timestamp(time_ns: i64) -> Timestamp {
     let time_ns = time_ns.max(0);
     let seconds = u32::try_from(time_ns / 1_000_000_000).unwrap_or(u32::MAX);
-    // The rest of a division by 10⁹ is smaller than that.
+    // The remainder is below 10⁹, so it fits into 32 bits.
     Timestamp::new(seconds, (time_ns % 1_000_000_000) as u32)
 }
 
@@ -239,8 +239,8 @@ mod tests {
     use super::*;
     use prost_reflect::{DescriptorPool, DynamicMessage};
 
-    /// Oracle: the MCAP library's own reader, and a Protobuf reader that knows nothing but the
-    /// schemas in the file.
+    /// Oracle: the MCAP library's own reader, and a Protobuf reader that uses only the schemas in
+    /// the file.
     #[test]
     fn what_is_recorded_is_read_again() {
         let mut recording = McapRecording::new().unwrap();

@@ -14,8 +14,8 @@ pub fn tum_trajectory(timestamps_ns: &[i64], poses: &[Pose]) -> String {
         let t = pose.translation.vector;
         let q = pose.rotation.coords;
 
-        // The sign is written apart, since the whole seconds of −0.5 s are zero and would lose
-        // it. Integers keep the nanoseconds exact, which a 64-bit float of seconds would round.
+        // The sign is written separately, since the whole seconds of −0.5 s are zero and have none.
+        // Integers keep the nanoseconds exact; a 64-bit float of seconds would round them.
         let sign = if *time < 0 { "-" } else { "" };
         let time = time.unsigned_abs();
         let seconds = time / 1_000_000_000;

@@ -1,4 +1,4 @@
-//! The conventions in which poses are written down, and how each is read.
+//! Pose conventions and their conversion to `world_from_camera`.
 
 use std::fmt;
 
@@ -6,7 +6,7 @@ use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion};
 
 use seese3_core::geometry::Pose;
 
-/// Which way the axes of a camera point.
+/// Directions of a camera's axes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Axes {
     /// x right, y down, z forward: OpenCV, COLMAP, ROS optical frames, and this project.
@@ -14,51 +14,50 @@ pub enum Axes {
     OpenCv,
     /// x right, y up, z backward: OpenGL, Blender, NeRF, ARKit.
     OpenGl,
-    /// x forward, y left, z up: the bodies of robots in ROS.
+    /// x forward, y left, z up: robot bodies in ROS.
     Ros,
 }
 
-/// Which transform a pose is.
+/// Direction of the transform that a pose stores.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Direction {
-    /// From coordinates of the camera to those of the world; its translation is the camera's place.
+    /// From camera to world coordinates; the translation is the camera's position.
     #[default]
     WorldFromCamera,
-    /// From coordinates of the world to those of the camera: the inverse, as COLMAP writes it.
+    /// From world to camera coordinates: the inverse, as in COLMAP.
     CameraFromWorld,
 }
 
-/// In which order a quaternion's numbers stand.
+/// Order of a quaternion's components.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum QuaternionOrder {
-    /// As the format says.
+    /// The order that the format defines.
     #[default]
     Stated,
-    /// (w, x, y, z) in a place where (x, y, z, w) is read.
+    /// (w, x, y, z), although the format defines (x, y, z, w).
     ScalarFirst,
 }
 
-/// A way in which poses can be written down.
+/// A convention for storing camera poses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Convention {
     /// The camera's axes.
     pub axes: Axes,
-    /// Which transform.
+    /// The direction of the transform.
     pub direction: Direction,
-    /// By how many quarter turns the images are turned clockwise against the camera that the poses
-    /// are of, 0 to 3.
+    /// Clockwise quarter turns of the images relative to the camera of the poses, 0 to 3.
     pub image_quarter_turns: u8,
-    /// The order of quaternions.
+    /// The order of quaternion components.
     pub quaternions: QuaternionOrder,
 }
 
 impl Convention {
-    /// `world_from_camera` with axes x right, y down, z forward in the image, from a pose that is
-    /// stated in this convention.
+    /// Converts a pose in this convention to `world_from_camera` with image axes x right, y down,
+    /// z forward.
     pub fn to_world_from_camera(self, stated: &Pose) -> Pose {
         let mut pose = *stated;
         if self.quaternions == QuaternionOrder::ScalarFirst {
-            // What was read as (x, y, z, w) is (w, x, y, z).
+            // The numbers were read as (x, y, z, w), but are (w, x, y, z).
             let read = pose.rotation.quaternion();
             let meant = Quaternion::new(read.i, read.j, read.k, read.w);
             pose.rotation = UnitQuaternion::from_quaternion(meant);
@@ -70,8 +69,7 @@ impl Convention {
         pose * stated_from_optical(self.axes) * camera_from_turned_image(self.image_quarter_turns)
     }
 
-    /// Every convention that a mistake may be, the one of this project first and the common ones
-    /// before the rare ones.
+    /// Every convention that the check tries: this project's first, common ones before rare ones.
     pub fn all() -> Vec<Self> {
         let mut all = Vec::new();
         for image_quarter_turns in 0..4 {
@@ -126,7 +124,7 @@ fn rotation(rows: [[f64; 3]; 3]) -> UnitQuaternion<f64> {
     UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(matrix))
 }
 
-/// Takes coordinates along x right, y down, z forward to those along the stated axes.
+/// Rotation from x right, y down, z forward to the stated axes.
 fn stated_from_optical(axes: Axes) -> UnitQuaternion<f64> {
     match axes {
         Axes::OpenCv => UnitQuaternion::identity(),
@@ -135,9 +133,9 @@ fn stated_from_optical(axes: Axes) -> UnitQuaternion<f64> {
     }
 }
 
-/// Takes coordinates in a turned image's axes to those of the camera that is not turned.
+/// Rotation from the axes of a turned image to those of the unturned camera.
 fn camera_from_turned_image(quarter_turns: u8) -> UnitQuaternion<f64> {
-    // What points right in the image that was turned clockwise pointed up before.
+    // In an image turned clockwise by a quarter, right was up before.
     let angle = -std::f64::consts::FRAC_PI_2 * f64::from(quarter_turns);
     UnitQuaternion::from_axis_angle(&nalgebra::Vector3::z_axis(), angle)
 }
@@ -156,7 +154,7 @@ mod tests {
         let seen = pose * Point3::new(0.0, 0.0, 5.0);
         assert!((seen - Point3::new(6.0, 2.0, 3.0)).norm() < 1e-12);
 
-        // A robot whose body looks along x of the world stands as the world does.
+        // A robot body that faces the world's x axis has the identity rotation.
         let body = Pose::from_parts(pose.translation, UnitQuaternion::identity());
         // In OpenGL's axes the camera looks along its −z, and its y is up: the world's z.
         let gl = rotation([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
@@ -180,7 +178,7 @@ mod tests {
             assert!(off < 1e-12, "{axes:?} {direction:?}");
         }
 
-        // An image that was turned clockwise by a quarter: what was up, the world's z, is right now.
+        // An image turned clockwise by a quarter: up, the world's z, becomes right.
         let turned = Convention {
             image_quarter_turns: 1,
             ..Convention::default()
@@ -188,7 +186,7 @@ mod tests {
         let right = turned.to_world_from_camera(&pose).rotation * Vector3::x();
         assert!((right - Vector3::z()).norm() < 1e-12);
 
-        // A file's (w, x, y, z) = (.5, .5, −.5, .5) read as (x, y, z, w).
+        // A file's (w, x, y, z) = (0.5, 0.5, −0.5, 0.5) read as (x, y, z, w).
         let mixed = Pose::from_parts(
             pose.translation,
             UnitQuaternion::from_quaternion(Quaternion::new(0.5, 0.5, 0.5, -0.5)),

@@ -1,34 +1,36 @@
-//! Whether one way to read poses explains the motion of images better than another, throughout a
-//! recording.
+//! Tests whether one interpretation of poses explains image motion better than another throughout
+//! a recording.
 //!
-//! Exchanging an axis along which the camera hardly moves changes little of what is explained. But it
-//! changes it in the same direction in every part of the recording, which chance does not.
+//! Swapping an axis along which the camera hardly moves changes the fit little. But a real
+//! difference has the same sign in every part of the recording; a random one does not.
 
 use seese3_core::statistics::median;
 
-/// The recording is compared in so many parts; neighbouring pairs of frames err together.
+/// Number of consecutive blocks of a recording. Neighboring pairs have correlated errors, so blocks
+/// are compared instead of pairs.
 const PARTS: usize = 10;
-/// The mean gain of the parts is at least so many of its standard errors.
+/// Minimum mean gain of the blocks, in standard errors.
 const STANDARD_ERRORS: f64 = 3.0;
-/// Alignments are not more exact than this, image widths and radians together.
+/// Accuracy of an alignment, image widths and radians together: lower bound of the loss scale.
 const EXACT: f64 = 0.002;
 
-/// What two ways to read poses leave unexplained of the same pairs, in the order of the recording,
-/// image widths and radians together.
+/// Residuals of the same pairs under two interpretations of the poses, in the order of the
+/// recording, image widths and radians together.
 pub(super) struct Residuals {
     pub stated: Vec<f64>,
     pub other: Vec<f64>,
 }
 
 impl Residuals {
-    /// Whether the other way explains more, and not in some parts of the recording alone.
+    /// Whether the other interpretation fits significantly better across the blocks of the
+    /// recording.
     pub fn is_other_better_throughout(&self) -> bool {
         let Self { stated, other } = self;
         if other.len() < 2 * PARTS {
             return false;
         }
 
-        // The logarithm keeps single pairs, whose alignment went wrong, from deciding.
+        // The logarithm limits the influence of single pairs with a failed alignment.
         let scale = median(other).max(EXACT);
         let loss = |off: f64| (off / scale).powi(2).ln_1p();
         let gains: Vec<f64> = stated
@@ -72,7 +74,7 @@ mod tests {
         assert!(!is_better(&worse_everywhere, &other));
         assert!(!is_better(&other, &other));
 
-        // More is gained on the whole, but in one part alone.
+        // The total gain is larger, but it comes from one block alone.
         let mut in_one_part = other.clone();
         in_one_part[40..50].iter_mut().for_each(|off| *off *= 3.0);
         assert!(!is_better(&other, &in_one_part));

@@ -1,9 +1,9 @@
-//! Whether the poses of a recording can be those of its images.
+//! Checks whether the poses of a recording match its images.
 //!
-//! Poses in a wrong convention (inverted, along other axes, of other frames) train and score almost
-//! as well as right ones, and then mislead whoever uses them. The images know better: when a camera
-//! turns right, everything moves left. So the motion of the images ([`crate::image_motion`]) is
-//! compared with the motion that the poses state, read in every convention that is in use.
+//! Poses in a wrong convention (inverted, other axes, other frames) train and score almost as well
+//! as right ones, and then mislead their users. The images are independent evidence: when a camera
+//! turns right, the image moves left. The check compares image motion ([`crate::image_motion`])
+//! with the motion of the poses, read in every common convention.
 //!
 //! | what the camera does | what the image does |
 //! | --- | --- |
@@ -13,8 +13,8 @@
 //! | moves right, t_x, or down, t_y | shifts left or up by focal · t / depth |
 //! | moves forward, t_z | grows by t_z / depth |
 //!
-//! The focal length and the depth are not known. They are fitted, may not be negative, and are worth
-//! reading themselves: a wrong unit of length shows as an impossible depth.
+//! Focal length and depth are unknown. They are fitted as non-negative factors, and reported: a
+//! wrong unit of length shows as an impossible depth.
 //!
 //! | file | what |
 //! | --- | --- |
@@ -47,51 +47,54 @@ use motion_fit::{MotionFit, fit_motions, unexplained};
 use seese3_core::geometry::Pose;
 use seese3_core::room::{FrameId, Room};
 
-/// Pairs of frames that are looked at.
+/// Maximum number of frame pairs to compare.
 const PAIRS: usize = 100;
-/// Between the frames of a pair the camera should turn by this, radians: 3 degrees, enough to see and
-/// not too much to follow.
+/// Preferred rotation between the frames of a pair, radians (3 degrees): large enough to measure,
+/// small enough to align.
 const WANTED_TURN_RAD: f64 = 0.052;
-/// The frames of a pair are at most this many rows apart.
+/// Maximum distance between the frames of a pair, rows.
 const FURTHEST_ROWS: u32 = 60;
-/// Alignments with a lower correlation are not used.
+/// Minimum correlation of a usable alignment.
 const LEAST_CORRELATION: f64 = 0.7;
-/// Fewer pairs than this decide nothing.
+/// Minimum number of usable pairs for a verdict.
 const FEWEST_PAIRS: usize = 12;
-/// Images that move less than this on average, image widths, decide nothing.
+/// Minimum mean image shift for a verdict, image widths. The same number, in radians, bounds the
+/// mean turn of an image that stands still.
 const LEAST_MOTION: f64 = 0.005;
 
-/// Poses that explain this share of the images' motion agree with it.
+/// Minimum explained share of poses that agree with the images.
 const AGREES: f64 = 0.6;
-/// Another convention is named where it explains this share at least,
+/// Minimum explained share to report another convention, mirrored images or transposed rotations.
 const EXPLAINS: f64 = 0.6;
-/// and by this much more than the stated one,
+/// Minimum gain over the stated convention to report another one.
 const BETTER_BY: f64 = 0.15;
-/// or by this much, if it shows throughout the recording.
+/// Minimum gain to report another convention if the gain is consistent throughout the recording.
 const THROUGHOUT_BETTER_BY: f64 = 0.05;
-/// Other translations are named where they explain by this much more than the stated ones,
+/// Minimum gain over the stated translations to report others.
 const TRANSLATIONS_BETTER_BY: f64 = 0.05;
-/// or by this much, if it shows throughout the recording.
+/// Minimum gain to report other translations if the gain is consistent throughout the recording.
 const TRANSLATIONS_THROUGHOUT_BETTER_BY: f64 = 0.015;
-/// Other translations have to explain this share at least: of 49, one explains much by chance.
+/// Minimum explained share to report other translations. It is higher than [`EXPLAINS`], because
+/// the best of 49 candidates explains much by chance.
 const TRANSLATIONS_EXPLAIN: f64 = 0.7;
-/// Mirrored images and transposed rotations are named where they explain by this much more than every
-/// convention and every way to write translations.
+/// Minimum gain of mirrored images or transposed rotations over the best convention and the best
+/// translations.
 const RARER_BETTER_BY: f64 = 0.07;
-/// Where poses turn by this on average, radians, images that stand still are not theirs.
+/// Mean rotation of the poses, radians, from which still images contradict them.
 const SURE_TURN_RAD: f64 = 0.03;
-/// Poses of other frames are named where they explain by this much more than those of the same,
+/// Minimum gain of shifted over unshifted poses to report a row shift.
 const ROWS_BETTER_BY: f64 = 0.02;
-/// and this share at least: of 121 places to look for them, one explains much by chance.
+/// Minimum explained share to report a row shift. It is higher than [`EXPLAINS`], because the best
+/// of 121 shifts explains much by chance.
 const ROWS_EXPLAIN: f64 = 0.75;
-/// Poses are looked for so many rows away from their images.
+/// Maximum shift between poses and images that is tried, rows.
 const FURTHEST_SHIFT: i64 = 60;
-/// Conventions within this of the best one may be meant as well.
+/// Explained shares that differ by at most this count as equally good.
 const AS_GOOD: f64 = 0.03;
-/// Poses that explain less than this are not those of the images, where no mistake explains enough.
+/// Below this explained share, poses are unrelated to the images if no mistake explains them.
 const UNRELATED: f64 = 0.4;
 
-/// Two frames of a recording and how the image moved between them.
+/// Two frames of a recording and the image motion between them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ObservedPair {
     /// The frame that the motion starts from.
@@ -214,8 +217,8 @@ pub fn pairs_to_look_at(room: &Room) -> Vec<(FrameId, FrameId)> {
     pairs.take(PAIRS).collect()
 }
 
-/// The next frame of the same sequence at which the camera has turned by enough; if there is none,
-/// the one at which it has turned most. None at the end of a sequence.
+/// The next frame of the same sequence that is turned by [`WANTED_TURN_RAD`] or more; if there is
+/// none within [`FURTHEST_ROWS`], the most turned one. `None` at the end of a sequence.
 fn turned_since(room: &Room, first: FrameId) -> Option<FrameId> {
     let poses = room.poses();
     let turn = |other: &FrameId| {
@@ -234,9 +237,9 @@ fn turned_since(room: &Room, first: FrameId) -> Option<FrameId> {
     enough.or(most).copied()
 }
 
-/// Compares poses with how images moved.
+/// Compares poses with image motion.
 ///
-/// `poses` are as they were stated, one a frame; `read_as` is the convention in which they are taken.
+/// `poses` are as stated, one per frame; `read_as` is the convention in which they are interpreted.
 pub fn check(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) -> PoseCheck {
     let observed: Vec<ObservedPair> = observed
         .iter()
@@ -307,7 +310,7 @@ fn verdict(
         };
     }
 
-    // Where other rows and other translations both would explain it, the better ones are meant.
+    // If a row shift and other translations both explain the motion, the better one is reported.
     let shifted = best_shift(poses, read_as, observed);
     let by_shift = shifted.map_or(0.0, |shift| shift.explained);
     let gain = with_translations - stated.explained;
@@ -333,11 +336,11 @@ fn verdict(
     }
 }
 
-/// The conventions that explain most, and how much that is.
+/// The conventions that explain most of the motion.
 struct RankedConventions {
-    /// The best first; those after it explain hardly less.
+    /// The best first; the others explain at most [`AS_GOOD`] less.
     likely: Vec<Convention>,
-    /// What the best one explains, 0 to 1.
+    /// The share explained in the best one, 0 to 1.
     explained: f64,
 }
 
@@ -360,8 +363,8 @@ impl RankedConventions {
     }
 }
 
-/// The verdict that images are mirrored or rotations transposed, if that explains much more than
-/// anything more usual, of which the best explains `usual`.
+/// The verdict of mirrored images or transposed rotations, if it explains clearly more than
+/// `usual`, the share explained by the best of the more common mistakes.
 fn rarer_mistake(
     poses: &[Pose],
     read_as: Convention,
@@ -387,7 +390,7 @@ fn rarer_mistake(
     })
 }
 
-/// How the images would have moved with left and right exchanged.
+/// The observed motions with left and right exchanged.
 fn mirrored(observed: &[ObservedPair]) -> Vec<ObservedPair> {
     let mirrored = |pair: &ObservedPair| {
         let mut pair = *pair;
@@ -398,21 +401,21 @@ fn mirrored(observed: &[ObservedPair]) -> Vec<ObservedPair> {
     observed.iter().map(mirrored).collect()
 }
 
-/// Poses that are those of images so many rows later, and how much they explain then.
+/// A shift of poses to images some rows later, and the share of the motion that they then explain.
 #[derive(Debug, Clone, Copy)]
 struct Shift {
     rows: i64,
     explained: f64,
 }
 
-/// The rows by which poses are shifted, if they are.
+/// The row shift that explains most, if it explains enough and clearly more than no shift.
 fn best_shift(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) -> Option<Shift> {
     let mut best = Shift {
         rows: 0,
         explained: 0.0,
     };
     for rows in -FURTHEST_SHIFT..=FURTHEST_SHIFT {
-        // The pose of an image stands so many rows before it.
+        // An image's pose is `rows` rows before the image.
         let shifted = |frame: FrameId| {
             let row = i64::from(frame.0) - rows;
             let is_there = (0..poses.len() as i64).contains(&row);
@@ -430,7 +433,7 @@ fn best_shift(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) ->
             continue;
         }
 
-        // Compared with the stated rows on the same pairs.
+        // The unshifted poses are evaluated on the same pairs.
         let back = |frame: FrameId| FrameId((i64::from(frame.0) + rows) as u32);
         let there = moved.iter().map(|pair| ObservedPair {
             first: back(pair.first),
@@ -448,8 +451,8 @@ fn best_shift(poses: &[Pose], read_as: Convention, observed: &[ObservedPair]) ->
     (best.explained >= ROWS_EXPLAIN).then_some(best)
 }
 
-/// The translations that explain most beside the stated rotations, and how much that is. Of those that
-/// explain the same, the first: the stated ones.
+/// The translations that explain most with the stated rotations, and the share explained. Of ties,
+/// the first wins; the stated ones come first.
 fn best_translations(
     poses: &[Pose],
     read_as: Convention,
@@ -466,7 +469,7 @@ fn best_translations(
     best
 }
 
-/// The camera motions of the pairs, if translations were written down in another way.
+/// The camera motions of the pairs with reinterpreted translations.
 fn motions_with(
     translations: Translations,
     poses: &[Pose],
@@ -483,7 +486,7 @@ fn motions_with(
         .collect()
 }
 
-/// The stated camera motions of the pairs, if poses are read in a convention.
+/// The camera motions of the pairs with poses read in a convention.
 fn motions(poses: &[Pose], convention: Convention, observed: &[ObservedPair]) -> Vec<Pose> {
     let read = |frame: FrameId| convention.to_world_from_camera(&poses[frame.row()]);
     let motion = |pair: &ObservedPair| read(pair.first).inverse() * read(pair.second);

@@ -1,59 +1,60 @@
-//! How well stated camera motions explain the motion of images.
+//! Fits stated camera motions to image motions and measures the explained share.
 
 use super::ObservedPair;
 use seese3_core::geometry::Pose;
 
-/// The depth is told only where translations explain at least this share of the motion.
+/// Minimum share of the motion that translations must explain for a depth estimate.
 const TELLS_DEPTH: f64 = 0.03;
-/// Pairs whose motion is off by more than this, image widths and radians together, count for less and
-/// less in a fit: their alignment went wrong, or something near to the camera fills the image.
+/// Scale of the Cauchy weight of a pair's residual, image widths and radians together. It reduces
+/// the influence of failed alignments and of objects close to the camera.
 const ROBUST_MOTION: f64 = 0.02;
-/// Rounds of a fit; pairs are weighed again after each.
+/// Number of rounds of a fit; pairs are reweighted after each.
 const ROUNDS: usize = 8;
 
-/// What the images tell of the camera and of the scene, if the poses are right.
+/// Focal length and depth fitted to the images, assuming that the poses are right.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SceneEstimate {
-    /// The focal length, image widths; about 0.8 for a phone or a webcam; 0 if the camera does not turn.
+    /// The focal length, image widths: about 0.8 for a phone or a webcam, 0 if the camera does not
+    /// turn.
     pub focal: f64,
-    /// How far away the things in view are, in the unit of the translations; none if the camera
-    /// moves too little, or along a line that tells nothing.
+    /// The typical depth of the scene, in the unit of the translations. `None` if rotations explain
+    /// nothing, or translations explain too little of the motion.
     pub depth: Option<f64>,
 }
 
-/// How much of the motion of images a list of camera motions explains.
+/// The result of fitting camera motions to image motions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct MotionFit {
-    /// The share of the motion that is explained, 0 to 1: shifts in image widths, turns in radians
-    /// and growths, taken together. A pair whose residual is larger than its motion counts as 0, and
-    /// not as less.
+    /// The explained share of the motion, 0 to 1, with shifts in image widths, turns in radians and
+    /// growths taken together. A pair whose residual exceeds its motion counts as 0, not less.
     pub explained: f64,
-    /// The focal length and the depth that fit best.
+    /// The best-fitting focal length and depth.
     pub seen: SceneEstimate,
 }
 
-/// What one observed number would be by a stated rotation and by a stated translation, each times a
-/// factor: the regressors of the fit.
+/// The regressors of one observed number: it is predicted as a factor times `by_rotation` plus a
+/// factor times `by_translation`.
 #[derive(Clone, Copy, Default)]
 struct Causes {
     by_rotation: f64,
     by_translation: f64,
 }
 
-/// A pair of frames: right, down, turn and growth, and their causes.
+/// A pair of frames: the observed shift right, shift down, turn and growth, with their regressors.
 struct Pair {
     observed: [f64; 4],
     causes: [Causes; 4],
 }
 
-/// The factors that causes are multiplied by, none below 0.
+/// The non-negative factors of the regressors.
 #[derive(Debug, Clone, Copy, Default)]
 struct Factors {
     rotation: f64,
     translation: f64,
 }
 
-/// Which factors a number is predicted by: both shifts have those of focal length and depth.
+/// The index of each observed number's factors. Both shifts share the first: focal length, and
+/// focal length over depth.
 const KIND: [usize; 4] = [0, 0, 1, 2];
 
 /// Fits camera motions, `first_from_second` in the first camera's axes, to the motions of images.
@@ -74,7 +75,7 @@ pub(super) fn fit_motions(motions: &[Pose], observed: &[ObservedPair]) -> Motion
     });
     let (explained_by_rotations, _) = fit(&turning.collect::<Vec<_>>());
 
-    // Where translations explain little, the depth would be a quotient of noise.
+    // If translations explain little, the depth would be a quotient of noise.
     let of_shifts = factors[KIND[0]];
     let has_both = of_shifts.rotation > 0.0 && of_shifts.translation > 0.0;
     let tells_depth = has_both && explained - explained_by_rotations >= TELLS_DEPTH;
@@ -87,7 +88,7 @@ pub(super) fn fit_motions(motions: &[Pose], observed: &[ObservedPair]) -> Motion
     }
 }
 
-/// What of each pair's motion is not explained, image widths and radians together.
+/// The residual of each pair's motion, image widths and radians together.
 pub(super) fn unexplained(motions: &[Pose], observed: &[ObservedPair]) -> Vec<f64> {
     let pairs = motions.iter().zip(observed);
     let pairs: Vec<Pair> = pairs.map(|(motion, pair)| pair_of(motion, pair)).collect();
@@ -116,7 +117,7 @@ fn pair_of(motion: &Pose, pair: &ObservedPair) -> Pair {
     }
 }
 
-/// The share of the motion that is explained, and the factors of shifts, turns and growths.
+/// Fits the factors of shifts, turns and growths, and returns them with the explained share.
 fn fit(pairs: &[Pair]) -> (f64, [Factors; 3]) {
     let mut factors = [Factors::default(); 3];
     let mut weights = vec![1.0; pairs.len()];
@@ -141,7 +142,7 @@ fn fit(pairs: &[Pair]) -> (f64, [Factors; 3]) {
     (if total > 0.0 { explained / total } else { 0.0 }, factors)
 }
 
-/// How far a pair's motion is from the predicted one.
+/// The distance between a pair's observed and predicted motion.
 fn residual(pair: &Pair, factors: &[Factors; 3]) -> f64 {
     let numbers = pair.observed.iter().zip(&pair.causes).zip(KIND);
     let squares = numbers.map(|((observed, causes), kind)| {
@@ -156,7 +157,7 @@ fn residual(pair: &Pair, factors: &[Factors; 3]) -> f64 {
     squares.sum::<f64>().sqrt()
 }
 
-/// Weighted least squares with factors that may not be negative.
+/// Weighted least squares with non-negative factors.
 fn factors_of(kind: usize, pairs: &[Pair], weights: &[f64]) -> Factors {
     let mut rr = 0.0;
     let mut tt = 0.0;
@@ -176,8 +177,8 @@ fn factors_of(kind: usize, pairs: &[Pair], weights: &[f64]) -> Factors {
         }
     }
 
-    // The best factors lie inside, where both are positive, or on an edge, where one is 0. What they
-    // take off the sum of squares tells which.
+    // At the optimum, either no factor is constrained or one is 0. If one is 0, keep the one that
+    // reduces the sum of squares more.
     let quotient = |observed: f64, cause: f64| match observed / cause {
         factor if factor.is_finite() => factor.max(0.0),
         _ => 0.0,

@@ -1,4 +1,4 @@
-//! What the poses of a recording alone tell: how far the camera went, and what looks wrong in it.
+//! Path statistics and warnings from the poses of a recording alone, without images.
 
 use nalgebra::Vector3;
 
@@ -6,21 +6,21 @@ use seese3_core::geometry::Pose;
 use seese3_core::room::{FrameId, Room};
 use seese3_core::statistics::{median, quantile};
 
-/// A step is a jump if it is longer than so many times the 95th percentile of all steps.
+/// A step is a jump if it exceeds this multiple of the 95th percentile of all steps.
 const JUMP: f64 = 10.0;
-/// Jumps are looked for in recordings of at least so many steps.
+/// Minimum number of steps for the detection of jumps.
 const FEWEST_STEPS: usize = 40;
-/// A median speed above this, m/s, is none of a camera: the unit of length is another one.
+/// Maximum plausible median speed of a camera, m/s. Above it, the unit of length is wrong.
 const FASTEST_M_S: f64 = 50.0;
-/// The same where no times are known: a median step above this, metres.
+/// Maximum plausible median step of a recording without timestamps, metres.
 const LONGEST_STEP_M: f64 = 10.0;
 
-/// What the poses of a recording say about its camera's path.
+/// Statistics of a camera's path.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PathFacts {
     /// The size of the box around all camera positions, along the world's axes, metres.
     pub extent_m: [f64; 3],
-    /// The length of the path, metres; sequences count one by one.
+    /// The length of the path, metres, without the gaps between sequences.
     pub length_m: f64,
     /// The median distance between consecutive frames, metres.
     pub median_step_m: f64,
@@ -30,40 +30,40 @@ pub struct PathFacts {
     pub median_step_rad: f64,
     /// The largest of these rotations, and the later of its two frames.
     pub largest_step_rad: (f64, FrameId),
-    /// Frames per second, from the median of the times between consecutive frames; none if times are
-    /// not known.
+    /// Frames per second, from the median interval between consecutive frames; `None` without
+    /// timestamps, or if that interval is not positive.
     pub rate_hz: Option<f64>,
-    /// What looks wrong.
+    /// Suspicious properties of the poses.
     pub warnings: Vec<PathWarning>,
 }
 
-/// What looks wrong in poses.
+/// A suspicious property of a recording's poses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum PathWarning {
     /// All poses are the same.
     NeverMoves,
     /// All positions are the same, and the camera turns.
     OnlyTurns,
-    /// Poses are exactly the identity, or it read along other axes, after others that are not.
+    /// Poses are exactly the identity, in any axis convention, after poses that are not.
     Identities {
-        /// How many.
+        /// The number of such poses.
         count: usize,
-        /// The first of them.
+        /// The frame of the first.
         first: FrameId,
     },
     /// The camera jumps.
     Jumps {
-        /// How often.
+        /// The number of jumps.
         count: usize,
-        /// The frame that the first jump leads to.
+        /// The frame after the first jump.
         first: FrameId,
     },
-    /// Steps are so long that the translations are likely in another unit than metres.
+    /// Steps are so long that the translations are likely not in metres.
     OtherUnit {
         /// The median step, metres.
         median_step_m: f64,
     },
-    /// Times do not rise from frame to frame.
+    /// Times do not increase from frame to frame.
     TimesFall {
         /// The first frame that is not later than the one before it.
         first: FrameId,
@@ -79,7 +79,7 @@ struct Step {
 }
 
 impl PathFacts {
-    /// Of a room's poses. `None` if no two frames follow each other.
+    /// The statistics of a room's poses. `None` if no two frames are consecutive.
     pub fn of(room: &Room) -> Option<Self> {
         let steps = steps(room);
         let metres: Vec<f64> = steps.iter().map(|step| step.metres).collect();
@@ -127,8 +127,7 @@ fn steps(room: &Room) -> Vec<Step> {
     joined.map(step).collect()
 }
 
-/// Whether this is a pose that recorders write when tracking is lost: the identity, read in any
-/// convention of axes.
+/// Whether a pose is the identity in any axis convention. Recorders write it when tracking is lost.
 pub fn is_identity(pose: &Pose) -> bool {
     let rotation = pose.rotation.to_rotation_matrix();
     let is_along_axis = |number: &f64| number.abs() < 1e-9 || (number.abs() - 1.0).abs() < 1e-9;

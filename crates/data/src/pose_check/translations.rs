@@ -1,24 +1,24 @@
-//! Ways in which translations can be wrong while rotations are right.
+//! Variants of wrong translations with right rotations, as tried by the check.
 
 use nalgebra::Vector3;
 
 use seese3_core::geometry::Pose;
 
-/// How translations were written down.
+/// The relation of stated translations to camera positions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Translations {
-    /// The camera's position is made of these of its numbers, each with a sign: the stated x, y and z
-    /// are 0, 1 and 2.
+    /// Each coordinate of the camera's position is a stated coordinate (0, 1 or 2 for x, y, z)
+    /// times a sign.
     Axes([(usize, f64); 3]),
-    /// They are those of the inverse, `camera_from_world`, beside rotations of `world_from_camera`.
+    /// Translations of `camera_from_world`, combined with rotations of `world_from_camera`.
     OfTheInverse,
 }
 
 impl Translations {
-    /// As they are stated.
+    /// Positions as stated.
     pub const STATED: Self = Self::Axes([(0, 1.0), (1, 1.0), (2, 1.0)]);
 
-    /// Every way that a mistake may be, with the stated one first.
+    /// Every variant that the check tries, with the stated one first.
     pub(super) fn all() -> Vec<Self> {
         let orders = [
             [0, 1, 2],
@@ -41,7 +41,7 @@ impl Translations {
         all
     }
 
-    /// The pose that is meant.
+    /// The pose with its translation reinterpreted.
     pub(super) fn meant(self, world_from_camera: &Pose) -> Pose {
         let stated = world_from_camera.translation.vector;
         let rotation = world_from_camera.rotation;

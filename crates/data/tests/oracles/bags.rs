@@ -233,7 +233,7 @@ fn what_is_no_bag_of_ros_2_is_said() {
             written("cut.db3", &whole[..whole.len() / 2]),
             "is a damaged .db3 bag",
         ),
-        (written("one.bag", b"#ROSBAG V2.0\n"), "is a bag of ROS 1"),
+        (written("one.bag", b"#ROSBAG V2.0\n"), "is a ROS 1 bag"),
         (
             written("bag.db3.zstd", b"\x28\xb5\x2f\xfd\x04\x00"),
             "is compressed as a whole",
@@ -268,7 +268,7 @@ fn what_is_no_bag_of_ros_2_is_said() {
                 "UPDATE topics SET type = 'std_msgs/msg/String' WHERE name = '/odom'",
                 None,
             ),
-            "has no pose topic: ROS 2's PoseStamped",
+            "has no pose topic: supported types are ROS 2's PoseStamped",
         ),
         (
             changed(

@@ -1,5 +1,4 @@
-//! Incoming requests, converted to domain queries. Every field is checked here, and an error names
-//! the field that is wrong.
+//! Converts and validates incoming requests. Errors name the invalid field.
 
 use seese3_client::convert::{self, ConvertError};
 
@@ -45,8 +44,7 @@ pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
         orientation,
     } = pose;
 
-    // Empty frame names stand for the room's world and the camera. Any other name would be a pose
-    // in a frame that this server cannot relate to the room.
+    // Empty names mean the room's world and the camera. The server knows no other frames.
     let world = world_frame(room);
     if !parent_frame.is_empty() && parent_frame != world {
         return Err(Error::invalid(
@@ -77,10 +75,10 @@ pub fn pose(pose: pb::Pose, room: &str) -> Result<Pose, Error> {
     Ok(pose)
 }
 
-/// A camera as its calibration states it.
+/// Pinhole intrinsics in pixels; the principal point defaults to the image center.
 ///
 /// # Errors
-/// [`Error::Invalid`] if it is none.
+/// [`Error::Invalid`] on `camera` if the intrinsics are not valid.
 pub fn pinhole(camera: &pb::Pinhole) -> Result<Pinhole, Error> {
     let pb::Pinhole {
         width,
@@ -101,8 +99,8 @@ pub fn pinhole(camera: &pb::Pinhole) -> Result<Pinhole, Error> {
     .map_err(|problem| Error::invalid("camera", problem))
 }
 
-/// A view as the source of a query to `adapter`. An image is encoded here. `field` is the name of
-/// the view's field in its request.
+/// A view as the source of a query to `adapter`. Encodes images. `field` is the view's field in the
+/// request, for errors.
 ///
 /// # Errors
 /// [`Error::Invalid`] if the view is missing, or is a feature of another source or an image that
@@ -121,8 +119,8 @@ pub fn source(
         })) => {
             let own = &adapter.adapter.source().name;
 
-            // Features of different sources never compare, even where their width is the same. A
-            // caller that states the source is protected from mixing them up.
+            // Features of different sources are not comparable, even if their width is the same. If
+            // the caller states the source, check it.
             if !source_name.is_empty() && source_name != *own {
                 let problem =
                     format!("'{source_name}' is not '{own}', which the adapter was trained on");
@@ -182,13 +180,13 @@ fn displacement(displacement: Option<pb::Displacement>, room: &str) -> Result<Di
 /// A navigation query, and the thresholds ε of Hit@ε for its errors.
 ///
 /// # Errors
-/// [`Error::Invalid`], naming the field.
+/// [`Error::Invalid`] on the invalid field; for an image also as [`source`].
 pub fn query(
     request: pb::NavigateRequest,
     adapter: &StoredAdapter,
     snapshot: &Snapshot,
 ) -> Result<(Query, Vec<f64>), Error> {
-    // Destructured with no `..`, so that a new field breaks the build here.
+    // Destructured without `..`, so that a new field fails to compile here.
     let pb::NavigateRequest {
         room,
         adapter: _,
@@ -215,7 +213,7 @@ pub fn query(
         .map(|given| pose(given, &room).map_err(|error| error.within("source_pose")))
         .transpose()?;
 
-    // Encoding an image is costly, so that every other field is checked before it.
+    // Encoding an image is costly, so check every other field first.
     let source = source("source", view, adapter, snapshot)?;
     if source_pose.is_some() && matches!(source, Source::Frame(_)) {
         return Err(Error::invalid(
@@ -242,16 +240,15 @@ pub fn query(
     Ok((query, thresholds))
 }
 
-/// How a motion becomes a latent step, and the metric of the search: as `name` says, or inverse
-/// Poincaré with the given reading if the name is empty.
+/// Latent step method and retrieval metric of the navigator `name`; if empty, inverse Poincaré with
+/// the given reading.
 fn step_of(name: &str, reading: i32) -> Result<(StepKind, RetrievalMetric), Error> {
     let given = reading_of(reading)?;
     if name.is_empty() {
         return Ok((StepKind::InversePoincare(given), RetrievalMetric::Full));
     }
 
-    // The name of a navigator determines its reading, if it has one, so a reading beside it could
-    // only contradict.
+    // A navigator name determines the reading; a separate one could only contradict it.
     if reading != pb::Reading::Unspecified as i32 {
         return Err(Error::invalid(
             "reading",
@@ -268,8 +265,9 @@ fn step_of(name: &str, reading: i32) -> Result<(StepKind, RetrievalMetric), Erro
     }
 }
 
-/// The pairs of a room on which a ridge refit is fitted (A-24): those of the adapter's own split
-/// and stride. An adapter trained under `whole` held out no frames; then the time split is used.
+/// The pairs of a room on which a ridge refit is fitted (A-24): those of the adapter's split and
+/// stride. For an adapter trained on the `whole` split, which holds out no frames, the time split
+/// is used.
 fn fit_on(adapter: &StoredAdapter) -> FitOn {
     let split = match adapter.record.split {
         Split::Whole => Split::Time,
@@ -284,7 +282,8 @@ fn fit_on(adapter: &StoredAdapter) -> FitOn {
 fn navigator_named(field: &str, name: &str) -> Result<NavigatorKind, Error> {
     NavigatorKind::from_name(name).ok_or_else(|| {
         let problem =
-            "is no navigator; adapters list theirs, and +row-space, +whitened, +motion or +calibrated may be added";
+            "is not a navigator; Adapter.navigators lists the names, and +row-space, +whitened, +motion or +calibrated \
+             may be appended";
         Error::invalid(field, format!("'{name}' {problem}"))
     })
 }
@@ -313,20 +312,17 @@ fn reading_of(reading: i32) -> Result<Reading, Error> {
     }
 }
 
-/// The exclusion radius: how many rows on each side of the source frame may not be retrieved,
-/// besides the frame itself. None if the source may be retrieved.
+/// Exclusion radius: the number of rows on each side of the source frame that may not be retrieved,
+/// besides the frame itself. `None` if the source may be retrieved.
 pub fn exclusion(exclude_source: bool, exclude_radius: u32) -> Result<Option<u32>, Error> {
     match (exclude_source, exclude_radius) {
         (true, radius) => Ok(Some(radius)),
         (false, 0) => Ok(None),
-        (false, _) => Err(Error::invalid(
-            "exclude_radius",
-            "means nothing without exclude_source",
-        )),
+        (false, _) => Err(Error::invalid("exclude_radius", "needs exclude_source")),
     }
 }
 
-/// The given thresholds ε, or the paper's if there are none.
+/// The given thresholds ε; the paper's if empty.
 pub fn thresholds(given: Vec<f64>) -> Result<Vec<f64>, Error> {
     let thresholds = if given.is_empty() {
         default_thresholds()
@@ -338,7 +334,7 @@ pub fn thresholds(given: Vec<f64>) -> Result<Vec<f64>, Error> {
     Ok(thresholds)
 }
 
-/// The split of this name; none if the name is empty.
+/// The split with this name; `None` if the name is empty.
 pub fn split(name: &str) -> Result<Option<Split>, Error> {
     match Split::from_name(name) {
         Some(split) => Ok(Some(split)),
@@ -347,13 +343,13 @@ pub fn split(name: &str) -> Result<Option<Split>, Error> {
             let known = Split::ALL.map(Split::name).join(", ");
             Err(Error::invalid(
                 "split",
-                format!("'{name}' is none of {known}"),
+                format!("'{name}' must be one of {known}"),
             ))
         }
     }
 }
 
-/// The navigators of an evaluation by name. An empty list stands for the adapter's own table.
+/// The named navigators of an evaluation. An empty list selects the default navigators.
 pub fn navigators(names: &[String]) -> Result<Vec<NavigatorKind>, Error> {
     let twice = |(position, name): (usize, &String)| names[..position].contains(name);
 

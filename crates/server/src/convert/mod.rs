@@ -1,5 +1,5 @@
-//! Conversion between wire types and domain types. Messages that only one service builds are built
-//! beside it.
+//! Conversion between wire types and domain types. Messages of a single service are converted in
+//! that service's module.
 
 mod incoming;
 mod outgoing;
@@ -9,7 +9,7 @@ pub use incoming::{
 };
 pub use outgoing::*;
 
-/// The child frame of every pose, unless a Track stream names its own.
+/// Default child frame of poses; a Track stream may choose another name.
 const CAMERA: &str = "camera";
 
 /// The name of a room's world frame, the parent frame of its poses.

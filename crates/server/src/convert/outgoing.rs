@@ -1,4 +1,4 @@
-//! Outgoing answers: domain types converted to wire types.
+//! Converts domain types to wire types for answers.
 
 use nalgebra::Vector3;
 
@@ -27,7 +27,7 @@ pub fn vector_to_wire(vector: &Vector3<f64>) -> pb::Vector3 {
 
 /// The 36 numbers of the matrix in row-major order.
 pub fn matrix_to_wire(matrix: &nalgebra::Matrix6<f64>) -> Vec<f64> {
-    // nalgebra stores matrices by column, so the transposed one is read in rows.
+    // nalgebra is column-major; iterating the transpose gives row-major order.
     matrix.transpose().iter().copied().collect()
 }
 
@@ -106,7 +106,7 @@ pub fn error_to_wire(error: &StepError, thresholds: &[f64]) -> pb::PoseError {
     }
 }
 
-/// The names of the navigators that an adapter offers, under the paper's metric.
+/// Names of the adapter's navigators, with the paper's metric.
 pub fn navigator_names(adapter: &Adapter) -> Vec<String> {
     let has = |step: &StepKind| match step {
         StepKind::Corrector(kind) => adapter
@@ -121,12 +121,12 @@ pub fn navigator_names(adapter: &Adapter) -> Vec<String> {
         .collect()
 }
 
-/// The name of the navigator that a query uses.
+/// The name of the query's navigator.
 pub fn navigator_to_wire(query: &Query) -> String {
     NavigatorKind::Step(query.step, query.metric).name()
 }
 
-/// The reading that a query uses; unspecified for a navigator that has none.
+/// The reading of a step; unspecified for a navigator without one.
 pub fn reading_to_wire(step: StepKind) -> pb::Reading {
     match step {
         StepKind::InversePoincare(Reading::Affine) => pb::Reading::Affine,
@@ -158,7 +158,7 @@ pub fn adapter_revision(navigator: &ServedNavigator) -> pb::Revision {
     }
 }
 
-/// A point in time that a manifest states in RFC 3339; none if it states no time.
+/// A manifest's RFC 3339 time as a timestamp; `None` if it cannot be parsed.
 pub fn time_to_wire(stated: &str) -> Option<prost_types::Timestamp> {
     let time = chrono::DateTime::parse_from_rfc3339(stated).ok()?;
     Some(prost_types::Timestamp {
@@ -167,7 +167,7 @@ pub fn time_to_wire(stated: &str) -> Option<prost_types::Timestamp> {
     })
 }
 
-/// A camera on the wire, in image widths.
+/// A camera as a wire message, in units of the image width.
 pub fn pinhole_to_wire(camera: &Pinhole) -> pb::Pinhole {
     pb::Pinhole {
         width: 1.0,
@@ -178,7 +178,7 @@ pub fn pinhole_to_wire(camera: &Pinhole) -> pb::Pinhole {
     }
 }
 
-/// The source of a set of features on the wire.
+/// A feature source as a wire message.
 pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
     let FeatureSource {
         name,
@@ -204,7 +204,7 @@ pub fn source_to_wire(source: &FeatureSource) -> pb::FeatureSource {
 }
 
 pub fn scores_to_wire(scores: &MotionScores) -> pb::MotionScores {
-    // R² is NaN where the true motions do not vary; on the wire it is then absent.
+    // R² is NaN if the true motions do not vary; the field is then absent.
     let known = |value: f64| value.is_finite().then_some(value);
     pb::MotionScores {
         n: scores.n as u32,

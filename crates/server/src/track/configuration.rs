@@ -1,4 +1,4 @@
-//! The configuration of a Track stream, checked field by field.
+//! Validates the configuration of a Track stream.
 
 use std::sync::Arc;
 
@@ -10,36 +10,36 @@ use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
 use seese3_robot::tracking::{Drift, MeasuredPose, PoseWithCovariance, TrackerSettings};
 
-/// The standard deviation by axis of a pose whose sender states none: 0.1 m and 0.1 rad.
+/// Default standard deviation of a given pose, by axis: 0.1 m and 0.1 rad.
 const KNOWN: f64 = 0.1;
-/// The standard deviations that a sender may state, metres or radians.
+/// Valid standard deviations of a given pose, meters or radians.
 const DEVIATIONS: std::ops::RangeInclusive<f64> = 1e-6..=1e3;
-/// The names of the map, odometry, camera and base frames if the stream does not choose its own.
+/// Default names of the map, odometry, camera and base frames.
 const FRAME_NAMES: [&str; 4] = ["map", "odom", "camera", "base_link"];
-/// The longest name of a frame.
+/// Maximum length of a frame name, bytes.
 pub const LONGEST_NAME: usize = 100;
-/// How fast the odometry of another sensor drifts if its sender does not say, and what it may say:
-/// metres per metre, radians per radian.
+/// Default drift of another sensor's odometry: meters per meter, radians per radian and per meter.
 const DRIFT_SHARE: f64 = 0.05;
+/// Valid drift shares.
 const DRIFT_SHARES: std::ops::RangeInclusive<f64> = 1e-4..=10.0;
 
-/// The rooms of a configuration, all under one adapter; at least one. With a camera, those that
-/// were mapped with one like it, or with one that is not known.
+/// The rooms of a configuration, all under one adapter; at least one. If cameras are given, rooms
+/// mapped with a different field of view are removed; rooms with an unknown camera stay.
 ///
 /// # Errors
-/// [`Error::Invalid`] if both `room` and `rooms` are given, or the camera is not valid or unlike
-/// that of every room; otherwise as [`rooms_to_track_in`].
+/// [`Error::Invalid`] if both `room` and `rooms` are given, a camera is not valid, or no room
+/// matches the cameras; otherwise as [`rooms_to_track_in`].
 pub fn rooms(
     snapshot: &Snapshot,
     config: &pb::TrackConfig,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
     let mut served = named_rooms(snapshot, config)?;
     if let Some(camera) = &config.camera {
-        served = seen_alike(camera, served)?;
+        served = with_matching_camera(camera, served)?;
     }
     for (number, other) in config.other_cameras.iter().enumerate() {
         if let Some(camera) = &other.camera {
-            served = seen_alike(camera, served)
+            served = with_matching_camera(camera, served)
                 .map_err(|error| error.within(&format!("other_cameras[{number}]")))?;
         }
     }
@@ -51,8 +51,7 @@ fn named_rooms(
     snapshot: &Snapshot,
     config: &pb::TrackConfig,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
-    // A single room is passed on as a list of one, so that errors about `rooms[0]` are renamed to
-    // the field that the caller filled.
+    // A single room becomes a list of one; errors on `rooms[0]` are renamed to the field `room`.
     match (config.room.as_str(), config.rooms.as_slice()) {
         ("", rooms) => rooms_to_track_in(snapshot, rooms, &config.adapter),
         (room, []) => {
@@ -113,11 +112,11 @@ pub fn settings(
     })
 }
 
-/// The rooms that were mapped with a camera like this one, as far as theirs are known.
+/// The rooms mapped with the same field of view as this camera, or with an unknown camera.
 ///
 /// # Errors
 /// [`Error::Invalid`] if the camera is not valid, or no room is left.
-fn seen_alike(
+fn with_matching_camera(
     camera: &pb::Pinhole,
     served: Vec<Arc<ServedNavigator>>,
 ) -> Result<Vec<Arc<ServedNavigator>>, Error> {
@@ -158,13 +157,13 @@ pub fn back_pressure(given: i32) -> Result<(), Error> {
 /// The coordinate frames of a stream.
 #[derive(Debug, Clone)]
 pub struct StreamFrames {
-    /// Their names, all different.
+    /// The frame names, all different.
     pub names: pb::FrameNames,
-    /// The camera's pose on the robot, if it is known.
+    /// The camera's pose on the robot, if given.
     pub base_from_camera: Option<Pose>,
 }
 
-/// What a pose that a client sends is of.
+/// The body that a client's pose refers to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Body {
     Camera,
@@ -172,11 +171,11 @@ enum Body {
 }
 
 impl StreamFrames {
-    /// The frames that a configuration names. Names that are left empty take the defaults; the name
-    /// of a base only matters where the base is known.
+    /// The frames of a configuration. Empty names take the defaults. The base name matters only
+    /// with `base_from_camera`.
     ///
     /// # Errors
-    /// [`Error::Invalid`] for a name that is too long or twice the same, and for a bad pose.
+    /// [`Error::Invalid`] for a name that is too long or used twice, and for an invalid pose.
     pub fn of(config: &pb::TrackConfig) -> Result<Self, Error> {
         let given = config.base_from_camera.clone();
         let names = frame_names(config.frames.clone().unwrap_or_default(), given.is_some())?;
@@ -194,9 +193,8 @@ impl StreamFrames {
         })
     }
 
-    /// A pose on the map that is given from outside, of the camera or the base, as the camera's.
-    /// Its frames may have the stream's own names or those of the service, `rooms/NAME` and
-    /// `camera`.
+    /// The camera's map pose from an initial pose of the camera or the base. Frames may have the
+    /// stream's names or the service's names, `rooms/NAME` and `camera`.
     ///
     /// # Errors
     /// [`Error::Invalid`] if the pose is missing or not valid, or a standard deviation is out of
@@ -213,8 +211,8 @@ impl StreamFrames {
         } = given;
         let mut pose = pose.ok_or_else(|| Error::invalid("pose", "is required"))?;
 
-        // `convert::pose` takes an empty name for the room's world or the camera, so the stream's
-        // own names are cleared.
+        // Clear the stream's frame names: `convert::pose` accepts empty names for the room's world
+        // and the camera.
         clear_name(&mut pose.parent_frame, &self.names.map);
         let body = self.body(&mut pose, Body::Camera);
         let pose = convert::pose(pose, room).map_err(|error| error.within("pose"))?;
@@ -227,7 +225,7 @@ impl StreamFrames {
         Ok(self.of_camera(PoseWithCovariance::known(pose, translation, rotation), body))
     }
 
-    /// The odometry of another sensor, as the camera's.
+    /// The camera's odometry pose from another sensor's odometry.
     ///
     /// # Errors
     /// [`Error::Invalid`] if the pose is missing or not valid, or a share is out of range.
@@ -259,8 +257,8 @@ impl StreamFrames {
         })
     }
 
-    /// Whose pose a pose is, by the name of its child, which is cleared if it is one of the
-    /// stream's.
+    /// The body of a pose, by its child frame; `unnamed` if that is empty and the base is known.
+    /// Clears the child name if it is one of the stream's.
     fn body(&self, pose: &mut pb::Pose, unnamed: Body) -> Body {
         if self.base_from_camera.is_none() {
             clear_name(&mut pose.child_frame, &self.names.camera);
@@ -279,7 +277,7 @@ impl StreamFrames {
         Body::Camera
     }
 
-    /// A belief of a body's pose as one of the camera's.
+    /// Converts a pose of `body` to a pose of the camera.
     fn of_camera(&self, belief: PoseWithCovariance, body: Body) -> PoseWithCovariance {
         match (body, self.base_from_camera) {
             (Body::Base, Some(base_from_camera)) => belief.of_attached(&base_from_camera),
@@ -288,8 +286,8 @@ impl StreamFrames {
     }
 }
 
-/// A pose between two of the stream's frames, whose names were cleared: what is left is none of
-/// them.
+/// Converts a pose from which the stream's frame names were cleared. Any remaining name is unknown
+/// and refused.
 pub fn unnamed(pose: pb::Pose) -> Result<Pose, Error> {
     for (field, name) in [
         ("parent_frame", &pose.parent_frame),
@@ -330,8 +328,8 @@ fn frame_names(given: pb::FrameNames, has_base: bool) -> Result<pb::FrameNames, 
     } = given;
     let mut names = [map, odom, camera, base];
 
-    // Empty names take the defaults. The others are repeated in answers, so they must be short
-    // and free of control characters.
+    // Empty names take the defaults. Answers repeat the names, so they must be short and free of
+    // control characters.
     for (name, (plain, field)) in names.iter_mut().zip(
         FRAME_NAMES
             .into_iter()
@@ -346,7 +344,7 @@ fn frame_names(given: pb::FrameNames, has_base: bool) -> Result<pb::FrameNames, 
         }
     }
 
-    // In a transform tree every frame needs a name of its own.
+    // Every frame of a transform tree needs a unique name.
     let used = if has_base { &names[..] } else { &names[..3] };
     let mut different: Vec<&String> = used.iter().collect();
     different.sort();

@@ -1,7 +1,8 @@
-//! OdometryService.Track: a stream of frames in, one answer for each in the same order.
+//! OdometryService.Track: receives a stream of frames and answers each in order.
 //!
-//! Two tasks serve a stream. `read` receives messages and, if the newest frame wins, drops frames
-//! that waited too long; `answer_all` hands each message to the [`Session`] on a worker thread.
+//! Two tasks serve a stream. `read` receives messages and, with `BACK_PRESSURE_NEWEST`, drops
+//! waiting frames that a newer frame supersedes. `answer_all` passes each message to the
+//! [`Session`] on a worker thread.
 
 mod configuration;
 mod sealed;
@@ -31,22 +32,21 @@ use seese3_client::proto::v1::track_request::Message;
 use seese3_client::proto::v1::track_response::Answer;
 use session::Session;
 
-/// The stream of answers.
+/// Stream of answers.
 pub type Answers = Pin<Box<dyn Stream<Item = Result<pb::TrackResponse, Status>> + Send>>;
 
-/// The largest number of answers that wait for a slow reader; beyond it, frames are not processed
-/// until one is read.
+/// Capacity of the answer channel. When a slow reader leaves it full, no frames are processed.
 const UNREAD: usize = 32;
 
-/// A message, its time of arrival, and the frames that were dropped in its favour.
+/// A message, its arrival time, and the frames that it superseded.
 struct Incoming {
     since: Instant,
     message: Result<Message, Status>,
     overtaken: Option<Overtaken>,
 }
 
-/// Frames that were dropped because a newer one arrived before their turn: time and sequence of the
-/// last of them, and their number.
+/// Frames dropped because a newer one arrived before they were processed: their number, and the
+/// timestamp and sequence of the last one.
 #[derive(Debug, Clone, Copy)]
 pub struct Overtaken {
     pub timestamp_ns: i64,
@@ -55,13 +55,13 @@ pub struct Overtaken {
 }
 
 impl Handlers {
-    /// Starts a stream and answers its messages until the caller ends it, an error ends it, or the
+    /// Opens a stream and answers its messages until the caller ends it, an error occurs, or the
     /// server stops.
     ///
     /// # Errors
-    /// [`Error::Loading`] if the server does not serve, [`Error::Deadline`] if no first message
-    /// comes, [`Error::Invalid`] if it is no valid configuration, [`Error::Full`] if too many
-    /// streams are open, or as [`Session::open`].
+    /// [`Error::Loading`] if the server is not serving, [`Error::Deadline`] if the configuration
+    /// does not arrive in time, [`Error::Invalid`] if the first message is not a configuration,
+    /// [`Error::Full`] if too many streams are open, or as [`Session::open`].
     pub(super) async fn follow(
         &self,
         request: Request<Streaming<pb::TrackRequest>>,
@@ -70,8 +70,8 @@ impl Handlers {
         let caller = principal(&request).cloned();
         let mut requests = request.into_inner();
 
-        // A stream has no deadline, but its configuration must arrive in time, or streams that
-        // never send one would stay open for ever.
+        // A stream has no deadline, but its configuration must arrive in time: streams without one
+        // must not stay open forever.
         let mut phase = self.phase.clone();
         let first = tokio::select! {
             first = tokio::time::timeout(self.config.longest, requests.message()) => first,
@@ -89,8 +89,8 @@ impl Handlers {
             }
         };
 
-        // The permit is held for as long as the stream lives and bounds the number of streams,
-        // since their frames are never refused for a full queue.
+        // The stream holds this permit while it is open. It bounds the number of streams, whose
+        // frames are never refused for a full queue.
         let place = self
             .streams
             .clone()
@@ -114,8 +114,8 @@ impl Handlers {
             })
             .await?;
 
-        // One message waits in this channel and `read` holds another one. Later ones stay unread,
-        // so that the transport makes the sender wait.
+        // One message waits in this channel and `read` holds another one. Later messages stay
+        // unread, so that flow control makes the sender wait.
         let (sender, frames) = mpsc::channel(1);
         let (answers, stream) = mpsc::channel(UNREAD);
         tokio::spawn(read(requests, sender, session.newest_wins()));
@@ -133,8 +133,8 @@ impl Handlers {
                     let _ = answers.try_send(Err(revoked.into()));
                 }
                 () = shutdown_requested(&mut phase) => {
-                    // The caller can resume on another server with the token of its last answer. A
-                    // reader that is too slow to take this error is not waited for.
+                    // The caller can resume on another server with its last token. Do not wait for
+                    // a slow reader to take this error.
                     let _ = answers.try_send(Err(Error::Loading.into()));
                 }
             }
@@ -152,7 +152,7 @@ impl Handlers {
         mut frames: mpsc::Receiver<Incoming>,
         answers: &mpsc::Sender<Result<pb::TrackResponse, Status>>,
     ) {
-        // The first answer confirms the configuration, before any frame.
+        // The first answer confirms the configuration.
         if answers.send(Ok(session.started())).await.is_err() {
             return;
         }
@@ -163,16 +163,14 @@ impl Handlers {
             overtaken,
         }) = frames.recv().await
         {
-            // One refusal counts all frames that this one overtook, so that the caller can
-            // account for every frame it sent.
+            // One refusal counts all superseded frames, so that every frame is accounted for.
             if let Some(frames) = overtaken
                 && answers.send(Ok(session.superseded(frames))).await.is_err()
             {
                 return;
             }
 
-            // A refused frame is an answer like any other. An error means that the stream cannot
-            // go on: it is sent as the last item.
+            // A refused frame is a normal answer. An error ends the stream and is its last item.
             let answer = match message {
                 Ok(message) => match self.handled(session, message, since).await {
                     Ok((back, answer)) => {
@@ -197,12 +195,12 @@ impl Handlers {
         }
     }
 
-    /// Handles one message on a worker thread. The session moves to that thread and comes back with
-    /// the answer.
+    /// Handles one message on a worker thread. The session moves to that thread and is returned
+    /// with the answer.
     ///
     /// # Errors
-    /// The outer error means that the session is lost, because the work panicked or the server
-    /// stops; the inner one is the answer to the message.
+    /// The outer error means that the session is lost, because the work panicked or the server is
+    /// stopping. The inner error is the answer to the message.
     async fn handled(
         &self,
         mut session: Session,
@@ -237,8 +235,8 @@ impl Handlers {
     }
 }
 
-/// What became of a frame, for the metrics: the tracking status, or why it was refused; none if the
-/// answer is to no frame.
+/// Metrics label of an answer: the tracking status or the refusal reason; `None` for answers
+/// without either.
 fn outcome(answer: &pb::TrackResponse) -> Option<&'static str> {
     match answer.answer.as_ref()? {
         Answer::Update(update) => Some(update.status().as_str_name()),
@@ -247,7 +245,7 @@ fn outcome(answer: &pb::TrackResponse) -> Option<&'static str> {
     }
 }
 
-/// Completes when the caller of a stream has other rights than when it was opened.
+/// Completes when the caller's rights have changed since the stream was opened.
 async fn revoked(keyring: Option<&Arc<Keyring>>, caller: Option<&Arc<Principal>>) {
     match (keyring, caller) {
         (Some(keyring), Some(caller)) => keyring.revoked(caller).await,
@@ -257,17 +255,17 @@ async fn revoked(keyring: Option<&Arc<Keyring>>, caller: Option<&Arc<Principal>>
 
 /// Completes when the server is no longer serving.
 async fn shutdown_requested(phase: &mut watch::Receiver<Phase>) {
-    // An error means that the server is gone. The guard is dropped at once, because `run` cannot
-    // change the phase while it lives.
+    // `wait_for` fails if the server has ended. Drop its guard at once: it blocks `run` from
+    // changing the phase.
     let _ = phase
         .wait_for(|phase| !matches!(phase, Phase::Serving(_)))
         .await
         .map(drop);
 }
 
-/// Reads messages as they arrive, at most one ahead of the one being answered. If the newest frame
-/// wins, it goes on reading while a message waits, and each newer frame replaces the waiting one.
-/// Ends with the stream, at its first error, or when the messages are no longer wanted.
+/// Reads messages as they arrive and passes them to `sender`, holding at most one. With
+/// `newest_wins` it continues to read while a message waits, and a newer frame replaces a waiting
+/// frame. Ends at the end of the stream, at its first error, or when the receiver is closed.
 async fn read(
     mut requests: Streaming<pb::TrackRequest>,
     sender: mpsc::Sender<Incoming>,
@@ -277,8 +275,8 @@ async fn read(
     loop {
         let may_read = waiting.is_none() || newest_wins;
         tokio::select! {
-            // Polled in this order: a message that can be handed over leaves before the next one
-            // is read, so that no frame is dropped without need.
+            // Polled in this order: pass on a waiting message before reading the next one, so that
+            // no frame is dropped needlessly.
             biased;
             () = sender.closed() => return,
             permit = sender.reserve(), if waiting.is_some() => {
@@ -286,8 +284,7 @@ async fn read(
                 let ends = came.message.is_err();
                 permit.send(came);
 
-                // Nothing is read after an error, of the transport or of a message without
-                // content.
+                // Stop reading after an error: a transport error or an empty message.
                 if ends {
                     return;
                 }
@@ -295,7 +292,7 @@ async fn read(
             next = requests.next(), if may_read => {
                 let Some(next) = next else {
                     if let Some(came) = waiting.take() {
-                        // An error means that the messages are no longer wanted.
+                        // `send` fails if the receiver is closed.
                         let _ = sender.send(came).await;
                     }
                     return;
@@ -324,17 +321,16 @@ fn message_of(next: Result<pb::TrackRequest, Status>) -> Result<Message, Status>
     }
 }
 
-/// Drops the waiting frame `before` in favour of the newer frame `came`, which then counts it.
-/// Returns `before` if it has to be answered itself: if either message is not a frame, or `came` is
-/// not later in both time and sequence.
+/// Replaces the waiting frame `before` by the newer frame `came`, which then counts it as
+/// superseded. Returns `before` if it needs its own answer: if either message is not a frame, or
+/// `came` is not later in both time and sequence.
 fn overtake(before: Incoming, came: &mut Incoming) -> Option<Incoming> {
     let (Ok(Message::Frame(old)), Ok(Message::Frame(new))) = (&before.message, &came.message)
     else {
         return Some(before);
     };
 
-    // Late and duplicate frames must not displace a good one; each gets its own refusal from the
-    // tracker.
+    // Late and duplicate frames must not replace a valid one; the tracker refuses each of them.
     if new.timestamp_ns <= old.timestamp_ns || new.sequence <= old.sequence {
         return Some(before);
     }

@@ -1,8 +1,8 @@
-//! The content of a resume token: a stream's configuration and the state of its tracker, in
-//! postcard's encoding. Every number comes back bit by bit.
+//! Content of a resume token: the stream's configuration and tracker state, encoded with postcard.
+//! The encoding is bit-exact.
 //!
-//! The encoding has no field tags and is no part of the public API: a change of [`Sealed`], or of the
-//! types of the tracker's state, needs a new `MAGIC` in `token`.
+//! It has no field tags and is not part of the public API. A change of [`Sealed`] or of the
+//! tracker's state types needs a new `MAGIC` in `token`.
 
 use std::sync::Arc;
 
@@ -14,12 +14,12 @@ use super::super::snapshot::{ServedNavigator, frames_content};
 use seese3_client::proto::v1 as pb;
 use seese3_robot::tracking::State;
 
-/// The content of a token.
+/// Content of a token.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 pub struct Sealed {
     /// The stream's `TrackConfig`, encoded as protobuf.
     config: Vec<u8>,
-    /// Of `Content::adapter`.
+    /// Digest of the adapter, `Content::adapter`.
     adapter: Vec<u8>,
     state: State,
     /// The rooms that the state refers to.
@@ -29,11 +29,11 @@ pub struct Sealed {
 /// A room that a state refers to.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct SealedRoom {
-    /// Its index in the state.
+    /// Index by which the state refers to the room.
     place: usize,
     name: String,
     frame_count: usize,
-    /// Of `Content::frames`.
+    /// Digest of the room's first `frame_count` frames, `Content::frames`.
     frames: Vec<u8>,
 }
 
@@ -56,8 +56,8 @@ impl SealedRoom {
         places.into_iter().map(sealed).collect()
     }
 
-    /// The index of this room in `served`: a room of the same name that begins with the same frames. Poses
-    /// and latents of a state mean the same there.
+    /// The index in `served` of a room with the same name that begins with the same frames. The
+    /// state's poses and latents are valid there.
     fn place_in(&self, served: &[Arc<ServedNavigator>]) -> Option<usize> {
         let is_this = |served: &Arc<ServedNavigator>| {
             let room = served.navigator.room();
@@ -78,7 +78,7 @@ impl SealedRoom {
 }
 
 impl Sealed {
-    /// The content of a token for a stream with this configuration and state, answered from `served`.
+    /// The content of a token for this configuration and state; `served` are the stream's rooms.
     pub fn new(config: &pb::TrackConfig, state: &State, served: &[Arc<ServedNavigator>]) -> Self {
         Self {
             config: config.encode_to_vec(),
@@ -97,8 +97,10 @@ impl Sealed {
         postcard::to_allocvec(self).expect("every length is known")
     }
 
+    /// Decodes the content.
+    ///
     /// # Errors
-    /// [`Error::Internal`] if the bytes are not those of a `Sealed`: their seal was verified before.
+    /// [`Error::Internal`] if the bytes cannot be decoded, because their seal was verified before.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, Error> {
         postcard::from_bytes(bytes).map_err(|_| Error::Internal)
     }
@@ -111,8 +113,8 @@ impl Sealed {
         pb::TrackConfig::decode(self.config.as_slice()).map_err(|_| Error::Internal)
     }
 
-    /// The state with the rooms' indices in `served`, which share the stream's adapter; none if a room or
-    /// the adapter is not the same here.
+    /// The state with room indices mapped to `served`; `None` if the adapter or a room differs from
+    /// the token's.
     pub fn opened_in(self, served: &[Arc<ServedNavigator>]) -> Option<State> {
         let is_adapter = |served: &Arc<ServedNavigator>| served.content.adapter == *self.adapter;
         if !served.iter().all(is_adapter) {
@@ -169,7 +171,7 @@ mod tests {
         }
     }
 
-    /// A state whose numbers are all odd ones.
+    /// A state with values that an inexact encoding would change.
     fn odd_state() -> State {
         let odd = Pose::new(
             nalgebra::Vector3::new(0.1, -2.3, 1e-17),
@@ -238,7 +240,7 @@ mod tests {
         }
     }
 
-    /// Oracle: the contract: a sealed state comes back bit by bit.
+    /// Oracle: the contract: encoding and decoding a state is bit-exact.
     #[test]
     fn a_state_comes_back_to_the_bit() {
         for state in [
@@ -266,7 +268,7 @@ mod tests {
             let back = Sealed::from_bytes(&bytes).unwrap();
             assert_eq!(back, sealed);
 
-            // Equality does not distinguish -0 from 0, but the bytes do.
+            // Equality does not distinguish -0 from 0, so compare the bytes too.
             assert_eq!(back.to_bytes(), bytes);
         }
     }

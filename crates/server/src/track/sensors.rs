@@ -1,5 +1,4 @@
-//! What a robot measures besides the views of the stream's own camera: the direction of gravity, and
-//! what its other cameras see.
+//! Additional sensors of a stream: the direction of gravity and other cameras.
 
 use nalgebra::{Unit, Vector3};
 
@@ -9,22 +8,23 @@ use seese3_client::proto::v1 as pb;
 use seese3_core::geometry::Pose;
 use seese3_robot::tracking::MeasuredGravity;
 
-/// The most other cameras of one stream.
+/// Maximum number of other cameras of a stream.
 const MOST_CAMERAS: usize = 8;
-/// The standard deviation of a measured direction of gravity if its sender states none, and what it
-/// may state, radians.
+/// Default standard deviation of a measured gravity direction, radians.
 const GRAVITY_DEVIATION: f64 = 0.03;
+/// Valid standard deviations of a measured gravity direction, radians.
 const GRAVITY_DEVIATIONS: std::ops::RangeInclusive<f64> = 1e-3..=1.0;
-/// Directions shorter than this have none.
+/// Minimum length of a direction vector.
 const SHORTEST: f64 = 1e-9;
 
-/// The sensors of a stream besides its own camera.
+/// The configured sensors of a stream besides its own camera.
 #[derive(Debug, Clone)]
 pub struct Sensors {
     gravity_in_map: Option<Unit<Vector3<f64>>>,
     base_from_camera: Option<Pose>,
-    /// The names of the base and of the stream's own camera.
+    /// Frame name of the base.
     base: String,
+    /// Frame name of the stream's own camera.
     camera: String,
     other_cameras: Vec<OtherCamera>,
 }
@@ -33,24 +33,24 @@ pub struct Sensors {
 #[derive(Debug, Clone)]
 struct OtherCamera {
     name: String,
-    /// In the frame of the stream's own camera.
+    /// Pose in the frame of the stream's own camera.
     camera_from_other: Pose,
 }
 
-/// One of the other cameras, as frames name it.
+/// One of the other cameras, found by its name.
 #[derive(Debug, Clone, Copy)]
 pub struct NamedCamera {
-    /// Its place in the configuration.
+    /// Index in the configuration.
     pub number: u32,
     pub camera_from_other: Pose,
 }
 
 impl Sensors {
-    /// The sensors that a configuration names.
+    /// The sensors of a configuration.
     ///
     /// # Errors
-    /// [`Error::Invalid`], naming the field, for a direction without length, too many cameras, a name
-    /// that is empty, too long or used twice, and a bad pose.
+    /// [`Error::Invalid`] on the field, for a gravity direction of zero length or without a room,
+    /// too many cameras, a name that is empty, too long or used twice, and an invalid pose.
     pub fn of(config: &pb::TrackConfig, frames: &StreamFrames) -> Result<Self, Error> {
         let gravity_in_map = config
             .gravity_in_map
@@ -59,7 +59,7 @@ impl Sensors {
         if gravity_in_map.is_some() && config.room.is_empty() {
             return Err(Error::invalid(
                 "gravity_in_map",
-                "needs the room in whose world frame it is",
+                "needs `room`: the direction is in the room's world frame",
             ));
         }
 
@@ -134,7 +134,7 @@ impl Sensors {
                 .map(|other| other.name.as_str())
                 .collect();
             let problem = match known.as_slice() {
-                [] => "names a camera, and the configuration names no other_cameras".to_owned(),
+                [] => "is unknown: the configuration has no other_cameras".to_owned(),
                 known => format!("must be one of: {}", known.join(", ")),
             };
             Error::invalid("camera", problem)
@@ -146,18 +146,18 @@ impl Sensors {
         })
     }
 
-    /// The name of one of the other cameras; empty for a number that is none.
+    /// The name of the other camera with this index; empty if there is none.
     pub fn camera_name(&self, number: u32) -> String {
         self.other_cameras
             .get(number as usize)
             .map_or_else(String::new, |other| other.name.clone())
     }
 
-    /// A measured direction of gravity in the camera's frame.
+    /// Converts a measured gravity direction to the camera's frame.
     ///
     /// # Errors
-    /// [`Error::Invalid`] for a direction without length, a frame that is neither the camera's nor the
-    /// base's, a deviation out of range, and where gravity is not known in the map.
+    /// [`Error::Invalid`] without `gravity_in_map` in the configuration, for a direction of zero
+    /// length, a frame other than the camera's or the base's, and a deviation out of range.
     pub fn gravity(&self, given: &pb::MeasuredGravity) -> Result<MeasuredGravity, Error> {
         let in_world = self.gravity_in_map.ok_or_else(|| {
             Error::invalid("direction", "needs gravity_in_map in the configuration")
@@ -199,6 +199,6 @@ fn direction(field: &str, given: pb::Vector3) -> Result<Unit<Vector3<f64>>, Erro
         return Err(Error::invalid(field, "must be finite and longer than 0"));
     }
 
-    // Divided first, so that squares of large numbers stay finite.
+    // Scale first, so that squares of large numbers stay finite.
     Ok(Unit::new_normalize(given / largest))
 }

@@ -1,5 +1,4 @@
-//! One Track stream: its configuration, its rooms, the state of its tracker, and the answers to its
-//! messages.
+//! A Track session: configuration, rooms, tracker state, and the answers to messages.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -25,11 +24,11 @@ use seese3_robot::tracking::{
 
 const FIELD: &str = "config";
 
-/// A configured stream and the state of its tracker. The server keeps it only while the stream is
-/// open; every answer carries it as a resume token.
+/// A configured stream and its tracker state. The server keeps it only while the stream is open; a
+/// resume token in the answers carries it.
 pub struct Session {
-    /// What encodes images. The rooms of the snapshot are not held: a stream may last for days, and
-    /// would keep every room in memory that was replaced since.
+    /// Snapshot without rooms, for the image encoders. A stream may last for days and must not keep
+    /// replaced rooms in memory.
     encoders: Snapshot,
     served: Vec<Arc<ServedNavigator>>,
     tracker: Tracker,
@@ -41,12 +40,11 @@ pub struct Session {
 }
 
 impl Session {
-    /// Opens a stream from its configuration, or resumes the one whose token the configuration
-    /// holds.
+    /// Opens a stream from its configuration, or resumes the stream of the configuration's token.
     ///
     /// # Errors
-    /// [`Error`], naming the field: the configuration or the token is not valid, or this server has
-    /// other rooms or another adapter than the one that sealed the token.
+    /// [`Error`] on the field, if the configuration or the token is not valid, or this server's
+    /// rooms or adapter differ from those of the token.
     pub fn open(
         snapshot: &Arc<Snapshot>,
         config: pb::TrackConfig,
@@ -58,8 +56,7 @@ impl Session {
 
         let field = format!("{FIELD}.resume_token");
 
-        // A token contains the configuration of its stream, so any other field could only
-        // contradict it.
+        // The token contains the stream's configuration; any other field could only contradict it.
         let alone = pb::TrackConfig {
             resume_token: config.resume_token.clone(),
             ..pb::TrackConfig::default()
@@ -68,12 +65,11 @@ impl Session {
         if config != alone {
             return Err(Error::invalid(
                 field,
-                "brings its own configuration: every other field must be empty",
+                "contains the configuration: every other field must be empty",
             ));
         }
 
-        // The seal is genuine from here on, so a token that does not decode is an error of this
-        // server.
+        // The seal is verified before decoding, so a decoding error is internal.
         let sealed = Sealed::from_bytes(key.open(&field, &config.resume_token)?)?;
         let config = sealed.config()?;
 
@@ -84,8 +80,7 @@ impl Session {
             other => other,
         })?;
 
-        // The state is made of latents and poses, which mean nothing under another adapter or in
-        // another room.
+        // The state's latents and poses are valid only with the same adapter and rooms.
         session.state = sealed.opened_in(&session.served).ok_or_else(|| {
             let problem = "this server has another room or adapter than the token; start anew";
             Error::Precondition(format!("{field}: {problem}"))
@@ -100,9 +95,8 @@ impl Session {
         Ok(session)
     }
 
-    /// Whether the state's latents have the width of this adapter and its room indices exist here.
-    /// The rooms' content should guarantee it; without this check a state that does not fit would
-    /// be a panic in the tracker.
+    /// Whether the state's latents have this adapter's width and its room indices are valid. The
+    /// content digests should guarantee this; an invalid state would panic in the tracker.
     fn fits(&self) -> bool {
         let adapter = &self.served[0].adapter.adapter;
         let rooms = self.served.len();
@@ -152,8 +146,7 @@ impl Session {
         config: pb::TrackConfig,
         key: &TokenKey,
     ) -> Result<Self, Error> {
-        // Everything is checked before the stream starts: rooms and adapter, maps, settings,
-        // frame names, and the initial pose.
+        // Validate everything before the stream starts.
         let served = rooms(snapshot, &config)?;
         let adapter = &served[0].adapter;
         let maps = maps(&served)?;
@@ -163,7 +156,7 @@ impl Session {
         let sensors = Sensors::of(&config, &frames)?;
         back_pressure(config.back_pressure)?;
 
-        // A pose only has a meaning in the world of a room, so the room must be known as well.
+        // The pose is in a room's world frame, so it needs `room`.
         let begins = match config.initial_pose.clone() {
             None => None,
             Some(_) if config.room.is_empty() => {
@@ -176,8 +169,7 @@ impl Session {
             ),
         };
 
-        // Without anchors nothing ever finds the camera on the map, so dead reckoning needs a
-        // pose to begin from.
+        // Dead reckoning never localizes the camera, so it needs an initial pose.
         if !settings.fuse && begins.is_none() {
             return Err(Error::invalid(
                 "fusion",
@@ -205,8 +197,7 @@ impl Session {
         self.config.back_pressure == pb::BackPressure::Newest as i32
     }
 
-    /// The first answer of a stream: which adapter, room, frame names and keyframe policy are in
-    /// effect.
+    /// The first answer of a stream: adapter, room, frame names and keyframe policy in effect.
     pub fn started(&self) -> pb::TrackResponse {
         let adapter = &self.served[0].adapter;
         let settings = self.tracker.settings();
@@ -228,11 +219,11 @@ impl Session {
         self.answer(pb::track_response::Answer::Started(started))
     }
 
-    /// Answers one frame with an update of the tracker, or with a refusal if the frame itself is at
-    /// fault. `waited` is the time since the frame's arrival.
+    /// Answers a frame with a tracker update, or with a refusal if the frame is not valid. `waited`
+    /// is the time since the frame's arrival.
     ///
     /// # Errors
-    /// [`Error`] if the server is at fault; the stream then ends.
+    /// [`Error`] for a server error, which ends the stream.
     pub fn take(
         &mut self,
         frame: pb::TrackFrame,
@@ -254,7 +245,7 @@ impl Session {
                     .map_or_else(String::new, |number| self.sensors.camera_name(number));
                 let update = wire::update(&update, &self.frames, &self.served);
 
-                // Counted from the frame's arrival, so that the wait for a thread is included.
+                // Measured from the frame's arrival, including the wait for a thread.
                 let elapsed_ns =
                     u64::try_from((waited + begun.elapsed()).as_nanos()).unwrap_or(u64::MAX);
 
@@ -285,7 +276,7 @@ impl Session {
         })
     }
 
-    /// Whether the answer to a frame of this number brings a token that it did not ask for.
+    /// Whether `token_every` adds a token to the answer for this sequence number.
     fn is_token_due(&self, sequence: u64) -> bool {
         match self.config.token_every {
             None => true,
@@ -294,7 +285,7 @@ impl Session {
         }
     }
 
-    /// One refusal for all the frames that a newer one overtook.
+    /// One refusal for all frames that a newer frame superseded.
     pub fn superseded(&self, frames: Overtaken) -> pb::TrackResponse {
         let Overtaken {
             timestamp_ns,
@@ -306,7 +297,7 @@ impl Session {
             timestamp_ns,
             sequence,
             reason: pb::TrackRefusalReason::Superseded as i32,
-            message: "a newer frame came before this one's turn".to_owned(),
+            message: "a newer frame arrived before this one was processed".to_owned(),
             frames,
         });
 
@@ -319,8 +310,7 @@ impl Session {
 
     /// Sets the camera's pose on the map, or answers with a refusal if the given pose is not valid.
     pub fn put(&mut self, given: pb::SetInitialPose) -> pb::TrackResponse {
-        // A bad pose ends neither the stream nor the tracking: the caller gets a refusal and the
-        // state stays as it was.
+        // An invalid pose is refused; the stream and its state continue unchanged.
         let answer = match self.place_of(given) {
             Ok(place) => {
                 self.tracker.set_pose(&mut self.state, place);
@@ -342,8 +332,7 @@ impl Session {
             .initial_pose
             .ok_or_else(|| Error::invalid(field, "is required"))?;
 
-        // A pose is relative to the world of one room. As long as several rooms are possible it
-        // has no meaning.
+        // The pose is in one room's world frame, so the room must be known.
         let room = self.state.room.ok_or_else(|| {
             Error::Precondition(format!(
                 "{field}: the room is not known yet; name it in the configuration"
@@ -356,8 +345,8 @@ impl Session {
             .map_err(|error| error.within(field))
     }
 
-    /// Starts tracking anew with the same configuration. The configured initial pose is not used
-    /// again, because the camera has moved since.
+    /// Restarts tracking with the same configuration, but without its initial pose: the camera has
+    /// moved since.
     pub fn reset(&mut self) -> pb::TrackResponse {
         self.state = self.tracker.start(None);
         self.answer(pb::track_response::Answer::Acknowledged(
@@ -365,9 +354,8 @@ impl Session {
         ))
     }
 
-    /// What a view in this field shows, and whether its image is blank, which nobody can tell of a
-    /// feature.
-    fn seen(&self, field: &str, view: Option<pb::View>) -> Result<SeenView, Error> {
+    /// Encodes the view in `field`. Only an image can be detected as blank.
+    fn encoded_view(&self, field: &str, view: Option<pb::View>) -> Result<SeenView, Error> {
         let adapter = &self.served[0].adapter;
         let (view, is_blank) = match view {
             Some(pb::View {
@@ -405,8 +393,8 @@ impl Session {
         })
     }
 
-    /// What the other cameras of a frame see.
-    fn seen_beside(&self, views: Vec<pb::OtherView>) -> Result<Vec<OtherView>, Error> {
+    /// Encodes the views of a frame's other cameras.
+    fn encoded_other_views(&self, views: Vec<pb::OtherView>) -> Result<Vec<OtherView>, Error> {
         let mut seen: Vec<OtherView> = Vec::with_capacity(views.len());
         for (number, given) in views.into_iter().enumerate() {
             let field = format!("frame.other_views[{number}]");
@@ -425,7 +413,7 @@ impl Session {
                 latent,
                 feature,
                 is_blank,
-            } = self.seen(&format!("{field}.view"), given.view)?;
+            } = self.encoded_view(&format!("{field}.view"), given.view)?;
             seen.push(OtherView {
                 camera: camera.number,
                 camera_from_other: camera.camera_from_other,
@@ -456,7 +444,7 @@ impl Session {
                 Error::Invalid { .. } | Error::Precondition(_) => {
                     Refused::Frame(reason, error.to_string())
                 }
-                // What is not the frame's fault is the server's, and ends the stream.
+                // Any other error is the server's and ends the stream.
                 other => Refused::Server(other),
             }
         };
@@ -466,10 +454,10 @@ impl Session {
             feature,
             is_blank,
         } = self
-            .seen("frame.view", view)
+            .encoded_view("frame.view", view)
             .map_err(refused(Reason::View))?;
         let other_views = self
-            .seen_beside(other_views)
+            .encoded_other_views(other_views)
             .map_err(refused(Reason::View))?;
         let measured = odometry
             .map(|given| self.frames.measured(given))
@@ -491,7 +479,7 @@ impl Session {
             other_views,
         };
 
-        // Late and duplicate frames are refused too. A refused frame leaves the state as it was.
+        // The tracker refuses late and duplicate frames. A refused frame does not change the state.
         self.tracker
             .observe(&mut self.state, &observation)
             .map_err(|refusal| {
@@ -505,8 +493,8 @@ impl Session {
     }
 
     fn answer(&self, answer: pb::track_response::Answer) -> pb::TrackResponse {
-        // The token carries the whole state, so that the stream can go on from it after a restart
-        // or on another server.
+        // The token carries the whole state, so that the stream can resume after a restart or on
+        // another server.
         let sealed = Sealed::new(&self.config, &self.state, &self.served);
         pb::TrackResponse {
             answer: Some(answer),
@@ -522,14 +510,14 @@ fn without_token(answer: pb::track_response::Answer) -> pb::TrackResponse {
     }
 }
 
-/// What a camera sees.
+/// An encoded camera view.
 struct SeenView {
     latent: Array1<f64>,
     feature: Option<Vec<f32>>,
     is_blank: bool,
 }
 
-/// Why a frame gets no update.
+/// Reason for a frame without an update.
 enum Refused {
     /// The frame is refused; the stream goes on.
     Frame(pb::TrackRefusalReason, String),

@@ -1,27 +1,26 @@
-//! Resume tokens: the state of a stream, authenticated with the server's key, so that servers keep
-//! no sessions.
+//! Resume tokens: stream state authenticated with the server's key, so that servers are stateless.
 //!
-//! A token is MAGIC, key id, state, and the HMAC-SHA-256 of all of that. It is protected against
-//! changes but not encrypted: its holder can read the state.
+//! A token is MAGIC, key id, state, and the HMAC-SHA-256 of these three. It is authenticated but
+//! not encrypted: its holder can read the state.
 
 use hmac::{Hmac, Mac};
 use sha2::{Digest, Sha256};
 
 use super::super::Error;
 
-/// The first bytes of a token: its kind and the version of its layout.
+/// First bytes of a token: file type and layout version.
 const MAGIC: &[u8; 4] = b"S3T6";
-/// Bytes of the id of the key that sealed it.
+/// Length of the key id, bytes.
 const KEY_ID: usize = 8;
-/// Bytes of the seal, an HMAC-SHA-256.
+/// Length of the HMAC-SHA-256 seal, bytes.
 const SEAL: usize = 32;
-/// The shortest secret that a key may be derived from, bytes.
+/// Minimum length of the secret, bytes.
 const LEAST_KEY_BYTES: usize = 16;
 
-/// A key that seals tokens and verifies them. Servers that share it accept one another's tokens.
+/// A key that seals and verifies tokens. Servers with the same key accept each other's tokens.
 #[derive(Clone)]
 pub struct TokenKey {
-    /// HMAC-SHA-256 initialised with the key; cloned for every token.
+    /// HMAC-SHA-256 initialized with the key; cloned for every token.
     mac: Hmac<Sha256>,
     id: [u8; KEY_ID],
 }
@@ -49,8 +48,8 @@ impl TokenKey {
     }
 
     fn of(secret: &[u8]) -> Self {
-        // Secrets of any length become 32 bytes. The id is a hash with another prefix, so that it
-        // reveals nothing of the key although tokens show it.
+        // A hash turns secrets of any length into 32 bytes. The id is a hash with another prefix:
+        // it is visible in tokens and must not reveal the key.
         let hash = |what: &[u8]| Sha256::digest([what, secret].concat());
         let mut id = [0; KEY_ID];
         id.copy_from_slice(&hash(b"seese3 token key id ")[..KEY_ID]);
@@ -65,10 +64,10 @@ impl TokenKey {
         }
     }
 
-    /// A random key that no other server has: its tokens are worthless once this server ends.
+    /// A random key. Its tokens become invalid when this server ends.
     pub fn random() -> Self {
         let secret: [u8; 32] = rand::random();
-        // 32 random bytes are long enough, so the check in `new` is not needed.
+        // 32 bytes satisfy the length check in `new`.
         Self::of(&secret)
     }
 
@@ -100,8 +99,7 @@ impl TokenKey {
             ));
         }
 
-        // The key's id is compared first, so that a server with the wrong key can be told from an
-        // altered token.
+        // Compare the key id first, to distinguish a wrong key from an altered token.
         if token[MAGIC.len()..begins] != self.id {
             let problem = "was sealed with another key; give both servers one --token-key-file";
             return Err(Error::invalid(field, problem));
@@ -109,8 +107,7 @@ impl TokenKey {
 
         let (sealed, seal) = token.split_at(token.len() - SEAL);
 
-        // Compared in constant time, so that the duration tells a forger nothing about the right
-        // seal.
+        // Compare in constant time, so that timing reveals nothing about the correct seal.
         let genuine = self
             .mac
             .clone()
@@ -134,7 +131,7 @@ mod tests {
         TokenKey::new(b"sixteen bytes or more").unwrap()
     }
 
-    /// Oracle: the contract: a sealed state comes back, and a token with any bit changed is
+    /// Oracle: the contract: a sealed state can be opened, and a token with any bit changed is
     /// refused.
     #[test]
     fn an_altered_token_is_refused() {
@@ -164,7 +161,7 @@ mod tests {
         assert!(key().open("t", &[token.as_slice(), b"x"].concat()).is_err());
     }
 
-    /// Oracle: the contract: tokens of another key are refused, and the message says so.
+    /// Oracle: the contract: tokens of another key are refused with an error that names the cause.
     #[test]
     fn another_keys_token_is_refused() {
         let other = TokenKey::new(b"another secret, as long").unwrap();

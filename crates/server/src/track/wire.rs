@@ -1,4 +1,4 @@
-//! A tracker's updates as wire messages.
+//! Converts tracker updates to wire messages.
 
 use std::sync::Arc;
 
@@ -10,15 +10,15 @@ use seese3_core::geometry::{Pose, Twist, adjoint};
 use seese3_core::navigation::RetrievedFrame;
 use seese3_robot::tracking::{ANCHORS_TO_AGREE, PoseWithCovariance, Status, Update};
 
-/// An update as a wire message. Its `timestamp_ns`, `sequence`, `elapsed_ns` and `best_camera` are
-/// left 0 or empty; the session fills them in.
+/// Converts an update. The session fills in `timestamp_ns`, `sequence`, `elapsed_ns` and
+/// `best_camera`.
 pub fn update(
     update: &Update,
     frames: &StreamFrames,
     served: &[Arc<ServedNavigator>],
 ) -> pb::TrackUpdate {
-    // As in REP-105, map_from_odom = map_from_camera · camera_from_odom is the correction of the
-    // drift: it jumps when the pose is corrected, while odom stays continuous.
+    // As in REP-105, map_from_odom = map_from_camera · camera_from_odom is the drift correction. It
+    // jumps when the pose is corrected, while odom stays continuous.
     let names = &frames.names;
     let odom = odom_of_stream(&update.odom, frames);
     let odom_from_camera = odom.pose;
@@ -33,8 +33,7 @@ pub fn update(
         pose: navigator.room().poses()[neighbour.frame.row()],
     };
 
-    // The nearest frame of an unknown room would be misleading, so that it is reported only when
-    // the room is known.
+    // Report the nearest frame only if the room is known; otherwise it would be misleading.
     let known = update.room.map(|room| &served[room]);
 
     let camera_from_base = frames.base_from_camera.map(|pose| pose.inverse());
@@ -96,8 +95,8 @@ pub fn update(
     }
 }
 
-/// The tracker's odometry begins at the camera; where the base is known, the stream's begins at the
-/// base.
+/// The odometry pose in the stream's odometry frame. The tracker's odometry starts at the camera;
+/// if the base is known, the stream's odometry starts at the base.
 fn odom_of_stream(odom: &PoseWithCovariance, frames: &StreamFrames) -> PoseWithCovariance {
     match frames.base_from_camera {
         Some(base_from_camera) => PoseWithCovariance {

@@ -1,8 +1,8 @@
-//! The files of a bag, whichever way it is stored: the messages of all of them, in the order written.
+//! Finds the files of a bag and reads their messages in the order written.
 //!
-//! ROS 2 writes a bag as a folder, of one file or of several that follow each other, `NAME_0.mcap`,
-//! `NAME_1.mcap`; until Iron the files were databases of SQLite, `.db3`. What a file is stands in its
-//! first bytes, whatever its name.
+//! A ROS 2 bag is a folder with one file or several consecutive ones, `NAME_0.mcap`,
+//! `NAME_1.mcap`. Before Iron the default was SQLite databases, `.db3`. The format is detected from
+//! a file's first bytes, not from its name.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -16,16 +16,17 @@ use crate::datasets::natural::sort_naturally;
 
 /// The first bytes of an MCAP file.
 const MCAP: &[u8] = b"\x89MCAP0\r\n";
-/// The first bytes of a database of SQLite.
+/// The first bytes of an SQLite database.
 const SQLITE: &[u8] = b"SQLite format 3\0";
-/// The endings of the files of a bag's folder; beside them it has a description.
+/// File name endings of a bag's data. Other files in its folder, such as `metadata.yaml`, are
+/// ignored.
 const ENDINGS: [&str; 3] = [".mcap", ".db3", ".zstd"];
 
-/// Calls `take` with every message that is understood, and returns all topics by their names. What
-/// `take` refuses is an error of the file that has the message.
+/// Calls `take` with every message of a supported type, and returns all topics by name. An error of
+/// `take` is reported for the file that contains the message.
 ///
 /// # Errors
-/// [`Error`] if the bag cannot be read, or is not of a form that is understood.
+/// [`Error`] if the bag cannot be read, its format is not supported, or `take` fails.
 pub fn each_message(
     bag: &Path,
     mut take: impl FnMut(&Message<'_>) -> Result<(), String>,
@@ -63,14 +64,14 @@ fn files_of(bag: &Path) -> Result<Vec<PathBuf>, Error> {
     if names.is_empty() {
         return Err(Error::Malformed {
             file: bag.to_owned(),
-            problem: "has no .mcap and no .db3 files: it is not a bag of ROS 2".into(),
+            problem: "has no .mcap and no .db3 files: it is not a ROS 2 bag".into(),
         });
     }
     let has = |ending: &str| names.iter().any(|name| name.ends_with(ending));
     if has(".mcap") && has(".db3") {
         return Err(Error::Malformed {
             file: bag.to_owned(),
-            problem: "has .mcap and .db3 files, which may be the same recording twice: name one of the files"
+            problem: "has .mcap and .db3 files, which may be the same recording twice: give one of the files"
                 .into(),
         });
     }
@@ -89,7 +90,7 @@ fn form_of(file: &Path) -> Result<Form, Error> {
         file: file.to_owned(),
         cause,
     };
-    // Opening a pipe would wait for someone to write into it.
+    // Opening a named pipe would block until a writer opens it.
     if !std::fs::metadata(file).map_err(io)?.is_file() {
         return Err(Error::Malformed {
             file: file.to_owned(),
@@ -107,9 +108,9 @@ fn form_of(file: &Path) -> Result<Form, Error> {
             "is compressed as a whole: unpack it with `zstd -d`, or `ros2 bag convert` the bag"
         }
         bytes if bytes.starts_with(b"#ROSBAG") => {
-            "is a bag of ROS 1: `rosbags-convert` makes one of ROS 2 of it"
+            "is a ROS 1 bag: convert it to ROS 2 with `rosbags-convert`"
         }
-        _ => "is neither an MCAP file nor a .db3 of ROS 2",
+        _ => "is neither an MCAP file nor a .db3 file of ROS 2",
     };
     Err(Error::Malformed {
         file: file.to_owned(),

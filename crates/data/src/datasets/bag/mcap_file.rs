@@ -1,4 +1,4 @@
-//! The messages of an MCAP file, read in pieces, whatever its size.
+//! Reads the messages of an MCAP file record by record, whatever its size.
 
 use seese3_core::Cause;
 use std::collections::BTreeMap;
@@ -12,11 +12,11 @@ use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOp
 use super::message::{Kind, Message, Topic};
 use crate::datasets::Error;
 
-/// Records, and chunks of them when they are unpacked, are at most as long as their file, and may have this
-/// length at least and at most, bytes: what states a greater one is damaged.
+/// Bounds of the length limit of records and unpacked chunks, bytes. The limit is the file's
+/// length, clamped to this range; a file with a longer record is damaged.
 const LONGEST_RECORD: std::ops::Range<usize> = 1 << 28..1 << 30;
 
-/// Calls `take` with every message that is understood, and returns all topics.
+/// Calls `take` with every message of a supported type, and returns all topics.
 pub fn each_message(
     file: &Path,
     take: &mut impl FnMut(&Message<'_>) -> Result<(), String>,
@@ -36,7 +36,7 @@ pub fn each_message(
     let mut source = File::open(file).map_err(io)?;
     let length = source.metadata().map_err(io)?.len();
     let length = usize::try_from(length).unwrap_or(usize::MAX);
-    // Checked before its messages are used: a chunk whose bits were flipped reads as other poses.
+    // CRCs are checked before messages are used: flipped bits would decode as wrong poses.
     let options = LinearReaderOptions::default()
         .with_prevalidate_chunk_crcs(true)
         .with_validate_data_section_crc(true)

@@ -1,6 +1,6 @@
-//! A message of a bag, and the topic that it was published on.
+//! Messages of a bag and their topics.
 
-/// A kind of message that is understood.
+/// A supported message type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// sensor_msgs/msg/CompressedImage.
@@ -28,7 +28,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// The kind of messages of this schema and encoding; none if they are not understood.
+    /// The kind of a schema and encoding, or `None` if it is not supported.
     pub fn of(schema: &str, encoding: &str) -> Option<Self> {
         match (schema, encoding) {
             ("sensor_msgs/msg/CompressedImage", "cdr") => Some(Self::RosCompressedImage),
@@ -56,7 +56,7 @@ impl Kind {
         )
     }
 
-    /// Whether its messages are transforms between frames that both have names.
+    /// Whether its messages are transforms between two named frames.
     pub fn is_transforms(&self) -> bool {
         matches!(
             self,
@@ -64,7 +64,7 @@ impl Kind {
         )
     }
 
-    /// Whether its messages say where something is, one pose each.
+    /// Whether each of its messages is one pose.
     pub fn is_pose(&self) -> bool {
         matches!(
             self,
@@ -77,24 +77,24 @@ impl Kind {
     }
 }
 
-/// The first bytes of what zstd compressed.
+/// The first bytes of zstd-compressed data.
 pub const ZSTD: &[u8] = b"\x28\xb5\x2f\xfd";
 
 /// A topic of a bag.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Topic {
     pub name: String,
-    /// The name of its messages' definition, such as sensor_msgs/msg/Image.
+    /// The name of its message type, such as sensor_msgs/msg/Image.
     pub schema: String,
-    /// What its messages are; none if they are not understood.
+    /// The kind of its messages, or `None` if it is not supported.
     pub kind: Option<Kind>,
 }
 
-/// A message of a kind that is understood.
+/// A message of a supported kind.
 pub struct Message<'a> {
     pub topic: &'a str,
     pub kind: Kind,
-    /// When it was recorded, nanoseconds.
+    /// The time of recording, nanoseconds.
     pub log_time_ns: i64,
     pub data: &'a [u8],
 }

@@ -1,4 +1,4 @@
-//! The messages of bags that are of use: of ROS 2 in CDR, and of Foxglove in Protobuf.
+//! Decodes the supported messages of bags: ROS 2 in CDR, Foxglove in Protobuf.
 
 use std::io::Cursor;
 
@@ -12,27 +12,27 @@ use serde::de::DeserializeOwned;
 use super::message::{Kind, Message, ZSTD};
 use seese3_core::geometry::{Pose, pose_from_quaternion};
 
-/// An image and when it was taken.
+/// An image and its capture time.
 #[derive(Debug)]
 pub struct Image {
     pub time_ns: i64,
     pub picture: Picture,
 }
 
-/// Where one frame was in another, `parent_from_child`.
+/// The pose of one frame in another at one time, `parent_from_child`.
 #[derive(Debug, Clone)]
 pub struct StampedPose {
     pub time_ns: i64,
     pub parent: String,
-    /// Empty if the message does not say what the pose is of.
+    /// The frame whose pose this is; empty if the message does not name it.
     pub child: String,
     pub pose: Pose,
 }
 
-/// An image of a message.
+/// The content of an image message.
 #[derive(Debug)]
 pub enum Picture {
-    /// A file, with the format that the message states.
+    /// An image file, with the format that the message states.
     Compressed { format: String, bytes: Vec<u8> },
     /// Rows of pixels.
     Raw(RosImage),
@@ -45,7 +45,7 @@ pub struct ImageFile {
 }
 
 impl Picture {
-    /// The image as a JPEG or PNG file. The error says what is wrong with it.
+    /// Converts the image to a JPEG or PNG file. The error describes the problem.
     pub fn file(&self) -> Result<ImageFile, String> {
         match self {
             Self::Compressed { bytes, format } => {
@@ -64,17 +64,17 @@ impl Picture {
     }
 }
 
-/// The poses that a message states, none if it is an image. The time of recording stands for a stamp of
-/// zero. The error says what is wrong.
+/// Decodes the poses in a message; an image has none. A zero stamp is replaced by the time of
+/// recording. The error describes the problem.
 pub fn poses_of(message: &Message<'_>) -> Result<Vec<StampedPose>, String> {
     decode_poses(message.kind, uncompressed(message)?, message.log_time_ns)
 }
 
-/// The frame of the camera that an image is of; empty if the message does not state one.
+/// The camera frame of an image message; empty if the message names none.
 pub fn camera_frame_of(message: &Message<'_>) -> Result<String, String> {
     let data = uncompressed(message)?;
     match message.kind {
-        // Every message with a header begins with it: the pixels need not be read.
+        // The header comes first, so the pixels need not be decoded.
         Kind::RosCompressedImage | Kind::RosImage => Ok(cdr::<RosHeader>(data)?.frame_id),
         Kind::FoxgloveCompressedImage => {
             let image: foxglove::messages::CompressedImage = protobuf(data)?;
@@ -84,7 +84,8 @@ pub fn camera_frame_of(message: &Message<'_>) -> Result<String, String> {
     }
 }
 
-/// The bytes of a message, which begin with a zero in CDR.
+/// The bytes of a message. Zstd-compressed messages are an error; CDR begins with a zero byte, so
+/// it cannot be mistaken for zstd.
 fn uncompressed<'a>(message: &Message<'a>) -> Result<&'a [u8], String> {
     if message.data.starts_with(ZSTD) {
         return Err(
@@ -95,7 +96,7 @@ fn uncompressed<'a>(message: &Message<'a>) -> Result<&'a [u8], String> {
     Ok(message.data)
 }
 
-/// The image that a message is; none if it is something else.
+/// Decodes an image message; `None` if the message is of another kind.
 pub fn image_of(message: &Message<'_>) -> Result<Option<Image>, String> {
     let data = uncompressed(message)?;
     let image = |time_ns: i64, picture: Picture| {
@@ -130,7 +131,7 @@ pub fn image_of(message: &Message<'_>) -> Result<Option<Image>, String> {
     })
 }
 
-/// The stamp of a message, or when it was recorded if it has none.
+/// The stamp of a message, or its time of recording if the stamp is zero.
 fn stamp_or(stamp_ns: i64, log_time_ns: i64) -> i64 {
     if stamp_ns == 0 { log_time_ns } else { stamp_ns }
 }
@@ -153,7 +154,7 @@ fn decode_poses(kind: Kind, data: &[u8], log_time: i64) -> Result<Vec<StampedPos
             of_header(message.header, String::new(), &message.pose)
         }
         Kind::RosPoseWithCovariance => {
-            // What follows the pose is not read.
+            // The covariance after the pose is not decoded.
             let message: RosPoseStamped = cdr(data)?;
             of_header(message.header, String::new(), &message.pose)
         }
@@ -208,7 +209,7 @@ fn decode_poses(kind: Kind, data: &[u8], log_time: i64) -> Result<Vec<StampedPos
     }
 }
 
-/// A message of ROS 2. The first four bytes say in which order the bytes of numbers are.
+/// Decodes a ROS 2 message. The second of its first four bytes gives the byte order.
 fn cdr<T: DeserializeOwned>(data: &[u8]) -> Result<T, String> {
     let wrong =
         |error: cdr_encoding::Error| format!("the message is truncated or malformed: {error}");
@@ -302,9 +303,9 @@ pub struct RosImage {
     height: u32,
     width: u32,
     encoding: String,
-    #[allow(dead_code, reason = "of 16-bit images alone, which are not read")]
+    #[allow(dead_code, reason = "only for 16-bit images, which are unsupported")]
     is_bigendian: u8,
-    /// Bytes of a row.
+    /// Bytes per row, including padding.
     step: u32,
     data: Vec<u8>,
 }
@@ -320,7 +321,7 @@ impl RosImage {
             "mono8" | "8UC1" => (1, false),
             other => {
                 return Err(format!(
-                    "its images are '{other}'; rgb8, bgr8, rgba8, bgra8, mono8, 8UC1 and 8UC3 are read"
+                    "its images are encoded as '{other}'; supported are rgb8, bgr8, rgba8, bgra8, mono8, 8UC1 and 8UC3"
                 ));
             }
         };
@@ -405,7 +406,7 @@ struct RosPoseStamped {
     pose: RosPose,
 }
 
-/// The beginning of nav_msgs/msg/Odometry.
+/// The first fields of nav_msgs/msg/Odometry.
 #[derive(Debug, Deserialize)]
 struct RosOdometry {
     header: RosHeader,

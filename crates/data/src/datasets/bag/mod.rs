@@ -1,17 +1,20 @@
-//! Bags of ROS 2, and recordings of Foxglove.
+//! Reads ROS 2 bags and Foxglove recordings.
 //!
-//! A bag has images on one topic and says on others where something was: the camera, or a robot's base
-//! that carries it. The poses at the times of the images lie between those before and after. Images
-//! are written to a folder as files, since rooms refer to files.
+//! One topic of a bag has the images; others have poses of the camera, or of the robot's base that
+//! carries it. Poses are interpolated to the times of the images. Images are written to a folder,
+//! since rooms refer to image files.
 //!
-//! A bag is read twice, message by message, whatever its size: first the poses, then the images.
+//! A bag is read twice, message by message: first the poses, then the images. Only the poses stay
+//! in memory.
 //!
 //! | file | what |
 //! | --- | --- |
-//! | `files` | the files of a bag, and the messages of all of them |
-//! | `mcap_file`, `sqlite_file` | the messages of one file |
-//! | `messages` | what a message says |
-//! | `poses` | where the camera was at the time of an image |
+//! | `files` | finds the files of a bag and reads their messages in order |
+//! | `mcap_file`, `sqlite_file` | read the messages of one file |
+//! | `message` | supported message types |
+//! | `messages` | decodes messages |
+//! | `poses` | interpolates the camera's pose to the time of an image |
+//! | `written_images` | writes images, and removes them if the import fails |
 
 mod files;
 mod mcap_file;
@@ -34,30 +37,34 @@ use seese3_core::Cause;
 use seese3_core::geometry::Pose;
 pub use written_images::WrittenImages;
 
-/// Which parts of a bag are read. A topic that is `None` is chosen if the bag has only one of its kind.
+/// The topics and frames to read from a bag. A topic that is `None` is chosen automatically if the
+/// bag has only one of its kind.
 #[derive(Debug, Clone, Default)]
 pub struct Bag {
     /// The topic of the images.
     pub image_topic: Option<String>,
-    /// The topic of the poses; without it, and with `world`, the transforms of /tf are used. The world of
-    /// the room is the frame in which its poses are stated.
+    /// The topic of the poses; the frame that they are stated in becomes the room's world. If it is
+    /// `None` and `world` is set, the transforms of /tf are used.
     pub pose_topic: Option<String>,
-    /// The frame of /tf in which the camera's poses are wanted.
+    /// The frame of /tf that becomes the room's world.
     pub world: Option<String>,
-    /// The camera's pose in the frame whose poses the topic states, such as base_link. `None`: it is
-    /// looked up in /tf, or the poses are the camera's own if the topic names no frame.
+    /// The camera's pose in the frame that the topic tracks, such as base_link. If `None`, it is
+    /// looked up in /tf; poses without a tracked frame are taken as the camera's own.
     pub base_from_camera: Option<Pose>,
-    /// The folder for the images, made if it does not exist. Each topic has a folder in it.
+    /// The folder for the images, created if missing. Each image topic gets a subfolder.
     pub images: PathBuf,
 }
 
-/// Reads a bag: a folder as ROS 2 writes it, or one of its files. The images are removed again unless
-/// they are kept, see [`WrittenImages`].
+/// Reads a bag: a folder written by ROS 2, or one of its files. The images are deleted when the
+/// returned [`WrittenImages`] is dropped, unless [`WrittenImages::keep`] is called.
 ///
 /// # Errors
-/// [`Error`] if a file cannot be read or is damaged, a topic is not in it or has messages of another
-/// kind, several could be meant, no image has a pose, an image cannot be written or would replace
-/// another one, or if `reader` refuses unusable frames and there are some.
+/// [`Error`] if
+/// - a file cannot be read or is damaged,
+/// - a topic is missing, has messages of another kind, or is ambiguous,
+/// - no image has a pose,
+/// - an image cannot be written or would replace a different file,
+/// - a frame is unusable and `reader.unusable` is `Refuse`.
 pub fn read_bag(
     path: &Path,
     bag: &Bag,
@@ -91,7 +98,8 @@ pub fn read_bag(
         bag.base_from_camera,
     );
     let camera = camera.map_err(|problem| {
-        // Nothing is known where all messages are malformed: what is wrong with the first one says why.
+        // Poses may be missing because all messages are malformed: report the first problem as
+        // well.
         let first = malformed_poses
             .iter()
             .find(|message| is_of_pose_topic(message));
@@ -143,7 +151,8 @@ pub fn read_bag(
     Ok((recording.map_err(|error| of_bag(error, path))?, written))
 }
 
-/// The image of a message as a file, and when it was taken, nanoseconds; none if it is no image.
+/// The capture time of an image message, nanoseconds, and its image as a file; `None` for messages
+/// of another kind.
 fn image_file(message: &Message<'_>) -> Result<Option<(i64, ImageFile)>, String> {
     let Some(Image { time_ns, picture }) = messages::image_of(message)? else {
         return Ok(None);
@@ -151,8 +160,8 @@ fn image_file(message: &Message<'_>) -> Result<Option<(i64, ImageFile)>, String>
     Ok(Some((time_ns, picture.file()?)))
 }
 
-/// The recording of frames, each when it was taken, its image and `world_from_camera`. Messages may be
-/// recorded in another order than that in which their images were taken.
+/// Builds the recording from frames (capture time, image name, `world_from_camera`). Frames are
+/// sorted by capture time, because messages may be recorded in another order.
 fn in_order(
     mut collected: Collected,
     mut frames: Vec<(i64, String, Pose)>,
@@ -180,7 +189,7 @@ fn malformed(path: &Path, problem: Cause) -> Error {
     }
 }
 
-/// What is missing is missing in the bag, and not in the folder of its images.
+/// Replaces the image folder by the bag's path in errors about unusable frames.
 fn of_bag(error: Error, path: &Path) -> Error {
     match error {
         Error::NoFrames { dropped, .. } => Error::NoFrames {
@@ -195,20 +204,20 @@ fn of_bag(error: Error, path: &Path) -> Error {
     }
 }
 
-/// What the first pass finds.
+/// The result of the first pass.
 struct Contents {
     topics: BTreeMap<String, Topic>,
     poses: Poses,
     malformed_poses: Vec<MalformedPose>,
-    /// By topic, the number of images and the frame of the camera.
+    /// The number of images and the camera's frame, by topic.
     images: BTreeMap<String, (usize, String)>,
 }
 
-/// A message that should state poses, and states none.
+/// A pose or transform message that cannot be decoded.
 struct MalformedPose {
     topic: String,
     is_transform: bool,
-    /// Counted from 1, of the messages of its topic.
+    /// Its number among the messages of its topic, from 1.
     number: usize,
     problem: String,
 }
@@ -224,7 +233,7 @@ fn contents(path: &Path) -> Result<Contents, Error> {
         if message.kind.is_image() {
             let (count, frame) = images.entry(topic).or_default();
             *count += 1;
-            // An image that cannot be read is named when it is written.
+            // An image that cannot be decoded is reported in the second pass.
             if frame.is_empty() {
                 *frame = messages::camera_frame_of(message).unwrap_or_default();
             }
@@ -254,7 +263,7 @@ fn contents(path: &Path) -> Result<Contents, Error> {
     })
 }
 
-/// A topic as the name of a folder: /camera/image is camera-image.
+/// The folder name of a topic: /camera/image becomes camera-image.
 fn folder_of(topic: &str) -> String {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '_';
     let words = topic
@@ -263,29 +272,31 @@ fn folder_of(topic: &str) -> String {
     words.collect::<Vec<_>>().join("-")
 }
 
-/// What a topic is wanted for.
+/// The role of a topic: images or poses.
 struct Wanted {
-    /// In words, and as the option that names it.
+    /// The role's name in messages and in the option `--ROLE-topic`.
     what: &'static str,
     is_of_kind: fn(&Kind) -> bool,
-    /// What to do if there is none.
+    /// The hint for a bag without such a topic.
     else_do: &'static str,
 }
 
 const IMAGES: Wanted = Wanted {
     what: "image",
     is_of_kind: Kind::is_image,
-    else_do: "ROS 2's sensor_msgs/msg/Image and CompressedImage and Foxglove's CompressedImage are read",
+    else_do: "supported types are ROS 2's sensor_msgs/msg/Image and CompressedImage, and Foxglove's \
+              CompressedImage",
 };
 
 const POSES: Wanted = Wanted {
     what: "pose",
     is_of_kind: Kind::is_pose,
-    else_do: "ROS 2's PoseStamped, PoseWithCovarianceStamped and Odometry and Foxglove's PoseInFrame and \
-              Odometry are read; give --world-frame FRAME to take the camera's poses from /tf",
+    else_do: "supported types are ROS 2's PoseStamped, PoseWithCovarianceStamped and Odometry, and \
+              Foxglove's PoseInFrame and Odometry; give --world-frame FRAME to take the camera's poses \
+              from /tf",
 };
 
-/// The topic that is named, or the only one of its kind.
+/// The named topic, or the only one of its kind.
 fn chosen_topic(
     topics: &BTreeMap<String, Topic>,
     named: Option<&str>,
@@ -323,7 +334,7 @@ fn chosen_topic(
     }
 }
 
-/// All topics with what they carry, for a message that says what is there instead of what was asked.
+/// All topics with their message types, for error messages.
 fn all_of(topics: &BTreeMap<String, Topic>) -> String {
     let words = topics
         .values()

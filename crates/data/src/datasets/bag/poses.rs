@@ -1,24 +1,23 @@
-//! Where the camera was at the times of its images, from the poses and transforms of a bag.
+//! The camera's pose at the times of its images, interpolated from a bag's poses and transforms.
 
 use std::collections::{BTreeMap, VecDeque};
 
 use super::messages::StampedPose;
 use seese3_core::geometry::Pose;
 
-/// The longest time between the poses before and after an image, nanoseconds. Between poses further
-/// apart the camera may have been anywhere.
+/// The longest gap between two poses that is interpolated, nanoseconds.
 const LONGEST_GAP_NS: i64 = 500_000_000;
 
-/// Poses over time, ascending.
+/// Times, nanoseconds, and poses, in ascending order of time.
 type Track = Vec<(i64, Pose)>;
 
-/// Everything that a bag says of poses.
+/// All poses and transforms of a bag.
 #[derive(Default)]
 pub struct Poses {
-    /// By topic of poses: the frame whose poses it has, and the poses.
+    /// The pose topics, by name.
     topics: BTreeMap<String, PoseTopic>,
-    /// `parent_from_child`, by the names of both, of topics of transforms alone: other topics may state
-    /// the same two frames and mean another estimate.
+    /// `parent_from_child` by (parent, child), from transform topics only. A pose topic with the
+    /// same two frames may be another estimate.
     transforms: BTreeMap<(String, String), Transform>,
 }
 
@@ -31,12 +30,12 @@ struct PoseTopic {
 #[derive(Default)]
 struct Transform {
     track: Track,
-    /// Whether it was said on /tf_static, and holds for ever.
+    /// Whether it was published on /tf_static, so that it does not expire.
     is_static: bool,
 }
 
 impl Poses {
-    /// Adds what a message of a topic of poses said.
+    /// Adds the poses of a message on a pose topic.
     pub fn add_poses(&mut self, topic: &str, poses: Vec<StampedPose>) {
         let of_topic = self.topics.entry(topic.to_owned()).or_default();
         for stated in poses {
@@ -45,7 +44,7 @@ impl Poses {
         }
     }
 
-    /// Adds what a message of a topic of transforms said.
+    /// Adds the transforms of a message on a transform topic.
     pub fn add_transforms(&mut self, topic: &str, transforms: Vec<StampedPose>) {
         for stated in transforms {
             let edge = (without_slash(&stated.parent), without_slash(&stated.child));
@@ -55,7 +54,7 @@ impl Poses {
         }
     }
 
-    /// Brings everything into the order of time. Called once, after the last message.
+    /// Sorts everything by time. Called once, after the last message.
     pub fn sort(&mut self) {
         let of_topics = self.topics.values_mut().map(|topic| &mut topic.track);
         let of_transforms = self.transforms.values_mut().map(|one| &mut one.track);
@@ -64,8 +63,8 @@ impl Poses {
         }
     }
 
-    /// The path of the camera, by a topic of poses or, without one, by transforms in `world`. The
-    /// error says what is missing.
+    /// The camera's path: from a pose topic or, without one, from the transforms between `world`
+    /// and the camera. The error names what is missing.
     pub fn path(
         &self,
         pose_topic: Option<&str>,
@@ -86,18 +85,18 @@ impl Poses {
         let found = self
             .topics
             .get(topic)
-            .ok_or_else(|| format!("topic {topic} has no message that states a pose"))?;
+            .ok_or_else(|| format!("topic {topic} has no message with a valid pose"))?;
         let mut chain = vec![Edge {
             track: &found.track,
             is_reversed: false,
             is_static: false,
         }];
 
-        // A topic that does not say what its poses are of is taken to be of the camera.
+        // Poses without a child frame are taken as the camera's own.
         if base_from_camera.is_none() && !found.child.is_empty() && found.child != camera {
             let rest = self.chain(&found.child, &camera).map_err(|problem| {
                 format!(
-                    "{problem}; topic {topic} has poses of '{}' and the images are of '{camera}': give --base-from-camera",
+                    "{problem}; topic {topic} has poses of frame '{}', but the images have frame '{camera}': give --base-from-camera",
                     found.child
                 )
             })?;
@@ -109,7 +108,8 @@ impl Poses {
         })
     }
 
-    /// The transforms that lead from one frame to another, the fewest; none if they are the same.
+    /// The shortest chain of transforms from one frame to another; empty if the frames are the
+    /// same.
     fn chain(&self, from: &str, to: &str) -> Result<Vec<Edge<'_>>, String> {
         let mut reached: BTreeMap<&str, Vec<Edge<'_>>> = BTreeMap::from([(from, Vec::new())]);
         let mut open = VecDeque::from([from]);
@@ -145,16 +145,16 @@ impl Poses {
         known.sort_unstable();
         known.dedup();
         let known = match known.as_slice() {
-            [] => "it has none".to_owned(),
-            names => format!("it has {}", names.join(", ")),
+            [] => "the bag has no transforms".to_owned(),
+            names => format!("the bag has transforms between {}", names.join(", ")),
         };
         Err(format!(
-            "no transforms lead from '{from}' to '{to}'; {known}"
+            "no chain of transforms connects '{from}' and '{to}'; {known}"
         ))
     }
 }
 
-/// A frame's name as TF compares it.
+/// A frame's name without leading slashes, as TF compares names.
 fn without_slash(frame: &str) -> String {
     frame.trim_start_matches('/').to_owned()
 }
@@ -166,14 +166,15 @@ struct Edge<'a> {
     is_static: bool,
 }
 
-/// Where a camera was, over time.
+/// The camera's pose as a function of time.
 pub struct Path<'a> {
     chain: Vec<Edge<'a>>,
     then: Pose,
 }
 
 impl Path<'_> {
-    /// The camera's pose, `world_from_camera`; none if there is no pose near that time.
+    /// The camera's pose, `world_from_camera`. `None` if a pose before or after is missing, or the
+    /// two are further apart than `LONGEST_GAP_NS`.
     pub fn at(&self, time_ns: i64) -> Option<Pose> {
         let mut pose = Pose::identity();
         for edge in &self.chain {
@@ -192,14 +193,14 @@ impl Path<'_> {
     }
 }
 
-/// The pose that was said last, as of a static transform: the first one also holds before it was said.
+/// The latest pose at or before a time, for static transforms; before the first one, the first.
 fn last_before(track: &Track, time_ns: i64) -> Option<Pose> {
     let after = track.partition_point(|(time, _)| *time <= time_ns);
     let (_, pose) = track.get(after.saturating_sub(1))?;
     Some(*pose)
 }
 
-/// The pose at a time, between those before and after.
+/// The pose at a time, interpolated between its neighbors.
 fn between(track: &Track, time_ns: i64) -> Option<Pose> {
     let after = track.partition_point(|(time, _)| *time < time_ns);
     let (next_time, next) = track.get(after)?;
@@ -241,8 +242,8 @@ mod tests {
         path.at(time_ns).map(|pose| pose.translation.x)
     }
 
-    /// By hand: the base moves 1 m in .4 s, and the camera stands .5 m before it. The map is a child
-    /// of odom, so that this transform is inverted.
+    /// Oracle: by hand. The base moves 1 m in 0.4 s; the camera is 0.5 m ahead of it. The map is a
+    /// child of odom, so that this transform is inverted.
     #[test]
     fn transforms_are_chained_and_interpolated() {
         let mut poses = Poses::default();
@@ -253,7 +254,7 @@ mod tests {
                 said(400_000_000, "odom", "base", 1.0),
             ],
         );
-        // Broadcasters of static transforms say theirs again whenever they have a new one.
+        // Static broadcasters repeat all their transforms whenever one is added.
         poses.add_transforms(
             "/tf_static",
             vec![
@@ -296,7 +297,7 @@ mod tests {
         assert_eq!(x_at(&path, 50), Some(2.75));
     }
 
-    /// Two estimates of the same frames, of which /tf has one: transforms are those of /tf alone.
+    /// Oracle: by hand. Two topics estimate the same frames; only the one on /tf is a transform.
     #[test]
     fn an_odometry_is_no_transform() {
         let mut poses = Poses::default();
@@ -307,13 +308,13 @@ mod tests {
 
         let path = poses.path(None, Some("odom"), "base", None).unwrap();
         assert_eq!(x_at(&path, 50), Some(1.5));
-        // One pose of a topic is that of its own time.
+        // A single pose is valid only at its own time.
         let path = poses.path(Some("/wheel/odom"), None, "base", None).unwrap();
         assert_eq!(x_at(&path, 50), Some(9.0));
         assert_eq!(x_at(&path, 51), None);
     }
 
-    /// Half a second without poses: the camera may have been anywhere.
+    /// Oracle: the definition. A gap longer than half a second is not interpolated.
     #[test]
     fn no_pose_is_made_up_over_a_gap() {
         let mut poses = Poses::default();

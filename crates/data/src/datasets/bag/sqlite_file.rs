@@ -1,8 +1,8 @@
-//! The messages of a `.db3`, the database of SQLite that ROS 2 records to until Iron.
+//! Reads the messages of a `.db3` file, the SQLite database that ROS 2 recorded to before Iron.
 //!
-//! | table | columns that are read |
+//! | table | columns used |
 //! | --- | --- |
-//! | `topics` | `id`, `name`, `type` (the definition), `serialization_format` ("cdr") |
+//! | `topics` | `id`, `name`, `type` (the message type), `serialization_format` ("cdr") |
 //! | `messages` | `id` in the order of writing, `topic_id`, `timestamp` (nanoseconds), `data` |
 
 use seese3_core::Cause;
@@ -14,7 +14,7 @@ use rusqlite::{Connection, OpenFlags, Row};
 use super::message::{Kind, Message, Topic};
 use crate::datasets::Error;
 
-/// Calls `take` with every message that is understood, and returns all topics.
+/// Calls `take` with every message of a supported type, and returns all topics.
 pub fn each_message(
     file: &Path,
     take: &mut impl FnMut(&Message<'_>) -> Result<(), String>,
@@ -26,7 +26,7 @@ pub fn each_message(
     let damaged =
         |error: rusqlite::Error| malformed(format!("is a damaged .db3 bag: {error}").into());
 
-    // A name such as `file:a.db3` is a name here, and not a URI.
+    // An absolute path keeps SQLite from reading a name such as `file:a.db3` as a URI.
     let path = file.canonicalize().map_err(|cause| Error::Io {
         file: file.to_owned(),
         cause,
@@ -36,7 +36,7 @@ pub fn each_message(
     for table in ["topics", "messages"] {
         if !has_table(&database, table).map_err(damaged)? {
             return Err(malformed(
-                format!("is a database without the table '{table}': it is not a bag of ROS 2")
+                format!("is a database without the table '{table}': it is not a ROS 2 bag")
                     .into(),
             ));
         }
@@ -58,7 +58,7 @@ pub fn each_message(
     Ok(topics.into_values().collect())
 }
 
-/// Whether this is a table of the database. A view of the same name could compute for ever.
+/// Whether the database has this table. A view is not accepted: its query could run forever.
 fn has_table(database: &Connection, name: &str) -> rusqlite::Result<bool> {
     let query = "SELECT count(*) FROM sqlite_schema WHERE type = 'table' AND name = ?1";
     database.query_row(query, [name], |row| row.get(0))

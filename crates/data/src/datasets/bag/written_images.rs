@@ -1,4 +1,4 @@
-//! The images of a bag as files, which are removed again if the import fails.
+//! Image files extracted from a bag. They are deleted if the import fails.
 
 use std::fs::{self, OpenOptions};
 use std::io::{ErrorKind, Write};
@@ -6,21 +6,21 @@ use std::path::{Path, PathBuf};
 
 use crate::datasets::Error;
 
-/// Images that were written to a folder. What was not there before is removed when this is dropped,
-/// unless [`WrittenImages::keep`] was called: a room that is not published leaves nothing behind.
+/// Images written to a folder. New files and folders are deleted on drop, unless
+/// [`WrittenImages::keep`] was called: a room that is not published leaves nothing behind.
 ///
-/// A file that is there already is never changed: it may be an image of another room. If it has the
-/// same content, as after the same import, it is used.
+/// An existing file is never changed, because it may belong to another room. A file with the same
+/// content, as from an earlier import, is reused.
 #[derive(Debug)]
 pub struct WrittenImages {
     folder: PathBuf,
-    /// The folders that were made, the outermost first.
+    /// The folders that were created, the outermost first.
     made_folders: Vec<PathBuf>,
     made_files: Vec<PathBuf>,
 }
 
 impl WrittenImages {
-    /// Makes the folder, with those above it, if it does not exist.
+    /// Creates the folder and its parents if they do not exist.
     pub(super) fn in_folder(folder: PathBuf) -> Result<Self, Error> {
         let missing = folder.ancestors().take_while(|above| {
             !above.as_os_str().is_empty() && fs::symlink_metadata(above).is_err()
@@ -45,13 +45,13 @@ impl WrittenImages {
         &self.folder
     }
 
-    /// Leaves the images where they are, since a room refers to them now.
+    /// Keeps the images, because a room refers to them now.
     pub fn keep(mut self) {
         self.made_files.clear();
         self.made_folders.clear();
     }
 
-    /// Writes a file of the folder. The error says why it cannot be written.
+    /// Writes a file into the folder. The error describes the problem.
     pub(super) fn write(&mut self, name: &str, bytes: &[u8]) -> Result<(), String> {
         let path = self.folder.join(name);
         let failed =
@@ -68,7 +68,7 @@ impl WrittenImages {
                     return Ok(());
                 }
                 Err(format!(
-                    "{} is there already, with another content: give another folder with --images-to",
+                    "{} already exists with different content: give another folder with --images-to",
                     path.display()
                 ))
             }
@@ -79,7 +79,7 @@ impl WrittenImages {
 
 impl Drop for WrittenImages {
     fn drop(&mut self) {
-        // What cannot be removed stays: there is nobody left to tell.
+        // Errors are ignored: a drop cannot report them.
         for file in &self.made_files {
             let _ = fs::remove_file(file);
         }
