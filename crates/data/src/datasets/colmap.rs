@@ -152,11 +152,14 @@ fn images_root(model: &Path, given: Option<&Path>, frames: &[Image]) -> Result<P
         names.any(|image| image.is_file())
     };
     let folders = IMAGES.map(|folder| model.join(folder));
-    folders.into_iter().find(has_one).ok_or_else(|| Error::Malformed {
-        file: model.to_owned(),
-        problem: "has no folder with the model's images nearby; give it with --images DIR"
-            .into(),
-    })
+    folders
+        .into_iter()
+        .find(has_one)
+        .ok_or_else(|| Error::Malformed {
+            file: model.to_owned(),
+            problem: "has no folder with the model's images nearby; give it with --images DIR"
+                .into(),
+        })
 }
 
 /// The camera shared by all images, if its two focal lengths differ by less than 5 %. Distortion is
@@ -417,13 +420,16 @@ fn binary_cameras(file: &Path) -> Result<BTreeMap<u32, Camera>, Error> {
         let height = bytes.u64()? as f64;
 
         // The number of parameters is needed to find the next camera.
-        let model = CAMERA_MODELS.get(kind as usize).ok_or_else(|| Error::Malformed {
-            file: file.to_owned(),
-            problem: format!(
-                "camera {id} has the unknown model {kind}; convert the model to text with \
+        let model = CAMERA_MODELS
+            .get(kind as usize)
+            .ok_or_else(|| Error::Malformed {
+                file: file.to_owned(),
+                problem: format!(
+                    "camera {id} has the unknown model {kind}; convert the model to text with \
                      `colmap model_converter --output_type TXT`"
-            ).into(),
-        })?;
+                )
+                .into(),
+            })?;
         let numbers: Result<Vec<f64>, Error> = (0..model.numbers).map(|_| bytes.f64()).collect();
         cameras.insert(id, model.camera(width, height, &numbers?));
     }

@@ -18,15 +18,15 @@
 //!
 //! | file | what |
 //! | --- | --- |
-//! | `convention` | the conventions and how each is read |
-//! | `translations` | ways in which translations alone can be wrong |
-//! | `motion_fit` | how well poses explain the motion of images |
-//! | `evidence` | whether a small difference shows throughout a recording |
-//! | `path` | what the poses alone tell: extents, steps, jumps |
+//! | `convention` | pose conventions and their conversion |
+//! | `translations` | ways in which only the translations are wrong |
+//! | `motion_fit` | share of the image motion that poses explain |
+//! | `evidence` | whether a small difference is consistent throughout a recording |
+//! | `path` | statistics of the poses alone: extents, steps, jumps |
 //! | `report` | [`check_room`]: all checks of a room, and the warnings in words |
 //!
 //! Not a method of the paper. The limits were chosen on a real recording and on drawn rooms;
-//! docs/rooms-and-encoders.md reports them on rooms that were drawn afterwards.
+//! docs/rooms-and-encoders.md reports the results on held-out rooms that were drawn afterwards.
 
 mod convention;
 mod evidence;
@@ -97,68 +97,70 @@ const UNRELATED: f64 = 0.4;
 /// Two frames of a recording and the image motion between them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ObservedPair {
-    /// The frame that the motion starts from.
+    /// The frame at which the motion starts.
     pub first: FrameId,
-    /// The frame that it leads to.
+    /// The frame at which the motion ends.
     pub second: FrameId,
-    /// Where the contents of the first image are in the second.
+    /// The motion of the content from the first image to the second.
     pub motion: ImageMotion,
-    /// How alike the two images are when laid over one another, -1 to 1.
+    /// The brightness correlation of the aligned images, -1 to 1.
     pub correlation: f64,
 }
 
-/// What a comparison of poses and images says.
+/// The result of comparing poses with images.
+///
+/// `explained` is the share of the image motion that poses explain, 0 to 1.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Verdict {
-    /// The poses can be those of the images.
+    /// The poses match the images.
     Agrees(SceneEstimate),
-    /// The poses are written in another convention.
+    /// The poses are in another convention.
     OtherConvention {
-        /// The likely ones, the best first.
+        /// The likely conventions, the best first.
         likely: Vec<Convention>,
-        /// How much of the motion the best of them explains, 0 to 1.
+        /// The share explained in the best of them.
         explained: f64,
     },
     /// The images are mirrored: left and right are exchanged.
     MirroredImages {
-        /// In which conventions the poses then explain the motion, the best first.
+        /// The likely conventions of the poses, the best first.
         likely: Vec<Convention>,
-        /// How much of the motion the best of them explains, 0 to 1.
+        /// The share of the mirrored motion explained in the best of them.
         explained: f64,
     },
-    /// The translations are right, and the rotations are those of the inverse.
+    /// The translations are right, but the rotations are inverted.
     TransposedRotations {
-        /// How much of the motion is explained with rotations turned round, 0 to 1.
+        /// The share explained with inverted rotations.
         explained: f64,
     },
-    /// The rotations are right, and the translations do not go with them.
+    /// The rotations are right, but the translations do not match them.
     OtherTranslations {
-        /// The likely ones.
+        /// The likely translations.
         likely: Translations,
-        /// How much of the motion they explain, 0 to 1.
+        /// The share explained with them.
         explained: f64,
     },
-    /// The poses are those of images so many rows later, or earlier if below 0.
+    /// The poses belong to images some rows later, or earlier if negative.
     OtherRows {
-        /// The rows.
+        /// The number of rows.
         rows: i64,
-        /// How much of the motion the poses then explain, 0 to 1.
+        /// The share explained by the shifted poses.
         explained: f64,
     },
-    /// The images move, and no convention makes the poses explain how: they are of other frames, in
-    /// another order, or of another recording.
+    /// The poses do not explain the image motion in any convention, or turn while the images stand
+    /// still. They are of other frames, in another order, or of another recording.
     Unrelated {
-        /// How much of the motion the best convention explains, 0 to 1.
+        /// The share explained in the best convention.
         explained: f64,
     },
-    /// Poses and images do not contradict each other, and do not agree well either.
+    /// Poses and images neither contradict each other nor agree well.
     Unclear {
-        /// How much of the motion the best convention explains, 0 to 1.
+        /// The share explained in the best convention.
         explained: f64,
     },
-    /// Too few pairs of frames could be laid over one another.
+    /// Too few pairs of frames could be aligned.
     TooFewPairs,
-    /// The camera hardly moves.
+    /// The images hardly move.
     TooLittleMotion,
 }
 
@@ -198,16 +200,16 @@ impl Verdict {
 /// The comparison of poses with images.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PoseCheck {
-    /// What it says.
+    /// The result.
     pub verdict: Verdict,
-    /// How much of the images' motion the poses explain as they are, 0 to 1; 0 if nothing was
+    /// The share of the image motion that the poses explain as stated, 0 to 1; 0 if nothing was
     /// compared.
     pub explained: f64,
-    /// The pairs that were compared.
+    /// The number of usable pairs.
     pub pair_count: usize,
 }
 
-/// Pairs of frames to look at, spread over the recording.
+/// Selects frame pairs to compare, spread over the recording.
 pub fn pairs_to_look_at(room: &Room) -> Vec<(FrameId, FrameId)> {
     let frame_count = room.frame_count() as u32;
     let every = room.frame_count().div_ceil(PAIRS);

@@ -36,8 +36,7 @@ pub fn each_message(
     for table in ["topics", "messages"] {
         if !has_table(&database, table).map_err(damaged)? {
             return Err(malformed(
-                format!("is a database without the table '{table}': it is not a ROS 2 bag")
-                    .into(),
+                format!("is a database without the table '{table}': it is not a ROS 2 bag").into(),
             ));
         }
     }
