@@ -1,19 +1,19 @@
-//! The laboratory of [seese3](https://docs.rs/seese3): what researchers run, and the service never
-//! needs.
+//! The laboratory of [seese3](https://docs.rs/seese3): experiments for researchers, not used by the
+//! service.
 //!
-//! The modules are listed from the lowest layer up: each uses only those listed before it, and a test
-//! enforces it.
+//! The modules are listed from the lowest layer up. Each uses only those listed before it; a test
+//! enforces this.
 //!
 //! | module | what |
 //! | --- | --- |
 //! | [`formulations`] | the paper's alternatives A to D to the adapter |
-//! | [`probes`] | M1 to M3: how much of SE(3) features hold; M4 is the training of an adapter |
-//! | [`theory`] | the paper's theorems as numeric checks |
-//! | [`experiments`] | what is computed over rooms, and its result types |
-//! | [`report`] | tables, JSON, pictures and documents of those results |
+//! | [`probes`] | probes M1 to M3 of the SE(3) information in features; M4 trains an adapter |
+//! | [`theory`] | numeric checks of the paper's theorems |
+//! | [`experiments`] | experiments over rooms, with their result types |
+//! | [`report`] | tables, JSON, pictures and documents of the results |
 //! | [`reproduction`] | the paper's tables and figures on given rooms, as one report |
 //!
-//! Nothing here reads or writes files; the program does.
+//! This crate reads and writes no files; the program does.
 
 pub mod formulations;
 pub mod probes;

@@ -1,25 +1,24 @@
-//! Which boxes a ray may meet: lists made once for a bundle of rays, so that a ray tests a few boxes
-//! instead of all.
+//! Candidate boxes for ray intersection: lists built once per bundle of rays, so that each ray
+//! tests only a few boxes.
 
 use nalgebra::{Point3, Vector3};
 
 use super::Solid;
 
-/// The boxes' bounding spheres as a point sees them.
+/// Bounding spheres of the boxes, as seen from one point.
 pub(super) struct Spheres {
     seen: Vec<Sphere>,
 }
 
 struct Sphere {
-    /// Towards the centre, of length 1.
+    /// Unit vector toward the center.
     direction: Vector3<f64>,
-    /// Sine and cosine of the angle between the direction and the sphere's edge; none if the point
-    /// lies inside the sphere.
+    /// Sine and cosine of the sphere's angular radius; `None` if the point is inside the sphere.
     edge: Option<(f64, f64)>,
 }
 
 impl Spheres {
-    /// The bounding spheres as `apex` sees them, each `margin`, metres, larger than its box needs.
+    /// The bounding spheres as seen from `apex`, each enlarged by `margin`, metres.
     pub fn around(apex: Point3<f64>, solids: &[Solid], margin: f64) -> Self {
         let seen = solids
             .iter()
@@ -38,9 +37,9 @@ impl Spheres {
         Self { seen }
     }
 
-    /// The numbers of the boxes that a ray in the narrowest cone about `axis` that holds all
-    /// `directions` may meet, in ascending order. All directions have length 1; the cone must be
-    /// narrower than half of all directions.
+    /// Indices of the boxes that rays in a cone may hit, in ascending order. The cone is the
+    /// narrowest about `axis` that contains all `directions`. All vectors have length 1; the cone's
+    /// half-angle must be below 90°.
     pub fn met(&self, axis: Vector3<f64>, directions: &[Vector3<f64>]) -> Vec<u16> {
         let cosine = directions
             .iter()
@@ -55,8 +54,8 @@ impl Spheres {
                     return true;
                 };
 
-                // The cosine of the sum of both angles: what is farther from the axis than that is
-                // outside. A sum over 180° does not occur, as each is below 90°.
+                // Cosine of the sum of both angles; a sphere farther from the axis is outside. The
+                // sum is below 180°, because each angle is below 90°.
                 let limit = cosine * edge_cosine - sine * edge_sine;
                 axis.dot(&sphere.direction) >= limit - 1e-9
             })
@@ -65,18 +64,19 @@ impl Spheres {
     }
 }
 
-/// Cells along each side of a face of the lamp's cube.
+/// Number of cells along each side of a face of the lamp's cube.
 const CELLS: usize = 24;
 
-/// Boxes between the lamp and the room, by direction from the lamp: a cube around the lamp, each
-/// face of which is divided into square cells.
+/// Index of boxes by direction from the lamp: a cube around the lamp, with each face divided into
+/// square cells.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Shade {
     cells: Vec<Vec<u16>>,
 }
 
 impl Shade {
-    /// The boxes around a lamp at `lamp`. Shadow rays may pass the lamp at `margin`, metres.
+    /// Builds the index for a lamp at `lamp`. Shadow rays may miss the lamp by up to `margin`,
+    /// metres.
     pub fn new(lamp: Point3<f64>, solids: &[Solid], margin: f64) -> Self {
         let spheres = Spheres::around(lamp, solids, margin);
         let cells = (0..6 * CELLS * CELLS)
@@ -103,7 +103,7 @@ impl Shade {
         Self { cells }
     }
 
-    /// The boxes that may be met in a direction from the lamp; its length does not matter.
+    /// The boxes that a ray from the lamp may hit; `direction` can have any length.
     pub fn towards(&self, direction: Vector3<f64>) -> &[u16] {
         let axis = direction.iamax();
         let face = 2 * axis + usize::from(direction[axis] < 0.0);
@@ -120,7 +120,7 @@ impl Shade {
     }
 }
 
-/// The direction to a point of a face of the cube, of length 1; both coordinates are −1 to 1.
+/// Unit vector to a point on a face of the cube; both coordinates are −1 to 1.
 fn direction(face: usize, x: f64, y: f64) -> Vector3<f64> {
     let axis = face / 2;
     let mut direction = Vector3::zeros();
@@ -138,8 +138,8 @@ mod tests {
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    /// Oracle: every box asked one by one. The lists leave out no box that a ray meets, and they
-    /// leave out most of those that it does not meet.
+    /// Oracle: testing every box. The lists contain every box that a ray hits, and exclude most of
+    /// the others.
     #[test]
     fn no_box_that_is_met_is_left_out() {
         let scene = Scene::new(8);

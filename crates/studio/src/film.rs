@@ -1,4 +1,4 @@
-//! Recordings of drawn rooms: the poses of a camera, and the image at each.
+//! Recordings of synthetic rooms: camera poses, and an image at each pose.
 
 use nalgebra::Isometry3;
 
@@ -9,21 +9,21 @@ use super::{FRAMES_PER_SECOND, Light, Scene, render};
 use seese3_core::geometry::{Pinhole, PinholeError, PixelCamera, Pose};
 use seese3_core::image::RgbImage;
 
-/// The field of view of a camera where it does not vary: the middle of the others.
+/// Field of view of a camera without variation: the middle of the range of 55° to 80°.
 pub(super) const FIELD_OF_VIEW_RAD: f64 = 67.5 * std::f64::consts::PI / 180.0;
 
-/// What makes drawn photographs as different from one another as real ones are.
+/// Variations that make synthetic photographs differ like real ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Variation {
-    /// Day, dusk or night, and lamps of different colours, another for each visit.
+    /// Day, dusk or night, and the color of the lamp, per visit.
     Light,
-    /// An exposure and a white balance for each visit.
+    /// Exposure and white balance, per visit.
     Exposure,
-    /// Motion blur, noise, and corners that are darker than the middle.
+    /// Motion blur, noise and vignetting.
     Lens,
-    /// A field of view for each room.
+    /// Field of view, per room.
     FieldOfView,
-    /// Things that were moved between visits, and passers-by.
+    /// Objects moved between visits, and people walking by.
     Clutter,
     /// Fine detail of all surfaces.
     Detail,
@@ -53,47 +53,47 @@ impl Variation {
     }
 }
 
-/// A recording of one room, of one visit or of several, one after the other.
+/// A recording of one room, with one or more visits in sequence.
 #[derive(Debug, Clone)]
 pub struct Film {
-    /// How the room is filmed: a part of it, all of it, a corridor.
+    /// Type of the tour, for instance a part of a room, a whole room or a corridor.
     pub kind: &'static str,
-    /// Angle of view of the camera across the width, radians; its pixels are square.
+    /// Horizontal field of view of the camera, radians; its pixels are square.
     pub field_of_view_rad: f64,
     /// `world_from_camera`, metres, at 30 frames per second.
     pub poses: Vec<Pose>,
-    /// The room as it is in each visit.
+    /// The room during each visit.
     pub(super) scenes: Vec<Scene>,
-    /// How each visit is filmed, or empty for plain images.
+    /// Camera settings of each visit; empty for plain images.
     pub(super) visits: Vec<Visit>,
 }
 
-/// How a visit is filmed.
+/// Camera settings of a visit.
 #[derive(Debug, Clone)]
 pub(super) struct Visit {
     /// The first frame of the visit.
     pub begin: usize,
-    /// Share of the time between two frames in which the shutter is open.
+    /// Exposure time, as a fraction of the frame period.
     pub shutter: f64,
-    /// What every shot of the visit has in common.
+    /// Settings shared by all shots of the visit.
     pub shot: Shot,
-    /// Somebody who walks by.
+    /// A person who walks by.
     pub passer_by: Option<PasserBy>,
 }
 
-/// Somebody who walks along a line while some frames of a visit are taken.
+/// A person who walks along a line during some frames of a visit.
 #[derive(Debug, Clone)]
 pub(super) struct PasserBy {
-    /// The body where the line begins.
+    /// The body at the start of the line.
     pub body: Vec<Solid>,
-    /// Metres per frame.
+    /// Displacement per frame, metres.
     pub step: nalgebra::Vector3<f64>,
-    /// The frames that see the person.
+    /// The frames during which the person is in the room.
     pub frames: std::ops::Range<usize>,
 }
 
 impl Film {
-    /// The number of the visit that each frame belongs to, or nothing if there is one visit.
+    /// The visit number of each frame; empty for a plain walk.
     pub fn sequences(&self) -> Vec<u32> {
         if self.visits.is_empty() {
             return Vec::new();
@@ -104,8 +104,8 @@ impl Film {
             .collect()
     }
 
-    /// When each frame was taken, nanoseconds, or nothing for a plain walk. An hour passes between
-    /// two visits.
+    /// The timestamp of each frame, nanoseconds; empty for a plain walk. Visits are
+    /// an hour apart.
     pub fn timestamps_ns(&self) -> Vec<i64> {
         if self.visits.is_empty() {
             return Vec::new();
@@ -120,8 +120,8 @@ impl Film {
             .collect()
     }
 
-    /// The same recording, in which one thing no longer varies. The poses stay as they are. A plain
-    /// walk has no variations.
+    /// The same recording without one variation. The poses do not change. A plain walk has no
+    /// variations and is returned unchanged.
     pub fn without(mut self, variation: Variation) -> Self {
         if self.visits.is_empty() {
             return self;
@@ -166,10 +166,10 @@ impl Film {
         self
     }
 
-    /// The camera that takes images of this size.
+    /// The camera for images of this size.
     ///
     /// # Errors
-    /// [`PinholeError`] for an image that is far higher than it is wide.
+    /// [`PinholeError`] for an image that is much taller than wide.
     pub fn camera(&self, width: usize, height: usize) -> Result<Pinhole, PinholeError> {
         let width = width as f64;
 
@@ -199,7 +199,7 @@ impl Film {
             .as_ref()
             .map_or_else(Vec::new, |person| person.at(frame));
 
-        // A photograph is softer and noisier than a plain image, and needs fewer rays.
+        // A photograph is softer and noisier than a plain image, so fewer rays are enough.
         let camera = Camera {
             sampling: Sampling::Quincunx,
             ..camera
@@ -222,8 +222,8 @@ impl Film {
             .saturating_sub(1)
     }
 
-    /// The camera's motion while the shutter is open, by its motion from the frame before; none for
-    /// the first frame of a visit.
+    /// Camera motion while the shutter is open, interpolated from the motion since the previous
+    /// frame; identity for the first frame of a visit.
     fn motion_of(&self, frame: usize, visit: &Visit) -> Isometry3<f64> {
         let Some(before) = frame.checked_sub(1).filter(|&before| before >= visit.begin) else {
             return Isometry3::identity();
@@ -256,11 +256,11 @@ mod tests {
     use super::*;
     use crate::Suite;
 
-    /// Oracle: the definition of each variation: without it the image is another one and the poses
-    /// are the same, and leaving it out twice changes nothing more.
+    /// Oracle: the definition of a variation. Removing it changes the images but not the poses, and
+    /// removing it twice has no further effect.
     #[test]
     fn a_variation_that_is_left_out_changes_the_images_alone() {
-        // A room that has a passer-by in its second visit.
+        // A room with a passer-by in its second visit.
         let whole = (0..40)
             .map(|number| Suite::Visits.film(5, number, 60))
             .find(|film| film.visits[1].passer_by.is_some())

@@ -1,7 +1,7 @@
-//! The furniture of a room: pieces along the walls, and a table with chairs in the middle.
+//! Furniture: pieces along the walls, and a table with chairs in the middle of the room.
 //!
-//! A piece is built in its own coordinates: x along its width, centred; y out of the wall into the
-//! room; z up; metres.
+//! A piece has its own coordinates, metres: x along its width, centered; y from the wall into the
+//! room; z up.
 
 use nalgebra::{Point3, Vector3};
 use rand::RngExt;
@@ -18,8 +18,8 @@ pub(super) fn furnish(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Vec<Solid>
     let mut solids = Vec::new();
     let quarter = std::f64::consts::FRAC_PI_2;
 
-    // Two pieces stand at each wall, turned so that their backs are 2 cm from it. Walls are
-    // numbered counterclockwise, seen from above, from the wall y = 0.
+    // Two pieces at each wall, with their backs 2 cm from it. Walls are numbered counterclockwise,
+    // seen from above, from the wall y = 0.
     for wall in 0..4u8 {
         let length = if wall % 2 == 0 { size.x } else { size.y };
         let turn = f64::from(wall) * quarter;
@@ -70,8 +70,7 @@ pub(super) fn furnish_loosely(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Ve
                 + random.random_range(-0.12..0.12);
             let blocks = wall_piece(random);
 
-            // The piece is drawn before it is left out: the order of the draws decides what a
-            // seed looks like.
+            // Sample the piece before skipping it, so that the random sequence does not change.
             if random.random_bool(0.2) {
                 continue;
             }
@@ -171,8 +170,8 @@ fn bookshelf(random: &mut ChaCha8Rng) -> Vec<Block> {
     let high = random.random_range(1.3..2.1);
     let wood = timber(random);
 
-    // The books, the two sides and the top; then shelves 0.33 m apart, as the rows of spines in
-    // the books' texture are.
+    // Books, two sides and the top; then shelves 0.33 m apart, aligned with the rows of the book
+    // texture.
     let mut blocks = vec![
         ([-half, 0.0, 0.0], [half, 0.24, high], Material::Books),
         ([-half - 0.03, 0.0, 0.0], [-half, 0.32, high], wood),
@@ -235,7 +234,7 @@ fn desk(random: &mut ChaCha8Rng) -> Vec<Block> {
     let wood = timber(random);
     let screen = random.random_range(-0.25..0.25);
 
-    // Top, one side, cupboard, screen, its stand, and an object beside it.
+    // Top, one side, cupboard, screen, screen stand and an object.
     vec![
         ([-0.7, 0.0, 0.7], [0.7, 0.65, 0.74], wood),
         ([-0.68, 0.03, 0.0], [-0.62, 0.6, 0.7], wood),
@@ -306,7 +305,7 @@ fn plant(random: &mut ChaCha8Rng) -> Vec<Block> {
     let pot = Material::Plain(hue(random, 0.5, 0.5));
     let mut blocks = vec![([-0.17, 0.12, 0.0], [0.17, 0.46, 0.36], pot)];
 
-    // Cubes of leaves at random around the stem, which is added last.
+    // Random cubes of leaves around the stem; the stem is added last.
     for _ in 0..7 {
         let x = random.random_range(-0.25..0.25);
         let y = random.random_range(0.15..0.5);
@@ -375,7 +374,7 @@ fn chair(random: &mut ChaCha8Rng) -> Vec<Block> {
     ]
 }
 
-/// Small things on the furniture's level tops, and larger ones on the floor along the walls of a
+/// Small objects on horizontal furniture tops, and larger ones on the floor along the walls of a
 /// room of `size`, metres.
 pub(super) fn things(
     furniture: &[Solid],
@@ -384,8 +383,8 @@ pub(super) fn things(
 ) -> Vec<Solid> {
     let mut things = Vec::new();
 
-    // What stands on a top as high as a table ends below the camera; what stands higher is on a
-    // shelf at the wall.
+    // Objects on tops of table height stay below the camera; higher tops belong to shelves at the
+    // wall.
     for top in furniture
         .iter()
         .filter(|solid| solid.half.xy().min() > 0.14)
@@ -435,7 +434,7 @@ pub(super) fn things(
     things
 }
 
-/// A box of a material and a turn that are drawn.
+/// A box with random material and rotation.
 fn thing(centre: Point3<f64>, half: Vector3<f64>, random: &mut ChaCha8Rng) -> Solid {
     let (sin, cos) = random.random_range(-1.5f64..1.5).sin_cos();
     let strength = random.random_range(0.2..0.8);
@@ -458,7 +457,7 @@ fn thing(centre: Point3<f64>, half: Vector3<f64>, random: &mut ChaCha8Rng) -> So
     }
 }
 
-/// The boxes of a piece that stands at `at` on the floor, metres, turned about the vertical axis by
+/// The boxes of a piece at position `at` on the floor, metres, rotated about the vertical axis by
 /// `turn`, radians.
 fn placed<'a>(
     blocks: &'a [Block],
@@ -474,7 +473,7 @@ fn placed<'a>(
         let middle = (low + high) / 2.0;
         let half = (high - low) / 2.0;
 
-        // From the piece's coordinates into those of the room.
+        // Transform from piece to room coordinates.
         let centre = Point3::new(
             at[0] + cos * middle.x - sin * middle.y,
             at[1] + sin * middle.x + cos * middle.y,

@@ -1,9 +1,9 @@
-//! Paths of a person who looks around a room with a camera in the hand.
+//! Paths of a hand-held camera in a room.
 //!
-//! The person has a few standpoints and a few things to look at, and goes from one to the next: in
-//! one stroke each, as an arm moves, with a rest in between. Position, view and roll change
-//! independently. So the camera comes back to earlier poses in all six dimensions, each time a
-//! little off, and never by the same way.
+//! The camera moves between a few standpoints and a few viewing directions. Each move is one
+//! minimum-jerk stroke, like an arm's, followed by a rest. Position, view and roll change
+//! independently. The camera therefore revisits earlier poses in all six dimensions, each time
+//! with a small offset and on a different path.
 
 use nalgebra::{SVector, Vector3};
 use rand::RngExt;
@@ -14,25 +14,28 @@ use super::camera_path::{looking, posed};
 use seese3_core::geometry::Pose;
 use seese3_core::statistics::normal_deviates;
 
-/// Where a person stands and looks, and how fast.
+/// Distribution of standpoints and views, and speeds.
 #[derive(Debug, Clone)]
 pub(super) struct Habit {
-    /// The middle of the standpoints, and how far they reach to each side, metres.
+    /// Center of the standpoints, metres.
     pub middle: Vector3<f64>,
+    /// Maximum offset of a standpoint from the center along each axis, metres.
     pub reach: Vector3<f64>,
-    /// The middle of the views and how far they reach to each side, as yaw and pitch, radians.
+    /// Center of the views, as yaw and pitch, radians.
     pub view: [f64; 2],
+    /// Maximum offset of a view from the center, as yaw and pitch, radians.
     pub view_reach: [f64; 2],
     /// Standard deviation of the roll, radians.
     pub roll: f64,
-    /// Mean speed of a stroke, metres per second and radians per second.
+    /// Mean translation speed of a stroke, metres per second.
     pub speed: f64,
+    /// Mean rotation speed of a stroke, radians per second.
     pub turning: f64,
     /// The longest rest between two strokes, seconds.
     pub rest: f64,
 }
 
-/// The standpoints and views of a person in a room, to which every visit returns.
+/// The standpoints and views in a room, shared by all visits.
 #[derive(Debug, Clone)]
 pub(super) struct Goals {
     habit: Habit,
@@ -40,7 +43,7 @@ pub(super) struct Goals {
     views: Vec<SVector<f64, 2>>,
 }
 
-/// How far a return misses a standpoint, metres, and a view, radians: standard deviations.
+/// Standard deviations of the offset when a standpoint, metres, or a view, radians, is revisited.
 const MISS: [f64; 2] = [0.06, 0.06];
 
 impl Goals {
@@ -95,7 +98,7 @@ impl Goals {
             habit.roll * deviation::<1>(random)
         });
 
-        // The hand's tremor: position in metres, then yaw, pitch and roll in radians.
+        // Tremor of the hand: position in metres, then yaw, pitch and roll in radians.
         let tremor: [Tremor; 6] =
             std::array::from_fn(|axis| Tremor::new(if axis < 3 { 0.005 } else { 0.006 }, random));
 
@@ -111,8 +114,8 @@ impl Goals {
     }
 }
 
-/// The nearer of two goals drawn at random, missed by a deviation of `miss`: people look next at
-/// what is beside rather than at what is behind.
+/// The nearer of two random goals, plus noise of standard deviation `miss`. Nearby goals are more
+/// likely, as for a person.
 fn near_one<const N: usize>(
     goals: &[SVector<f64, N>],
     now: Option<SVector<f64, N>>,
@@ -135,11 +138,12 @@ fn deviation<const N: usize>(random: &mut ChaCha8Rng) -> SVector<f64, N> {
     SVector::from_iterator(normal_deviates(random, N))
 }
 
-/// `frame_count` values that go from goal to goal in strokes of the mean speed `speed`, per second,
-/// and rest up to `rest` seconds at each.
+/// `frame_count` values that move from goal to goal in strokes of mean speed `speed`, per second,
+/// with a rest of up to `rest` seconds at each goal.
 ///
-/// A stroke has minimum jerk: 10 τ³ − 15 τ⁴ + 6 τ⁵ of the way after the share τ of its time (Flash
-/// and Hogan 1985). It takes at least half a second.
+/// A stroke has minimum jerk: after the fraction τ of its time, it has covered 10 τ³ − 15 τ⁴ + 6 τ⁵
+/// of its length (Flash and Hogan 1985). The nominal duration is at least 0.5 s, varied by −20 % to
+/// +25 %.
 fn strokes<const N: usize>(
     frame_count: usize,
     speed: f64,
@@ -169,9 +173,9 @@ fn strokes<const N: usize>(
     values
 }
 
-/// The tremor of a hand along one axis: three oscillations of about 0.7, 2 and 6 Hz.
+/// Hand tremor along one axis: three oscillations of about 0.7, 2 and 6 Hz.
 struct Tremor {
-    /// Amplitude, radians per frame, and phase of each.
+    /// Amplitude, angular frequency (radians per frame) and phase of each oscillation.
     waves: [[f64; 3]; 3],
 }
 
@@ -200,8 +204,8 @@ mod tests {
     use super::*;
     use rand::SeedableRng;
 
-    /// Oracle: the definition of a stroke. It begins and ends at rest at its goals, and never goes
-    /// beyond them; at most it is 1.875 times as fast as on average.
+    /// Oracle: the definition of a stroke. It begins and ends at rest at its goals and does not
+    /// overshoot. Its peak speed is 1.875 times its mean speed.
     #[test]
     fn a_stroke_goes_from_goal_to_goal_and_rests_there() {
         let mut random = ChaCha8Rng::seed_from_u64(3);
@@ -218,7 +222,7 @@ mod tests {
             .iter()
             .fold(0.0, |most: f64, step| most.max(step.abs()));
 
-        // The stroke of 1 at 0.5 per second takes 2 s, or down to 0.8 times that.
+        // A stroke of length 1 at speed 0.5 takes 2 s nominally, at least 0.8 times that.
         assert!(fastest < 1.01 * 1.875 * 0.5 / 0.8 / FRAMES_PER_SECOND);
         assert!(values.iter().all(|value| (0.0..=1.0).contains(&value[0])));
         assert!(steps[0].abs() < 1e-3 && values.iter().any(|value| value[0] > 0.999));

@@ -1,9 +1,9 @@
-//! The studio: procedural rooms, rendered by ray casting, which give images with exact poses
+//! The studio: procedural rooms, rendered by ray casting. They provide images with exact poses
 //! without a data set.
 //!
-//! - World axes: x and y along the floor, z up, metres. The floor is z = 0, and the room begins at
-//!   (0, 0).
-//! - Everything follows from a seed. Images are those of a pinhole camera with square pixels.
+//! - World axes: x and y along the floor, z up, metres. The floor is z = 0, and one corner of the
+//!   room is at (0, 0).
+//! - Everything is deterministic for a seed. The camera is a pinhole with square pixels.
 
 mod camera_path;
 mod candidates;
@@ -34,7 +34,7 @@ use candidates::Shade;
 use solid::Solid;
 use texture::Colour;
 
-/// Frames per second of a recording.
+/// Frame rate of a recording, frames per second.
 const FRAMES_PER_SECOND: f64 = 30.0;
 
 /// A furnished room.
@@ -46,26 +46,26 @@ pub struct Scene {
     solids: Vec<Solid>,
     lamp: Point3<f64>,
     light: Light,
-    /// Which boxes may be between the lamp and a point.
+    /// Index of the boxes that may lie between the lamp and a point.
     shade: Shade,
     /// Strength of the fine detail of all surfaces, 0 to 1.
     detail: f64,
 }
 
-/// How a room is lit.
+/// Lighting of a room.
 #[derive(Debug, Clone, Copy)]
 struct Light {
     /// Brightness of the lamp on a surface that faces it at about one metre.
     lamp: f64,
-    /// Factors of the lamp's light in red, green and blue.
+    /// Tint of the lamp: factors of red, green and blue.
     lamp_tint: [f64; 3],
-    /// Ambient light, which comes from all directions.
+    /// Ambient light, from all directions.
     sky: f64,
-    /// The middle of a window and the light that comes through it, or none at night.
+    /// Center of the window and brightness of its light; `None` without daylight or window.
     window: Option<(Point3<f64>, f64)>,
-    /// Factor of the light that the lamp's own panel shines with.
+    /// Brightness factor of the lamp's panel on the ceiling.
     panel: f64,
-    /// Factor of the light of the view out of a window.
+    /// Brightness factor of the view through a window.
     daylight: f64,
 }
 
@@ -136,8 +136,8 @@ struct Rug {
 }
 
 impl Scene {
-    /// The room of a seed, 4.4 to 6.4 m by 3.8 to 5.2 m, with furniture along its walls and a table
-    /// in the middle.
+    /// The room of a seed, 4.4 to 6.4 m by 3.8 to 5.2 m. It has furniture along its walls and a
+    /// table in the middle.
     pub fn new(seed: u64) -> Self {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let size = Vector3::new(
@@ -158,7 +158,7 @@ impl Scene {
         Self::lit_by(size, shell, solids, lamp, Light::PLAIN)
     }
 
-    /// A room of `size`, metres, whose lamp hangs at `lamp`.
+    /// A room of `size`, metres, with its lamp at `lamp`.
     fn lit_by(
         size: Vector3<f64>,
         shell: Shell,
@@ -180,7 +180,7 @@ impl Scene {
         scene
     }
 
-    /// Notes which boxes are around the lamp. It must be called whenever a box has moved.
+    /// Rebuilds the index of boxes around the lamp. Must be called after any box has moved.
     fn shade_lamp(&mut self) {
         self.shade = Shade::new(self.lamp, &self.solids, light::LIFT_M);
     }
@@ -193,7 +193,7 @@ impl Scene {
 
 impl Shell {
     fn new(size: Vector3<f64>, random: &mut ChaCha8Rng) -> Self {
-        // One of the four walls has an accent colour.
+        // One of the four walls has an accent color.
         let base = Colour::of_hue(random.random_range(0.0..1.0), 0.22, 0.78);
         let accent = Colour::of_hue(random.random_range(0.0..1.0), 0.45, 0.6);
         let accent_wall = random.random_range(0..4);
@@ -213,7 +213,7 @@ impl Shell {
             Floor::Tiles(tile)
         };
 
-        // The window is never in the wall of the door.
+        // The window is never in the door's wall.
         let door_wall = random.random_range(0..4);
         let window_wall = (door_wall + random.random_range(1..4)) % 4;
 
@@ -257,7 +257,7 @@ impl Shell {
 }
 
 impl Shell {
-    /// Takes colour out of the walls; a `share` of 0 leaves grey.
+    /// Desaturates the walls: a `share` of 0 gives gray, 1 changes nothing.
     fn fade(&mut self, share: f64) {
         for colour in &mut self.wall_colours {
             let grey = colour.0.iter().sum::<f64>() / 3.0;
@@ -265,7 +265,7 @@ impl Shell {
         }
     }
 
-    /// Pins notes and prints to the walls, three or fewer per metre.
+    /// Adds notes and prints to the walls, at most three per metre.
     fn pin_up(&mut self, size: Vector3<f64>, random: &mut ChaCha8Rng) {
         for (wall, panels) in self.panels.iter_mut().enumerate() {
             let length = if wall.is_multiple_of(2) {
@@ -293,7 +293,7 @@ impl Shell {
     }
 }
 
-/// The panels of one wall: the door or the window, if there is one, and pictures beside it.
+/// The panels of one wall: the optional door or window, and pictures.
 fn wall_panels(length: f64, feature: Option<PanelKind>, random: &mut ChaCha8Rng) -> Vec<Panel> {
     let mut panels = Vec::new();
     let mut taken = None;
@@ -315,12 +315,12 @@ fn wall_panels(length: f64, feature: Option<PanelKind>, random: &mut ChaCha8Rng)
             seed: random.random(),
         });
 
-        // Pictures keep 15 cm away from the door or window.
+        // Keep pictures 15 cm away from the door or window.
         taken = Some((from - 0.15, to + 0.15));
     }
 
-    // Each third of the wall gets a picture, unless it would overlap the door or window or reach
-    // into a corner of the room.
+    // Each third of the wall gets a picture, unless it would overlap the door or window or come
+    // within 10 cm of a corner.
     for slot in 0..3 {
         let middle = length * (f64::from(slot) + 0.5) / 3.0 + random.random_range(-0.2..0.2);
         let width = random.random_range(0.4..0.9);

@@ -1,5 +1,5 @@
-//! What a ray sees: the nearest surface, lit by a lamp that casts shadows, by a window, and by
-//! ambient light.
+//! Shading: the nearest surface along a ray, lit by a lamp with shadows, a window and ambient
+//! light.
 
 use nalgebra::{Point3, Vector3};
 
@@ -7,30 +7,29 @@ use super::Scene;
 use super::solid::{Place, Ray, Solid, Surface};
 use super::texture::{Colour, detail};
 
-/// The height over a surface at which its shadow ray begins, so that it does not shadow itself,
-/// metres.
+/// Offset of a shadow ray's origin from its surface, metres, which prevents self-shadowing.
 pub(super) const LIFT_M: f64 = 1e-3;
 
-/// What a ray sees.
+/// The light and distance at the end of a ray.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LitPoint {
     pub light: [f64; 3],
-    /// From the ray's origin, metres.
+    /// Distance from the ray's origin, metres.
     pub distance: f64,
 }
 
 impl Scene {
-    /// What a ray sees of the room and of `candidates`, the boxes that it may meet.
+    /// Traces a ray through the room and `candidates`, the boxes that it may hit.
     ///
-    /// `spread` is the size of a pixel at distance 1: finer detail is not drawn.
+    /// `spread` is the size of a pixel at distance 1; finer detail is not rendered.
     pub(super) fn seen<'a>(
         &'a self,
         ray: &Ray,
         candidates: impl Iterator<Item = &'a Solid>,
         spread: f64,
     ) -> LitPoint {
-        // A ray always ends at the shell. That distance limits the search for nearer furniture,
-        // and every hit limits it further.
+        // Every ray ends at the shell. This distance limits the search for nearer boxes, and every
+        // hit tightens the limit.
         let (mut limit, axis) = self.shell_reach(ray);
         let mut nearest = None;
         for solid in candidates {
@@ -60,8 +59,8 @@ impl Scene {
     }
 
     fn lit(&self, surface: &Surface, ray: &Ray) -> [f64; 3] {
-        // Diffuse (Lambertian) light: the cosine of the angle to the lamp, and a falloff with
-        // distance that is softened near the lamp.
+        // Lambertian light: the cosine of the angle to the lamp, with a distance falloff softened
+        // near the lamp.
         let at = ray.origin + ray.direction * surface.distance;
         let normal = surface.normal;
         let light = &self.light;
@@ -79,7 +78,7 @@ impl Scene {
             light.lamp * facing / (0.7 + 0.35 * distance * distance)
         };
 
-        // A window is large, so that its shadows are soft: they are left out.
+        // A window is large and its shadows are soft, so they are omitted.
         let window = light.window.map_or(0.0, |(from, brightness)| {
             let to_window = from - at;
             let distance = to_window.norm();
@@ -88,8 +87,8 @@ impl Scene {
             brightness * (0.15 + facing) / (1.0 + 0.3 * distance * distance)
         });
 
-        // Ambient light is stronger on surfaces that face up, and weaker within some 20 cm of
-        // floor, walls and ceiling, as an approximation of ambient occlusion.
+        // Ambient light is stronger on surfaces that face up. Within about 20 cm of floor, walls
+        // and ceiling it is weaker, an approximation of ambient occlusion.
         let sky = light.sky + 0.12 * normal.z;
 
         let edge = [
@@ -106,8 +105,8 @@ impl Scene {
             .map(|d| 1.0 - 0.35 * (-d.max(0.0) / 0.22).exp())
             .product();
 
-        // A surface of the shell lies on one of these planes itself, which has darkened it by 0.65:
-        // that factor is taken back. The limit of 1 is for furniture, which lies on none of them.
+        // A shell surface lies on one of these planes, which darkens it by 0.65: undo that factor.
+        // The limit of 1 is for furniture, which lies on none of the planes.
         let ambient = sky * (corner / 0.65).min(1.0);
 
         std::array::from_fn(|c| {
@@ -124,8 +123,8 @@ impl Scene {
         })
     }
 
-    /// Distance from inside the room to the first plane (floor, ceiling or wall) through which the
-    /// ray leaves, and the axis of that plane.
+    /// Distance from the ray's origin, inside the room, to the plane (floor, ceiling or wall) where
+    /// it leaves the room, and the axis of that plane.
     pub(super) fn shell_reach(&self, ray: &Ray) -> (f64, usize) {
         let mut distance = f64::INFINITY;
         let mut axis = 0;
@@ -138,8 +137,8 @@ impl Scene {
             };
             let reach = (edge - ray.origin[candidate]) / speed;
 
-            // A ray parallel to a plane has an infinite or undefined reach, which is never the
-            // smallest positive one.
+            // A ray parallel to a plane has an infinite or NaN reach, which is never the smallest
+            // positive reach.
             if reach > 0.0 && reach < distance {
                 distance = reach;
                 axis = candidate;
@@ -154,8 +153,8 @@ impl Scene {
         let mut normal = Vector3::zeros();
         normal[axis] = -ray.direction[axis].signum();
 
-        // Axis and direction name the plane. Along each wall the coordinate runs
-        // counterclockwise, seen from above, as the walls are numbered.
+        // Axis and direction identify the plane. The coordinate along each wall runs
+        // counterclockwise, seen from above, like the wall numbers.
         let on_wall = |wall: u32, along: f64| {
             let (colour, glow) = self.wall_colour(wall as usize, along, at.z);
             (colour, glow, along, at.z, wall)

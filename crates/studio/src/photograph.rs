@@ -1,5 +1,4 @@
-//! What a camera makes of the light: motion blur, exposure, white balance, a lens that darkens
-//! towards the corners, and a sensor that is noisy.
+//! Camera model: motion blur, exposure, white balance, vignetting and sensor noise.
 
 use nalgebra::{Isometry3, Matrix4, Vector4};
 
@@ -7,32 +6,30 @@ use super::render::{Camera, Radiance};
 use super::texture::hash2;
 use seese3_core::image::RgbImage;
 
-/// How one photograph is taken.
+/// Camera settings of one photograph.
 #[derive(Debug, Clone)]
 pub(super) struct Shot {
-    /// The camera's motion while the shutter is open: the pose at its end in the frame of its
-    /// beginning, metres.
+    /// Camera motion while the shutter is open: the end pose in the start pose's frame, metres.
     pub motion: Isometry3<f64>,
-    /// Factor of the exposure beside the one that the camera's meter sets.
+    /// Exposure factor, in addition to the automatic exposure.
     pub exposure: f64,
-    /// Factors of red, green and blue.
+    /// White balance: factors of red, green and blue.
     pub white: [f64; 3],
-    /// Darkening of the image's corners, as a share.
+    /// Vignetting: relative darkening at the image corners.
     pub vignette: f64,
-    /// Standard deviation of the noise of light in a white pixel, and that of the electronics; 1 is
-    /// white.
+    /// Standard deviations of photon noise in a white pixel and of electronic noise; 1 is white.
     pub noise: [f64; 2],
     pub seed: u32,
 }
 
-/// The mean light that the meter aims at, linear, and the share of the way (in the logarithm) that
-/// it goes there.
+/// Automatic exposure: target mean light, linear, and the fraction of the logarithmic difference
+/// that is corrected.
 const METER: (f64, f64) = (0.2, 0.75);
 
-/// Samples along the path of a pixel while the shutter is open.
+/// Number of samples of motion blur per pixel.
 const BLUR: usize = 6;
 
-/// The photograph of `radiance`, which `camera` sees in the middle of the exposure.
+/// The photograph of `radiance`, the light at `camera` in the middle of the exposure.
 pub(super) fn photograph(radiance: &Radiance, camera: Camera, shot: &Shot) -> RgbImage {
     let Radiance { width, height, .. } = *radiance;
     let gain = shot.exposure * metered(radiance);
@@ -45,7 +42,7 @@ pub(super) fn photograph(radiance: &Radiance, camera: Camera, shot: &Shot) -> Rg
         for column in 0..width {
             let light = blur.light(column, row);
 
-            // The lens darkens with the square of the distance from the image's middle.
+            // Vignetting grows with the squared distance from the image center.
             let right = column as f64 - width as f64 / 2.0;
             let down = row as f64 - height as f64 / 2.0;
             let lens = 1.0 - shot.vignette * (right * right + down * down) / corner;
@@ -53,8 +50,8 @@ pub(super) fn photograph(radiance: &Radiance, camera: Camera, shot: &Shot) -> Rg
             for (channel, &light) in light.iter().enumerate() {
                 let exposed = (gain * lens * shot.white[channel] * light).min(1.5);
 
-                // The variance of light counted in photons grows with the light, beside that of
-                // the electronics.
+                // The variance of photon noise is proportional to the light; that of electronic
+                // noise is constant.
                 let [white, black] = shot.noise;
                 let deviation = (white * white * exposed + black * black).sqrt();
                 let place = (row * width + column) * 3 + channel;
@@ -71,7 +68,7 @@ pub(super) fn photograph(radiance: &Radiance, camera: Camera, shot: &Shot) -> Rg
     }
 }
 
-/// The gain that the camera's meter sets: part of what would bring the mean to its aim.
+/// The gain of the automatic exposure. It corrects only part of the difference to the target.
 fn metered(radiance: &Radiance) -> f64 {
     let sum: f64 = radiance
         .light
@@ -84,12 +81,12 @@ fn metered(radiance: &Radiance) -> f64 {
     (aim / mean.max(1e-3)).powf(share)
 }
 
-/// The smear of an image while the shutter is open.
+/// Motion blur of an image.
 struct Blur<'a> {
     radiance: &'a Radiance,
     /// The size of a pixel at distance 1.
     scale: f64,
-    /// From the camera at the beginning to the camera at the end.
+    /// Transform from the camera frame at the start of the exposure to that at its end.
     end_from_begin: Matrix4<f64>,
 }
 
@@ -102,14 +99,14 @@ impl<'a> Blur<'a> {
         }
     }
 
-    /// The mean light along the way of a pixel's surface.
+    /// The mean light along the image motion of a pixel.
     fn light(&self, column: usize, row: usize) -> [f64; 3] {
         let Radiance { width, height, .. } = *self.radiance;
         let still = self.radiance.light[row * width + column];
         let [right, down] = self.way(column, row);
 
-        // Less than 0.7 pixels is no smear; more than a fifth of the image is of a surface that is
-        // nearer than a camera's lens can be.
+        // Skip motions below 0.7 pixels. Skip those above a fifth of the image width too: they
+        // belong to surfaces nearer than a real lens allows.
         let squared_length = right * right + down * down;
         let limit = (width as f64 / 5.0).powi(2);
         if !(0.5..limit).contains(&squared_length) {
@@ -130,11 +127,11 @@ impl<'a> Blur<'a> {
         sum.map(|channel| channel / BLUR as f64)
     }
 
-    /// How far a pixel's surface moves in the image, pixels to the right and down.
+    /// Image motion of a pixel's surface during the exposure, pixels to the right and down.
     fn way(&self, column: usize, row: usize) -> [f64; 2] {
         let Radiance { width, height, .. } = *self.radiance;
 
-        // Where the surface is in the camera's frame, and where the camera sees it at the end.
+        // The surface point in the camera frame, then in the camera frame at the end.
         let x = (column as f64 + 0.5 - width as f64 / 2.0) * self.scale;
         let y = (row as f64 + 0.5 - height as f64 / 2.0) * self.scale;
         let distance = f64::from(self.radiance.distance[row * width + column]);
@@ -148,16 +145,17 @@ impl<'a> Blur<'a> {
     }
 }
 
-/// Noise of mean 0 and deviation 1 for a place in the image: the sum of four uniform numbers.
+/// Noise of mean 0 and standard deviation 1 for an index in the image: the sum of four uniform
+/// numbers.
 fn grain(place: usize, seed: u32) -> f64 {
     let bits = (hash2(place as i64, 0, seed) * f64::from(u32::MAX)) as u32;
     let sum: u32 = bits.to_le_bytes().into_iter().map(u32::from).sum();
 
-    // A byte has the variance (256² − 1) / 12.
+    // A uniform byte has variance (256² − 1) / 12.
     (f64::from(sum) - 510.0) / (4.0 * 65_535.0 / 12.0_f64).sqrt()
 }
 
-/// The curve from linear light to the bytes of an image, the power 1 / 2.2, as a table.
+/// Lookup table from linear light to image bytes: the power 1 / 2.2.
 struct Tone {
     bytes: Vec<u8>,
 }
@@ -185,7 +183,7 @@ impl Tone {
 mod tests {
     use super::*;
 
-    /// A camera of 40 × 30 pixels whose focal length is 20 pixels.
+    /// A camera of 40 × 30 pixels with a focal length of 20 pixels.
     fn camera() -> Camera {
         Camera {
             field_of_view_rad: std::f64::consts::FRAC_PI_2,
@@ -204,7 +202,7 @@ mod tests {
         }
     }
 
-    /// A white column of pixels on black, everywhere `distance` metres away.
+    /// A white column of pixels on black; all pixels are `distance` metres away.
     fn stripe(distance: f32) -> Radiance {
         let light = (0..40 * 30)
             .map(|at| if at % 40 == 20 { [1.0; 3] } else { [0.0; 3] })
@@ -218,9 +216,9 @@ mod tests {
         }
     }
 
-    /// Oracle: the pinhole camera by hand. A step of 0.3 m to the right at 1 m and a focal length of
-    /// 20 pixels moves the image by 6 pixels, so that a line is smeared over about 6; at 4 m over
-    /// a quarter of that, which touches up to 3.
+    /// Oracle: the pinhole camera by hand. With a focal length of 20 pixels, a step of 0.3 m moves
+    /// an image point at 1 m by 6 pixels, so a line blurs over about 6 columns. At 4 m it is a
+    /// quarter of that, which covers up to 3 columns.
     #[test]
     fn what_is_near_blurs_more() {
         let motion = Isometry3::translation(0.3, 0.0, 0.0);
@@ -236,8 +234,8 @@ mod tests {
         assert!((1..=3).contains(&smeared(4.0)), "{}", smeared(4.0));
     }
 
-    /// Oracle: the meter's definition. A scene twice as bright comes out brighter, but by less than
-    /// half as much as without a meter.
+    /// Oracle: the definition of the automatic exposure. It corrects 75 % of the change, so twice
+    /// the light gives 2^0.25 times the linear brightness.
     #[test]
     fn the_meter_takes_back_most_of_a_change_of_light() {
         let grey = |light: f64| Radiance {

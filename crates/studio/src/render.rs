@@ -1,4 +1,4 @@
-//! Ray casting: what a camera in a scene sees, pixel by pixel.
+//! Ray casting: renders the image of a camera in a scene.
 
 use nalgebra::{Point3, Vector3};
 
@@ -9,40 +9,41 @@ use super::solid::{Ray, Solid};
 use seese3_core::geometry::Pose;
 use seese3_core::image::RgbImage;
 
-/// Rays along each side of a pixel: 2 × 2 in all.
+/// Rays along each side of a pixel: 2 × 2 in total.
 const SUPERSAMPLING: usize = 2;
 
-/// The largest difference of light between a pixel's corners that needs no rays inside the pixel.
+/// Maximum difference of light between a pixel's corners without additional rays inside the pixel.
 const CALM: f64 = 0.04;
 
-/// Which rays make a pixel.
+/// Sampling pattern of a pixel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sampling {
     /// Four rays inside every pixel.
     Full,
-    /// Four rays at the corners, shared with the neighbouring pixels; where these differ, four rays
-    /// inside the pixel instead.
+    /// Four rays at the corners, shared with neighboring pixels. If these differ, four rays inside
+    /// the pixel replace them.
     Adaptive,
-    /// Four rays at the corners, shared with the neighbouring pixels; where these differ, one more
-    /// in the middle, which counts as much as the four: softer, at half of the rays.
+    /// Four rays at the corners, shared with neighboring pixels. If these differ, a ray in the
+    /// middle is added with half of the total weight. Images are softer and need about half the
+    /// rays.
     Quincunx,
 }
 
 /// A pinhole camera with square pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
-    /// Pixels.
+    /// Image width, pixels.
     pub width: usize,
-    /// Pixels.
+    /// Image height, pixels.
     pub height: usize,
-    /// Angle of view across the width, radians.
+    /// Horizontal field of view, radians.
     pub field_of_view_rad: f64,
-    /// Which rays make a pixel.
+    /// Sampling pattern of a pixel.
     pub sampling: Sampling,
 }
 
 impl Camera {
-    /// A camera of 64×48 pixels that sees 75° across.
+    /// A camera of 64 × 48 pixels with a horizontal field of view of 75°.
     pub fn small() -> Self {
         Self {
             width: 64,
@@ -52,7 +53,7 @@ impl Camera {
         }
     }
 
-    /// A camera of this size that sees 75° across, with adaptive sampling.
+    /// A camera of this size with a horizontal field of view of 75° and adaptive sampling.
     pub fn sized(width: usize, height: usize) -> Self {
         Self {
             width,
@@ -81,18 +82,18 @@ impl Camera {
     }
 }
 
-/// The light of an image before a camera develops it, and how far away each pixel's surface is.
+/// Linear light and surface distance of every pixel, before the camera model is applied.
 #[derive(Debug, Clone)]
 pub(super) struct Radiance {
     pub width: usize,
     pub height: usize,
-    /// Linear light in red, green and blue, row by row; 1 is the white of a plain image.
+    /// Linear light in red, green and blue, row by row; 1 is white in a plain image.
     pub light: Vec<[f64; 3]>,
-    /// From the camera's centre, metres, row by row.
+    /// Distance from the camera's center, metres, row by row.
     pub distance: Vec<f32>,
 }
 
-/// The image that `camera` takes at `world_from_camera`, which must lie inside the room.
+/// Renders the image of `camera` at `world_from_camera`, which must be inside the room.
 pub fn render(scene: &Scene, camera: Camera, world_from_camera: &Pose) -> RgbImage {
     let radiance = radiance(scene, &[], camera, world_from_camera, 1.0);
 
@@ -108,8 +109,10 @@ pub fn render(scene: &Scene, camera: Camera, world_from_camera: &Pose) -> RgbIma
 }
 
 /// The light that reaches `camera` at `world_from_camera` from a room and from `others`, boxes that
-/// cast no shadow. Rays that a pixel shares with its neighbours count no brighter than `ceiling`:
-/// 1 for an image that clips light there, infinity for a camera that sets its exposure afterwards.
+/// cast no shadow.
+///
+/// Rays shared between pixels are clipped at brightness `ceiling`: 1 for an image that clips light
+/// there, infinity for a camera that sets its exposure afterward.
 pub(super) fn radiance(
     scene: &Scene,
     others: &[Solid],
@@ -131,7 +134,7 @@ pub(super) fn radiance(
     let mut light = Vec::with_capacity(width * height);
     let mut distance = Vec::with_capacity(width * height);
 
-    // Rays through corners are shared: of every row only the lower corners are new.
+    // Corner rays are shared: each row adds only its lower corners.
     let mut above = view.corners(0);
     for row in 0..height {
         let below = view.corners(row + 1);
@@ -164,7 +167,7 @@ pub(super) fn radiance(
     }
 }
 
-/// A scene as one camera sees it.
+/// A scene and the camera that it is rendered for.
 struct View<'a> {
     scene: &'a Scene,
     others: &'a [Solid],
@@ -172,13 +175,13 @@ struct View<'a> {
     /// [`Camera::pixel`].
     scale: f64,
     world_from_camera: &'a Pose,
-    /// The brightest that a shared ray counts.
+    /// Maximum brightness of a shared ray.
     ceiling: f64,
     tiles: Tiles,
 }
 
 impl View<'_> {
-    /// What is seen through a point of the image, in pixels from the top left corner.
+    /// Traces the ray through a point of the image, in pixels from the top left corner.
     fn seen(&self, column: f64, row: f64) -> LitPoint {
         let ray = self
             .camera
@@ -193,7 +196,7 @@ impl View<'_> {
         self.scene.seen(&ray, candidates, self.scale)
     }
 
-    /// What the corners over a row of pixels see; nothing if pixels share no rays.
+    /// Traces the rays through the upper corners of a row; empty if pixels share no rays.
     fn corners(&self, row: usize) -> Vec<LitPoint> {
         if self.camera.sampling == Sampling::Full {
             return Vec::new();
@@ -204,7 +207,7 @@ impl View<'_> {
             .collect()
     }
 
-    /// A pixel by the four corners around it, and by rays inside it where these differ.
+    /// A pixel from its four corners, with rays inside it if the corners differ.
     fn shared(&self, around: &[LitPoint; 4], column: usize, row: usize) -> LitPoint {
         let around = &around.map(|corner| LitPoint {
             light: corner.light.map(|channel| channel.min(self.ceiling)),
@@ -226,7 +229,7 @@ impl View<'_> {
         }
     }
 
-    /// A pixel by a regular grid of rays inside it.
+    /// A pixel from a regular grid of rays inside it.
     fn inner(&self, column: usize, row: usize) -> LitPoint {
         let mut light = [0.0; 3];
         let mut distance = f64::INFINITY;
@@ -245,7 +248,7 @@ impl View<'_> {
     }
 }
 
-/// The boxes that the rays of each part of an image may meet.
+/// Candidate boxes for the rays of each tile of an image.
 struct Tiles {
     across: usize,
     down: usize,
@@ -291,7 +294,7 @@ impl Tiles {
         }
     }
 
-    /// The boxes for the ray through a point of the image, pixels from the top left corner.
+    /// Candidate boxes for the ray through a point of the image, pixels from the top left corner.
     fn at(&self, column: f64, row: f64) -> &[u16] {
         // The image's right and lower edges belong to its last tiles.
         let across = (column as usize / Self::SIDE).min(self.across - 1);
@@ -301,7 +304,7 @@ impl Tiles {
     }
 }
 
-/// Whether the light of a pixel's corners differs by no more than [`CALM`].
+/// Whether the light at a pixel's corners differs by at most [`CALM`].
 fn calm(corners: &[LitPoint; 4]) -> bool {
     (0..3).all(|c| {
         let of = corners.map(|corner| corner.light[c]);
@@ -332,8 +335,8 @@ fn to_srgb(light: f64) -> u8 {
 mod tests {
     use super::*;
 
-    /// Oracle: geometry by hand. A camera in the middle that looks along x meets the wall at half
-    /// the room's width.
+    /// Oracle: geometry by hand. From the center, a ray along x hits the wall at half the room's
+    /// width.
     #[test]
     fn the_far_wall_is_half_a_room_away() {
         let mut scene = Scene::new(3);
@@ -350,7 +353,7 @@ mod tests {
         assert_eq!(surface.normal, -Vector3::x());
     }
 
-    /// Oracle: the definition of deterministic, and that another seed is another room.
+    /// Oracle: one seed always gives the same image, and two seeds give different images.
     #[test]
     fn a_seed_gives_one_image_and_another_seed_another() {
         let camera = Camera {
@@ -373,8 +376,8 @@ mod tests {
         assert_ne!(image(5), image(6));
     }
 
-    /// Oracle: four rays in every pixel. Where corners agree nothing is missed but what is smaller
-    /// than a pixel, so the two pictures differ by little on the whole.
+    /// Oracle: full sampling. If the corners agree, only detail smaller than a pixel is missed, so
+    /// the mean difference of the two images is small.
     #[test]
     fn adaptive_sampling_sees_what_full_sampling_sees() {
         let scene = Scene::new(4);

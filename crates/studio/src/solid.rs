@@ -1,16 +1,16 @@
-//! Boxes, and where rays meet them.
+//! Boxes and their ray intersections.
 
 use nalgebra::{Point3, Vector3};
 
 use super::texture::{Colour, Material};
 
-/// A box, turned about the vertical axis.
+/// A box, rotated about the vertical axis.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Solid {
     pub centre: Point3<f64>,
     /// Half of the length of each side, metres.
     pub half: Vector3<f64>,
-    /// Cosine and sine of the turn.
+    /// Cosine and sine of the rotation.
     pub cos: f64,
     pub sin: f64,
     pub material: Material,
@@ -23,13 +23,13 @@ pub(super) struct Ray {
     pub direction: Vector3<f64>,
 }
 
-/// What a ray ends at.
+/// The surface point at the end of a ray.
 pub(super) struct Surface {
-    /// From the ray's origin, metres.
+    /// Distance from the ray's origin, metres.
     pub distance: f64,
     pub normal: Vector3<f64>,
     pub colour: Colour,
-    /// Emitted light, as a factor of the colour: windows, and the lamp's panel on the ceiling.
+    /// Emitted light, as a factor of the color; nonzero for windows and the lamp's panel.
     pub glow: f64,
     /// Coordinates on the surface, metres, and the seed of its texture.
     pub place: Place,
@@ -43,7 +43,7 @@ pub(super) struct Place {
 }
 
 impl Solid {
-    /// A vector of the room in the box's own axes: the inverse of its turn.
+    /// Rotates a vector from room axes to the box's axes.
     pub fn turned_back(&self, v: Vector3<f64>) -> Vector3<f64> {
         Vector3::new(
             self.cos * v.x + self.sin * v.y,
@@ -52,7 +52,7 @@ impl Solid {
         )
     }
 
-    /// Where a ray enters the box, if within `limit`, metres.
+    /// The point where a ray enters the box, if within `limit`, metres.
     pub fn touch(&self, ray: &Ray, limit: f64) -> Option<Touch<'_>> {
         let origin = self.turned_back(ray.origin - self.centre);
         let direction = self.turned_back(ray.direction);
@@ -61,8 +61,8 @@ impl Solid {
 
         let mut axis = 0;
 
-        // The slab method: the ray is inside the box from the last of the three front planes that
-        // it passes to the first of the three back planes.
+        // Slab method: the ray is inside the box between the last of the three front planes and the
+        // first of the three back planes.
         for candidate in 0..3 {
             let inverse = direction[candidate].recip();
             let a = (-self.half[candidate] - origin[candidate]) * inverse;
@@ -75,7 +75,7 @@ impl Solid {
             leave = leave.min(a.max(b));
         }
 
-        // A ray that begins inside the box or on its surface does not count as entering it.
+        // A ray that starts inside the box or on its surface does not hit it.
         if !(enter > 1e-6 && enter < leave && enter < limit) {
             return None;
         }
@@ -90,10 +90,10 @@ impl Solid {
     }
 }
 
-/// Where a ray enters a box; origin and direction are in the box's own coordinates.
+/// The point where a ray enters a box; origin and direction are in box coordinates.
 pub(super) struct Touch<'a> {
     solid: &'a Solid,
-    /// From the ray's origin, metres.
+    /// Distance from the ray's origin, metres.
     pub distance: f64,
     axis: usize,
     origin: Vector3<f64>,
@@ -101,7 +101,7 @@ pub(super) struct Touch<'a> {
 }
 
 impl Touch<'_> {
-    /// The surface there.
+    /// The surface at this point.
     pub fn surface(&self) -> Surface {
         let &Touch {
             solid,
@@ -122,11 +122,11 @@ impl Touch<'_> {
             _ => (at.x, at.y),
         };
 
-        // Heights are counted from the bottom of the box, so that rows of books and boards line up.
+        // Heights start at the bottom of the box, so that rows of books and boards align.
         let v = if axis == 2 { v } else { v + solid.half.z };
         let colour = solid.material.colour(u, v, front, solid.seed);
 
-        // Back into world coordinates, by the box's rotation about the vertical axis.
+        // Rotate the normal back to world coordinates.
         let normal = Vector3::new(
             solid.cos * normal.x - solid.sin * normal.y,
             solid.sin * normal.x + solid.cos * normal.y,

@@ -1,14 +1,14 @@
-//! The suites of rooms that can be drawn.
+//! The suites of synthetic rooms.
 
 use super::film::Film;
 use super::render::Camera;
 use super::{SuiteRoom, visits};
 
-/// A suite of rooms: how they look, and how the camera moves in them.
+/// A suite of rooms, with a style of images and of camera motion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Suite {
-    /// Rooms that a person films twice with a camera in the hand, in other light: photographs with
-    /// blur, noise and an exposure of their own, objects that were moved, passers-by.
+    /// Rooms filmed twice with a hand-held camera in different light. Photographs have blur, noise
+    /// and varying exposure; objects move between visits, and people walk by.
     Visits,
     /// Plain images of one calm walk each, which hardly covers what its last fifth sees: the hard
     /// class.
@@ -27,8 +27,7 @@ impl Suite {
         }
     }
 
-    /// The recording of room `number` of the suite of `seed`. Adding rooms changes none of the
-    /// others.
+    /// The recording of room `number` of the suite with `seed`. Rooms do not depend on each other.
     pub fn film(self, seed: u64, number: u32, frame_count: usize) -> Film {
         match self {
             Self::Visits => visits::film(seed, number, frame_count),

@@ -1,4 +1,4 @@
-//! Colours of floor, ceiling and walls, by position in metres.
+//! Colors of floor, ceiling and walls, by position in metres.
 
 use super::texture::{Colour, fractal, hash2, noise, note, picture, wood};
 use super::{Floor, Panel, PanelKind, Scene, Wallpaper};
@@ -24,8 +24,7 @@ impl Scene {
         }
 
         match shell.floor {
-            // Planks are 14 cm wide and 1.1 m long; every row is shifted, so that the joints do
-            // not line up.
+            // Planks are 14 cm wide and 1.1 m long; rows are shifted, so that joints do not align.
             Floor::Planks(colour) => {
                 let plank = (y / 0.14).floor();
                 let along = x + 0.9 * hash2(plank as i64, 1, shell.seed);
@@ -42,7 +41,7 @@ impl Scene {
                 colour.scaled(weave * (0.85 + 0.3 * fractal(x * 1.5, y * 1.5, shell.seed ^ 3)))
             }
 
-            // Tiles of 40 cm, each with its own tone, between grey joints.
+            // Tiles of 40 cm with individual tones, and gray joints.
             Floor::Tiles(colour) => {
                 let i = (x / 0.4).floor();
                 let j = (y / 0.4).floor();
@@ -60,7 +59,7 @@ impl Scene {
     }
 
     pub(super) fn ceiling_colour(&self, x: f64, y: f64) -> (Colour, f64) {
-        // The lamp hangs below a bright panel of 60 by 60 cm, which emits light of its own.
+        // Above the lamp is a panel of 60 by 60 cm that emits light.
         let lamp = inside(
             [x, y],
             [self.lamp.x - 0.3, self.lamp.y - 0.3],
@@ -76,7 +75,7 @@ impl Scene {
     pub(super) fn wall_colour(&self, wall: usize, along: f64, up: f64) -> (Colour, f64) {
         let shell = &self.shell;
 
-        // From front to back: doors, windows and pictures, then a skirting board of 10 cm, then
+        // From front to back: panels (door, window, pictures, notes), a skirting board of 10 cm,
         // the wall.
         let on = |panel: &&Panel| inside([along, up], panel.low, panel.high);
         if let Some(panel) = shell.panels[wall].iter().find(on) {
@@ -100,7 +99,7 @@ impl Scene {
 }
 
 impl Wallpaper {
-    /// The wall's colour with this pattern on it.
+    /// The wall's color with this pattern.
     fn over(self, colour: Colour, along: f64, up: f64, seed: u32) -> Colour {
         match self {
             Self::None => colour,
@@ -113,7 +112,7 @@ impl Wallpaper {
                 Colour::WHITE.scaled(if groove { 0.45 } else { 0.7 })
             }
 
-            // Bricks of 22 by 8 cm; every second course is shifted by half a brick.
+            // Bricks of 22 by 8 cm; every second row is shifted by half a brick.
             Self::Bricks => {
                 let course = (up / 0.08).floor();
                 let place = along / 0.22 + 0.5 * (course.rem_euclid(2.0));
@@ -156,8 +155,8 @@ fn panel_colour(panel: &Panel, along: f64, up: f64) -> (Colour, f64) {
                 return (Colour::WHITE, 0.2);
             }
 
-            // The view out of the window: hills up to a wavy line, above them a sky that pales
-            // downwards.
+            // The view through the window: hills below a wavy line, and a sky that is paler toward
+            // the horizon.
             let height = v / (panel.high[1] - panel.low[1]);
             let hills = 0.35 + 0.2 * fractal(u * 2.0, 0.0, panel.seed);
             if height < hills {
@@ -175,8 +174,7 @@ fn panel_colour(panel: &Panel, along: f64, up: f64) -> (Colour, f64) {
         }
         PanelKind::Door if framed => (Colour::WHITE.scaled(0.75), 0.0),
         PanelKind::Door => {
-            // A door is 0.9 m wide, with a handle near one edge and two darker fields, one above
-            // the other.
+            // A door is 0.9 m wide, with a handle near one edge and two darker fields.
             let handle = (u - 0.75).abs() < 0.05 && (v - 1.0).abs() < 0.03;
             let fill =
                 (0.2..0.7).contains(&u) && ((0.25..0.9).contains(&v) || (1.1..1.8).contains(&v));

@@ -1,13 +1,13 @@
-//! Procedural textures: colours from noise, by position on a surface in metres.
+//! Procedural textures: colors from noise, by position on a surface in metres.
 
-/// A colour in linear light: red, green and blue, 0 to 1.
+/// A color in linear light: red, green and blue, 0 to 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Colour(pub [f64; 3]);
 
 impl Colour {
     pub const WHITE: Self = Self([0.85, 0.85, 0.83]);
 
-    /// The colour of a hue, a saturation and a value (HSV), 0 to 1 each; the hue wraps around.
+    /// The color with a hue, a saturation and a value (HSV), 0 to 1 each; the hue wraps around.
     pub fn of_hue(hue: f64, saturation: f64, value: f64) -> Self {
         let channel = |shift: f64| {
             let distance = ((hue * 6.0 + shift).rem_euclid(6.0) - 3.0).abs() - 1.0;
@@ -37,12 +37,12 @@ pub(super) enum Material {
     Doors(Colour),
     Screen,
     Leaves(Colour),
-    /// Cardboard with print on it.
+    /// Printed cardboard: paper color and ink color.
     Printed(Colour, Colour),
 }
 
 impl Material {
-    /// Colour at (u, v), metres, on a face; `front` marks the face that looks into the room.
+    /// Color at (u, v), metres, on a face. `front` is true for the face toward the room.
     pub fn colour(self, u: f64, v: f64, front: bool, seed: u32) -> Colour {
         match self {
             Self::Plain(colour) => colour.scaled(0.94 + 0.06 * noise(u * 8.0, v * 8.0, seed)),
@@ -58,7 +58,8 @@ impl Material {
             Self::Books if front => books(u, v, seed),
             Self::Books => wood(Colour([0.3, 0.2, 0.12]), u, v, seed),
             Self::Doors(colour) => {
-                // Doors are 50 cm wide, with dark seams between them and a handle near one edge.
+                // Doors are 50 cm wide, with dark seams between them and a handle near one edge;
+                // seams and handles only on the front.
                 let gap = (u / 0.5).rem_euclid(1.0);
                 let seam = front && !(0.015..=0.985).contains(&gap);
                 let handle = front && (0.86..0.9).contains(&gap) && (v.abs() < 0.12);
@@ -94,12 +95,12 @@ pub(super) fn wood(colour: Colour, u: f64, v: f64, seed: u32) -> Colour {
     colour.scaled(0.7 + 0.5 * ring)
 }
 
-/// Rows of book spines between boards that are 0.33 m apart.
+/// Rows of book spines between boards 0.33 m apart.
 fn books(u: f64, v: f64, seed: u32) -> Colour {
     let row = (v / 0.33).floor() as i64;
     let height = (v / 0.33).rem_euclid(1.0);
 
-    // Spines are 4.5 cm wide; each has its own height, and above it the shelf is dark.
+    // Spines are 4.5 cm wide and vary in height; the shelf above them is dark.
     let cell = (u / 0.045 + 0.4 * hash2(row, 1, seed)).floor() as i64;
     let tall = 0.62 + 0.3 * hash2(cell, row, seed);
 
@@ -121,7 +122,7 @@ fn books(u: f64, v: f64, seed: u32) -> Colour {
     }
 }
 
-/// A sheet on a wall: half of them small paintings, half of them printed paper.
+/// A sheet on a wall: a small painting or printed paper, with equal probability.
 pub(super) fn note(u: f64, v: f64, seed: u32) -> Colour {
     if unit(seed, 5) < 0.5 {
         return picture(2.0 * u, 2.0 * v, seed);
@@ -132,7 +133,7 @@ pub(super) fn note(u: f64, v: f64, seed: u32) -> Colour {
     printed(paper, ink, u, v, seed)
 }
 
-/// Blocks of print, 4 by 2.5 cm: plain, lines of text, or a field of ink.
+/// Blocks of print, 4 by 2.5 cm: blank, lines of text, or solid ink.
 fn printed(paper: Colour, ink: Colour, u: f64, v: f64, seed: u32) -> Colour {
     let column = (u / 0.04).floor() as i64;
     let row = (v / 0.025).floor() as i64;
@@ -146,10 +147,11 @@ fn printed(paper: Colour, ink: Colour, u: f64, v: f64, seed: u32) -> Colour {
     }
 }
 
-/// The fine detail of a surface, as a factor of its colour: grain, wear and dirt in three octaves from
-/// 11 cm down to `finest`, metres, which is the size of a pixel there. `strength` is 0 to 1.
+/// Fine detail of a surface (grain, wear, dirt), as a factor of its color. It has three octaves,
+/// from 11 cm down to 8 mm. Octaves too fine for `finest`, the size of a pixel there in metres,
+/// fade out. `strength` is 0 to 1.
 pub(super) fn detail(u: f64, v: f64, finest: f64, strength: f64, seed: u32) -> f64 {
-    // Some surfaces are smooth, and others are rough.
+    // Roughness varies between surfaces.
     let rough = strength * (0.3 + 0.7 * unit(seed, 23));
     let mut sum = 0.0;
 
@@ -157,7 +159,7 @@ pub(super) fn detail(u: f64, v: f64, finest: f64, strength: f64, seed: u32) -> f
         .into_iter()
         .enumerate()
     {
-        // An octave fades out where its cells are as small as two pixels: it would only flicker.
+        // Fade out an octave as its cells shrink to 1.5 pixels, to avoid aliasing.
         let shown = (2.0 - 3.0 * per_metre * finest).clamp(0.0, 1.0);
         if shown <= 0.0 {
             break;
@@ -170,7 +172,7 @@ pub(super) fn detail(u: f64, v: f64, finest: f64, strength: f64, seed: u32) -> f
     (1.0 + rough * sum).max(0.05)
 }
 
-/// A painting that follows from its seed: soft shapes in three colours.
+/// A random painting: soft shapes in three colors.
 pub(super) fn picture(u: f64, v: f64, seed: u32) -> Colour {
     let a = fractal(u * 5.0, v * 5.0, seed);
     let b = fractal(u * 3.0 + 9.0, v * 6.0, seed ^ 0xa5);
@@ -200,8 +202,8 @@ pub(super) fn noise(x: f64, y: f64, seed: u32) -> f64 {
     let i = floor(x);
     let j = floor(y);
 
-    // The smoothstep polynomial has slope zero at 0 and 1, so that the noise has no creases at
-    // the edges of its cells.
+    // The smoothstep polynomial has zero slope at 0 and 1, so the noise is smooth across cell
+    // borders.
     let smooth = |t: f64| t * t * (3.0 - 2.0 * t);
     let s = smooth(x - i as f64);
     let t = smooth(y - j as f64);
@@ -214,7 +216,7 @@ pub(super) fn noise(x: f64, y: f64, seed: u32) -> f64 {
     low * (1.0 - t) + high * t
 }
 
-/// The largest integer up to `x`. A cast cuts towards zero, which the processor does faster than
+/// The largest integer not above `x`. The cast truncates toward zero and is faster than
 /// [`f64::floor`].
 fn floor(x: f64) -> i64 {
     let cut = x as i64;
@@ -223,8 +225,8 @@ fn floor(x: f64) -> i64 {
 
 /// A pseudo-random number, 0 to 1, for a cell (i, j).
 pub(super) fn hash2(i: i64, j: i64, seed: u32) -> f64 {
-    // An integer hash: multiplications and shifts mix the bits, so that neighbouring cells get
-    // unrelated numbers.
+    // Integer hash: multiplications and shifts mix the bits, so that neighboring cells get
+    // uncorrelated numbers.
     let mut h = (i as u32).wrapping_mul(0x9e37_79b1)
         ^ (j as u32).wrapping_mul(0x85eb_ca77)
         ^ seed.wrapping_mul(0xc2b2_ae3d);

@@ -1,4 +1,5 @@
-//! The suite of visits: rooms full of things, which a person films twice in different light.
+//! The suite of visits: cluttered rooms, each filmed twice with a hand-held camera in different
+//! light.
 
 use nalgebra::{Isometry3, Point3, Vector3};
 use rand::{RngExt, SeedableRng};
@@ -13,28 +14,28 @@ use super::texture::{Colour, Material};
 use super::{Light, PanelKind, Scene, Shell, Walk, furniture};
 use seese3_core::statistics::normal_deviates;
 
-/// Visits of one room.
+/// Number of visits to one room.
 const VISITS: usize = 2;
 
-/// The distance that standpoints keep from the walls of a room: furniture as high as a camera is
-/// less deep.
+/// Minimum distance of standpoints from the walls, metres. Furniture as high as the camera is less
+/// deep.
 const CLEARANCE_M: f64 = 0.85;
 
-/// How a person films a room.
+/// Types of tours through a room.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Tour {
     /// A part of a room, from nearby standpoints.
     Part,
     /// All of a room.
     Room,
-    /// A corridor, to and fro.
+    /// A corridor, back and forth.
     Corridor,
 }
 
-/// The recording of room `number` of the suite of `seed`. Of twenty rooms, on average nine are
-/// filmed in part, seven in whole, and four are corridors.
+/// The recording of room `number` of the suite with `seed`. On average, of twenty rooms nine are
+/// partial tours, seven are whole rooms and four are corridors.
 pub(super) fn film(seed: u64, number: u32, frame_count: usize) -> Film {
-    // The streams are others than those of the suite of walks.
+    // Use other random streams than the suite of walks.
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream((1 << 32) + u64::from(number));
 
@@ -105,10 +106,10 @@ fn furnished(walk: Walk, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Scene {
     scene
 }
 
-/// Where the person of a room stands and looks.
+/// Random standpoints, views and speeds for a tour.
 ///
-/// The kitchen of 7-Scenes, whose camera films a part of a room, moves by 0.14 m and 7° in 20
-/// frames. Rooms that are filmed in whole are turned about in faster.
+/// Reference for partial tours: the camera in the kitchen of 7-Scenes moves by 0.14 m and 7° in 20
+/// frames. Tours of whole rooms rotate faster.
 fn habit(tour: Tour, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Habit {
     let free = (size / 2.0 - Vector3::repeat(CLEARANCE_M)).map(|reach| reach.max(0.15));
     let mut up_to = |low: f64, high: f64, free: f64| random.random_range(low..high).min(free);
@@ -120,8 +121,8 @@ fn habit(tour: Tour, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Habit {
     };
     reach.z = random.random_range(0.08..0.22);
 
-    // The camera stays above tables and what is on them, and the standpoints inside the free part
-    // of the room.
+    // Keep the camera above tables and the objects on them, and the standpoints in the free part of
+    // the room.
     let mut middle = size / 2.0;
     for axis in 0..2 {
         let spare = (free[axis] - reach[axis]).max(0.0);
@@ -165,8 +166,8 @@ fn habit(tour: Tour, size: Vector3<f64>, random: &mut ChaCha8Rng) -> Habit {
     }
 }
 
-/// The room as one visit finds it: in other light, and after the first with a quarter of the small
-/// things moved by up to 20 cm each way, wherever that is.
+/// The room as it is during one visit, with random light. If `moved`, about a quarter of the small
+/// objects are shifted by up to 20 cm along each axis, without collision checks.
 fn changed(scene: &Scene, moved: bool, random: &mut ChaCha8Rng) -> Scene {
     let mut scene = scene.clone();
     let small = |solid: &&mut Solid| moved && solid.half.max() < 0.16;
@@ -199,7 +200,7 @@ fn changed(scene: &Scene, moved: bool, random: &mut ChaCha8Rng) -> Scene {
     scene
 }
 
-/// The middle of the room's first window.
+/// Center of the room's first window.
 fn window(scene: &Scene) -> Option<Point3<f64>> {
     let size = scene.size;
 
@@ -219,7 +220,7 @@ fn window(scene: &Scene) -> Option<Point3<f64>> {
     })
 }
 
-/// How the visit of `frames` frames from `begin` on is filmed.
+/// Random camera settings of a visit of `frames` frames from `begin`.
 fn visited(scene: &Scene, begin: usize, frames: usize, random: &mut ChaCha8Rng) -> Visit {
     let mut factor = |deviation: f64| {
         let exponent: f64 = normal_deviates(random, 1).sum();
@@ -231,7 +232,7 @@ fn visited(scene: &Scene, begin: usize, frames: usize, random: &mut ChaCha8Rng) 
     Visit {
         begin,
 
-        // From 1/300 s to 1/40 s.
+        // Exposure times from 1/300 s to 1/40 s.
         shutter: random.random_range(0.1..0.75),
         shot: Shot {
             motion: Isometry3::identity(),
@@ -250,7 +251,7 @@ fn visited(scene: &Scene, begin: usize, frames: usize, random: &mut ChaCha8Rng) 
     }
 }
 
-/// Somebody who walks along one of the long walls during the visit, through what stands there.
+/// A person who walks along one of the long walls during the visit, without collision checks.
 fn passer_by(scene: &Scene, begin: usize, frames: usize, random: &mut ChaCha8Rng) -> PasserBy {
     let size = scene.size;
     let step_m = random.random_range(0.02..0.04);
@@ -296,8 +297,7 @@ fn passer_by(scene: &Scene, begin: usize, frames: usize, random: &mut ChaCha8Rng
 mod tests {
     use super::*;
 
-    /// Oracle: geometry. A camera needs 20 cm to the walls and must not stand inside a box, or
-    /// nearer than 5 cm to one.
+    /// Oracle: geometry. A camera keeps 20 cm from the walls and 5 cm from every box.
     #[test]
     fn the_camera_keeps_clear_of_walls_and_furniture() {
         for number in 0..60 {
@@ -322,10 +322,10 @@ mod tests {
         }
     }
 
-    /// Oracle: the recordings that the suite imitates. The kitchen of 7-Scenes moves by 0.139 m and
-    /// 6.6° in 20 frames, and its fifths are 0.12 to 0.30 m and 9 to 17° from the rest of it. The
-    /// median room lies around that, turning at most three times as fast, and none moves faster than
-    /// a hand.
+    /// Oracle: the recordings that the suite imitates. The camera in the kitchen of 7-Scenes moves
+    /// by 0.139 m and 6.6° in 20 frames. Its fifths are 0.12 to 0.30 m and 9 to 17° from the rest.
+    /// The median room must be close to that, with at most three times the rotation. No camera
+    /// may move faster than a hand.
     #[test]
     fn visits_move_as_people_do() {
         let mut moved = Vec::new();
@@ -347,7 +347,7 @@ mod tests {
                 (0..480).map(|frame| apart(frame, frame + 20).1).collect(),
             ));
 
-            // From the last fifth to the nearest pose of the rest, where 1° counts as 1 cm.
+            // Distance from the last fifth to the nearest pose of the rest; 1° counts as 1 cm.
             let nearest = |frame: usize| {
                 (0..800)
                     .map(|other| apart(frame, other))

@@ -1,4 +1,4 @@
-//! A sweep over adapters: one row per run, which says what decided the run and what it reached.
+//! A sweep over adapters: one row per run, with its settings and its scores.
 
 use std::time::Instant;
 
@@ -9,14 +9,13 @@ use seese3_core::adapter::{PairPlan, TrainConfig};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 
-/// Bytes of the hash of a room's content that enter its runs' keys.
+/// Number of bytes of the room content hash used in a run's key.
 const CONTENT_BYTES: usize = 16;
 
-/// The settings and scores of one run. R² values are null where R² is undefined or where the run
-/// failed.
+/// The settings and scores of one run. R² values are null if R² is undefined or the run failed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SweepRow {
-    /// Identifies the run: it names everything that decides the run's numbers.
+    /// Unique key of the run: room, revision, content hash and all settings.
     pub key: String,
     /// The room.
     pub room: String,
@@ -28,33 +27,33 @@ pub struct SweepRow {
     pub frames: usize,
     /// The name of the features.
     pub features: String,
-    /// The preset that the settings began from.
+    /// The preset that the settings are based on.
     pub preset: String,
-    /// How training and test frames are kept apart.
+    /// The train/test split.
     pub split: String,
     /// Frames from source to target in the test pairs.
     pub stride: u32,
-    /// Columns of a chart's latent.
+    /// Width of a chart's latent.
     pub geo_dim: usize,
     /// Number of charts.
     pub charts: usize,
     /// How the charts are mixed.
     pub mixing: String,
-    /// Which training pairs were taken, in words.
+    /// The training pairs, in words.
     pub pairs: String,
     /// The learning rate.
     pub lr: f64,
     /// The training loss.
     pub loss: String,
-    /// Passes over the pairs.
+    /// Passes over the training pairs.
     pub epochs: usize,
-    /// Pairs per optimiser step.
+    /// Pairs per optimizer step.
     pub batch: usize,
     /// Decoupled weight decay.
     pub weight_decay: f64,
     /// Width of φ's hidden layer.
     pub hidden: usize,
-    /// Seed of weights, order and drawn pairs.
+    /// Seed of the initial weights, the batch order and the sampled pairs.
     pub seed: u64,
     /// Number of test pairs.
     pub n: usize,
@@ -72,7 +71,7 @@ pub struct SweepRow {
     pub train_overall: Option<f64>,
     /// Wall time of the run, seconds.
     pub seconds: f64,
-    /// Why the run has no scores; empty if it has scores.
+    /// Why the run failed; empty if it has scores.
     pub failure: String,
 }
 
@@ -90,8 +89,8 @@ impl SweepRow {
         self.train_overall = known(train.overall);
     }
 
-    /// The settings that a grid varies: runs of one protocol that share them differ in room and
-    /// seed alone.
+    /// The settings that a grid varies. Runs of one protocol with equal settings differ only in
+    /// room and seed.
     pub fn configuration(&self) -> (usize, usize, String, String, String) {
         // The learning rate is compared as text, since floating-point numbers have no total
         // order.
@@ -105,7 +104,7 @@ impl SweepRow {
     }
 }
 
-/// Does the run of a row, and scores it; a run that fails says why in its row.
+/// Executes the run of a row and fills in its scores, or the reason for its failure.
 pub fn run(data: &RoomData<'_>, plan: &TrainingPlan, mut row: SweepRow) -> SweepRow {
     let begun = Instant::now();
 
@@ -118,8 +117,8 @@ pub fn run(data: &RoomData<'_>, plan: &TrainingPlan, mut row: SweepRow) -> Sweep
     row
 }
 
-/// A hash of a room's poses and features, hexadecimal. Another store may have other content under
-/// the same names, and its runs must not be taken for these.
+/// Hash of a room's poses and features, hexadecimal. It keeps runs apart when another store has
+/// other content under the same names.
 pub fn content(data: &RoomData<'_>) -> String {
     let mut digest = Sha256::new();
     for value in data.features.rows() {
@@ -135,8 +134,7 @@ pub fn content(data: &RoomData<'_>) -> String {
     hex::encode(&digest.finalize()[..CONTENT_BYTES])
 }
 
-/// The row of a run that was not done yet: its settings, and no scores. `content` is that of
-/// [`content`].
+/// The row of a pending run: its settings, without scores. `content` is the hash from [`content`].
 pub fn row(data: &RoomData<'_>, content: &str, plan: &TrainingPlan) -> SweepRow {
     let config = &plan.config;
     let room = data.room.id().to_string();
@@ -183,7 +181,7 @@ fn pairs_in_words(pairs: &PairPlan) -> String {
     }
 }
 
-/// Every setting that decides a run's numbers, as one line.
+/// Every setting that affects a run's scores, in one line.
 fn settings(plan: &TrainingPlan) -> String {
     // Destructured with no `..`, so that a new setting breaks the build here.
     let TrainingPlan {

@@ -1,7 +1,7 @@
-//! Cross-room statistics: how an adapter does in rooms that it was not trained on, and whether one
-//! navigator is better than another there.
+//! Cross-room evaluation: scores of an adapter in held-out rooms, and comparison of navigators
+//! there.
 //!
-//! Confidence intervals resample rooms rather than pairs, because the pairs of one room are alike.
+//! Confidence intervals resample rooms, not pairs, because the pairs of one room are correlated.
 
 use std::sync::Arc;
 
@@ -21,8 +21,8 @@ use seese3_robot::calibration::{Calibrated, calibrate_retrieval};
 
 use super::Error;
 
-/// R² below this counts as this in a clipped mean: R² has no lower bound, and one bad room would
-/// dominate the mean.
+/// Lower clip of R² in a clipped mean. R² has no lower bound, so one bad room would dominate the
+/// mean.
 pub const CLIPPED_R2: f64 = -1.0;
 
 /// The scores of an adapter in one room.
@@ -30,13 +30,13 @@ pub const CLIPPED_R2: f64 = -1.0;
 pub struct RoomOutcome {
     /// The room.
     pub room: RoomId,
-    /// R² of the motions between the ends of its test pairs.
+    /// R² of the motions of its test pairs.
     pub motion: MotionScores,
     /// One row per navigator.
     pub rows: Vec<Row>,
-    /// Number of frames among which answers were searched for.
+    /// Number of candidate frames of retrieval.
     pub candidate_count: usize,
-    /// What R² has to be read beside.
+    /// Baselines to compare R² with.
     pub baselines: Baselines,
 }
 
@@ -53,25 +53,25 @@ impl RoomOutcome {
 pub struct CrossRoomRun {
     /// Rooms that the adapter was trained on.
     pub training_rooms: Vec<String>,
-    /// Calibration rooms, in which the adapter's errors were measured.
+    /// Rooms that the adapter was calibrated on.
     pub calibration_rooms: Vec<String>,
     /// Seed of the training run.
     pub seed: u64,
     /// One outcome per held-out room.
     pub outcomes: Vec<RoomOutcome>,
-    /// Rooms that could not be evaluated, and why.
+    /// Rooms that could not be evaluated, each with the reason.
     pub skipped: Vec<(String, String)>,
 }
 
 impl CrossRoomRun {
-    /// The names of the navigators that were evaluated, in their order.
+    /// Names of the evaluated navigators, in evaluation order.
     pub fn navigators(&self) -> Vec<&str> {
         self.outcomes.first().map_or(Vec::new(), |outcome| {
             outcome.rows.iter().map(|row| row.name.as_str()).collect()
         })
     }
 
-    /// A navigator's hit rates, one per room in which it was evaluated.
+    /// Hit rates of a navigator, one per room in which it was evaluated.
     pub fn hit_rates(&self, navigator: &str) -> Vec<f64> {
         self.outcomes
             .iter()
@@ -93,24 +93,23 @@ impl CrossRoomRun {
 pub struct CrossRoomPlan<'a> {
     /// How the adapter is trained, with its seed.
     pub training: &'a TrainingPlan,
-    /// How many of the rooms, from the last one on, are calibration rooms instead of training
-    /// rooms.
+    /// Number of rooms, taken from the end of the list, used for calibration instead of training.
     pub calibration_rooms: usize,
     /// How the held-out rooms are evaluated.
     pub protocol: &'a Protocol,
 }
 
-/// What became of a [`CrossRoomPlan`].
+/// The result of [`train_and_test`].
 pub struct CrossRoomResult {
     /// The adapter, calibrated for retrieval if there were calibration rooms.
     pub adapter: Adapter,
-    /// How it was trained.
+    /// Its training record.
     pub record: TrainingRecord,
-    /// How it did in the held-out rooms.
+    /// Its results in the held-out rooms.
     pub run: CrossRoomRun,
 }
 
-/// Who hears of the progress of [`train_and_test`].
+/// Progress callbacks of [`train_and_test`].
 pub struct CrossRoomProgress<'a> {
     /// Called after every epoch of the training.
     pub epoch: &'a (dyn Fn() + Sync),
@@ -122,7 +121,7 @@ pub struct CrossRoomProgress<'a> {
 ///
 /// # Errors
 /// [`Error`] when the training or the calibration fails. A held-out room that cannot be evaluated
-/// is skipped, and the run says why.
+/// is skipped; the run records the reason.
 pub fn train_and_test(
     rooms: &[RoomData<'_>],
     held_out: &[RoomData<'_>],
@@ -131,7 +130,7 @@ pub fn train_and_test(
 ) -> Result<CrossRoomResult, Error> {
     let Some(training_rooms) = rooms.len().checked_sub(plan.calibration_rooms) else {
         return Err(Error::Input(format!(
-            "{} of {} rooms cannot be calibration rooms",
+            "cannot use {} of {} rooms for calibration",
             plan.calibration_rooms,
             rooms.len()
         )));
@@ -183,7 +182,7 @@ fn names(rooms: &[RoomData<'_>]) -> Vec<String> {
 }
 
 /// Evaluates an adapter in each of several rooms, in parallel. Results are in the order of the
-/// rooms; a room that cannot be evaluated gives its error. `done` is called after each room.
+/// rooms; a room that cannot be evaluated yields an error. `done` is called after each room.
 pub fn outcomes(
     adapter: &Arc<Adapter>,
     record: &TrainingRecord,
@@ -221,7 +220,7 @@ fn outcome(
         &mut |_, _| (),
     )?;
 
-    // The motion scores are of the same test pairs as the retrieval scores above.
+    // Motion scores use the same test pairs as the retrieval scores above.
     let pairs = protocol
         .split
         .test_pairs(room.timeline(), protocol.stride)?;
@@ -245,8 +244,8 @@ fn outcome(
     })
 }
 
-/// The share of rooms in which a navigator's hit rate is strictly above Identity's; `None` when no
-/// room has both.
+/// The fraction of rooms in which a navigator's hit rate is strictly above Identity's. `None` when
+/// no room has both.
 pub fn wins(outcomes: &[RoomOutcome], navigator: &str) -> Option<Rate> {
     let identity = NavigatorKind::Identity.name();
     let pairs: Vec<(f64, f64)> = outcomes
@@ -276,15 +275,14 @@ pub struct MotionSummary {
     pub above_0_3: Rate,
     /// The largest overall R².
     pub best: f64,
-    /// Mean of max(R², −1), ours: it still tells bad from worse.
+    /// Mean of max(R², −1), our variant: it still separates bad from worse.
     pub clipped: RoomMean,
     /// Mean of max(R², 0), the paper's.
     pub clipped_at_zero: RoomMean,
 }
 
 impl MotionSummary {
-    /// The summary of one overall R² per room; rooms without one (NaN) are left out. `None` when
-    /// none remains.
+    /// Summarizes one overall R² per room. Rooms with NaN are skipped; `None` when no room remains.
     pub fn of(r2: &[f64], seed: u64) -> Option<Self> {
         let known: Vec<f64> = r2.iter().copied().filter(|r2| !r2.is_nan()).collect();
         let above =
@@ -304,13 +302,13 @@ impl MotionSummary {
     }
 }
 
-/// The first `count` of `of` rooms in a seeded random order, so that a smaller choice is contained
-/// in a larger one.
+/// The first `count` of `of` rooms in a seeded random order. With one seed, a smaller choice is a
+/// subset of a larger one.
 pub fn nested_choice(count: usize, of: usize, seed: u64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..of).collect();
     let mut random = ChaCha8Rng::seed_from_u64(seed);
 
-    // Fisher–Yates shuffle of all rooms: the order must not depend on how many are taken.
+    // Fisher–Yates shuffle of all rooms: the order must not depend on `count`.
     for place in 0..of.saturating_sub(1) {
         let other = random.random_range(place..of);
         order.swap(place, other);

@@ -1,8 +1,8 @@
-//! Training and testing under one split or under the folds of a recording.
+//! Scores under one split, or under the cross-validation folds of a recording.
 //!
-//! The motions of all folds' test pairs are scored together. The R² of a single fold divides by the
-//! variance of that fifth, which may be a small part of the recording's; that of all folds together
-//! divides by the variance of all that was filmed.
+//! The test pairs of all folds are scored together. The R² of a single fold divides by the motion
+//! variance of that fifth, which may be much smaller than that of the whole recording. The pooled
+//! R² divides by the variance over all folds.
 
 use seese3_core::eval::{Baselines, TestPairs};
 use seese3_core::geometry::PoseError;
@@ -13,18 +13,18 @@ use seese3_core::statistics::mean_of_known;
 
 use super::Error;
 
-/// The motions of the test pairs of several rooms under one split after the other.
+/// Motions of the test pairs of several rooms, for each of several splits.
 #[derive(Debug, Clone)]
 pub struct FoldedMotions {
-    /// For each split the motions of each room.
+    /// Per split, the motions of each room.
     pub by_split: Vec<Vec<ReadMotions>>,
 }
 
 impl FoldedMotions {
-    /// Reads the motions of each room under each of `splits`.
+    /// Calls `read` for each of `splits`; it returns the motions of each room.
     ///
     /// # Errors
-    /// That of `read`.
+    /// The first error of `read`.
     pub fn of(
         splits: &[Split],
         read: impl Fn(Split) -> Result<Vec<ReadMotions>, Error>,
@@ -37,13 +37,14 @@ impl FoldedMotions {
         })
     }
 
-    /// The scores of each room over the pairs of all splits together, averaged over rooms.
+    /// Scores over the pairs of all splits of a room together, averaged over rooms.
     pub fn scores(&self) -> MotionScores {
         let rooms: Vec<MotionScores> = self.rooms().iter().map(ReadMotions::scores).collect();
         MotionScores::mean(&rooms)
     }
 
-    /// As [`FoldedMotions::scores`], of always answering the mean training motion: the overall R².
+    /// The overall R² of the constant baseline, pooled and averaged as in
+    /// [`FoldedMotions::scores`]. The baseline always predicts the mean training motion.
     pub fn constant_r2(&self) -> f64 {
         let rooms: Vec<f64> = self.rooms().iter().map(ReadMotions::constant_r2).collect();
         mean_of_known(&rooms)
@@ -58,7 +59,7 @@ impl FoldedMotions {
         self.by_split.iter().map(of).collect()
     }
 
-    /// The motions of each room, of all splits one after the other.
+    /// The motions of each room, concatenated over all splits.
     fn rooms(&self) -> Vec<ReadMotions> {
         let mut rooms = vec![ReadMotions::default(); self.by_split.first().map_or(0, Vec::len)];
         for split in &self.by_split {
@@ -70,17 +71,19 @@ impl FoldedMotions {
     }
 }
 
-/// What R² under `splits` has to be read beside: of each split, and of all together.
+/// Baselines to compare R² with: for each split, and for all splits together.
 #[derive(Debug, Clone)]
 pub struct FoldedBaselines {
-    /// The constant's R² over the pairs of all splits together; otherwise means over the splits.
+    /// The constant's R² over the pairs of all splits together; the other fields are means over
+    /// the splits.
     pub together: Baselines,
     /// One entry per split.
     pub by_split: Vec<Baselines>,
 }
 
 impl FoldedBaselines {
-    /// The baselines of what learned from the room's own training pairs in so many steps.
+    /// The baselines of a model trained on the room's own training pairs, with the given number of
+    /// optimizer steps.
     ///
     /// # Errors
     /// [`splits::Error`] when the room has no training or no test pairs under a split.
@@ -124,9 +127,9 @@ mod tests {
 
     use super::*;
 
-    /// Oracle: by hand: two folds that each move along one value of x only have no R² of their own,
-    /// and together R² 1 − (0.25 + 0.25) / 2 = 0.75; the constants, each the other fold's mean, miss
-    /// by 2 each: 1 − 8 / 2 = −3.
+    /// Oracle: by hand. Each fold has one value of x, so its own R² is undefined. Together,
+    /// R² = 1 − (0.25 + 0.25) / 2 = 0.75. Each constant is the other fold's mean and misses by 2:
+    /// 1 − 8 / 2 = −3.
     #[test]
     fn folds_are_scored_together() {
         let along =

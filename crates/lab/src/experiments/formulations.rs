@@ -1,4 +1,4 @@
-//! The adapter beside the paper's alternatives A to D and the constant, over several seeds.
+//! Compares the adapter with the paper's alternatives A to D and the constant, over several seeds.
 
 use rayon::prelude::*;
 
@@ -10,26 +10,27 @@ use super::Error;
 use super::folds::FoldedMotions;
 use crate::formulations::{Formulation, train_formulation};
 
-/// How the formulations do, and what the simplest answer does on the same pairs.
+/// Scores of every formulation, and of the constant baseline on the same pairs.
 #[derive(Debug, Clone)]
 pub struct Comparison {
     /// One entry per formulation, the adapter first.
     pub formulations: Vec<FormulationScores>,
-    /// R² of always answering the mean training motion, mean over rooms.
+    /// R² of the constant baseline, which always predicts the mean training motion; mean over
+    /// rooms.
     pub constant_r2: f64,
 }
 
-/// Scores of one formulation, one per seed, each over the test pairs of all splits of a room
-/// together, and then the mean over rooms.
+/// Scores of one formulation, one per seed. Each is computed over the test pairs of all splits of
+/// a room together, then averaged over rooms.
 #[derive(Debug, Clone)]
 pub struct FormulationScores {
     /// The formulation's name.
     pub name: &'static str,
-    /// One score per seed, in their order.
+    /// One score per seed, in seed order.
     pub runs: Vec<MotionScores>,
 }
 
-/// How many networks a formulation trains for several rooms.
+/// Whether a formulation trains one network per room or one for all rooms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RoomPooling {
     /// One network per room.
@@ -38,12 +39,12 @@ pub enum RoomPooling {
     Together,
 }
 
-/// Trains every formulation under every split of `splits` (that of `plan` is replaced) with seeds 0
-/// to `seeds`, on all cores; `done` hears of each seed of a formulation.
+/// Trains every formulation under every split in `splits`, with seeds from 0 to `seeds` − 1, on
+/// all cores. The split of `plan` is ignored. `done` is called after each seed of a formulation.
 ///
 /// # Errors
 /// [`Error::Training`] when a room is too short or the plan has settings that only the adapter
-/// knows.
+/// supports.
 pub fn compare(
     rooms: &[RoomData<'_>],
     plan: &TrainingPlan,
@@ -73,7 +74,7 @@ pub fn compare(
         })
         .collect::<Result<_, Error>>()?;
 
-    // The runs were computed in parallel; the table wants them by formulation.
+    // Group the runs of all tasks by formulation.
     let scores_of = |which: Formulation| FormulationScores {
         name: which.name(),
         runs: runs
@@ -90,7 +91,7 @@ pub fn compare(
     })
 }
 
-/// The motions of each room's test pairs by one formulation with one seed.
+/// Predicted motions of each room's test pairs, by one formulation with one seed.
 fn one_run(
     which: Formulation,
     rooms: &[RoomData<'_>],

@@ -1,4 +1,4 @@
-//! M1 to M4 of one feature set in one room: a row of the table over an encoder's layers.
+//! Scores M1 to M4 of one feature set in one room: one row of the table over an encoder's layers.
 
 use rayon::prelude::*;
 
@@ -12,19 +12,18 @@ use super::folds::FoldedMotions;
 use crate::formulations::read_by_adapter;
 use crate::probes::{Duplicates, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
 
-/// What decides the numbers of a row besides its room and features.
+/// Settings of a row, besides its room and features.
 #[derive(Debug, Clone)]
 pub struct LayerProtocol {
     /// How M1 compares neighbours.
     pub mutual_knn: MutualKnn,
-    /// Frames to each side that M2 leaves out as neighbours.
+    /// Frames before and after each frame that M2 excludes as neighbors.
     pub gap: usize,
-    /// Stride of M3 and M4, and how M4 is trained; its split and its seed are replaced.
+    /// Stride of M3 and M4, and training settings of M4. Its split and seed are overridden.
     pub plan: TrainingPlan,
-    /// How training and test pairs are kept apart in M3 and M4: one split, or the folds of a
-    /// recording.
+    /// Train/test splits of M3 and M4: one split, or the folds of a recording.
     pub splits: Vec<Split>,
-    /// Adapters of M4 under each split, from seed 0 on.
+    /// Number of M4 adapters per split, with seeds from 0.
     pub seeds: u64,
 }
 
@@ -33,30 +32,30 @@ pub struct LayerProtocol {
 pub struct LayerScores {
     /// The features' name.
     pub features: String,
-    /// The encoder they come from.
+    /// The encoder of the features.
     pub encoder: String,
     /// The room.
     pub room: String,
-    /// Columns of a feature.
+    /// Width of a feature.
     pub dim: usize,
-    /// Mutual k-NN, 0 to 1.
+    /// Mutual k-NN score, 0 to 1.
     pub m1: f64,
     /// Intrinsic dimension by TwoNN.
     pub m2_two_nn: f64,
     /// Intrinsic dimension by maximum likelihood.
     pub m2_mle: f64,
-    /// Rows that M2 dropped because they equal another row.
+    /// Number of duplicate rows that M2 dropped.
     pub m2_dropped: usize,
-    /// R² of always answering the mean training motion. This and the R² below are over the test
-    /// pairs of all splits together.
+    /// R² of the constant baseline, which always predicts the mean training motion. This and the
+    /// R² values below are over the test pairs of all splits together.
     pub constant_r2: f64,
     /// R² of ridge regression.
     pub m3_r2: f64,
     /// Mean over seeds of the adapter's R².
     pub m4_r2: f64,
-    /// Mean over seeds of R² of translation.
+    /// Mean over seeds of the adapter's R² of translation.
     pub m4_translation: f64,
-    /// Mean over seeds of R² of rotation.
+    /// Mean over seeds of the adapter's R² of rotation.
     pub m4_rotation: f64,
     /// Sample standard deviation over seeds of the adapter's R².
     pub m4_deviation: f64,

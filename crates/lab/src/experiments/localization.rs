@@ -1,4 +1,4 @@
-//! Single views located in a partly mapped room: an adapter's answers beside the simplest ones.
+//! Evaluates localization of single views in a partly mapped room, beside retrieval baselines.
 
 use std::sync::Arc;
 
@@ -12,13 +12,13 @@ use seese3_robot::fitting::{Fitted, Localizer, MotionHypotheses, MotionReader, R
 
 use super::Error;
 
-/// Which frames are mapped, and who is asked.
+/// Which frames are mapped, and which are queried.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LocalizationProtocol {
-    /// Every so many frames one is mapped; at least 1.
+    /// Stride of the mapped frames; at least 1.
     pub map_every: usize,
-    /// Whether every fifth of twenty blocks is not mapped at all; then views of these blocks alone
-    /// are asked for.
+    /// Whether every fifth of twenty blocks is left unmapped. Then only views of these blocks are
+    /// queried.
     pub withhold_blocks: bool,
     /// The seed of the fitted adapter.
     pub seed: u64,
@@ -30,7 +30,7 @@ impl LocalizationProtocol {
         self.frames(frame_count, |row| self.is_mapped(row, frame_count))
     }
 
-    /// The frames whose views are asked for, in order; none of them is mapped.
+    /// The query frames, in order; none of them is mapped.
     pub fn asked(&self, frame_count: usize) -> Vec<FrameId> {
         self.frames(frame_count, |row| {
             let is_withheld = is_in_left_out_block(row, frame_count);
@@ -51,17 +51,17 @@ impl LocalizationProtocol {
     }
 }
 
-/// Median, with its interval, and 90 % quantile of errors.
+/// Median, with its confidence interval, and 90 % quantile of errors.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ErrorQuantiles {
-    /// Half of the errors are at most this; its interval is that of twenty parts of the recording.
+    /// The median, with a bootstrap interval over twenty blocks of the recording.
     pub median: RecordedMedian,
-    /// Nine tenths of the errors are at most this.
+    /// The 90 % quantile.
     pub p90: f64,
 }
 
 impl ErrorQuantiles {
-    /// The quantiles of these errors, in the order of the recording; NaN without any.
+    /// The quantiles of errors in recording order; NaN without errors.
     pub fn of(errors: &[f64]) -> Self {
         Self {
             median: median_of_recording(errors, 0),
@@ -70,12 +70,12 @@ impl ErrorQuantiles {
     }
 }
 
-/// How far located poses are from the true ones.
+/// Errors of the estimated poses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LocalizationErrors {
-    /// Distances, metres.
+    /// Translation errors, metres.
     pub translation_m: ErrorQuantiles,
-    /// Angles, degrees.
+    /// Rotation errors, degrees.
     pub rotation_deg: ErrorQuantiles,
 }
 
@@ -97,43 +97,44 @@ impl LocalizationErrors {
 /// The results in one room.
 #[derive(Debug, Clone)]
 pub struct Localization {
-    /// How many views were located.
+    /// Number of query views.
     pub asked: usize,
-    /// How many frames were mapped.
+    /// Number of mapped frames.
     pub mapped: usize,
-    /// What the product answers: by the measured rules where an adapter was fitted, else the given
-    /// adapter's reading from the nearest frame.
+    /// The poses that the product returns. With a fitted adapter, they follow the measured rules.
+    /// Else they are the given adapter's full estimate relative to the nearest frame.
     pub ours: LocalizationErrors,
-    /// The pose of the mapped frame whose feature is nearest.
+    /// The pose of the mapped frame with the nearest feature.
     pub nearest_frame: LocalizationErrors,
-    /// The pose of the mapped frame that is truly nearest, by metres plus radians: about what
-    /// retrieval alone can reach.
+    /// The pose of the mapped frame with the nearest true pose, by metres plus radians: about the
+    /// best that retrieval alone can reach.
     pub nearest_pose: LocalizationErrors,
-    /// The given adapter's whole reading from the nearest frame.
+    /// The given adapter's full estimate relative to the nearest frame.
     pub zero_shot: Option<LocalizationErrors>,
-    /// The fitted adapter's whole reading, without the rules.
+    /// The fitted adapter's full estimate, without the rules.
     pub fitted: Option<LocalizationErrors>,
-    /// What holds of the answers by the rules, where an adapter was fitted.
+    /// Scores of the rules, if an adapter was fitted.
     pub rules: Option<RuleScores>,
 }
 
-/// How the rules of a fitted adapter were used, and whether their covariances hold.
+/// How often the rules fell back to the nearest frame, and the coverage of their covariances.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RuleScores {
-    /// The share of views whose translation was the nearest frame's own.
+    /// Fraction of views that use the nearest frame's translation unchanged.
     pub translation_unread: f64,
-    /// The share of views whose rotation was the nearest frame's own.
+    /// Fraction of views that use the nearest frame's rotation unchanged.
     pub rotation_unread: f64,
-    /// The shares of errors within the 68 % and 95 % ellipsoids.
+    /// Fractions of errors within the 68 % and 95 % ellipsoids.
     pub coverage: Coverage,
 }
 
-/// Maps a part of a room and locates the views of the other part. With `fit_adapter` an adapter is
-/// fitted to the mapped frames alone, so that nothing leaks. `progress` hears of its training.
+/// Maps a part of a room and locates the views of the rest. With `fit_adapter`, an adapter is
+/// fitted to the mapped frames only, so that no query view leaks into training. `progress` is
+/// called during that training.
 ///
 /// # Errors
-/// [`Error::Input`] when neither an adapter is given nor one is to be fitted, or no view is left to
-/// ask for; [`Error::Fitting`] when the room is too small or the features are not the adapter's.
+/// - [`Error::Input`] without an adapter and without `fit_adapter`, or when no query view is left.
+/// - [`Error::Fitting`] when the room is too small or the features do not match the adapter.
 pub fn evaluate(
     data: &RoomData<'_>,
     adapter: Option<&Arc<Adapter>>,
@@ -143,7 +144,7 @@ pub fn evaluate(
 ) -> Result<Localization, Error> {
     if adapter.is_none() && !fit_adapter {
         return Err(Error::Input(
-            "nothing is to be evaluated: give --adapter, or --fit".to_owned(),
+            "no adapter to evaluate: pass --adapter or --fit".to_owned(),
         ));
     }
 
@@ -151,8 +152,7 @@ pub fn evaluate(
     let asked = protocol.asked(data.room.frame_count());
     if asked.is_empty() {
         return Err(Error::Input(
-            "every frame is mapped, so that no view is left to locate; raise --map-every"
-                .to_owned(),
+            "every frame is mapped, so no view is left to locate; raise --map-every".to_owned(),
         ));
     }
 
@@ -190,7 +190,7 @@ pub fn evaluate(
     })
 }
 
-/// A view that is asked for: what the readers say of it, and where its camera truly was.
+/// A query view: its motion hypotheses and its true pose.
 struct View<'a> {
     readings: MotionHypotheses,
     truth: &'a Pose,
@@ -255,7 +255,7 @@ fn by_rules(
     (LocalizationErrors::of(&errors), scores)
 }
 
-/// The errors of the mapped frames that are truly nearest, metres and radians alike.
+/// Errors of the mapped frames with the nearest true poses, by metres plus radians.
 fn nearest_poses(views: &[View<'_>], mapped: &[FrameId], poses: &[Pose]) -> LocalizationErrors {
     let nearest = |view: &View<'_>| {
         mapped
@@ -275,7 +275,8 @@ fn nearest_poses(views: &[View<'_>], mapped: &[FrameId], poses: &[Pose]) -> Loca
 mod tests {
     use super::*;
 
-    /// Oracle: by hand. Blocks of 1,000 frames have 50; the third of every five is withheld.
+    /// Oracle: by hand. A block of 1,000 frames has 50 frames; the third of every five blocks is
+    /// withheld.
     #[test]
     fn what_is_asked_for_is_not_mapped() {
         let every_tenth = LocalizationProtocol {

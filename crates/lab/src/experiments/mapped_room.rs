@@ -1,4 +1,4 @@
-//! A partly mapped room, and what planners are asked and answer in it.
+//! A partly mapped room, with the queries to planners and their answers.
 
 use std::sync::Arc;
 
@@ -17,66 +17,66 @@ use seese3_robot::tracking::Map;
 
 use super::{Error, Within};
 
-/// What decides an evaluation besides the rooms and the adapter.
+/// Settings of an evaluation, besides the rooms and the adapter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlanningProtocol {
-    /// Which frames are mapped, and which views are asked about.
+    /// Which frames are mapped, and which are used as query views.
     pub hold_out: HoldOut,
-    /// Questions in each room.
+    /// Number of queries per room.
     pub questions: usize,
-    /// The longest hop, ‖(v, ω)‖ with metres and radians mixed. None takes the adapter's own, which
-    /// ours and the pose graph exceed where there is no other way.
+    /// The longest hop, ‖(v, ω)‖ with metres and radians mixed. `None` uses the adapter's own,
+    /// which the pose-graph planners exceed if there is no other path.
     pub longest_hop: Option<f64>,
-    /// Of the questions.
+    /// Seed of the random queries.
     pub seed: u64,
-    /// Whether an adapter is fitted to the mapped frames, from the given one's weights, and tells
-    /// ours where a view is.
+    /// Whether an adapter is fitted to the mapped frames, starting from the given adapter's
+    /// weights. Our planner then locates the query view with it.
     pub is_fitted: bool,
 }
 
-/// What a planner answers.
+/// The answer of a planner.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlannedWay {
-    /// Where the planner believes the camera to be, `world_from_camera`.
+    /// The planner's estimate of the camera pose, `world_from_camera`.
     pub start: Pose,
     /// The poses to drive to, in order, `world_from_camera`.
     pub poses: Vec<Pose>,
-    /// Whether the planner says that the goal is reached.
+    /// Whether the planner reports that the goal is reached.
     pub says_reached: bool,
-    /// How probable the planner thinks it that the robot ends within the tolerance, if it says
-    /// that.
+    /// The planner's probability that the robot ends within the tolerance, if it estimates one.
     pub probability: Option<f64>,
 }
 
-/// What planners know of a room.
+/// The mapped part of a room, as planners see it.
 pub struct MappedRoom {
-    /// The mapped frames as a room of their own.
+    /// Navigator over the mapped frames alone.
     pub navigator: Arc<Navigator>,
-    /// The same features, row by frame.
+    /// Raw features of the mapped frames, row by frame.
     pub features: Features,
-    /// None if the adapter is not calibrated.
+    /// The map; `None` if the adapter is not calibrated.
     pub(super) map: Option<Map>,
-    /// Of the adapter that was fitted to the mapped frames, if one was.
+    /// Pose estimator of the adapter fitted to the mapped frames, if one was fitted.
     pub(super) reader: Option<RoomReader>,
     pub(super) pursuit: Pursuit,
     pub(super) bounds: RouteBounds,
 }
 
-/// A question to the planners.
+/// A query to the planners.
 pub struct PlanningQuestion {
-    /// What the camera sees, shape (d,).
+    /// Raw feature of the camera's view, shape (d,).
     pub feature: Vec<f32>,
-    /// The same under the adapter, shape (k,).
+    /// Latent of the view, shape (k,).
     pub latent: Array1<f64>,
     /// The goal, a frame of the mapped room.
     pub goal: FrameId,
 }
 
 impl MappedRoom {
-    /// Maps the frames that a protocol keeps, and fits an adapter to them if it says so.
+    /// Maps the frames of the protocol's hold-out, and fits an adapter to them if
+    /// [`PlanningProtocol::is_fitted`].
     ///
     /// # Errors
-    /// [`Error`] if the room is too small, or its features are not those of the adapter.
+    /// [`Error`] if the room is too small, or its features do not match the adapter.
     pub fn new(
         data: &RoomData<'_>,
         adapter: &Arc<Adapter>,
@@ -144,12 +144,12 @@ impl MappedRoom {
         self.navigator.room().poses()
     }
 
-    /// What is asked of a way.
+    /// Step size and tolerances of the latent planner.
     pub fn pursuit(&self) -> &Pursuit {
         &self.pursuit
     }
 
-    /// What is asked of a route.
+    /// Bounds of the pose-graph planners: hop length, tolerances and arrival probability.
     pub fn bounds(&self) -> RouteBounds {
         self.bounds
     }

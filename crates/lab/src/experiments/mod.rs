@@ -1,19 +1,19 @@
-//! What researchers run: each experiment computes its results and owns their types.
+//! Experiments of researchers. Each module computes its results and defines their types.
 //!
-//! - [`seeds`]: one training plan with several seeds; [`folds`]: under several splits.
-//! - [`probe`] and [`layers`]: M1 to M4 of features in rooms, and over the layers of an encoder.
-//! - [`formulations`]: the adapter beside the paper's alternatives.
+//! - [`seeds`]: one training plan with several seeds; [`folds`]: with several splits.
+//! - [`probe`] and [`layers`]: scores M1 to M4 of features in rooms, and per encoder layer.
+//! - [`formulations`]: the adapter compared with the paper's alternatives.
 //! - [`adapter_sweep`]: a grid of adapters, one row per run.
-//! - [`cross_room`]: an adapter in rooms that it never saw.
+//! - [`cross_room`]: an adapter in held-out rooms.
 //! - [`localization`]: single views in a partly mapped room.
-//! - [`motion`]: the motion between two views, beside the simplest answers.
-//! - [`odometry`]: a tracker along held-out frames.
-//! - [`planning`]: ways to a goal, beside simple planners.
+//! - [`motion`]: motion between two views, compared with simple baselines.
+//! - [`odometry`]: a tracker on held-out frames.
+//! - [`planning`]: paths to a goal, compared with simple planners.
 //! - [`robustness`]: a tracker under disturbances of its images.
-//! - [`path_comparison`]: an estimated path against a reference.
+//! - [`path_comparison`]: an estimated path compared with a reference.
 //!
-//! An experiment takes rooms that are loaded ([`seese3_core::training::RoomData`]) and reads and
-//! writes no file. [`crate::report`] renders the results.
+//! An experiment takes loaded rooms ([`seese3_core::training::RoomData`]); it reads and writes no
+//! files. [`crate::report`] renders the results.
 
 pub mod adapter_sweep;
 pub mod cross_room;
@@ -37,23 +37,23 @@ use seese3_robot::{calibration, fitting, tracking, two_view};
 
 use crate::probes;
 
-/// Why an experiment has no result.
+/// Why an experiment failed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// No adapter could be trained.
     #[error(transparent)]
     Training(#[from] training::Error),
-    /// An adapter refused its input.
+    /// An adapter rejected its input.
     #[error(transparent)]
     Adapter(#[from] adapter::Error),
-    /// An adapter's errors could not be measured.
+    /// An adapter could not be calibrated.
     #[error(transparent)]
     Calibration(#[from] calibration::Error),
-    /// An adapter could not be fitted to a room, or a view not located in it.
+    /// An adapter could not be fitted to a room, or a view could not be located in it.
     #[error(transparent)]
     Fitting(#[from] fitting::Error),
-    /// A room could not be navigated in.
+    /// Navigation in a room failed.
     #[error(transparent)]
     Navigation(#[from] navigation::Error),
     /// Navigators could not be evaluated.
@@ -68,19 +68,19 @@ pub enum Error {
     /// Features could not be probed.
     #[error(transparent)]
     Probe(#[from] probes::Error),
-    /// The motion between two views could not be read.
+    /// The motion between two views could not be estimated.
     #[error(transparent)]
     TwoView(#[from] two_view::Error),
-    /// A room gives no pairs.
+    /// A room has no training or no test pairs under a split.
     #[error(transparent)]
     Splits(#[from] splits::Error),
     /// A result could not be rendered.
     #[error("a result cannot be rendered")]
     Rendering(#[source] Box<dyn std::error::Error + Send + Sync>),
-    /// Seeds have 32 bits, as PyTorch's have.
-    #[error("--seed and --seeds reach over 2³²")]
+    /// A seed does not fit in 32 bits, the seed size of PyTorch.
+    #[error("--seed plus --seeds must be at most 2³²")]
     Seed,
-    /// What failed, and why.
+    /// One room or one part of an experiment failed.
     #[error("{what}")]
     In {
         /// The room, or the part of the experiment.
@@ -89,14 +89,14 @@ pub enum Error {
         #[source]
         problem: Box<Error>,
     },
-    /// What the experiment needs and did not get, in words.
+    /// The input of the experiment is invalid; the text says why.
     #[error("{0}")]
     Input(String),
 }
 
-/// Says in an error what failed.
+/// Adds context to errors.
 pub(crate) trait Within<T> {
-    /// Names the room or the part that failed, if it failed.
+    /// Wraps an error with the room or the part of the experiment that failed.
     fn within(self, what: impl Fn() -> String) -> Result<T, Error>;
 }
 

@@ -1,5 +1,5 @@
-//! The motion between two views of a room, as an adapter or a two-view reader reads it, beside the
-//! simplest answers.
+//! Evaluates motion estimates between two views of a room: by an adapter, by a two-view estimator,
+//! and by simple baselines.
 
 use ndarray::ArrayView3;
 use rayon::prelude::*;
@@ -17,67 +17,67 @@ use seese3_robot::two_view;
 use super::Error;
 use super::localization::ErrorQuantiles;
 
-/// How far read motions are from the true ones.
+/// Errors of estimated motions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionErrors {
-    /// Distances between where the read and the true motion end, metres.
+    /// Distances between the end positions of the estimated and the true motion, metres.
     pub translation_m: ErrorQuantiles,
-    /// Angles between how they end, degrees.
+    /// Angles between their end orientations, degrees.
     pub rotation_deg: ErrorQuantiles,
 }
 
 /// The results in one room.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionEvaluation {
-    /// How many pairs of frames were read.
+    /// Number of frame pairs.
     pub n: usize,
-    /// What an adapter read, if one was asked.
+    /// Errors of the adapter, if one was given.
     pub adapter: Option<AdapterErrors>,
-    /// What a two-view reader read, if one was asked.
+    /// Errors of the two-view estimator, if feature maps were given.
     pub two_view: Option<TwoViewErrors>,
-    /// No motion at all.
+    /// Errors of the zero-motion baseline.
     pub no_motion: MotionErrors,
 }
 
 /// The errors of an adapter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdapterErrors {
-    /// What `EstimateMotion` answers: the adapter's reading with the mean training motion μ.
+    /// The adapter's estimate with the mean training motion μ, as `EstimateMotion` returns it.
     pub ours: MotionErrors,
-    /// The adapter's reading without μ, as trackers take it.
+    /// The adapter's estimate without μ, as trackers use it.
     pub without_mean: MotionErrors,
-    /// μ, whatever the views show.
+    /// The constant baseline, which always predicts μ.
     pub constant: MotionErrors,
 }
 
-/// The errors of a two-view reader.
+/// The errors of a two-view estimator.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TwoViewErrors {
-    /// Over all pairs; where the reader cannot read it answers no motion.
+    /// Errors over all pairs; pairs without an estimate count as zero motion.
     pub ours: MotionErrors,
-    /// The share of pairs whose motion it could read.
+    /// Fraction of pairs with an estimate.
     pub answered: f64,
-    /// Over the pairs that it could read, how often its covariance holds.
+    /// Coverage of its covariances, over the pairs with an estimate.
     pub coverage: Coverage,
 }
 
-/// The frames of a room as feature maps, for a two-view reader.
+/// The feature maps of a room's frames, for a two-view estimator.
 #[derive(Debug, Clone, Copy)]
 pub struct Maps<'a> {
-    /// One map per row, in the order (channels, rows, columns).
+    /// One flattened map per row, in the order (channels, rows, columns).
     pub features: &'a Features,
-    /// Channels, rows and columns of a map; their product is the width of a feature.
+    /// Channels, rows and columns of a map; their product is the feature width.
     pub shape: [usize; 3],
     /// The camera that took the images.
     pub camera: Pinhole,
 }
 
-/// Reads the motion between the frames of every pair. `on_pair_read` is called after each pair that
-/// the two-view reader has read.
+/// Estimates the motion between the frames of every pair. `on_pair_read` is called after each pair
+/// of the two-view estimator.
 ///
 /// # Errors
-/// [`Error::Adapter`] when the features are not the adapter's, [`Error::TwoView`] when the maps are
-/// too small.
+/// [`Error::Adapter`] when the features do not match the adapter, [`Error::TwoView`] when the maps
+/// are too small.
 pub fn evaluate(
     room: &Room,
     adapter: Option<(&Adapter, &Features)>,
@@ -206,7 +206,7 @@ fn errors(truth: &[Twist], read: &[Twist]) -> MotionErrors {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand: a motion of 3 and 4 m along two axes that is read as none is 5 m off.
+    /// Oracle: by hand: for a true motion of 3 m and 4 m along two axes, zero motion is 5 m off.
     #[test]
     fn no_motion_is_off_by_the_motion_itself() {
         let truth = Twist {

@@ -1,8 +1,7 @@
-//! How well a tracker does on frames that its map does not hold: paths, covariances, and whether it
-//! knows when it is lost.
+//! Evaluates a tracker on held-out frames: path errors, covariances, and detection of being lost.
 //!
-//! Start reading at [`evaluate`]. Every room is mapped and tracked under one hold-out; frames of
-//! the other rooms are then played to its tracker, which should answer LOST.
+//! Start reading at [`evaluate`]. Every room is mapped and tracked under one hold-out. Frames of
+//! the other rooms are then replayed through its tracker, which should report LOST.
 
 use std::sync::Arc;
 
@@ -26,22 +25,22 @@ use seese3_robot::tracking::{
 use super::tracking_scores::TrackingScores;
 use super::{Error, Within};
 
-/// Nanoseconds between the frames of a recording without times: a camera at 30 Hz.
+/// Frame period of replays that contain frames of another room, nanoseconds: 30 Hz.
 const PERIOD_NS: i64 = 33_333_333;
-/// How many frames of another room are played to a room's tracker.
+/// Maximum number of frames of each other room replayed through a room's tracker.
 const OTHER_ROOM_FRAMES: usize = 60;
-/// Every so many tracked frames, one is looked for in all rooms.
+/// Stride of the tracked frames that are relocalized in all rooms.
 const RELOCALISED_STEP: usize = 5;
 
-/// What decides an evaluation besides the rooms and the adapter.
+/// Settings of an evaluation, besides the rooms and the adapter.
 #[derive(Debug, Clone, Copy)]
 pub struct OdometryProtocol {
     /// Which frames are mapped and which are tracked.
     pub hold_out: HoldOut,
     /// Settings of the trackers.
     pub settings: TrackerSettings,
-    /// Whether an adapter is fitted to each room's mapped frames, from the given one's weights, and
-    /// gives the anchors.
+    /// Whether an adapter is fitted to each room's mapped frames, starting from the given
+    /// adapter's weights. The fitted adapter then provides the anchors.
     pub is_fitted: bool,
 }
 
@@ -55,40 +54,40 @@ pub struct TrackedRoom<'a> {
     tracker: Tracker,
 }
 
-/// How a room was tracked in.
+/// Tracking results of one room.
 #[derive(Debug, Clone)]
 pub struct RoomOdometry {
     /// The room.
     pub room: String,
-    /// How it was recorded.
+    /// Source format of the recording.
     pub format: String,
-    /// Frames that the map holds.
+    /// Number of mapped frames.
     pub mapped_frames: usize,
-    /// Frames that were tracked.
+    /// Number of tracked frames.
     pub tracked_frames: usize,
-    /// Errors of dead reckoning, laid on the true first pose.
+    /// Errors of dead reckoning, aligned to the true first pose.
     pub odom: PathErrors,
-    /// Errors of the fused path, over the frames where a place was known.
+    /// Errors of the fused path, over the frames with a map pose.
     pub fused: PathErrors,
-    /// The answers beside the simplest ones to the same frames.
+    /// Errors of the tracker and of its baselines on the same frames.
     pub scores: TrackingScores,
-    /// Squared Mahalanobis lengths of the errors of map poses whose neighbours in time are mapped.
+    /// Squared Mahalanobis lengths of map pose errors, for frames with mapped neighbors in time.
     pub map_poses_mapped: Vec<f64>,
-    /// The same where the neighbours are not mapped.
+    /// The same for frames without mapped neighbors in time.
     pub map_poses_unmapped: Vec<f64>,
-    /// Errors of read motions, with the lengths of the motions.
+    /// Errors of the estimated motions, with the lengths of the motions.
     pub motions: Vec<MotionSurprise>,
-    /// Shares of frames by status.
+    /// Fractions of frames by status.
     pub statuses: StatusShares,
-    /// The same stream when nothing was known at its beginning.
+    /// Results of the same streams without an initial pose.
     pub unknown_start: UnknownStart,
-    /// Frames of other rooms, played to the tracker as the beginning of a stream.
+    /// LOST counts for frames of other rooms, replayed as the start of a stream.
     pub other_rooms_from_start: LostFrames,
-    /// Frames of other rooms, played after this room's own.
+    /// LOST counts for frames of other rooms, replayed after this room's own frames.
     pub other_rooms_after_own: LostFrames,
 }
 
-/// Errors of a path without alignment, as root mean squares.
+/// Root-mean-square errors of a path, without alignment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PathErrors {
     /// Absolute translation errors, metres.
@@ -100,7 +99,7 @@ pub struct PathErrors {
 }
 
 impl PathErrors {
-    /// Of a path with fewer than two poses.
+    /// Errors of a path with fewer than two poses: all NaN.
     const UNKNOWN: Self = Self {
         ape_m: f64::NAN,
         ape_rad: f64::NAN,
@@ -108,7 +107,7 @@ impl PathErrors {
     };
 }
 
-/// Shares of frames by the status that they were answered with.
+/// Fractions of frames by reported status.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StatusShares {
     /// TRACKING.
@@ -121,42 +120,42 @@ pub struct StatusShares {
     pub relocalizing: f64,
 }
 
-/// A stream of which nothing was known at its beginning.
+/// Results of a stream without an initial pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UnknownStart {
-    /// The share of frames that were answered LOST.
+    /// Fraction of frames reported LOST.
     pub lost: f64,
-    /// Frames until the place was right; none if it never was.
+    /// Number of frames until the tracker was TRACKING near the true pose; `None` if it never was.
     pub frames_to_relocalise: Option<usize>,
 }
 
-/// How many frames of other rooms were answered LOST.
+/// Number of frames of other rooms, and of those reported LOST.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct LostFrames {
-    /// Frames that were played.
+    /// Number of replayed frames.
     pub frames: usize,
-    /// Frames that were answered LOST.
+    /// Number of frames reported LOST.
     pub lost: usize,
 }
 
-/// Which room single views were taken to be in.
+/// Results of relocalizing single views among several rooms.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Relocalisation {
-    /// The right room was named.
+    /// Number of views located in the right room.
     pub right: usize,
-    /// A wrong room was named.
+    /// Number of views located in a wrong room.
     pub wrong: usize,
-    /// No room was named.
+    /// Number of views with an ambiguous result.
     pub ambiguous: usize,
-    /// Some room was named when the right one was not among those that were looked in.
+    /// Number of views located in some room when the right room was not among the candidates.
     pub named_without_own: usize,
-    /// The number of rooms to choose from.
+    /// Number of candidate rooms.
     pub rooms: usize,
-    /// Squared Mahalanobis lengths of the errors of the poses in the right room.
+    /// Squared Mahalanobis lengths of the pose errors in the right room.
     pub pose_surprises: Vec<f64>,
-    /// The errors of those poses, metres.
+    /// Translation errors of those poses, metres.
     pub pose_errors_m: Vec<f64>,
-    /// Those of the nearest frames' poses, metres.
+    /// Translation errors of the nearest frames' poses, metres.
     pub nearest_errors_m: Vec<f64>,
 }
 
@@ -171,8 +170,8 @@ impl TrackedRoom<'_> {
         &self.tracker
     }
 
-    /// The pose of the mapped frame whose raw feature is most like one of shape (d,), by the
-    /// cosine: the simplest answer.
+    /// The pose of the mapped frame most similar to a raw feature of shape (d,), by the cosine:
+    /// the retrieval baseline.
     pub fn most_alike(&self, feature: ArrayView1<'_, f32>) -> &Pose {
         let cosine = |frame: &&FrameId| {
             let row = self.features.row(frame.row());
@@ -183,7 +182,7 @@ impl TrackedRoom<'_> {
             .iter()
             .max_by(|a, b| cosine(a).total_cmp(&cosine(b)));
 
-        // A map has frames.
+        // A map has at least one frame.
         let row = best.map_or(0, |frame| frame.row());
         &self.room.poses()[row]
     }
@@ -194,7 +193,7 @@ impl TrackedRoom<'_> {
     }
 }
 
-/// Trackers over each of several rooms, mapped as the protocol says.
+/// Builds one tracker per room, with the frames mapped under the protocol's hold-out.
 ///
 /// # Errors
 /// [`Error`] when a room is too small or the adapter has no error model.
@@ -236,10 +235,11 @@ pub fn trackers<'a>(
     rooms.iter().map(tracker).collect()
 }
 
-/// Tracks the held-out frames of every room; `done` hears of each room's replay, for its paths.
+/// Tracks the held-out frames of every room. `done` is called with the result and the replay of
+/// each room.
 ///
 /// # Errors
-/// [`Error`] when a room's path cannot be compared with the true one.
+/// [`Error`] when a room's path cannot be compared with the true path.
 pub fn evaluate(
     rooms: &[TrackedRoom<'_>],
     hold_out: HoldOut,
@@ -255,10 +255,10 @@ pub fn evaluate(
     rooms.par_iter().map(one).collect()
 }
 
-/// Looks for single views of the tracked frames in all rooms; with one room there is no choice.
+/// Relocalizes every fifth tracked frame, as a single view, among all rooms.
 ///
 /// # Errors
-/// [`Error`] of matching the views.
+/// [`Error`] when a view cannot be matched.
 pub fn relocalisation(
     rooms: &[TrackedRoom<'_>],
     hold_out: HoldOut,
@@ -319,7 +319,7 @@ pub fn relocalisation(
 }
 
 impl Relocalisation {
-    /// Counts how far the pose of a view in its right room is off.
+    /// Adds the pose errors of a view that was located in the right room.
     fn add_pose(&mut self, matched: &MapMatch, room: &TrackedRoom<'_>, frame: FrameId) {
         let poses = room.room.poses();
         let truth = &poses[frame.row()];
@@ -402,7 +402,7 @@ fn path_errors(estimate: &Trajectory, reference: &Trajectory) -> Result<PathErro
     })
 }
 
-/// The tracked frames of a room, replayed through its own tracker.
+/// Replays the tracked frames of a room through its own tracker.
 fn own_replay(room: &TrackedRoom<'_>, hold_out: HoldOut, initial_pose: InitialPose) -> Replay {
     let segment = Segment {
         latents: room.map.navigator().latents(),
@@ -414,9 +414,9 @@ fn own_replay(room: &TrackedRoom<'_>, hold_out: HoldOut, initial_pose: InitialPo
     replay_streams(&room.tracker, segment, &room.room, initial_pose)
 }
 
-/// Frames of every other room, played to a room's tracker: as the beginning of a stream, or after
-/// the last frames that the hold-out tracks in the room itself. A tracker that knows when it is
-/// lost answers LOST to all of them.
+/// Replays frames of every other room through a room's tracker, and counts the LOST answers. With
+/// `own`, the last tracked frames of the room itself come first in the stream. A perfect tracker
+/// reports LOST for all frames of other rooms.
 fn lost_frames(
     room: &TrackedRoom<'_>,
     all: &[TrackedRoom<'_>],
@@ -456,7 +456,7 @@ fn lost_frames(
             }
         };
 
-        // The other room's frames are the last ones that were played.
+        // The other room's frames are the last ones of the replay.
         let updates = &replayed.updates[replayed.updates.len() - frames.len()..];
         let is_lost = |update: &&seese3_robot::tracking::Update| update.status == Status::Lost;
         found.frames += updates.len();

@@ -9,25 +9,25 @@ use seese3_core::trajectory::{
 /// Settings of the relative pose error.
 #[derive(Debug, Clone, Copy)]
 pub struct PathProtocol {
-    /// Δ, the number of poses from the start of a relative motion to its end.
+    /// Δ, the length of a relative motion in poses.
     pub delta: usize,
-    /// Which pairs of poses that are Δ apart are compared.
+    /// Which of the pose pairs Δ apart are compared.
     pub pairs: RpePairs,
 }
 
 /// Errors of one estimated path.
 #[derive(Debug, Clone)]
 pub struct PathComparison {
-    /// Number of pose pairs that were compared.
+    /// Number of associated pose pairs.
     pub matched: usize,
-    /// Poses of the reference that have no matching estimate.
+    /// Number of reference poses without a matching estimate.
     pub unmatched_reference: usize,
-    /// Poses of the estimate that have no matching reference.
+    /// Number of estimated poses without a matching reference.
     pub unmatched_estimate: usize,
-    /// Absolute errors by alignment, one entry per relation of [`Relation::ALL`]. An alignment that
-    /// the path does not determine holds the reason instead.
+    /// Absolute errors by alignment, one entry per relation of [`Relation::ALL`]. An alignment
+    /// that is undefined for the path holds the reason instead.
     pub absolute: Vec<(Alignment, Result<[Statistics; 3], Error>)>,
-    /// Relative errors, one entry per relation of [`Relation::ALL`], or why there are none.
+    /// Relative errors, one entry per relation of [`Relation::ALL`], or why they are undefined.
     pub relative: Result<[Statistics; 3], Error>,
     /// The settings of the relative error.
     pub protocol: PathProtocol,
@@ -37,8 +37,8 @@ impl PathComparison {
     /// The errors of the associated poses, with each alignment.
     ///
     /// # Errors
-    /// [`Error`] if `matches` does not hold as many poses of the one path as of the other. An error
-    /// that is undefined for another reason is kept in the result.
+    /// [`Error`] if `matches` has different numbers of poses of the two paths. If an error is
+    /// undefined for another reason, the result holds that reason.
     pub fn of(
         reference: &Trajectory,
         estimate: &Trajectory,

@@ -1,13 +1,12 @@
-//! Planners beside one another: from an unmapped view to a mapped goal, driven without looking
-//! again.
+//! Compares planners: from an unmapped view to a mapped goal, driven open-loop.
 //!
-//! Every second frame of a room (or what the hold-out says) is a room of its own, which is all that
-//! a planner knows. A question is the view of another frame, and a mapped frame as the goal. A
-//! planner answers with where it believes the camera to be and with poses to drive to. A simulated
-//! robot then drives these motions one after another from where the camera truly is. The planner is
-//! right if the robot ends within the tolerance of the goal.
+//! A planner knows only the mapped frames of a room: every second frame, or those of another
+//! hold-out. A query is the view of an unmapped frame, with a mapped frame as the goal. The planner
+//! returns its estimate of the camera pose and a sequence of poses to drive to. A simulated robot
+//! executes these motions from the true camera pose. The planner succeeds if the robot ends within
+//! the tolerance of the goal.
 //!
-//! Views of other rooms are asked about too: there a planner should find no way.
+//! Views of other rooms are queried too; there a planner should find no path.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -29,24 +28,23 @@ use super::Error;
 pub use super::mapped_room::{MappedRoom, PlannedWay, PlanningProtocol, PlanningQuestion};
 use super::simple_planners::{greedy, pose_graph, topological};
 
-/// Views of each other room that a room's planners are asked about.
+/// Number of query views from each other room.
 const OTHER_ROOM_VIEWS: usize = 5;
 
 /// A planner that is evaluated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Planner {
-    /// What the server answers: the shortest way over the room's frames, from the pose that they
-    /// tell.
+    /// The server's planner: the shortest path over the room's frames from the estimated pose.
     Ours,
-    /// The latent way of the paper: a frame near the imagined latent, step by step.
+    /// The paper's latent navigation: each step retrieves a frame near the predicted latent.
     Latent,
-    /// From frame to frame, each time the one nearest to the goal that one hop reaches.
+    /// Each hop moves to the reachable frame nearest to the goal.
     Greedy,
-    /// The shortest way over the frames' poses from the pose of the nearest frame.
+    /// The shortest path over the frames' poses, from the pose of the nearest frame.
     PoseGraph,
-    /// The shortest way over the frames that look alike.
+    /// The shortest path over visually similar frames.
     Topological,
-    /// The robot stays where it is.
+    /// The robot does not move.
     StandingStill,
 }
 
@@ -62,26 +60,26 @@ impl Planner {
     ];
 }
 
-/// How a planner did.
+/// Scores of one planner.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct PlannerScores {
-    /// Questions about views of the room.
+    /// Number of queries with views of the room.
     pub questions: usize,
-    /// How often it said that the goal is reached.
+    /// Number of queries for which the planner reported success.
     pub says_reached: usize,
-    /// How often it said so and the robot was within the tolerance of the goal.
+    /// Number of reported successes with the robot within the tolerance of the goal.
     pub truly_there: usize,
-    /// How often the robot was there, whatever the planner said.
+    /// Number of queries with the robot within the tolerance, whatever the planner reported.
     pub there_anyway: usize,
-    /// The sum of the stated probabilities to arrive; of planners that state none, 0.
+    /// Sum of the planner's arrival probabilities; 0 for planners without them.
     pub expected_there: f64,
-    /// The sum of the hops where the goal was truly reached.
+    /// Total number of hops in the queries counted in `truly_there`.
     pub steps: usize,
     /// The longest hop, ‖(v, ω)‖ with metres and radians mixed.
     pub longest_hop: f64,
-    /// Questions about views of other rooms.
+    /// Number of queries with views of other rooms.
     pub other_questions: usize,
-    /// How often it said that the goal is reached from there.
+    /// Number of those queries for which the planner reported success.
     pub other_says_reached: usize,
 }
 
@@ -90,11 +88,11 @@ pub struct PlannerScores {
 pub struct RoomPlanning {
     /// The room.
     pub room: String,
-    /// Mapped frames.
+    /// Number of mapped frames.
     pub mapped_frames: usize,
-    /// The longest hop that was allowed.
+    /// The longest allowed hop, ‖(v, ω)‖ with metres and radians mixed.
     pub longest_hop: f64,
-    /// The scores.
+    /// Scores by planner.
     pub scores: BTreeMap<Planner, PlannerScores>,
 }
 
@@ -172,7 +170,7 @@ fn latent(room: &MappedRoom, question: &PlanningQuestion) -> Result<PlannedWay, 
         room.pursuit,
         &Cancellation::default(),
         &mut |feedback| {
-            // An attempt that found no frame repeats the last one.
+            // A step without a new frame repeats the last frame; skip it.
             let at = feedback.frame.map(|frame| frame.pose);
             if let Some(at) = at.filter(|at| poses.last() != Some(at)) {
                 poses.push(at);
@@ -188,10 +186,10 @@ fn latent(room: &MappedRoom, question: &PlanningQuestion) -> Result<PlannedWay, 
     })
 }
 
-/// Asks every planner in every room; `done` hears of each room.
+/// Evaluates every planner in every room; `done` is called after each room.
 ///
 /// # Errors
-/// [`Error`] when a room is too small, or its features are not those of the adapter.
+/// [`Error`] when a room is too small, or its features do not match the adapter.
 pub fn evaluate(
     rooms: &[RoomData<'_>],
     adapter: &Arc<Adapter>,
@@ -270,7 +268,7 @@ fn question(
 }
 
 impl PlannerScores {
-    /// Counts one answer: drives its motions from the true pose of the camera.
+    /// Adds one answer: executes its motions from the true camera pose.
     fn add(&mut self, way: &PlannedWay, truth: &Pose, room: &MappedRoom, goal: FrameId) {
         let end = way.poses.last().unwrap_or(&way.start);
         let driven = truth * way.start.inv_mul(end);
@@ -293,7 +291,7 @@ impl PlannerScores {
         }
     }
 
-    /// The scores of several rooms together.
+    /// Sums the scores of several rooms.
     pub fn sum<'a>(rooms: impl Iterator<Item = &'a Self>) -> Self {
         rooms.fold(Self::default(), |sum, room| Self {
             questions: sum.questions + room.questions,

@@ -1,4 +1,4 @@
-//! M1 to M4 of one feature set in one room, or in several rooms together.
+//! Scores M1 to M4 of one feature set in one room, or in several rooms together.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -17,30 +17,30 @@ use crate::probes::{
     Duplicates, IntrinsicDimension, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe,
 };
 
-/// What is measured; what is `None` or empty is left out.
+/// Which scores are computed; `None` or an empty list skips a score.
 #[derive(Debug, Clone)]
 pub struct ProbeProtocol {
     /// How M1 compares neighbours.
     pub m1: Option<MutualKnn>,
     /// How M2 treats neighbours in time and repeated rows.
     pub m2: Option<DimensionProtocol>,
-    /// Stride of M3, one plan per stride; their splits are replaced.
+    /// Strides of M3, one plan per stride. The splits of the plans are overridden.
     pub m3: Vec<TrainingPlan>,
-    /// How M4 is trained, one plan per stride; their seeds and splits are replaced.
+    /// Training plans of M4, one per stride. Their seeds and splits are overridden.
     pub m4: Vec<TrainingPlan>,
-    /// How training and test pairs are kept apart in M3 and M4: one split, or the folds of a
-    /// recording, each of which is trained and tested by itself.
+    /// Train/test splits of M3 and M4: one split, or the folds of a recording. Each is trained and
+    /// tested separately.
     pub splits: Vec<Split>,
-    /// Adapters of M4 per stride, from seed 0 on.
+    /// Number of M4 adapters per stride and split, with seeds from 0.
     pub seeds: u64,
 }
 
-/// How the intrinsic dimension is taken.
+/// Settings of the intrinsic dimension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DimensionProtocol {
-    /// Frames to each side that are left out as neighbours.
+    /// Frames before and after each frame that are excluded as neighbors.
     pub gap: usize,
-    /// What happens to rows that equal another row.
+    /// How duplicate rows are handled.
     pub duplicates: Duplicates,
 }
 
@@ -49,17 +49,17 @@ pub struct DimensionProtocol {
 pub struct AtStride {
     /// Frames from source to target.
     pub stride: u32,
-    /// One score of a ridge regression, or one per adapter's seed: over the test pairs of all
-    /// splits together.
+    /// Scores over the test pairs of all splits together: one for ridge regression, or one per
+    /// seed of the adapter.
     pub runs: Vec<MotionScores>,
     /// The overall R² under each split, mean over seeds.
     pub by_split: Vec<(Split, f64)>,
-    /// What R² has to be read beside; none for several rooms together.
+    /// Baselines to compare R² with; `None` for several rooms together.
     pub baselines: Option<FoldedBaselines>,
 }
 
 impl AtStride {
-    /// The scores of runs with one seed each; `room` if they are of one room alone.
+    /// The scores of runs, one per seed. `room` is set if all runs are of one room.
     fn of(
         room: Option<&Room>,
         splits: &[Split],
@@ -87,25 +87,25 @@ impl AtStride {
     }
 }
 
-/// M1, and how it was taken.
+/// M1 and its settings.
 #[derive(Debug, Clone, Copy)]
 pub struct MutualKnnScore {
-    /// The mean share of neighbours by feature that are neighbours by pose, 0 to 1.
+    /// Mean fraction of feature neighbors that are also pose neighbors, 0 to 1.
     pub share: f64,
     /// How the neighbours were compared.
     pub options: MutualKnn,
 }
 
-/// M2, and how it was taken.
+/// M2 and its settings.
 #[derive(Debug, Clone)]
 pub struct DimensionScore {
     /// The intrinsic dimension by several estimators.
     pub dimension: IntrinsicDimension,
-    /// How it was taken.
+    /// The settings.
     pub protocol: DimensionProtocol,
 }
 
-/// What was measured in a room, or in several rooms together; what was not asked for is absent.
+/// Scores of one room, or of several rooms together; skipped scores are `None` or empty.
 #[derive(Debug, Clone)]
 pub struct ProbeScores {
     /// The room, or the rooms in words.
@@ -123,7 +123,7 @@ pub struct ProbeScores {
 /// Probes one room.
 ///
 /// # Errors
-/// [`Error::In`], which names the probe that failed.
+/// [`Error::In`] with the name of the failed probe.
 pub fn probe(data: &RoomData<'_>, protocol: &ProbeProtocol) -> Result<ProbeScores, Error> {
     let rows = data.features.rows();
 
@@ -165,7 +165,8 @@ pub fn probe(data: &RoomData<'_>, protocol: &ProbeProtocol) -> Result<ProbeScore
     })
 }
 
-/// M4 of several rooms together: test scores of one adapter per split and seed, at every stride.
+/// Computes M4 of several rooms together: test scores of one adapter per split and seed, at every
+/// stride.
 ///
 /// # Errors
 /// [`Error::Training`] when a room is too short.

@@ -1,4 +1,4 @@
-//! One training plan with several seeds.
+//! Trains one plan with several seeds.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -19,7 +19,7 @@ use super::Error;
 pub struct TrainingRun {
     /// The training record of this seed.
     pub record: TrainingRecord,
-    /// Hit@0.1 of inverse Poincaré in the affine reading, on the seed's test pairs.
+    /// Hit@0.1 of inverse Poincaré with the affine reading, on the seed's test pairs.
     pub hit_rate: Rate,
     /// Wall time of training alone, seconds.
     pub seconds: f64,
@@ -30,15 +30,15 @@ pub struct TrainingRun {
 pub struct SeededTraining {
     /// The first seed's adapter.
     pub adapter: Adapter,
-    /// One run per seed, in their order; at least one.
+    /// One run per seed, in seed order; at least one.
     pub runs: Vec<TrainingRun>,
 }
 
-/// Trains one adapter per seed, from the plan's own seed on, on all cores. `progress` hears of
-/// every epoch of every seed.
+/// Trains one adapter per seed on all cores, starting at the plan's seed. `progress` is called
+/// after every epoch of every seed.
 ///
 /// # Errors
-/// [`Error`], when a seed is too large or training fails.
+/// [`Error`] when a seed is too large or training fails.
 pub fn train_seeds(
     rooms: &[RoomData<'_>],
     plan: &TrainingPlan,
@@ -73,12 +73,12 @@ pub fn train_seeds(
     let adapter = adapters
         .into_iter()
         .next()
-        .ok_or_else(|| Error::Input("at least one seed is needed".to_owned()))?;
+        .ok_or_else(|| Error::Input("at least one seed is required".to_owned()))?;
 
     Ok(SeededTraining { adapter, runs })
 }
 
-/// Hit@0.1 of inverse Poincaré, affine reading, over the test pairs of all rooms together.
+/// Hit@0.1 of inverse Poincaré with the affine reading, over the test pairs of all rooms together.
 fn hit_rate(rooms: &[RoomData<'_>], adapter: &Adapter, plan: &TrainingPlan) -> Result<Rate, Error> {
     let adapter = Arc::new(adapter.clone());
     let inverse = StepKind::InversePoincare(Reading::Affine);
@@ -88,7 +88,7 @@ fn hit_rate(rooms: &[RoomData<'_>], adapter: &Adapter, plan: &TrainingPlan) -> R
         ..Protocol::paper(plan.stride)
     };
 
-    // Hits and pairs are summed, so that each room counts by the number of its test pairs.
+    // Sum hits and pairs, so that each room is weighted by its number of test pairs.
     let mut hits = 0;
     let mut pairs = 0;
     for data in rooms {

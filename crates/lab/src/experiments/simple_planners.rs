@@ -1,5 +1,5 @@
-//! Planners of a few lines, beside which ours has to stand. All begin at the pose of a stored frame, and
-//! none judges whether the camera is there.
+//! Baseline planners. Each starts from the pose of a stored frame and does not check whether the
+//! camera is there.
 
 use std::collections::BTreeSet;
 
@@ -12,11 +12,11 @@ use seese3_robot::planning::PoseGraph;
 
 use super::mapped_room::{MappedRoom, PlannedWay, PlanningQuestion};
 
-/// Frames that look most like a frame, to which the topological graph joins it.
+/// Number of most similar frames to which the topological graph connects each frame.
 const LOOK_ALIKE: usize = 10;
 
-/// From the nearest frame under the adapter: each time to the frame within one hop that is nearest to
-/// the goal, until none is nearer.
+/// Greedy planner. It starts at the frame with the nearest latent and moves, among the frames
+/// within one hop, to the one nearest to the goal. It stops when no frame is nearer.
 pub(super) fn greedy(room: &MappedRoom, question: &PlanningQuestion) -> PlannedWay {
     let start = room.navigator.nearest(question.latent.view(), 1)[0].pose;
     let goal = room.poses()[question.goal.row()];
@@ -50,7 +50,8 @@ pub(super) fn greedy(room: &MappedRoom, question: &PlanningQuestion) -> PlannedW
     }
 }
 
-/// The shortest way over the poses of all frames, from the nearest frame under the adapter.
+/// Pose-graph planner: the shortest path over the poses of all frames, from the frame with the
+/// nearest latent.
 pub(super) fn pose_graph(room: &MappedRoom, question: &PlanningQuestion) -> PlannedWay {
     let start = room.navigator.nearest(question.latent.view(), 1)[0].pose;
     let goal = room.poses()[question.goal.row()];
@@ -75,9 +76,9 @@ pub(super) fn pose_graph(room: &MappedRoom, question: &PlanningQuestion) -> Plan
     }
 }
 
-/// The shortest way over frames that look alike, by the cosine of their raw features: from each, edges
-/// lead to the ten that look most like it and to the rows before and after it. Poses serve only
-/// to drive from frame to frame.
+/// Topological planner: the shortest path over similar frames, by the cosine of their raw
+/// features. Each frame has edges to its ten most similar frames and to the rows before and after
+/// it. Poses are used only to drive from frame to frame.
 pub(super) fn topological(room: &MappedRoom, question: &PlanningQuestion) -> PlannedWay {
     let directions = Directions::of(room);
     let view = direction(ArrayView1::from(&question.feature));
@@ -113,7 +114,7 @@ pub(super) fn topological(room: &MappedRoom, question: &PlanningQuestion) -> Pla
     }
 }
 
-/// Raw features of length one, row by frame.
+/// Raw features, normalized to length one, row by frame.
 struct Directions {
     rows: Vec<Array1<f64>>,
 }
@@ -130,7 +131,7 @@ impl Directions {
         self.rows.iter().map(|row| 1.0 - row.dot(&to)).collect()
     }
 
-    /// The frames that a frame is joined with, and how unlike they look.
+    /// The frames connected to a frame, with their cosine distances.
     fn joined(&self, row: usize) -> Vec<(usize, f64)> {
         let distances = self.distances(self.rows[row].view());
         let mut joined = nearest(&distances, LOOK_ALIKE + 1);
@@ -150,7 +151,7 @@ fn direction(feature: ArrayView1<'_, f32>) -> Array1<f64> {
     feature / length
 }
 
-/// The places of the smallest numbers, the smallest first.
+/// Indices of the `count` smallest distances, smallest first.
 fn nearest(distances: &[f64], count: usize) -> Vec<usize> {
     let mut places: Vec<usize> = (0..distances.len()).collect();
     places.sort_by(|&a, &b| distances[a].total_cmp(&distances[b]));

@@ -1,59 +1,59 @@
-//! What a tracker's answers are worth: their errors beside those of the simplest answers to the
-//! same frames, and how honest their covariances and statuses are.
+//! Scores of a tracker: pose and velocity errors beside those of simple baselines on the same
+//! frames, and the calibration of its covariances and statuses.
 
 use seese3_core::geometry::{Pose, PoseError, body_twist};
 use seese3_core::statistics::{mean, root_mean_square};
 use seese3_robot::tracking::{PoseWithCovariance, Replay, Status};
 
-/// An answer further than this from the truth is wrong, metres.
+/// Translation error above which a pose counts as wrong, metres.
 const WRONG_BEYOND_M: f64 = 0.5;
-/// An answer turned by more than this from the truth is wrong, degrees.
+/// Rotation error above which a pose counts as wrong, degrees.
 const WRONG_BEYOND_DEG: f64 = 15.0;
 
 /// The scores of one replay.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrackingScores {
-    /// Absolute errors of position over the frames with a map pose, metres.
+    /// Absolute position errors over the frames with a map pose, metres.
     pub ape: AnswerErrors,
-    /// Absolute errors of rotation over the same frames, radians.
+    /// Absolute rotation errors over the same frames, radians.
     pub turn: AnswerErrors,
-    /// Squared Mahalanobis lengths of the errors of map poses that were TRACKING.
+    /// Squared Mahalanobis lengths of the map pose errors in TRACKING frames.
     pub tracking_surprises: Vec<f64>,
-    /// The same of all `odom_from_camera`, laid on the true first pose.
+    /// The same for `odom_from_camera` in all frames, aligned to the true first pose.
     pub odom_surprises: Vec<f64>,
-    /// How many frames were TRACKING.
+    /// Number of TRACKING frames with a map pose.
     pub tracking: usize,
-    /// How many of those were more than half a metre or 15 degrees off.
+    /// Number of those frames with an error above 0.5 m or 15°.
     pub tracking_wrong: usize,
-    /// The velocity beside that of a camera that does not move.
+    /// Velocity errors, beside those of the zero-velocity baseline.
     pub velocity: VelocityErrors,
 }
 
-/// Root mean squares of the errors of several answers to the same frames.
+/// Root-mean-square errors of the tracker and of its baselines, over the same frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AnswerErrors {
     /// The map pose.
     pub fused: f64,
-    /// Dead reckoning, laid on the true first pose.
+    /// Dead reckoning, aligned to the true first pose.
     pub odom: f64,
-    /// The pose of the mapped frame whose raw feature is most alike, by the cosine.
+    /// The pose of the mapped frame with the most similar raw feature, by the cosine.
     pub nearest_frame: f64,
-    /// The true pose of the first frame, throughout.
+    /// The true first pose of the stream, for every frame.
     pub standing_still: f64,
 }
 
-/// Root mean squares over frames, metres per second.
+/// Root-mean-square velocity errors over frames, metres per second.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VelocityErrors {
-    /// Of the reported velocity.
+    /// Error of the reported velocity.
     pub error_m_s: f64,
-    /// Of reporting zero: the true speed.
+    /// Error of the zero-velocity baseline, which is the true speed.
     pub zero_m_s: f64,
 }
 
 impl TrackingScores {
-    /// The scores of a replay; `nearest_frame` gives the pose of the mapped frame whose raw feature
-    /// is most like that of a row.
+    /// The scores of a replay. `nearest_frame` returns the pose of the mapped frame with the raw
+    /// feature most similar to that of a row.
     pub fn of(replay: &Replay, nearest_frame: impl Fn(usize) -> Pose) -> Self {
         Self::of_rows(replay, |_| true, nearest_frame)
     }
@@ -123,7 +123,7 @@ impl TrackingScores {
 }
 
 impl AnswerErrors {
-    /// Means over rooms. A room without a map pose counts for none.
+    /// Means over rooms; rooms without a map pose are skipped.
     pub fn mean<'a>(rooms: impl Iterator<Item = &'a Self>) -> Self {
         let known: Vec<&Self> = rooms.filter(|errors| errors.fused.is_finite()).collect();
         let of =
@@ -139,7 +139,7 @@ impl AnswerErrors {
 }
 
 impl VelocityErrors {
-    /// Of the linear velocities of a replay; NaN without one.
+    /// Errors of the linear velocities in the rows that `keep` accepts; NaN without any.
     fn of(replay: &Replay, keep: &dyn Fn(usize) -> bool) -> Self {
         let mut error = Vec::new();
         let mut speed = Vec::new();

@@ -1,4 +1,4 @@
-//! D: φ applied to the difference of two features, instead of the difference of two latents.
+//! D: φ applied to the difference of two features; the adapter takes the difference of two latents.
 
 use nalgebra::Vector6;
 use ndarray::{Array2, ArrayView2};
@@ -18,13 +18,13 @@ impl<T: Real> DifferenceInput<T> {
         Self(Siamese::random(widths, random))
     }
 
-    /// The initial weights of a seed, PyTorch's.
+    /// PyTorch's initial weights for a seed.
     pub fn initial(widths: Widths, seed: u64) -> Self {
         Self::random(widths, &mut Seeded::new(seed))
     }
 
-    /// The motions between the features of sources and targets, each (n, d); `scale` undoes the
-    /// z-scoring of the targets.
+    /// The motions between the features of sources and targets, each (n, d). `scale` inverts the
+    /// z-scoring of the training targets.
     pub fn motions(&self, features: [ArrayView2<'_, f32>; 2], scale: &TargetScale) -> Vec<Twist> {
         let [from, to] = features.map(|rows| rows.mapv(|x| T::of(f64::from(x))));
         let normalised = self.0.embed(to - from).dot(&self.0.motion_matrix().t());
@@ -66,8 +66,7 @@ impl<T: Real> Objective<T> for DifferenceInput<T> {
         let mut gradient = self.zeros_like();
         gradient.0.motion += &d_predicted.t().dot(&forward.latents);
 
-        // Nothing is subtracted after φ here, so its last bias does not cancel and needs its
-        // gradient.
+        // Latents are not subtracted here: the last bias of φ does not cancel and has a gradient.
         self.0.phi.backward_whole(
             &forward,
             &d_predicted.dot(&self.0.motion),

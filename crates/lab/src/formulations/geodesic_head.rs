@@ -1,4 +1,4 @@
-//! C: a head turns the difference of two latents into a pose; trained on the motion in the body
+//! C: a head maps the difference of two latents to a pose. It is trained on the motion in the body
 //! frame.
 
 use ndarray::{Array2, ArrayView2};
@@ -8,7 +8,7 @@ use seese3_core::adapter::building_blocks::{Dense, Seeded};
 use seese3_core::adapter::{At, Network, Objective, Phi, Real, Samples, Widths};
 use seese3_core::geometry::{Twist, exp, log};
 
-/// Columns of the head's hidden layer.
+/// Width of the head's hidden layer.
 const HEAD_HIDDEN: usize = 64;
 
 /// φ: d → 64 → 20, and the head 20 → 64 → 9.
@@ -27,12 +27,12 @@ impl<T: Real> GeodesicHead<T> {
         }
     }
 
-    /// The initial weights of a seed, PyTorch's.
+    /// PyTorch's initial weights for a seed.
     pub fn initial(widths: Widths, seed: u64) -> Self {
         Self::random(widths, &mut Seeded::new(seed))
     }
 
-    /// The motions between features (n, d), each in its source's body frame.
+    /// The motions between features (n, d), each in the body frame of its source.
     pub fn motions(&self, features: [ArrayView2<'_, f32>; 2]) -> Vec<Twist> {
         let latents =
             features.map(|rows| self.phi.forward(rows.mapv(|x| T::of(f64::from(x)))).latents);
@@ -85,8 +85,8 @@ impl<T: Real> Objective<T> for GeodesicHead<T> {
         let head = self.head.forward(rows.differences(&forward.latents));
         let mut d_numbers = Array2::zeros(head.output.dim());
 
-        // The loss is the batch mean of ‖log(M⁻¹ M_true)‖², with M the pose that the head predicts.
-        // Its gradient is carried back to the nine numbers of each M.
+        // The loss is the batch mean of ‖log(M⁻¹ M_true)‖², with M the pose predicted by the head.
+        // Its gradient is propagated to the nine numbers of each M.
         let mut loss = 0.0;
         let share = (batch.len() as f64).recip();
         for ((&pair, row), mut into) in batch

@@ -1,12 +1,12 @@
-//! The paper's alternatives to the adapter: other ways from two features to a motion (Sec. A.5).
+//! The paper's alternatives to the adapter: other models from two features to a motion (Sec. A.5).
 //!
 //! - A: M = ψ(z₂) ψ(z₁)⁻¹ with ψ: d → SE(3), trained on the motion in the world frame.
 //! - B: the same ψ, trained on absolute poses.
 //! - C: M = head(φ(z₂) − φ(z₁)), a pose, trained on the motion in the body frame.
 //! - D: W φ(z₂ − z₁), trained on z-scored twists.
 //!
-//! All are scored by the twist in the body frame of the first camera. They are compared, not
-//! served.
+//! All are scored by the twist in the body frame of the first camera. The service does not
+//! use them.
 
 mod difference_input;
 mod geodesic_head;
@@ -45,7 +45,7 @@ pub enum Formulation {
 }
 
 impl Formulation {
-    /// The adapter, then the paper's four.
+    /// The adapter, then the paper's four alternatives.
     pub const ALL: [Self; 5] = [
         Self::Poincare,
         Self::Unanchored,
@@ -66,11 +66,11 @@ impl Formulation {
     }
 }
 
-/// Trains one formulation on all rooms together and reads the motions of each room's test pairs.
+/// Trains one formulation on all rooms together and predicts the motions of each room's test pairs.
 ///
 /// # Errors
-/// As [`training::train_adapter`]; [`training::Error::NotPlain`] when a setting is one that only
-/// the adapter supports.
+/// As [`training::train_adapter`]; [`training::Error::NotPlain`] for a setting that only the
+/// adapter supports.
 ///
 /// Source: SeeSE3, Sec. A.5.
 pub fn train_formulation(
@@ -80,8 +80,8 @@ pub fn train_formulation(
     progress: &mut dyn FnMut(EpochProgress),
 ) -> Result<Vec<ReadMotions>, training::Error> {
     if formulation == Formulation::Poincare {
-        // Settings that only the adapter supports would favour it in the comparison, so the other
-        // formulations refuse them below.
+        // Settings that only the adapter supports would favor it in the comparison, so the other
+        // formulations reject them below.
         return read_by_adapter(room_data, plan, progress).map(|(read, _)| read);
     }
 
@@ -149,7 +149,7 @@ pub fn train_formulation(
             })?
         }
 
-        // The adapter has returned above; it stands here only to complete the match.
+        // The adapter has already returned above; it is listed only to complete the match.
         Formulation::Poincare | Formulation::DifferenceInput => {
             let start = DifferenceInput::random(widths, &mut random);
             let scale = samples.scale();
@@ -161,8 +161,8 @@ pub fn train_formulation(
     })
 }
 
-/// Trains an adapter on all rooms together and reads the motions of each room's test pairs; also how
-/// many steps its optimiser took.
+/// Trains an adapter on all rooms together. Returns the predicted motions of each room's test pairs
+/// and the number of optimizer steps.
 ///
 /// # Errors
 /// As [`training::train_adapter`].
@@ -187,14 +187,14 @@ pub fn read_by_adapter(
     ))
 }
 
-/// The mean motion of a room's training pairs at the tested stride. An adapter's own μ is another
-/// number where it learned from other strides, and zero where it was made to pass through zero.
+/// The mean motion of a room's training pairs at the test stride. An adapter's own μ can differ: it
+/// may come from other strides, and is zero for an adapter trained through zero.
 fn mean_motion(data: &RoomData<'_>, plan: &TrainingPlan) -> Result<Vector6<f64>, training::Error> {
     let training = plan.split.train_pairs(data.room.timeline(), plan.stride)?;
     Ok(TargetScale::of(&motions(data.room.poses(), &training)).mean)
 }
 
-/// The two ends of pairs, as a formulation sees them.
+/// Inputs of a formulation: the two ends of each pair.
 pub struct Ends<'a> {
     /// Features of the sources and of the targets, each (n, d).
     pub features: [ArrayView2<'a, f32>; 2],
@@ -246,8 +246,8 @@ impl Run<'_> {
     }
 }
 
-/// log(P₁⁻¹ M P₁): a motion M in the world frame, P₂ = M P₁, as a twist in the body frame of the
-/// first camera.
+/// Converts a motion M in the world frame, P₂ = M P₁, to a twist in the body frame of the first
+/// camera: log(P₁⁻¹ M P₁).
 fn body_motion(world: &Pose, source: &Pose) -> Twist {
     log(&(source.inv_mul(world) * source))
 }

@@ -1,5 +1,5 @@
-//! Conversion of nine network outputs to a pose, and the gradient of pose losses with respect to
-//! them.
+//! Conversion of nine network outputs to a pose, and gradients of pose losses with respect to these
+//! outputs.
 //!
 //! The numbers are t, a₁, a₂. The rotation is R = (b₁, b₂, b₁ × b₂), with b₁, b₂ from a₁, a₂ by
 //! Gram–Schmidt: the 6D rotation of Zhou et al. (2019). Losses are squared norms of logarithms.
@@ -11,32 +11,31 @@ use ndarray::ArrayView1;
 use seese3_core::adapter::Real;
 use seese3_core::geometry::{Pose, Twist, left_jacobian_inverse, log};
 
-/// Number of outputs that describe a pose.
+/// Number of network outputs per pose.
 pub const POSE_NUMBERS: usize = 9;
-/// Vectors shorter than this are divided by it instead of by their length, as in PyTorch's
-/// `normalize`.
+/// Lower limit of the divisor when vectors are normalized, as in PyTorch's `normalize`.
 const SHORTEST: f64 = 1e-12;
 
-/// A pose, with the intermediate values that its gradient needs.
+/// A pose, with the intermediate values for its gradient.
 pub struct HeadPose {
     first: Vector3<f64>,
     second: Vector3<f64>,
     basis: [Vector3<f64>; 3],
-    /// The part of a₂ orthogonal to b₁, before it is normalised.
+    /// The component of a₂ orthogonal to b₁, not normalized.
     beside: Vector3<f64>,
     /// The pose.
     pub pose: Pose,
 }
 
 impl HeadPose {
-    /// The pose that nine numbers describe.
+    /// The pose of nine network outputs.
     pub fn of<T: Real>(row: ArrayView1<'_, T>) -> Self {
         let three = |first: usize| Vector3::from_fn(|i, _| row[first + i].f64());
         let translation = three(0);
         let first = three(3);
         let second = three(6);
 
-        // Gram–Schmidt: b₁ is a₁ normalised, b₂ is the normalised part of a₂ orthogonal to b₁.
+        // Gram–Schmidt: b₁ is a₁ normalized; b₂ is the normalized component of a₂ orthogonal to b₁.
         let b1 = first / first.norm().max(SHORTEST);
         let beside = second - b1 * b1.dot(&second);
         let b2 = beside / beside.norm().max(SHORTEST);
@@ -56,7 +55,7 @@ impl HeadPose {
         }
     }
 
-    /// The gradient with respect to the nine numbers, from the gradient q with respect to the pose.
+    /// Propagates the gradient q with respect to the pose to the nine network outputs.
     pub fn backward(&self, q: &Vector6<f64>) -> [f64; POSE_NUMBERS] {
         let [b1, b2, _] = self.basis;
         let rotation = Matrix3::from_columns(&self.basis);
@@ -66,12 +65,12 @@ impl HeadPose {
         let g = rotation * Vector3::from(q.fixed_rows::<3>(3)).cross_matrix() * 0.5;
         let column = |i: usize| Vector3::from(g.column(i));
 
-        // The third column is b₁ × b₂ and passes its gradient on to both factors.
+        // The third column is b₁ × b₂; its gradient flows to both factors.
         let mut d_b1 = column(0) + b2.cross(&column(2));
         let d_b2 = column(1) + column(2).cross(&b1);
 
-        // Back through Gram–Schmidt in reverse order. Normalising passes on only the part of a
-        // gradient that is orthogonal to the unit vector, divided by the length.
+        // Gram–Schmidt in reverse order. The gradient of a normalization keeps only the component
+        // orthogonal to the unit vector, divided by the length.
         let d_beside = (d_b2 - b2 * b2.dot(&d_b2)) / self.beside.norm().max(SHORTEST);
         let d_second = d_beside - b1 * b1.dot(&d_beside);
 

@@ -1,4 +1,4 @@
-//! A and B: ψ maps every feature to a pose; a motion is ψ(z₂) ψ(z₁)⁻¹, in the world frame.
+//! A and B: ψ maps each feature to a pose; a motion is ψ(z₂) ψ(z₁)⁻¹, in the world frame.
 
 use ndarray::{Array2, ArrayView1};
 
@@ -8,7 +8,7 @@ use seese3_core::adapter::building_blocks::Seeded;
 use seese3_core::adapter::{At, Network, Objective, Phi, Real, Samples, Widths};
 use seese3_core::geometry::{Pose, Twist, adjoint};
 
-/// ψ: d → 64 → 9, shaped as φ.
+/// ψ: d → 64 → 9, with the architecture of φ.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorldPose<T> {
     psi: Phi<T>,
@@ -27,12 +27,12 @@ impl<T: Real> WorldPose<T> {
         }
     }
 
-    /// The initial weights of a seed, PyTorch's.
+    /// PyTorch's initial weights for a seed.
     pub fn initial(widths: Widths, seed: u64) -> Self {
         Self::random(widths, &mut Seeded::new(seed))
     }
 
-    /// The motions between the ends, each in its source's body frame.
+    /// The motions between the ends, each in the body frame of its source.
     pub fn motion(&self, ends: Ends<'_>) -> Vec<Twist> {
         let poses = |end: usize| {
             let rows = self
@@ -47,8 +47,8 @@ impl<T: Real> WorldPose<T> {
         let from = poses(0);
         let to = poses(1);
 
-        // ψ gives motions in the world frame. The true source poses turn them into the body frame,
-        // in which all formulations are scored.
+        // ψ predicts motions in the world frame. Convert them with the true source poses to the
+        // body frame, in which all formulations are scored.
         let motion = |((from, to), source): ((&Pose, &Pose), &Pose)| {
             body_motion(&(to * from.inverse()), source)
         };
@@ -60,8 +60,8 @@ impl<T: Real> WorldPose<T> {
         Phi::<T>::NAMES.map(|name| format!("psi.{name}")).to_vec()
     }
 
-    /// The mean loss of a batch and its gradient with respect to ψ's parameters. `losses` gives the
-    /// loss of one pair and its gradients with respect to the two predicted poses.
+    /// The mean loss of a batch and its gradient with respect to ψ's parameters. `losses` returns
+    /// the loss of one pair and its gradients with respect to the two predicted poses.
     fn through_psi(
         &self,
         samples: &Samples<T>,
@@ -69,8 +69,7 @@ impl<T: Real> WorldPose<T> {
         at: At<'_>,
         losses: impl Fn(usize, [&HeadPose; 2]) -> (f64, [nalgebra::Vector6<f64>; 2]),
     ) -> (f64, Self) {
-        // ψ runs once for each distinct frame of the batch; a frame at the end of several pairs
-        // collects the gradients of all of them.
+        // ψ runs once per distinct frame of the batch. A frame sums the gradients of its pairs.
         let rows = samples.batch(batch, at);
         let forward = self.psi.forward(rows.features.clone());
         let heads: Vec<HeadPose> = forward

@@ -1,7 +1,7 @@
-//! M2: the intrinsic dimension of the features, that is of the manifold on which they lie.
+//! M2: the intrinsic dimension of the feature manifold.
 //!
-//! Distances are computed directly, in f64. Expanding them as ‖x‖² − 2xy + ‖y‖² cancels for
-//! duplicate rows and gives meaningless dimensions.
+//! Distances are computed directly, in f64. The expansion ‖x‖² − 2xy + ‖y‖² cancels for near
+//! duplicate rows and yields meaningless dimensions.
 
 use ndarray::{ArrayView2, Axis};
 use rayon::prelude::*;
@@ -9,15 +9,15 @@ use rayon::prelude::*;
 use super::Error;
 use seese3_core::statistics::{mean, median};
 
-/// Number of neighbours K of the maximum-likelihood estimate.
+/// Number of neighbors K of the maximum-likelihood estimate.
 const MLE_NEIGHBOURS: usize = 20;
-/// Share of the largest ratios that TwoNN leaves out.
+/// Fraction of the largest ratios that TwoNN discards.
 const DISCARDED: f64 = 0.1;
 
-/// How identical rows are treated.
+/// How identical rows are handled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Duplicates {
-    /// A row whose nearest neighbour is at distance zero is dropped, as in scikit-dimension.
+    /// A row at distance zero from its nearest neighbor is dropped, as in scikit-dimension.
     DropRows,
     /// The first of each group of identical rows is kept.
     KeepFirst,
@@ -26,8 +26,8 @@ pub enum Duplicates {
 /// TwoNN (Facco et al. 2017), estimated in three ways.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TwoNn {
-    /// Slope of −log(1 − F) over log μ through the origin, without the largest tenth of the ratios
-    /// μ: the usual estimate.
+    /// The usual estimate: slope of −log(1 − F) over log μ through the origin, without the largest
+    /// tenth of the ratios μ.
     pub linear: f64,
     /// Maximum likelihood with the largest tenth of the ratios censored.
     pub censored: f64,
@@ -35,11 +35,11 @@ pub struct TwoNn {
     pub likelihood: f64,
 }
 
-/// MLE (Levina and Bickel 2004) over 20 neighbours. The unbiased form normalises by K − 2, the
-/// biased one by K − 1.
+/// MLE (Levina and Bickel 2004) over 20 neighbors. The unbiased form normalizes by K − 2, the
+/// biased form by K − 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Mle {
-    /// The harmonic mean over rows (MacKay and Ghahramani): the usual combination.
+    /// The harmonic mean over rows (MacKay and Ghahramani), the usual combination.
     pub harmonic: f64,
     /// The mean over rows.
     pub mean: f64,
@@ -52,18 +52,18 @@ pub struct Mle {
 pub struct IntrinsicDimension {
     /// See [`TwoNn`].
     pub two_nn: TwoNn,
-    /// Normalised by K − 1.
+    /// MLE normalized by K − 1.
     pub mle_biased: Mle,
-    /// Normalised by K − 2.
+    /// MLE normalized by K − 2.
     pub mle_unbiased: Mle,
-    /// Rows that were used.
+    /// Number of rows used.
     pub used: usize,
-    /// Rows that were dropped as duplicates.
+    /// Number of rows dropped as duplicates.
     pub dropped: usize,
 }
 
-/// The intrinsic dimension of `rows` (n, d). Rows at most `gap` apart do not count as neighbours;
-/// with 0 only the row itself is left out.
+/// The intrinsic dimension of `rows` (n, d). Rows at most `gap` apart do not count as neighbors; a
+/// `gap` of 0 excludes only the row itself.
 ///
 /// # Errors
 /// [`Error::TooFewRows`] when fewer than 21 rows are left without duplicates;
@@ -81,8 +81,8 @@ pub fn intrinsic_dimension(
         Duplicates::KeepFirst => {
             let mut seen = std::collections::HashSet::new();
 
-            // Rows are compared bit by bit; adding 0.0 turns −0.0 into 0.0, so that equal numbers
-            // have equal bits.
+            // Compare rows by bits. Adding 0.0 turns −0.0 into 0.0, so equal numbers have equal
+            // bits.
             let bits = |row: usize| {
                 all.row(row)
                     .iter()
@@ -117,8 +117,7 @@ pub fn intrinsic_dimension(
             });
         }
 
-        // Only the K nearest have to be sorted; selecting them first is linear in the number of
-        // rows.
+        // Select the K nearest in linear time, then sort only these.
         squares.select_nth_unstable_by(MLE_NEIGHBOURS - 1, f64::total_cmp);
         squares.truncate(MLE_NEIGHBOURS);
         squares.sort_by(f64::total_cmp);
@@ -131,8 +130,7 @@ pub fn intrinsic_dimension(
         .map(nearest)
         .collect::<Result<_, _>>()?;
 
-    // The estimators divide by the nearest distance, so rows at distance zero to another are
-    // dropped.
+    // Drop rows at distance zero to another row: the estimators divide by the nearest distance.
     let usable: Vec<&Vec<f64>> = distances.iter().filter(|row| row[0] > 0.0).collect();
 
     if usable.len() <= MLE_NEIGHBOURS {
@@ -153,7 +151,7 @@ pub fn intrinsic_dimension(
 }
 
 fn two_nn(distances: &[&Vec<f64>]) -> TwoNn {
-    // log μ of each row, with μ the distance to its second neighbour over that to its first.
+    // log μ of each row; μ is the ratio of the distances to its second and first neighbor.
     let mut logs: Vec<f64> = distances.iter().map(|row| (row[1] / row[0]).ln()).collect();
     logs.sort_by(f64::total_cmp);
     let count = logs.len();
@@ -173,7 +171,7 @@ fn two_nn(distances: &[&Vec<f64>]) -> TwoNn {
         .sum::<f64>()
         / square;
 
-    // All that is used of a censored ratio is that it is at least as large as the last one kept.
+    // A censored ratio is known only to be at least as large as the last kept ratio.
     let tail = (count - used) as f64 * used_logs.last().copied().unwrap_or(f64::NAN);
     let censored = (used as f64 - 1.0) / (used_logs.iter().sum::<f64>() + tail);
 
@@ -185,7 +183,7 @@ fn two_nn(distances: &[&Vec<f64>]) -> TwoNn {
 }
 
 fn mle(distances: &[&Vec<f64>], factor: f64) -> Mle {
-    // One row's estimate: the factor over Σ_j log(r_K / r_j).
+    // Estimate of one row: factor / Σ_j log(r_K / r_j).
     let of = |row: &&Vec<f64>| {
         factor
             / row

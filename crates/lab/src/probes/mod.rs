@@ -1,5 +1,5 @@
-//! The probes M1 to M3: how much of SE(3) a room's features hold before an adapter is trained on
-//! them. M4, the score of a trained adapter, is in `training`.
+//! The probes M1 to M3: the SE(3) information in a room's features, without a trained adapter. M4
+//! is the score of a trained adapter; see [`seese3_core::training`].
 
 mod intrinsic_dimension;
 mod mutual_knn;
@@ -11,7 +11,7 @@ pub use ridge_probe::ridge_probe;
 
 use seese3_core::{ridge, splits};
 
-/// Why a probe has no value.
+/// Why a probe failed.
 #[derive(Debug, thiserror::Error, PartialEq)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
@@ -38,7 +38,7 @@ pub enum Error {
     },
     #[error("row {row} of the features is zero; it has no direction")]
     NoDirection { row: usize },
-    #[error("{kept} of {rows} rows are left without duplicates; {needed} are needed")]
+    #[error("only {kept} of {rows} rows are left after removing duplicates; {needed} are required")]
     TooFewRows {
         kept: usize,
         rows: usize,

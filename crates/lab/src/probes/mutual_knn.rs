@@ -1,5 +1,5 @@
-//! M1: whether frames with similar features have similar poses, measured as the overlap of their
-//! nearest neighbours.
+//! M1: overlap between the nearest neighbors by feature and by pose. It measures whether frames
+//! with similar features have similar poses.
 
 use ndarray::{ArrayView2, Axis};
 use rayon::prelude::*;
@@ -10,26 +10,27 @@ use seese3_core::geometry::Pose;
 /// The options of M1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MutualKnn {
-    /// Number of frames that are compared: 0, s, 2s, … of the room.
+    /// Number of sampled frames: 0, s, 2s, … of the room.
     pub frames: usize,
     /// The stride s, in frames of the room.
     pub stride: usize,
-    /// Number of neighbours of each frame.
+    /// Number of neighbors of each frame.
     pub k: usize,
-    /// Frames within this temporal distance do not count as neighbours; a frame itself never does.
+    /// Temporal distance within which frames do not count as neighbors. A frame is never its own
+    /// neighbor.
     pub exclusion: usize,
     /// The unit of `exclusion`.
     pub counted: Counted,
-    /// Whether a frame at exactly the distance `exclusion` is left out too.
+    /// Whether a frame at exactly the distance `exclusion` is excluded too.
     pub limit: Limit,
 }
 
-/// What a temporal distance is counted in.
+/// The unit of a temporal distance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Counted {
-    /// The frames that are compared.
+    /// Sampled frames.
     Sampled,
-    /// The frames of the room.
+    /// Frames of the room.
     Native,
 }
 
@@ -43,7 +44,7 @@ pub enum Limit {
 }
 
 impl MutualKnn {
-    /// Whether two of the compared frames may be neighbours.
+    /// Whether two sampled frames may be neighbors.
     fn apart(&self, frame: usize, other: usize) -> bool {
         let distance = match self.counted {
             Counted::Sampled => frame.abs_diff(other),
@@ -59,7 +60,7 @@ impl MutualKnn {
 }
 
 impl Default for MutualKnn {
-    /// The paper's: 256 frames, k = 10, 10 frames to each side left out.
+    /// The paper's options: 256 frames, k = 10, exclusion of 10 frames before and after.
     fn default() -> Self {
         Self {
             frames: 256,
@@ -72,8 +73,8 @@ impl Default for MutualKnn {
     }
 }
 
-/// The mean share of a frame's k nearest by feature (cosine) that are among its k nearest by pose,
-/// 0 to 1.
+/// The mutual k-NN score, 0 to 1: the mean fraction of a frame's k nearest frames by feature
+/// (cosine) that are also among its k nearest by pose.
 ///
 /// `rows` are features (n, d), `poses` are `world_from_camera`, metres.
 ///
@@ -97,7 +98,7 @@ pub fn mutual_knn(
     Ok(shared as f64 / (options.frames * options.k) as f64)
 }
 
-/// The k nearest neighbours of each compared frame by the cosine of their features, nearest first;
+/// The k nearest neighbors of each sampled frame by the cosine of their features, nearest first;
 /// ties go to the smaller frame number.
 ///
 /// # Errors
@@ -117,8 +118,8 @@ pub fn feature_neighbours(
         row /= norm;
     }
 
-    // Summed in the same order for every pair, so that identical rows have exactly the same
-    // distance to any other row.
+    // Sum in the same order for every pair, so that identical rows have exactly equal distances to
+    // any other row.
     let distance = |a: usize, b: usize| {
         1.0 - units
             .row(a)
@@ -131,13 +132,13 @@ pub fn feature_neighbours(
     neighbours(options, distance)
 }
 
-/// The k nearest neighbours of each compared frame, nearest first, by the Euclidean distance of (t,
-/// R[:, 0], R[:, 1]), metres and unitless.
+/// The k nearest neighbors of each sampled frame by pose, nearest first. The distance is Euclidean
+/// over (t, R[:, 0], R[:, 1]), mixing metres and unitless numbers.
 ///
 /// # Errors
 /// As [`mutual_knn`].
 pub fn pose_neighbours(poses: &[Pose], options: &MutualKnn) -> Result<Vec<Vec<usize>>, Error> {
-    // The first two columns of R determine the third, so that nine numbers describe a pose.
+    // The first two columns of R determine the third, so nine numbers describe a pose.
     let nine = |frame: usize| -> [f64; 9] {
         let t = poses[frame].translation.vector;
         let r = poses[frame].rotation.to_rotation_matrix();
@@ -214,7 +215,7 @@ fn neighbours(
             });
         }
 
-        // Ties go to the smaller frame number, so that the neighbours are the same in every run.
+        // Ties go to the smaller frame number, so that the result is deterministic.
         others.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         Ok(others.into_iter().take(k).map(|(_, other)| other).collect())
     };
@@ -226,7 +227,7 @@ fn neighbours(
 mod tests {
     use super::*;
 
-    /// Oracle: by hand, of a frame and the one three samples on, six frames of the room.
+    /// Oracle: by hand, for two frames that are three samples, or six room frames, apart.
     #[test]
     fn distances_are_counted_as_asked() {
         let apart = |counted, limit, exclusion| {

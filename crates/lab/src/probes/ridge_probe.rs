@@ -1,4 +1,4 @@
-//! M3: how well a linear map predicts a motion from the difference of two features.
+//! M3: ridge regression from feature differences to motions.
 
 use ndarray::{Array2, ArrayView2, Axis};
 
@@ -10,10 +10,10 @@ use seese3_core::ridge::{Intercept, Ridge};
 use seese3_core::room::Room;
 use seese3_core::splits::{Pair, Split};
 
-/// The motions of the test pairs by a ridge regression (α = 1, with intercept) from feature
+/// Predicts the motions of the test pairs by ridge regression (α = 1, with intercept) on feature
 /// differences.
 ///
-/// `rows` are the room's features (n, d), one a frame. Differences are taken in f64.
+/// `rows` are the room's features (n, d), one row per frame. Differences are computed in f64.
 ///
 /// # Errors
 /// [`Error::Pairs`] if the room is too short for the stride.

@@ -1,4 +1,4 @@
-//! A sweep over adapters: one row per run, and the paper's tables computed from the rows.
+//! Tables of a sweep over adapters: one row per run, and the paper's tables from these rows.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use seese3_core::statistics::{deviation, mean, mean_of_known};
 /// The rows as the bytes of a Parquet file, one column per field.
 ///
 /// # Errors
-/// The message of the Parquet library, if it refuses a column.
+/// [`Error::Parquet`] if the library rejects a column.
 pub fn sweep_parquet(rows: &[SweepRow]) -> Result<Vec<u8>, Error> {
     // One closure per type of column, so that the list below reads as name and field.
     let text = |of: fn(&SweepRow) -> &str| {
@@ -60,13 +60,12 @@ pub fn sweep_parquet(rows: &[SweepRow]) -> Result<Vec<u8>, Error> {
 }
 
 /// The paper's success table (Sec. 5): by recording format and features, the best R² and the
-/// share of rooms above 0 and 0.3. Each room counts by its best run, chosen by its test score, as
-/// in the paper's "Max R²".
+/// percentage of rooms above 0 and 0.3. A room's score is that of its best run, chosen by test
+/// score, as in the paper's "Max R²".
 pub fn success_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     let mut groups: BTreeMap<(String, String), BTreeMap<String, f64>> = BTreeMap::new();
     for row in rows.iter().filter(|row| row.failure.is_empty()) {
-        // A room with runs but without a defined R² still counts as a room, one that did not
-        // succeed.
+        // A room without a defined R² still counts, as a failure.
         let best = groups
             .entry((row.format.clone(), row.features.clone()))
             .or_default();
@@ -102,15 +101,15 @@ pub fn success_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     lines
 }
 
-/// The paper's difficulty table (Sec. A.4): by recording format and over all features, the mean
-/// number of frames and of test pairs per room, the share of rooms whose best run is above 0, and
-/// the R² of the best run.
+/// The paper's difficulty table (Sec. A.4), by recording format over all features. It has the mean
+/// numbers of frames and of test pairs per room, the percentage of rooms with a best run above 0,
+/// and the R² of the best run.
 pub fn difficulty_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     let mut groups: BTreeMap<&str, BTreeMap<&str, (usize, usize, f64)>> = BTreeMap::new();
     for row in rows.iter().filter(|row| row.failure.is_empty()) {
         let rooms = groups.entry(&row.format).or_default();
 
-        // Of each room: frames, the largest number of test pairs of its runs, and the best R².
+        // Per room: frames, the largest number of test pairs of its runs, and the best R².
         let (_, pairs, best) = rooms
             .entry(&row.room)
             .or_insert((row.frames, 0, f64::NEG_INFINITY));
@@ -150,9 +149,9 @@ pub fn difficulty_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     lines
 }
 
-/// The paper's sweep table: by part of the motion, the best R², the share of runs above 0 and 0.5,
-/// and the standard deviation over seeds, averaged over all rooms, splits, strides and
-/// configurations that have several seeds.
+/// The paper's sweep table: by part of the motion, the best R², the percentage of runs above 0 and
+/// 0.5, and the standard deviation over seeds. The deviation is averaged over all combinations of
+/// room, split, stride and configuration with several seeds.
 pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     type Part = fn(&SweepRow) -> Option<f64>;
 
@@ -186,8 +185,7 @@ pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
             seeds.extend(part(row));
         }
 
-        // A single seed has no spread, so that only rooms and configurations with several seeds
-        // count.
+        // A single seed has no spread; use only rooms and configurations with several seeds.
         let spreads: Vec<f64> = by_configuration
             .values()
             .filter(|seeds| seeds.len() > 1)
@@ -214,7 +212,7 @@ pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
     lines
 }
 
-/// The `most` best configurations, by their mean R² over rooms and seeds, the best first.
+/// The `most` best configurations by mean R² over rooms and seeds, best first.
 pub fn configurations_rows(rows: &[SweepRow], most: usize) -> Vec<Vec<String>> {
     let mut by_configuration: BTreeMap<_, Vec<f64>> = BTreeMap::new();
     for row in rows {
@@ -304,7 +302,7 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand. A room counts by its best run, a failed run by nothing.
+    /// Oracle: by hand. A room's score is that of its best run; failed runs are skipped.
     #[test]
     fn rooms_count_by_their_best_run() {
         let rows = [
@@ -324,7 +322,7 @@ mod tests {
             ["tum", "2", "200", "40", "50", "0.400"]
         );
 
-        // The seeds of room a deviate by 1.4/√2; room b has one that counts.
+        // The seeds of room a deviate by 1.4/√2; room b has only one successful seed.
         assert_eq!(
             parts_rows(&rows)[1],
             ["overall", "3", "0.400", "33", "0", "0.990", "-0.367"]

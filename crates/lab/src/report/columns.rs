@@ -1,5 +1,4 @@
-//! Tables for other programs: Parquet files with one column per attribute, which pandas and DuckDB
-//! read.
+//! Writes tables as Parquet files, one column per attribute, for pandas and DuckDB.
 
 use std::sync::Arc;
 
@@ -12,7 +11,7 @@ use parquet::file::properties::WriterProperties;
 use parquet::file::writer::SerializedFileWriter;
 use parquet::schema::types::Type;
 
-/// The values of one column. All columns of a table must be equally long.
+/// The values of one column. All columns of a table must have the same length.
 #[derive(Debug, Clone)]
 pub enum Column {
     /// Text, stored as UTF-8.
@@ -31,7 +30,7 @@ impl Column {
             Self::Real(_) => (Physical::DOUBLE, ConvertedType::NONE),
         };
 
-        // Columns are required, that is without nulls: a missing number is NaN instead.
+        // Columns have no nulls (REQUIRED): a missing number is NaN.
         let builder =
             Type::primitive_type_builder(name, physical).with_repetition(Repetition::REQUIRED);
 
@@ -39,10 +38,10 @@ impl Column {
     }
 }
 
-/// The bytes of a Parquet file with these named columns, in their order.
+/// The bytes of a Parquet file with the named columns, in order.
 ///
 /// # Errors
-/// [`Error::Parquet`], if the library refuses the schema or a column.
+/// [`Error::Parquet`] if the library rejects the schema or a column.
 pub fn parquet_file(columns: &[(&str, Column)]) -> Result<Vec<u8>, Error> {
     let mut fields = Vec::with_capacity(columns.len());
     for (name, column) in columns {
@@ -62,7 +61,7 @@ pub fn parquet_file(columns: &[(&str, Column)]) -> Result<Vec<u8>, Error> {
         Arc::new(WriterProperties::builder().build()),
     )?;
 
-    // All rows form a single row group. Its columns must be written in the order of the schema.
+    // Write all rows as one row group, its columns in schema order.
     let mut group = writer.next_row_group()?;
 
     for (_, column) in columns {

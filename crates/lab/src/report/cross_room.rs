@@ -1,4 +1,4 @@
-//! Results of an adapter in rooms that it was not trained on, for `seese3 cross-room`.
+//! Results of an adapter in held-out rooms, for `seese3 cross-room`.
 
 use std::collections::BTreeMap;
 
@@ -9,9 +9,9 @@ use super::table::aligned;
 use crate::experiments::cross_room::{CrossRoomRun, MotionSummary, RoomOutcome, wins};
 use seese3_core::statistics::{RoomMean, bootstrap_mean, paired_difference};
 
-/// One line per navigator: the number of rooms in which it beats Identity with Wilson's interval,
-/// its mean hit rate, and by how much that exceeds the hit rate of `baseline`. The intervals of the
-/// last two come from a bootstrap over rooms.
+/// One line per navigator: the number of rooms in which it beats Identity, its mean hit rate, and
+/// the difference to the hit rate of `baseline`. The first has Wilson's interval; the intervals of
+/// the other two are bootstrapped over rooms.
 pub fn cross_room_table(run: &CrossRoomRun, baseline: &str, threshold: f64) -> String {
     let head = [
         "navigator".to_owned(),
@@ -36,8 +36,7 @@ pub fn cross_room_table(run: &CrossRoomRun, baseline: &str, threshold: f64) -> S
             )
         });
 
-        // The difference is taken room by room, which needs a hit rate of both navigators in
-        // every room.
+        // The difference is paired by room, so both navigators need a hit rate in every room.
         let over = match theirs.len() == ours.len() && name != baseline {
             true => room_difference_text(&paired_difference(&ours, &theirs, 0)),
             false => String::new(),
@@ -54,7 +53,7 @@ pub fn cross_room_table(run: &CrossRoomRun, baseline: &str, threshold: f64) -> S
     aligned(&lines)
 }
 
-/// One line per run: R² over the held-out rooms against the number of training rooms.
+/// One line per run: the number of training rooms and R² over the held-out rooms.
 pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str, threshold: f64) -> String {
     let mut head = [
         "rooms",
@@ -71,7 +70,7 @@ pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str, threshold: f64) -> S
     head.push(format!("Hit@{threshold}, {baseline}"));
     let mut lines = vec![head];
     for run in runs {
-        // A run without evaluated rooms has no line.
+        // Skip a run without evaluated rooms.
         let Some(summary) = MotionSummary::of(&run.r2(), 0) else {
             continue;
         };
@@ -104,7 +103,7 @@ pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str, threshold: f64) -> S
     aligned(&lines)
 }
 
-/// One line per room: the number of pairs, R², that of the constant, and each navigator's hit rate.
+/// One line per room: the number of pairs, R², R² of the constant, and each navigator's hit rate.
 pub fn rooms_table(run: &CrossRoomRun) -> String {
     let names = run.navigators();
     let mut lines = vec![
@@ -136,7 +135,7 @@ pub fn rooms_table(run: &CrossRoomRun) -> String {
     aligned(&lines)
 }
 
-/// The runs of `seese3 cross-room`, with a summary over rooms and the scores of every room.
+/// The JSON record of `seese3 cross-room`: for each run a summary and the scores of every room.
 #[derive(Debug, Serialize)]
 pub struct CrossRoomJson {
     baseline: String,
@@ -164,7 +163,7 @@ struct SummaryJson {
     best: f64,
     /// The mean of max(R², −1).
     clipped_mean: RoomMeanJson,
-    /// The mean of max(R², 0), as the paper takes it.
+    /// The mean of max(R², 0), as in the paper.
     clipped_mean_at_0: RoomMeanJson,
 }
 
@@ -182,7 +181,7 @@ struct RoomJson {
     candidates: usize,
     motion: MotionJson,
     baselines: BaselinesJson,
-    /// By navigator.
+    /// Hit rates by navigator.
     hit: BTreeMap<String, RateJson>,
 }
 
@@ -192,7 +191,7 @@ struct SkippedJson {
     why: String,
 }
 
-/// The record of cross-room runs; differences are taken from the navigator `baseline`.
+/// Builds the JSON record of cross-room runs; differences are relative to navigator `baseline`.
 pub fn cross_room_json(runs: &[CrossRoomRun], baseline: &str) -> CrossRoomJson {
     CrossRoomJson {
         baseline: baseline.to_owned(),
@@ -254,7 +253,7 @@ fn room_json(outcome: &RoomOutcome) -> RoomJson {
 
 /// A mean over rooms with its 95 % interval, as text.
 pub fn room_mean_text(mean: &RoomMean) -> String {
-    // A bootstrap over a single room has no spread, so that there is no interval to show.
+    // A bootstrap over a single room has no spread, so there is no interval.
     if mean.rooms < 2 {
         return format!("{:.3}", mean.mean);
     }

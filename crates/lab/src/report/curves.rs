@@ -1,4 +1,4 @@
-//! Plots of curves and scattered points, as SVG.
+//! Line and scatter plots, as SVG.
 
 use super::Error;
 use plotters::coord::Shift;
@@ -9,7 +9,7 @@ use plotters::prelude::*;
 pub struct Series {
     /// Name in the legend.
     pub name: String,
-    /// Points in the order in which a line joins them; those that are not finite are left out.
+    /// Points in the order of the line; points that are not finite are skipped.
     pub points: Vec<[f64; 2]>,
     /// Whether a line joins the points.
     pub joined: bool,
@@ -24,14 +24,14 @@ pub struct Curves {
     pub x: String,
     /// Label of the y axis.
     pub y: String,
-    /// Sets of points, each in its own colour; the ninth has the colour of the first again.
+    /// Sets of points, one color each; eight colors repeat cyclically.
     pub series: Vec<Series>,
     /// Whether the line y = x is drawn.
     pub diagonal: bool,
 }
 
 const SIZE: (u32, u32) = (1_080, 520);
-/// Left edge of the legend, pixels. It stands beside the plot so that it covers no points.
+/// Left edge of the legend, pixels. The legend is beside the plot and covers no points.
 const LEGEND_X: u32 = 800;
 const COLOURS: [RGBColor; 8] = [
     RGBColor(31, 119, 180),
@@ -44,10 +44,10 @@ const COLOURS: [RGBColor; 8] = [
     RGBColor(23, 160, 180),
 ];
 
-/// The plot as an SVG document.
+/// Draws the plot as an SVG document.
 ///
 /// # Errors
-/// [`Error::Picture`], if the drawing library refuses.
+/// [`Error::Picture`] if the drawing library fails.
 pub fn curves_svg(curves: &Curves) -> Result<String, Error> {
     let mut svg = String::new();
     {
@@ -67,7 +67,7 @@ fn draw(
     root.fill(&WHITE)?;
     let (plot, legend) = root.split_horizontally(LEGEND_X);
 
-    // Values that are not finite are not drawn, and must not decide the ranges of the axes.
+    // Values that are not finite are not drawn and must not affect the axis ranges.
     let values = |axis: usize| {
         curves
             .series
@@ -80,7 +80,7 @@ fn draw(
     let mut x_range = range(values(0));
     let mut y_range = range(values(1));
     if curves.diagonal {
-        // Both axes share one range, so that the diagonal y = x runs through the whole plot.
+        // Both axes share one range, so that the diagonal y = x crosses the whole plot.
         let both = x_range.start.min(y_range.start)..x_range.end.max(y_range.end);
         x_range = both.clone();
         y_range = both;
@@ -122,7 +122,7 @@ fn draw(
             ))?;
         }
 
-        // Points are marked on joined lines too, since only they are measured.
+        // Mark the points on lines too: only the points are measured.
         chart.draw_series(points.iter().map(|&at| Circle::new(at, 3, colour.filled())))?;
 
         // The legend is drawn by hand, one line of 22 pixels per series.
@@ -158,8 +158,8 @@ fn range(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
 mod tests {
     use super::*;
 
-    /// Oracle: SVG's own words: a circle for every point that is a number (and one a series for the
-    /// legend), labels as given.
+    /// Oracle: the SVG text: one circle per finite point, one per series for the legend, and the
+    /// given labels.
     #[test]
     fn every_point_is_drawn() {
         let points = vec![[0.0, 1.0], [1.0, 2.0], [2.0, f64::NAN]];

@@ -1,5 +1,5 @@
-//! A report of sections, tables and pictures: as Markdown with the pictures in files beside it, or
-//! as one HTML file with the pictures embedded.
+//! A report of sections, tables and pictures. It is rendered as Markdown with separate picture
+//! files, or as one HTML file with embedded pictures.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -86,7 +86,7 @@ impl Document {
     }
 
     /// The report as Markdown. Links to pictures point into `folder`, a path relative to the
-    /// Markdown file; an empty `folder` means that the pictures lie beside it.
+    /// Markdown file; an empty `folder` is the folder of that file.
     pub fn markdown(&self, folder: &str) -> String {
         let mut text = format!("# {}\n", self.title);
         for section in &self.sections {
@@ -113,7 +113,7 @@ impl Document {
         text
     }
 
-    /// The report as one HTML file with the pictures embedded, so that it refers to no other file.
+    /// The report as one self-contained HTML file with embedded pictures.
     pub fn html(&self) -> String {
         let mut body = format!("<h1>{}</h1>\n", escaped(&self.title));
         for section in &self.sections {
@@ -255,6 +255,6 @@ mod tests {
             "{html}"
         );
 
-        assert!(!html.contains("p.svg"), "nothing outside is needed");
+        assert!(!html.contains("p.svg"), "the file is self-contained");
     }
 }

@@ -1,4 +1,4 @@
-//! Navigators on the pairs of one room, for `seese3 evaluate`.
+//! Scores of navigators on the pairs of one room, for `seese3 evaluate`.
 
 use std::collections::BTreeMap;
 
@@ -10,8 +10,8 @@ use seese3_core::eval::{Baselines, PoseRecall, Report, RetrievalScores, Row};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::statistics::Rate;
 
-/// Two tables with one line per navigator: first Hit@ε with 95 % intervals beside the scores of the
-/// latents, then median pose errors and joint recalls.
+/// Two tables with one line per navigator. The first has latent scores and Hit@ε with 95 %
+/// intervals; the second has median pose errors and joint recalls.
 pub fn evaluation_table(report: &Report) -> String {
     let mut head: Vec<String> = ["navigator", "n", "MSE", "R²", "Top-1"]
         .map(str::to_owned)
@@ -66,7 +66,7 @@ fn pose_cells(row: &Row) -> Vec<String> {
         format!("{:.2}", row.retrieval.rotation_rad_median.to_degrees()),
     ];
 
-    // The protocol may hold more recalls; these are the ones that the head of the table names.
+    // The protocol may contain more recalls; the table shows only these three.
     let shown = [(0.05, 5.0), (0.1, 5.0), (0.5, 5.0)];
     for recall in &row.retrieval.pose_recalls {
         if shown.contains(&(recall.translation_m, recall.rotation_deg)) {
@@ -81,7 +81,7 @@ fn interval(rate: &Rate) -> String {
     format!("{:.3} [{:.3}, {:.3}]", rate.rate, rate.low, rate.high)
 }
 
-/// What was evaluated, besides the protocol of the report; flattened into `protocol` of the record.
+/// What was evaluated. It is flattened into `protocol` of the JSON record.
 #[derive(Debug, Clone, Serialize)]
 pub struct EvaluationContext {
     /// The room.
@@ -92,7 +92,7 @@ pub struct EvaluationContext {
     pub adapter: AdapterJson,
     /// Whether the adapter was trained in this room.
     pub in_room: bool,
-    /// Whether the adapter saw frames that are tested.
+    /// Whether test frames were in the adapter's training data.
     pub leaks: bool,
 }
 
@@ -112,26 +112,26 @@ pub struct AdapterJson {
     pub name: String,
     /// Its revision.
     pub revision: u64,
-    /// The preset that its training began from.
+    /// The preset of its training.
     pub preset: String,
-    /// How its training and test frames were kept apart.
+    /// The train/test split of its training.
     pub trained_split: &'static str,
-    /// Frames from source to target in the pairs that it was tested on after its training.
+    /// Stride of the test pairs of its training, frames.
     pub trained_stride: u32,
-    /// The seed of its weights.
+    /// The seed of its training.
     pub seed: u64,
 }
 
-/// How well the adapter reads the motions of the test pairs, and what that has to be read beside.
+/// R² of the adapter's motions on the test pairs, with the baselines.
 #[derive(Debug, Clone, Copy)]
 pub struct MotionBaselines {
-    /// R² of the read motions.
+    /// R² of the adapter's motions.
     pub motion: MotionScores,
-    /// The simplest answers, and how much there was to learn from.
+    /// The baselines, with the extent of the training data.
     pub baselines: Baselines,
 }
 
-/// The adapter's R² of motions beside the constant's, as a line of text.
+/// The adapter's and the constant's R² of motions, as one line of text.
 pub fn baselines_text(found: &MotionBaselines) -> String {
     let Baselines {
         constant_r2,
@@ -150,17 +150,17 @@ pub fn baselines_text(found: &MotionBaselines) -> String {
     let verdict = if found.baselines.can_tell() {
         ""
     } else {
-        "; the constant is so far below 0 that these pairs cannot tell how good the adapter is"
+        "; the constant is so far below 0 that these pairs cannot rate the adapter"
     };
 
     format!(
-        "R² of motions {:.3}; of always answering the mean training motion {constant_r2:.3} (variance of test over \
-         training motions {variance_ratio:.2}{nearest}; {optimiser_steps} optimiser steps){verdict}",
+        "R² of motions {:.3}; of the mean training motion {constant_r2:.3} (variance ratio of test to training \
+         motions {variance_ratio:.2}{nearest}; {optimiser_steps} optimizer steps){verdict}",
         found.motion.overall
     )
 }
 
-/// The record of `seese3 evaluate`.
+/// The JSON record of `seese3 evaluate`.
 #[derive(Debug, Serialize)]
 pub struct EvaluationJson {
     motion: MotionJson,
@@ -189,7 +189,7 @@ struct ProtocolJson {
 struct NavigatorJson {
     name: String,
     n: usize,
-    /// The scores of the imagined latent; null for a navigator that imagines none.
+    /// Scores of the predicted latent; null for a navigator that does not predict one.
     mse: Option<f64>,
     r2: Option<f64>,
     r2_uniform: Option<f64>,
@@ -201,7 +201,7 @@ struct NavigatorJson {
 struct RetrievalJson {
     top1: f64,
     top1_interval: RateJson,
-    /// By ε, as text.
+    /// Hit rates, keyed by ε as text.
     hit: BTreeMap<String, RateJson>,
     twist_error: TwistErrorJson,
     median_translation_m: f64,
@@ -223,7 +223,7 @@ struct RecallJson {
     rate: RateJson,
 }
 
-/// The record of an evaluation.
+/// Builds the JSON record of an evaluation.
 pub fn evaluation_json(
     report: &Report,
     motion: &MotionBaselines,

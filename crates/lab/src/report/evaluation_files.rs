@@ -1,5 +1,4 @@
-//! The scores of navigators as files for papers and programs: Hit@ε curves as SVG, tables as CSV and
-//! LaTeX.
+//! Files of navigator scores: Hit@ε curves as SVG, tables as CSV and LaTeX.
 
 use std::fmt::Write;
 
@@ -7,8 +6,9 @@ use super::curves::{Curves, Series};
 use seese3_core::eval::{Report, Row};
 use seese3_core::statistics::Rate;
 
-/// The largest ε of a curve, and the number of them: every .02.
+/// The largest ε of a curve.
 const LARGEST: f64 = 1.0;
+/// The number of intervals of a curve: one every 0.02.
 const STEPS: u32 = 50;
 
 /// The thresholds ε of a curve, ascending.
@@ -17,7 +17,7 @@ pub fn curve_thresholds() -> Vec<f64> {
     (1..=STEPS).map(|count| f64::from(count) * step).collect()
 }
 
-/// The same report with the hits of these thresholds alone.
+/// Returns a copy of the report with only the hits at the given thresholds.
 pub fn report_at(report: &Report, thresholds: &[f64]) -> Report {
     let mut narrowed = report.clone();
     narrowed.protocol.thresholds = thresholds.to_vec();
@@ -29,7 +29,7 @@ pub fn report_at(report: &Report, thresholds: &[f64]) -> Report {
     narrowed
 }
 
-/// Hit@ε over ε, a curve for each navigator.
+/// Plots Hit@ε over ε, one curve per navigator.
 pub fn hit_curves(report: &Report, title: String) -> Curves {
     let curve = |row: &Row| Series {
         name: row.name.clone(),
@@ -51,7 +51,8 @@ pub fn hit_curves(report: &Report, title: String) -> Curves {
     }
 }
 
-/// A line for each navigator, with the ends of the 95 % intervals; what is not defined is empty.
+/// CSV with one line per navigator and the bounds of the 95 % intervals; undefined values are
+/// empty.
 pub fn evaluation_csv(report: &Report) -> String {
     let mut text = "navigator,n,mse,r2,top1,top1_low,top1_high".to_owned();
     for epsilon in &report.protocol.thresholds {
@@ -77,7 +78,7 @@ pub fn evaluation_csv(report: &Report) -> String {
     text
 }
 
-/// A table of the LaTeX package `booktabs`: Hit@ε with its 95 % interval in small figures.
+/// LaTeX table for the package `booktabs`: Hit@ε with its 95 % interval in small print.
 pub fn evaluation_latex(report: &Report) -> String {
     let columns = "r".repeat(3 + report.protocol.thresholds.len());
     let mut head = "navigator & $R^2$".to_owned();

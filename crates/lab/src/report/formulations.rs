@@ -1,5 +1,5 @@
-//! R² of the adapter beside that of the alternative formulations, in the shape of the paper's table
-//! (Sec. A.5).
+//! R² of the adapter and of the alternative formulations, in the layout of the paper's table (Sec.
+//! A.5).
 
 use serde::Serialize;
 
@@ -9,8 +9,8 @@ use crate::experiments::formulations::{Comparison, FormulationScores};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::statistics::{deviation, mean_of_known};
 
-/// One line per formulation: R² by part of the motion, averaged over seeds; the overall R² with its
-/// sample standard deviation; below them the constant's.
+/// One line per formulation: R² by part of the motion, averaged over seeds, and the sample standard
+/// deviation of the overall R². The last line is the constant baseline.
 pub fn formulations_table(comparison: &Comparison) -> String {
     let head = [
         "formulation",
@@ -61,11 +61,11 @@ pub fn formulations_table(comparison: &Comparison) -> String {
     aligned(&lines)
 }
 
-/// The record of `seese3 sweep formulations`, one entry per formulation.
+/// The JSON record of `seese3 sweep formulations`, one entry per formulation.
 #[derive(Debug, Serialize)]
 pub struct FormulationsJson {
     formulations: Vec<FormulationJson>,
-    /// R² of always answering the mean training motion, mean over rooms.
+    /// R² of the constant baseline (the mean training motion), averaged over rooms.
     constant_r2: f64,
 }
 
@@ -76,7 +76,7 @@ struct FormulationJson {
     runs: Vec<MotionJson>,
 }
 
-/// The record of formulations.
+/// Builds the JSON record of a comparison.
 pub fn formulations_json(comparison: &Comparison) -> FormulationsJson {
     let entry = |score: &FormulationScores| FormulationJson {
         name: score.name,

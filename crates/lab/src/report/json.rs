@@ -1,4 +1,4 @@
-//! The parts that JSON records share. Keys are stable; a value that is undefined is null.
+//! Parts shared by several JSON records. Keys are stable; undefined values are null.
 
 use serde::Serialize;
 
@@ -123,19 +123,18 @@ impl PartsJson {
     }
 }
 
-/// What an R² has to be read beside.
+/// Baselines to compare an R² with.
 #[derive(Debug, Clone, Serialize)]
 pub struct BaselinesJson {
     constant_r2: f64,
     variance_ratio: f64,
     nearest_pose: Option<NearestPoseJson>,
     optimiser_steps: u64,
-    /// False where the constant is so far below zero that the recording tells nothing of an
-    /// adapter.
+    /// False if the constant's R² is so far below zero that the recording cannot rate an adapter.
     can_tell: bool,
 }
 
-/// Medians from the tested frames to the nearest training poses.
+/// Median distance and angle from the test frames to the nearest training poses.
 #[derive(Debug, Clone, Serialize)]
 struct NearestPoseJson {
     m: f64,
@@ -158,7 +157,7 @@ impl From<&Baselines> for BaselinesJson {
 }
 
 impl BaselinesJson {
-    /// The medians over rooms that one adapter never saw; none without rooms.
+    /// Medians over the held-out rooms of one adapter; `None` without rooms.
     pub fn medians<'a>(rooms: impl Iterator<Item = &'a Baselines> + Clone) -> Option<Self> {
         let first = *rooms.clone().next()?;
         let middle = |of: fn(&Baselines) -> f64| median(&rooms.clone().map(of).collect::<Vec<_>>());

@@ -1,4 +1,4 @@
-//! The probe metrics M1 to M4 by layer of an encoder, for `seese3 sweep layers`.
+//! Probe metrics M1 to M4 per encoder layer, for `seese3 sweep layers`.
 
 use serde::Serialize;
 
@@ -6,9 +6,9 @@ use super::table::aligned;
 use crate::experiments::layers::LayerScores;
 use seese3_core::statistics::mean;
 
-/// One line per layer with means over rooms. A star marks the best layer by each metric, which for
-/// the intrinsic dimension is the one nearest to 6. The last column is the R² of always answering
-/// the mean training motion.
+/// One line per layer with means over rooms. A star marks the best layer of each metric; for the
+/// intrinsic dimension that is the layer nearest to 6. The last column is the R² of the constant
+/// baseline, which always predicts the mean training motion.
 pub fn layers_table(scores: &[LayerScores]) -> String {
     // A list instead of a set keeps the layers in the order of the scores.
     let mut layers: Vec<&str> = Vec::new();
@@ -32,8 +32,8 @@ pub fn layers_table(scores: &[LayerScores]) -> String {
         layers.iter().map(by_layer).collect()
     };
 
-    // SE(3) has six dimensions: features that hold just the camera's pose have an intrinsic
-    // dimension near six, and both more and less are worse.
+    // SE(3) has six dimensions: features that encode only the camera pose have an intrinsic
+    // dimension near six. Larger and smaller values are both worse.
     let highest = |value: f64| value;
     let near_six = |value: f64| -(value - 6.0).abs();
     type Merit = fn(f64) -> f64;
@@ -74,8 +74,7 @@ pub fn layers_table(scores: &[LayerScores]) -> String {
             cells.push(format!("{:.3}{star}", values[row]));
         }
 
-        // The deviation goes between the mean of M4 and its star, which is the last character of
-        // the cell.
+        // Insert the deviation between the mean of M4 and its star, the last character of the cell.
         if spread[row].is_finite() {
             let last = cells.pop().unwrap_or_default();
             cells.push(format!(
@@ -93,12 +92,12 @@ pub fn layers_table(scores: &[LayerScores]) -> String {
     aligned(&lines)
 }
 
-/// One line per encoder, for its layer with the highest mean test R² of the adapters; this compares
-/// checkpoints of one encoder. The table has the shape of the paper's ablation table (Sec. A.8).
+/// One line per encoder, for its layer with the highest mean test R² of the adapters. It compares
+/// checkpoints of one encoder. The layout follows the paper's ablation table (Sec. A.8).
 pub fn encoders_table(scores: &[LayerScores]) -> String {
     type Layer<'a> = (&'a str, Vec<&'a LayerScores>);
 
-    // Scores are grouped by encoder and then by features, both in the order in which they come.
+    // Group scores by encoder, then by features, both in order of first appearance.
     let mut by_encoder: Vec<(&str, Vec<Layer<'_>>)> = Vec::new();
     for score in scores {
         let at = match by_encoder
@@ -145,7 +144,7 @@ pub fn encoders_table(scores: &[LayerScores]) -> String {
             continue;
         };
 
-        // In the order of the head, from `M1` on.
+        // In the column order, from `M1` on.
         let figures: [fn(&LayerScores) -> f64; 5] = [
             |s| s.m1,
             |s| s.m4_r2,
@@ -166,7 +165,7 @@ pub fn encoders_table(scores: &[LayerScores]) -> String {
     aligned(&lines)
 }
 
-/// The record of `seese3 sweep layers`, one entry per layer and room.
+/// The JSON record of `seese3 sweep layers`, one entry per layer and room.
 #[derive(Debug, Serialize)]
 pub struct LayersJson {
     layers: Vec<LayerJson>,
@@ -182,7 +181,7 @@ struct LayerJson {
     m2: M2Json,
     m3: M3Json,
     m4: M4Json,
-    /// R² of always answering the mean training motion.
+    /// R² of the constant baseline, the mean training motion.
     constant_r2: f64,
 }
 
@@ -213,7 +212,7 @@ struct M4Json {
     runs: Vec<f64>,
 }
 
-/// The record of layers.
+/// Builds the JSON record of layer scores.
 pub fn layers_json(scores: &[LayerScores]) -> LayersJson {
     let entry = |score: &LayerScores| LayerJson {
         features: score.features.clone(),
@@ -246,7 +245,7 @@ pub fn layers_json(scores: &[LayerScores]) -> LayersJson {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand. Means over two rooms; the dimension nearest to 6 is the best, not the
+    /// Oracle: by hand. Means over two rooms. The best dimension is the nearest to 6, not the
     /// highest.
     #[test]
     fn the_best_of_each_metric_has_a_star() {

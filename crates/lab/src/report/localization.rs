@@ -1,5 +1,5 @@
-//! Single views located in a partly mapped room, for `seese3 evaluate localization`, and motions
-//! between two views, for `seese3 evaluate motion`.
+//! Localization of single views, for `seese3 evaluate localization`, and motion between two views,
+//! for `seese3 evaluate motion`.
 
 use serde::Serialize;
 
@@ -9,8 +9,7 @@ use super::table::aligned;
 use crate::experiments::localization::{ErrorQuantiles, Localization, LocalizationErrors};
 use crate::experiments::motion::{AdapterErrors, MotionErrors, MotionEvaluation, TwoViewErrors};
 
-/// One line per way to locate a view: medians, with their intervals, and 90 % quantiles of the
-/// errors.
+/// One line per localization method: medians with intervals, and 90 % quantiles of the errors.
 pub fn localization_table(found: &Localization) -> String {
     let mut lines = vec![head("located by")];
     let mut add = |name: &str, errors: &LocalizationErrors| {
@@ -21,17 +20,16 @@ pub fn localization_table(found: &Localization) -> String {
     add("nearest frame", &found.nearest_frame);
     add("nearest pose (by metres plus radians)", &found.nearest_pose);
     if let Some(zero_shot) = &found.zero_shot {
-        add("the adapter's whole reading", zero_shot);
+        add("the adapter's full estimate", zero_shot);
     }
     if let Some(fitted) = &found.fitted {
-        add("the fitted adapter's whole reading", fitted);
+        add("the fitted adapter's full estimate", fitted);
     }
 
     aligned(&lines)
 }
 
-/// One line per way to read a motion: medians, with their intervals, and 90 % quantiles of the
-/// errors.
+/// One line per motion estimator: medians with intervals, and 90 % quantiles of the errors.
 pub fn motion_table(found: &MotionEvaluation) -> String {
     let mut lines = vec![head("motion by")];
     let mut add = |name: &str, errors: &MotionErrors| {
@@ -54,7 +52,7 @@ pub fn motion_table(found: &MotionEvaluation) -> String {
     }) = &found.two_view
     {
         table += &format!(
-            "the two-view reader could read {:.1} % of the motions",
+            "the two-view reader estimated {:.1} % of the motions",
             100.0 * answered
         );
         if *answered > 0.0 {
@@ -85,7 +83,7 @@ fn line(name: &str, metres: &ErrorQuantiles, degrees: &ErrorQuantiles) -> Vec<St
     ]
 }
 
-/// A median with its interval, to so many decimals.
+/// Formats a median and its interval with the given number of decimals.
 fn interval(median: &RecordedMedian, decimals: usize) -> String {
     format!(
         "{:.decimals$} [{:.decimals$}, {:.decimals$}]",
@@ -100,17 +98,17 @@ pub struct LocalizationContext {
     pub room: String,
     /// The name of the features.
     pub features: String,
-    /// The adapter of other rooms, if one was given.
+    /// The name of the adapter trained on other rooms, if one was given.
     pub adapter: Option<String>,
-    /// Every so many frames one was mapped.
+    /// Stride of the mapped frames.
     pub map_every: usize,
-    /// Whether blocks of the recording were not mapped.
+    /// Whether blocks of the recording were left unmapped.
     pub map_blocks: bool,
     /// The seed of the fitted adapter.
     pub seed: u64,
 }
 
-/// The record of `seese3 evaluate localization`.
+/// The JSON record of `seese3 evaluate localization`.
 #[derive(Debug, Serialize)]
 pub struct LocalizationJson {
     n: usize,
@@ -124,11 +122,11 @@ pub struct LocalizationJson {
     protocol: LocalizationContext,
 }
 
-/// The record of `seese3 evaluate motion`.
+/// The JSON record of `seese3 evaluate motion`.
 #[derive(Debug, Serialize)]
 pub struct MotionEvaluationJson {
     n: usize,
-    /// The adapter's errors; with these two of its parts.
+    /// The adapter's errors, followed by those without its mean and of its mean alone.
     ours: Option<ErrorsJson>,
     without_mean: Option<ErrorsJson>,
     constant: Option<ErrorsJson>,
@@ -145,7 +143,7 @@ pub struct MotionEvaluationJson {
 struct TwoViewJson {
     #[serde(flatten)]
     errors: ErrorsJson,
-    /// The share of motions that it could read.
+    /// Fraction of motions with an estimate.
     answered: f64,
     coverage_68: f64,
     coverage_95: f64,
@@ -160,7 +158,7 @@ struct ErrorsJson {
 #[derive(Debug, Serialize)]
 struct QuantilesJson {
     median: f64,
-    /// The median's 95 % interval.
+    /// Bounds of the median's 95 % interval.
     low: f64,
     high: f64,
     p90: f64,
@@ -168,10 +166,10 @@ struct QuantilesJson {
 
 #[derive(Debug, Serialize)]
 struct RulesJson {
-    /// The shares of views whose translation and rotation were the nearest frame's own.
+    /// Fractions of views that use the nearest frame's translation and rotation unchanged.
     translation_unread: f64,
     rotation_unread: f64,
-    /// The shares of errors within the stated 68 % and 95 % ellipsoids.
+    /// Fractions of errors within the 68 % and 95 % ellipsoids.
     coverage_68: f64,
     coverage_95: f64,
 }
@@ -205,7 +203,7 @@ impl From<&ErrorQuantiles> for QuantilesJson {
     }
 }
 
-/// The record of located views.
+/// Builds the JSON record of a localization.
 pub fn localization_json(found: &Localization, protocol: LocalizationContext) -> LocalizationJson {
     LocalizationJson {
         n: found.asked,
@@ -225,7 +223,8 @@ pub fn localization_json(found: &Localization, protocol: LocalizationContext) ->
     }
 }
 
-/// The record of read motions; the adapter by its name and whether it was trained in this room.
+/// Builds the JSON record of motion errors. `adapter` is the adapter's name and whether it was
+/// trained in this room.
 pub fn motion_evaluation_json(
     found: &MotionEvaluation,
     room: &str,

@@ -1,7 +1,7 @@
-//! Results for people and for programs: tables, JSON and pictures.
+//! Renders results as tables, JSON and pictures.
 //!
-//! The records that programs read are types with names in `…Json`, here, or `…Record`, in
-//! [`crate::reproduction`]: their fields are the keys of the file.
+//! Types named `…Json` here, and `…Record` in [`crate::reproduction`], define the JSON files: their
+//! fields are the keys.
 
 mod adapter_sweep;
 mod columns;

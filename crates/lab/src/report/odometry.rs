@@ -8,10 +8,10 @@ use crate::experiments::tracking_scores::{AnswerErrors, TrackingScores, Velocity
 use seese3_core::statistics::{Rate, coverage, mean, median, root_mean_square};
 use seese3_robot::tracking::MotionSurprise;
 
-/// Groups of about equal size into which the coverage table divides motions by their length.
+/// Number of groups of about equal size by which the coverage table splits motions by length.
 const STRATA: usize = 4;
 
-/// One line per room; with several rooms also a line of means.
+/// One line per room, and a line of means if there are several rooms.
 pub fn odometry_table(rooms: &[RoomOdometry]) -> String {
     let head = [
         "room",
@@ -26,10 +26,10 @@ pub fn odometry_table(rooms: &[RoomOdometry]) -> String {
         "DEGRADED",
         "LOST",
         "TRACKING wrong",
-        "velocity m/s off",
-        "0 m/s off",
-        "unknown: LOST",
-        "found after",
+        "velocity error m/s",
+        "zero-velocity error m/s",
+        "unknown start: LOST",
+        "relocalized after",
     ];
 
     let mut lines = vec![head.map(str::to_owned).to_vec()];
@@ -49,8 +49,7 @@ pub fn odometry_table(rooms: &[RoomOdometry]) -> String {
 }
 
 fn line(name: &str, count: String, rooms: &[RoomOdometry]) -> Vec<String> {
-    // Over one room the mean is the room's own value, so that both kinds of line share this
-    // function.
+    // The mean over one room is the room's own value, so both kinds of line share this function.
     let of =
         |figure: &dyn Fn(&RoomOdometry) -> f64| mean(&rooms.iter().map(figure).collect::<Vec<_>>());
     let scores = || rooms.iter().map(|room| &room.scores);
@@ -66,7 +65,7 @@ fn line(name: &str, count: String, rooms: &[RoomOdometry]) -> Vec<String> {
 
     let found = match found.len() {
         0 => "never".to_owned(),
-        // The median covers only the rooms in which the map pose was found; the rest are counted.
+        // The median covers only the rooms in which the tracker relocalized; their number follows.
         some if some < rooms.len() => format!("{:.0} ({some} of {})", median(&found), rooms.len()),
         _ => format!("{:.0}", median(&found)),
     };
@@ -95,14 +94,15 @@ fn scores_of(rooms: &[RoomOdometry]) -> Vec<&TrackingScores> {
     rooms.iter().map(|room| &room.scores).collect()
 }
 
-/// The share of TRACKING frames that were more than half a metre or 15 degrees off, over all rooms.
+/// Fraction of TRACKING frames with an error above 0.5 m or 15°, over all rooms.
 pub(super) fn wrong_share(rooms: &[&TrackingScores]) -> f64 {
     let sum =
         |of: fn(&TrackingScores) -> usize| -> usize { rooms.iter().map(|scores| of(scores)).sum() };
     sum(|scores| scores.tracking_wrong) as f64 / sum(|scores| scores.tracking) as f64
 }
 
-/// Nominal against measured coverage: of map poses, of motions, and of motions by their length.
+/// Measured coverage of the 68 % and 95 % ellipsoids: for map poses, for odometry, for motions, and
+/// for motions by length.
 pub fn coverage_table(rooms: &[RoomOdometry]) -> String {
     let head = ["errors", "n", "within 68 %", "within 95 %"];
     let mut lines = vec![head.map(str::to_owned).to_vec()];
@@ -112,8 +112,8 @@ pub fn coverage_table(rooms: &[RoomOdometry]) -> String {
 
     // Most hold-outs leave one of the two groups empty.
     for (name, surprises) in [
-        ("map poses, neighbours mapped", &mapped),
-        ("map poses, neighbours not mapped", &unmapped),
+        ("map poses, neighbors mapped", &mapped),
+        ("map poses, neighbors not mapped", &unmapped),
     ] {
         if !surprises.is_empty() {
             lines.push(coverage_line(name, surprises));
@@ -133,7 +133,7 @@ pub fn coverage_table(rooms: &[RoomOdometry]) -> String {
         rooms.iter().flat_map(|room| room.motions.clone()).collect();
     lines.push(coverage_line("motions", &squared_errors(&motions)));
 
-    // A covariance that is right only on average shows here: short and long motions would differ.
+    // Detects a covariance that is right only on average: short and long motions would differ.
     motions.sort_by(|a, b| a.length.total_cmp(&b.length));
     for part in motions.chunks(motions.len().div_ceil(STRATA).max(1)) {
         let shortest = part[0].length;
@@ -163,12 +163,12 @@ fn squared_errors(motions: &[MotionSurprise]) -> Vec<f64> {
     motions.iter().map(|motion| motion.squared_error).collect()
 }
 
-/// How many frames of other rooms were answered LOST, as text with Wilson's 95 % interval.
+/// Fraction of frames of other rooms reported LOST, as text with Wilson's 95 % interval.
 pub fn other_rooms_text(rooms: &[RoomOdometry]) -> String {
-    let from_start = other_rooms_line("from the beginning", rooms, |room| {
+    let from_start = other_rooms_line("at the start of a stream", rooms, |room| {
         room.other_rooms_from_start
     });
-    let after_own = other_rooms_line("after the room's own", rooms, |room| {
+    let after_own = other_rooms_line("after the room's own frames", rooms, |room| {
         room.other_rooms_after_own
     });
 
@@ -185,20 +185,21 @@ fn other_rooms_line(
     let rate = Rate::of(lost, frames);
 
     format!(
-        "frames of other rooms answered LOST, {when}: {lost} of {frames} ({:.4} [{:.4}, {:.4}])\n",
+        "frames of other rooms reported LOST, {when}: {lost} of {frames} ({:.4} [{:.4}, {:.4}])\n",
         rate.rate, rate.low, rate.high
     )
 }
 
-/// Which room single views were taken to be in, as text.
+/// Results of relocalizing single views, as text.
 pub fn relocalisation_text(found: &Relocalisation) -> String {
     let count = found.right + found.wrong + found.ambiguous;
     let share = |n: usize| n as f64 / count.max(1) as f64;
 
     let covered = coverage(&found.pose_surprises);
     format!(
-        "single views among {} rooms: {:.4} right, {:.4} wrong, {:.4} ambiguous, of {count}; without their own \
-         room {:.4} are called clear; right ones {:.3} m off (root mean square; nearest frame {:.3}), {:.3} and {:.3} within 68 and 95 %",
+        "single views among {} rooms: {:.4} right, {:.4} wrong, {:.4} ambiguous, of {count}; with their own room \
+         left out, {:.4} are not ambiguous; poses in the right room: RMSE {:.3} m (nearest frame {:.3} m), \
+         {:.3} and {:.3} within the 68 and 95 % ellipsoids",
         found.rooms,
         share(found.right),
         share(found.wrong),
@@ -215,10 +216,10 @@ pub fn relocalisation_text(found: &Relocalisation) -> String {
 #[derive(Debug, Serialize)]
 pub struct OdometryJson {
     rooms: Vec<RoomJson>,
-    /// Means over rooms of errors, shares over the frames of all rooms.
+    /// Errors are means over rooms; fractions are over the frames of all rooms.
     #[serde(flatten)]
     all: ScoresJson,
-    /// Shares of map poses inside the 68 % and the 95 % ellipsoid, over all rooms.
+    /// Fractions of map poses inside the 68 % and the 95 % ellipsoid, over all rooms.
     coverage_places: [f64; 2],
     coverage_motions: [f64; 2],
     relocalisation: Option<RelocalisationJson>,
@@ -227,15 +228,15 @@ pub struct OdometryJson {
     alignment: &'static str,
 }
 
-/// A tracker's answers beside the simplest ones to the same frames.
+/// Errors of a tracker and of its baselines on the same frames.
 #[derive(Debug, Serialize)]
 pub(super) struct ScoresJson {
     ape_m: AnswersJson,
     ape_rad: AnswersJson,
-    /// Shares of TRACKING map poses inside the 68 % and the 95 % ellipsoid; null without one.
+    /// Fractions of TRACKING map poses inside the 68 % and the 95 % ellipsoid; null without any.
     coverage: CoverageJson,
     coverage_odom: CoverageJson,
-    /// The share of TRACKING frames that were more than half a metre or 15 degrees off.
+    /// Fraction of TRACKING frames with an error above 0.5 m or 15°.
     tracking_wrong: Option<f64>,
     velocity: VelocityJson,
 }
@@ -281,7 +282,7 @@ struct RoomJson {
     relocalizing: f64,
     lost_without_initial_pose: f64,
     frames_to_relocalise: Option<usize>,
-    /// Frames of other rooms: as the beginning of a stream, then after the room's own.
+    /// Frames of other rooms: first at the start of a stream, then after the room's own frames.
     foreign: [LostFramesJson; 2],
 }
 
@@ -303,15 +304,15 @@ struct RelocalisationJson {
     right: usize,
     wrong: usize,
     ambiguous: usize,
-    /// Views that were not ambiguous among the rooms without their own.
+    /// Number of views that are not ambiguous when their own room is left out.
     named_without_own: usize,
-    /// Root mean squares over the right ones, metres; null without one.
+    /// Root-mean-square errors of the views located in the right room, metres; null without any.
     pose_m: Option<f64>,
     nearest_frame_m: Option<f64>,
     coverage: CoverageJson,
 }
 
-/// The record of tracking: the results of every room, the coverage over all rooms, relocalisation,
+/// Builds the JSON record of tracking: results per room, coverage over all rooms, relocalization,
 /// and the formulas.
 pub fn odometry_json(
     rooms: &[RoomOdometry],
@@ -380,7 +381,7 @@ fn room_json(room: &RoomOdometry) -> RoomJson {
     }
 }
 
-/// Means over rooms of errors, shares over the frames of all rooms.
+/// Scores over several rooms: errors are means over rooms, fractions are over all frames.
 pub(super) fn scores_json(rooms: &[&TrackingScores]) -> ScoresJson {
     let scores = || rooms.iter().copied();
     let answers = |errors: AnswerErrors| AnswersJson {
@@ -408,7 +409,7 @@ pub(super) fn scores_json(rooms: &[&TrackingScores]) -> ScoresJson {
     }
 }
 
-/// JSON has no NaN: what is not known is null.
+/// `None` for a value that is not finite, because JSON has no NaN.
 fn known(value: f64) -> Option<f64> {
     value.is_finite().then_some(value)
 }

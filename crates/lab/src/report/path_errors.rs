@@ -8,22 +8,22 @@ use super::table::aligned;
 use crate::experiments::path_comparison::PathComparison;
 use seese3_core::trajectory::{Error, Relation, RpePairs, Statistics};
 
-/// Definition of the absolute pose error, as it is printed with the results.
+/// Definition of the absolute pose error, printed with the results.
 pub const APE_FORMULA: &str = "APE: E_i = est_i⁻¹ ref_i after alignment; translation ‖t(E)‖ in metres, rotation ∠E in \
                                radians, full ‖E − I‖_F; poses world_from_camera";
-/// Definition of the relative pose error, as it is printed with the results.
+/// Definition of the relative pose error, printed with the results.
 pub const RPE_FORMULA: &str =
     "RPE: E_i = (ref_i⁻¹ ref_j)⁻¹ (est_i⁻¹ est_j), j = i + Δ poses; no alignment";
 
 /// One line per error and relation: root mean square, mean, median, standard deviation, smallest
-/// and largest value, and count. The formulas stand below.
+/// and largest value, and count. The formulas follow the table.
 pub fn path_errors_table(errors: &PathComparison) -> String {
     let head = [
         "error", "part", "rmse", "mean", "median", "sd", "least", "largest", "n",
     ];
     let mut lines = vec![head.map(str::to_owned).to_vec()];
 
-    // Errors that the path does not determine are listed with their reason below the table.
+    // Undefined errors are listed below the table, each with the reason.
     let mut undefined = String::new();
     for (name, found) in rows(errors) {
         match found {
@@ -63,13 +63,13 @@ fn rows(errors: &PathComparison) -> Vec<(String, &Result<[Statistics; 3], Error>
     absolute.chain([(relative, &errors.relative)]).collect()
 }
 
-/// The record of `seese3 evaluate trajectory`, with the settings and formulas that define it.
+/// The JSON record of `seese3 evaluate trajectory`, with its settings and formulas.
 #[derive(Debug, Serialize)]
 pub struct PathErrorsJson {
     matched: usize,
     unmatched_reference: usize,
     unmatched_estimate: usize,
-    /// By alignment.
+    /// Absolute errors by alignment.
     ape: BTreeMap<&'static str, ErrorsJson>,
     ape_formula: &'static str,
     rpe: ErrorsJson,
@@ -81,9 +81,9 @@ pub struct PathErrorsJson {
 #[derive(Debug, Serialize)]
 #[serde(untagged)]
 enum ErrorsJson {
-    /// By relation.
+    /// Statistics by relation.
     Found(BTreeMap<&'static str, StatisticsJson>),
-    /// The path does not determine these errors.
+    /// These errors are undefined for the path.
     Undefined { undefined: String },
 }
 
@@ -99,7 +99,7 @@ struct StatisticsJson {
     n: usize,
 }
 
-/// The record of a path's errors.
+/// Builds the JSON record of a path's errors.
 pub fn path_errors_json(errors: &PathComparison) -> PathErrorsJson {
     PathErrorsJson {
         matched: errors.matched,

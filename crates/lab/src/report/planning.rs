@@ -1,4 +1,4 @@
-//! Planners beside one another, for `seese3 evaluate planning`.
+//! Comparison of planners, for `seese3 evaluate planning`.
 
 use std::collections::BTreeMap;
 
@@ -8,14 +8,14 @@ use super::table::aligned;
 use crate::experiments::planning::{Planner, PlannerScores, PlanningProtocol, RoomPlanning};
 use seese3_core::statistics::Rate;
 
-/// One line per planner, over the questions of all rooms.
+/// One line per planner, over the queries of all rooms.
 pub fn planning_table(rooms: &[RoomPlanning]) -> String {
     let head = [
         "planner",
         "says reached",
         "truly there",
         "95 %",
-        "says so, not there",
+        "says reached, not there",
         "steps",
         "longest hop",
         "other rooms: says reached",
@@ -85,7 +85,7 @@ impl Planner {
 /// The file of `seese3 evaluate planning --json`.
 #[derive(Debug, Serialize)]
 pub struct PlanningJson {
-    /// Over the questions of all rooms, by planner.
+    /// Scores by planner, over the queries of all rooms.
     #[serde(flatten)]
     all: BTreeMap<&'static str, PlannerJson>,
     rooms: Vec<RoomJson>,
@@ -96,7 +96,7 @@ pub struct PlanningJson {
 struct RoomJson {
     room: String,
     mapped_frames: usize,
-    /// The longest hop that was allowed, metres and radians mixed.
+    /// The longest allowed hop, metres and radians mixed.
     allowed_hop: f64,
     #[serde(flatten)]
     planners: BTreeMap<&'static str, PlannerJson>,
@@ -105,26 +105,26 @@ struct RoomJson {
 #[derive(Debug, Serialize)]
 struct PlannerJson {
     n: usize,
-    /// The share of questions after which the planner said that the goal is reached.
+    /// Fraction of queries for which the planner reported success.
     says_reached: f64,
-    /// The share of questions after which it said so and the robot was there.
+    /// Fraction of queries with reported success and the robot at the goal.
     truly_there: f64,
-    /// The share of questions after which the robot was there, whatever the planner said.
+    /// Fraction of queries with the robot at the goal, whatever the planner reported.
     there_anyway: f64,
-    /// The mean over all questions of the stated probability to arrive, 0 where nothing was planned; null
-    /// for planners that state none.
+    /// Mean arrival probability over all queries, 0 where nothing was planned; null for planners
+    /// without probabilities.
     expected_there: Option<f64>,
-    /// The mean number of hops where the goal was truly reached; null without any.
+    /// Mean number of hops of the queries counted in `truly_there`; null without any.
     steps: Option<f64>,
     longest_hop: f64,
     other_rooms: OtherRoomsJson,
 }
 
-/// Questions about views of other rooms.
+/// Scores of queries with views of other rooms.
 #[derive(Debug, Serialize)]
 struct OtherRoomsJson {
     n: usize,
-    /// Null without any question.
+    /// Fraction of queries with reported success; null without any query.
     says_reached: Option<f64>,
 }
 
@@ -136,11 +136,11 @@ struct ProtocolJson {
     adapter: String,
     /// Whether an adapter was fitted to the mapped frames.
     fit: bool,
-    /// The longest hop that was asked for; null for the adapter's own.
+    /// The requested longest hop; null for the adapter's own.
     step: Option<f64>,
 }
 
-/// The record of an evaluation with an adapter of this name.
+/// Builds the JSON record of an evaluation with the named adapter.
 pub fn planning_json(
     rooms: &[RoomPlanning],
     protocol: &PlanningProtocol,

@@ -4,20 +4,20 @@ use super::Error;
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
-/// What is drawn: positions in the plan, metres, and headings, radians from the x axis.
+/// Contents of a plan view: positions in metres and headings in radians from the x axis.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PathPlot {
-    /// Title, drawn above the picture.
+    /// Title above the picture.
     pub title: String,
-    /// Positions (x, y) of all frames of the map.
+    /// Positions (x, y) of all map frames.
     pub map: Vec<[f64; 2]>,
     /// The source camera: x, y, heading.
     pub source: [f64; 3],
     /// The target camera: x, y, heading.
     pub target: [f64; 3],
-    /// The poses that the steps should reach: x, y, heading.
+    /// The target poses of the steps: x, y, heading.
     pub requested: Vec<[f64; 3]>,
-    /// The poses of the frames that the steps retrieved: x, y, heading.
+    /// The poses of the retrieved frames, one per step: x, y, heading.
     pub retrieved: Vec<[f64; 3]>,
 }
 
@@ -28,10 +28,10 @@ const TARGET_COLOUR: RGBColor = RGBColor(20, 140, 70);
 const REQUESTED_COLOUR: RGBColor = RGBColor(40, 100, 220);
 const RETRIEVED_COLOUR: RGBColor = RGBColor(225, 90, 20);
 
-/// The picture as an SVG document.
+/// Draws the plan view as an SVG document.
 ///
 /// # Errors
-/// [`Error::Picture`], if the drawing library refuses.
+/// [`Error::Picture`] if the drawing library fails.
 pub fn path_svg(plot: &PathPlot) -> Result<String, Error> {
     let mut svg = String::new();
     {
@@ -82,7 +82,7 @@ fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, plot: &PathPlot) -> Drawn {
             .collect()
     };
 
-    // A heading is drawn as a stroke of 12 cm.
+    // A heading is a line of 12 cm.
     let arrow = |at: &[f64; 3]| {
         let (sin, cos) = at[2].sin_cos();
         vec![(at[0], at[1]), (at[0] + 0.12 * cos, at[1] + 0.12 * sin)]
@@ -110,7 +110,7 @@ fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, plot: &PathPlot) -> Drawn {
             .legend(entry(colour));
     }
 
-    // Source and target are drawn last, on top of both paths.
+    // Draw source and target last, on top of both paths.
     for (label, at, colour) in [
         ("source", &plot.source, SOURCE_COLOUR),
         ("target", &plot.target, TARGET_COLOUR),
@@ -134,7 +134,7 @@ fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, plot: &PathPlot) -> Drawn {
     Ok(())
 }
 
-/// Ranges of x and y that hold every point, with the same scale on both axes.
+/// Ranges of x and y that contain every point, with the same scale on both axes.
 fn ranges(plot: &PathPlot) -> (std::ops::Range<f64>, std::ops::Range<f64>) {
     let places = [plot.source, plot.target];
     let posed = plot
@@ -146,8 +146,7 @@ fn ranges(plot: &PathPlot) -> (std::ops::Range<f64>, std::ops::Range<f64>) {
 
     let points: Vec<[f64; 2]> = plot.map.iter().copied().chain(posed).collect();
 
-    // Centre and half width of an axis, with a margin of 25 cm; a path that hardly moves still
-    // spans a metre.
+    // Center and half width of an axis, with a margin of 25 cm; the full width is at least 1 m.
     let span = |axis: usize| {
         let low = points
             .iter()
@@ -165,8 +164,8 @@ fn ranges(plot: &PathPlot) -> (std::ops::Range<f64>, std::ops::Range<f64>) {
     let (x, half_x) = span(0);
     let (y, half_y) = span(1);
 
-    // The plot area inside the margins and labels is about 830 by 600 pixels. The shorter range is
-    // widened until a metre is equally long on both axes.
+    // The plot area inside the margins and labels is about 830 × 600 pixels. Widen the shorter
+    // range until a metre has the same length on both axes.
     let aspect = 830.0 / 600.0;
     let half_y = half_y.max(half_x / aspect);
     let half_x = half_y * aspect;

@@ -1,4 +1,4 @@
-//! The probe metrics M1 to M4 of features in rooms, for `seese3 probe`.
+//! Probe metrics M1 to M4 of features in rooms, for `seese3 probe`.
 
 use serde::Serialize;
 
@@ -13,7 +13,7 @@ use seese3_core::motion_scores::MotionScores;
 use seese3_core::splits::Split;
 use seese3_core::statistics::{deviation, mean_of_known};
 
-/// The record of `seese3 probe`.
+/// The JSON record of `seese3 probe`.
 #[derive(Debug, Serialize)]
 pub struct ProbeJson {
     #[serde(flatten)]
@@ -25,7 +25,7 @@ pub struct ProbeJson {
     skipped: Vec<String>,
 }
 
-/// The scores of a single room stand at the top of the file; those of several are a list.
+/// The scores of one room are top-level keys of the file; those of several rooms are a list.
 #[derive(Debug, Serialize)]
 #[serde(untagged)]
 enum RoomsJson {
@@ -33,7 +33,7 @@ enum RoomsJson {
     Several { rooms: Vec<RoomJson> },
 }
 
-/// The scores of one room; a metric that was not asked for is left out.
+/// The scores of one room; metrics that were not requested are absent.
 #[derive(Debug, Serialize)]
 struct RoomJson {
     room: String,
@@ -72,7 +72,7 @@ struct M2Json {
     dropped_rows: usize,
 }
 
-/// A maximum-likelihood dimension by the way in which the points' own are averaged.
+/// A maximum-likelihood dimension, by averaging method of the local estimates.
 #[derive(Debug, Serialize)]
 struct MleJson {
     harmonic: f64,
@@ -80,8 +80,8 @@ struct MleJson {
     median: f64,
 }
 
-/// The first stride stands at the top, so that a probe of a single stride can be read without
-/// looking into `strides`.
+/// The scores of the first stride are repeated at the top, so that a client with one stride can
+/// ignore `strides`.
 #[derive(Debug, Serialize)]
 struct StridesJson {
     #[serde(flatten)]
@@ -93,18 +93,18 @@ struct StridesJson {
 struct StrideJson {
     stride: u32,
     r2: f64,
-    /// Deviations over seeds; a single run has none.
+    /// Standard deviations over seeds; absent for a single run.
     #[serde(flatten)]
     spread: Option<SeedSpreadJson>,
     n: usize,
     /// One entry per seed, over the test pairs of all splits together.
     runs: Vec<MotionJson>,
     baselines: Option<BaselinesJson>,
-    /// One entry per split: one, or five folds.
+    /// One entry per split: a single split, or five folds.
     splits: Vec<SplitJson>,
 }
 
-/// The scores under one split, and what they have to be read beside.
+/// The scores and baselines under one split.
 #[derive(Debug, Clone, Serialize)]
 struct SplitJson {
     split: &'static str,
@@ -119,12 +119,12 @@ struct SeedSpreadJson {
     by_part: PartsJson,
 }
 
-/// What was probed, and what could not be.
+/// The settings of a probe, and what was skipped.
 #[derive(Debug, Clone)]
 pub struct ProbeContext {
     /// The name of the features.
     pub features: String,
-    /// How training and test frames were kept apart.
+    /// The train/test split.
     pub split: &'static str,
     /// The preset of M4.
     pub preset: &'static str,
@@ -132,7 +132,7 @@ pub struct ProbeContext {
     pub skipped: Vec<String>,
 }
 
-/// The record of a probe.
+/// Builds the JSON record of a probe.
 pub fn probe_json(scores: &[ProbeScores], context: ProbeContext) -> ProbeJson {
     let rooms = match scores {
         [only] => RoomsJson::One(Box::new(room_json(only))),
@@ -273,8 +273,7 @@ pub fn probe_table(scores: &[ProbeScores]) -> String {
         };
 
         if let Some(MutualKnnScore { share, options }) = &score.m1 {
-            // M1 has only a value and a number of frames: empty cells keep the latter in the
-            // column `n`.
+            // M1 has only a value and a frame count: empty cells keep the count in column `n`.
             let absent = || "".to_owned();
             let cells = [
                 format!("{share:.3}"),
@@ -307,7 +306,7 @@ pub fn probe_table(scores: &[ProbeScores]) -> String {
             for at in strides.iter() {
                 line(format!("{name} s{}", at.stride), &stride_cells(at));
 
-                // What the folds' pairs score together does not say how unlike the folds are.
+                // Show each fold: the joint score hides differences between folds.
                 if at.by_split.len() > 1 {
                     for (place, (split, r2)) in at.by_split.iter().enumerate() {
                         let mut cells = vec![format!("{r2:.3}")];
@@ -353,8 +352,8 @@ fn stride_cells(at: &AtStride) -> Vec<String> {
     cells
 }
 
-/// The R² of the mean training motion, and the distance to the nearest training pose; empty where no
-/// room stands alone.
+/// The R² of the mean training motion and the distance to the nearest training pose; empty for
+/// several rooms together.
 fn baseline_cells(baselines: Option<&Baselines>) -> [String; 2] {
     let Some(baselines) = baselines else {
         return [String::new(), String::new()];

@@ -1,4 +1,4 @@
-//! A tracker under disturbances, for `seese3 evaluate robustness`.
+//! Tracking results under disturbances, for `seese3 evaluate robustness`.
 
 use serde::Serialize;
 
@@ -9,8 +9,7 @@ use crate::experiments::tracking_scores::{AnswerErrors, TrackingScores, Velocity
 use seese3_core::splits::HoldOut;
 use seese3_core::statistics::coverage;
 
-/// One line per disturbance, over all rooms. The results of all rooms come disturbance by disturbance
-/// in the same order.
+/// One line per disturbance, over all rooms, in the order of `found`.
 pub fn robustness_table(found: &[DisturbedTracking]) -> String {
     let head = [
         "disturbance",
@@ -24,9 +23,9 @@ pub fn robustness_table(found: &[DisturbedTracking]) -> String {
         "TRACKING wrong",
         "within 68 %",
         "within 95 %",
-        "velocity m/s off",
-        "0 m/s off",
-        "noticed after",
+        "velocity error m/s",
+        "zero-velocity error m/s",
+        "detected after",
     ];
 
     let mut lines = vec![head.map(str::to_owned).to_vec()];
@@ -34,7 +33,7 @@ pub fn robustness_table(found: &[DisturbedTracking]) -> String {
     aligned(&lines)
 }
 
-/// The results of each disturbance, in the order in which they first come.
+/// Groups the results by disturbance, in order of first appearance.
 fn by_disturbance(found: &[DisturbedTracking]) -> Vec<Vec<&DisturbedTracking>> {
     let mut groups: Vec<Vec<&DisturbedTracking>> = Vec::new();
     for one in found {
@@ -92,7 +91,7 @@ fn frames(rooms: &[&DisturbedTracking]) -> usize {
     rooms.iter().map(|room| room.frames).sum()
 }
 
-/// The most frames of any room; none if it stayed unnoticed in one of them.
+/// The largest frame count over rooms; `None` if a room did not detect the disturbance.
 fn noticed_after(rooms: &[&DisturbedTracking]) -> Option<usize> {
     rooms
         .iter()
@@ -102,9 +101,9 @@ fn noticed_after(rooms: &[&DisturbedTracking]) -> Option<usize> {
 /// The file of `seese3 evaluate robustness --json`.
 #[derive(Debug, Serialize)]
 pub struct RobustnessJson {
-    /// One for each disturbance, over all rooms.
+    /// One row per disturbance, over all rooms.
     rows: Vec<RowJson>,
-    /// One for each disturbance and room.
+    /// One row per disturbance and room.
     rooms: Vec<RowJson>,
     adapter: String,
     hold_out: &'static str,
@@ -113,20 +112,20 @@ pub struct RobustnessJson {
 #[derive(Debug, Serialize)]
 struct RowJson {
     disturbance: String,
-    /// Absent over all rooms.
+    /// The room; absent in rows over all rooms.
     #[serde(skip_serializing_if = "Option::is_none")]
     room: Option<String>,
-    /// The frames that are scored.
+    /// Number of scored frames.
     n: usize,
     #[serde(flatten)]
     scores: ScoresJson,
     status: StatusJson,
-    /// Frames from the beginning of a disturbance of a part of the stream to a status that is not
-    /// TRACKING; null where it stayed TRACKING, and for other disturbances.
+    /// Number of disturbed frames until the status left TRACKING. Null if it stayed TRACKING, or
+    /// if the disturbance covers whole streams.
     noticed_after: Option<usize>,
 }
 
-/// Shares of the scored frames by status.
+/// Fractions of the scored frames by status.
 #[derive(Debug, Serialize)]
 struct StatusJson {
     tracking: f64,
@@ -135,7 +134,7 @@ struct StatusJson {
     relocalizing: f64,
 }
 
-/// The record of an evaluation with an adapter of this name.
+/// Builds the JSON record of an evaluation with the named adapter.
 pub fn robustness_json(
     found: &[DisturbedTracking],
     adapter: &str,

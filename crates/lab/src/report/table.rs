@@ -1,7 +1,7 @@
 //! Tables of plain text.
 
-/// The table as text: every column is as wide as its widest cell, the first is aligned to the left,
-/// the others to the right. Lines may have fewer cells than the first.
+/// Formats a table as text. Every column is as wide as its widest cell. The first column is
+/// left-aligned, the others are right-aligned. Lines may have different numbers of cells.
 pub fn aligned(lines: &[Vec<String>]) -> String {
     let columns = lines.iter().map(Vec::len).max().unwrap_or(0);
 
@@ -28,7 +28,7 @@ pub fn aligned(lines: &[Vec<String>]) -> String {
             text.push_str(&cell);
         }
 
-        // A left-aligned last cell or an empty one leaves blanks at the end of the line.
+        // A left-aligned or empty last cell leaves trailing blanks.
         text.truncate(text.trim_end().len());
         text.push('\n');
     }

@@ -1,16 +1,16 @@
-//! The numeric checks of the paper's theorems, as a table and as JSON.
+//! Numeric checks of the paper's theorems, as a table and as JSON.
 
 use serde::Serialize;
 
 use super::table::aligned;
 use crate::theory::{Bound, Check};
 
-/// One line per check: the measured value and the bound that it has to keep.
+/// One line per check: the measured value and its bound.
 pub fn theory_table(checks: &[Check]) -> String {
     aligned(&theory_table_rows(checks))
 }
 
-/// The cells of [`theory_table`], the head first.
+/// The cells of [`theory_table`], header row first.
 pub fn theory_table_rows(checks: &[Check]) -> Vec<Vec<String>> {
     let head = ["theorem: what", "measured", "bound", ""];
     let mut lines = vec![head.map(str::to_owned).to_vec()];
@@ -48,7 +48,7 @@ fn bound_text(bound: Bound) -> String {
     }
 }
 
-/// The record of `seese3 theory`, one entry per check.
+/// The JSON record of `seese3 theory`, one entry per check.
 #[derive(Debug, Serialize)]
 pub struct TheoryJson {
     checks: Vec<CheckJson>,
@@ -64,7 +64,7 @@ struct CheckJson {
     holds: bool,
 }
 
-/// The record of checks.
+/// Builds the JSON record of checks.
 pub fn theory_json(checks: &[Check]) -> TheoryJson {
     let entry = |check: &Check| CheckJson {
         theorem: check.theorem.to_string(),

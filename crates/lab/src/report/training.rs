@@ -1,4 +1,4 @@
-//! Adapters of several seeds and their test scores, for `seese3 train`.
+//! Test scores of adapters trained with several seeds, for `seese3 train`.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use seese3_core::adapter::{PairPlan, TrainingRecord};
 use seese3_core::eval::LEAST_CONSTANT_R2;
 use seese3_core::statistics::{deviation, mean};
 
-/// Fewer test pairs than this tell nothing.
+/// Minimum number of test pairs for a meaningful score.
 const FEWEST_TEST_PAIRS: usize = 10;
 
 /// R² by part of the motion, one line per seed; with several seeds also their mean and sample
@@ -32,7 +32,7 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
 
     let mut lines = vec![head.map(str::to_owned).to_vec()];
 
-    // In the order of the head, from `overall` on.
+    // In the column order, from `overall` on.
     let numbers = |run: &TrainingRun| {
         let test = &run.record.test;
         let hit = run.hit_rate.rate;
@@ -72,8 +72,8 @@ pub fn training_table(runs: &[TrainingRun]) -> String {
     aligned(&lines)
 }
 
-/// What a reader of the table should not miss: the adapter is worse than the constant, or the test
-/// pairs are too few to tell. `None` if there is nothing of the kind.
+/// A warning about the table: the adapter is worse than the constant, or there are too few test
+/// pairs. `None` if neither is the case.
 pub fn training_remark(runs: &[TrainingRun]) -> Option<String> {
     let test_count = runs.first()?.record.test.n;
     if test_count == 0 {
@@ -81,7 +81,7 @@ pub fn training_remark(runs: &[TrainingRun]) -> Option<String> {
     }
     if test_count < FEWEST_TEST_PAIRS {
         return Some(format!(
-            "{test_count} test pairs are too few to tell how good the adapter is"
+            "{test_count} test pairs are too few to rate the adapter"
         ));
     }
 
@@ -95,16 +95,16 @@ pub fn training_remark(runs: &[TrainingRun]) -> Option<String> {
     }
 
     let verdict = if constant >= LEAST_CONSTANT_R2 {
-        "no motion was learned that carries over to them"
+        "the adapter does not generalize to them"
     } else {
-        "the constant is so far below 0 that they cannot tell how good the adapter is; try another --split"
+        "the constant is so far below 0 that they cannot rate the adapter; try another --split"
     };
     Some(format!(
-        "always answering the mean training motion is better on these pairs (R² {constant:.3} against {read:.3}): {verdict}"
+        "the mean training motion predicts these pairs better (R² {constant:.3} against {read:.3}): {verdict}"
     ))
 }
 
-/// A score; one that is not defined, as those of a test without pairs, is a dash.
+/// Formats a score. An undefined score, as of a test without pairs, is a dash.
 fn number_text(value: f64) -> String {
     if value.is_finite() {
         format!("{value:.3}")
@@ -113,7 +113,7 @@ fn number_text(value: f64) -> String {
     }
 }
 
-/// The record of `seese3 train`: one entry per seed, and the protocol that they share.
+/// The JSON record of `seese3 train`: one entry per seed, and the shared protocol.
 #[derive(Debug, Serialize)]
 pub struct TrainingJson {
     runs: Vec<RunJson>,
@@ -135,7 +135,7 @@ struct RunJson {
 
 #[derive(Debug, Serialize)]
 struct HitsJson {
-    /// By ε, as text.
+    /// Hit rates, keyed by ε as text.
     hit: BTreeMap<&'static str, RateJson>,
 }
 
@@ -152,7 +152,7 @@ struct ProtocolJson {
     stride: u32,
     rooms: Vec<TrainedRoomJson>,
     training_pairs: usize,
-    /// The shortest and the longest stride of the training pairs, if they were drawn from a range.
+    /// The shortest and the longest stride of training pairs sampled from a range.
     drawn_from_strides: Option<[u32; 2]>,
     epochs: usize,
     optimiser_steps: u64,
@@ -171,8 +171,8 @@ struct ProtocolJson {
     through_zero: bool,
     calibrated_on: Vec<String>,
     twist: &'static str,
-    /// The σ that standardises the training twists is the population's. Deviations over
-    /// seeds, elsewhere in these files, are sample deviations.
+    /// Degrees of freedom of the σ that standardizes the training twists: 0, the population
+    /// deviation. Deviations over seeds, elsewhere in these files, are sample deviations.
     deviation_ddof: u32,
 }
 
@@ -182,7 +182,7 @@ struct TrainedRoomJson {
     revision: u64,
 }
 
-/// The record of a training: the runs of all seeds, and the adapter that was published.
+/// Builds the JSON record of a training: the runs of all seeds, and the published adapter.
 pub fn training_json(runs: &[TrainingRun], adapter: &str, revision: u64) -> TrainingJson {
     TrainingJson {
         runs: runs.iter().map(run_json).collect(),
@@ -190,7 +190,7 @@ pub fn training_json(runs: &[TrainingRun], adapter: &str, revision: u64) -> Trai
             name: adapter.to_owned(),
             revision,
         },
-        // The runs differ in their seed alone, so that the protocol of the first one holds for all.
+        // The runs differ only in their seed, so the protocol of the first run holds for all.
         protocol: runs.first().map(|run| protocol_json(&run.record)),
     }
 }

@@ -1,4 +1,4 @@
-//! Which navigators and presets beat the paper's in rooms that were never seen.
+//! Section: navigators and presets compared with the paper's, in held-out rooms.
 
 use serde::Serialize;
 
@@ -14,7 +14,7 @@ use crate::report::{RoomMeanJson, Section, room_difference_text, room_mean_text}
 
 const CALIBRATED: &str = "inverse-poincare-homogeneous+calibrated";
 
-/// The section that compares other navigators and presets with the paper's.
+/// Builds the section that compares other navigators and presets with the paper's.
 pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<BetterRecord>> {
     let mut section = Section::new("Better than the paper's navigator and recipe?");
 
@@ -37,14 +37,13 @@ pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<Bet
     for set in results {
         let baseline = &set.baseline().run;
 
-        // Only plans that were given all rooms are compared; with calibration rooms they train on
-        // fewer.
+        // Compare only plans that use all rooms. Plans with calibration rooms train on fewer.
         for result in &set.on_all_rooms {
             let compared = compared(&set.features, result, baseline);
             rows.push(compared.row);
             record.push(compared.record);
 
-            // Two rows decide the claims: the calibrated navigator, and preset steady.
+            // Two rows decide the claims: the calibrated navigator and preset steady.
             match result.plan.kind {
                 PlanKind::PaperRangeCalibrated => {
                     let over = [&compared.over_affine, &compared.over_homogeneous];
@@ -85,7 +84,7 @@ pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<Bet
     Found { section, record }
 }
 
-/// Whether both hold; false as soon as one of them does not.
+/// Whether both hold: false if one is false, else `None` if one is unknown.
 fn all_of(both: [Option<bool>; 2]) -> Option<bool> {
     match both {
         [Some(true), Some(true)] => Some(true),
@@ -94,7 +93,7 @@ fn all_of(both: [Option<bool>; 2]) -> Option<bool> {
     }
 }
 
-/// A row of the section in `record.json`.
+/// JSON record of a table row.
 #[derive(Debug, Serialize)]
 pub struct BetterRecord {
     features: String,
@@ -110,30 +109,30 @@ pub struct BetterRecord {
     clipped_r2_over_paper_range: RoomMeanJson,
 }
 
-/// A plan against the baseline: its row of the table, its record, and three differences, paired
-/// room by room.
+/// A plan compared with the baseline: its table row, its record, and three differences paired by
+/// room.
 struct Compared {
     row: Vec<String>,
     record: BetterRecord,
-    /// Of the hit rate over the baseline's affine reading.
+    /// Hit rate minus that of the baseline's affine reading.
     over_affine: RoomMean,
-    /// Of the hit rate over the baseline's homogeneous reading.
+    /// Hit rate minus that of the baseline's homogeneous reading.
     over_homogeneous: RoomMean,
-    /// Of the clipped R².
+    /// Clipped R² minus that of the baseline.
     clipped_r2: RoomMean,
 }
 
 fn compared(features: &str, result: &PlanResult, baseline: &CrossRoomRun) -> Compared {
     let PlanResult { plan, run } = result;
 
-    // An adapter with calibration rooms is shown with the navigator that makes use of them.
+    // An adapter with calibration rooms is shown with the calibrated navigator.
     let navigator = if run.calibration_rooms.is_empty() {
         HOMOGENEOUS
     } else {
         CALIBRATED
     };
 
-    // Both runs hold the same rooms in the same order.
+    // Both runs have the same rooms in the same order.
     let ours = run.hit_rates(navigator);
     let hit = bootstrap_mean(&ours, 0);
     let over_affine = paired_difference(&ours, &baseline.hit_rates(AFFINE), 0);
@@ -175,7 +174,8 @@ fn compared(features: &str, result: &PlanResult, baseline: &CrossRoomRun) -> Com
     }
 }
 
-/// R² has no lower bound: without clipping, a single room could decide the mean.
+/// Overall R² per room, clipped from below: R² has no lower bound, so one room could dominate the
+/// mean.
 fn clipped(run: &CrossRoomRun) -> Vec<f64> {
     run.r2().iter().map(|r2| r2.max(CLIPPED_R2)).collect()
 }

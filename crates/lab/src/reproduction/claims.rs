@@ -1,4 +1,4 @@
-//! What the given rooms say about the paper's claims, and about ours.
+//! Verdicts on the paper's claims, and on ours, from the given rooms.
 
 use serde::Serialize;
 
@@ -8,11 +8,11 @@ use crate::report::Section;
 
 /// A claim and the evidence found for or against it.
 pub struct Claim {
-    /// The claim in one sentence.
+    /// The claim, one sentence.
     pub claim: &'static str,
     /// Whether these rooms confirm it.
     pub verdict: Verdict,
-    /// The numbers behind the verdict, in words.
+    /// The evidence for the verdict, in words.
     pub found: String,
 }
 
@@ -25,14 +25,14 @@ pub enum Verdict {
     Contradicted,
     /// The claim holds for some feature sets or rooms and not for others.
     Mixed,
-    /// No case tells: the simplest answers fail there too, or every interval holds the limit.
+    /// No case is conclusive: the baselines fail there too, or every interval contains the limit.
     CannotTell,
-    /// There was no case to test the claim on.
+    /// There is no case to test the claim on.
     Untested,
 }
 
 impl Verdict {
-    /// Confirmed if the claim holds in every case, contradicted if it holds in none of them.
+    /// Confirmed if the claim holds in every case, contradicted if it holds in no case.
     pub fn of(holds: &[bool]) -> Self {
         let held = holds.iter().filter(|&&holds| holds).count();
         match held {
@@ -43,8 +43,8 @@ impl Verdict {
         }
     }
 
-    /// As [`Verdict::of`], over the cases that can tell: `None` is a case in which no method could
-    /// have succeeded.
+    /// As [`Verdict::of`], over the conclusive cases. `None` is an inconclusive case, in which no
+    /// method could have succeeded.
     pub fn of_telling(cases: &[Option<bool>]) -> Self {
         let telling: Vec<bool> = cases.iter().copied().flatten().collect();
         if telling.is_empty() && !cases.is_empty() {
@@ -53,8 +53,8 @@ impl Verdict {
         Self::of(&telling)
     }
 
-    /// The verdict over cases that are told by intervals: `None` is an interval that holds the limit.
-    /// Only where every interval tells the same is a claim confirmed or contradicted.
+    /// The verdict over cases decided by confidence intervals. `None` is an interval that contains
+    /// the limit. A claim is confirmed or contradicted only if all intervals agree.
     pub fn of_intervals(cases: &[Option<bool>]) -> Self {
         match Self::of_telling(cases) {
             Self::Confirmed | Self::Contradicted if cases.contains(&None) => Self::Mixed,
@@ -73,8 +73,8 @@ impl Verdict {
     }
 }
 
-/// Whether a claim about several things holds for each: it does not if it fails for one, and where one
-/// cannot tell, all cannot.
+/// Whether a claim holds for each of several cases: false if one case fails, else `None` if one
+/// case is inconclusive.
 pub fn holds_for_each(cases: &[Option<bool>]) -> Option<bool> {
     if cases.contains(&Some(false)) {
         Some(false)
@@ -85,11 +85,11 @@ pub fn holds_for_each(cases: &[Option<bool>]) -> Option<bool> {
     }
 }
 
-/// The fewest rooms whose resampled means say something: five of the same sign happen by chance in
-/// one of sixteen cases.
+/// Minimum number of rooms for a bootstrap interval to be conclusive. Five differences of the same
+/// sign occur by chance with probability 1/16.
 const FEWEST_ROOMS: usize = 6;
 
-/// Whether a mean over rooms is above zero, if its interval can tell.
+/// Whether a mean over rooms is above zero; `None` if its interval is inconclusive.
 pub fn is_above_zero(mean: &RoomMean) -> Option<bool> {
     if mean.rooms < FEWEST_ROOMS {
         None
@@ -102,7 +102,7 @@ pub fn is_above_zero(mean: &RoomMean) -> Option<bool> {
     }
 }
 
-/// Whether a share of rooms is above one half, if its interval can tell.
+/// Whether a fraction of rooms is above one half; `None` if its interval is inconclusive.
 pub fn is_most(share: &Rate) -> Option<bool> {
     if share.low > 0.5 {
         Some(true)
@@ -113,7 +113,7 @@ pub fn is_most(share: &Rate) -> Option<bool> {
     }
 }
 
-/// How many cases a claim holds in, and how many cannot tell, in words.
+/// The number of cases in which a claim holds, and of inconclusive cases, in words.
 pub fn count_words(cases: &[Option<bool>], of_what: &str) -> String {
     let telling: Vec<bool> = cases.iter().copied().flatten().collect();
     let held = telling.iter().filter(|&&held| held).count();
@@ -170,8 +170,8 @@ pub fn records(claims: &[Claim]) -> Vec<ClaimRecord> {
 mod tests {
     use super::*;
 
-    /// Oracle: three rooms of three are too few for Wilson's interval, 0.44 to 1, to say that most
-    /// rooms are won; ten of ten are enough, and none of ten says that most are not.
+    /// Oracle: Wilson's interval of 3 of 3 rooms is 0.44 to 1 and contains one half. 10 of 10 rooms
+    /// is conclusive, and so is 0 of 10.
     #[test]
     fn few_rooms_cannot_tell_what_most_do() {
         assert_eq!(is_most(&Rate::of(3, 3)), None);
@@ -179,7 +179,7 @@ mod tests {
         assert_eq!(is_most(&Rate::of(0, 10)), Some(false));
     }
 
-    /// Oracle: the meaning of "each": one failure is enough, and one unknown leaves it open.
+    /// Oracle: the meaning of "each": one failure decides, and one unknown case leaves it open.
     #[test]
     fn a_claim_about_each_fails_with_one() {
         assert_eq!(holds_for_each(&[Some(true), Some(true)]), Some(true));

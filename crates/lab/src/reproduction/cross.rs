@@ -1,5 +1,5 @@
-//! Rooms that were never seen: zero-shot navigation against Identity, and scaling with the number
-//! of training rooms.
+//! Section: held-out rooms. Zero-shot navigation compared with Identity, and scaling with the
+//! number of training rooms.
 
 use serde::Serialize;
 
@@ -15,21 +15,21 @@ use crate::report::{CrossRoomJson, Curves, Section, Series, cross_room_json, roo
 
 /// The paper's navigator.
 pub const AFFINE: &str = "inverse-poincare-affine";
-/// The refit of z-scored motions: raw metres and radians are shrunk by the ridge's α.
+/// The refit on z-scored motions. The ridge's α would over-shrink raw metres and radians.
 const REFIT: &str = "ridge-refit-z-scored-in-sample";
 /// The service's navigator.
 pub const HOMOGENEOUS: &str = "inverse-poincare-homogeneous";
 
-/// The results with one feature set in `record.json`.
+/// JSON record of the results with one feature set.
 #[derive(Debug, Serialize)]
 pub struct ZeroShotRecord {
     features: String,
-    /// The adapters' names in the store, from the fewest rooms to all.
+    /// The adapters' names in the store, by increasing number of training rooms.
     adapters: Vec<String>,
     paper_range_by_size: CrossRoomJson,
 }
 
-/// The section on zero-shot navigation against Identity, with the scaling curves.
+/// Builds the section on zero-shot navigation and on scaling.
 #[expect(
     clippy::too_many_lines,
     reason = "a section of the report: its loop, its table and its claim"
@@ -67,14 +67,14 @@ pub fn section(
         let whole = &set.baseline().run;
         rows.extend(zero_shot_rows(features, whole));
 
-        // The interval has to tell, not only the share of rooms or the mean itself.
+        // Verdicts use the confidence intervals, not only the fraction of rooms or the mean.
         zero_shot.push(wins(&whole.outcomes, AFFINE).as_ref().and_then(is_most));
         let over = |ours: &CrossRoomRun, name: &str, theirs: &CrossRoomRun| {
             paired_difference(&ours.hit_rates(name), &theirs.hit_rates(AFFINE), 0)
         };
         refitted.push(is_above_zero(&over(whole, REFIT, whole)));
 
-        // The scaling curve: one preset, by the number of training rooms.
+        // The scaling curve: one preset, with increasing numbers of training rooms.
         let points = |of: &dyn Fn(&CrossRoomRun) -> f64| {
             set.by_size
                 .iter()
@@ -83,7 +83,7 @@ pub fn section(
         };
         let hit = points(&|run| mean_hit(run, AFFINE));
 
-        // NaN marks a size at which no room has an R².
+        // NaN if no room has an R² at this size.
         let fraction =
             points(&|run| MotionSummary::of(&run.r2(), 0).map_or(f64::NAN, |s| s.positive.rate));
 
@@ -94,7 +94,7 @@ pub fn section(
         if let [fewest, .., all] = set.by_size.as_slice() {
             grows.push(is_above_zero(&over(&all.run, AFFINE, &fewest.run)));
 
-            // On a plateau, the second half of the rooms adds nothing.
+            // On a plateau, the second half of the rooms would add nothing.
             let is_half = |result: &&PlanResult| 2 * result.plan.rooms <= all.plan.rooms;
             if let Some(half) = set.by_size.iter().rfind(is_half) {
                 keeps_growing.push(is_above_zero(&over(&all.run, AFFINE, &half.run)));
@@ -140,7 +140,7 @@ pub fn section(
     rows.extend(paper_rows());
     section.table(rows);
 
-    // Only the run of the table reports its skipped rooms: paper-range on all rooms.
+    // Report skipped rooms only for the run of the table: paper-range on all rooms.
     for set in results {
         let features = &set.features;
         for (room, why) in &set.baseline().run.skipped {
@@ -196,7 +196,7 @@ pub fn section(
     Ok(Found { section, record })
 }
 
-/// Adds the scaling curves of hit rates, of the share of rooms with R² above 0, and of the paper's
+/// Adds three scaling curves: hit rates, the fraction of rooms with R² above 0, and the paper's
 /// clipped mean.
 fn add_curves(
     section: &mut Section,
@@ -242,7 +242,7 @@ fn add_curves(
     Ok(())
 }
 
-/// One row per navigator: how one adapter does in the held-out rooms.
+/// One row per navigator: scores of one adapter in the held-out rooms.
 fn zero_shot_rows(features: &str, run: &CrossRoomRun) -> Vec<Vec<String>> {
     let summary = MotionSummary::of(&run.r2(), 0);
 
@@ -256,7 +256,7 @@ fn zero_shot_rows(features: &str, run: &CrossRoomRun) -> Vec<Vec<String>> {
     ];
 
     let row = |name: &str| {
-        // R² belongs to the adapter, not to a navigator, so only the first row shows it.
+        // R² depends only on the adapter, so only the first row shows it.
         let [positive, clipped, clipped_at_zero] = match (name, &summary) {
             (AFFINE, Some(s)) => [
                 rate_text(&s.positive),
@@ -296,7 +296,7 @@ fn paper_rows() -> Vec<Vec<String>> {
                 count.to_owned(),
             ];
 
-            // The paper gives no hit rates and no R² for these rows: four cells stay empty.
+            // The paper has no hit rates and no R² for these rows: four cells stay empty.
             rows.push(
                 cells
                     .into_iter()
@@ -313,7 +313,7 @@ fn mean_hit(run: &CrossRoomRun, navigator: &str) -> f64 {
     mean(&run.hit_rates(navigator))
 }
 
-/// A count of rooms with its share and Wilson's interval.
+/// Formats a count of rooms with its percentage and Wilson's interval.
 pub fn rate_text(rate: &Rate) -> String {
     format!(
         "{}/{} ({:.0} %, {:.2}–{:.2})",

@@ -1,4 +1,4 @@
-//! The adapter beside the alternatives A to D, within a room.
+//! Section: the adapter compared with the alternatives A to D, within a room.
 
 use serde::Serialize;
 
@@ -15,19 +15,19 @@ use seese3_core::training::RoomData;
 use crate::experiments::formulations::{Comparison, RoomPooling, compare};
 use crate::report::{FormulationsJson, Section, formulations_json};
 
-/// How many of the rooms that are learned alone the formulations are compared in, as in the paper.
+/// Maximum number of single-adapter rooms for the comparison, as in the paper.
 const SCENES: usize = 3;
 
-/// The formulations with one feature set in `record.json`.
+/// JSON record of the formulations with one feature set.
 #[derive(Debug, Serialize)]
 pub struct FormulationRecord {
     features: String,
-    /// How long every formulation was trained, in words.
+    /// The training of every formulation, in words.
     training: String,
     scores: FormulationsJson,
 }
 
-/// The section that compares the adapter with the alternatives A to D.
+/// Builds the section that compares the adapter with the alternatives A to D.
 pub fn section(
     given: &Reproduction<'_>,
     claims: &mut Vec<Claim>,
@@ -45,7 +45,7 @@ pub fn section(
         ));
         section.table(table_rows(&compared));
 
-        // The paper's training has one seed, and so no interval: its rows decide nothing.
+        // The paper's training has one seed and no interval, so it does not enter the verdict.
         if training == Training::Base {
             best.push(is_best(&compared));
         }
@@ -76,8 +76,8 @@ pub fn section(
     Ok(Found { section, record })
 }
 
-/// Whether the adapter's overall R² is above that of every alternative, if intervals over the seeds
-/// can tell; where no formulation beats the constant, the order among them says nothing.
+/// Whether the adapter's overall R² is above that of every alternative. `None` if the intervals
+/// over the seeds are inconclusive, or if no formulation beats the constant and an R² of zero.
 fn is_best(compared: &Comparison) -> Option<bool> {
     let by_formulation: Vec<Vec<f64>> = compared
         .formulations
@@ -100,7 +100,7 @@ fn is_best(compared: &Comparison) -> Option<bool> {
     holds_for_each(&is_above)
 }
 
-/// One row per formulation, then the constant's and the paper's.
+/// One row per formulation, then the row of the constant and the paper's rows.
 fn table_rows(compared: &Comparison) -> Vec<Vec<String>> {
     let head = [
         "formulation",
@@ -113,7 +113,7 @@ fn table_rows(compared: &Comparison) -> Vec<Vec<String>> {
 
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     for score in &compared.formulations {
-        // Every score is one value per seed, already averaged over the rooms.
+        // One value per seed, already averaged over the rooms.
         let column = |of: fn(&MotionScores) -> f64| score.runs.iter().map(of).collect::<Vec<_>>();
 
         let parts = [
@@ -137,7 +137,7 @@ fn table_rows(compared: &Comparison) -> Vec<Vec<String>> {
         format!("{:.2}", compared.constant_r2),
     ]);
 
-    // The paper's numbers stand under ours as context: its encoders and rooms differ.
+    // The paper's numbers follow ours as context: its encoders and rooms differ.
     for (name, numbers) in paper::ALTERNATIVES {
         rows.push(
             [format!("paper: {name}")]
@@ -150,13 +150,12 @@ fn table_rows(compared: &Comparison) -> Vec<Vec<String>> {
     rows
 }
 
-/// How long the formulations are trained.
+/// Training schedules of the formulations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Training {
     /// Preset base, with every seed.
     Base,
-    /// The paper's 200 epochs of 30,000 pairs, which take 30 times as many steps: one seed, in the
-    /// first room alone.
+    /// The paper's 200 epochs of 30,000 pairs, 30 times as many steps: one seed, first room only.
     Paper,
 }
 
@@ -168,7 +167,7 @@ impl Training {
         }
     }
 
-    /// How many of the rooms that are learned alone it takes, from the first on.
+    /// Number of single-adapter rooms, from the first.
     fn scenes(self) -> usize {
         match self {
             Self::Base => SCENES,
@@ -207,9 +206,9 @@ impl Training {
     }
 }
 
-/// Every feature set but the control with the shorter training, and the first one with the paper's
-/// as well. Of the control the section on strides tells that it reads no motion: there the order of
-/// formulations would say nothing, after a third of the command's time.
+/// The short training for every feature set except the control, and the paper's training for the
+/// first set. The control is skipped because its adapters estimate no motion (see the section on
+/// strides). Ranking formulations there would be meaningless and take a third of the run time.
 fn runs<'a>(given: &'a Reproduction<'a>) -> Vec<(Training, &'a FeatureSet<'a>)> {
     let sets = match &given.sets[..] {
         [trained @ .., _control] if !trained.is_empty() => trained,
@@ -233,7 +232,7 @@ fn compared(
 ) -> Result<Comparison, Error> {
     let stride = given.options.stride;
 
-    // The folds replace the plan's split.
+    // The folds override the plan's split.
     let plan = given.plan(training.preset(), Split::Time, stride, 0, None);
     compare(
         scenes(set, training),
@@ -250,7 +249,7 @@ mod tests {
     use super::*;
     use crate::experiments::formulations::FormulationScores;
 
-    /// The adapter and one alternative, each with its overall R² per seed.
+    /// A comparison of the adapter with one alternative, from overall R² per seed.
     fn comparison(adapter: &[f64], alternative: &[f64], constant_r2: f64) -> Comparison {
         let scores = |name, r2: &[f64]| FormulationScores {
             name,
@@ -272,8 +271,8 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand: differences of one sign in all six seeds tell, of both signs they do not;
-    /// nor do one seed, or scores that are all below the constant's.
+    /// Oracle: by hand. Differences of the same sign in all six seeds are conclusive. Inconclusive
+    /// are differences of both signs, a single seed, and scores below the constant's.
     #[test]
     fn the_adapter_is_best_where_every_seed_says_so() {
         let high = [0.5, 0.6, 0.5, 0.6, 0.5, 0.6];

@@ -1,7 +1,7 @@
-//! The paper's tables and figures on given rooms, as one report.
+//! Reproduces the paper's tables and figures on given rooms, as one report.
 //!
-//! Start reading at [`reproduce`]: every experiment gives one section of the report and one entry
-//! of the record. Claims and adapters that the sections leave are collected in [`Notes`].
+//! Start reading at [`reproduce`]. Every experiment produces one section of the report and one
+//! entry of the record. [`Notes`] collects the claims and adapters of all sections.
 
 mod better;
 mod claims;
@@ -34,7 +34,7 @@ use crate::experiments::adapter_sweep::SweepRow;
 use crate::report::{Document, Section, TheoryJson, theory_json, theory_table_rows};
 use crate::theory::{Effort, checks};
 
-/// What decides the numbers of a reproduction besides its rooms and features.
+/// Settings of a reproduction, besides its rooms and features.
 #[derive(Debug, Clone)]
 pub struct Options {
     /// Frames from source to target.
@@ -43,66 +43,65 @@ pub struct Options {
     pub strides: Vec<u32>,
     /// Numbers of training rooms along the scaling curve.
     pub sizes: Vec<usize>,
-    /// Of the rooms that are learned together, how many a plan with calibration takes for that
-    /// instead.
+    /// Number of training rooms that plans with calibration use for calibration instead.
     pub calibration_rooms: usize,
-    /// How many seeds, from 0 on, where a table averages over seeds.
+    /// Number of seeds, from 0, in tables that average over seeds.
     pub seeds: u64,
-    /// The same for the table of the alternatives A to D, in which the paper takes 15.
+    /// Number of seeds in the table of the alternatives A to D; the paper uses 15.
     pub formulation_seeds: u64,
-    /// Epochs in place of every preset's own, for a trial.
+    /// Number of epochs that overrides every preset, for a trial run.
     pub epochs: Option<usize>,
 }
 
-/// The rooms of the three groups, each with the same one of its feature sets.
+/// The rooms of the three groups, with one feature set.
 pub struct FeatureSet<'a> {
     /// The name of the features.
     pub features: String,
-    /// Rooms that one adapter is trained on together.
+    /// Training rooms of the adapters that are trained on several rooms.
     pub train: Vec<RoomData<'a>>,
-    /// Held-out rooms, which the adapters of several rooms never see.
+    /// Held-out rooms of these adapters.
     pub test: Vec<RoomData<'a>>,
-    /// Rooms that each get an adapter of their own.
+    /// Rooms with one adapter per room.
     pub in_room: Vec<RoomData<'a>>,
 }
 
-/// What is reproduced: options, and rooms with features.
+/// The input of a reproduction: options, and rooms with features.
 pub struct Reproduction<'a> {
-    /// What decides the numbers.
+    /// The settings.
     pub options: Options,
     /// One entry per feature set, the control last; each has the same rooms.
     pub sets: Vec<FeatureSet<'a>>,
-    /// Where the pictures of walks come from.
+    /// Access to the images for the pictures of walks.
     pub images: &'a dyn Images,
 }
 
-/// Access to the images of rooms, which lie outside of this crate's reach.
+/// Access to the images of rooms; implemented by the caller, because this crate reads no files.
 pub trait Images: Sync {
     /// The image of a frame.
     ///
     /// # Errors
-    /// Why it cannot be read, in words.
+    /// The reason why the image cannot be read.
     fn read(&self, room: &Room, frame: FrameId) -> Result<RgbImage, String>;
 
-    /// An image as a PNG file.
+    /// Encodes an image as a PNG file.
     ///
     /// # Errors
-    /// Why it cannot be encoded, in words.
+    /// The reason why the image cannot be encoded.
     fn png(&self, image: &RgbImage) -> Result<Vec<u8>, String>;
 }
 
-/// The report, its machine-readable record, and the adapters behind its numbers.
+/// The report, its machine-readable record, and the trained adapters.
 pub struct Reproduced {
     /// The report.
     pub document: Document,
-    /// Everything in the report, for programs.
+    /// All results of the report, for JSON.
     pub record: ReproductionRecord,
     /// The adapters of the navigation tables.
     pub adapters: Vec<ReproducedAdapter>,
 }
 
-/// The results of every experiment; the fields are keys of `record.json`, to which the command adds
-/// the published adapters and the time it took.
+/// The results of every experiment. The fields are keys of `record.json`; the command adds the
+/// published adapters and the run time.
 #[derive(Debug, Serialize)]
 pub struct ReproductionRecord {
     probes: Vec<probes::ProbeRecord>,
@@ -135,22 +134,22 @@ struct ProtocolRecord {
     in_room: Vec<(String, u64)>,
 }
 
-/// How many experiments [`reproduce`] runs.
+/// Number of experiments run by [`reproduce`].
 pub const EXPERIMENTS: u64 = 10;
 
-/// What an experiment found: a section of the report, and the same for programs.
+/// The result of an experiment: a section of the report, and its JSON record.
 struct Found<R> {
     section: Section,
     record: R,
 }
 
-/// Refuses options and rooms that could only fail after hours.
+/// Checks options and rooms before hours of training.
 ///
 /// # Errors
-/// [`Error::Input`], which names the option to change.
+/// [`Error::Input`] with the option or the room to change.
 pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
     for set in &given.sets {
-        // A room on both sides would turn the zero-shot numbers into training scores.
+        // A room in both groups would make the zero-shot scores training scores.
         let is_held_out = |data: &&RoomData<'_>| {
             set.test
                 .iter()
@@ -164,7 +163,7 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
         }
     }
 
-    // Every set holds the same rooms, so the first one stands for all.
+    // Every set has the same rooms, so checking the first one is enough.
     if let Some(set) = given.sets.first() {
         let Options {
             stride, strides, ..
@@ -194,7 +193,7 @@ pub fn check(given: &Reproduction<'_>) -> Result<(), Error> {
     Ok(())
 }
 
-/// Refuses a recording that is too short to be cut into folds at one of the strides.
+/// Checks that every recording has training and test pairs in every fold, at each stride.
 fn has_pairs_in_every_fold(
     rooms: &[RoomData<'_>],
     option: &str,
@@ -217,8 +216,8 @@ fn has_pairs_in_every_fold(
     Ok(())
 }
 
-/// The names of the adapters of single rooms, and one that is as long as any of the others, so that
-/// names can be checked before hours of training.
+/// The names of the single-room adapters, and the longest name of the other adapters. They allow
+/// checking names before hours of training.
 pub fn adapter_names(given: &Reproduction<'_>) -> Vec<String> {
     let mut names = Vec::new();
     for set in &given.sets {
@@ -230,10 +229,10 @@ pub fn adapter_names(given: &Reproduction<'_>) -> Vec<String> {
     names
 }
 
-/// Runs the paper's experiments; `done` hears of each.
+/// Runs the paper's experiments; `done` is called after each.
 ///
 /// # Errors
-/// [`Error`] of the first experiment that fails, or of [`check`].
+/// The [`Error`] of [`check`] or of the first failed experiment.
 pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced, Error> {
     check(given)?;
 
@@ -252,20 +251,20 @@ pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced
     let navigation = navigation::section(given, &mut notes)?;
     done();
 
-    // Adapters trained on many rooms, evaluated in rooms that they never saw.
+    // Adapters trained on several rooms, evaluated in held-out rooms.
     let across = plans::evaluate(given, &mut notes)?;
     let cross_room = cross::section(given, &across, &mut notes.claims)?;
     done();
     let better = better::section(&across, &mut notes.claims);
     done();
 
-    // The walks use the steady adapter that was trained for the sections before.
+    // The walks use the steady adapter trained for the previous sections.
     let pictures = pictures::section(given, &notes)?;
     done();
     let theory = theory()?;
     done();
 
-    // The verdicts are known only now, but stand near the top of the report, behind the rooms.
+    // The verdicts are complete only now; place them near the top of the report, after the rooms.
     let mut sections = vec![rooms_and_features(given), claims::section(&notes.claims)];
     sections.extend([
         probes.section,
@@ -307,8 +306,8 @@ pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced
 }
 
 impl Reproduction<'_> {
-    /// A preset at a stride. Its epochs are the command's `--epochs`, else `epochs`, else the
-    /// preset's own; only the last have a floor in steps.
+    /// The training plan of a preset at a stride. The number of epochs is the command's `--epochs`,
+    /// else `epochs`, else the preset's own. Only the last has a minimum number of steps.
     fn plan(
         &self,
         preset: Preset,
@@ -328,7 +327,7 @@ impl Reproduction<'_> {
 }
 
 impl Reproduction<'_> {
-    /// How long the adapters within a room are trained, in words.
+    /// The training length of single-room adapters, in words.
     fn training_words(&self) -> String {
         match self.options.epochs {
             Some(epochs) => format!("Preset base, cut to {epochs} epochs."),
@@ -346,7 +345,7 @@ fn protocol(given: &Reproduction<'_>) -> ProtocolRecord {
             .collect()
     };
 
-    // The sets differ in their features alone, so the first one names all rooms.
+    // The sets differ only in their features, so the first one names all rooms.
     let set = &given.sets[0];
     ProtocolRecord {
         features: given.sets.iter().map(|set| set.features.clone()).collect(),
@@ -374,7 +373,7 @@ fn rooms_and_features(given: &Reproduction<'_>) -> Section {
          models that were not run.",
     );
 
-    // A report from a trial run must not be mistaken for a result.
+    // Mark a trial run, so that it is not mistaken for a result.
     if let Some(epochs) = given.options.epochs {
         section.text(format!(
             "All training was cut to {epochs} epochs: this is a trial of the command, not a result."
@@ -384,7 +383,7 @@ fn rooms_and_features(given: &Reproduction<'_>) -> Section {
     section
 }
 
-/// The three groups of rooms; the sets differ in their features alone, so one stands for all.
+/// Table rows of the three groups of rooms, the same for every feature set.
 fn room_rows(set: &FeatureSet<'_>) -> Vec<Vec<String>> {
     let head = ["rooms", "count", "frames", "recorded as"];
     let mut rows = vec![head.map(str::to_owned).to_vec()];
@@ -418,8 +417,7 @@ fn feature_rows(sets: &[FeatureSet<'_>]) -> Vec<Vec<String>> {
     let mut rows = vec![head.map(str::to_owned).to_vec()];
 
     for set in sets {
-        // One room stands for all: rooms whose features differ in source cannot be trained on
-        // together.
+        // All rooms of a set have the same feature source; training on several rooms requires it.
         let source = set.train[0].features.source();
         rows.push(vec![
             set.features.clone(),
@@ -433,7 +431,7 @@ fn feature_rows(sets: &[FeatureSet<'_>]) -> Vec<Vec<String>> {
     rows
 }
 
-/// The section that says under which names the adapters are published.
+/// The section about the names of the published adapters.
 fn published(notes: &Notes) -> Section {
     let mut section = Section::new("Adapters");
     section.text(format!(

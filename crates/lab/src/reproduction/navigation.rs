@@ -1,4 +1,4 @@
-//! The navigation table within a room, learned correctors included.
+//! Section: navigation within a room, including learned correctors.
 
 use std::sync::Arc;
 
@@ -19,10 +19,10 @@ use super::render::plotted;
 use super::{Error, Found, Reproduction, paper};
 use crate::report::{Curves, Section, Series};
 
-/// Epochs of the adapters of the navigation table, which train on all pairs at one stride.
+/// Number of training epochs for the navigation table, on all pairs at one stride.
 const NAVIGATION_EPOCHS: usize = 200;
 
-/// A navigator with one feature set in `record.json`: means over the rooms.
+/// JSON record of a navigator with one feature set: means over the rooms.
 #[derive(Debug, Serialize)]
 pub struct NavigationRecord {
     features: String,
@@ -30,15 +30,15 @@ pub struct NavigationRecord {
     mse: f64,
     r2: f64,
     top1: f64,
-    /// One per threshold ε.
+    /// One hit rate per threshold ε.
     hits: Vec<f64>,
     /// The adapters' names in the store, one per room.
     adapters: Vec<String>,
-    /// The number of pairs, one per room.
+    /// Numbers of pairs, one per room.
     n: Vec<usize>,
 }
 
-/// The section of the navigation table, learned correctors included.
+/// Builds the section with the navigation table.
 #[expect(
     clippy::too_many_lines,
     reason = "a section of the report: its loop, its table and its claim"
@@ -60,8 +60,7 @@ pub fn section(
             navigated.into_iter().unzip();
         let adapters: Vec<String> = learned.iter().map(|learned| learned.name.clone()).collect();
 
-        // They are published at the end of the run, under the names that the record gives in every
-        // row.
+        // The adapters are published at the end of the run, under the names in every record row.
         notes.adapters.extend(learned);
         let mut head = ["navigator", "MSE", "R²", "Top-1"]
             .map(str::to_owned)
@@ -78,7 +77,7 @@ pub fn section(
         let mut rows = vec![head];
         let mut series = Vec::new();
 
-        // All rooms are evaluated under one protocol, so a row's number names the same navigator.
+        // All rooms share one protocol, so a row index identifies the same navigator in every room.
         for place in 0..reports[0].rows.len() {
             let name = reports[0].rows[place].name.clone();
             let numbers = averaged(&reports, place);
@@ -132,7 +131,7 @@ pub fn section(
 
         dominates.push(hits_more_than_correctors(&reports));
 
-        // The picture shows a selection of the rows, to stay readable.
+        // The picture shows only a selection of the rows.
         let shown = |s: &Series| {
             ["identity", "oracle", "inverse-poincare-affine"].contains(&s.name.as_str())
                 || s.name.starts_with("corrector")
@@ -184,12 +183,12 @@ fn navigated(
         Some(NAVIGATION_EPOCHS),
     );
 
-    // Correctors are trained on the same pairs as the adapter, after it.
+    // Correctors are trained after the adapter, on the same pairs.
     plan.correctors = CorrectorKind::ALL.to_vec();
     let (adapter, record) = train_adapter(&[*room], &plan, &mut |_| ())?;
     let learned = ReproducedAdapter::new(room.room.id().as_str(), room, adapter.clone(), record);
 
-    // The index is exact: scores must not depend on an approximation.
+    // Use an exact index: scores must not depend on an approximation.
     let navigator = Navigator::new(
         Arc::new(room.room.clone()),
         room.features,
@@ -207,8 +206,8 @@ fn navigated(
     Ok((report, learned))
 }
 
-/// Whether inverse Poincaré hits more often than each corrector within the first threshold of the
-/// paper's protocol, ε = 0.1, if intervals over the rooms can tell.
+/// Whether inverse Poincaré has a higher hit rate than each corrector at ε = 0.1, the first
+/// threshold of the paper's protocol. `None` if the intervals over the rooms are inconclusive.
 fn hits_more_than_correctors(reports: &[Report]) -> Option<bool> {
     let hit_rates = |name: &str| -> Vec<f64> {
         let rows = reports.iter().flat_map(|report| &report.rows);
@@ -226,12 +225,12 @@ fn hits_more_than_correctors(reports: &[Report]) -> Option<bool> {
     holds_for_each(&is_above)
 }
 
-/// MSE, R², Top-1 and hit rates of the row numbered `place`, each the mean over rooms.
+/// MSE, R², Top-1 and hit rates of row `place`, averaged over rooms.
 fn averaged(reports: &[Report], place: usize) -> Vec<f64> {
     let of_room = |report: &Report| {
         let row = &report.rows[place];
 
-        // A row without latents has no MSE and no R²; NaN is left out of the mean over rooms.
+        // A row without latents has no MSE and no R²; the mean over rooms skips NaN.
         let latent = row
             .latent
             .map_or([f64::NAN; 2], |latent| [latent.mse, latent.r2]);

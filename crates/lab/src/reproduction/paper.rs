@@ -1,5 +1,5 @@
-//! Numbers published in the paper, to be printed beside ours. Encoders and rooms differ: the
-//! numbers are context, not a target.
+//! Numbers published in the paper, printed beside ours. Encoders and rooms differ, so the numbers
+//! are context, not a target.
 
 /// R² of the alternative formulations on DINOv2-B, layer 7, three scenes, 15 seeds (Sec. A.5):
 /// name, overall, translation, rotation, direction, magnitude.
@@ -37,8 +37,8 @@ pub const NAVIGATION: [(&str, [f64; 7]); 6] = [
     ),
 ];
 
-/// Number of rooms, of 31, in which zero-shot navigation and the ridge-refit beat Identity at
-/// Hit@0.1 (Sec. A.10): encoder, zero-shot, refit.
+/// Numbers of rooms, of up to 31, in which zero-shot navigation and the ridge refit beat Identity
+/// at Hit@0.1 (Sec. A.10): encoder, zero-shot, refit.
 pub const CROSS_ROOM: [(&str, &str, &str); 3] = [
     ("DINOv2", "19/30 (63 %)", "29/31 (94 %)"),
     ("DUSt3R", "17/29 (59 %)", "26/29 (90 %)"),
@@ -73,8 +73,8 @@ const SEVEN_SCENES: Recordings = Recordings {
     rooms: 46,
 };
 
-/// Rooms in which an adapter succeeds (Table 2): recordings, encoder, largest R², percentage of
-/// rooms above 0, percentage above 0.3.
+/// Success rates of adapters (Table 2): recordings, encoder, largest R², percentage of rooms above
+/// 0, percentage above 0.3.
 pub const SUCCESS: [(Recordings, &str, [f64; 3]); 15] = [
     (TWELVE_SCENES, "V-JEPA", [0.803, 100.0, 70.0]),
     (TWELVE_SCENES, "DUSt3R", [0.789, 90.0, 80.0]),

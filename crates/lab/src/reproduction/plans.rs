@@ -1,5 +1,5 @@
-//! The adapters of the cross-room sections: which are trained, on how many rooms, and how they did
-//! in the held-out rooms.
+//! The adapters of the cross-room sections: training plans, numbers of rooms, and results in the
+//! held-out rooms.
 
 use rayon::prelude::*;
 
@@ -15,13 +15,13 @@ use crate::experiments::cross_room::{
     CrossRoomPlan, CrossRoomProgress, CrossRoomRun, nested_choice, train_and_test,
 };
 
-/// How many adapters an ensemble has.
+/// Number of adapters in an ensemble.
 pub const MEMBERS: usize = 4;
 
-/// The longest name that a plan gives an adapter: names are checked before training.
+/// An upper bound on the length of plan names, for checking names before training.
 pub const LONGEST_NAME: &str = "paper-range-aside-of-100000";
 
-/// What distinguishes the adapters of the cross-room sections.
+/// The kinds of adapters in the cross-room sections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PlanKind {
     /// The paper's preset.
@@ -37,7 +37,7 @@ pub enum PlanKind {
 }
 
 impl PlanKind {
-    /// What tables call it.
+    /// Its name in tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::PaperRange => "paper-range",
@@ -48,7 +48,7 @@ impl PlanKind {
         }
     }
 
-    /// The first part of its adapter's name; the number of rooms follows it.
+    /// The first part of the adapter's name; the number of rooms follows.
     fn short_name(self) -> &'static str {
         match self {
             Self::PaperRange => "paper-range",
@@ -87,24 +87,24 @@ impl PlanKind {
 /// One adapter to train and to evaluate in the held-out rooms.
 #[derive(Debug, Clone, Copy)]
 pub struct AdapterPlan {
-    /// What distinguishes it.
+    /// The kind of adapter.
     pub kind: PlanKind,
-    /// Rooms in all, calibration rooms included.
+    /// Number of rooms, including calibration rooms.
     pub rooms: usize,
 }
 
 impl AdapterPlan {
-    /// The adapter's name, as [`super::published_name`] takes it.
+    /// The adapter's name, for use with [`super::published_name`].
     pub fn adapter_name(&self) -> String {
         format!("{}-of-{}", self.kind.short_name(), self.rooms)
     }
 }
 
-/// A plan, and how its adapter did in the held-out rooms.
+/// A plan and the results of its adapter in the held-out rooms.
 pub struct PlanResult {
     /// The plan.
     pub plan: AdapterPlan,
-    /// How its adapter did.
+    /// The results.
     pub run: CrossRoomRun,
 }
 
@@ -112,21 +112,20 @@ pub struct PlanResult {
 pub struct SetResults {
     /// The name of the features.
     pub features: String,
-    /// The plans that were given all rooms, the paper's first.
+    /// Results of the plans on all rooms, the paper's preset first.
     pub on_all_rooms: Vec<PlanResult>,
-    /// The paper's preset by the number of rooms, from the fewest to all.
+    /// Results of the paper's preset, by increasing number of rooms.
     pub by_size: Vec<PlanResult>,
 }
 
 impl SetResults {
-    /// The paper's preset on all rooms: what everything is compared with.
+    /// The baseline of all comparisons: the paper's preset on all rooms.
     pub fn baseline(&self) -> &PlanResult {
         &self.on_all_rooms[0]
     }
 }
 
-/// The name of the adapter that preset steady gives on all rooms, with no calibration rooms among
-/// them.
+/// The name of the adapter of preset steady on all rooms, without calibration rooms.
 pub fn steady_adapter(set: &FeatureSet<'_>) -> String {
     let plan = AdapterPlan {
         kind: PlanKind::Steady,
@@ -175,7 +174,7 @@ pub fn evaluate(given: &Reproduction<'_>, notes: &mut Notes) -> Result<Vec<SetRe
     Ok(all)
 }
 
-/// Every plan, the longest training first, so that it does not run alone at the end.
+/// All plans, longest training first, so that no long training runs alone at the end.
 fn plans(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<AdapterPlan> {
     let all = set.train.len();
     let on_all_rooms = [
@@ -187,7 +186,7 @@ fn plans(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<AdapterPlan> {
         .map(|kind| AdapterPlan { kind, rooms: all })
         .to_vec();
 
-    // The scaling curve of the paper's preset; its last point, all rooms, stands above.
+    // The scaling curve of the paper's preset. Its last point, all rooms, is already in the list.
     let mut sizes = given.options.sizes.clone();
     sizes.retain(|&size| size != all);
     sizes.sort_unstable();
@@ -197,7 +196,7 @@ fn plans(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<AdapterPlan> {
         rooms,
     }));
 
-    // Preset steady takes a fraction of the steps.
+    // Preset steady needs only a fraction of the steps.
     let steady = [PlanKind::Steady, PlanKind::SteadyCalibrated];
     plans.extend(steady.map(|kind| AdapterPlan { kind, rooms: all }));
 
@@ -219,7 +218,7 @@ fn result_of(
         0
     };
 
-    // Held-out rooms are tested whole: every pair at the stride, with every frame as a candidate.
+    // Test on the whole held-out rooms: every pair at the stride, every frame as a candidate.
     let protocol = Protocol {
         split: Split::Whole,
         thresholds: vec![0.1],
@@ -264,8 +263,8 @@ fn training_plan(given: &Reproduction<'_>, kind: PlanKind) -> TrainingPlan {
     plan
 }
 
-/// The rows of the cross-room tables. Calibrated retrieval needs the covariance of errors in rooms
-/// that were not trained on.
+/// The navigators of the cross-room tables. Calibrated retrieval needs the error covariance from
+/// calibration rooms.
 fn navigators(is_calibrated: bool) -> Vec<NavigatorKind> {
     let affine = StepKind::InversePoincare(Reading::Affine);
     let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);

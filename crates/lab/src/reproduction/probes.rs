@@ -1,4 +1,4 @@
-//! Probes M1 to M3 of the rooms that are learned alone and of the held-out rooms.
+//! Section: probes M1 to M3 of the single-adapter rooms and of the held-out rooms.
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -15,10 +15,10 @@ use crate::experiments::folds::FoldedMotions;
 use crate::probes::{Duplicates, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
 use crate::report::{Curves, Section, Series, room_difference_text};
 
-/// How many frames M1 compares, as in the paper; of a shorter recording all of them.
+/// Maximum number of frames that M1 compares, as in the paper.
 const M1_FRAMES: usize = 256;
 
-/// The probes of a room in `record.json`.
+/// JSON record of the probes of one room.
 #[derive(Debug, Serialize)]
 pub struct ProbeRecord {
     features: String,
@@ -27,7 +27,7 @@ pub struct ProbeRecord {
     m1_long: f64,
     twonn: f64,
     mle: f64,
-    /// Over the pairs of all five folds together, as that of the mean training motion.
+    /// R² over the pairs of all five folds together, like `constant`.
     m3: f64,
     constant: f64,
 }
@@ -42,7 +42,7 @@ struct Probed {
     constant: f64,
 }
 
-/// The section of M1 at a short and a long stride, M2 and M3.
+/// Builds the section with M1 at a short and a long stride, M2 and M3.
 #[expect(
     clippy::too_many_lines,
     reason = "a section of the report: its loop, its table and its claim"
@@ -60,14 +60,14 @@ pub fn section(
     let mut series = Vec::new();
     let mut record = Vec::new();
     for set in &given.sets {
-        // Probes learn nothing from other rooms: the held-out rooms are probed as well.
+        // Probes use no other rooms, so the held-out rooms are probed too.
         let rooms: Vec<&RoomData<'_>> = set.in_room.iter().chain(&set.test).collect();
         let probed: Vec<Probed> = rooms
             .into_par_iter()
             .map(|room| probed(room, given))
             .collect::<Result<_, Error>>()?;
 
-        // Probes train no adapter, so a room has one number and no spread over seeds.
+        // Probes train no adapter, so a room has one value per probe and no spread over seeds.
         for Probed {
             room,
             short,
@@ -109,7 +109,7 @@ pub fn section(
         });
     }
 
-    // The paper's rows have M2 and M3 alone: the cells of the room and of M1 stay empty.
+    // The paper's rows have only M2 and M3: the cells of the room and of M1 stay empty.
     for (encoder, numbers) in paper::DIMENSIONS {
         let empty = [String::new(), String::new()];
         let numbers = numbers.map(|x| format!("{x:.2}"));
@@ -147,15 +147,15 @@ pub fn section(
         "M1 at a short and a long stride, a point a room; the line is y = x",
     );
 
-    // By convention the last feature set given is the control, which needs no trained encoder.
+    // By convention the last feature set is the control, which needs no trained encoder.
     let long = |of: &Series| of.points.iter().map(|point| point[1]).collect::<Vec<f64>>();
     let (control, trained) = curves
         .series
         .split_last()
-        .ok_or_else(|| Error::Input("at least one feature set is needed".to_owned()))?;
+        .ok_or_else(|| Error::Input("at least one feature set is required".to_owned()))?;
 
-    // Room by room: by how much does the trained encoder's M1 at the long stride exceed the
-    // control's?
+    // Difference of M1 at the long stride between the trained encoder and the control, paired by
+    // room.
     let over_control: Vec<RoomMean> = trained
         .iter()
         .map(|series| paired_difference(&long(series), &long(control), 0))
@@ -181,7 +181,7 @@ pub fn section(
 }
 
 impl Probed {
-    /// The columns of the table, in their order.
+    /// The numbers in table column order.
     fn numbers(&self) -> [f64; 6] {
         [
             self.short,
@@ -194,7 +194,7 @@ impl Probed {
     }
 }
 
-/// Each column's mean over the rooms.
+/// Mean of each column over the rooms.
 fn mean_numbers(rooms: &[Probed]) -> [f64; 6] {
     std::array::from_fn(|column| {
         let values: Vec<f64> = rooms.iter().map(|room| room.numbers()[column]).collect();
@@ -222,7 +222,7 @@ fn probed(data: &RoomData<'_>, given: &Reproduction<'_>) -> Result<Probed, Error
         )
     };
 
-    // The long stride spreads the compared frames over the whole recording.
+    // The long stride spreads the sampled frames over the whole recording.
     let frames = M1_FRAMES.min(room.frame_count());
     let long = (room.frame_count().saturating_sub(1) / frames.saturating_sub(1).max(1)).max(1);
 
@@ -235,7 +235,7 @@ fn probed(data: &RoomData<'_>, given: &Reproduction<'_>) -> Result<Probed, Error
         mutual_knn(rows, room.poses(), &options).within(what)
     };
 
-    // M2 without a temporal gap, as in the paper; `sweep layers` leaves a gap by default.
+    // M2 without a temporal gap, as in the paper; `sweep layers` uses a gap by default.
     let dimension = intrinsic_dimension(rows, 0, Duplicates::DropRows).within(what)?;
     let ridge = FoldedMotions::of(&Split::FOLDS, |split| {
         Ok(vec![ridge_probe(rows, room, split, given.options.stride)?])

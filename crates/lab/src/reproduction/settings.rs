@@ -1,5 +1,4 @@
-//! What the settings of the adapter are worth within a room: both losses, the width of the latent
-//! and the learning rate.
+//! Section: effect of adapter settings within a room: loss, latent width and learning rate.
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -15,11 +14,12 @@ use crate::experiments::folds::FoldedMotions;
 use crate::formulations::read_by_adapter;
 use crate::report::Section;
 
-/// Columns of a latent, and learning rates.
+/// Latent widths of the grid.
 const GEO_DIMS: [usize; 4] = [6, 20, 80, 320];
+/// Learning rates of the grid.
 const LEARNING_RATES: [f64; 4] = [3e-4, 1e-3, 3e-3, 1e-2];
 
-/// The tables in `record.json`.
+/// JSON record of the tables.
 #[derive(Debug, Serialize)]
 pub struct SettingsRecord {
     features: String,
@@ -27,7 +27,7 @@ pub struct SettingsRecord {
     grid: Vec<GridRecord>,
 }
 
-/// The scores of a loss; one value per seed.
+/// The scores with one loss, one value per seed.
 #[derive(Debug, Serialize)]
 struct LossRecord {
     loss: &'static str,
@@ -35,7 +35,7 @@ struct LossRecord {
     rotation: Vec<f64>,
 }
 
-/// A point of the grid, one seed.
+/// One grid point, with one seed.
 #[derive(Debug, Serialize)]
 struct GridRecord {
     geo_dim: usize,
@@ -43,8 +43,8 @@ struct GridRecord {
     r2: f64,
 }
 
-/// The section of the paper's tables "joint against rotation only" and of its sweep, with the first
-/// feature set.
+/// Builds the section with the paper's table "joint against rotation only" and its sweep, for the
+/// first feature set.
 pub fn section(given: &Reproduction<'_>) -> Result<Found<SettingsRecord>, Error> {
     let mut section = Section::new("Settings of the adapter, within a room");
     let set = &given.sets[0];
@@ -122,7 +122,7 @@ fn losses(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Result<Vec<LossReco
         .collect()
 }
 
-/// Every point, the learning rate varying fastest.
+/// All grid points; the learning rate varies fastest.
 fn grid(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Result<Vec<GridRecord>, Error> {
     let mut points = Vec::new();
     for geo_dim in GEO_DIMS {
@@ -134,7 +134,7 @@ fn grid(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Result<Vec<GridRecord
             points.push(GridRecord {
                 geo_dim,
                 learning_rate,
-                // A point of the grid whose training diverges has no score, and ends nothing.
+                // If training diverges, the score is NaN and the sweep continues.
                 r2: scores(set, &plan).map_or(f64::NAN, |scores| scores.overall),
             });
         }
@@ -143,12 +143,12 @@ fn grid(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Result<Vec<GridRecord
     Ok(points)
 }
 
-/// The plan of every run here; the folds replace its split.
+/// The base plan of all runs; the folds override its split.
 fn base_plan(given: &Reproduction<'_>, seed: u64) -> TrainingPlan {
     given.plan(Preset::Base, Split::Time, given.options.stride, seed, None)
 }
 
-/// The mean over rooms that are learned alone.
+/// Scores averaged over the single-adapter rooms.
 fn scores(set: &FeatureSet<'_>, plan: &TrainingPlan) -> Result<MotionScores, Error> {
     let of_room = |room: &RoomData<'_>| {
         let read = FoldedMotions::of(&Split::FOLDS, |split| {

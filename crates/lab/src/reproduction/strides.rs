@@ -1,4 +1,4 @@
-//! M4 by stride, within a room.
+//! Section: M4 by stride, within a room.
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -16,21 +16,21 @@ use crate::experiments::cross_room::CLIPPED_R2;
 use crate::experiments::probe::{ProbeProtocol, probe_adapters};
 use crate::report::{Curves, Section, Series};
 
-/// M4 at a stride in `record.json`.
+/// JSON record of M4 at one stride.
 #[derive(Debug, Serialize)]
 pub struct StrideRecord {
     features: String,
     stride: u32,
-    /// Over the test pairs of all five folds together.
+    /// R² over the test pairs of all five folds together.
     r2_by_room_and_seed: Vec<Vec<f64>>,
-    /// R² of always answering the mean training motion, by room.
+    /// R² of the constant baseline (the mean training motion), by room.
     constant_r2_by_room: Vec<f64>,
-    /// Of the last fold alone, the paper's split, by room: mean over seeds, and the constant's.
+    /// R² in the last fold only (the paper's split), by room: mean over seeds, then the constant's.
     last_fifth_r2_by_room: Vec<f64>,
     last_fifth_constant_r2_by_room: Vec<f64>,
 }
 
-/// The section of M4 by stride.
+/// Builds the section with M4 by stride.
 #[expect(
     clippy::too_many_lines,
     reason = "a section of the report: its loop, its table and its claim"
@@ -61,7 +61,7 @@ pub fn section(
             .collect();
         let mut last_by_room = by_room.clone();
 
-        // For every stride new adapters are trained on pairs at that stride and tested at it.
+        // Train and test new adapters at every stride.
         for &stride in strides {
             let scored = m4(given, set, stride)?;
             for (row, scores) in by_room.iter_mut().zip(&scored) {
@@ -76,15 +76,14 @@ pub fn section(
                 row.push(format!("{ours:.2} ({constant:.2})"));
             }
 
-            // R² has no lower bound: without clipping, a single room could decide the curve.
+            // R² has no lower bound: without clipping, one room could dominate the curve.
             let clipped: Vec<f64> = scored
                 .iter()
                 .map(|scores| scores.mean().max(CLIPPED_R2))
                 .collect();
             points.push([f64::from(stride), mean(&clipped)]);
 
-            // The claim is tested by the mean over seeds, where the constant leaves an adapter a
-            // chance.
+            // Test the claim on the mean over seeds; skip cases with a too low constant baseline.
             positive.extend(scored.iter().map(RoomScores::is_positive));
             record.push(StrideRecord {
                 features: set.features.clone(),
@@ -155,9 +154,9 @@ pub fn section(
 struct RoomScores {
     /// Overall test R², one value per seed.
     overall: Vec<f64>,
-    /// R² of always answering the mean training motion.
+    /// R² of the constant baseline, the mean training motion.
     constant: f64,
-    /// Both in the last fold alone, ours as the mean over seeds.
+    /// R² in the last fold only: the adapters' mean over seeds, then the constant's.
     last_fifth: [f64; 2],
 }
 
@@ -166,7 +165,8 @@ impl RoomScores {
         mean_of_known(&self.overall)
     }
 
-    /// Whether the mean is above zero; `None` where the constant leaves an adapter no chance.
+    /// Whether the mean is above zero; `None` if the constant is below [`LEAST_CONSTANT_R2`], so
+    /// that R² is not informative.
     fn is_positive(&self) -> Option<bool> {
         (self.constant >= LEAST_CONSTANT_R2).then(|| self.mean() > 0.0)
     }
@@ -177,7 +177,7 @@ fn m4(
     set: &FeatureSet<'_>,
     stride: u32,
 ) -> Result<Vec<RoomScores>, Error> {
-    // The probe replaces the plan's split and seed.
+    // The probe overrides the plan's split and seed.
     let protocol = ProbeProtocol {
         m1: None,
         m2: None,

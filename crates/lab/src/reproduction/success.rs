@@ -1,5 +1,5 @@
-//! Each room by itself with one, two and four charts: in how many rooms training succeeds, and how
-//! hard the rooms are.
+//! Section: one adapter per room with one, two and four charts. It reports the fraction of rooms
+//! where training succeeds, and the difficulty of the rooms.
 
 use rayon::prelude::*;
 
@@ -15,8 +15,8 @@ use crate::report::{Section, configurations_rows, difficulty_rows, parts_rows, s
 /// Numbers of charts K, as in the paper's mixtures.
 const CHARTS: [usize; 3] = [1, 2, 4];
 
-/// The section of the paper's Table 2, with the tables of difficulty, of mixtures, and of the parts
-/// of the motion.
+/// Builds the section with the paper's Table 2 and the tables of difficulty, mixtures and parts of
+/// the motion.
 pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<SweepRow>>, Error> {
     let mut section = Section::new("Each room by itself: success, difficulty, mixtures of charts");
 
@@ -30,7 +30,7 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<SweepRow>>, Error> 
         "Best run of each room over all strides, chosen by its test score as the paper's \"Max R²\" is:",
     );
 
-    // Our rows come first; the paper's follow, grouped by its own recordings and encoders.
+    // Our rows come first, then the paper's, grouped by its recordings and encoders.
     let mut success = success_rows(&rows);
     for (recordings, encoder, [best, above_0, above_0_3]) in paper::SUCCESS {
         let format = format!("paper: {}", recordings.name);
@@ -74,7 +74,7 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<SweepRow>>, Error> 
         given.training_words()
     ));
 
-    // Runs of a room stand one after the other; a reason that they share is given once.
+    // Runs of a room are adjacent; report a shared reason once.
     let mut failures: Vec<(&str, &str)> = rows
         .iter()
         .filter(|row| !row.failure.is_empty())
@@ -92,7 +92,7 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<SweepRow>>, Error> 
     })
 }
 
-/// The rooms in three parts by contrast: in how many training succeeds, and how well.
+/// Success rate and median best R² for three groups of rooms by contrast.
 fn contrast_rows(given: &Reproduction<'_>, rows: &[SweepRow]) -> Vec<Vec<String>> {
     let control = given.sets.last();
     let mut rooms: Vec<(f64, f64)> = control
@@ -100,7 +100,7 @@ fn contrast_rows(given: &Reproduction<'_>, rows: &[SweepRow]) -> Vec<Vec<String>
         .flat_map(|set| set.test.iter().chain(&set.in_room))
         .map(|data| (contrast(data), best_r2(rows, data.room.id().as_str())))
         .collect();
-    // A room whose runs all failed is named below the tables.
+    // Skip rooms where all runs failed; they are named below the tables.
     rooms.retain(|room| room.1.is_finite());
     rooms.sort_by(|a, b| a.0.total_cmp(&b.0));
 
@@ -123,7 +123,7 @@ fn contrast_rows(given: &Reproduction<'_>, rows: &[SweepRow]) -> Vec<Vec<String>
     lines
 }
 
-/// The best R² of a room's runs; −∞ if it has none.
+/// The best R² of a room's runs; −∞ if all runs failed.
 fn best_r2(rows: &[SweepRow], room: &str) -> f64 {
     rows.iter()
         .filter(|row| row.room == room)
@@ -131,7 +131,7 @@ fn best_r2(rows: &[SweepRow], room: &str) -> f64 {
         .fold(f64::NEG_INFINITY, f64::max)
 }
 
-/// The median over frames of the standard deviation over a frame's columns.
+/// The median over frames of the standard deviation of a frame's feature.
 fn contrast(data: &RoomData<'_>) -> f64 {
     let of_frames: Vec<f64> = data
         .features
@@ -143,7 +143,7 @@ fn contrast(data: &RoomData<'_>) -> f64 {
 }
 
 fn of_set(given: &Reproduction<'_>, set: &FeatureSet<'_>) -> Vec<SweepRow> {
-    // Held-out rooms belong here too: each adapter is trained and tested within one room.
+    // Held-out rooms are included: each adapter is trained and tested within one room.
     let rooms: Vec<&RoomData<'_>> = set.test.iter().chain(&set.in_room).collect();
 
     let of_room = |room: &&RoomData<'_>| {

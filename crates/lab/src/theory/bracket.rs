@@ -1,5 +1,5 @@
-//! Theorem 5c: the error that remains when features are perfectly unrolled is that of the group
-//! itself, (J_r⁻¹(X) − I) ξ, with ½\[X, ξ\] as its leading term.
+//! Theorem 5c: the residual error of perfectly unrolled features comes from the group itself. It is
+//! (J_r⁻¹(X) − I) ξ, with leading term ½\[X, ξ\].
 
 use nalgebra::{Matrix6, SymmetricEigen, Vector6};
 use rand_chacha::ChaCha8Rng;
@@ -27,8 +27,7 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
         let x = twist_of_length(0.7, random);
         let small = twist_of_length(1e-5, random);
 
-        // For a small ξ the error of unrolling is the residual (J_r⁻¹(X) − I) ξ, to first order in
-        // ξ.
+        // For small ξ, the error of unrolling equals the residual (J_r⁻¹(X) − I) ξ to first order.
         exact = exact.max(
             (unrolled_error(x, small) - residual(x, small)).norm() / residual(x, small).norm(),
         );
@@ -36,11 +35,11 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
         let near = twist_of_length(1e-2, random);
         let xi = twist_of_length(1.0, random);
 
-        // For a small X that residual is ½[X, ξ], to first order in X.
+        // For small X, the residual equals ½[X, ξ] to first order.
         let half = bracket(near, xi).to_vector() * 0.5;
         leading = leading.max((residual(near, xi) - half).norm() / half.norm());
 
-        // Hence it is at most ½ C_Lie ‖X‖ ‖ξ‖, again to first order in X.
+        // Hence it is at most ½ C_Lie ‖X‖ ‖ξ‖, to first order in X.
         over = over.max(residual(near, xi).norm() / (0.5 * C_LIE * near.norm() * xi.norm()));
     }
 
@@ -93,8 +92,8 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
     ]
 }
 
-/// log(g₂) − log(g₁) − log(g₁⁻¹g₂) with g₁ = exp(X), g₂ = g₁ exp(ξ): the error that remains when a
-/// pose is unrolled by the logarithm itself.
+/// The error of unrolling a pose by the logarithm: log(g₂) − log(g₁) − log(g₁⁻¹g₂), with
+/// g₁ = exp(X) and g₂ = g₁ exp(ξ).
 fn unrolled_error(x: Twist, xi: Twist) -> Vector6<f64> {
     log(&(exp(&x) * exp(&xi))).to_vector() - x.to_vector() - xi.to_vector()
 }
@@ -105,8 +104,7 @@ fn residual(x: Twist, xi: Twist) -> Vector6<f64> {
     (left_jacobian_inverse(&backwards) - Matrix6::identity()) * xi.to_vector()
 }
 
-/// sup ‖\[X, ξ\]‖ over unit X and ξ, by maximising over one and the other in turn from many random
-/// starts.
+/// sup ‖\[X, ξ\]‖ over unit X and ξ, by alternating maximization from many random starts.
 fn steepest(effort: Effort, random: &mut ChaCha8Rng) -> f64 {
     let ad = |x: &Vector6<f64>| {
         let columns: [Vector6<f64>; 6] = std::array::from_fn(|c| {
@@ -123,7 +121,7 @@ fn steepest(effort: Effort, random: &mut ChaCha8Rng) -> f64 {
         for _ in 0..200 {
             let matrix = ad(&x);
 
-            // For a fixed X the best unit ξ is the right singular vector of ad_X for its largest
+            // For fixed X, the best unit ξ is the right singular vector of ad_X with the largest
             // singular value.
             let eigen = SymmetricEigen::new(matrix.transpose() * matrix);
             let xi = eigen
@@ -132,7 +130,7 @@ fn steepest(effort: Effort, random: &mut ChaCha8Rng) -> f64 {
                 .normalize();
             best = best.max((matrix * xi).norm());
 
-            // ‖[X, ξ]‖ = ‖[ξ, X]‖, so the roles are swapped and ξ becomes the next X.
+            // ‖[X, ξ]‖ = ‖[ξ, X]‖, so swap the roles: ξ becomes the next X.
             x = xi;
         }
     }

@@ -1,5 +1,5 @@
-//! Theorems 3 and 5a, b: how well a linear readout of features recovers a motion, near one pose and
-//! over a region.
+//! Theorems 3 and 5a, b: error of a motion recovered by a linear readout of features, near one pose
+//! and over a region.
 
 use nalgebra::DMatrix;
 use rand_chacha::ChaCha8Rng;
@@ -10,13 +10,13 @@ use super::{Bound, Check, ConstructedMap, DrawnMap, Effort, FeatureMap};
 use seese3_core::geometry::{Pose, Twist, body_twist, exp};
 use seese3_core::statistics::median;
 
-/// Columns of the constructed features.
+/// Width of the constructed features.
 const DIM: usize = 48;
-/// The region's radius around its centre, metres and radians.
+/// Radius of the region, metres and radians.
 const RADIUS: f64 = 0.3;
-/// Poses sampled along a geodesic, both ends included.
+/// Number of poses sampled along a geodesic, including both ends.
 const STATIONS: usize = 33;
-/// Relative error that a difference quotient is allowed.
+/// Allowed relative error of a difference quotient.
 const SLACK: f64 = 1e-6;
 
 pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
@@ -36,8 +36,8 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
         bound,
     };
 
-    // Theorem 3: the local readout's error is quadratic in the motion, so halving the motion
-    // quarters it (order 2). Drawn maps are not smooth enough for the full order.
+    // Theorem 3: the local readout's error is quadratic in the motion (order 2): halving the motion
+    // divides the error by four. Drawn maps are not smooth enough for the full order.
     let order = order(&map, &centre, 1e-2, effort.samples, random);
     let drawn = order_of_drawn(&room, &pose, effort.samples / 4, random);
     let global = global(&map, &centre, effort.samples, random);
@@ -76,18 +76,18 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
     ]
 }
 
-/// A left inverse of the Jacobian at a pose, shape (6, d).
+/// The readout W at a pose: a left inverse of the Jacobian, shape (6, d).
 fn readout(map: &dyn FeatureMap, pose: &Pose) -> DMatrix<f64> {
     let jacobian = map.jacobian(pose);
 
-    // The theorem assumes full column rank; then the pseudo-inverse is a left inverse.
+    // With full column rank, as the theorem assumes, the pseudo-inverse is a left inverse.
     jacobian
         .pseudo_inverse(1e-9)
         .unwrap_or_else(|_| DMatrix::zeros(6, 0))
 }
 
-/// The order of the readout's error: log₂ of the factor by which it shrinks when a motion of this
-/// length is halved, as the median over random directions.
+/// The order of the readout's error: log₂ of the ratio of the errors for a motion of this length
+/// and for half of it. The result is the median over random directions.
 fn order(
     map: &dyn FeatureMap,
     pose: &Pose,
@@ -123,9 +123,9 @@ struct Global {
     spread: f64,
 }
 
-/// The largest ratios over pairs of poses of the region; suprema are taken along geodesics.
+/// The largest ratios over pairs of poses in the region. Suprema are taken along geodesics.
 fn global(map: &ConstructedMap, centre: &Pose, samples: usize, random: &mut ChaCha8Rng) -> Global {
-    // W is the readout at the centre, where WJ = I; the theorems bound how far it is off elsewhere.
+    // W is the readout at the center, where WJ = I; the theorems bound its error elsewhere.
     let w = readout(map, centre);
     let pairs: Vec<[Pose; 2]> = (0..samples)
         .map(|_| [0, 1].map(|_| pose_near(centre, RADIUS, random)))

@@ -1,5 +1,5 @@
-//! Theorem 1: features of a static scene lie on a manifold of at most six dimensions, and of six
-//! when the map is an embedding.
+//! Theorem 1: features of a static scene lie on a manifold of dimension at most six, exactly six if
+//! the map is an embedding.
 
 use ndarray::Array2;
 use rand::RngExt;
@@ -11,14 +11,14 @@ use super::{Bound, Check, ConstructedMap, DrawnMap, Effort, FeatureMap};
 use crate::probes::{self, Duplicates, IntrinsicDimension, intrinsic_dimension};
 use seese3_core::geometry::{Pose, Twist, exp};
 
-/// Columns of the constructed features.
+/// Width of the constructed features.
 const DIM: usize = 48;
 /// Radius of the region of poses, metres and radians.
 const RADIUS: f64 = 0.6;
 /// Radius of the region of poses for drawn maps.
 const DRAWN_RADIUS: f64 = 0.15;
-/// How far the estimates may be off, which is how far they are off on known manifolds of this size
-/// (checked on Gaussians of rank 6).
+/// Tolerance of the dimension estimates: their error on known manifolds of this size (checked on
+/// Gaussians of rank 6).
 const TOLERANCE: f64 = 1.0;
 
 pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Result<Vec<Check>, probes::Error> {
@@ -28,8 +28,8 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Result<Vec<Chec
             .collect()
     };
 
-    // The first map depends on position and rotation; the second on x and y alone, so its features
-    // lie on a surface.
+    // The first map depends on position and rotation. The second depends only on x and y, so its
+    // features lie on a surface.
     let embedding = ConstructedMap::new(DIM, 12, random);
     let flat = ConstructedMap::new(DIM, 2, random);
     let poses = near(random);
@@ -37,8 +37,8 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Result<Vec<Chec
 
     let collapsed = dimension(&flat, &poses)?;
 
-    // Poses are drawn at random along the path. Evenly spaced poses have two neighbours at equal
-    // distances, and a ratio of 1 tells TwoNN nothing.
+    // Sample poses at random along the path. Evenly spaced poses have two neighbors at equal
+    // distances, and a ratio of 1 carries no information for TwoNN.
     let ahead = Twist {
         linear: [1.0, 0.2, 0.0].into(),
         angular: [0.0, 0.4, 0.1].into(),
@@ -47,7 +47,7 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Result<Vec<Chec
     let line: Vec<Pose> = (0..effort.poses).map(|_| exp(&along())).collect();
     let path = dimension(&embedding, &line)?;
 
-    // A rendered image need not be an embedding of the pose, so it is only bounded from above.
+    // A rendered image need not be an embedding of the pose, so it has only an upper bound.
     let (room, centre) = DrawnMap::new(effort.seed, 0);
     let seen: Vec<Pose> = (0..effort.poses / 2)
         .map(|_| pose_near(&centre, DRAWN_RADIUS, random))

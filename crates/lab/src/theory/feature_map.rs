@@ -9,7 +9,8 @@ use seese3_studio::{Camera, Scene, SuiteRoom, render};
 
 /// Step of the central differences for constructed maps, metres and radians.
 const STEP: f64 = 1e-4;
-/// Step for drawn maps, metres and radians: far above what the rounding of pixels can change.
+/// Step of the central differences for drawn maps, metres and radians: large compared with the
+/// effect of pixel rounding.
 const DRAWN_STEP: f64 = 0.02;
 
 /// A map from a pose, `world_from_camera`, to a feature of shape (d,).
@@ -17,11 +18,11 @@ pub trait FeatureMap: Sync {
     /// f(g).
     fn feature(&self, pose: &Pose) -> DVector<f64>;
 
-    /// The step of the differences in [`FeatureMap::jacobian`], metres and radians.
+    /// The difference step of [`FeatureMap::jacobian`], metres and radians.
     fn step(&self) -> f64;
 
-    /// J(g), shape (d, 6): the derivative of f(g exp(ξ)) by ξ = (v, ω) at 0, by central
-    /// differences.
+    /// J(g), shape (d, 6): the derivative of f(g exp(ξ)) with respect to ξ = (v, ω) at 0, by
+    /// central differences.
     fn jacobian(&self, pose: &Pose) -> DMatrix<f64> {
         let h = self.step();
         let columns: Vec<DVector<f64>> = (0..6)
@@ -39,8 +40,8 @@ pub trait FeatureMap: Sync {
     }
 }
 
-/// Sines of random linear combinations of position and rotation matrix: smooth, and of rank 6 at
-/// every pose that was checked.
+/// Sines of random linear combinations of position and rotation matrix: smooth, with rank 6 at all
+/// checked poses.
 #[derive(Debug, Clone)]
 pub struct ConstructedMap {
     weights: DMatrix<f64>,
@@ -48,8 +49,8 @@ pub struct ConstructedMap {
 }
 
 impl ConstructedMap {
-    /// A map to `dim` numbers that depends on the first `coordinates` of x, y, z and the nine
-    /// entries of R.
+    /// A map to `dim` numbers. It depends on the first `coordinates` of twelve inputs: x, y, z and
+    /// the nine entries of R.
     pub fn new(dim: usize, coordinates: usize, random: &mut ChaCha8Rng) -> Self {
         let weights = DMatrix::from_fn(dim, 12, |_, column| match column < coordinates {
             true => random.random_range(-0.8..0.8),
@@ -82,7 +83,7 @@ impl FeatureMap for ConstructedMap {
     }
 }
 
-/// A rendered studio room: the mean colour of each of 8×6 patches, 144 numbers from 0 to 1.
+/// A rendered studio room: the mean colors of 8 × 6 patches, 144 numbers from 0 to 1.
 pub struct DrawnMap {
     scene: Scene,
     camera: Camera,
@@ -104,7 +105,7 @@ impl DrawnMap {
     }
 }
 
-/// Patches horizontally and vertically.
+/// Number of patches, horizontally and vertically.
 const PATCHES: (usize, usize) = (8, 6);
 
 impl FeatureMap for DrawnMap {
@@ -137,16 +138,16 @@ pub(super) fn twist_of_length(length: f64, random: &mut ChaCha8Rng) -> Twist {
         let direction = Vector6::from_fn(|_, _| random.random_range(-1.0..1.0));
         let norm: f64 = direction.norm();
 
-        // Points of the cube outside the unit ball are rejected, or its corners would be favoured.
+        // Reject points outside the unit ball; else directions to the cube's corners are favored.
         if (1e-3..=1.0).contains(&norm) {
             return Twist::from_vector(&(direction * (length / norm)));
         }
     }
 }
 
-/// A pose at most `radius` away from another, measured as the length of the twist between them.
+/// A random pose at most `radius` from `centre`, by the length of the twist between them.
 pub(super) fn pose_near(centre: &Pose, radius: f64, random: &mut ChaCha8Rng) -> Pose {
-    // In six dimensions the sixth root makes the points uniform in the ball.
+    // In six dimensions, the sixth root makes points uniform in the ball.
     let length = radius * random.random_range(0.0f64..1.0).powf(1.0 / 6.0);
     centre * exp(&twist_of_length(length, random))
 }

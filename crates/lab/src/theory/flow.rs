@@ -1,5 +1,5 @@
-//! Theorem 7: image flow from rotation does not depend on depth, flow from translation goes with
-//! 1/Z, and scaling the scene and the translation by the same factor leaves the image unchanged.
+//! Theorem 7: image flow from rotation does not depend on depth, and flow from translation is
+//! proportional to 1/Z. Scaling the scene and the translation together leaves the image unchanged.
 
 use nalgebra::{Matrix2x6, Point3, Vector2, Vector3, Vector6};
 use rand::RngExt;
@@ -9,7 +9,7 @@ use super::feature_map::twist_of_length;
 use super::{Bound, Check, DrawnMap, Effort, FeatureMap};
 use seese3_core::geometry::{Pose, Twist, exp};
 
-/// Focal lengths of a camera, pixels; image coordinates are taken from the principal point.
+/// Focal lengths of a camera, pixels. Image coordinates are relative to the principal point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pinhole {
     /// Along u.
@@ -31,7 +31,7 @@ impl Pinhole {
 /// The Jacobian of the image flow as printed in the paper, with respect to (v, ω): pixels per metre
 /// and pixels per radian.
 ///
-/// It is the negative of the flow that a camera sees when it moves by the body twist.
+/// It is the negative of the image flow of a camera that moves by the body twist.
 ///
 /// Source: SeeSE3, theorem 7a and b.
 pub fn flow_jacobian(camera: Pinhole, at: Vector2<f64>, depth: f64) -> Matrix2x6<f64> {
@@ -48,12 +48,12 @@ pub fn flow_jacobian(camera: Pinhole, at: Vector2<f64>, depth: f64) -> Matrix2x6
     jacobian
 }
 
-/// Where the scene point of a pixel is imaged after the camera has moved by a twist.
+/// The image position of a pixel's scene point after the camera has moved by a twist.
 fn moved(camera: Pinhole, at: Vector2<f64>, depth: f64, twist: Twist) -> Vector2<f64> {
     camera.project(&(exp(&twist).inverse() * camera.point(at, depth)))
 }
 
-/// The flow that a camera sees when it moves by a body twist, by central differences.
+/// The image flow of a camera that moves by a body twist, by central differences.
 fn measured(camera: Pinhole, at: Vector2<f64>, depth: f64) -> Matrix2x6<f64> {
     const H: f64 = 1e-5;
 
@@ -89,19 +89,18 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
         let [near_flow, far_flow] = [near, far].map(|depth| measured(camera, at, depth));
         let largest = near_flow.amax();
 
-        // 7: the printed Jacobian is the negative of the camera's flow, so the sum must vanish.
+        // 7: the printed Jacobian is the negative of the camera's flow, so their sum must be zero.
         sign = sign.max((near_flow + flow_jacobian(camera, at, near)).amax() / largest);
 
-        // 7a and b: between the two depths the rotation columns must not change, nor the
-        // translation columns once they are multiplied by Z.
+        // 7a and b: the rotation columns must be equal at both depths, and so must the translation
+        // columns multiplied by Z.
         let part =
             |flow: &Matrix2x6<f64>, first: usize| flow.fixed_columns::<3>(first).into_owned();
         turning = turning.max((part(&near_flow, 3) - part(&far_flow, 3)).amax() / largest);
         moving =
             moving.max((part(&near_flow, 0) * near - part(&far_flow, 0) * far).amax() / largest);
 
-        // 7d: with translation and depth scaled by the same factor, the image point must stay where
-        // it was.
+        // 7d: scaling translation and depth by the same factor must not move the image point.
         let twist = twist_of_length(0.1, random);
         let factor = random.random_range(0.2..5.0);
         let larger = Twist {
@@ -151,8 +150,8 @@ pub(super) fn checks(effort: Effort, random: &mut ChaCha8Rng) -> Vec<Check> {
     found
 }
 
-/// How much the v half and the ω half of a drawn room's Jacobian change between two poses 0.2 m
-/// apart, relative to their size; the mean over six rooms.
+/// Relative change of the ω half and the v half of a drawn room's Jacobian between two poses 0.2 m
+/// apart; mean over six rooms.
 fn drawn_variation(effort: Effort) -> [Check; 2] {
     const PLACES: u32 = 6;
 

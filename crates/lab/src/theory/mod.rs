@@ -1,11 +1,10 @@
-//! The paper's theorems as numeric checks (Sec. A.7): what is measured, and the bound that it must
-//! satisfy.
+//! Numeric checks of the paper's theorems (Sec. A.7): measured values and their bounds.
 //!
-//! - Feature maps are *constructed* (smooth functions of the pose that are known exactly) or
-//!   *drawn*: the colours of a rendered studio image, averaged over patches. Drawn maps are only
-//!   nearly smooth: pixels have 8 bits and edges alias.
+//! - *Constructed* feature maps are exactly known smooth functions of the pose. *Drawn* maps are
+//!   colors of a rendered studio image, averaged over patches. Drawn maps are only nearly smooth:
+//!   pixels have 8 bits and edges alias.
 //! - Lengths of twists add metres and radians one to one (A-34: length scale 1 m/rad).
-//! - A check only measures; nothing in it is fitted to the bound.
+//! - A check only measures; nothing is fitted to the bound.
 
 mod bracket;
 mod decodability;
@@ -22,23 +21,23 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::probes;
 
-/// The condition that a measured number must satisfy.
+/// The bound on a measured value.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Bound {
-    /// At most this.
+    /// At most this value.
     AtMost(f64),
-    /// At least this.
+    /// At least this value.
     AtLeast(f64),
-    /// Within a tolerance of this.
+    /// Equal to the first value within the second, a tolerance.
     Equals(f64, f64),
-    /// Between these, both included.
+    /// Between two values, inclusive.
     Between(f64, f64),
-    /// No condition: the theorem says nothing about the number, and it is only reported.
+    /// No bound: the value is only reported.
     Free,
 }
 
 impl Bound {
-    /// Whether a measured number satisfies it; NaN satisfies only [`Bound::Free`].
+    /// Whether a measured value satisfies the bound; NaN satisfies only [`Bound::Free`].
     pub fn holds(self, measured: f64) -> bool {
         match self {
             Self::AtMost(most) => measured <= most,
@@ -53,13 +52,13 @@ impl Bound {
 /// One measured quantity of one theorem.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Check {
-    /// The theorem, numbered as the compiled paper numbers it.
+    /// The theorem, numbered as in the compiled paper.
     pub theorem: &'static str,
-    /// What was measured, and on what.
+    /// Description of the measured quantity.
     pub what: &'static str,
     /// The measured value.
     pub measured: f64,
-    /// The condition that it must satisfy.
+    /// Its bound.
     pub bound: Bound,
 }
 
@@ -70,10 +69,10 @@ impl Check {
     }
 }
 
-/// How thorough the checks are.
+/// Sample sizes and seed of the checks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Effort {
-    /// Seed of everything that is drawn at random.
+    /// Seed of all random samples.
     pub seed: u64,
     /// Number of poses for estimating an intrinsic dimension.
     pub poses: usize,
@@ -91,7 +90,7 @@ impl Default for Effort {
     }
 }
 
-/// Runs every check; `progress` is called with the name of each part as it begins.
+/// Runs every check; `progress` is called with the name of each part when it starts.
 ///
 /// # Errors
 /// [`probes::Error`] when there are too few poses for an intrinsic dimension.
@@ -119,8 +118,7 @@ pub fn checks(
 mod tests {
     use super::*;
 
-    /// Oracle: the theorems themselves, and Bound by hand; with few samples, since the command
-    /// takes more.
+    /// Oracle: the theorems. The test uses fewer samples than the command.
     #[test]
     fn every_bound_is_kept() {
         let effort = Effort {

@@ -1,4 +1,4 @@
-//! What is done to a camera's images on the way to a tracker.
+//! Disturbances of a camera's images and of its frame rate.
 
 use image::imageops;
 use nalgebra::{Unit, Vector2, Vector3};
@@ -10,75 +10,77 @@ use seese3_core::image::RgbImage;
 use seese3_core::statistics::normal_deviates;
 use seese3_robot::tracking::MeasuredGravity;
 
-/// The width in pixels for which blurs are stated; in other images they are as large a part.
+/// Image width for which blurs are stated, pixels; blurs scale with the image width.
 const STATED_WIDTH: f64 = 640.0;
-/// The occluder crosses the image once in so many frames.
+/// Period of the occluder's motion across the image and back, frames.
 const OCCLUDER_PERIOD: usize = 40;
 /// The brightness of the occluder, 0 to 255.
 const OCCLUDER_BRIGHTNESS: u8 = 60;
 
-/// How far off measured directions of gravity are, radians.
+/// Error of the simulated gravity direction, radians.
 const GRAVITY_ERROR_RAD: f64 = 0.02;
-/// What the tracker is told of that, radians: what the service assumes if nobody says.
+/// Standard deviation of the gravity direction passed to the tracker, radians: the service's
+/// default.
 const GRAVITY_DEVIATION_RAD: f64 = 0.03;
 
 /// A disturbance of a stream.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Disturbance {
-    /// The images as they are.
+    /// The unchanged images.
     None,
-    /// The camera is turned about its axis. Corners are filled with the nearest pixels of the edge.
+    /// The camera is rotated about its optical axis. Corners are filled with the nearest edge
+    /// pixels.
     Roll {
-        /// Clockwise, degrees.
+        /// Clockwise angle, degrees.
         degrees: f64,
-        /// Whether the robot measures which way is down.
+        /// Whether the robot measures the direction of gravity.
         with_gravity: bool,
     },
     /// A Gaussian blur.
     Blur {
-        /// Standard deviation, pixels of an image that is 640 wide.
+        /// Standard deviation, pixels in an image 640 pixels wide.
         deviation: f64,
     },
-    /// All brightness is multiplied.
+    /// The brightness of every pixel is multiplied by a factor.
     Exposure {
-        /// By this.
+        /// The factor.
         factor: f64,
     },
-    /// A grey bar over the whole height moves across the image, back and forth.
+    /// A gray bar of full image height moves across the image, back and forth.
     Occluder {
-        /// The part of the image that it covers.
+        /// Fraction of the image that the bar covers.
         share: f64,
     },
-    /// Normal noise on every pixel and channel.
+    /// Gaussian noise is added to every pixel and channel.
     Noise {
-        /// Standard deviation, of 255.
+        /// Standard deviation, on the scale 0 to 255.
         deviation: f64,
     },
-    /// The camera sees less than the one that mapped, and is not known to.
+    /// The camera has a narrower field of view than the mapping camera, unknown to the tracker.
     FieldOfView {
-        /// The part of the width and of the height that it sees.
+        /// Fraction of the width and of the height that the camera sees.
         share: f64,
     },
-    /// For a while the same image comes again and again, with new times, while the camera moves on.
+    /// One image is repeated with new timestamps for a part of the stream, while the camera moves.
     Frozen,
-    /// For a while every pixel has one brightness.
+    /// Every pixel has the same brightness for a part of the stream.
     Blank {
-        /// 0 to 255.
+        /// The brightness, 0 to 255.
         brightness: u8,
     },
-    /// The camera takes fewer frames a second, and numbers those that it takes.
+    /// The camera has a lower frame rate, and numbers its frames consecutively.
     Rate {
-        /// Of so many tracked frames it takes one.
+        /// One of this many tracked frames is taken.
         every: usize,
     },
 }
 
-/// When a disturbance is there.
+/// Which frames of a stream are disturbed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Extent {
-    /// From the first frame to the last.
+    /// All frames.
     Whole,
-    /// During a part in the middle of each stream.
+    /// A part in the middle of each stream.
     Part,
 }
 
@@ -135,7 +137,7 @@ impl Disturbance {
         }
     }
 
-    /// When it is there.
+    /// Which frames of a stream it disturbs.
     pub fn extent(self) -> Extent {
         match self {
             Self::Frozen | Self::Blank { .. } => Extent::Part,
@@ -143,13 +145,13 @@ impl Disturbance {
         }
     }
 
-    /// Whether the images are those of the undisturbed camera, though others or fewer of them.
+    /// Whether all images are images of the undisturbed camera, possibly repeated or skipped.
     pub fn keeps_images(self) -> bool {
         matches!(self, Self::None | Self::Frozen | Self::Rate { .. })
     }
 
-    /// Where the disturbed camera is, if the undisturbed one is at `pose`; both `world_from_camera`. A
-    /// camera that is turned clockwise about its axis is turned about +z, from x, right, to y, down.
+    /// The pose of the disturbed camera for an undisturbed camera at `pose`; both
+    /// `world_from_camera`. A clockwise roll is a rotation about +z, from x (right) to y (down).
     pub fn truth(self, pose: &Pose) -> Pose {
         match self {
             Self::Roll { degrees, .. } => {
@@ -160,9 +162,9 @@ impl Disturbance {
         }
     }
 
-    /// Which way is down, as a robot measures it whose camera is at `pose`; none if it does not.
-    /// `down` is the direction in the world's frame. The measured direction is off by
-    /// 1.1 degrees about the camera's axis all the time.
+    /// The gravity direction measured by a robot with its camera at `pose`; `None` if the robot
+    /// does not measure gravity. `down` is the true direction in the world frame. The measurement
+    /// has a constant error of 0.02 rad (1.1°) about the camera's axis.
     pub fn gravity(self, pose: &Pose, down: Unit<Vector3<f64>>) -> Option<MeasuredGravity> {
         let Self::Roll {
             with_gravity: true, ..
@@ -179,7 +181,7 @@ impl Disturbance {
         })
     }
 
-    /// The image that the camera takes as frame `number` of its stream.
+    /// The disturbed image of frame `number` of a stream.
     pub fn disturbed(self, picture: &RgbImage, number: usize) -> RgbImage {
         match self {
             Self::None | Self::Frozen | Self::Rate { .. } => picture.clone(),
@@ -198,7 +200,7 @@ impl Disturbance {
     }
 }
 
-/// A camera that is turned by an angle sees the world turned by its opposite.
+/// The image of a camera rolled clockwise by an angle; the scene rotates the opposite way.
 fn turned(picture: &RgbImage, radians: f64) -> RgbImage {
     let (sin, cos) = radians.sin_cos();
     resampled(picture, |at| {
@@ -206,8 +208,8 @@ fn turned(picture: &RgbImage, radians: f64) -> RgbImage {
     })
 }
 
-/// Each pixel taken from elsewhere, bilinearly: `source` says from where, both places relative to the
-/// centre of the image. Beyond the image its edge goes on.
+/// Resamples an image bilinearly. `source` maps an output pixel to an input pixel, both relative
+/// to the image center. Positions outside the image are clamped to its edge.
 fn resampled(picture: &RgbImage, source: impl Fn(Vector2<f64>) -> Vector2<f64>) -> RgbImage {
     let last = Vector2::new(picture.width as f64 - 1.0, picture.height as f64 - 1.0);
     let centre = last / 2.0;
@@ -241,7 +243,7 @@ fn bilinear(picture: &RgbImage, at: Vector2<f64>) -> [u8; 3] {
 
 fn blurred(picture: &RgbImage, deviation: f64) -> RgbImage {
     let (width, height) = (picture.width as u32, picture.height as u32);
-    // The bytes are as many as the size says, or the picture would not be one.
+    // The byte count always matches the size, so the fallback is never taken.
     let Some(buffer) = image::RgbImage::from_raw(width, height, picture.bytes.clone()) else {
         return picture.clone();
     };
@@ -253,7 +255,7 @@ fn blurred(picture: &RgbImage, deviation: f64) -> RgbImage {
 }
 
 fn occluded(picture: &RgbImage, share: f64, number: usize) -> RgbImage {
-    // The left edge of the bar goes from 0 to 1 − share and back.
+    // The left edge of the bar moves from 0 to 1 − share and back.
     let phase = (number % OCCLUDER_PERIOD) as f64 / OCCLUDER_PERIOD as f64;
     let left = (1.0 - share) * (1.0 - (2.0 * phase - 1.0).abs());
     let width = picture.width as f64;
@@ -299,7 +301,7 @@ mod tests {
 
     use super::*;
 
-    /// A white point at a place of a black image of 41 × 31 pixels.
+    /// A black image of 41 × 31 pixels with one white pixel at (x, y).
     fn point(x: usize, y: usize) -> RgbImage {
         let mut picture = RgbImage {
             width: 41,
@@ -316,27 +318,27 @@ mod tests {
         pixels.max_by_key(|&(x, y)| picture.pixel(x, y)[0]).unwrap()
     }
 
-    /// Oracle: by hand. The camera turns clockwise by a quarter: what was to the right of the centre
-    /// is then above it.
+    /// Oracle: by hand. The camera rolls clockwise by 90°, so a point to the right of the center
+    /// moves above it.
     #[test]
     fn a_camera_that_rolls_clockwise_sees_the_world_turn_the_other_way() {
         let quarter = Disturbance::roll(90.0, false);
         let turned = quarter.disturbed(&point(30, 15), 0);
         assert_eq!(brightest(&turned), (20, 5));
 
-        // What is to the right of the level camera, in its frame, is above the turned one: y is down.
+        // A point to the right of the level camera is above the rolled camera (y is down).
         let right = quarter.truth(&Pose::identity()).inverse() * Point3::new(1.0, 0.0, 5.0);
         assert!((right - Point3::new(0.0, -1.0, 5.0)).norm() < 1e-12);
     }
 
-    /// Oracle: by hand. A camera that sees half as much shows things twice as far from the centre.
+    /// Oracle: by hand. Half the field of view doubles the distance of a point from the center.
     #[test]
     fn a_narrower_field_of_view_magnifies() {
         let near = Disturbance::FieldOfView { share: 0.5 }.disturbed(&point(25, 15), 0);
         assert_eq!(brightest(&near), (30, 15));
     }
 
-    /// Oracle: a Gaussian keeps the sum; at one deviation it has e^(−1/2) of its height.
+    /// Oracle: a Gaussian of unit sum has height 1 / (2πσ²), and e^(−1/2) of that at one σ.
     #[test]
     fn a_blur_is_a_gaussian() {
         let deviation = 3.0;
@@ -349,7 +351,7 @@ mod tests {
         assert!((value(23, 15) - height * (-0.5_f64).exp()).abs() < 1.0);
     }
 
-    /// Oracle: the definitions, on a grey image.
+    /// Oracle: the definitions, on a gray image.
     #[test]
     fn exposure_noise_and_occluders_do_what_they_say() {
         let grey = RgbImage {

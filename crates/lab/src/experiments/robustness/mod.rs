@@ -1,8 +1,8 @@
-//! A tracker under disturbances: the same stream with its images turned, blurred, darkened, hidden,
-//! frozen or thinned out, and the answers beside the simplest ones to the same frames.
+//! Evaluates a tracker under disturbances of its images, beside simple baselines on the same
+//! frames. The images are rolled, blurred, darkened, occluded, frozen or subsampled.
 //!
-//! The map is made of the images as they are; each stream begins with its true pose. A disturbance
-//! that is there only for a while is scored while it is there.
+//! The map uses the undisturbed images; each stream starts with its true pose. A disturbance of
+//! part of a stream is scored on the disturbed frames only.
 
 mod disturbance;
 
@@ -22,38 +22,37 @@ use super::Error;
 use super::odometry::{StatusShares, TrackedRoom};
 use super::tracking_scores::TrackingScores;
 
-/// The most frames for which a camera is frozen or blank.
+/// Maximum number of frames for which a camera is frozen or blank.
 const MOST_DISTURBED: usize = 60;
 
-/// The views of a disturbed camera, one for each tracked frame of a room.
+/// Views of a disturbed camera, one per tracked frame of a room.
 #[derive(Debug, Clone, Copy)]
 pub struct DisturbedViews<'a> {
     /// Raw features, shape (tracked frames, d).
     pub features: ArrayView2<'a, f32>,
-    /// Whether the disturbed images show nothing, one for each tracked frame.
+    /// Whether each disturbed image is blank, one flag per tracked frame.
     pub is_blank: &'a [bool],
 }
 
-/// How a room was tracked in under one disturbance.
+/// Tracking results of one room under one disturbance.
 #[derive(Debug, Clone)]
 pub struct DisturbedTracking {
     /// The room.
     pub room: String,
     /// The disturbance.
     pub disturbance: Disturbance,
-    /// The frames that are scored.
+    /// Number of scored frames.
     pub frames: usize,
-    /// The answers beside the simplest ones.
+    /// Errors of the tracker and of its baselines.
     pub scores: TrackingScores,
-    /// Shares of the scored frames by status.
+    /// Fractions of the scored frames by status.
     pub statuses: StatusShares,
-    /// After how many disturbed frames the status was no longer TRACKING, in the stream where that
-    /// took longest; none where it stayed TRACKING to the end. Only of disturbances of a part of
-    /// the stream.
+    /// Number of disturbed frames until the status left TRACKING, in the slowest stream. `None` if
+    /// a stream stayed TRACKING, or if the disturbance covers whole streams.
     pub noticed_after: Option<usize>,
 }
 
-/// The frames of one stream that are disturbed.
+/// Range of scored frames in one stream, from `begin` up to `end` (exclusive).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Part {
     begin: usize,
@@ -79,15 +78,15 @@ impl Part {
     }
 }
 
-/// The direction that is down in a recording's world frame, on average for its camera, whose y axis
-/// points down where it is level: of the six directions of the axes the nearest.
+/// The down direction in a recording's world frame: the signed world axis nearest to the mean
+/// y axis of the camera, which points down when the camera is level.
 fn down_of(poses: &[Pose]) -> Unit<Vector3<f64>> {
     let sum: Vector3<f64> = poses.iter().map(|pose| pose.rotation * Vector3::y()).sum();
     let axis = sum.iamax();
     Unit::new_unchecked(Vector3::ith(axis, sum[axis].signum()))
 }
 
-/// The tracked frames of a room under a hold-out, stream by stream.
+/// The tracked frames of a room under a hold-out, one list per stream.
 pub fn streams(room: &TrackedRoom<'_>, hold_out: HoldOut) -> Vec<Vec<FrameId>> {
     let timeline = room.room().timeline();
     hold_out
@@ -151,7 +150,7 @@ pub fn evaluate(
         }
 
         let replay = replay_frames(room.tracker(), &played, InitialPose::Given);
-        // A stream of two frames has none that is disturbed.
+        // A stream of two frames has no disturbed frame.
         if part.begin < part.end {
             noticed.push(noticed_after(&replay, &is_scored));
         }
@@ -177,7 +176,7 @@ pub fn evaluate(
             lost: share(Status::Lost),
             relocalizing: share(Status::Relocalizing),
         },
-        // One stream in which nothing was noticed makes the answer none.
+        // The result is `None` if any stream stayed TRACKING.
         noticed_after: match disturbance.extent() {
             Extent::Whole => None,
             Extent::Part => noticed
@@ -187,16 +186,16 @@ pub fn evaluate(
     })
 }
 
-/// What a camera takes as a frame of its stream.
+/// A frame of the disturbed stream.
 struct Taken {
-    /// The number of the tracked frame whose view it is.
+    /// Index in the stream of the tracked frame that provides the view.
     view: usize,
     is_disturbed: bool,
-    /// The number that the camera gives it, if it counts by itself.
+    /// The sequence number assigned by the camera, if it numbers its frames itself.
     own_number: Option<u64>,
 }
 
-/// None where the camera takes no frame.
+/// The frame taken at index `number` of a stream; `None` if the camera skips it.
 fn taken(disturbance: Disturbance, part: Part, number: usize) -> Option<Taken> {
     let plain = Taken {
         view: number,
@@ -217,7 +216,7 @@ fn taken(disturbance: Disturbance, part: Part, number: usize) -> Option<Taken> {
     }
 }
 
-/// After how many scored frames the status is no longer TRACKING.
+/// Number of scored frames until the status leaves TRACKING; `None` if it never does.
 fn noticed_after(replay: &Replay, is_scored: &[bool]) -> Option<usize> {
     let mut scored = replay
         .updates
@@ -240,8 +239,8 @@ fn share_of(replay: &Replay, is_scored: &[bool], status: Status) -> f64 {
     with_status.count() as f64 / scored().count() as f64
 }
 
-/// The tracked frames whose images a disturbance changes, by number among all tracked frames of the
-/// room, each with its number in its stream.
+/// The tracked frames with images changed by a disturbance. Each entry is the index among all
+/// tracked frames of the room and the index in the frame's stream.
 pub fn changed_images(
     room: &TrackedRoom<'_>,
     hold_out: HoldOut,
@@ -266,8 +265,8 @@ pub fn changed_images(
 mod tests {
     use super::*;
 
-    /// Oracle: by hand. A camera that looks along the world's x axis in a world whose z axis points up
-    /// has its y axis, down, along −z; it looks a little up and down, and that changes nothing.
+    /// Oracle: by hand. In a world with z up, a level camera that looks along x has its y axis
+    /// along −z. Small pitch angles do not change the result.
     #[test]
     fn down_is_where_cameras_have_their_feet() {
         let half = std::f64::consts::FRAC_PI_2;

@@ -1,5 +1,5 @@
-//! Pictures: walks as strips of images and plans, pairs of images by stride, and a recording's path
-//! before and after the adapter.
+//! Section: pictures. Walks as image strips and plan views, image pairs by stride, and the path of
+//! a recording before and after the adapter.
 
 mod plane;
 mod strip;
@@ -18,17 +18,17 @@ use super::{Error, Found, Reproduction};
 use crate::report::Section;
 use walks::{Length, WalkRecord};
 
-/// The walks in `record.json`.
+/// JSON record of the walks.
 #[derive(Debug, Serialize)]
 #[serde(transparent)]
 pub struct PicturesRecord {
     walks: Vec<WalkRecord>,
 }
 
-/// The section of walks in rooms that have images, and of the paths of features and latents.
+/// Builds the section with walks in rooms with images, and with the paths of features and latents.
 pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<PicturesRecord>, Error> {
     let mut section = Section::new("Walks in rooms never seen, and a recording unrolled");
-    // Pictures are of the first feature set alone.
+    // Pictures use only the first feature set.
     let set = &given.sets[0];
     let adapter = notes
         .adapter(&steady_adapter(set), &set.features)
@@ -42,7 +42,7 @@ pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Pictures
     let has_images = |data: &&RoomData<'_>| !data.room.images().is_empty();
     let mut walks = Vec::new();
 
-    // A held-out drawn room, with a motion that is short for it, a middle one and a long one.
+    // A held-out synthetic room, with a short, a middle and a long motion.
     let drawn = set.test.iter().filter(is_drawn).find(has_images);
     for length in Length::ALL {
         if let Some(data) = drawn {
@@ -50,7 +50,7 @@ pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Pictures
         }
     }
 
-    // A real room that the adapter did not learn from.
+    // A real room that the adapter was not trained on.
     let is_unseen = |data: &&RoomData<'_>| {
         let mut learned = set.train.iter();
         learned.all(|other| other.room.id() != data.room.id())
@@ -71,7 +71,7 @@ pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Pictures
         section.text("No such room has images; walks are not shown.");
     }
 
-    // What a stride looks like.
+    // Example images at each stride.
     if let Some(data) = real.or(drawn) {
         let source = data.room.frame_count() as u32 / 4;
         let strides = given.options.strides.iter().copied();

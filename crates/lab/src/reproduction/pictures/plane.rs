@@ -1,18 +1,18 @@
-//! The plane in which a recording's positions vary most, seen from above.
+//! The principal plane of a recording's positions, seen from above.
 
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 
 use seese3_core::geometry::Pose;
 
-/// A plane through the middle of a path.
+/// A plane through the mean position of a path.
 pub struct Plane {
     middle: Vector3<f64>,
     axes: [Vector3<f64>; 2],
 }
 
 impl Plane {
-    /// The plane of a path of at least one pose, seen from the side to which the cameras' upper edges
-    /// point on average.
+    /// The principal plane of a path with at least one pose, seen from above: from the side of the
+    /// cameras' mean up direction.
     pub fn of(poses: &[Pose]) -> Self {
         let count = poses.len() as f64;
         let position = |pose: &Pose| pose.translation.vector;
@@ -39,7 +39,7 @@ impl Plane {
         }
     }
 
-    /// Where a camera is in the plane, metres, and where it looks, radians from the first axis.
+    /// A camera's position in the plane, metres, and its heading, radians from the first axis.
     pub fn place(&self, pose: &Pose) -> [f64; 3] {
         let on = |vector: Vector3<f64>| self.axes.map(|axis| axis.dot(&vector));
         let [x, y] = on(pose.translation.vector - self.middle);
@@ -55,9 +55,8 @@ mod tests {
 
     use super::*;
 
-    /// Oracle: by hand: level cameras over a floor in x and z whose up is −y, as of an OpenCV world;
-    /// from above, what is ahead of a camera that looks along +x is a quarter turn left of what is to
-    /// its right.
+    /// Oracle: by hand. Level cameras over a floor in x and z, with up along −y as in OpenCV. Seen
+    /// from above, the forward direction is 90° to the left of the right direction.
     #[test]
     fn a_level_path_is_seen_from_above() {
         let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), std::f64::consts::FRAC_PI_2);
@@ -67,7 +66,7 @@ mod tests {
         let plane = Plane::of(&poses);
         let [a, b, c] = [0, 1, 2].map(|at: usize| plane.place(&poses[at]));
 
-        // The way from the first to the second is where the camera looks; the third lies to its left.
+        // The camera looks from the first pose to the second; the third lies to its left.
         let ahead = [b[0] - a[0], b[1] - a[1]];
         assert!((ahead[0].hypot(ahead[1]) - 4.0).abs() < 1e-9);
         assert!((ahead[1].atan2(ahead[0]) - a[2]).abs() < 1e-9);

@@ -1,4 +1,4 @@
-//! Images of a recording side by side.
+//! Image strips: frames of a recording side by side.
 
 use seese3_core::image::RgbImage;
 use seese3_core::room::FrameId;
@@ -9,7 +9,7 @@ use super::super::{Error, Images};
 /// Width of an image in a strip, pixels.
 const WIDTH: usize = 200;
 
-/// Images side by side, as a PNG file.
+/// Renders frames side by side, as a PNG file.
 pub fn strip(images: &dyn Images, data: &RoomData<'_>, frames: &[u32]) -> Result<Vec<u8>, Error> {
     let source = images;
     let mut images = Vec::with_capacity(frames.len());
@@ -20,7 +20,8 @@ pub fn strip(images: &dyn Images, data: &RoomData<'_>, frames: &[u32]) -> Result
         images.push(smaller(&image));
     }
 
-    // The first image gives the height: a lower one leaves white below it, a higher one is cut off.
+    // The strip has the height of the first image: shorter images are padded with white, taller
+    // ones are cropped.
     let height = images[0].height;
     let gap = 4;
     let width = images.len() * (WIDTH + gap) - gap;
@@ -42,13 +43,13 @@ pub fn strip(images: &dyn Images, data: &RoomData<'_>, frames: &[u32]) -> Result
     source.png(&strip).map_err(Error::Input)
 }
 
-/// The image scaled to [`WIDTH`]: each pixel is the mean of the pixels that it covers.
+/// Scales an image to [`WIDTH`]; each pixel is the mean of the source pixels it covers.
 fn smaller(image: &RgbImage) -> RgbImage {
     let height = (image.height * WIDTH / image.width).max(1);
     let mut bytes = Vec::with_capacity(WIDTH * height * 3);
     for row in 0..height {
         for column in 0..WIDTH {
-            // The range of source pixels under a target pixel, at least one.
+            // The range of source pixels covered by a target pixel, at least one.
             let span = |at: usize, of: usize, from: usize| {
                 at * from / of..((at + 1) * from / of).max(at * from / of + 1)
             };
@@ -81,7 +82,7 @@ fn smaller(image: &RgbImage) -> RgbImage {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand: a pixel is the mean of those under it.
+    /// Oracle: by hand: a pixel is the mean of the source pixels it covers.
     #[test]
     fn a_smaller_image_is_the_mean() {
         let bytes = (0..400 * 2)

@@ -1,4 +1,4 @@
-//! The path of a recording in features and in latents, laid over the true path.
+//! The path of a recording in feature space and in latent space, aligned to the true path.
 
 use nalgebra::{Matrix2, SymmetricEigen};
 use ndarray::{Array2, ArrayView2, Axis, s};
@@ -17,8 +17,7 @@ pub fn add(section: &mut Section, data: &RoomData<'_>, adapter: &Adapter) -> Res
     let features = data.features.rows();
     let truth = places(data);
 
-    // σ ⊙ W keeps the part of a latent that a motion can change, as six numbers; the first three are
-    // of the translation.
+    // σ ⊙ W maps a latent to the six motion components; the first three are the translation.
     let latents = adapter.embed(features)?;
     let coordinates = latents.slice(s![.., ..adapter.coordinate_count()]);
     let motion = coordinates.dot(&adapter.motion_of_coordinates()?.t());
@@ -51,7 +50,7 @@ pub fn add(section: &mut Section, data: &RoomData<'_>, adapter: &Adapter) -> Res
     Ok(())
 }
 
-/// The positions of a recording in the plane in which they vary most, metres, shape (n, 2).
+/// The positions of a recording in its principal plane, metres, shape (n, 2).
 fn places(data: &RoomData<'_>) -> Array2<f64> {
     let poses = data.room.poses();
     let plane = Plane::of(poses);
@@ -66,8 +65,8 @@ fn series(name: &str, rows: &Array2<f64>) -> Series {
     }
 }
 
-/// Rows (n, 2) turned, mirrored if that helps, and scaled so that they come nearest to `truth` (n,
-/// 2): Procrustes. Both must have their mean at zero.
+/// Procrustes alignment of rows (n, 2) to `truth` (n, 2): rotation, reflection if needed, and
+/// scale. Both must have zero mean.
 fn laid_over(truth: &Array2<f64>, rows: &Array2<f64>) -> Array2<f64> {
     let product = rows.t().dot(truth);
     let svd = Matrix2::from_fn(|r, c| product[(r, c)]).svd(true, true);
@@ -80,17 +79,17 @@ fn laid_over(truth: &Array2<f64>, rows: &Array2<f64>) -> Array2<f64> {
     rows.dot(&Array2::from_shape_fn((2, 2), |(r, c)| turn[(r, c)]))
 }
 
-/// The root mean square of the distances between rows.
+/// Root mean square of the distances between corresponding rows.
 fn off(truth: &Array2<f64>, rows: &Array2<f64>) -> f64 {
     let squares: f64 = (truth - rows).iter().map(|x| x * x).sum();
     (squares / truth.nrows().max(1) as f64).sqrt()
 }
 
-/// The rows' scores on their two principal components, shape (n, 2).
+/// Scores of the rows on their first two principal components, shape (n, 2).
 fn main_directions(rows: ArrayView2<'_, f64>) -> Array2<f64> {
     let centred = &rows - &(rows.sum_axis(Axis(0)) / rows.nrows().max(1) as f64);
 
-    // The two Gram matrices share their eigenvalues above zero; the smaller one is decomposed.
+    // Both Gram matrices have the same nonzero eigenvalues; decompose the smaller one.
     let wide = centred.ncols() > centred.nrows();
     let gram = if wide {
         centred.dot(&centred.t())
@@ -99,12 +98,12 @@ fn main_directions(rows: ArrayView2<'_, f64>) -> Array2<f64> {
     };
     let eigen = SymmetricEigen::new(to_nalgebra(gram.view()));
 
-    // Eigenvalues come in no order: the largest belong to the directions of largest variance.
+    // Sort the eigenvalues, largest variance first.
     let mut order: Vec<usize> = (0..gram.nrows()).collect();
     order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
 
-    // From X Xᵀ a score is the eigenvector's entry times the singular value; from XᵀX it is the
-    // row's projection on the eigenvector.
+    // With X Xᵀ, a score is the eigenvector's entry times the singular value. With XᵀX, it is the
+    // projection of the row on the eigenvector.
     let main = |which: usize, row: usize| match order.get(which) {
         None => 0.0,
         Some(&at) if wide => eigen.eigenvectors[(row, at)] * eigen.eigenvalues[at].max(0.0).sqrt(),
@@ -123,23 +122,23 @@ fn main_directions(rows: ArrayView2<'_, f64>) -> Array2<f64> {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand: a path that is turned by a quarter, mirrored and doubled lies on the true one
-    /// again.
+    /// Oracle: by hand: a path that is rotated by 90°, mirrored and doubled aligns exactly with the
+    /// true path.
     #[test]
     fn a_turned_mirrored_and_scaled_path_is_laid_over_the_true_one() {
         let truth = ndarray::array![[-1.0, -1.0], [2.0, -1.0], [-1.0, 2.0]];
         let rows = ndarray::array![[-2.0, -2.0], [-2.0, 4.0], [4.0, -2.0]];
         assert!(off(&truth, &laid_over(&truth, &rows)) < 1e-9);
 
-        // Turned by a quarter and doubled alone: unlike a mirror, that is not its own inverse.
+        // Rotated by 90° and doubled only: unlike a reflection, a rotation is not its own inverse.
         let rows = ndarray::array![[2.0, -2.0], [2.0, 4.0], [-4.0, -2.0]];
         assert!(off(&truth, &laid_over(&truth, &rows)) < 1e-9);
 
         assert!((off(&truth, &Array2::zeros((3, 2))) - 2.0).abs() < 1e-12);
     }
 
-    /// Oracle: by hand. Points along (3, 4) lie along one line; wide rows give what tall ones give,
-    /// up to sign.
+    /// Oracle: by hand. Points along (3, 4) lie on one line. Wide rows give the same scores as tall
+    /// rows, up to sign.
     #[test]
     fn the_main_direction_is_where_rows_vary_most() {
         let rows = Array2::from_shape_fn((5, 2), |(i, c)| i as f64 * [3.0, 4.0][c]);

@@ -1,4 +1,4 @@
-//! Walks: a motion in several steps, as a strip of images and as a plan.
+//! Walks: a motion in several steps, as an image strip and as a plan view.
 
 use std::sync::Arc;
 
@@ -20,12 +20,12 @@ use super::plane::Plane;
 use super::strip::strip;
 use crate::report::{PathPlot, Section, path_svg};
 
-/// Equal parts of a walk, as in the paper.
+/// Number of equal steps of a walk, as in the paper.
 const STEPS: u32 = 4;
-/// Frames from the source to the target of a walk: farther than any training pair of preset steady.
+/// Stride of a walk, frames: longer than any training pair of preset steady.
 const FAR: u32 = 50;
 
-/// Which of a room's pairs is walked, by the share of pairs whose translation is shorter.
+/// Length of a walk, as a quantile of the translations of a room's pairs.
 #[derive(Debug, Clone, Copy)]
 pub enum Length {
     Short,
@@ -53,21 +53,21 @@ impl Length {
     }
 }
 
-/// A walk in `record.json`.
+/// JSON record of a walk.
 #[derive(Debug, Serialize)]
 pub struct WalkRecord {
     room: String,
-    /// Which of the room's pairs.
+    /// The length class of the pair.
     length: &'static str,
     frames: Vec<u32>,
     metres_off: f64,
     degrees_off: f64,
-    /// The same of standing still: the motion itself.
+    /// Distance from source to target, the error of not moving; the angle follows.
     metres: f64,
     degrees: f64,
 }
 
-/// Walks a room's pair of this length, and adds its strip and its plan to the section.
+/// Walks a room's pair of the given length, and adds its strip and its plan view to the section.
 pub fn add(
     section: &mut Section,
     given: &Reproduction<'_>,
@@ -123,7 +123,7 @@ pub fn add(
     })
 }
 
-/// The pair of the room whose translation is longer than the length's share of all pairs at [`FAR`].
+/// The pair at the length's quantile of translation, among all pairs [`FAR`] frames apart.
 fn chosen(data: &RoomData<'_>, length: Length) -> Result<Pair, Error> {
     let mut pairs = Split::Whole.test_pairs(data.room.timeline(), FAR)?;
     let poses = data.room.poses();
@@ -137,7 +137,7 @@ fn chosen(data: &RoomData<'_>, length: Length) -> Result<Pair, Error> {
     Ok(pairs[place])
 }
 
-/// The source, and the frame that each step retrieves.
+/// The source frame and the retrieved frame of each step.
 fn walked(navigator: &Navigator, pair: Pair) -> Result<Vec<u32>, Error> {
     let query = Query {
         source: SourceAt {
@@ -149,7 +149,7 @@ fn walked(navigator: &Navigator, pair: Pair) -> Result<Vec<u32>, Error> {
         mode: Mode::OpenLoop,
         step: StepKind::InversePoincare(Reading::Homogeneous),
         metric: RetrievalMetric::Full,
-        // Only a refit is fitted on pairs of the room; inverse Poincaré ignores this.
+        // Used only by refits; inverse Poincaré ignores this field.
         fit_on: FitOn {
             split: Split::Time,
             stride: FAR,
@@ -166,7 +166,7 @@ fn walked(navigator: &Navigator, pair: Pair) -> Result<Vec<u32>, Error> {
     Ok([pair.source.0].into_iter().chain(steps).collect())
 }
 
-/// The walk in the plane in which the recording's positions vary most.
+/// The walk in the principal plane of the recording.
 fn plan(data: &RoomData<'_>, pair: Pair, frames: &[u32], length: Length) -> PathPlot {
     let plane = Plane::of(data.room.poses());
     let poses = data.room.poses();
