@@ -1,4 +1,4 @@
-//! The option `--camera`: a pinhole camera as its calibration states it.
+//! The option `--camera`: pinhole intrinsics in pixels.
 
 use std::str::FromStr;
 
@@ -31,7 +31,7 @@ impl FromStr for CameraOption {
             Some(&[width, height, focal]) => (width, height, focal, None),
             Some(&[width, height, focal, x, y]) => (width, height, focal, Some([x, y].into())),
             _ => bail!(
-                "is not WIDTHxHEIGHT,FOCAL or WIDTHxHEIGHT,FOCAL,CX,CY in pixels, for instance \
+                "must be WIDTHxHEIGHT,FOCAL or WIDTHxHEIGHT,FOCAL,CX,CY in pixels, for example \
                  640x480,585"
             ),
         };

@@ -1,4 +1,4 @@
-//! `seese3 check`: looks for mistakes in what is stored.
+//! `seese3 check`: checks stored data for mistakes.
 
 use std::path::PathBuf;
 
@@ -19,8 +19,8 @@ pub struct Check {
 
 #[derive(Debug, Subcommand)]
 enum What {
-    /// A room: what its camera did, and whether its poses can be those of its images. Fails if they
-    /// are wrong
+    /// Check a room: its camera path, and whether its poses agree with its images. Fails if the
+    /// poses are wrong
     Room(CheckRoom),
 }
 
@@ -32,7 +32,7 @@ struct CheckRoom {
     /// Name of the room
     #[arg(long)]
     room: String,
-    /// The folder of the images, if it is no longer where the room was imported from
+    /// Folder of the images, if they were moved since the import
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
     #[command(flatten)]

@@ -8,9 +8,9 @@
 //! max-streams = 64
 //! ```
 //!
-//! A key is a flag of `serve` without its dashes, and a value is what stands behind the flag. So
-//! there is one list of settings, one check of each value and one text of help for the file, the
-//! environment and the command line. Flags go before the environment, and that before the file.
+//! A key is a flag of `serve` without its leading dashes; a value is the flag's value. The file,
+//! the environment and the command line therefore share one list of settings, one validation and
+//! one help text. Flags override environment variables, which override the file.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -24,9 +24,10 @@ use super::examples::with_examples;
 use super::output::say;
 use super::serve::Serve;
 
-/// The environment variable that names the file.
+/// Environment variable with the path of the file.
 const VARIABLE: &str = "SEESE3_CONFIG";
-/// How like a key has to be to another to be taken for a misspelling of it, 0 to 1.
+/// Smallest similarity, 0 to 1, at which an unknown key is reported as a misspelling of a known
+/// one.
 const NEARLY: f64 = 0.75;
 
 /// Check or print the settings of `serve`
@@ -38,9 +39,9 @@ pub struct Config {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// Exit successfully if `serve` would accept these settings, files included
+    /// Exit with status 0 if `serve` would accept these settings and the files that they name
     Check(Serve),
-    /// Print the settings that `serve` would have, each with where it comes from
+    /// Print the effective settings of `serve`, each with its source
     Print(Print),
 }
 
@@ -48,12 +49,12 @@ enum Action {
 struct Print {
     #[command(flatten)]
     _serve: Serve,
-    /// What was found while parsing.
+    /// Effective settings, filled in by [`Config::remember`].
     #[arg(skip)]
     settings: Vec<Setting>,
 }
 
-/// A setting as it is in effect.
+/// An effective setting and its source.
 #[derive(Debug, Clone)]
 struct Setting {
     key: String,
@@ -78,7 +79,7 @@ impl Config {
         Ok(())
     }
 
-    /// Remembers what `print` is to print.
+    /// Stores the effective settings for `config print`.
     pub(super) fn remember(&mut self, matches: &ArgMatches) {
         if let Action::Print(print) = &mut self.action
             && let Some(matches) = matches
@@ -102,7 +103,7 @@ impl std::fmt::Display for Setting {
             .iter()
             .map(|value| match value.parse::<i64>() {
                 Ok(_) => value.clone(),
-                // The escapes of JSON are those of TOML's basic strings.
+                // JSON string escapes are also valid in TOML basic strings.
                 Err(_) => serde_json::Value::from(value.as_str()).to_string(),
             })
             .collect();
@@ -113,12 +114,11 @@ impl std::fmt::Display for Setting {
     }
 }
 
-/// Parses the command line, with the configuration file behind it where the command is `serve` or
-/// `config`.
+/// Parses the command line. For `serve` and `config`, the values of the configuration file become
+/// argument defaults.
 ///
 /// # Errors
-/// If the file cannot be read or has a key that `serve` does not know. What clap refuses is printed
-/// and ends the program.
+/// If the file cannot be read or has an unknown key. Clap prints its own errors and exits.
 pub fn parse() -> anyhow::Result<Cli> {
     let arguments: Vec<OsString> = std::env::args_os().collect();
     let mut command = with_examples(Cli::command());
@@ -145,9 +145,9 @@ pub fn parse() -> anyhow::Result<Cli> {
     Ok(cli)
 }
 
-/// The file that is named on the command line, else in the environment.
+/// Path of the configuration file: from the command line, else from the environment.
 ///
-/// It has to be known before the command line can be parsed: the file may have what is required.
+/// Needed before the command line is parsed, because the file may supply required arguments.
 fn file_of(arguments: &[OsString]) -> Option<PathBuf> {
     let mut rest = arguments.iter();
     while let Some(argument) = rest.next() {
@@ -163,7 +163,7 @@ fn file_of(arguments: &[OsString]) -> Option<PathBuf> {
     std::env::var_os(VARIABLE).map(PathBuf::from)
 }
 
-/// The keys of a file as identities of arguments, with their values.
+/// Settings of a file as pairs of clap argument id and values.
 fn defaults(file: &Path, text: &str) -> anyhow::Result<Vec<(String, Vec<String>)>> {
     let place = file.display();
     let table: toml::Table = text.parse().with_context(|| format!("--config: {place}"))?;
@@ -187,10 +187,10 @@ fn defaults(file: &Path, text: &str) -> anyhow::Result<Vec<(String, Vec<String>)
                 .max_by(|a, b| a.0.total_cmp(&b.0));
             match nearest {
                 Some((_, nearest)) => {
-                    bail!("--config: {place}: '{key}' is no setting; did you mean '{nearest}'?")
+                    bail!("--config: {place}: '{key}' is not a setting; did you mean '{nearest}'?")
                 }
                 None => bail!(
-                    "--config: {place}: '{key}' is no setting; it has to be a flag of `seese3 serve` without its dashes"
+                    "--config: {place}: '{key}' is not a setting; use a flag of `seese3 serve` without its dashes"
                 ),
             }
         };
@@ -204,7 +204,7 @@ fn defaults(file: &Path, text: &str) -> anyhow::Result<Vec<(String, Vec<String>)
     Ok(given)
 }
 
-/// A value as the command line would have it.
+/// A TOML value as command-line values. `None` for a boolean, a date or a table.
 fn values(value: toml::Value) -> Option<Vec<String>> {
     match value {
         toml::Value::String(text) => Some(vec![text]),
@@ -227,7 +227,7 @@ fn with_defaults(mut command: Command, given: &[(String, Vec<String>)]) -> Comma
     command
 }
 
-/// Every setting that is in effect.
+/// All effective settings.
 fn settings(matches: &ArgMatches) -> Vec<Setting> {
     let serve = Serve::augment_args(Command::new("serve"));
     let of_argument = |argument: &clap::Arg| {
@@ -283,7 +283,7 @@ mod tests {
 
         for (text, word) in [
             ("max-stream = 7", "did you mean 'max-streams'"),
-            ("colour = \"red\"", "'colour' is no setting"),
+            ("colour = \"red\"", "'colour' is not a setting"),
             ("queue = true", "'queue' must be"),
             ("queue = ", "seese3.toml"),
         ] {

@@ -44,8 +44,8 @@ pub struct CrossRoom {
     /// --calibration-rooms rooms. All rooms of --train if omitted
     #[arg(long, value_delimiter = ',')]
     sizes: Vec<usize>,
-    /// Number of rooms, out of each count, that are not trained on but used to measure the
-    /// adapter's errors for +calibrated navigators
+    /// Number of rooms in each count that are used for calibration instead of training: the
+    /// adapter's errors are measured there for +calibrated navigators
     #[arg(long, alias = "aside", default_value_t = 0)]
     calibration_rooms: usize,
     /// Number of adapters trained per room count, with seeds --seed, --seed + 1, …; 1 to 1000
@@ -57,8 +57,7 @@ pub struct CrossRoom {
     seed: u64,
     #[command(flatten)]
     protocol: ProtocolOptions,
-    /// Split of the held-out rooms: which pairs are tested, and among which frames answers are
-    /// searched
+    /// Split of the held-out rooms: selects the test pairs and the candidate frames for retrieval
     #[arg(long, value_parser = one_of::<Split>(), default_value = "whole")]
     test_split: Split,
     /// Navigators by name, separated by commas; if omitted: identity, inverse Poincaré (affine and
@@ -66,10 +65,10 @@ pub struct CrossRoom {
     /// split allows
     #[arg(long, value_delimiter = ',')]
     navigators: Vec<String>,
-    /// Navigator that the others' Hit@ε is compared with
+    /// Baseline navigator that the others' Hit@ε is compared with
     #[arg(long, default_value = "inverse-poincare-affine")]
     baseline: String,
-    /// ε of Hit@ε: the largest ‖ΔP_target − ΔP_retrieved‖ that counts as a hit, metres and radians
+    /// ε of Hit@ε: the largest ‖ΔP_target − ΔP_retrieved‖ that counts as a hit, meters and radians
     /// mixed
     #[arg(long, default_value_t = 0.1)]
     threshold: f64,
@@ -85,7 +84,7 @@ pub struct CrossRoom {
 
 type Loaded = (StoredRoom, Features);
 
-/// The file of --json: the results, and the protocol without which they mean little.
+/// Content of the --json file: the results and the protocol that they were measured with.
 #[derive(Debug, Serialize)]
 struct CrossRoomRecord {
     #[serde(flatten)]
@@ -121,15 +120,15 @@ impl CrossRoom {
                 .any(|(other, _)| other.room.id() == room.room.id())
         };
 
-        // A room on both sides would turn zero-shot transfer into memorisation.
+        // A room on both sides would turn zero-shot transfer into memorization.
         if let Some((room, _)) = train.iter().find(shared) {
             bail!(
-                "room '{}' is both learned from and held out; leave it out of one",
+                "room '{}' is in both --train and --test; leave it out of one",
                 room.room.id()
             );
         }
 
-        // Everything that can be refused is checked before the first adapter is trained.
+        // Validate everything before the first adapter is trained.
         let sizes = self.sizes(train.len())?;
         let protocol = self.test_protocol()?;
         check_thresholds(&protocol.thresholds)?;
@@ -143,8 +142,8 @@ impl CrossRoom {
         let mut runs = Vec::new();
         for &size in &sizes {
             for seed in self.seed..self.seed + self.seeds {
-                // With one seed, the rooms of a smaller count are among those of a larger one, so
-                // that the curve shows the effect of adding rooms.
+                // With one seed, a smaller count is a subset of a larger one, so that the curve
+                // shows the effect of adding rooms.
                 let chosen: Vec<RoomData<'_>> = nested_choice(size, train.len(), seed)
                     .into_iter()
                     .map(|room| data(&train[room]))
@@ -169,8 +168,8 @@ impl CrossRoom {
 
         progress.finish_and_clear();
 
-        // Some held-out rooms may be skipped, for instance as too short for the stride. A run
-        // that skipped all of them has nothing to report.
+        // Held-out rooms may be skipped, for example if they are too short for the stride. A run
+        // that skipped all of them has no results.
         if let Some((room, why)) = runs
             .iter()
             .find(|run| run.outcomes.is_empty())
@@ -181,7 +180,7 @@ impl CrossRoom {
 
         self.say(&train, &test, &plan, &runs)?;
 
-        // The protocol is written beside the scores, which mean little without it.
+        // The record includes the protocol, which is needed to interpret the scores.
         if self.json.is_wanted() {
             let record = CrossRoomRecord {
                 results: cross_room_json(&runs, &self.baseline),
@@ -236,8 +235,8 @@ impl CrossRoom {
             NavigatorKind::Step(StepKind::InversePoincare(reading), metric)
         };
 
-        // The default table: the baseline that stays where it is, inverse Poincaré, and the
-        // refits that the test split can fit.
+        // Default table: the Identity baseline, inverse Poincaré, and the refits that the test
+        // split allows.
         let mut navigators = navigators_named(&self.navigators)?;
         if navigators.is_empty() {
             navigators = vec![NavigatorKind::Identity];
@@ -251,8 +250,8 @@ impl CrossRoom {
                 navigators.push(inverse(Reading::Homogeneous, RetrievalMetric::Calibrated));
             }
 
-            // A refit is fitted on training pairs of the held-out room, which the split `whole`
-            // does not set apart. The in-sample refit takes the test pairs instead.
+            // A refit is fitted on training pairs of the held-out room; the split `whole` has none.
+            // The in-sample refit uses the test pairs instead.
             if self.test_split != Split::Whole {
                 navigators.push(refit(false));
             }
@@ -260,8 +259,8 @@ impl CrossRoom {
             navigators.push(refit(true));
         }
 
-        // Refuse what no held-out room could answer; otherwise every room would be skipped after
-        // the training.
+        // Reject navigators that no held-out room can evaluate; otherwise every room would be
+        // skipped after the training.
         for kind in &navigators {
             match kind {
                 NavigatorKind::Step(StepKind::Corrector(_), _) => {
@@ -279,7 +278,7 @@ impl CrossRoom {
                     if !refit.in_sample && self.test_split == Split::Whole =>
                 {
                     bail!(
-                        "--navigators: '{}' has no pairs to be fitted on under --test-split whole",
+                        "--navigators: '{}' needs training pairs, and --test-split whole has none",
                         kind.name()
                     );
                 }
@@ -303,11 +302,11 @@ impl CrossRoom {
             }
         }
 
-        // Each test motion is taken in a single open-loop step, as in the paper.
+        // Each test motion is one open-loop step, as in the paper.
         Ok(Protocol {
             split: self.test_split,
             thresholds: vec![self.threshold],
-            // Radius 0: only the source frame itself is excluded, not its neighbours in time.
+            // Radius 0: only the source frame itself is excluded, not its neighbors in time.
             exclude_source: self.exclude_source.then_some(0),
             navigators,
             ..Protocol::paper(self.protocol.plan(self.seed)?.stride)
@@ -322,7 +321,7 @@ impl CrossRoom {
         runs: &[CrossRoomRun],
     ) -> anyhow::Result<()> {
         say(format_args!(
-            "rooms to learn from: {}, features '{}', preset {} with {} epochs, split {}; held out: {}, stride {}, split \
+            "trained on {}, features '{}', preset {} with {} epochs, split {}; held out: {}, stride {}, split \
              {}, source {}",
             room_words(train),
             train[0].1.source().name,

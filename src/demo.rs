@@ -1,4 +1,4 @@
-//! `seese3 demo`: the whole pipeline in one command, on a room that is rendered on the spot.
+//! `seese3 demo`: the whole pipeline in one command, on a newly rendered room.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -36,13 +36,13 @@ const ROOM: &str = "studio";
 const FEATURES: &str = "builtin";
 const STRIDE: u32 = 40;
 const STEPS: u32 = 4;
-/// How many times the server is asked, 50 ms apart, while it loads its store: 60 s in all.
+/// Maximum number of polls, 50 ms apart, while the server loads its store: 60 s in all.
 const LOADING_POLLS: u32 = 1_200;
 const MOST_FRAMES: usize = 100_000;
 
 #[derive(Debug, Args)]
 pub struct Demo {
-    /// Folder that the store and the picture are written to; created if it does not exist
+    /// Output folder for the store and the plot of the path; created if it does not exist
     #[arg(long, default_value = "demo-output")]
     out: PathBuf,
     /// Seed of the room, the camera path and the training, 0 to 2³² − 1
@@ -99,8 +99,8 @@ impl Demo {
         say("2. Training a Poincaré adapter on the first 80 % of the path (preset paper-range)");
         let plan = TrainingPlan::of(Preset::PaperRange, Split::Time, STRIDE, self.seed);
 
-        // `train_seeds` takes rooms as the store returns them. This one is put together from what
-        // was just published, instead of being loaded again.
+        // `train_seeds` takes rooms in the form that the store returns. This one is built from the
+        // published data, instead of being loaded again.
         let stored = StoredRoom {
             room,
             revision: published.revision,
@@ -127,7 +127,7 @@ impl Demo {
         say(score(&room, &features, adapter)?.trim_end());
 
         say(format_args!(
-            "4. Serving the store and asking it over gRPC: one motion of {STRIDE} frames in {STEPS} steps, closed loop"
+            "4. Serving the store and querying it over gRPC: one motion of {STRIDE} frames in {STEPS} steps, closed loop"
         ));
 
         let picture = self.out.join("path.svg");
@@ -147,7 +147,7 @@ impl Demo {
 
         say(format_args!("   {}", picture.display()));
         let from = example_source(room.frame_count());
-        say("Go on from here:");
+        say("Next steps:");
         say(format_args!("   seese3 serve --store {location}"));
 
         say(format_args!(
@@ -159,7 +159,7 @@ impl Demo {
             "   seese3 evaluate --store {location} --room {ROOM} --exclude-source"
         ));
 
-        say("(`cargo run --release --` stands for `seese3` in a checkout)");
+        say("(in a checkout, run `cargo run --release --` instead of `seese3`)");
         self.json.write(&json!({
             "store": location,
             "room": ROOM,
@@ -211,8 +211,7 @@ fn draw(frame_count: usize, seed: u64) -> anyhow::Result<(Room, Features)> {
 fn score(room: &Arc<Room>, features: &Features, adapter: Adapter) -> anyhow::Result<String> {
     let navigator = Navigator::new(room.clone(), features, Arc::new(adapter), IndexKind::Exact)?;
 
-    // A refit fitted on the test pairs themselves would be the best row of the table without
-    // showing anything about navigation.
+    // A refit fitted on the test pairs would top the table without measuring navigation.
     let leaks = |kind: &NavigatorKind| matches!(kind, NavigatorKind::Step(StepKind::Refit(refit), _) if refit.in_sample);
     let navigators = NavigatorKind::table(navigator.adapter())
         .into_iter()
@@ -246,7 +245,7 @@ async fn serve_and_ask(
         .context("cannot listen on a loopback port")?;
     let address = listener.local_addr()?.to_string();
 
-    // The server runs in this process, on the code of `seese3 serve`, until `stop` is sent or
+    // The server runs in this process, with the code of `seese3 serve`, until `stop` is sent or
     // dropped.
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
     let mut server = tokio::spawn(seese3_server::run(
@@ -254,8 +253,8 @@ async fn serve_and_ask(
         store.clone(),
         seese3_server::Config::default(),
         async {
-            // An error means that the demo failed and dropped the sender: the server stops all the
-            // same.
+            // An error means that the demo failed and dropped the sender. The server stops in
+            // either case.
             let _ = stopped.await;
         },
     ));
@@ -288,8 +287,8 @@ async fn serve_and_ask(
     Ok(answer)
 }
 
-/// The frame that the example starts from: five sixths of the way through the held-out frames that
-/// still have a frame STRIDE later.
+/// Start frame of the example: five sixths into the held-out frames that have a successor STRIDE
+/// frames later.
 fn example_source(frame_count: usize) -> u32 {
     let held_out = Split::Time
         .candidates(&Timeline::unbroken(frame_count))
@@ -325,8 +324,7 @@ async fn ask(
     let client = Client::connect(address, Duration::from_secs(30)).await?;
     let source = example_source(frame_count);
 
-    // The goal is given as a frame of the room, whose pose the server knows and the closed loop
-    // steers to.
+    // The goal is a frame of the room, so that the server has its pose for the closed loop.
     let request = pb::NavigateRequest {
         room: ROOM.to_owned(),
         adapter: adapter.to_owned(),
@@ -358,8 +356,8 @@ async fn ask(
 }
 
 fn plot_of(room: &Room, answer: &pb::NavigateResponse) -> anyhow::Result<PathPlot> {
-    // The picture is the room from above: x and y of a position in metres, and the optical axis's
-    // heading in that plane, radians.
+    // The plot is a top view: position x and y in meters, and the heading of the optical axis in
+    // that plane, radians.
     let place = |pose: &seese3_core::geometry::Pose| {
         let at = pose.translation.vector;
         let view = pose.rotation * nalgebra::Vector3::z();

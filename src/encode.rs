@@ -17,7 +17,7 @@ use seese3_core::room::{Room, is_plain_name};
 use seese3_encoder::{Encoded, Encoder, Journal, Kept, OnBadImage, Task, encode_room, read_image};
 use seese3_store::{Published, Store, StoredRoom};
 
-/// The number of unreadable images that are listed one by one; beyond that they are only counted.
+/// Maximum number of unreadable images that are listed one by one; further ones are only counted.
 const NAMED: usize = 20;
 
 #[derive(Debug, Args)]
@@ -38,15 +38,16 @@ pub struct Encode {
     /// Frames per run of the model, 1 to 4096
     #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=4_096))]
     batch: u32,
-    /// Folder that the room's image paths start from, if the images were moved since the import
+    /// Folder that the room's image paths are relative to, if the images were moved since the
+    /// import
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
     /// Prefix of the feature names, PREFIX-LAYER-POOLING; the model's file name without extension
     /// if omitted
     #[arg(long = "as", value_name = "PREFIX")]
     prefix: Option<String>,
-    /// Drop frames whose image cannot be read, instead of stopping. The room's new revision is
-    /// without these frames, in all its features
+    /// Drop frames with an unreadable image, instead of stopping. The room's new revision omits
+    /// these frames, in all its features
     #[arg(long)]
     skip_bad: bool,
     /// Encode even if the room already has these features, and discard an unfinished run
@@ -74,8 +75,8 @@ impl Encode {
         check_names(&sources)?;
         let root = images_root(&stored.room, self.images.as_deref())?;
 
-        // Features count as present only if encoder, layer and preprocessing agree too. A set of
-        // the same name that was made differently is replaced.
+        // Features count as present only if encoder, layer and preprocessing match too. A set with
+        // the same name and another source is replaced.
         if !self.again && sources.iter().all(|source| has(&stored, source)) {
             let names: Vec<&str> = sources.iter().map(|source| source.name.as_str()).collect();
             let room = &self.room;
@@ -96,8 +97,8 @@ impl Encode {
             sources[0].preprocess
         ));
 
-        // The journal keeps the rows of an interrupted run. Its key covers everything that
-        // decides them, so that rows of another model or of changed images are never mixed in.
+        // The journal keeps the rows of an interrupted run. Its key covers all inputs of the
+        // encoding, so that rows of another model or of changed images are never mixed in.
         let key = key(&stored, &encoder, &root);
         let path = self.journal_path(&key)?;
         if self.again && path.exists() {
@@ -129,11 +130,11 @@ impl Encode {
         }
 
         // Another process may have published the room in the meantime. The rows belong to the
-        // frames that were encoded, so these must not have changed.
+        // encoded frames, so these must not have changed.
         let newest = store.load_room(&self.room, None).await?;
         if !same_poses(&newest.room, &stored.room) {
             bail!(
-                "room '{}' got other frames while it was encoded (revision {}, was {}); run the command again",
+                "the frames of room '{}' changed during encoding (revision {}, was {}); run the command again",
                 self.room,
                 newest.revision,
                 stored.revision
@@ -157,7 +158,7 @@ impl Encode {
         self.write_record(&sources, revision, encoded_now, &encoded.bad)
     }
 
-    /// What was done, as JSON.
+    /// Writes the JSON record of the run.
     fn write_record(
         &self,
         sources: &[FeatureSource],
@@ -201,8 +202,8 @@ impl Encode {
             None => Path::new(&self.store).join("unfinished"),
         };
 
-        // Another encoder, room revision or image folder gives another key, and hence a journal
-        // of its own.
+        // Another encoder, room revision or image folder gives another key, and hence a separate
+        // journal.
         Ok(folder.join(format!(
             "{}-{}.rows",
             self.room,
@@ -247,18 +248,18 @@ impl Encode {
         let encoded = pool.install(|| encode_room(&task, encoder, Some(kept), &told));
         progress.finish_and_clear();
 
-        encoded.context("what was encoded is kept; the same command goes on from there")
+        encoded.context("the rows encoded so far are kept; run the same command again to resume")
     }
 }
 
-/// Prints which stored features are replaced: those of the same name that were made differently.
+/// Prints which stored features are replaced: those with the same name and a different source.
 fn say_replaced(stored: &StoredRoom, sources: &[FeatureSource]) {
     for source in sources
         .iter()
         .filter(|source| stored.features(&source.name).is_some() && !has(stored, source))
     {
         say(format_args!(
-            "replaces features '{}', made with another encoder, layer or preprocessing",
+            "replaces features '{}', computed with another encoder, layer or preprocessing",
             source.name
         ));
     }
@@ -305,15 +306,15 @@ pub(super) fn images_root(room: &Room, given: Option<&Path>) -> anyhow::Result<P
     Ok(root)
 }
 
-/// Whether the room has features of this name that were made in the same way.
+/// Whether the room has features with this name and exactly this source.
 pub fn has(stored: &StoredRoom, source: &FeatureSource) -> bool {
     stored
         .features(&source.name)
         .is_some_and(|set| set.source() == source)
 }
 
-/// A text that covers everything that decides the rows of a run: room, revision, images with their
-/// sizes and times, runtime, and sources.
+/// Journal key. It covers all inputs of the encoding: room, revision, image folder, runtime, images
+/// with their sizes and times, sequences, and sources.
 fn key(stored: &StoredRoom, encoder: &Encoder, root: &Path) -> String {
     let room = &stored.room;
     let sources = encoder.sources("");
@@ -344,19 +345,19 @@ fn key(stored: &StoredRoom, encoder: &Encoder, root: &Path) -> String {
     )
 }
 
-/// Rejects layers whose features would have no valid or no distinct name, before anything is
-/// encoded.
+/// Rejects layers with invalid or duplicate feature names, before anything is encoded.
 pub fn check_names(sources: &[FeatureSource]) -> anyhow::Result<()> {
     for (position, FeatureSource { name, layer, .. }) in sources.iter().enumerate() {
         if !is_plain_name(name) {
             bail!(
-                "layer '{layer}' would give features of the name '{name}', which is over 100 characters or empty; give --as PREFIX"
+                "layer '{layer}' gives the feature name '{name}', which is not valid (1 to 100 letters, digits, '.', '-' \
+                 and '_', starting with a letter or digit); give --as PREFIX"
             );
         }
 
         if sources[..position].iter().any(|other| other.name == *name) {
             bail!(
-                "two layers would give features of the name '{name}'; encode them apart, with --as PREFIX"
+                "two layers give the feature name '{name}'; encode them separately, with --as PREFIX"
             );
         }
     }
@@ -381,14 +382,13 @@ fn say_bad(room: &Room, encoded: &Encoded) {
 
     if !encoded.bad.is_empty() {
         say(format_args!(
-            "left out {} frames in all; the room's new revision does not have them",
+            "left out {} frames in all; the room's new revision omits them",
             encoded.bad.len()
         ));
     }
 }
 
-/// Splits encoded rows (n, Σ d), in which the layers stand side by side, into one feature set (n,
-/// d) per source.
+/// Splits encoded rows (n, Σ d), the layers concatenated, into one feature set (n, d) per source.
 pub fn by_layer(
     sources: &[FeatureSource],
     rows: &ndarray::Array2<f32>,
@@ -407,8 +407,7 @@ pub fn by_layer(
     Ok(features)
 }
 
-/// Publishes the rows with the frames that they belong to. Frames that were left out on purpose leave
-/// the room with other frames.
+/// Publishes the feature rows with their frames. Skipped frames are removed from the room.
 async fn publish(
     store: &Store,
     newest: StoredRoom,
@@ -424,8 +423,7 @@ async fn publish(
     })
 }
 
-/// The room and its new feature sets. If frames were dropped, the room and all its feature sets are
-/// without them.
+/// The room and its feature sets for publication. Skipped frames are removed from all of them.
 fn whole(
     stored: StoredRoom,
     sources: &[FeatureSource],
@@ -436,8 +434,8 @@ fn whole(
         return Ok((stored.room, features));
     }
 
-    // Without the bad frames it is a room of other poses, to which the store carries nothing
-    // over. The older features are therefore cut to the same frames and published again.
+    // With other frames, the store carries no features over. The older features are therefore cut
+    // to the same frames and published again.
     let frames = stored.room.frames().select(&encoded.good);
     let provenance = stored.room.provenance().clone();
     let room = Room::new(stored.room.id().clone(), frames, provenance)?;

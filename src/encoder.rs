@@ -16,7 +16,7 @@ pub struct RuntimeOptions {
     /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
     #[arg(long, value_enum, default_value_t = RuntimeName::Tract, env = "SEESE3_RUNTIME")]
     runtime: RuntimeName,
-    /// Path of the shared library of onnxruntime
+    /// Path of the onnxruntime shared library
     #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
     library: Option<PathBuf>,
     /// Number of threads, at most 1024; 0 takes all cores
@@ -42,7 +42,7 @@ impl From<RuntimeName> for RuntimeKind {
 }
 
 impl RuntimeOptions {
-    /// The options in the form that the library takes.
+    /// The options as the library's type.
     pub fn runtime(&self) -> Runtime {
         Runtime {
             kind: self.runtime.into(),
@@ -64,12 +64,12 @@ impl RuntimeOptions {
 /// How images are preprocessed, and which layers are kept and how they are pooled.
 #[derive(Debug, Clone, Args)]
 pub struct EncoderOptions {
-    /// Preprocessing and layer defaults of a well-known encoder, by a name that `seese3 encoders`
-    /// lists; the options below override single values
+    /// Preprocessing and layer defaults of a known encoder, by a name from `seese3 encoders`; the
+    /// options below override single values
     #[arg(long)]
     recipe: Option<String>,
-    /// Preprocessing, where there is no recipe: the JSON FILE that the model's authors publish (the
-    /// preprocessor_config.json of transformers, the config.json of timm), or that of a family: `imagenet`
+    /// Preprocessing if there is no recipe: a JSON FILE from the model's authors
+    /// (preprocessor_config.json of transformers, config.json of timm), or a family: `imagenet`
     /// (torchvision), `clip`, `half` (-1 to 1: SigLIP, Inception) or `unit` (0 to 1)
     #[arg(long, value_name = "FAMILY|FILE", value_parser = preprocessing, conflicts_with = "recipe")]
     preprocess: Option<Preprocessing>,
@@ -82,19 +82,18 @@ pub struct EncoderOptions {
     #[arg(long)]
     pool: Option<String>,
     /// Number of tokens before the patch tokens (class token and registers), which pooling skips;
-    /// the recipe's if omitted, else 0, which is refused where the number of tokens speaks against it
+    /// the recipe's if omitted, else 0, which is an error if the token count contradicts it
     #[arg(long, value_name = "N")]
     prefix_tokens: Option<usize>,
-    /// What layer numbers count from: 0, 1, or `name` for unnumbered layers; only recorded with the
-    /// features; the recipe's if omitted, else name
+    /// First layer number: 0, 1, or `name` for unnumbered layers; only recorded with the features;
+    /// the recipe's if omitted, else name
     #[arg(long)]
     base: Option<String>,
     /// Whether the layers include the encoder's final norm: none or final; only recorded with the
     /// features; the recipe's if omitted, else unspecified
     #[arg(long)]
     norm: Option<String>,
-    /// Images per clip, 1 to 256, centred on the frame that is encoded; the recipe's if omitted,
-    /// else 1
+    /// Images per clip, 1 to 256, centered on the encoded frame; the recipe's if omitted, else 1
     #[arg(long, value_name = "T", value_parser = clap::value_parser!(u32).range(1..=256))]
     window: Option<u32>,
     /// Resize: WIDTHxHEIGHT of the whole image, shortest:PIXELS for the shorter edge, or none; if
@@ -108,21 +107,21 @@ pub struct EncoderOptions {
     /// none
     #[arg(long)]
     crop: Option<String>,
-    /// Normalisation, first step: pixel values 0 to 255 are divided by this; the recipe's if
-    /// omitted, else 1
+    /// Normalization, first step: divisor of the pixel values 0 to 255; the recipe's if omitted,
+    /// else 1
     #[arg(long)]
     divisor: Option<f32>,
-    /// Normalisation, second step: this mean is subtracted, R,G,B or one number; the recipe's if
-    /// omitted, else 0
+    /// Normalization, second step: mean to subtract, R,G,B or one number; the recipe's if omitted,
+    /// else 0
     #[arg(long, value_name = "R,G,B")]
     mean: Option<String>,
-    /// Normalisation, last step: divided by this deviation, R,G,B or one number; the recipe's if
-    /// omitted, else 1
+    /// Normalization, last step: standard deviation to divide by, R,G,B or one number; the recipe's
+    /// if omitted, else 1
     #[arg(long, value_name = "R,G,B")]
     std: Option<String>,
 }
 
-/// Where the preprocessing comes from if no recipe has it.
+/// Source of the preprocessing if there is no recipe.
 #[derive(Debug, Clone)]
 enum Preprocessing {
     Family(Preprocess),
@@ -141,18 +140,17 @@ fn preprocessing(text: &str) -> Result<Preprocessing, String> {
     family
         .map(Preprocessing::Family)
         .or_else(file)
-        .ok_or_else(|| "is none of imagenet, clip, half, unit, and no file".to_owned())
+        .ok_or_else(|| "must be imagenet, clip, half, unit or a file".to_owned())
 }
 
 impl EncoderOptions {
     /// Opens the encoder: `builtin`, `pixels`, or the ONNX model in a file.
     pub fn open(&self, model: &str, runtime: &Runtime) -> anyhow::Result<Encoder> {
-        // These two encoders are fixed. An option that they would ignore is refused, so that
-        // nobody takes it for applied.
+        // These two encoders are fixed. Options that they would ignore are rejected.
         match model {
             "builtin" | "pixels" if !self.is_plain() => {
                 bail!(
-                    "'{model}' is one fixed encoder; leave out --layers, --pool, --recipe, \
+                    "'{model}' is a fixed encoder; leave out --layers, --pool, --recipe, \
                     --resize and the other options for models"
                 )
             }
@@ -181,14 +179,14 @@ impl EncoderOptions {
         let recipe = self.recipe()?;
         let preparation = self.preparation(recipe, file)?;
 
-        // `all` stands for the outputs that the file declares, in its order.
+        // `all` selects the outputs that the file declares, in the file's order.
         let names = if self.layers == ["all"] {
             seese3_encoder::declared_outputs(file)?
         } else {
             self.layers.clone()
         };
 
-        // For each setting an option wins over the recipe, and the recipe over the default.
+        // Options override the recipe, and the recipe overrides the defaults.
         let skip = self
             .prefix_tokens
             .unwrap_or(recipe.map_or(0, |recipe| recipe.prefix_tokens));
@@ -205,8 +203,7 @@ impl EncoderOptions {
                 .unwrap_or_else(|| recipe.unwrap_or(otherwise).to_owned())
         };
 
-        // `base` and `norm` only describe the layer for later readers; they do not change its
-        // numbers.
+        // `base` and `norm` are metadata; they do not change feature values.
         let layer = |name: &String| Layer {
             name: name.clone(),
             base: word(
@@ -285,7 +282,7 @@ impl EncoderOptions {
 
         seese3_encoder::recipe(name)
             .map(Some)
-            .with_context(|| format!("there is no recipe '{name}'; there are {}", known()))
+            .with_context(|| format!("unknown recipe '{name}'; known recipes: {}", known()))
     }
 
     fn preparation(
@@ -295,8 +292,8 @@ impl EncoderOptions {
     ) -> anyhow::Result<Preparation> {
         let says = self.divisor.is_some() || self.mean.is_some() || self.std.is_some();
 
-        // There is no default normalisation: a wrong one gives features that look plausible and
-        // are wrong. Either a recipe or explicit numbers are required.
+        // There is no default normalization: a wrong one gives plausible but wrong features. A
+        // recipe, a --preprocess value or explicit numbers are required.
         let chosen = match &self.preprocess {
             Some(Preprocessing::Family(family)) => {
                 Some(family.preparation(seese3_encoder::declared_size(file)?)?)
@@ -310,8 +307,8 @@ impl EncoderOptions {
         let mut preparation = match known {
             Some(preparation) => preparation,
             None if !says => bail!(
-                "how are images prepared for {}? give --recipe NAME (see `seese3 encoders`), --preprocess imagenet, \
-                 clip, half, unit or its authors' JSON file, or --divisor, --mean and --std, with --resize and --crop where they are needed",
+                "the preprocessing for {} is missing: give --recipe NAME (see `seese3 encoders`), --preprocess imagenet, \
+                 clip, half, unit or its authors' JSON file, or --divisor, --mean and --std, with --resize and --crop if needed",
                 file.display()
             ),
             None => {

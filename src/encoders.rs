@@ -1,4 +1,4 @@
-//! `seese3 encoders`: the known encoders and how their images are prepared.
+//! `seese3 encoders`: the known encoders and their preprocessing.
 
 use clap::Args;
 use serde_json::json;
@@ -18,8 +18,8 @@ impl Encoders {
     pub fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
 
-        // With a name, one recipe is printed with its export script; without, all of them without
-        // scripts.
+        // With a name, print that recipe with its export script; otherwise print all recipes
+        // without scripts.
         let chosen: Vec<_> = RECIPES
             .iter()
             .filter(|recipe| self.name.as_ref().is_none_or(|name| *name == recipe.name))
@@ -28,7 +28,7 @@ impl Encoders {
         if chosen.is_empty() {
             let known: Vec<&str> = RECIPES.iter().map(|recipe| recipe.name.as_str()).collect();
             anyhow::bail!(
-                "there is no recipe '{}'; there are {}",
+                "unknown recipe '{}'; known recipes: {}",
                 self.name.unwrap_or_default(),
                 known.join(", ")
             );
@@ -41,15 +41,15 @@ impl Encoders {
             say("Without a model:");
             say("  pixels    raw pixels at 320x240, averaged over 16x12 patches, 576 columns");
 
-            say("  builtin   gradient orientations and colour, weight-free stand-in, 528 columns");
+            say("  builtin   gradient orientations and color, weight-free stand-in, 528 columns");
 
             say("");
             say(
-                "With a model: seese3 encode --model FILE.onnx --recipe NAME. Any ONNX image model works whose values",
+                "With a model: seese3 encode --model FILE.onnx --recipe NAME. Any ONNX image model with named outputs",
             );
 
             say(
-                "are named; without a recipe say how images are prepared (--resize, --divisor, --mean, --std).",
+                "works; without a recipe, give the preprocessing (--resize, --divisor, --mean, --std).",
             );
 
             say("");

@@ -1,17 +1,17 @@
-//! The examples in every command's help, in one place: a test parses each of them.
+//! Usage examples for every command's help. A test parses each one.
 
 use clap::Command;
 
-/// What exit codes mean; part of the program's own help.
+/// Exit codes and environment, shown at the end of the program's help.
 const EXIT_CODES: &str = "Exit codes:\n  \
     0    done\n  \
-    1    failed; the last line on standard error says why and what to change\n  \
-    2    the command line was not understood\n  \
+    1    failed; the last line on standard error gives the cause and the remedy\n  \
+    2    invalid command line\n  \
     130  stopped by Ctrl-C\n\n\
-    NO_COLOR=1 leaves colours out. Progress goes to standard error: a bar on a terminal, a line every\n\
-    half minute elsewhere; --quiet leaves it out.";
+    NO_COLOR=1 turns colors off. Progress goes to standard error: a bar on a terminal, otherwise a line\n\
+    every 30 s; --quiet turns it off.";
 
-/// Commands by their names on the command line, each with its examples.
+/// Command paths, each with its examples.
 const EXAMPLES: &[(&[&str], &[&str])] = &[
     (
         &["demo"],
@@ -277,7 +277,7 @@ const EXAMPLES: &[(&[&str], &[&str])] = &[
     (&["man"], &["seese3 man --out ~/.local/share/man/man1"]),
 ];
 
-/// The commands with their examples.
+/// Adds the exit codes and the examples to the help of `command`.
 pub fn with_examples(command: Command) -> Command {
     let mut command = command.after_help(EXIT_CODES);
     for (path, examples) in EXAMPLES {
@@ -294,7 +294,7 @@ fn text(examples: &[&str]) -> String {
     format!("{title}\n  {}", examples.join("\n  "))
 }
 
-/// Adds a text at the end of the help of the command that the path leads to, if this build has it.
+/// Appends a text to the help of the subcommand at `path`, if this build has it.
 fn with_text(command: Command, path: &[&str], text: &str) -> Command {
     let [first, rest @ ..] = path else {
         let before = command.get_after_help().map(ToString::to_string);
@@ -315,7 +315,7 @@ mod tests {
     use crate::Cli;
     use clap::CommandFactory;
 
-    /// The words of a line without a pipe or a redirection, as a shell has them.
+    /// Splits a line into words as a shell does, for lines without pipes and redirections.
     fn words(line: &str) -> impl Iterator<Item = &str> {
         line.split_whitespace().map(|word| word.trim_matches('\''))
     }
@@ -341,7 +341,7 @@ mod tests {
     fn every_command_has_an_example() {
         fn check(command: &Command, path: &str) {
             for inner in command.get_subcommands() {
-                // The formats of a dataset and the forms of a file differ in their names alone.
+                // Dataset formats and file formats differ only in their names.
                 if inner.get_name() == "help" || matches!(path, "import" | "export" | "config") {
                     continue;
                 }

@@ -21,10 +21,10 @@ pub struct Export {
 enum Format {
     /// A folder with poses.npy, timestamps.npy, frame_ids.npy, features_NAME.npy and bundle.json
     Numpy(From),
-    /// A TUM trajectory file, "timestamp tx ty tz qx qy qz qw" per line: seconds, metres,
+    /// A TUM trajectory file, "timestamp tx ty tz qx qy qz qw" per line: seconds, meters,
     /// world_from_camera
     Tum(Timed),
-    /// A KITTI trajectory file: the first three rows of world_from_camera per line, metres
+    /// A KITTI trajectory file: the first three rows of world_from_camera per line, meters
     Kitti(From),
 }
 
@@ -50,8 +50,8 @@ struct From {
 struct Timed {
     #[command(flatten)]
     from: From,
-    /// Frames per second, 0.001 to 1000000: makes timestamps for a room that has none, starting at
-    /// 0
+    /// Frames per second, 0.001 to 1000000: creates timestamps, starting at 0, for a room without
+    /// any
     #[arg(long)]
     rate: Option<f64>,
 }
@@ -70,8 +70,8 @@ impl Export {
             Format::Tum(Timed { from, rate }) => {
                 let stored = from.load().await?;
 
-                // The format needs a time per pose. Recorded times are never overridden; a room
-                // without them gets evenly spaced ones.
+                // The format needs one timestamp per pose. Recorded timestamps are never
+                // overridden; a room without any gets evenly spaced ones.
                 let times = match (stored.room.timestamps_ns(), rate) {
                     ([], Some(rate)) if (1e-3..=1e6).contains(&rate) => {
                         (0..stored.room.frame_count())
@@ -88,7 +88,7 @@ impl Export {
                     ),
                     (times, None) => times.to_vec(),
                     (_, Some(_)) => bail!(
-                        "room '{}' has timestamps of its own; leave out --rate",
+                        "room '{}' already has timestamps; leave out --rate",
                         from.room
                     ),
                 };

@@ -17,17 +17,17 @@ pub struct Fit {
     /// The store: a folder, or a URL of a bucket (feature `cloud`)
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// The room, all of whose frames are its map
+    /// The room; all its frames form the map
     #[arg(long)]
     room: String,
-    /// An adapter that learned from other rooms: its weights are where the fitted one begins, and
-    /// it stays a reader of motions beside it where it was measured to be better
+    /// Pre-trained adapter of other rooms: it initializes the weights, and it also estimates
+    /// motions where it was measured to be more accurate
     #[arg(long)]
     adapter: Option<String>,
     /// Name of the feature set; by default that of the adapter, or the room's only one
     #[arg(long)]
     features: Option<String>,
-    /// Seed of the drawn pairs, of the noise and, without --adapter, of the initial weights
+    /// Seed of the sampled pairs, the noise and, without --adapter, the initial weights
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::from(u32::MAX)))]
     seed: u64,
     /// Name of the fitted adapter in the store; ROOM.FEATURES.fitted if omitted
@@ -68,7 +68,7 @@ impl Fit {
     }
 }
 
-/// Prints what was fitted, and the rules that were measured.
+/// Prints a summary of the fit and the measured rules.
 fn say_fitted(fitted: &Fitted, data: &RoomData<'_>) {
     let mapped = data.room.frame_count();
     say(format_args!(
@@ -79,7 +79,7 @@ fn say_fitted(fitted: &Fitted, data: &RoomData<'_>) {
         fitted.record.train.overall
     ));
 
-    say("measured on frames left out, by the distance of a view from the map:");
+    say("rules measured on held-out frames, by distance of the view from the map:");
     for rule in fitted.rules.rules() {
         say(format_args!(
             "  up to {:.3}: translation {}, rotation {}",
@@ -90,7 +90,7 @@ fn say_fitted(fitted: &Fitted, data: &RoomData<'_>) {
     }
 }
 
-/// A bar over the epochs of a fit and of its folds; without a fit it stays empty.
+/// A progress bar over the epochs of a fit and its folds; empty without a fit.
 pub fn fitting_bar(is_fitted: bool) -> ProgressBar {
     bar(if is_fitted { FITTING_EPOCHS } else { 0 }, "fitting")
 }

@@ -1,8 +1,7 @@
 //! The log of a server, on standard error.
 //!
-//! A log may be on a full disk, or in a pipe that nobody reads. Neither may hold up or fail a
-//! request: lines go to a thread of their own, and those that cannot be written are dropped and
-//! counted.
+//! A full disk or a blocked pipe must neither delay nor fail a request. A separate thread writes
+//! the lines; lines that cannot be written are dropped and counted.
 
 use std::io::{self, IsTerminal, Write};
 use std::sync::Arc;
@@ -16,7 +15,7 @@ use tracing_subscriber::fmt::format::FmtSpan;
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 
-/// How many lines may wait to be written; further ones are dropped.
+/// Capacity of the queue of unwritten lines; further lines are dropped.
 const WAITING_LINES: usize = 8_192;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -25,25 +24,25 @@ pub enum LogFormat {
     Json,
 }
 
-/// A started log. Dropping it writes the lines that wait, for at most about a second.
+/// A running log. Dropping it writes the queued lines, within about a second.
 pub struct Log {
     losses: LogLosses,
     _writer: WorkerGuard,
 }
 
 impl Log {
-    /// Counts the lines that were lost.
+    /// The counter of lost lines.
     pub fn losses(&self) -> LogLosses {
         self.losses.clone()
     }
 }
 
-/// Counts the lines that could not be written.
+/// Counter of lines that could not be written.
 #[derive(Clone)]
 pub struct LogLosses {
-    /// Lines for which there was no place to wait.
+    /// Lines dropped because the queue was full.
     overflowed: ErrorCounter,
-    /// Lines that the system refused to write.
+    /// Lines lost to a failed write.
     failed: Arc<AtomicU64>,
 }
 
@@ -54,14 +53,14 @@ impl LogLosses {
     }
 }
 
-/// Where spans of requests go besides the log; in a build without the feature `otlp`, nowhere.
+/// Exporter of request spans to OpenTelemetry.
 #[cfg(feature = "otlp")]
 pub use seese3_server::Traces;
-/// Where spans of requests go besides the log; in a build without the feature `otlp`, nowhere.
+/// Has no values: this build lacks the feature `otlp`.
 #[cfg(not(feature = "otlp"))]
 pub enum Traces {}
 
-/// Starts the log of this process. RUST_LOG sets what is logged, but not what is exported.
+/// Starts the log of this process. RUST_LOG filters the log, not the exported traces.
 pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
     let failed = Arc::new(AtomicU64::new(0));
     let writer = Forgiving {
@@ -81,7 +80,7 @@ pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| {
         EnvFilter::new("info,hnsw_rs=warn,opentelemetry=warn,opentelemetry_sdk=warn")
     });
-    // As no-color.org asks: any text in NO_COLOR means none.
+    // As no-color.org specifies, any non-empty NO_COLOR turns colors off.
     let no_colour = std::env::var_os("NO_COLOR").is_some_and(|set| !set.is_empty());
     let is_coloured = io::stderr().is_terminal() && !no_colour;
     let log = tracing_subscriber::fmt::layer()
@@ -89,7 +88,8 @@ pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
         .with_span_events(FmtSpan::CLOSE)
         .with_writer(writer)
         .with_ansi(is_coloured)
-        // It would print to standard error, and panic where that cannot be written.
+        // Internal errors would be printed to standard error, which panics if that cannot be
+        // written.
         .log_internal_errors(false);
     let log = match format {
         LogFormat::Text => log.with_filter(filter).boxed(),
@@ -101,7 +101,7 @@ pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
     subscriber.with(traces.map(Traces::layer)).init();
     #[cfg(not(feature = "otlp"))]
     {
-        // There is none in this build.
+        // `Traces` has no values in this build.
         let _ = traces;
         subscriber.init();
     }
@@ -112,7 +112,7 @@ pub fn start_log(format: LogFormat, traces: Option<&Traces>) -> Log {
     }
 }
 
-/// Counts failed writes and reports them as successful, so that the writing thread goes on.
+/// Counts failed writes and reports them as successful, so that the writing thread continues.
 struct Forgiving<W> {
     inner: W,
     failed: Arc<AtomicU64>,
@@ -127,7 +127,7 @@ impl<W: Write> Write for Forgiving<W> {
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        // What could not be flushed was counted when it was written.
+        // Lines that fail to flush were already counted as failed writes.
         let _ = self.inner.flush();
         Ok(())
     }
@@ -149,7 +149,7 @@ mod tests {
         }
     }
 
-    /// Oracle: the promise: a line that cannot be written is counted, and is no error.
+    /// Oracle: the specification: a line that cannot be written is counted and causes no error.
     #[test]
     fn a_line_that_cannot_be_written_is_counted() {
         let failed = Arc::new(AtomicU64::new(0));

@@ -1,5 +1,5 @@
-//! The program `seese3`: the command line, one file per command. Each reads its arguments, calls the
-//! crates and prints the results.
+//! The program `seese3`: the command line, one file per command. Each file reads its arguments,
+//! calls the crates and prints the results.
 
 mod camera;
 mod encoder;
@@ -53,7 +53,7 @@ use std::time::Duration;
 
 use clap::{Parser, Subcommand};
 
-/// How long blocking work that cannot be cancelled may delay the exit.
+/// Maximum delay of the exit by blocking tasks that cannot be canceled.
 const LAST_WORK: Duration = Duration::from_secs(1);
 
 fn main() -> ExitCode {
@@ -68,7 +68,7 @@ fn main() -> ExitCode {
     let runtime = match tokio::runtime::Runtime::new() {
         Ok(runtime) => runtime,
         Err(error) => {
-            complain(&format_args!("no threads can be started: {error}"));
+            complain(&format_args!("cannot start the async runtime: {error}"));
             return ExitCode::FAILURE;
         }
     };
@@ -99,8 +99,8 @@ fn with_causes(error: &anyhow::Error) -> String {
     text
 }
 
-/// Prints an error. Where standard error cannot be written, the exit code alone has to tell:
-/// `eprintln` would panic.
+/// Prints an error to standard error. A failed write is ignored, because `eprintln` would panic;
+/// the exit code still reports the failure.
 fn complain(error: &dyn std::fmt::Display) {
     let _ = writeln!(std::io::stderr(), "error: {error}");
 }
@@ -111,7 +111,7 @@ fn complain(error: &dyn std::fmt::Display) {
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
-    /// Print nothing but warnings and errors; files that options name are written
+    /// Print only warnings and errors; output files are still written
     #[arg(short, long, global = true)]
     quiet: bool,
 }
@@ -123,7 +123,7 @@ enum Command {
     Demo(demo::Demo),
     /// Read a recording from disk and publish it as a room in a store
     Import(import::Import),
-    /// Check a stored room: what its camera did, and whether its poses can be those of its images
+    /// Check a stored room: its camera path, and whether its poses agree with its images
     Check(check::Check),
     /// Write a stored room in a format that other programs read
     Export(export::Export),
@@ -137,7 +137,7 @@ enum Command {
     #[cfg(feature = "lab")]
     /// Train an adapter on the features of one or more rooms and publish it
     Train(train::Train),
-    /// Fit an adapter to one room, measure how far it may be believed there, and publish it
+    /// Fit an adapter to one room, cross-validate its pose errors there, and publish it
     Fit(fit::Fit),
     #[cfg(feature = "lab")]
     /// Score navigators on held-out motions: Hit@ε with baselines and intervals
@@ -147,8 +147,8 @@ enum Command {
     /// ridge probe, M4 trained adapter
     Probe(probe::Probe),
     #[cfg(feature = "lab")]
-    /// Train on some rooms and navigate zero-shot in others: scores against Identity, by the number
-    /// of training rooms
+    /// Train on some rooms and navigate zero-shot in others: scores against the Identity baseline,
+    /// by number of training rooms
     CrossRoom(cross_room::CrossRoom),
     #[cfg(feature = "lab")]
     /// Compare many layers, adapter configurations or formulations in one run
@@ -159,20 +159,19 @@ enum Command {
     #[cfg(feature = "lab")]
     /// Check the paper's theorems numerically: the measured value against the bound
     Theory(theory::Theory),
-    /// Answer over gRPC until SIGTERM or Ctrl-C
+    /// Serve a store over gRPC until SIGTERM or Ctrl-C
     Serve(Box<serve::Serve>),
-    /// Look after a store: list, defaults, removal, garbage, verification
+    /// Manage a store: list, set defaults, remove, collect garbage, verify
     Store(store::StoreCommand),
-    /// Upload a room or an adapter of a store to a server that was started with --writable
+    /// Upload a room or an adapter from a store to a server that was started with --writable
     Push(push::Push),
     /// Check or print the settings of `serve`
     Config(Box<config::Config>),
     /// Ask a server for the frames that a camera motion leads to
     Navigate(ask::Navigate),
-    /// Ask a server for the frames of its rooms that look most like a view
+    /// Ask a server for the mapped frames most similar to a view
     Localize(ask::Localize),
-    /// Ask a server in which room a camera is, and where in it, from some of its views; and how sure
-    /// that is
+    /// Ask a server for the room and the pose of a camera, with covariance, from one or more views
     Relocalize(ask::Relocalize),
     /// Ask a server for the camera motion between two views
     Motion(ask::Motion),
@@ -180,9 +179,9 @@ enum Command {
     Track(track::Track),
     /// List the rooms and adapters of a server
     Catalog(ask::Catalog),
-    /// Exit successfully if a server is serving, for containers and supervisors
+    /// Exit with status 0 if a server is serving, for container health checks and supervisors
     Health(health::Health),
-    /// Print the completions of a shell
+    /// Print a shell completion script
     Completions(manual::Completions),
     /// Write the manual pages, one for each command
     Man(manual::Man),
@@ -199,7 +198,7 @@ impl Cli {
 /// Runs a command. Results go to standard output; a failure is returned as the error.
 ///
 /// # Errors
-/// When the command fails: one line that says what went wrong and what to change.
+/// If the command fails: one line with the cause and the remedy.
 pub async fn run(cli: Cli) -> anyhow::Result<()> {
     dispatch(cli).await?;
     output::check_printed()

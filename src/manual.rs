@@ -1,5 +1,5 @@
-//! `seese3 completions` and `seese3 man`: what shells and `man` know of the program, made from its
-//! own command line.
+//! `seese3 completions` and `seese3 man`: shell completions and manual pages, generated from the
+//! command line definition.
 
 use std::path::PathBuf;
 
@@ -28,7 +28,7 @@ impl Completions {
 
 #[derive(Debug, Args)]
 pub struct Man {
-    /// The folder for the pages, created if it does not exist
+    /// Output folder for the pages; created if it does not exist
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 }

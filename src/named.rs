@@ -1,4 +1,4 @@
-//! Options whose values are a closed set: parsed by the names that the set itself has.
+//! Options with a closed set of values, parsed by the names of the values.
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
@@ -10,14 +10,14 @@ pub trait ClosedSet: Copy + Send + Sync + 'static {
     /// Every value, in the order of the help text.
     fn all() -> Vec<Self>;
 
-    /// The name on the command line, which is the name everywhere.
+    /// Name of the value, the same on the command line and elsewhere.
     fn name(self) -> &'static str;
 
-    /// What the help text says of the value.
+    /// Help text of the value.
     fn help(self) -> &'static str;
 }
 
-/// The parser of an option whose value is one of a closed set.
+/// The parser of an option with a closed set of values.
 pub fn one_of<T: ClosedSet>() -> impl TypedValueParser<Value = T> {
     let possible = T::all()
         .into_iter()
@@ -42,7 +42,7 @@ impl ClosedSet for Mode {
 
     fn help(self) -> &'static str {
         match self {
-            Self::OpenLoop => "All steps are added up in latent space, without feedback",
+            Self::OpenLoop => "Steps add up in latent space, without feedback",
             Self::Snap => "Each step starts from the frame that the previous step retrieved",
             Self::ClosedLoop => {
                 "As snap, and the remaining motion to the goal is replanned from the retrieved frame's pose"
@@ -62,8 +62,8 @@ impl ClosedSet for Reading {
 
     fn help(self) -> &'static str {
         match self {
-            Self::Affine => "Inverts the trained predictor exactly; zero motion moves the latent",
-            Self::Homogeneous => "Zero motion stays put, and equal parts add up to the whole",
+            Self::Affine => "Inverts the trained predictor exactly; zero motion changes the latent",
+            Self::Homogeneous => "Zero motion keeps the latent; equal parts add up to the whole",
             Self::Literal => "As printed in the paper",
         }
     }

@@ -1,5 +1,5 @@
-//! What commands print. Lines for people go to standard output, unless `--quiet` is given, or
-//! `--json -` has standard output to itself.
+//! Output of the commands. Text goes to standard output, unless `--quiet` is given or `--json -`
+//! writes JSON there.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -10,7 +10,7 @@ use anyhow::Context;
 use clap::Args;
 use serde::Serialize;
 
-/// Whether lines for people are left out. It belongs to the process, as standard output does.
+/// Whether text output is turned off. A static, because standard output belongs to the process.
 static IS_SILENT: AtomicBool = AtomicBool::new(false);
 
 /// The first error of a write to standard output.
@@ -19,11 +19,11 @@ static PRINT_PROBLEM: OnceLock<String> = OnceLock::new();
 /// The path that stands for standard output.
 pub const STANDARD_OUTPUT: &str = "-";
 
-/// `--json`, of commands whose results programs read.
+/// The option `--json`: machine-readable results.
 #[derive(Debug, Default, Args)]
 pub struct JsonOutput {
-    /// Also write the results as JSON to this file; "-", or no name, is standard output, where
-    /// nothing else is then printed
+    /// Also write the results as JSON to this file. With "-" or no value, JSON goes to standard
+    /// output, and no text is printed
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = STANDARD_OUTPUT)]
     json: Option<PathBuf>,
 }
@@ -35,7 +35,7 @@ impl JsonOutput {
         Self { json }
     }
 
-    /// Called before the work: refuses a file that could not be written.
+    /// Checks, before the work, that the file can be written.
     pub fn begin(&self) -> anyhow::Result<()> {
         match &self.json {
             Some(path) if is_standard_output(path) => {
@@ -47,13 +47,13 @@ impl JsonOutput {
         }
     }
 
-    /// Whether JSON is wanted.
+    /// Whether `--json` was given.
     #[cfg(feature = "lab")]
     pub fn is_wanted(&self) -> bool {
         self.json.is_some()
     }
 
-    /// Writes the results, indented, if they are wanted.
+    /// Writes the results as indented JSON, if `--json` was given.
     pub fn write(&self, record: &impl Serialize) -> anyhow::Result<()> {
         let Some(path) = &self.json else {
             return Ok(());
@@ -64,7 +64,7 @@ impl JsonOutput {
         Ok(())
     }
 
-    /// Where results are written as they come, a line each; none if they are not wanted.
+    /// A writer of one result per line; `None` without `--json`.
     pub fn lines(&self) -> anyhow::Result<Option<JsonLines>> {
         let Some(path) = &self.json else {
             return Ok(None);
@@ -84,20 +84,20 @@ impl JsonOutput {
     }
 }
 
-/// JSON, an object a line.
+/// Writer of JSON Lines: one object per line.
 pub struct JsonLines {
     to: std::io::BufWriter<Box<dyn Write>>,
     path: PathBuf,
 }
 
 impl JsonLines {
-    /// Writes one result, and hands it on at once: a program may be waiting for it.
+    /// Writes and flushes one result, because a program may be waiting for it.
     pub fn write(&mut self, record: &impl Serialize) -> anyhow::Result<()> {
         let mut line = serde_json::to_vec(record)?;
         line.push(b'\n');
         let written = self.to.write_all(&line).and_then(|()| self.to.flush());
 
-        // A closed pipe (`seese3 track --json - | head`) is no error here either.
+        // A closed pipe (`seese3 track --json - | head`) is not an error.
         if let Err(error) = &written
             && error.kind() == std::io::ErrorKind::BrokenPipe
         {
@@ -111,12 +111,12 @@ fn is_standard_output(path: &Path) -> bool {
     path.as_os_str() == STANDARD_OUTPUT
 }
 
-/// Prints no more lines for people.
+/// Turns text output off.
 pub fn silence() {
     IS_SILENT.store(true, Ordering::Relaxed);
 }
 
-/// Whether lines for people and progress are left out.
+/// Whether text output and progress are turned off.
 pub fn is_silent() -> bool {
     IS_SILENT.load(Ordering::Relaxed)
 }
@@ -128,8 +128,8 @@ pub fn say(line: impl std::fmt::Display) {
     }
 }
 
-/// Writes to standard output. What cannot be written is remembered for [`check_printed`]: the work
-/// itself goes on. A closed pipe (`seese3 … | head`) is no error.
+/// Writes to standard output. The first write error is kept for [`check_printed`], and the command
+/// continues. A closed pipe (`seese3 … | head`) is not an error.
 fn print(content: &[u8]) {
     let mut output = std::io::stdout().lock();
     let written = output.write_all(content).and_then(|()| output.flush());
@@ -140,7 +140,7 @@ fn print(content: &[u8]) {
     }
 }
 
-/// Fails if anything could not be written to standard output, as on a full disk.
+/// Fails if a write to standard output failed, for example on a full disk.
 pub fn check_printed() -> anyhow::Result<()> {
     match PRINT_PROBLEM.get() {
         Some(problem) => anyhow::bail!("standard output cannot be written: {problem}"),
@@ -164,7 +164,7 @@ pub fn say_published(store: &seese3_store::Store, name: &str, published: &seese3
     ));
 }
 
-/// The error of an option or command whose feature is not in this build.
+/// The error for an option or command that needs a feature missing in this build.
 #[cfg_attr(
     all(feature = "bags", feature = "hnsw", feature = "otlp"),
     expect(dead_code, reason = "everything is built in")
@@ -176,8 +176,7 @@ pub fn not_built(what: &str, feature: &str) -> anyhow::Error {
     )
 }
 
-/// Rejects an output file whose folder does not exist, before any long computation is started for
-/// it.
+/// Rejects an output file in a missing folder. Called before a long computation starts.
 pub fn check_writable(path: &Path) -> anyhow::Result<()> {
     if path.is_dir() {
         anyhow::bail!("{} is a folder; name a file in it", path.display());
@@ -215,12 +214,12 @@ pub fn write_result(path: &Path, content: &[u8]) -> anyhow::Result<()> {
     write_file(path, content)
 }
 
-/// Writes a file atomically: readers see either the old file or the complete new one. What is no
-/// regular file, such as a device or a pipe, is written into and never replaced.
+/// Writes a file atomically: readers see either the old file or the complete new one. A device or a
+/// pipe is written to directly.
 pub fn write_file(path: &Path, content: &[u8]) -> anyhow::Result<()> {
     let failed = || format!("{} cannot be written", path.display());
 
-    // A symbolic link stays, and what it points to is replaced.
+    // A symbolic link is kept; its target is replaced.
     let target = std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
     if std::fs::metadata(&target).is_ok_and(|found| !found.is_file()) {
         return std::fs::OpenOptions::new()
@@ -230,8 +229,8 @@ pub fn write_file(path: &Path, content: &[u8]) -> anyhow::Result<()> {
             .with_context(failed);
     }
 
-    // The content goes into a neighbouring file first: renaming within one folder replaces the
-    // target in a single step.
+    // Write to a temporary file in the same folder first: a rename within a folder replaces the
+    // target atomically.
     let mut partial = target.as_os_str().to_owned();
     partial.push(".partial");
     let partial = PathBuf::from(partial);
@@ -239,7 +238,7 @@ pub fn write_file(path: &Path, content: &[u8]) -> anyhow::Result<()> {
     let written =
         std::fs::write(&partial, content).and_then(|()| std::fs::rename(&partial, &target));
     if written.is_err() {
-        // Half a file is of no use, and on a full disk it takes what space there is.
+        // Remove the partial file: it is useless, and takes space on a full disk.
         let _ = std::fs::remove_file(&partial);
     }
     written.with_context(failed)

@@ -1,23 +1,22 @@
-//! The options that say how a recording's poses are written down.
+//! Options for the pose convention of a recording.
 
 use clap::{Args, ValueEnum};
 use seese3_core::geometry::Pose;
 use seese3_data::pose_check::{Axes, Convention, Direction, QuaternionOrder};
 
-/// How poses are written down in the files.
+/// Pose convention of the files.
 #[derive(Debug, Clone, Args)]
 pub struct PoseOptions {
-    /// Which way the camera's axes point in the poses
+    /// Camera axes of the poses
     #[arg(long, value_enum, default_value_t = AxesName::Opencv)]
     convention: AxesName,
-    /// Order of the numbers of quaternions in the files; `wxyz` where a format that has the scalar
-    /// last was written with the scalar first
+    /// Quaternion order in the files; `wxyz` if a scalar-last format was written scalar-first
     #[arg(long, value_enum, default_value_t = QuaternionName::AsTheFormat)]
     quaternions: QuaternionName,
-    /// By how many degrees the images are turned clockwise against the camera that the poses are of
+    /// Clockwise rotation of the images relative to the camera of the poses, degrees
     #[arg(long, value_name = "DEGREES", default_value_t = 0, value_parser = quarter_turns)]
     images_turned: u16,
-    /// Multiply all translations by this, to get metres: 0.001 for millimetres
+    /// Factor that converts all translations to meters: 0.001 for millimeters
     #[arg(long, value_name = "FACTOR", value_parser = scale)]
     scale: Option<f64>,
 }
@@ -35,27 +34,27 @@ enum AxesName {
 /// The option `--poses` of most formats.
 #[derive(Debug, Clone, Args)]
 pub struct DirectionOption {
-    /// Which transform the poses are, after what the format itself says has been applied
+    /// Transform that the poses represent, after the conversions that the format itself defines
     #[arg(long = "poses", value_enum, default_value_t = DirectionName::WorldFromCamera)]
     pub direction: DirectionName,
 }
 
-/// The two transforms that a pose can be, by their names on the command line.
+/// Transform that a pose represents, by its name on the command line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 #[value(rename_all = "snake_case")]
 pub enum DirectionName {
-    /// From the camera to the world: the translation is the camera's position
+    /// Camera to world: the translation is the camera's position
     #[default]
     WorldFromCamera,
-    /// From the world to the camera: the inverse
+    /// World to camera: the inverse
     CameraFromWorld,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum QuaternionName {
-    /// As the format has them
+    /// As the format defines
     AsTheFormat,
-    /// The scalar first
+    /// Scalar first
     Wxyz,
 }
 
@@ -74,7 +73,7 @@ fn scale(text: &str) -> Result<f64, String> {
 }
 
 impl PoseOptions {
-    /// The convention that is meant.
+    /// The convention that the options select.
     pub fn convention(&self, direction: DirectionName) -> Convention {
         Convention {
             axes: match self.convention {
@@ -94,12 +93,12 @@ impl PoseOptions {
         }
     }
 
-    /// Whether nothing was said of the unit of translations.
+    /// Whether --scale was omitted.
     pub fn has_no_scale(&self) -> bool {
         self.scale.is_none()
     }
 
-    /// Poses with their translations in metres, still in the convention in which they are stated.
+    /// The poses with translations in meters, still in their original convention.
     pub fn scaled(&self, poses: &[Pose]) -> Vec<Pose> {
         let scaled = poses.iter().map(|pose| {
             let mut pose = *pose;
@@ -110,7 +109,7 @@ impl PoseOptions {
     }
 }
 
-/// The options that read poses in a convention, as they are typed.
+/// The command-line options that select a convention.
 pub fn flags_of(convention: Convention) -> String {
     let axes = match convention.axes {
         Axes::OpenCv => "opencv",
@@ -157,8 +156,7 @@ mod tests {
         direction: DirectionOption,
     }
 
-    /// Oracle: the promise of the messages: the options that are named give the convention that is
-    /// meant.
+    /// Oracle: the messages: the suggested options select the described convention.
     #[test]
     fn what_is_advised_is_understood() {
         for convention in Convention::all() {

@@ -15,7 +15,7 @@ use seese3_data::pose_check::{
 };
 use seese3_encoder::{image_size, read_image};
 
-/// Where the poses come from that are compared with images.
+/// Origin of the poses that are compared with the images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PosesFrom {
     /// A recording, read in this convention: the options of `import` can mend it.
@@ -153,12 +153,14 @@ fn say_images(images: &ImageReport) {
         explained,
         pair_count,
     } = &images.check;
-    let share = format!("{:.0} % of how the images move", 100.0 * explained);
+    let share = format!("{:.0} % of the image motion", 100.0 * explained);
     match verdict {
-        _ if images.is_all_lost => say("poses against images: cannot tell, the poses say nothing"),
+        _ if images.is_all_lost => {
+            say("poses against images: no verdict, there are no usable poses")
+        }
         Verdict::Agrees(seen) => {
             let depth = seen.depth.map_or(String::new(), |depth| {
-                format!(", things in view about {depth:.1} m away")
+                format!(", scene depth about {depth:.1} m")
             });
             say(format_args!(
                 "poses against images: agree; they explain {share} ({pair_count} pairs; focal length about \
@@ -167,10 +169,10 @@ fn say_images(images: &ImageReport) {
             ));
         }
         Verdict::TooFewPairs => say(format_args!(
-            "poses against images: cannot tell, only {pair_count} pairs of images could be laid over one another"
+            "poses against images: no verdict, only {pair_count} pairs of images could be aligned"
         )),
         Verdict::TooLittleMotion => {
-            say("poses against images: cannot tell, the camera hardly moves");
+            say("poses against images: no verdict, the camera hardly moves");
         }
         Verdict::Unclear { .. } => say(format_args!(
             "poses against images: unclear, they explain {share} ({pair_count} pairs)"

@@ -41,7 +41,7 @@ pub struct Probe {
     /// Number of adapters that M4 trains per stride, with seeds 0, 1, …; 1 to 1000
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1_000))]
     seeds: u64,
-    /// For M4, also train one adapter on all rooms together, beside one per room
+    /// For M4, also train one adapter on all rooms together, in addition to one per room
     #[arg(long)]
     pooled: bool,
     #[command(flatten)]
@@ -52,23 +52,23 @@ pub struct Probe {
     /// M1: step between compared frames, in frames of the room
     #[arg(long, default_value_t = 1)]
     m1_stride: usize,
-    /// M1: number of nearest neighbours, k
+    /// M1: number of nearest neighbors, k
     #[arg(long, default_value_t = 10)]
     m1_k: usize,
-    /// M1: frames within this temporal distance do not count as neighbours
+    /// M1: frames within this temporal distance do not count as neighbors
     #[arg(long, default_value_t = 10)]
     m1_exclusion: usize,
     /// M1: the unit of --m1-exclusion
     #[arg(long, value_enum, default_value_t = CountedName::Sampled)]
     m1_counts: CountedName,
-    /// M1: let a frame at exactly the distance --m1-exclusion count as a neighbour
+    /// M1: count a frame at exactly the distance --m1-exclusion as a neighbor
     #[arg(long)]
     m1_exclusive: bool,
-    /// M2: frames to each side that do not count as neighbours. The paper uses 0, which measures
-    /// the dimension of the camera path rather than that of the room
+    /// M2: frames to each side that do not count as neighbors. The paper uses 0, which measures the
+    /// dimension of the camera path rather than that of the room
     #[arg(long, default_value_t = 0)]
     m2_gap: usize,
-    /// M2: of identical rows keep the first, instead of dropping every row that has a duplicate
+    /// M2: keep the first of identical rows, instead of dropping all of them
     #[arg(long)]
     m2_keep_first: bool,
     #[command(flatten)]
@@ -77,7 +77,7 @@ pub struct Probe {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum MetricName {
-    /// Mutual k-NN: whether neighbours by feature are neighbours by pose
+    /// Mutual k-NN: whether neighbors by feature are neighbors by pose
     M1,
     /// Intrinsic dimension of the features, by TwoNN and MLE
     M2,
@@ -198,8 +198,8 @@ impl Probe {
         Ok(())
     }
 
-    /// One training recipe per stride: those of --sweep-strides, or that of --stride alone. The
-    /// probes replace their splits.
+    /// One training plan per stride: those of --sweep-strides, else the one of --stride. The probes
+    /// replace the splits.
     fn plans(&self) -> anyhow::Result<Vec<TrainingPlan>> {
         let first = |protocol: &ProtocolOptions| {
             let plans = protocol.plans(0)?;
@@ -215,7 +215,7 @@ impl Probe {
         }
     }
 
-    /// What was asked for, at every stride of `plans`.
+    /// The requested metrics, at every stride of `plans`.
     fn probe_protocol(&self, plans: &[TrainingPlan]) -> ProbeProtocol {
         let wants = |metric: MetricName| self.metrics.contains(&metric);
         let plans_for = |metric: MetricName| {
@@ -261,7 +261,7 @@ impl Probe {
     }
 }
 
-/// The scores of every room that can be probed, and one line per skipped room that says why. A
+/// The scores of every room that can be probed, and one line per skipped room with the reason. A
 /// single room that cannot be probed is an error.
 fn probed(
     rooms: &[Loaded],
@@ -298,7 +298,7 @@ fn probed(
     }
 
     if let (true, Some(first)) = (scores.is_empty(), skipped.first()) {
-        bail!("no room could be probed; the first says: {first}");
+        bail!("no room could be probed; the first error: {first}");
     }
 
     Ok((scores, skipped))

@@ -1,4 +1,4 @@
-//! Progress on standard error: a bar on a terminal, and now and then a line elsewhere.
+//! Progress on standard error: a bar on a terminal, otherwise a line every 30 s.
 
 use std::io::{IsTerminal, Write};
 use std::time::Duration;
@@ -7,7 +7,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, WeakProgressBar}
 
 use super::output::is_silent;
 
-/// Where standard error is no terminal, progress is a line in so much time. Shorter work prints none.
+/// Interval of progress lines if standard error is not a terminal. Shorter work prints none.
 const LINE_EVERY: Duration = Duration::from_secs(30);
 
 /// A bar over `steps` steps.
@@ -22,7 +22,7 @@ pub fn bar(steps: u64, what: &'static str) -> ProgressBar {
     bar
 }
 
-/// A spinner with a message, for work whose length is not known.
+/// A spinner with a message, for work of unknown length.
 pub fn spinner(what: &'static str) -> ProgressBar {
     let style = ProgressStyle::with_template("{spinner} {prefix} {msg}");
     let style = style.unwrap_or_else(|_| ProgressStyle::default_spinner());
@@ -41,7 +41,7 @@ fn target() -> ProgressDrawTarget {
     }
 }
 
-/// Says now and then how far a bar is that nobody sees, until it is finished or dropped.
+/// Prints progress lines for a hidden bar, until it is finished or dropped.
 fn say_lines_of(bar: &ProgressBar, what: &'static str) {
     if std::io::stderr().is_terminal() || is_silent() {
         return;
@@ -59,7 +59,7 @@ fn say_lines_of(bar: &ProgressBar, what: &'static str) {
     });
 }
 
-/// How far a bar is; none once it is finished or dropped.
+/// The progress line of a bar; `None` once the bar is finished or dropped.
 fn line_of(bar: &WeakProgressBar, what: &str) -> Option<String> {
     let bar = bar.upgrade().filter(|bar| !bar.is_finished())?;
     let seconds = bar.elapsed().as_secs();
@@ -67,7 +67,7 @@ fn line_of(bar: &WeakProgressBar, what: &str) -> Option<String> {
 
     Some(match bar.length().filter(|length| *length > 0) {
         Some(length) => format!(
-            "{what}: {} of {length} after {seconds} s, some {} s left {message}",
+            "{what}: {} of {length} after {seconds} s, about {} s left {message}",
             bar.position(),
             bar.eta().as_secs()
         ),

@@ -9,7 +9,7 @@ use seese3_core::adapter::{Loss, Mixing, PairPlan, Preset};
 use seese3_core::splits::{Fifth, Split, StrideRange};
 use seese3_core::training::TrainingPlan;
 
-/// A preset, and options that override single settings of it.
+/// A training preset, with options that override single settings.
 #[derive(Debug, Clone, Args)]
 pub struct ProtocolOptions {
     /// Training protocol that supplies every setting not given below
@@ -30,7 +30,7 @@ pub struct ProtocolOptions {
     #[arg(long, value_name = "LOW-HIGH")]
     strides: Option<String>,
     /// Number of training pairs drawn from the range of strides, 1 to 10000000; the preset's if
-    /// omitted, 30000 where it has none
+    /// omitted, 30000 if it has none
     #[arg(long)]
     pairs: Option<usize>,
     /// Learning rate; the preset's if omitted (1e-3, steady 3e-4)
@@ -39,7 +39,7 @@ pub struct ProtocolOptions {
     /// Decoupled weight decay (AdamW) of every parameter; the preset's if omitted (0.01)
     #[arg(long)]
     weight_decay: Option<f64>,
-    /// Pairs per optimiser step; the preset's if omitted (512)
+    /// Pairs per optimizer step; the preset's if omitted (512)
     #[arg(long)]
     batch: Option<usize>,
     /// Width of φ's hidden layer; the preset's if omitted (64)
@@ -96,12 +96,12 @@ impl ProtocolOptions {
         }
     }
 
-    /// The splits that were asked for: one, or the five folds.
+    /// The selected splits: one, or the five folds.
     pub fn splits(&self) -> Vec<Split> {
         self.split.splits()
     }
 
-    /// The split by its name, `folds` for the five folds.
+    /// Name of the split; `folds` for the five folds.
     pub fn split_name(&self) -> &'static str {
         self.split.name()
     }
@@ -113,14 +113,14 @@ impl ProtocolOptions {
     pub fn plan(&self, seed: u64) -> anyhow::Result<TrainingPlan> {
         let SplitChoice::One(split) = self.split else {
             anyhow::bail!(
-                "--split folds trains an adapter for each of five folds, and this command trains one: take one of \
+                "--split folds trains one adapter per fold, but this command trains a single one: use one of \
                  fold1 to fold5"
             );
         };
         self.plan_under(split, seed)
     }
 
-    /// The training plan for each split that was asked for.
+    /// The training plan of each selected split.
     pub fn plans(&self, seed: u64) -> anyhow::Result<Vec<TrainingPlan>> {
         self.splits()
             .into_iter()
@@ -220,7 +220,7 @@ impl ClosedSet for Preset {
     fn help(self) -> &'static str {
         match self {
             Self::Base => {
-                "As paper-base, but for as many epochs as 400 optimiser steps take, at least 10"
+                "As paper-base, but with enough epochs for 400 optimizer steps, at least 10"
             }
             Self::PaperBase => {
                 "The paper's base protocol: all training pairs at one stride, 10 epochs"
@@ -235,11 +235,11 @@ impl ClosedSet for Preset {
     }
 }
 
-/// How a command that trains adapters of its own keeps training and test apart.
+/// Train/test split of a command that trains its own adapters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SplitChoice {
     One(Split),
-    /// The five folds, each trained and tested by itself.
+    /// The five folds, each trained and tested separately.
     Folds,
 }
 
@@ -270,7 +270,7 @@ impl ClosedSet for SplitChoice {
         match self {
             Self::One(split) => split.help(),
             Self::Folds => {
-                "Each contiguous fifth of the frames tests once, by adapters that the other four trained; the test pairs of all five are scored together. Of commands that train one adapter for each split: probe, sweep layers, sweep formulations"
+                "Five-fold cross-validation: each contiguous fifth of the frames is tested once, by adapters trained on the other four; the test pairs of all five are scored together. Only for probe, sweep layers and sweep formulations"
             }
         }
     }
@@ -287,19 +287,19 @@ impl ClosedSet for Split {
 
     fn help(self) -> &'static str {
         match self {
-            Self::Time => "The first 80 % of the frames train, the rest test",
-            Self::Fold(Fifth::First) => "The first fifth of the frames tests, the others train",
-            Self::Fold(Fifth::Second) => "The second fifth tests, the others train",
-            Self::Fold(Fifth::Third) => "The third fifth tests, the others train",
-            Self::Fold(Fifth::Fourth) => "The fourth fifth tests, the others train",
-            Self::Fold(Fifth::Last) => "The last fifth tests, the others train: as time",
-            Self::Blocks => "Every fifth block of 50 frames tests, the others train",
+            Self::Time => "Train on the first 80 % of the frames, test on the rest",
+            Self::Fold(Fifth::First) => "Test on the first fifth of the frames, train on the rest",
+            Self::Fold(Fifth::Second) => "Test on the second fifth, train on the others",
+            Self::Fold(Fifth::Third) => "Test on the third fifth, train on the others",
+            Self::Fold(Fifth::Fourth) => "Test on the fourth fifth, train on the others",
+            Self::Fold(Fifth::Last) => "Test on the last fifth, train on the others: as time",
+            Self::Blocks => "Test on every fifth block of 50 frames, train on the others",
             Self::Pairs => {
-                "Every fifth source frame gives a test pair. Training and test pairs share frames: only for checking an implementation, not for measuring generalisation"
+                "Every fifth source frame gives a test pair. Training and test pairs share frames: only for checking an implementation, not for measuring generalization"
             }
             Self::Dataset => "The recording's own split, if it has one",
             Self::Whole => {
-                "Every pair both trains and tests: for rooms that are training or held-out rooms as a whole"
+                "Use every pair for training and for testing: for rooms that are training or held-out rooms as a whole"
             }
         }
     }
@@ -316,9 +316,9 @@ impl ClosedSet for Mixing {
 
     fn help(self) -> &'static str {
         match self {
-            Self::Gate => "By a gate that is trained with the charts, as in the paper",
+            Self::Gate => "By a gate trained with the charts, as in the paper",
             Self::Even => {
-                "By their plain average: an ensemble of adapters, each trained for its share of the epochs"
+                "By their mean: an ensemble of adapters, each trained for its share of the epochs"
             }
         }
     }

@@ -13,7 +13,8 @@ use seese3_core::geometry::Pose;
 use seese3_server::{pinhole_to_wire, source_to_wire};
 use seese3_store::{Kind, ResourceName, Store, StoredRoom};
 
-/// The size of a message, bytes, as far as frames can be divided: well below what servers take.
+/// Target size of a message, bytes, well below the servers' limit. A message holds at least one
+/// frame.
 const MESSAGE_BYTES: usize = 1 << 20;
 
 #[derive(Debug, Args)]
@@ -26,18 +27,17 @@ pub struct Push {
     /// The name on the server; the same if omitted
     #[arg(long = "as", value_name = "NAME")]
     renamed: Option<String>,
-    /// Add the frames behind those of the room of this name on the server, whose world frame their
-    /// poses are in
+    /// Append the frames to the room of this name on the server; their poses must be in its world
+    /// frame
     #[arg(long)]
     extend: bool,
-    /// With --extend: the room's features that these frames do not have may be missing in its new
-    /// revision
+    /// With --extend: let the room's new revision omit features that these frames do not have
     #[arg(long, requires = "extend")]
     drop_other_features: bool,
-    /// Of a room: afterwards let the server fit an adapter to all of its frames
+    /// For a room: afterwards let the server fit an adapter to all of its frames
     #[arg(long, conflicts_with = "validate_only")]
     refit: bool,
-    /// Only let the server check it
+    /// Only validate the upload on the server; publish nothing
     #[arg(long)]
     validate_only: bool,
     #[command(flatten)]
@@ -80,10 +80,10 @@ impl Push {
         };
         let state = match (created, served) {
             (true, true) => "published and served",
-            (false, true) if self.extend => "it has these frames already",
+            (false, true) if self.extend => "the room already has these frames",
             (false, true) => "already there, unchanged, and served",
-            (true, false) => "published; the server answers from another revision",
-            (false, false) => "already there, unchanged; the server answers from another revision",
+            (true, false) => "published; the server serves another revision",
+            (false, false) => "already there, unchanged; the server serves another revision",
         };
         say(format_args!(
             "{}: {state}",
@@ -99,7 +99,7 @@ impl Push {
             let fitted = client.refit_room(request, |_| ()).await?.revision;
             let fitted = fitted.unwrap_or_default();
             say(format_args!(
-                "adapters/{}/revisions/{}: fitted to it",
+                "adapters/{}/revisions/{}: fitted to the room",
                 fitted.name, fitted.revision
             ));
             fitted_adapter = Some(json!({ "name": fitted.name, "revision": fitted.revision }));
@@ -117,7 +117,7 @@ impl Push {
     /// The description of a room's upload.
     fn upload(&self, stored: &StoredRoom, target: &ResourceName) -> pb::RoomUpload {
         let provenance = stored.room.provenance();
-        // A room that is extended keeps its own.
+        // An extended room keeps its own format and license.
         let own = |words: &String| {
             if self.extend {
                 String::new()
@@ -145,7 +145,7 @@ impl Push {
     }
 }
 
-/// The name on the server. It may be given as a plain name or as that of a room or adapter.
+/// The resource name on the server. `renamed` is a plain name, or one with its collection.
 fn target(source: &ResourceName, renamed: Option<&str>) -> anyhow::Result<ResourceName> {
     let collection = source.kind.collection();
     let name = match renamed {
@@ -159,8 +159,8 @@ fn target(source: &ResourceName, renamed: Option<&str>) -> anyhow::Result<Resour
     Ok(format!("{collection}/{name}").parse()?)
 }
 
-/// The messages of an upload. What the protocol does not carry, the numbers and the held-out marks
-/// of a dataset and the paths of its images, stays behind.
+/// The messages of a room upload. The protocol does not carry a dataset's frame numbers, held-out
+/// marks or image paths.
 fn room_messages(
     stored: &StoredRoom,
     upload: pb::RoomUpload,
@@ -168,7 +168,7 @@ fn room_messages(
     use pb::create_room_request::Message;
 
     if stored.features.is_empty() {
-        bail!("the room has no features; `seese3 encode` makes them");
+        bail!("the room has no features; compute them with `seese3 encode`");
     }
 
     let columns: usize = stored.features.iter().map(|set| set.rows().ncols()).sum();
@@ -197,13 +197,13 @@ fn room_messages(
 }
 
 fn batch(stored: &StoredRoom, rows: std::ops::Range<usize>) -> pb::FrameBatch {
-    /// The part of a column; empty if the room has no such column.
+    /// The given rows of a column; empty if the room has no such column.
     fn part<T: Clone>(column: &[T], rows: &std::ops::Range<usize>) -> Vec<T> {
         column.get(rows.clone()).unwrap_or_default().to_vec()
     }
 
     let pose_bytes = |pose: &Pose| {
-        // nalgebra stores a matrix by column; the transpose gives the rows that NumPy has.
+        // nalgebra matrices are column-major; the transpose gives the row-major order of NumPy.
         let matrix = pose.to_homogeneous().transpose();
         let numbers = matrix.iter().flat_map(|number| number.to_le_bytes());
         numbers.collect::<Vec<u8>>()

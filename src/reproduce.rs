@@ -30,11 +30,10 @@ pub struct Reproduce {
     /// Rooms that one adapter is trained on together: names, or patterns with *
     #[arg(long, required = true)]
     train: Vec<String>,
-    /// Held-out rooms, which the adapters of several rooms never see: names, or patterns with *
+    /// Held-out rooms, which no multi-room adapter is trained on: names, or patterns with *
     #[arg(long, required = true)]
     test: Vec<String>,
-    /// Rooms that each get an adapter of their own, for the tables within a room: names, or
-    /// patterns with *
+    /// Rooms that each get their own adapter, for the in-room tables: names, or patterns with *
     #[arg(long = "in-room", required = true)]
     in_room: Vec<String>,
     /// Feature sets that every room has, separated by commas; the last one is the control and
@@ -44,23 +43,22 @@ pub struct Reproduce {
     /// Frames from source to target
     #[arg(long, default_value_t = 25)]
     stride: u32,
-    /// Strides of the curves within a room
+    /// Strides of the in-room curves
     #[arg(long, value_delimiter = ',', default_values_t = [5, 10, 20, 40])]
     strides: Vec<u32>,
     /// Numbers of training rooms along the scaling curve
     #[arg(long, value_delimiter = ',', default_values_t = [5, 10, 20, 35, 50, 75, 100])]
     sizes: Vec<usize>,
-    /// How many of the training rooms are calibration rooms, which the adapter's errors are
-    /// measured in
+    /// Number of training rooms used for calibration, in which the adapter's errors are measured
     #[arg(long, alias = "aside", default_value_t = 20)]
     calibration_rooms: usize,
-    /// How many seeds, from 0 on, where a table averages over seeds
+    /// Number of seeds, from 0 on, for tables that average over seeds
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
     seeds: u64,
-    /// The same for the table of the alternatives A to D, in which the paper takes 15
+    /// Number of seeds for the table of the alternatives A to D; the paper uses 15
     #[arg(long, default_value_t = 15, value_parser = clap::value_parser!(u64).range(1..=100))]
     formulation_seeds: u64,
-    /// Epochs, in place of every preset's own: for a quick trial of the command
+    /// Epochs, instead of every preset's own; for a quick trial
     #[arg(long)]
     epochs: Option<usize>,
     /// Folder of the report; created if it does not exist
@@ -72,7 +70,7 @@ pub struct Reproduce {
 
 type Loaded = (StoredRoom, Features);
 
-/// The rooms of the three groups, each with the same one of its feature sets.
+/// The rooms of the three groups, loaded with one feature set.
 struct LoadedSet {
     features: String,
     train: Vec<Loaded>,
@@ -91,7 +89,7 @@ impl LoadedSet {
     }
 }
 
-/// Images where the rooms were recorded.
+/// Reads images from the rooms' original folders.
 struct RecordedImages;
 
 impl Images for RecordedImages {
@@ -117,7 +115,7 @@ impl Reproduce {
             images: &RecordedImages,
         };
 
-        // Everything that can be refused is refused now, and not after hours of training.
+        // Validate everything before hours of training.
         check(&reproduction)?;
         for name in adapter_names(&reproduction) {
             if !is_plain_name(&name) {
@@ -125,7 +123,7 @@ impl Reproduce {
             }
         }
         std::fs::create_dir_all(&self.out)
-            .with_context(|| format!("{} cannot be made", self.out.display()))?;
+            .with_context(|| format!("{} cannot be created", self.out.display()))?;
 
         let progress = bar(EXPERIMENTS, "reproduce");
         let Reproduced {

@@ -31,7 +31,7 @@ pub async fn room_names(store: &Store, given: &[String]) -> anyhow::Result<Vec<S
             false => vec![pattern.clone()],
         };
 
-        // A pattern without a match is more likely a typing error than an empty set.
+        // A pattern without a match is more likely a typo than an empty set.
         if meant.is_empty() {
             bail!("no room in the store matches '{pattern}'");
         }
@@ -46,8 +46,7 @@ pub async fn room_names(store: &Store, given: &[String]) -> anyhow::Result<Vec<S
     Ok(names)
 }
 
-/// Loads rooms, each with the same one of its feature sets: the one named, or else the only one
-/// that the first room has.
+/// Loads rooms with one feature set: the named one, else the only one of the first room.
 pub async fn load_rooms(
     store: &Store,
     given: &[String],
@@ -55,7 +54,7 @@ pub async fn load_rooms(
 ) -> anyhow::Result<Vec<(StoredRoom, Features)>> {
     let mut rooms: Vec<(StoredRoom, Features)> = Vec::new();
     for name in room_names(store, given).await? {
-        // The first room decides: the others are loaded with the feature set of that name.
+        // The other rooms are loaded with the feature set name of the first.
         let wanted = features.or_else(|| {
             rooms
                 .first()
@@ -91,12 +90,12 @@ pub fn room_words(rooms: &[(StoredRoom, Features)]) -> String {
     }
 }
 
-/// Whether a name matches a pattern, in which * stands for any characters, also none.
+/// Whether a name matches a pattern. `*` matches any characters, including none.
 fn matches(pattern: &str, name: &str) -> bool {
     match pattern.split_once('*') {
         None => pattern == name,
         Some((before, after)) => name.strip_prefix(before).is_some_and(|rest| {
-            // Try every length for the star's text; the rest of the name has to match the rest of
+            // Try every length of the star's text; the rest of the name has to match the rest of
             // the pattern.
             rest.char_indices()
                 .map(|(at, _)| at)

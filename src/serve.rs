@@ -1,4 +1,4 @@
-//! `seese3 serve`: answers over gRPC until SIGTERM or Ctrl-C.
+//! `seese3 serve`: the gRPC server, until SIGTERM or Ctrl-C.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -22,8 +22,8 @@ use seese3_store::Store;
 
 #[derive(Debug, Args)]
 pub struct Serve {
-    /// File of settings in TOML, each named as its flag without the dashes; flags and the environment
-    /// go before it
+    /// TOML file of settings, each named as its flag without the dashes; flags and environment
+    /// variables override it
     #[arg(long, value_name = "FILE", env = "SEESE3_CONFIG")]
     config: Option<PathBuf>,
     /// The store to serve: a folder, or a URL of a bucket (feature `cloud`)
@@ -32,14 +32,14 @@ pub struct Serve {
     /// Address to listen on, HOST:PORT; port 0 takes a free port
     #[arg(long, env = "SEESE3_LISTEN", default_value = "127.0.0.1:50051")]
     listen: String,
-    /// Address for those who operate the server, HOST:PORT: /metrics for Prometheus, /livez and
-    /// /readyz, over plain HTTP; none if omitted. Whoever reaches it may read it
+    /// Address of the operations endpoint, HOST:PORT: /metrics for Prometheus, /livez and /readyz,
+    /// over plain HTTP without authentication; none if omitted
     #[arg(long, value_name = "ADDR", env = "SEESE3_METRICS_LISTEN")]
     metrics_listen: Option<String>,
-    /// File with the callers and their rights, in TOML; everybody may call everything if omitted
+    /// TOML file with the callers and their permissions; without it, any caller may call everything
     #[arg(long, value_name = "FILE", env = "SEESE3_AUTH_FILE")]
     auth_file: Option<PathBuf>,
-    /// The server's certificate and those above it, in PEM; plain text if omitted
+    /// Certificate chain of the server, PEM; connections are unencrypted if omitted
     #[arg(
         long,
         value_name = "FILE",
@@ -47,7 +47,7 @@ pub struct Serve {
         requires = "tls_key"
     )]
     tls_cert: Option<PathBuf>,
-    /// The private key of the certificate, in PEM
+    /// Private key of the certificate, PEM
     #[arg(
         long,
         value_name = "FILE",
@@ -55,7 +55,8 @@ pub struct Serve {
         requires = "tls_cert"
     )]
     tls_key: Option<PathBuf>,
-    /// Authorities in PEM: only clients with a certificate of theirs may connect
+    /// Certificate authorities of clients, PEM: only clients with a certificate from one of them
+    /// may connect
     #[arg(
         long,
         value_name = "FILE",
@@ -63,23 +64,23 @@ pub struct Serve {
         requires = "tls_cert"
     )]
     tls_client_ca: Option<PathBuf>,
-    /// Largest number of connections at a time, 1 to 1000000; one more is closed at once
+    /// Maximum number of connections, 1 to 1000000; further ones are closed at once
     #[arg(long, env = "SEESE3_MAX_CONNECTIONS", default_value_t = Config::default().connections, value_parser = bounded(1, 1_000_000))]
     max_connections: usize,
-    /// How the nearest frames are searched
+    /// Index for the nearest-frame search
     #[arg(long, env = "SEESE3_INDEX", value_enum, default_value_t = IndexName::Exact)]
     index: IndexName,
-    /// Load and verify every room before it is served; with `false`, when it is first asked for: the
-    /// start is short, and a damaged room is noticed late
+    /// Load and verify every room before it is served. With `false`, load a room on its first
+    /// request: startup is faster, but a damaged room is detected late
     #[arg(long, env = "SEESE3_PRELOAD", default_value_t = RoomMemory::default().preload, default_missing_value = "true", num_args = 0..=1, action = ArgAction::Set)]
     preload: bool,
-    /// What the rooms in memory may hold together, about, 1048576 to 1099511627776 bytes; beyond it
-    /// the room that was asked for the longest time ago is dropped, and loaded again when it is asked
-    /// for; no bound if omitted. A room that is in use by a stream stays
+    /// Approximate memory limit of all loaded rooms, 1048576 to 1099511627776 bytes. Beyond it, the
+    /// least recently used room is unloaded until its next request; rooms in use by a stream stay.
+    /// No limit if omitted
     #[arg(long, env = "SEESE3_MAX_ROOM_BYTES", value_parser = bounded(1 << 20, 1 << 40))]
     max_room_bytes: Option<usize>,
     /// Also accept images instead of features, encoded by these models: `builtin`, `pixels`, or the
-    /// ONNX files that the adapters' features were made with, separated by commas; none if omitted
+    /// ONNX files of the adapters' features, separated by commas; none if omitted
     #[arg(
         long = "encoder",
         value_name = "MODEL",
@@ -87,82 +88,81 @@ pub struct Serve {
         value_delimiter = ','
     )]
     encoders: Vec<String>,
-    /// XFeat's ONNX file: the motion between two images of a known camera is then read from where
-    /// things are in both, in rooms that nobody has mapped
+    /// XFeat's ONNX file: enables motion estimation between two images of a known camera by feature
+    /// matching, also in unmapped rooms
     #[arg(long, value_name = "FILE", env = "SEESE3_TWO_VIEW")]
     two_view: Option<PathBuf>,
     /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
     #[arg(long, env = "SEESE3_RUNTIME", value_enum, default_value_t = RuntimeName::Tract)]
     runtime: RuntimeName,
-    /// Path of the shared library of onnxruntime
+    /// Path of the onnxruntime shared library
     #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
     library: Option<std::path::PathBuf>,
-    /// Largest accepted image, 1 to 1000000000 pixels after decoding
+    /// Maximum size of an image, 1 to 1000000000 pixels after decoding
     #[arg(long, env = "SEESE3_MAX_IMAGE_PIXELS", default_value_t = 16_000_000, value_parser = clap::value_parser!(u64).range(1..=1_000_000_000))]
     max_image_pixels: u64,
-    /// Largest number of steps in one navigation
+    /// Maximum number of steps in one navigation
     #[arg(long, env = "SEESE3_MAX_STEPS", default_value_t = Limits::default().steps, value_parser = clap::value_parser!(u32).range(1..))]
     max_steps: u32,
-    /// Largest number of frames returned for one step or one localisation
+    /// Maximum number of frames returned for one step or one localization
     #[arg(long, env = "SEESE3_MAX_TOP_K", default_value_t = Limits::default().top_k, value_parser = clap::value_parser!(u32).range(1..))]
     max_top_k: u32,
-    /// Largest number of frames in one answer (steps times frames per step)
+    /// Maximum number of frames in one answer (steps times frames per step)
     #[arg(long, env = "SEESE3_MAX_FRAMES_IN_ANSWER", default_value_t = Limits::default().frames_in_answer, value_parser = clap::value_parser!(u64).range(1..))]
     max_frames_in_answer: u64,
-    /// What all requests in progress may hold in memory together, 16777216 to 1099511627776 bytes:
-    /// what has arrived, what it becomes when it is decoded, and answers that are not sent yet.
-    /// Beyond it requests are refused
+    /// Memory limit of all requests in progress, 16777216 to 1099511627776 bytes: received data,
+    /// decoded data and unsent answers. Requests beyond it are refused
     #[arg(long, env = "SEESE3_MAX_MEMORY_BYTES", default_value_t = Config::default().memory_bytes, value_parser = bounded(16 << 20, 1 << 40))]
     max_memory_bytes: usize,
-    /// Let callers change the catalog: upload and remove rooms and adapters, fit, choose defaults. With
-    /// --auth-file only those with the verb "write"
+    /// Allow callers to change the catalog: upload and remove rooms and adapters, fit adapters, set
+    /// defaults. With --auth-file, only callers with the verb "write" may
     #[arg(long, env = "SEESE3_WRITABLE")]
     writable: bool,
-    /// Let callers that list a room's frames also see its images, as thumbnails of at most 512 pixels in
-    /// width. They are read from where the room was imported from
+    /// Allow callers that list a room's frames to also get its images, as thumbnails of at most 512
+    /// pixels in width. Images are read from the room's original folder
     #[arg(long, env = "SEESE3_THUMBNAILS")]
     thumbnails: bool,
-    /// What all uploads in progress may hold in memory together, 1048576 to 1099511627776 bytes
+    /// Memory limit of all uploads in progress, 1048576 to 1099511627776 bytes
     #[arg(long, env = "SEESE3_MAX_UPLOAD_BYTES", default_value_t = Config::default().upload_bytes, value_parser = bounded(1 << 20, 1 << 40))]
     max_upload_bytes: usize,
-    /// Largest message accepted from a client, 1024 to 1073741824 bytes; also the size limit of an
-    /// encoded image
+    /// Maximum size of a message from a client, 1024 to 1073741824 bytes; also limits an encoded
+    /// image
     #[arg(long, env = "SEESE3_MAX_MESSAGE_BYTES", default_value_t = Config::default().message_bytes, value_parser = bounded(1_024, 1 << 30))]
     max_message_bytes: usize,
-    /// Time limit of a request, seconds, 1 to 86400, whatever deadline the client sets
+    /// Time limit of a request, seconds, 1 to 86400, regardless of the client's deadline
     #[arg(long, env = "SEESE3_MAX_REQUEST_SECONDS", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     max_request_seconds: u64,
-    /// Time for which requests are still accepted after SIGTERM or Ctrl-C while health says
-    /// NOT_SERVING, so that load balancers notice first, seconds, 0 to 86400
+    /// Lame-duck time, seconds, 0 to 86400: after SIGTERM or Ctrl-C, requests are still accepted
+    /// while health reports NOT_SERVING, so that load balancers notice first
     #[arg(long, env = "SEESE3_LAME_DUCK_SECONDS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=86_400))]
     lame_duck_seconds: u64,
-    /// Time that running requests then get to finish, seconds, 0 to 86400
+    /// Time for running requests to finish after that, seconds, 0 to 86400
     #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = 10, value_parser = clap::value_parser!(u64).range(0..=86_400))]
     drain_seconds: u64,
-    /// Seconds between two looks for changes of the store, 0 to 86400; new revisions are then served
-    /// without a restart. 0 looks only when the process gets SIGHUP, which also tries again what was
+    /// Interval at which the store is checked for new revisions, seconds, 0 to 86400; they are
+    /// served without a restart. With 0, only SIGHUP triggers a check. SIGHUP also retries what was
     /// refused
     #[arg(long, env = "SEESE3_RELOAD_SECONDS", default_value_t = 5, value_parser = clap::value_parser!(u64).range(0..=86_400))]
     reload_seconds: u64,
-    /// Largest number of tracking streams at a time, 1 to 1000000; one more is refused
+    /// Maximum number of concurrent tracking streams, 1 to 1000000; further ones are refused
     #[arg(long, env = "SEESE3_MAX_STREAMS", default_value_t = Config::default().streams, value_parser = bounded(1, 1_000_000))]
     max_streams: usize,
     /// File with a secret of at least 16 bytes that signs the resume tokens of tracking streams.
-    /// Servers with the same secret can continue each other's streams; if omitted, the key is
-    /// random and tokens are void once the server ends
+    /// Servers with the same secret can resume each other's streams. If omitted, the key is random,
+    /// and tokens are invalid after the server stops
     #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_KEY_FILE")]
     token_key_file: Option<PathBuf>,
-    /// Requests computed at the same time, and threads of an onnxruntime session, 1 to 1024; the
-    /// number of cores if omitted
+    /// Number of requests computed concurrently, and of threads of an onnxruntime session, 1 to
+    /// 1024; the number of cores if omitted
     #[arg(long, env = "SEESE3_THREADS", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
-    /// Requests that may wait for a thread, 0 to 1000000; further ones are refused
+    /// Maximum number of requests waiting for a thread, 0 to 1000000; further ones are refused
     #[arg(long, env = "SEESE3_QUEUE", default_value_t = 1_024, value_parser = clap::value_parser!(u32).range(0..=1_000_000))]
     queue: u32,
-    /// Format of the log, which goes to standard error; RUST_LOG sets what is logged
+    /// Format of the log, which goes to standard error; RUST_LOG filters it
     #[arg(long, env = "SEESE3_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
     log_format: LogFormat,
-    /// Send spans of requests to the OpenTelemetry collector at this address, such as
+    /// Export request spans to the OpenTelemetry collector at this address, for example
     /// http://127.0.0.1:4317 (OTLP over gRPC, plain text). Needs a build with the feature `otlp`
     #[arg(long, value_name = "URL", env = "SEESE3_OTLP_ENDPOINT")]
     otlp_endpoint: Option<String>,
@@ -204,7 +204,7 @@ impl Serve {
         let losses = log.losses();
         config.metrics.count_elsewhere(
             "log_lines_lost",
-            "Lines of the log that could not be written",
+            "Log lines that could not be written",
             move || losses.count(),
         );
 
@@ -214,8 +214,7 @@ impl Serve {
             .await
             .with_context(|| format!("cannot listen on {}", self.listen))?;
 
-        // With port 0 the system chose the port; the line on standard output tells scripts which
-        // one.
+        // With port 0 the system chooses the port; scripts read it from this line.
         let address = listener
             .local_addr()
             .context("the listener has no address")?;
@@ -254,8 +253,8 @@ impl Serve {
 
         tokio::select! {
             ended = run(listeners, store, config, stopping) => ended?,
-            // Whoever signals twice does not want to wait for requests in flight.
-            () = signalled_twice => bail!("a second signal came: requests in flight were given up"),
+            // A second signal skips the wait for requests in flight.
+            () = signalled_twice => bail!("received a second signal: requests in flight were aborted"),
         }
 
         match log.losses().count() {
@@ -267,11 +266,11 @@ impl Serve {
     }
 }
 
-/// Files that a server has open besides its connections: the store's, the log, listeners.
+/// File descriptors reserved for the store, the log and the listeners.
 const FILES_KEPT: u64 = 128;
 
-/// As many connections as were asked for, or as the system lets this process have. The limit is
-/// raised as far as that goes: by default it is lower than one server needs.
+/// The requested number of connections, capped by the limit of open files. That limit is first
+/// raised to its maximum: its default is too low for one server.
 fn connections_within_file_limit(asked: usize) -> usize {
     #[cfg(unix)]
     {
@@ -283,7 +282,7 @@ fn connections_within_file_limit(asked: usize) -> usize {
             maximum: limit.maximum,
         };
 
-        // Where it cannot be raised, the current limit holds.
+        // If it cannot be raised, the current limit applies.
         let now = match setrlimit(Resource::Nofile, raised) {
             Ok(()) => limit.maximum,
             Err(_) => limit.current,
@@ -297,7 +296,7 @@ fn connections_within_file_limit(asked: usize) -> usize {
             tracing::warn!(
                 asked,
                 possible,
-                "fewer connections: raise the limit of open files (LimitNOFILE, ulimit -n)"
+                "connection limit lowered: raise the limit of open files (LimitNOFILE, ulimit -n)"
             );
         }
         asked.min(possible.max(1))
@@ -317,7 +316,7 @@ fn reload_on_hangup() -> Arc<Notify> {
 
         let asked = asked.clone();
         tokio::spawn(async move {
-            // Where the handler cannot be installed, the server still looks from time to time.
+            // Without the handler, the server still checks the store periodically.
             let Ok(mut hangup) = signal(SignalKind::hangup()) else {
                 return;
             };
@@ -331,7 +330,7 @@ fn reload_on_hangup() -> Arc<Notify> {
 }
 
 impl Serve {
-    /// Fails where `serve` would before it opens its port.
+    /// Makes the checks that `serve` makes before it opens its port.
     pub fn check(&self) -> anyhow::Result<()> {
         Store::open(&self.store)?;
         self.server_config().map(drop)
@@ -340,8 +339,7 @@ impl Serve {
     fn server_config(&self) -> anyhow::Result<Config> {
         let defaults = Config::default();
 
-        // One number bounds both the requests computed at a time and the threads of an
-        // onnxruntime session.
+        // One number limits both the concurrent requests and the threads of an onnxruntime session.
         let threads = self.threads.map_or(defaults.threads, usize::from);
 
         Ok(Config {
@@ -360,7 +358,7 @@ impl Serve {
                         library: self.library.clone(),
                     },
                     bounds: Bounds {
-                        // An image arrives within a single message, so it cannot be larger than that.
+                        // An image is part of one message, so it cannot be larger.
                         bytes: self.max_message_bytes as u64,
                         pixels: self.max_image_pixels,
                     },
@@ -414,12 +412,12 @@ impl Serve {
     }
 
     fn tls(&self) -> anyhow::Result<Option<Tls>> {
-        // Values of the configuration file reach clap as defaults, to which its rules on what belongs
-        // together do not apply.
+        // Values of the configuration file are clap defaults, to which the `requires` rules do not
+        // apply.
         let (cert, key) = match (&self.tls_cert, &self.tls_key) {
             (Some(cert), Some(key)) => (cert, key),
             (None, None) if self.tls_client_ca.is_none() => return Ok(None),
-            _ => bail!("--tls-cert and --tls-key belong together, and --tls-client-ca needs both"),
+            _ => bail!("give --tls-cert and --tls-key together; --tls-client-ca needs both"),
         };
         let files = TlsFiles {
             cert: cert.clone(),
@@ -436,7 +434,7 @@ impl Serve {
         };
         if self.tls_cert.is_none() {
             tracing::warn!(
-                "tokens travel in plain text: give --tls-cert, or listen on loopback behind a proxy"
+                "tokens are sent unencrypted: give --tls-cert, or listen on loopback behind a proxy"
             );
         }
 

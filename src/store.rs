@@ -1,4 +1,4 @@
-//! `seese3 store`: looks after a store.
+//! `seese3 store`: manages a store.
 
 use std::time::Duration;
 
@@ -18,21 +18,21 @@ pub struct StoreCommand {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// List the rooms and adapters, with their revisions and what is the default
+    /// List the rooms and adapters, with their revisions and defaults
     List(List),
     /// Show every revision of one room or adapter
     Show(Show),
-    /// Show or choose what the name alone means: which revision, and which adapter answers in a room
+    /// Show or set defaults: the revision that a name stands for, and the adapter of a room
     Default(Default),
     /// Remove a room, an adapter or one revision; `gc` frees the space
     Rm(Remove),
-    /// Remove files that nothing needs: of interrupted writes, and of what was removed
+    /// Remove unreferenced files: from interrupted writes, and of removed revisions
     Gc(CollectGarbage),
     /// Read everything and check it: checksums, golden vectors, references
     Verify(Verify),
 }
 
-/// The store, and the form of the output.
+/// Options that all actions share.
 #[derive(Debug, Args)]
 struct Common {
     /// The store: a folder, or a URL of a bucket (feature `cloud`)
@@ -65,16 +65,17 @@ struct Show {
 
 #[derive(Debug, Args)]
 struct Default {
-    /// What the default is of: a room or an adapter with a revision, or a room followed by an
-    /// adapter. All defaults are shown if omitted
+    /// A room or an adapter with a revision, or a room followed by its adapter. All defaults are
+    /// shown if omitted
     name: Option<ResourceName>,
-    /// The adapter that answers in the room when a request names none
+    /// Adapter of the room for requests that name none
     #[arg(requires = "name", conflicts_with = "unset")]
     adapter: Option<ResourceName>,
-    /// Choose nothing: the newest revision, and the adapter that is preferred
+    /// Remove the default: back to the newest revision, and the adapter that is preferred
+    /// automatically
     #[arg(long, requires = "name")]
     unset: bool,
-    /// Take the last choice back
+    /// Undo the last change of defaults
     #[arg(long, conflicts_with_all = ["name", "unset"])]
     back: bool,
     #[command(flatten)]
@@ -85,7 +86,7 @@ struct Default {
 struct Remove {
     /// rooms/NAME or adapters/NAME, or one revision: rooms/NAME/revisions/NUMBER
     name: ResourceName,
-    /// Only say what would be removed
+    /// Only print what would be removed
     #[arg(long)]
     dry_run: bool,
     #[command(flatten)]
@@ -94,10 +95,11 @@ struct Remove {
 
 #[derive(Debug, Args)]
 struct CollectGarbage {
-    /// Leave files alone that were written in the last SECONDS: somebody may be publishing them
+    /// Keep files that were written in the last SECONDS: they may belong to a publication in
+    /// progress
     #[arg(long, value_name = "SECONDS", default_value_t = 3_600)]
     older_than: u64,
-    /// Only say what would be removed
+    /// Only print what would be removed
     #[arg(long)]
     dry_run: bool,
     #[command(flatten)]
@@ -174,7 +176,7 @@ impl Default {
             store.choose(&choice).await?;
         }
 
-        // What holds now, in each case.
+        // Report the resulting defaults in each case.
         let contents = store.contents().await?;
         let listed: Vec<Value> = contents.iter().map(contents_json).collect();
         self.common.json.write(&listed)?;
@@ -184,7 +186,7 @@ impl Default {
             .filter(|held| held.is_chosen || held.default_adapter.is_some())
             .collect();
         if chosen.is_empty() {
-            say("nothing is chosen: names mean the newest revision");
+            say("no defaults are set: a name stands for its newest revision");
         }
         for held in chosen {
             say(headline(held));
@@ -305,7 +307,7 @@ impl Verify {
 
         match findings.len() {
             0 => {
-                say("everything can be read and belongs together");
+                say("everything can be read and is consistent");
                 Ok(())
             }
             found => bail!("{found} findings"),
@@ -313,7 +315,7 @@ impl Verify {
     }
 }
 
-/// The name, the current revision and what was chosen.
+/// The name, the current revision and the defaults.
 fn headline(held: &Contents) -> String {
     let chosen = match held.is_chosen {
         true => ", chosen",
@@ -363,7 +365,7 @@ fn contents_json(held: &Contents) -> Value {
     })
 }
 
-/// A size in the unit that suits it.
+/// A size with a suitable unit.
 fn size(bytes: u64) -> indicatif::DecimalBytes {
     indicatif::DecimalBytes(bytes)
 }

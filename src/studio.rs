@@ -22,16 +22,17 @@ use seese3_encoder::{Encoder, Error, OnBadImage, Task, encode_png, encode_room, 
 use seese3_store::{Store, StoredRoom};
 use seese3_studio::{Film, Suite, Variation};
 
-/// The largest number of rooms on a contact sheet; below, its columns and the size of a tile,
-/// pixels.
+/// Maximum number of rooms on a contact sheet.
 const SHEET_ROOMS: u32 = 48;
+/// Number of columns of a contact sheet.
 const SHEET_COLUMNS: usize = 8;
+/// Width and height of a tile on a contact sheet, pixels.
 const SHEET_SIZE: (usize, usize) = (160, 120);
 
 #[derive(Debug, Args)]
 pub struct Studio {
-    /// The store to publish the rooms in: a folder, created if it does not exist, or a URL of a bucket
-    /// (feature `cloud`)
+    /// The store to publish the rooms in: a folder, created if it does not exist, or a URL of a
+    /// bucket (feature `cloud`)
     #[arg(
         long,
         env = "SEESE3_STORE",
@@ -39,17 +40,17 @@ pub struct Studio {
         required_unless_present = "sheet"
     )]
     out: Option<String>,
-    /// How the rooms are filmed
+    /// Kind of rooms and of their recordings
     #[arg(long, default_value = "visits", value_parser = one_of::<Suite>())]
     suite: Suite,
-    /// What does not vary between the visits and rooms of the suite `visits`, separated by commas, to
-    /// see what a variation is good for; the poses stay the same
+    /// Variations that are turned off in the suite `visits`, separated by commas, for ablations;
+    /// the poses stay the same
     #[arg(long, value_delimiter = ',', value_name = "VARIATIONS", value_parser = one_of::<Variation>())]
     without: Vec<Variation>,
     /// Number of rooms, 1 to 100000
     #[arg(long, default_value_t = 131, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     rooms: u32,
-    /// Number of frames per room, 2 to 100000; 1000 of visits and 400 of walks if omitted
+    /// Number of frames per room, 2 to 100000; if omitted, 1000 for visits and 400 for walks
     #[arg(long, value_parser = clap::value_parser!(u32).range(2..=100_000))]
     frames: Option<u32>,
     /// Seed of the suite; the same seed gives the same rooms
@@ -80,8 +81,8 @@ pub struct Studio {
     json: JsonOutput,
 }
 
-/// Time spent: rendering summed over threads, microseconds, and wall time of the rooms that were
-/// rendered.
+/// Time spent: rendering time summed over threads, microseconds, and wall time of the rendered
+/// rooms.
 #[derive(Default)]
 struct Spent {
     drawing_us: AtomicU64,
@@ -92,7 +93,7 @@ impl Studio {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
         if self.suite == Suite::Walks && !self.without.is_empty() {
-            bail!("--without belongs to the suite visits: walks are plain already");
+            bail!("--without needs --suite visits: walks have no variations");
         }
         if let Some(file) = &self.sheet {
             return self.sheet(file);
@@ -131,13 +132,13 @@ impl Studio {
         ));
 
         if drawn > 0 {
-            // Wall time per room, and rendering time summed over threads, which may therefore be
-            // the larger of the two.
+            // Wall time per room, and rendering time summed over threads, which may be the larger
+            // one.
             let threads = self.runtime.threads();
             let rooms = f64::from(drawn);
             let drawing = spent.drawing_us.load(Ordering::Relaxed) as f64 / 1e6;
             say(format_args!(
-                "a room took {:.1} s on {threads} threads; drawing alone {:.1} thread-seconds",
+                "{:.1} s per room on {threads} threads; rendering alone {:.1} thread-seconds",
                 spent.wall.as_secs_f64() / rooms,
                 drawing / rooms
             ));
@@ -177,15 +178,14 @@ impl Studio {
         let mut drawn = 0;
         let mut there = 0;
 
-        // One room after another, the frames of each on all threads, so that memory holds one
-        // room at a time.
+        // Render one room at a time, its frames on all threads, so that memory holds only one room.
         for number in 0..self.rooms {
             let name = self.room_name(number);
             progress.set_message(name.clone());
             let begun = Instant::now();
 
-            // A room follows from seed and number alone. An interrupted command therefore
-            // continues by skipping the rooms that are complete in the store.
+            // A room depends only on seed and number. An interrupted command therefore continues by
+            // skipping the rooms that are complete in the store.
             let film = self.film(number);
             let mut room = self.room(&name, &film, encoder.render_size())?;
             let before = stored(store, &room).await?;
@@ -193,8 +193,8 @@ impl Studio {
                 .as_ref()
                 .is_some_and(|before| before.room.images() == room.images());
 
-            // A room is complete if it has every feature set, made in the same way, and its
-            // images where they are wanted.
+            // A room is complete if it has every feature set with the same source and, with
+            // --keep-images, its images.
             if before
                 .as_ref()
                 .is_some_and(|before| sources.iter().all(|source| has(before, source)))
@@ -202,7 +202,7 @@ impl Studio {
             {
                 there += 1;
             } else {
-                // Images that an earlier run kept stay with the room.
+                // Keep the images of an earlier run.
                 if let Some(before) = before.filter(|_| !self.keep_images) {
                     room = before.room;
                 }
@@ -339,7 +339,7 @@ impl Studio {
         let batch = self.batch as usize;
 
         let task = Task {
-            // Clips stay within a visit.
+            // Clips do not span visits.
             timeline: room.timeline(),
             image: &image,
             batch,
@@ -411,11 +411,11 @@ impl ClosedSet for Variation {
 
     fn help(self) -> &'static str {
         match self {
-            Self::Light => "Day, dusk or night, and the colour of lamps",
+            Self::Light => "Day, dusk or night, and the color of lamps",
             Self::Exposure => "Exposure and white balance",
-            Self::Lens => "Motion blur, noise and dark corners",
+            Self::Lens => "Motion blur, noise and vignetting",
             Self::FieldOfView => "The camera's field of view",
-            Self::Clutter => "Things that were moved, and passers-by",
+            Self::Clutter => "Moved objects, and passers-by",
             Self::Detail => "Fine detail of all surfaces",
         }
     }
@@ -433,16 +433,16 @@ impl ClosedSet for Suite {
     fn help(self) -> &'static str {
         match self {
             Self::Visits => {
-                "Filmed twice by a person with a camera in the hand, in other light: photographs \
-                 with blur, noise and an exposure of their own"
+                "Two handheld visits to each room in different light: photographs with blur, noise and \
+                 per-visit exposure"
             }
-            Self::Walks => "Plain images of one calm walk each: the hard class",
+            Self::Walks => "One smooth walk per room, plain images: the hard class",
         }
     }
 }
 
-/// The image that an earlier run kept, or none if there is none that can be read. An image of
-/// another size is an error: it would not give the features that a fresh rendering gives.
+/// The image kept by an earlier run; `None` if it is missing or unreadable. An image of another
+/// size is an error: its features would differ from those of a fresh rendering.
 fn drawn_before(
     room: &Room,
     row: usize,
@@ -465,7 +465,8 @@ fn drawn_before(
     }
 }
 
-/// The room as the store has it, or none; an error if the store has other frames under its name.
+/// The stored room; `None` if the store does not have it. An error if the store has other frames
+/// under its name.
 async fn stored(store: &Store, room: &Room) -> anyhow::Result<Option<StoredRoom>> {
     let name = room.id().as_str();
     let stored = match store.load_room(name, None).await {
@@ -474,7 +475,7 @@ async fn stored(store: &Store, room: &Room) -> anyhow::Result<Option<StoredRoom>
         Err(error) => return Err(error.into()),
     };
 
-    // The name holds the seed but not the number of frames, so equal names do not mean equal
+    // The name contains the seed but not the number of frames, so equal names do not imply equal
     // poses.
     if !same_poses(&stored.room, room) {
         bail!(
@@ -508,7 +509,7 @@ fn tiled(images: &[RgbImage], columns: usize) -> RgbImage {
         bytes: Vec::new(),
     };
 
-    // White, which remains where the last row of tiles is not full.
+    // White, which stays visible where the last row of tiles is not full.
     sheet.bytes = vec![255; sheet.width * sheet.height * 3];
 
     for (place, image) in images.iter().enumerate() {

@@ -10,7 +10,7 @@ use seese3_lab::theory::{Effort, checks};
 
 #[derive(Debug, Args)]
 pub struct Theory {
-    /// Seed of everything that is drawn at random
+    /// Seed of all random samples
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Number of poses for the intrinsic dimension, 64 to 100000
@@ -44,8 +44,7 @@ impl Theory {
         say(theory_table(&found).trim_end());
         self.json.write(&theory_json(&found))?;
 
-        // The table and the file show every check; the exit status tells scripts whether all
-        // bounds hold.
+        // The table and the file show every check; the exit status reports whether all bounds hold.
         let broken = found.iter().filter(|check| !check.holds()).count();
         if broken > 0 {
             bail!("{broken} of {} bounds are violated", found.len());

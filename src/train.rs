@@ -39,9 +39,9 @@ pub struct Train {
     /// attention, or all; none if omitted
     #[arg(long, value_delimiter = ',')]
     correctors: Vec<String>,
-    /// Calibration rooms, in which the adapter's errors are measured: names, or patterns with *,
-    /// none of them a training room. One is enough for +calibrated navigators; tracking and
-    /// relocalisation need two or more
+    /// Calibration rooms, in which the adapter's errors are measured: names, or patterns with *;
+    /// none may be a training room. One is enough for +calibrated navigators; tracking and
+    /// relocalization need two or more
     #[arg(long)]
     calibrate_on: Vec<String>,
     /// Seed of initial weights, drawn pairs and their order, 0 to 2³² − 1; weights and order are
@@ -52,7 +52,7 @@ pub struct Train {
     /// of the scores are reported, the first adapter is published
     #[arg(long, default_value_t = 1)]
     seeds: u64,
-    /// Name of the adapter in the store; made from the rooms, features and protocol if omitted
+    /// Name of the adapter in the store; derived from the rooms, features and protocol if omitted
     #[arg(long)]
     name: Option<String>,
     #[command(flatten)]
@@ -76,13 +76,13 @@ impl Train {
 
         let source = rooms[0].1.source().name.clone();
 
-        // Errors are measured on the features that the adapter is trained on.
+        // Errors are measured on the feature set that the adapter is trained on.
         let calibration = match self.calibrate_on.is_empty() {
             true => Vec::new(),
             false => load_rooms(&store, &self.calibrate_on, Some(&source)).await?,
         };
 
-        // Errors in a training room are not representative of other rooms. Refuse such a
+        // Errors in a training room are not representative of other rooms. Reject such a
         // calibration room now, not after the training.
         for room in &calibration {
             check_unseen(
@@ -120,8 +120,7 @@ impl Train {
             features.source().dim,
         ));
 
-        // Under `whole` nothing is held out: the printed scores are in-sample, and the text has
-        // to say so.
+        // Under `whole` nothing is held out: the scores are in-sample and labeled as such.
         let judged = match split {
             Split::Whole => {
                 "no test pairs; train R², and in-sample Hit@0.1 of inverse Poincaré (affine)"
@@ -147,7 +146,7 @@ impl Train {
     }
 }
 
-/// Prints the table of the seeds, and what its reader should not miss.
+/// Prints the table of seeds, with its caveats.
 fn say_scores(runs: &[TrainingRun]) {
     say(training_table(runs).trim_end());
     if let Some(remark) = training_remark(runs) {
@@ -173,7 +172,7 @@ fn calibrated(
     let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
     let calibrated = calibrate(adapter, record, &room_data)?;
     if !calibrated.can_track {
-        say("one room is too few to tell rooms apart in: the adapter can navigate, not track");
+        say("one calibration room is too few for tracking: the adapter can only navigate");
     }
 
     say(format_args!("errors measured in {}", room_words(rooms)));
@@ -194,8 +193,7 @@ fn correctors(names: &[String]) -> anyhow::Result<Vec<CorrectorKind>> {
     names.iter().map(kind).collect()
 }
 
-/// Trains one adapter per seed under one progress bar, whose loss is that of the seed that reported
-/// last.
+/// Trains one adapter per seed with one progress bar, which shows the loss reported last.
 pub fn train_with_progress(
     rooms: &[(StoredRoom, Features)],
     plan: &TrainingPlan,
@@ -206,7 +204,7 @@ pub fn train_with_progress(
 
     let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();
     let trained = train_seeds(&room_data, plan, seeds, &|epoch| {
-        // A plan with a floor in steps has more epochs than its preset.
+        // A plan with a minimum number of steps may have more epochs than its preset.
         progress.set_length((epoch.epochs as u64).saturating_mul(seeds));
         progress.set_message(format!("loss {:.4}", epoch.loss));
         progress.inc(1);

@@ -1,4 +1,4 @@
-//! `seese3 localize`: the frames that look most like a view.
+//! `seese3 localize`: the mapped frames most similar to a view, and the camera pose.
 
 use anyhow::{Context, bail};
 use clap::Args;
@@ -14,15 +14,13 @@ use seese3_client::proto::v1 as pb;
 pub struct Localize {
     #[command(flatten)]
     server: Server,
-    /// A room to search; all rooms that the adapter fits if none is named; may be given several
-    /// times
+    /// A room to search; all rooms that the adapter fits if omitted; may be given several times
     #[arg(long = "room")]
     rooms: Vec<String>,
     /// Name of the adapter; may be omitted when only one fits all the rooms
     #[arg(long, default_value = "")]
     adapter: String,
-    /// Use this frame as the view; exactly one --room must be given, and the frame is one of its
-    /// rows
+    /// Use this frame as the view: a row of the room, counted from 0; needs exactly one --room
     #[arg(long, conflicts_with_all = ["feature", "image"])]
     frame: Option<u32>,
     #[command(flatten)]
@@ -67,7 +65,7 @@ impl Localize {
             say(located_text(located));
         }
 
-        // Only a view that is itself a frame of the room has a recorded pose, and hence an error.
+        // Only a view that is a frame of the room has a recorded pose, and hence an error.
         for place in &answer.places {
             let frame = place
                 .frame
@@ -84,24 +82,26 @@ impl Localize {
     }
 }
 
-/// Where the camera is believed to be, and whether the view looks like the room.
+/// The estimated camera pose, and whether the view resembles the room.
 fn believed_text(believed: &pb::BelievedPose) -> String {
     let pose = pose_text(believed.pose.as_ref());
     let sure = deviations_text(&believed.covariance);
 
     match believed.out_of_distribution {
         None => format!(
-            "camera at {pose}{sure}; how much the view looks like the room is not known: the adapter is not calibrated"
+            "camera at {pose}{sure}; the view's distance from the room is unknown: the adapter is not calibrated"
         ),
         Some(far) if far > 1.0 => format!(
-            "the view looks like no place of the room: it is {far:.2} times as far as the room's limit, and where the \
-             camera is is not known"
+            "the view is out of distribution, at {far:.2} of the room's limit (above 1): the camera pose is \
+             unknown"
         ),
-        Some(far) => format!("camera at {pose}{sure}; the view is at {far:.2} of the room's limit"),
+        Some(far) => {
+            format!("camera at {pose}{sure}; the view's distance is {far:.2} of the room's limit")
+        }
     }
 }
 
-/// What the adapter that was fitted to the room says, and what told it.
+/// The pose from the adapter fitted to the room, with the sources of its translation and rotation.
 fn located_text(located: &pb::LocatedPose) -> String {
     format!(
         "the adapter fitted to the room: camera at {}{}\n\

@@ -1,4 +1,4 @@
-//! Requests to a running server: one file per command, and what they share.
+//! Requests to a running server: one file per command, and shared code.
 
 mod catalog;
 mod localize;
@@ -31,25 +31,25 @@ pub struct Server {
     /// The server's address, HOST:PORT
     #[arg(long, env = "SEESE3_SERVER", default_value = "127.0.0.1:50051")]
     server: String,
-    /// Deadline of each call, seconds, 1 to 86400; of a stream (`track`) only until it is open
+    /// Deadline of each call, seconds, 1 to 86400; for a stream (`track`), only of opening it
     #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u64).range(1..=86_400))]
     deadline: u64,
-    /// File with the token that the server asks for
+    /// File with the authentication token for the server
     #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_FILE")]
     token_file: Option<PathBuf>,
-    /// Authorities of the server's certificate, in PEM: the connection is TLS
+    /// Certificate authorities of the server, PEM; turns TLS on
     #[arg(long, value_name = "FILE", env = "SEESE3_TLS_CA")]
     tls_ca: Option<PathBuf>,
-    /// This client's certificate in PEM, if the server asks for one
+    /// Certificate of this client, PEM, if the server requires one
     #[arg(long, value_name = "FILE", requires_all = ["tls_key", "tls_ca"])]
     tls_cert: Option<PathBuf>,
-    /// The private key of the certificate, in PEM
+    /// Private key of the certificate, PEM
     #[arg(long, value_name = "FILE", requires = "tls_cert")]
     tls_key: Option<PathBuf>,
 }
 
 impl Server {
-    /// Connects to the server, with the deadline for every later call.
+    /// Connects to the server. The deadline applies to every later call.
     pub async fn connect(&self) -> anyhow::Result<Client> {
         let read = |option: &str, file: &PathBuf| {
             std::fs::read(file)
@@ -126,8 +126,8 @@ fn feature_view(file: &Path, row: usize) -> anyhow::Result<pb::View> {
         );
     }
 
-    // A NumPy file does not say which encoder made it, so the source name stays empty and the
-    // server can only check the width.
+    // A NumPy file does not name its encoder, so the source name stays empty and the server can
+    // only check the width.
     let feature = pb::Feature {
         values: features.row(row).to_vec(),
         source_name: String::new(),
@@ -164,8 +164,8 @@ fn error_text(error: &pb::PoseError) -> String {
         })
         .collect();
 
-    // ‖Δ‖ is the norm of the difference between the wanted and the retrieved motion, metres and
-    // radians mixed: what Hit@ε compares with ε.
+    // ‖Δ‖ is the norm of the difference between the wanted and the retrieved motion, meters and
+    // radians mixed: Hit@ε compares it with ε.
     format!(
         "  error {:.3} m {:.2}°, ‖Δ‖ {:.3} ({})",
         error.translation_m,
@@ -195,8 +195,8 @@ fn pose_text(pose: Option<&pb::Pose>) -> String {
     )
 }
 
-/// The standard deviations of position and rotation, each as one number: the root of the sum of the
-/// variances along its three axes. Nothing where the covariance is not known.
+/// Standard deviations of position and rotation, one number each: the root of the sum of the
+/// variances along the three axes. Empty if the covariance is unknown.
 fn deviations_text(covariance: &[f64]) -> String {
     let Some(variances) = diagonal(covariance) else {
         return String::new();
@@ -206,11 +206,11 @@ fn deviations_text(covariance: &[f64]) -> String {
     let metres = deviation(&variances[..3]);
     let degrees = deviation(&variances[3..]).to_degrees();
 
-    // There is no direction further away than the opposite one.
+    // A rotation error is at most 180°.
     if degrees < 180.0 {
         format!(", ± {metres:.3} m, ± {degrees:.2}°")
     } else {
-        format!(", ± {metres:.3} m, in any direction")
+        format!(", ± {metres:.3} m, rotation unknown")
     }
 }
 
@@ -230,7 +230,7 @@ fn revision(revision: Option<&pb::Revision>) -> String {
     })
 }
 
-/// The diagonal of a 6×6 matrix, row by row; none for another length.
+/// The diagonal of a row-major 6×6 matrix; `None` for another length.
 fn diagonal(matrix: &[f64]) -> Option<[f64; 6]> {
     (matrix.len() == 36).then(|| std::array::from_fn(|row| matrix[7 * row]))
 }

@@ -23,13 +23,13 @@ pub struct Motion {
     /// Name of the room that the frames belong to
     #[arg(long, default_value = "")]
     room: String,
-    /// The frame that the motion starts from: a row of the room, counted from 0
+    /// First frame: a row of the room, counted from 0
     #[arg(long, requires = "to", conflicts_with_all = ["frames", "images", "feature"])]
     from: Option<u32>,
-    /// The frame that it leads to
+    /// Second frame: a row of the room, counted from 0
     #[arg(long, requires = "from")]
     to: Option<u32>,
-    /// The same in one: frames A,B of the room
+    /// Both frames in one option, A,B
     #[arg(
         long,
         value_delimiter = ',',
@@ -40,8 +40,8 @@ pub struct Motion {
     /// Two JPEG or PNG files, A,B; the server must have been started with --encoder or --two-view
     #[arg(long, value_delimiter = ',', value_name = "A,B", conflicts_with_all = ["frames", "feature"])]
     images: Option<Vec<PathBuf>>,
-    /// The camera that took --images, in pixels. With it, a server started with --two-view compares
-    /// the images themselves, unless --adapter names who reads the motion
+    /// Camera of --images, in pixels. With it, a server started with --two-view estimates the
+    /// motion by feature matching between the images, unless --adapter is given
     #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]", requires = "images")]
     camera: Option<CameraOption>,
     /// A NumPy file of features, shape (n, d); --rows chooses two
@@ -55,7 +55,7 @@ pub struct Motion {
 }
 
 impl Motion {
-    /// The two views.
+    /// The two views of the request.
     fn views(&self) -> anyhow::Result<(pb::View, pb::View)> {
         // Both views come from one kind of input: frames of a room, rows of a feature file, or
         // image files.
@@ -110,9 +110,9 @@ impl Motion {
             .context("the server sent no motion")?;
 
         match answer.reader() {
-            pb::MotionReader::TwoView => say("read from where things are in both images"),
+            pb::MotionReader::TwoView => say("estimated by feature matching between the images"),
             pb::MotionReader::None => {
-                say("the images show too little in common: no motion is read");
+                say("the images have too little in common: no motion was estimated");
             }
             pb::MotionReader::Adapter | pb::MotionReader::Unspecified => say(format_args!(
                 "adapter {}",
@@ -125,18 +125,18 @@ impl Motion {
             motion_text(motion)
         ));
 
-        // Standard deviations: the roots of the means of the covariance's diagonal.
+        // Standard deviation per axis: the root of the mean of three variances.
         if let Some(variances) = diagonal(&answer.covariance) {
             let deviation = |part: &[f64]| (part.iter().sum::<f64>() / 3.0).sqrt();
             say(format_args!(
-                "give or take {:.3} m, {:.1}° along each axis",
+                "standard deviation {:.3} m, {:.1}° per axis",
                 deviation(&variances[..3]),
                 deviation(&variances[3..]).to_degrees()
             ));
         }
 
-        // The true motion is only known when both views are frames of the room, whose poses were
-        // recorded.
+        // The true motion is known only if both views are frames of the room, which have recorded
+        // poses.
         if let (Some(truth), Some(error)) = (&answer.true_motion, &answer.error) {
             say(format_args!(
                 "truth  {}{}",

@@ -19,8 +19,8 @@ pub struct Navigate {
     /// Name of the room to navigate in
     #[arg(long)]
     room: String,
-    /// Name of the adapter; if empty, the default of the room: one that was fitted to it, then one that
-    /// was trained in it, then the newest that fits
+    /// Name of the adapter; if empty, the default of the room: one fitted to it, else one trained
+    /// in it, else the newest that fits
     #[arg(long, default_value = "")]
     adapter: String,
     /// Start at this frame of the room (its row, counted from 0)
@@ -28,21 +28,21 @@ pub struct Navigate {
     from: Option<u32>,
     #[command(flatten)]
     feature: FeatureRow,
-    /// Go to this frame of the room: the motion is computed from the recorded poses
+    /// Target frame of the room: the motion is computed from the recorded poses
     #[arg(long, conflicts_with = "twist")]
     to: Option<u32>,
-    /// The motion as vx,vy,vz,wx,wy,wz (se(3) twist), metres and radians, in the body frame of the
+    /// The motion as vx,vy,vz,wx,wy,wz (se(3) twist), meters and radians, in the body frame of the
     /// start camera (x right, y down, z forward)
     #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
     twist: Option<Vec<f64>>,
     /// Number of equal steps that the motion is divided into
     #[arg(long, default_value_t = 1)]
     steps: u32,
-    /// Where each step starts from
+    /// How the steps are chained
     #[arg(long, value_parser = one_of::<Mode>(), default_value = "open-loop")]
     mode: Mode,
-    /// How the mean μ and deviation σ of the training motions enter the inverse of W; the server
-    /// takes homogeneous if neither this nor --navigator is given
+    /// How the mean μ and deviation σ of the training motions enter the inverse of W; homogeneous
+    /// if neither this nor --navigator is given
     #[arg(long, value_parser = one_of::<Reading>(), conflicts_with = "navigator")]
     reading: Option<Reading>,
     /// Navigator by name, instead of inverse Poincaré: corrector-mlp-3, ridge-refit,
@@ -65,8 +65,7 @@ impl Navigate {
 
         self.json.begin()?;
 
-        // A navigation starts from exactly one view. Clap refuses two of them together; here it
-        // remains to check that there is one.
+        // A navigation starts from exactly one view. Clap rejects two; reject none here.
         let source = match (self.from, self.feature.view()?) {
             (Some(frame), _) => frame_view(frame),
             (None, Some(view)) => view,

@@ -1,4 +1,4 @@
-//! `seese3 relocalize`: in which room a camera is, and where in it, from some of its views.
+//! `seese3 relocalize`: the room and the pose of a camera, from several of its views.
 
 use std::path::PathBuf;
 
@@ -13,15 +13,14 @@ use seese3_client::proto::v1 as pb;
 pub struct Relocalize {
     #[command(flatten)]
     server: Server,
-    /// A room to search; all rooms that the adapter fits if none is named; may be given several
-    /// times
+    /// A room to search; all rooms that the adapter fits if omitted; may be given several times
     #[arg(long = "room")]
     rooms: Vec<String>,
     /// Name of the adapter; may be omitted when only one that can track fits the rooms
     #[arg(long, default_value = "")]
     adapter: String,
-    /// JPEG or PNG files, A,B,…: views of one camera that hardly moves between them, the newest last;
-    /// the server must have been started with --encoder
+    /// JPEG or PNG files, A,B,…: views of one camera that hardly moves between them, the newest
+    /// last; the server must have been started with --encoder
     #[arg(
         long,
         value_delimiter = ',',
@@ -40,7 +39,7 @@ pub struct Relocalize {
         requires = "features"
     )]
     rows: Vec<usize>,
-    /// The largest number of rooms returned; all are compared
+    /// Maximum number of rooms returned; all are compared
     #[arg(long, default_value_t = 3)]
     max_rooms: u32,
     #[command(flatten)]
@@ -81,13 +80,13 @@ impl Relocalize {
             revision(answer.adapter.as_ref()),
             answer.room_count,
             match answer.ambiguous {
-                true => format!("do not rely on it, {}", answer.reason),
-                false => "clear".to_owned(),
+                true => format!("ambiguous, {}", answer.reason),
+                false => "unambiguous".to_owned(),
             }
         ));
         for found in &answer.rooms {
             say(format_args!(
-                "room {}: at {:.2} of its limit, camera at {}{}",
+                "room {}: distance {:.2} of its limit, camera at {}{}",
                 revision(found.room.as_ref()),
                 found.out_of_distribution,
                 pose_text(found.pose.as_ref()),

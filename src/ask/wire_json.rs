@@ -1,5 +1,5 @@
-//! Messages of the protocol as JSON, by protobuf's own mapping: fields under their names in the
-//! protos, numbers that are absent left out.
+//! Protocol messages as JSON, with protobuf's own mapping: field names as in the protos, absent
+//! fields omitted.
 
 use anyhow::Context;
 use prost::Message;
@@ -7,7 +7,7 @@ use prost_reflect::{DescriptorPool, DynamicMessage, SerializeOptions};
 use seese3_client::proto::FILE_DESCRIPTOR_SET;
 use serde_json::Value;
 
-/// A message as JSON; `name` is that of its type in the protos.
+/// A message as JSON; `name` is the name of its type in the protos.
 pub fn wire_json(name: &str, message: &impl Message) -> anyhow::Result<Value> {
     let pool = DescriptorPool::decode(FILE_DESCRIPTOR_SET)?;
     let descriptor = pool
@@ -15,8 +15,8 @@ pub fn wire_json(name: &str, message: &impl Message) -> anyhow::Result<Value> {
         .with_context(|| format!("the protocol has no message {name}"))?;
     let message = DynamicMessage::decode(descriptor, message.encode_to_vec().as_slice())?;
 
-    // Fields that are zero or empty stay, so that a reader finds the same keys in every answer.
-    // Absent ones are left out, and 64-bit numbers are numbers.
+    // Zero and empty fields are kept, so that every answer has the same keys. Absent fields are
+    // omitted, and 64-bit numbers are written as numbers.
     let options = SerializeOptions::new()
         .use_proto_field_name(true)
         .skip_default_fields(false)

@@ -1,4 +1,4 @@
-//! `seese3 evaluate localization`: maps a part of a room and locates the views of the other part.
+//! `seese3 evaluate localization`: maps a part of a room and localizes the views of the other part.
 
 use anyhow::bail;
 use clap::Args;
@@ -20,22 +20,21 @@ pub struct Localization {
     /// The room
     #[arg(long)]
     room: String,
-    /// An adapter that learned from other rooms: it reads motions by itself and, with --fit, its
-    /// weights are where the fitted one begins
+    /// Pre-trained adapter of other rooms: evaluated zero-shot and, with --fit, the initial weights
+    /// of the fitted adapter
     #[arg(long)]
     adapter: Option<String>,
     /// Name of the feature set; by default that of the adapter, or the room's only one
     #[arg(long)]
     features: Option<String>,
-    /// Fit an adapter to the mapped frames alone, and answer by the rules that were measured on
-    /// them
+    /// Also fit an adapter to the mapped frames only, with rules that are measured on them
     #[arg(long)]
     fit: bool,
-    /// Every so many frames one is mapped; the views of the others are located
+    /// Map one frame in this many; the views of the others are localized
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     map_every: u32,
-    /// Map nothing of every fifth of twenty blocks of the recording, and locate the views of these
-    /// blocks alone
+    /// Divide the recording into 20 blocks, leave every fifth block unmapped, and localize only the
+    /// views of these blocks
     #[arg(long)]
     map_blocks: bool,
     /// Seed of the fitted adapter
@@ -90,7 +89,7 @@ impl Localization {
         progress.finish_and_clear();
 
         say(format_args!(
-            "room '{}' revision {}, features '{}': {} frames mapped, {} views located",
+            "room '{}' revision {}, features '{}': {} frames mapped, {} views localized",
             self.room,
             stored.revision,
             features.source().name,
@@ -119,11 +118,11 @@ impl Localization {
     }
 }
 
-/// Says how often the rules took the nearest frame's own pose, and whether their covariances hold.
+/// Prints how often the rules used the nearest frame's pose, and the coverage of their covariances.
 fn say_rules(rules: &RuleScores) {
     say(format_args!(
-        "ours took the nearest frame's own translation for {:.0} % of the views and its rotation for {:.0} %; its \
-         covariances hold {:.3} of the errors at 68 % and {:.3} at 95 %",
+        "ours used the nearest frame's translation for {:.0} % of the views and its rotation for {:.0} %; coverage \
+         of its covariances: {:.3} at 68 % and {:.3} at 95 %",
         100.0 * rules.translation_unread,
         100.0 * rules.rotation_unread,
         rules.coverage.within_68,

@@ -48,24 +48,25 @@ pub struct Evaluate {
 
 #[derive(Debug, Subcommand)]
 enum What {
-    /// Track held-out frames of rooms: path errors, covariances, tracking status, relocalisation
+    /// Track held-out frames of rooms: path errors, covariances, tracking status, relocalization
     Odometry(odometry::Odometry),
-    /// Locate single views in a partly mapped room: an adapter, also one fitted to the mapped
-    /// frames, beside the nearest frame
+    /// Localize single views in a partly mapped room, by an adapter or one fitted to the mapped
+    /// frames; the baseline is the nearest frame
     Localization(localization::Localization),
-    /// Read the motion between two views of a room, beside no motion and the mean motion
+    /// Estimate the motion between two views of a room; the baselines are zero motion and the mean
+    /// motion
     Motion(motion::Motion),
-    /// Plan ways from unmapped views to mapped goals, beside greedy search, a pose graph and a
-    /// topological graph
+    /// Plan paths from unmapped views to mapped goals; the baselines are greedy search, a pose
+    /// graph and a topological graph
     Planning(planning::Planning),
-    /// Track held-out frames whose images are turned, blurred, darkened, hidden, frozen or thinned
-    /// out, beside the nearest frame and standing still
+    /// Track held-out frames with rotated, blurred, darkened, occluded, frozen or dropped images;
+    /// the baselines are the nearest frame and standing still
     Robustness(robustness::Robustness),
     /// APE and RPE of an estimated trajectory against the true one, as evo defines them
     Trajectory(trajectory::EvaluateTrajectory),
 }
 
-/// Says which rooms an adapter has learned from or was calibrated on.
+/// Prints which rooms the adapter was trained or calibrated on.
 fn say_leaks(rooms: &[(StoredRoom, Features)], record: &TrainingRecord) {
     for (room, _) in rooms {
         let room = room.room.id();
@@ -114,39 +115,40 @@ struct Navigation {
     /// How frames are split into training and test; by default as the adapter was trained
     #[arg(long, value_parser = one_of::<Split>())]
     split: Option<Split>,
-    /// Do not retrieve the source frame
+    /// Never retrieve the source frame
     #[arg(long)]
     exclude_source: bool,
     /// ε of Hit@ε, separated by commas
     #[arg(long, value_delimiter = ',', default_values_t = seese3_core::navigation::HIT_THRESHOLDS)]
     thresholds: Vec<f64>,
-    /// Rows of the table by name, separated by commas; +row-space, +whitened or +motion may follow
-    /// the name of a step, and +calibrated that of inverse-poincare-homogeneous
+    /// Navigators, the rows of the table, by name, separated by commas; +row-space, +whitened or
+    /// +motion may follow the name of a step, and +calibrated may follow
+    /// inverse-poincare-homogeneous
     #[arg(long, value_delimiter = ',')]
     navigators: Vec<String>,
-    /// Number of equal steps that each motion is cut into
+    /// Number of equal steps that each motion is divided into
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1_000))]
     steps: u32,
-    /// How these steps are chained
+    /// How the steps are chained
     #[arg(long, value_parser = one_of::<Mode>(), default_value = "open-loop")]
     mode: Mode,
     /// Seed of the random navigator
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Draw Hit@ε over ε up to 1, a curve for each navigator, to this SVG file
+    /// Plot Hit@ε against ε up to 1, one curve per navigator, to this SVG file
     #[arg(long, value_name = "FILE.svg", value_parser = plot_file)]
     plot: Option<PathBuf>,
     /// Write the table to this file: .csv for programs, .tex for LaTeX with booktabs
     #[arg(long, value_name = "FILE.csv|FILE.tex", value_parser = table_file)]
     table: Option<PathBuf>,
-    // Flattened, it would keep clap from telling whether any option of the table was given.
-    /// Also write the results as JSON to this file; "-", or no name, is standard output, where
-    /// nothing else is then printed
+    // Not flattened: clap could no longer detect whether any option of the table was given.
+    /// Also write the results as JSON to this file. With "-" or no value, JSON goes to standard
+    /// output, and no text is printed
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = STANDARD_OUTPUT)]
     json: Option<PathBuf>,
 }
 
-/// A file whose name does not promise another kind of picture.
+/// Accepts a file name that ends with .svg.
 fn plot_file(text: &str) -> Result<PathBuf, String> {
     match Path::new(text).extension().and_then(OsStr::to_str) {
         Some("svg") => Ok(PathBuf::from(text)),
@@ -154,7 +156,7 @@ fn plot_file(text: &str) -> Result<PathBuf, String> {
     }
 }
 
-/// A file whose name says in which form the table is wanted.
+/// Accepts a file name that ends with .csv or .tex.
 fn table_file(text: &str) -> Result<PathBuf, String> {
     match Path::new(text).extension().and_then(OsStr::to_str) {
         Some("csv" | "tex") => Ok(PathBuf::from(text)),
@@ -177,7 +179,7 @@ impl Navigation {
         let store = Store::open(&self.store)?;
         let chosen = choose(&store, &self, self.split).await?;
 
-        // Without a name, the features are those that the adapter was trained on.
+        // By default, the features are those that the adapter was trained on.
         let features_name = self
             .features
             .clone()
@@ -240,7 +242,7 @@ impl Navigation {
             protocol.split, protocol.stride, report.n, report.candidate_count
         ));
 
-        // Warnings come before the table, so that nobody reads it without them.
+        // Print warnings before the table, where they are not overlooked.
         say_caveats(&protocol, &record, navigator.room().id(), leak);
         say(evaluation_table(&report).trim_end());
 
@@ -250,8 +252,8 @@ impl Navigation {
 
         self.write_files(&report, &curves)?;
         if json.is_wanted() {
-            // The file says what was evaluated and whether it leaks, so that it can be judged by
-            // itself.
+            // The file states what was evaluated and whether it leaks, so that it is
+            // self-contained.
             let context = EvaluationContext {
                 room: RoomJson {
                     name: self.room.clone(),
@@ -286,7 +288,7 @@ impl Navigation {
         all
     }
 
-    /// Writes the table and the curves to the files that were asked for.
+    /// Writes the table and the curves to the requested files.
     fn write_files(&self, report: &Report, curves: &Report) -> anyhow::Result<()> {
         if let Some(file) = &self.table {
             let text = match file.extension().and_then(OsStr::to_str) {
@@ -304,8 +306,7 @@ impl Navigation {
             );
             let mut drawn = hit_curves(curves, title);
             if self.navigators.is_empty() {
-                // Other metrics of a navigator, and those that have seen the test pairs, would hide
-                // the rest.
+                // Other retrieval metrics and in-sample navigators would hide the other curves.
                 let is_plain = |name: &str| !name.contains('+') && !name.ends_with("-in-sample");
                 drawn.series.retain(|series| is_plain(&series.name));
             }
@@ -316,7 +317,7 @@ impl Navigation {
         Ok(())
     }
 
-    /// The protocol of the options; where they leave out split or stride, the adapter's own.
+    /// The protocol from the options; split and stride default to those of the adapter's training.
     fn protocol(&self, record: &TrainingRecord) -> anyhow::Result<Protocol> {
         Ok(Protocol {
             split: self.split.unwrap_or(record.split),
@@ -331,7 +332,7 @@ impl Navigation {
     }
 }
 
-/// How well the adapter reads the motions of the test pairs, beside the simplest answers.
+/// Scores of the adapter's motion estimates on the test pairs, and of trivial baselines.
 fn motion_baselines(
     navigator: &Navigator,
     features: &Features,
@@ -360,7 +361,7 @@ fn motion_baselines(
     })
 }
 
-/// Prints what a reader of the table must know: several steps per motion, and leaks.
+/// Prints the caveats of the table: several steps per motion, and leaks.
 fn say_caveats(protocol: &Protocol, record: &TrainingRecord, room: &RoomId, leak: Option<Leak>) {
     if protocol.steps > 1 {
         say(format_args!(
@@ -370,7 +371,7 @@ fn say_caveats(protocol: &Protocol, record: &TrainingRecord, room: &RoomId, leak
         ));
     }
 
-    // The calibrated metric uses errors measured on the very poses that it is tested on.
+    // The calibrated metric uses errors measured on the same poses that it is tested on.
     if is_calibrated_in(record, room) {
         say(
             "LEAK: the adapter's errors were measured in this room; +calibrated has seen its poses",
@@ -387,7 +388,7 @@ fn say_caveats(protocol: &Protocol, record: &TrainingRecord, room: &RoomId, leak
     ));
 }
 
-/// The navigators with these names, or an error that lists the known names.
+/// The navigators with these names; the error lists the known names.
 pub fn navigators_named(names: &[String]) -> anyhow::Result<Vec<NavigatorKind>> {
     let named = |name: &String| {
         let unknown = || {
@@ -402,8 +403,8 @@ pub fn navigators_named(names: &[String]) -> anyhow::Result<Vec<NavigatorKind>> 
     names.iter().map(named).collect()
 }
 
-/// The adapter that was named, else the newest that was trained on the room, with these features
-/// and this split where they are given. Adapters of the wanted stride come first.
+/// The named adapter, else the newest that was trained on the room, with these features and this
+/// split if given. An adapter with the requested stride is preferred.
 async fn choose(
     store: &Store,
     wanted: &Navigation,
@@ -418,9 +419,9 @@ async fn choose(
     for name in &names {
         let stored = match store.load_adapter(name, None).await {
             Ok(stored) => stored,
-            // One adapter that cannot be read must not hide the others.
+            // An unreadable adapter must not hide the others.
             Err(error) => {
-                say(format_args!("passed over adapter '{name}': {error}"));
+                say(format_args!("skipped adapter '{name}': {error}"));
                 continue;
             }
         };
@@ -436,7 +437,7 @@ async fn choose(
                 .iter()
                 .any(|(room, _)| room.as_str() == wanted.room)
             && split.is_none_or(|split| split == stored.record.split)
-            // A fitted adapter has learned from every frame: its scores here would say nothing.
+            // A fitted adapter was trained on every frame, so its scores here would be in-sample.
             && stored.room_fit.is_none();
 
         if fits {
@@ -450,7 +451,7 @@ async fn choose(
             .is_none_or(|stride| stride == stored.record.stride)
     };
 
-    // Compared in this order: none of an experiment, the right stride, then the date, then the name.
+    // Order of preference: not from an experiment, the right stride, the newest, the name.
     let best = |a: &StoredAdapter| {
         (
             !a.is_experiment,

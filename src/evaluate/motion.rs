@@ -1,4 +1,4 @@
-//! `seese3 evaluate motion`: how well the motion between two views of a room is read.
+//! `seese3 evaluate motion`: accuracy of motion estimation between two views of a room.
 
 use anyhow::Context;
 use clap::Args;
@@ -27,11 +27,11 @@ pub struct Motion {
     /// The adapter
     #[arg(long, required_unless_present = "two_view")]
     adapter: Option<String>,
-    /// Also read each motion from where things are in both images, by these features: a grid of an
-    /// encoder's feature map that is as fine as the map, for instance xfeat-fusion-grid40x30
+    /// Also estimate each motion by matching these features between the views: a feature map pooled
+    /// at its full resolution, for example xfeat-fusion-grid40x30
     #[arg(long, value_name = "FEATURES")]
     two_view: Option<String>,
-    /// The camera of the images, in pixels, for --two-view; the room's own if omitted
+    /// Camera of the images, in pixels, for --two-view; the room's own if omitted
     #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]", requires = "two_view")]
     camera: Option<CameraOption>,
     /// Frames from the first view to the second
@@ -51,7 +51,7 @@ impl Motion {
             let (other, features) = store.load_room_with(&self.room, Some(name)).await?;
             anyhow::ensure!(
                 other.revision == stored.revision,
-                "room '{}' was published again meanwhile; try again",
+                "room '{}' got a new revision during loading; try again",
                 self.room
             );
 
@@ -109,7 +109,7 @@ impl Motion {
         Ok(())
     }
 
-    /// The room's frames as feature maps, and the camera that took them.
+    /// The feature maps of the room's frames, and their camera.
     fn maps<'a>(&self, room: &Room, dense: &'a Features) -> anyhow::Result<Maps<'a>> {
         let source = dense.source();
         let shape = source
@@ -119,18 +119,18 @@ impl Motion {
             .and_then(|pooling| pooling.map_shape(source.dim))
             .with_context(|| {
                 format!(
-                    "--two-view {}: is pooled as '{}', and a grid of the whole feature map is \
-                     needed: encode the room with --pool gridCxR, C and R the columns and rows of \
-                     the layer's map",
+                    "--two-view {}: the pooling is '{}', but the full feature map is needed: encode \
+                     the room with --pool gridCxR, where C and R are the columns and rows of the \
+                     layer's map",
                     source.name, source.pooling
                 )
             })?;
 
-        // A crop would change where the image's middle and edges are.
+        // A crop would change the principal point and the field of view.
         if let Ok((Preparation { crop: Some(_), .. }, _)) = Preparation::parse(&source.preprocess) {
             anyhow::bail!(
-                "--two-view {}: its images were cropped, so that the camera's focal length does \
-                 not hold for them; encode them whole",
+                "--two-view {}: its images were cropped, so the camera's focal length is not valid \
+                 for them; encode the images without a crop",
                 source.name
             );
         }
@@ -139,7 +139,7 @@ impl Motion {
             (Some(camera), _) => camera.pinhole()?,
             (None, Some(camera)) => camera,
             (None, None) => anyhow::bail!(
-                "room '{}' states no camera: give --camera, or import the room with --camera",
+                "room '{}' has no camera: give --camera, or import the room with --camera",
                 self.room
             ),
         };

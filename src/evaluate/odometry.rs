@@ -1,5 +1,5 @@
 //! `seese3 evaluate odometry`: replays held-out frames of rooms through a tracker, and reports path
-//! errors, covariances and tracking status.
+//! errors, covariance coverage and tracking status.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
@@ -34,20 +34,20 @@ pub struct Odometry {
     /// The rooms: names, or patterns with *
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// The adapter; it must be calibrated (`train --calibrate-on`), and on none of these rooms
+    /// The adapter; it must be calibrated (`train --calibrate-on`), but in none of these rooms
     #[arg(long)]
     adapter: String,
     /// Which frames are mapped and which are replayed
     #[arg(long, alias = "course", value_parser = one_of::<HoldOut>(), default_value = "blocks")]
     hold_out: HoldOut,
-    /// Frames after which a new keyframe is taken; by default what suits the adapter's training
+    /// Keyframe interval, frames; derived from the adapter's training if omitted
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     keyframe_frames: Option<u32>,
-    /// Dead reckoning alone: the map never corrects the pose
+    /// Dead reckoning only: no corrections from the map
     #[arg(long)]
     no_fusion: bool,
-    /// Fit an adapter to each room's mapped frames, from the weights of --adapter, and correct the
-    /// pose by what it reads
+    /// Fit an adapter to each room's mapped frames, initialized from --adapter, and correct the
+    /// pose by its estimates
     #[arg(long)]
     fit: bool,
     /// Write each room's paths to this folder, as TUM and KITTI files: ROOM.truth, ROOM.fused and
@@ -86,7 +86,7 @@ impl Odometry {
         };
         let trackers = trackers(&room_data, &adapter, &protocol)?;
 
-        // Paths are written as the rooms are done; the first failure is reported at the end.
+        // Paths are written as each room completes; the first failure is reported at the end.
         let progress = bar(trackers.len() as u64, "tracking");
         let unwritten: Mutex<Option<anyhow::Error>> = Mutex::new(None);
         let tracked = evaluate(&trackers, hold_out, &|room, replay| {
@@ -105,7 +105,7 @@ impl Odometry {
             return Err(error);
         }
 
-        // With one room there is no choice to be right or wrong about.
+        // Relocalization needs at least two rooms to choose from.
         let relocalised = (trackers.len() > 1)
             .then(|| relocalisation(&trackers, hold_out))
             .transpose()?;
@@ -120,9 +120,9 @@ impl Odometry {
             if self.no_fusion {
                 "dead reckoning"
             } else if self.fit {
-                "fused with what an adapter fitted to the mapped frames reads"
+                "fused with estimates of an adapter fitted to the mapped frames"
             } else {
-                "fused with places that look alike"
+                "fused with the most similar mapped frames"
             },
         ));
 
@@ -155,7 +155,7 @@ impl Odometry {
         Ok(())
     }
 
-    /// The adapter's own settings, but for what was asked for.
+    /// The adapter's settings, overridden by the given options.
     fn settings(&self, own: TrackerSettings) -> TrackerSettings {
         TrackerSettings {
             keyframe_frames: self.keyframe_frames.unwrap_or(own.keyframe_frames),
@@ -174,7 +174,7 @@ impl Odometry {
 
 fn write_paths(folder: &Path, room: &str, replay: &Replay) -> anyhow::Result<()> {
     std::fs::create_dir_all(folder)
-        .with_context(|| format!("{} cannot be made", folder.display()))?;
+        .with_context(|| format!("{} cannot be created", folder.display()))?;
 
     for (name, path) in [
         ("truth", &replay.truth),
@@ -193,7 +193,7 @@ fn write_paths(folder: &Path, room: &str, replay: &Replay) -> anyhow::Result<()>
     Ok(())
 }
 
-/// The head of a table and its last line, which holds the means.
+/// The header of a table and its last line, the means.
 fn only_mean(table: &str) -> String {
     let lines: Vec<&str> = table.lines().collect();
     match lines.as_slice() {
@@ -213,9 +213,9 @@ impl ClosedSet for HoldOut {
 
     fn help(self) -> &'static str {
         match self {
-            Self::Interleaved => "Every second frame is mapped, the others are replayed",
-            Self::Blocks => "As interleaved, but a fifth of the path is not mapped",
-            Self::Time => "The first four fifths are mapped, the last fifth is replayed",
+            Self::Interleaved => "Map every second frame, replay the others",
+            Self::Blocks => "As interleaved, but a fifth of the path stays unmapped",
+            Self::Time => "Map the first four fifths, replay the last",
         }
     }
 }

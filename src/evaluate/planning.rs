@@ -1,5 +1,5 @@
-//! `seese3 evaluate planning`: ways from unmapped views to mapped goals, beside those of simple
-//! planners.
+//! `seese3 evaluate planning`: plans paths from unmapped views to mapped goals, and compares them
+//! with those of simple planners.
 
 use clap::Args;
 
@@ -23,24 +23,24 @@ pub struct Planning {
     /// The rooms: names, or patterns with *
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// The adapter; only a calibrated one (`train --calibrate-on`) knows views of other rooms
+    /// The adapter; only a calibrated one (`train --calibrate-on`) detects views of other rooms
     #[arg(long)]
     adapter: String,
-    /// Which frames are mapped; views of the others are asked about
+    /// Which frames are mapped; views of the others are the start views
     #[arg(long, value_parser = one_of::<HoldOut>(), default_value = "interleaved")]
     hold_out: HoldOut,
-    /// Questions in each room
+    /// Number of queries in each room
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     questions: u32,
-    /// The longest hop, metres and radians mixed; by default the root mean square of the motions
-    /// that the adapter was trained on
+    /// Maximum hop length, meters and radians mixed; if omitted, the root mean square of the
+    /// motions that the adapter was trained on
     #[arg(long, value_parser = positive)]
     step: Option<f64>,
-    /// Fit an adapter to each room's mapped frames, from the weights of --adapter, which tells where
-    /// a view is
+    /// Fit an adapter to each room's mapped frames, initialized from --adapter, and localize the
+    /// views with it
     #[arg(long)]
     fit: bool,
-    /// Seed of the questions
+    /// Seed of the queries
     #[arg(long, default_value_t = 0)]
     seed: u64,
     #[command(flatten)]
@@ -71,7 +71,7 @@ impl Planning {
         progress.finish_and_clear();
 
         say(format_args!(
-            "{} rooms, {} questions in each, adapter '{}' revision {}, hold-out {}",
+            "{} rooms, {} queries in each, adapter '{}' revision {}, hold-out {}",
             found.len(),
             self.questions,
             stored.name,

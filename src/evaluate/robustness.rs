@@ -1,4 +1,4 @@
-//! `seese3 evaluate robustness`: disturbs the images of rooms and tracks them.
+//! `seese3 evaluate robustness`: tracks rooms with disturbed images.
 
 use std::path::{Path, PathBuf};
 
@@ -34,22 +34,22 @@ pub struct Robustness {
     /// The store
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// The rooms, which need images: names, or patterns with *
+    /// The rooms, imported with images: names, or patterns with *
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// The adapter; it must be calibrated (`train --calibrate-on`), and on none of these rooms
+    /// The adapter; it must be calibrated (`train --calibrate-on`), but in none of these rooms
     #[arg(long)]
     adapter: String,
     /// The encoder that the adapter was trained on: an ONNX file, `pixels` or `builtin`
     #[arg(long)]
     encoder: String,
-    /// Folder of the images; by default the one that the room was imported from
+    /// Folder of the images; the original folder of the room if omitted
     #[arg(long)]
     images: Option<PathBuf>,
     /// Which frames are mapped and which are replayed
     #[arg(long, value_parser = one_of::<HoldOut>(), default_value = "interleaved")]
     hold_out: HoldOut,
-    /// Only disturbances whose name has this text in it, such as roll; may be repeated
+    /// Only disturbances with this text in their names, for example roll; may be repeated
     #[arg(long = "only", value_name = "TEXT")]
     only: Vec<String>,
     #[command(flatten)]
@@ -58,7 +58,7 @@ pub struct Robustness {
     json: JsonOutput,
 }
 
-/// Images that are encoded together.
+/// Number of images that are encoded together.
 const BATCH: usize = 16;
 
 impl Robustness {
@@ -110,7 +110,7 @@ impl Robustness {
         progress.finish_and_clear();
 
         say(format_args!(
-            "{} rooms, adapter '{}' revision {}, hold-out {}; blank and frozen cameras are scored while they are so",
+            "{} rooms, adapter '{}' revision {}, hold-out {}; blank and frozen cameras are scored only while blank or frozen",
             trackers.len(),
             stored.name,
             stored.revision,
@@ -124,7 +124,7 @@ impl Robustness {
         Ok(())
     }
 
-    /// Those that are asked for.
+    /// The disturbances selected by `--only`.
     fn disturbances(&self) -> anyhow::Result<Vec<Disturbance>> {
         let is_asked = |disturbance: &Disturbance| {
             let name = disturbance.name();
@@ -137,7 +137,7 @@ impl Robustness {
                 .map(Disturbance::name)
                 .collect();
             bail!(
-                "no disturbance has such a name; there are: {}",
+                "no disturbance matches --only; known names: {}",
                 names.join(", ")
             );
         }
@@ -150,7 +150,7 @@ impl Robustness {
         let encoder = Encoder::of_source(source, &models, &self.runtime.runtime())?;
         let Some(encoder) = encoder else {
             bail!(
-                "adapter '{}' was trained on features of encoder '{}', which {} is not",
+                "adapter '{}' was trained on features of encoder '{}', but {} is another encoder",
                 self.adapter,
                 source.encoder,
                 self.encoder
@@ -159,7 +159,7 @@ impl Robustness {
 
         if encoder.window() > 1 {
             bail!(
-                "the encoder takes clips of {} images; disturbances are of single ones",
+                "the encoder takes clips of {} images, but disturbances apply to single images",
                 encoder.window()
             );
         }
@@ -167,7 +167,7 @@ impl Robustness {
     }
 }
 
-/// A camera whose images are disturbed before they are encoded.
+/// A camera with disturbed images.
 struct DisturbedCamera<'a> {
     encoder: &'a Encoder,
     root: &'a Path,
@@ -209,7 +209,7 @@ impl DisturbedCamera<'_> {
         Ok(evaluate(room, hold_out, self.disturbance, views)?)
     }
 
-    /// A frame's disturbed image, ready for the encoder, and whether it shows nothing.
+    /// A frame's disturbed image, prepared for the encoder, and whether it is blank.
     fn image(
         &self,
         room: &TrackedRoom<'_>,

@@ -13,10 +13,10 @@ use seese3_lab::report::{path_errors_json, path_errors_table};
 
 #[derive(Debug, Args)]
 pub struct EvaluateTrajectory {
-    /// The true path, a TUM file with lines "timestamp tx ty tz qx qy qz qw", world_from_camera
+    /// Ground-truth path, a TUM file with lines "timestamp tx ty tz qx qy qz qw", world_from_camera
     #[arg(long)]
     reference: PathBuf,
-    /// The estimated path, a TUM file
+    /// Estimated path, a TUM file
     #[arg(long)]
     estimate: PathBuf,
     /// Largest time difference at which two poses are matched, milliseconds
@@ -28,13 +28,14 @@ pub struct EvaluateTrajectory {
     json: JsonOutput,
 }
 
-/// Between which poses the relative error is taken.
+/// Pose pairs of the relative pose error.
 #[derive(Debug, Clone, Args)]
 pub struct RelativeOptions {
-    /// Number of poses from the first to the second of a pair, in RPE
+    /// RPE: number of poses from the first to the second of a pair
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     delta: u32,
-    /// Take every pair that far apart, overlapping ones too, instead of one after the other
+    /// RPE: use all pairs at this distance, including overlapping ones, instead of consecutive
+    /// pairs
     #[arg(long)]
     all_pairs: bool,
 }

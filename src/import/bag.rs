@@ -1,4 +1,4 @@
-//! `seese3 import bag`: bags of ROS 2, and recordings of Foxglove.
+//! `seese3 import bag`: ROS 2 bags and Foxglove recordings.
 
 use std::path::{Path, PathBuf};
 
@@ -12,20 +12,20 @@ use seese3_data::datasets::{self, Bag, Reader};
 
 #[derive(Debug, Args)]
 pub struct BagPath {
-    /// The bag's folder, or one file of it, .mcap or .db3
+    /// Folder of the bag, or one of its files, .mcap or .db3
     path: PathBuf,
-    /// The topic of the images; may be omitted if there is only one
+    /// Image topic; may be omitted if there is only one
     #[arg(long, value_name = "TOPIC")]
     image_topic: Option<String>,
-    /// The topic of the poses: PoseStamped, PoseWithCovarianceStamped or Odometry; may be omitted if
-    /// there is only one
+    /// Pose topic: PoseStamped, PoseWithCovarianceStamped or Odometry; may be omitted if there is
+    /// only one
     #[arg(long, value_name = "TOPIC", conflicts_with = "world_frame")]
     pose_topic: Option<String>,
-    /// Take the camera's poses from /tf: its pose in this frame, such as map
+    /// Read the camera's poses from /tf, relative to this frame, for example map
     #[arg(long, value_name = "FRAME")]
     world_frame: Option<String>,
-    /// The camera's pose (optical axes) in the frame whose poses are read, such as base_link:
-    /// x,y,z,qx,qy,qz,qw in metres; needed where /tf does not have it
+    /// Pose of the camera (optical axes) in the frame that the pose topic describes, for example
+    /// base_link: x,y,z,qx,qy,qz,qw in meters; needed if /tf does not have it
     #[arg(
         long,
         value_delimiter = ',',
@@ -34,8 +34,8 @@ pub struct BagPath {
         conflicts_with = "world_frame"
     )]
     base_from_camera: Option<Vec<f64>>,
-    /// The folder for the images, which the room refers to, a folder in it for each topic; BAG-images
-    /// beside the bag if omitted. A file that is there is never replaced
+    /// Folder for the images, to which the room refers, with a subfolder per topic; BAG-images next
+    /// to the bag if omitted. Existing files are never replaced
     #[arg(long, value_name = "DIR")]
     images_to: Option<PathBuf>,
     #[command(flatten)]
@@ -69,7 +69,7 @@ impl BagPath {
     }
 }
 
-/// The pose of a camera on a robot.
+/// Parses the pose of a camera on a robot.
 fn mounting(numbers: &[f64]) -> anyhow::Result<Pose> {
     let &[x, y, z, qx, qy, qz, qw] = numbers else {
         bail!(
@@ -81,7 +81,7 @@ fn mounting(numbers: &[f64]) -> anyhow::Result<Pose> {
         .map_err(|problem| anyhow::anyhow!("--base-from-camera: {problem}"))
 }
 
-/// The folder BAG-images beside a bag, which is a folder BAG or a file BAG.mcap or BAG.db3.
+/// The folder BAG-images next to a bag, which is a folder BAG or a file BAG.mcap or BAG.db3.
 fn images_beside(bag: &Path) -> PathBuf {
     // A path such as `.` only has a name once it is resolved.
     let path = bag.canonicalize().unwrap_or_else(|_| bag.to_owned());

@@ -1,4 +1,4 @@
-//! `seese3 import bag` of a program without the feature `bags`.
+//! `seese3 import bag` in a build without the feature `bags`.
 
 use std::ffi::OsString;
 
@@ -8,7 +8,7 @@ use crate::output::not_built;
 
 #[derive(Debug, Args)]
 pub struct BagPath {
-    /// Whatever is given: the command needs a program with the feature `bags`
+    /// Ignored: the command needs a build with the feature `bags`
     #[arg(
         trailing_var_arg = true,
         allow_hyphen_values = true,

@@ -1,4 +1,4 @@
-//! Where a recording goes and how it is read: the options and the steps that all formats share.
+//! Options and steps that all import formats share.
 
 use std::path::{Path, PathBuf};
 
@@ -31,23 +31,23 @@ pub struct Destination {
     /// Keep every K-th usable frame of each sequence
     #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// Fail and publish nothing if a frame is unusable, instead of dropping it, and if the poses are
-    /// wrong (contradicted by the images, all the same, identities where tracking was lost, steps that
-    /// no camera makes in metres, times that do not rise), instead of warning
+    /// Fail and publish nothing, instead of dropping frames and warning, if a frame is unusable or
+    /// the poses are wrong: contradicted by the images, all identical, identities from lost
+    /// tracking, steps too long for meters, or timestamps that do not increase
     #[arg(long)]
     strict: bool,
     /// Publish a new revision even if the store has a room of this name with other frames; the
-    /// features of those frames are not carried over
+    /// features of the old frames are not carried over
     #[arg(long)]
     replace: bool,
     /// Features of all usable frames, NAME=FILE.npy, shape (n, d), one row per frame before
     /// --every; may be given several times
     #[arg(long = "features", value_name = "NAME=FILE")]
     features: Vec<String>,
-    /// Licence of the recording, stored with the room
+    /// License of the recording, stored with the room
     #[arg(long, default_value = "")]
     licence: String,
-    /// The camera of the images, in pixels; motions between two images are read with it
+    /// Camera of the images, in pixels; needed for motion estimation between two images
     #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]")]
     camera: Option<CameraOption>,
     #[command(flatten)]
@@ -60,8 +60,7 @@ pub struct Destination {
 }
 
 impl Destination {
-    /// Refuses to replace a room of the same name by one with other frames, unless --replace was
-    /// given.
+    /// Rejects replacing a room of the same name that has other frames, unless --replace was given.
     async fn refuse_other_frames(&self, store: &Store, room: &Room) -> anyhow::Result<()> {
         let before = match store.load_room(room.id().as_str(), None).await {
             Ok(before) => before.room,
@@ -69,15 +68,15 @@ impl Destination {
             Err(error) => return Err(error.into()),
         };
 
-        // Features belong to frames: new frames would silently lose the features that were
-        // computed for the old ones.
+        // Features belong to frames: a room with new frames would silently lose the features of the
+        // old ones.
         if self.replace || same_poses(&before, room) {
             return Ok(());
         }
 
         bail!(
             "room '{}' is in the store with other frames ({} from {}, these are {}); give another --name, or --replace, \
-             which leaves its features behind",
+             which drops its features",
             room.id(),
             before.frame_count(),
             before.provenance().format,
@@ -85,13 +84,12 @@ impl Destination {
         );
     }
 
-    /// Finds out before the work whether its results can be written.
+    /// Checks, before the work, that the results can be written.
     pub fn begin(&self) -> anyhow::Result<()> {
         self.json.begin()
     }
 
-    /// Reads a recording with a progress bar, dropping or refusing unusable frames as --strict
-    /// says.
+    /// Reads a recording with a progress bar. Drops unusable frames, or fails on one with --strict.
     pub fn read<T>(
         &self,
         read: impl FnOnce(&mut Reader<'_>) -> Result<T, datasets::Error>,
@@ -106,7 +104,7 @@ impl Destination {
             Unusable::Drop
         };
 
-        // Only the reader knows how many frames there are, so the bar gets its length from it.
+        // The reader determines the number of frames, so the bar gets its length from it.
         let mut tell = |done: usize, total: usize| {
             progress.set_length(total as u64);
             progress.set_position(done as u64);
@@ -120,8 +118,8 @@ impl Destination {
         Ok(recording)
     }
 
-    /// The room of a recording. An exported bundle states its name, format and licence: the
-    /// original format is kept, and --licence and --name win over the stated ones.
+    /// The room of a recording. An exported bundle states its name, format and license: the
+    /// original format is kept, and --licence and --name override the stated values.
     fn room(
         &self,
         format: &str,
@@ -149,7 +147,7 @@ impl Destination {
                 .or(stated.camera),
         };
 
-        // The name given wins, then the bundle's own, then one derived from the path.
+        // Name: --name, else the bundle's, else derived from the path.
         let name = match &self.name {
             Some(name) => name.clone(),
             None if !stated.name.is_empty() => stated.name.clone(),
@@ -159,7 +157,7 @@ impl Destination {
         Ok(Room::new(id, frames, provenance)?)
     }
 
-    /// Prints what was read.
+    /// Prints a summary of the recording.
     fn say_read(
         &self,
         room: &Room,
@@ -201,8 +199,8 @@ impl Destination {
         say_dropped(&recording.dropped);
     }
 
-    /// Reads the feature files that options name. They have one row per usable frame, and are checked
-    /// against that count before --every thins both.
+    /// Reads the feature files of the options. They have one row per usable frame; the count is
+    /// checked before --every thins both.
     fn read_features(&self, recording: &mut Recording) -> anyhow::Result<()> {
         for given in &self.features {
             recording.features.push(read_features(given)?);
@@ -235,7 +233,7 @@ impl Destination {
 
         self.read_features(&mut recording)?;
 
-        // Frames and features keep the same rows; counting starts anew in each sequence.
+        // Frames and features keep the same rows; counting restarts in each sequence.
         let kept = recording.every(self.every as usize);
         let features = recording
             .features
@@ -243,8 +241,8 @@ impl Destination {
             .map(|set| set.select(&kept))
             .collect::<Vec<_>>();
 
-        // The images are compared with the poses as they are stated, so that a mistake can be named
-        // by the options that mend it.
+        // Compare the images with the poses before their conversion, so that warnings can suggest
+        // the options that correct a mistake.
         let mut frames = recording.frames.select(&kept);
         let read_as = self.read_as.convention(direction);
         let stated = self.read_as.scaled(&frames.poses);
@@ -252,8 +250,7 @@ impl Destination {
         frames.poses = read.collect();
         let room = self.room(format, path, &recording, frames)?;
 
-        // The last checks come before the first write: a refused import leaves the store as it
-        // was.
+        // The last checks come before the first write: a failed import leaves the store unchanged.
         check_features(&room, &features)?;
         let store = Store::create(&self.store)?;
         self.refuse_other_frames(&store, &room).await?;
@@ -269,7 +266,7 @@ impl Destination {
         say_report(&report, from);
         if format == "colmap" && self.read_as.has_no_scale() {
             eprintln!(
-                "warning: COLMAP's unit of length is arbitrary, and everything here is in metres: give --scale \
+                "warning: the scale of a COLMAP model is arbitrary, and rooms are in meters: give --scale \
                  FACTOR, or --scale 1 if the model was aligned with known positions"
             );
         }
@@ -291,7 +288,7 @@ impl Destination {
             false => store.publish_same_frames(&room, &features).await?,
         };
 
-        // Publishing the same content again makes no new revision, so an import can safely be
+        // Publishing the same content again creates no new revision, so an import can safely be
         // repeated.
         let state = if published.is_new {
             "published"
@@ -314,8 +311,8 @@ impl Destination {
     }
 }
 
-/// A room's name from its path. Folder names of 12-Scenes rooms and 7-Scenes sequences repeat, so
-/// the name of the parent folder is put before them.
+/// A room name from its path. Folder names of 12-Scenes rooms and 7-Scenes sequences repeat, so the
+/// parent folder's name is prepended.
 fn name_from(format: &str, path: &Path) -> Option<String> {
     // A path such as `.` only has a name once it is resolved.
     let path = path.canonicalize().ok()?;

@@ -1,4 +1,4 @@
-//! What is printed about the frames of a recording.
+//! Printed summary of the frames of a recording.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -6,7 +6,7 @@ use crate::output::say;
 use seese3_core::room::Room;
 use seese3_data::datasets::Dropped;
 
-/// The number of dropped frames that are listed one by one; beyond that they are only counted.
+/// Maximum number of dropped frames that are listed one by one; further ones are only counted.
 const MOST_LISTED: usize = 20;
 
 /// Prints the facts about the frames that limit their use: sequences, the recording's own split,
@@ -53,13 +53,13 @@ pub fn say_frames(room: &Room) {
     }
 }
 
-/// Prints which frames were left out, and why.
+/// Prints which frames were dropped, and why.
 pub fn say_dropped(dropped: &[Dropped]) {
     for frame in dropped.iter().take(MOST_LISTED) {
         say(format_args!("dropped {frame}"));
     }
 
-    // A long list is cut after the first MOST_LISTED frames; the counts by reason cover all of them.
+    // The list ends after MOST_LISTED frames; the counts by reason cover all of them.
     let mut counts = BTreeMap::new();
     for frame in dropped {
         *counts.entry(frame.reason).or_insert(0) += 1;

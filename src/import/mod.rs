@@ -2,10 +2,10 @@
 //!
 //! | file | what |
 //! | --- | --- |
-//! | here | the formats, and what each of them is asked for |
-//! | `bag`, `numpy` | formats with more to ask for |
-//! | `destination` | where a recording goes and how it is read, the same for every format |
-//! | `frame_summary` | what is printed about the frames |
+//! | here | the formats and their options |
+//! | `bag`, `numpy` | formats with more options |
+//! | `destination` | options and steps that all formats share |
+//! | `frame_summary` | the printed summary of the frames |
 
 #[cfg_attr(not(feature = "bags"), path = "bag_not_built.rs")]
 mod bag;
@@ -43,7 +43,7 @@ enum Format {
     /// 7-Scenes: a scene's folder (seq-XX/frame-XXXXXX.pose.txt), or one sequence's
     #[command(name = "7scenes")]
     SevenScenes(Seven),
-    /// A folder of your own: images/, and poses.npy (n, 4, 4) in the order of the images' names
+    /// Your own folder: images/, and poses.npy (n, 4, 4) in the order of the image names
     Folder(Plain),
     /// COLMAP: a model (cameras and images, .bin or .txt), or a project's folder with sparse/0
     Colmap(Colmap),
@@ -53,10 +53,10 @@ enum Format {
     Kitti(KittiFiles),
     /// EuRoC MAV: a sequence's folder (mav0/cam0, mav0/state_groundtruth_estimate0)
     Euroc(Euroc),
-    /// A bag of ROS 2 (.mcap, .db3) or a recording of Foxglove, with images and poses or /tf
+    /// ROS 2 bag (.mcap, .db3) or Foxglove recording, with images and poses or /tf
     #[command(visible_alias = "mcap")]
     Bag(BagPath),
-    /// NumPy files: poses (n, 4, 4) world_from_camera in metres, features (n, d)
+    /// NumPy files: poses (n, 4, 4) world_from_camera in meters, features (n, d)
     Numpy(Numpy),
     /// A folder that `seese3 export numpy` wrote
     Bundle(Plain),
@@ -79,8 +79,8 @@ struct Seven {
     /// One sequence, for instance seq-01; if omitted, all sequences of the scene make one room
     #[arg(long)]
     sequence: Option<String>,
-    /// A text file with a 4x4 matrix, rgb_from_depth in metres: poses of the depth camera are
-    /// converted to those of the colour camera
+    /// A text file with a 4x4 matrix, rgb_from_depth in meters: converts poses of the depth camera
+    /// to those of the color camera
     #[arg(long, value_name = "FILE")]
     rgb_from_depth: Option<PathBuf>,
     #[command(flatten)]
@@ -93,7 +93,7 @@ struct Seven {
 struct Colmap {
     /// The model's folder, or the project's
     path: PathBuf,
-    /// The folder that the names of images start from; looked for beside the model if omitted
+    /// Folder that the image names are relative to; searched next to the model if omitted
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
     #[command(flatten)]
@@ -104,12 +104,12 @@ struct Colmap {
 
 #[derive(Debug, Args)]
 struct KittiFiles {
-    /// The file of poses, twelve numbers a line
+    /// Pose file, twelve numbers per line
     path: PathBuf,
-    /// The folder of the images, in the order of their numbers, such as sequences/00/image_2
+    /// Folder of the images, in the order of their numbers, for example sequences/00/image_2
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
-    /// The file of times, seconds, one a line, such as sequences/00/times.txt
+    /// File of timestamps, seconds, one per line, for example sequences/00/times.txt
     #[arg(long, value_name = "FILE")]
     times: Option<PathBuf>,
     #[command(flatten)]
@@ -122,7 +122,7 @@ struct KittiFiles {
 struct Euroc {
     /// The sequence's folder
     path: PathBuf,
-    /// Which of its cameras
+    /// Name of the camera
     #[arg(long = "device", value_name = "NAME", default_value = "cam0")]
     device: String,
     #[command(flatten)]
@@ -167,7 +167,7 @@ impl Import {
     }
 }
 
-/// A `.sens` file holds a whole scan; otherwise an exporter has unpacked it into a folder.
+/// A `.sens` file holds a whole scan; a folder holds an unpacked scan.
 fn scannet(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, datasets::Error> {
     if path.is_file() {
         datasets::read_sens(path, reader)

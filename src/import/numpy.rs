@@ -11,11 +11,12 @@ use seese3_data::datasets;
 
 #[derive(Debug, Args)]
 pub struct Numpy {
-    /// A folder of poses.npy and, optionally, timestamps.npy, frame_ids.npy and features_NAME.npy
+    /// A folder with poses.npy and, optionally, timestamps.npy, frame_ids.npy and features_NAME.npy
     #[arg(required_unless_present = "poses", conflicts_with = "timestamps")]
     path: Option<PathBuf>,
-    /// Two things, and may be given for each: world_from_camera or camera_from_world, which transform
-    /// the poses are; or, instead of a folder, the NumPy file of poses, shape (n, 4, 4), f64 or f32
+    /// Either the transform that the poses represent, world_from_camera or camera_from_world, or,
+    /// instead of a folder, the NumPy file of poses, shape (n, 4, 4), f64 or f32; may be given once
+    /// for each
     #[arg(long, value_name = "TRANSFORM|FILE", action = clap::ArgAction::Append)]
     poses: Vec<PosesOption>,
     /// NumPy file of timestamps, shape (n,), int64 nanoseconds or float seconds; only with --poses
@@ -50,7 +51,7 @@ impl Numpy {
             match given {
                 PosesOption::Direction(given) if direction.is_none() => direction = Some(given),
                 PosesOption::Direction(_) => {
-                    bail!("--poses: which transform the poses are was said twice")
+                    bail!("--poses: the transform was given twice")
                 }
                 PosesOption::File(given) if file.is_none() => file = Some(given),
                 PosesOption::File(given) => bail!(
@@ -63,8 +64,8 @@ impl Numpy {
         // Arrays come either as a folder with fixed file names or as single files.
         let recording = match (&self.path, &file) {
             (Some(folder), Some(file)) => bail!(
-                "--poses: {} is neither world_from_camera nor camera_from_world; as the file of \
-                 poses it is read instead of the folder {}: give one of them",
+                "--poses: {} is neither world_from_camera nor camera_from_world; as a pose file, it \
+                 would replace the folder {}: give only one of them",
                 file.display(),
                 folder.display()
             ),
@@ -87,7 +88,7 @@ impl Numpy {
             (None, None) => bail!("a folder or --poses FILE is required"),
         };
 
-        // Single files have no folder that the room could be named after.
+        // Without a folder, the room has no default name.
         if self.path.is_none() && self.to.name.is_none() {
             bail!("--name NAME is required");
         }

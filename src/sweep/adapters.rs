@@ -1,4 +1,4 @@
-//! `seese3 sweep adapters`: one adapter per room and point of a grid, resumable and sharded.
+//! `seese3 sweep adapters`: one adapter per room and grid point, resumable and sharded.
 
 use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
@@ -24,7 +24,7 @@ use seese3_lab::report::{
 };
 use seese3_store::{Store, StoredRoom};
 
-/// How many of the best configurations are printed.
+/// Number of best configurations that are printed.
 const SHOWN: usize = 10;
 
 #[derive(Debug, Args)]
@@ -32,10 +32,10 @@ pub struct Adapters {
     /// The store
     #[arg(long, env = "SEESE3_STORE")]
     store: String,
-    /// The rooms, each trained on by itself: names, or patterns with *
+    /// The rooms, each trained on separately: names, or patterns with *
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// Feature sets by name, separated by commas; may be left out when the first room has one
+    /// Feature sets by name, separated by commas; may be omitted when the first room has only one
     #[arg(long, value_delimiter = ',')]
     features: Vec<String>,
     #[command(flatten)]
@@ -52,16 +52,16 @@ pub struct Adapters {
     /// Losses, separated by commas
     #[arg(long, value_parser = one_of::<Loss>(), value_delimiter = ',', default_values = ["mse", "cosine", "rotation"])]
     losses: Vec<Loss>,
-    /// Runs of each configuration, from seed 0 on
+    /// Number of runs of each configuration, with seeds from 0 on
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     seeds: u64,
-    /// Try only this many configurations, drawn from the grid by --sample-seed; by default all
+    /// Run only this many configurations, drawn from the grid by --sample-seed; all if omitted
     #[arg(long)]
     sample: Option<usize>,
-    /// Seed of the draw of --sample
+    /// Seed of --sample
     #[arg(long, default_value_t = 0)]
     sample_seed: u64,
-    /// Do only part I of N of the runs, for a scheduler that spreads them: 1/4 to 4/4
+    /// Run only shard I of N, to distribute a sweep over jobs: 1/4 to 4/4
     #[arg(long, value_name = "I/N", default_value = "1/1")]
     shard: String,
     /// Folder of the results; runs that it already holds are not repeated
@@ -71,7 +71,7 @@ pub struct Adapters {
     json: JsonOutput,
 }
 
-/// A run to do, with its row still without scores.
+/// A pending run, with its row without scores.
 struct Task<'a> {
     room: &'a (StoredRoom, Features),
     plan: TrainingPlan,
@@ -86,7 +86,7 @@ impl Adapters {
         self.protocol.leaves_to_the_grid()?;
         ensure!(
             self.protocol.splits().len() == 1,
-            "--split folds: the tables of this sweep take the best run of a room, which would be its easiest fold; take one \
+            "--split folds: this sweep reports the best run of each room, which would favor its easiest fold; use one \
              of fold1 to fold5, or `seese3 probe --split folds`"
         );
         ensure!(self.sample != Some(0), "--sample must be at least 1");
@@ -104,7 +104,7 @@ impl Adapters {
 
         let journal = SweepJournal::open(&self.out, &format!("shard-{part}-of-{parts}"))?;
 
-        // What any shard has finished, now or before a restart, is not repeated.
+        // Skip the runs that any shard has finished, now or before a restart.
         let known: HashSet<String> = journal::rows(&self.out)?
             .into_iter()
             .map(|row| row.key)
@@ -123,14 +123,14 @@ impl Adapters {
             .filter(|task| !known.contains(&task.row.key))
             .collect();
         say(format_args!(
-            "{} rooms and features; {all} runs, {} of them to be done here (shard {part} of {parts})",
+            "{} combinations of room and features; {all} runs, {} of them to be done here (shard {part} of {parts})",
             rooms.len(),
             ours.len()
         ));
 
         let progress = bar(ours.len() as u64, "sweep");
 
-        // Every row is written when its run ends, so a killed sweep loses only the runs under way.
+        // Each row is written when its run ends, so a killed sweep loses only the runs in progress.
         ours.into_par_iter().try_for_each(|task| {
             let row = run(&data(task.room), &task.plan, task.row);
             progress.inc(1);
@@ -139,8 +139,7 @@ impl Adapters {
 
         progress.finish_and_clear();
 
-        // The Parquet file holds every run of the folder; the printed tables are of this grid
-        // alone.
+        // The Parquet file has every run of the folder; the printed tables cover only this grid.
         let in_folder = journal::rows(&self.out)?;
         let file = self.out.join("runs.parquet");
         write_file(&file, &sweep_parquet(&in_folder)?)?;
@@ -160,7 +159,7 @@ impl Adapters {
 
         self.json.write(&json!({ "runs": rows }))?;
 
-        // Failed runs are rows like others, but a sweep without any score has failed.
+        // Failed runs also have rows, but a sweep without any score has failed.
         ensure!(
             rows.iter().any(|row| row.failure.is_empty()),
             "no run of this grid has scores"
@@ -173,7 +172,7 @@ impl Adapters {
     fn say_summary(&self, rows: &[SweepRow]) -> anyhow::Result<()> {
         let base = self.protocol.plan(0)?;
         say(format_args!(
-            "preset {} with {} epochs, split {}, stride {}; of each room the best run counts, chosen by its test score:",
+            "preset {} with {} epochs, split {}, stride {}; best run of each room, selected by test score:",
             base.preset.name(),
             base.config.epochs,
             base.split,
@@ -181,7 +180,7 @@ impl Adapters {
         ));
 
         say(aligned(&success_rows(rows)).trim_end());
-        say("\nhow hard the rooms are:");
+        say("\nroom difficulty:");
         say(aligned(&difficulty_rows(rows)).trim_end());
 
         say(format_args!(
@@ -221,8 +220,8 @@ impl Adapters {
         }
     }
 
-    /// Every run of the grid. The order depends on the rooms and the arguments alone, so that all
-    /// shards cut the same list.
+    /// Every run of the grid. The order depends only on the rooms and the arguments, so that all
+    /// shards divide the same list.
     fn tasks<'a>(&self, rooms: &'a [(StoredRoom, Features)]) -> anyhow::Result<Vec<Task<'a>>> {
         let mut grid: Vec<(usize, usize, f64, Loss)> = Vec::new();
         for &geo_dim in &self.geo_dims {
@@ -238,7 +237,7 @@ impl Adapters {
             "the grid is empty: give at least one of --geo-dims, --chart-counts, --lrs, --losses"
         );
 
-        // A smaller sample with the same seed is a part of a larger one, so a sweep can be
+        // A smaller sample with the same seed is a subset of a larger one, so a sweep can be
         // extended.
         if let Some(count) = self.sample {
             let chosen = nested_choice(count, grid.len(), self.sample_seed);

@@ -20,7 +20,7 @@ pub struct Formulations {
     /// The rooms: names, or patterns with *
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// Name of their feature set; may be left out when the first room has one
+    /// Name of the feature set; may be omitted when the first room has only one
     #[arg(long)]
     features: Option<String>,
     #[command(flatten)]
@@ -28,7 +28,7 @@ pub struct Formulations {
     /// Train one network on all rooms together, instead of one per room
     #[arg(long)]
     pooled: bool,
-    /// Seeds of each formulation, from 0 on; the paper used 15
+    /// Number of seeds of each formulation, from 0 on; the paper uses 15
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1_000))]
     seeds: u64,
     #[command(flatten)]
@@ -42,11 +42,11 @@ impl Formulations {
         self.protocol.needs_test_pairs()?;
         let store = Store::open(&self.store)?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
-        // The plans of several folds differ in their split alone.
+        // The plans of several folds differ only in their split.
         let plans = self.protocol.plans(0)?;
         let plan = &plans[0];
 
-        // A setting out of range is refused here, before any task has started.
+        // Reject a setting out of range before any task starts.
         plan.check()?;
 
         let room_data: Vec<RoomData<'_>> = rooms.iter().map(data).collect();

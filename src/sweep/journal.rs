@@ -1,5 +1,5 @@
-//! The journal of a sweep: one line per finished run, written at once, from which a killed sweep
-//! resumes.
+//! The journal of a sweep: one line per finished run, written at once. A killed sweep resumes from
+//! it.
 
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -10,7 +10,7 @@ use anyhow::Context;
 
 use seese3_lab::experiments::adapter_sweep::SweepRow;
 
-/// The end of every journal's file name.
+/// Suffix of every journal's file name.
 const EXTENSION: &str = "runs.jsonl";
 
 /// The journal of one shard, open for appending and locked against other processes.
@@ -20,11 +20,11 @@ pub struct SweepJournal {
 }
 
 impl SweepJournal {
-    /// Opens the journal of a shard; creates the folder if needed, and cuts off a last line that a
+    /// Opens the journal of a shard. Creates the folder if needed, and removes a last line that a
     /// killed sweep left incomplete.
     pub fn open(folder: &Path, shard: &str) -> anyhow::Result<Self> {
         std::fs::create_dir_all(folder)
-            .with_context(|| format!("{} cannot be made", folder.display()))?;
+            .with_context(|| format!("{} cannot be created", folder.display()))?;
         let path = folder.join(format!("{shard}.{EXTENSION}"));
         let shown = || format!("{} cannot be written", path.display());
 
@@ -40,7 +40,8 @@ impl SweepJournal {
         file.try_lock()
             .with_context(|| format!("{} is in use by another sweep", path.display()))?;
 
-        // Appending to an incomplete line would spoil two rows: cut behind the last line that ends.
+        // Appending to an incomplete line would corrupt two rows: truncate after the last complete
+        // line.
         let text = std::fs::read(&path).with_context(shown)?;
         let whole = text
             .iter()
@@ -71,7 +72,7 @@ impl SweepJournal {
     }
 }
 
-/// The rows of all journals in a folder, sorted by key; a run that stands in several counts once.
+/// The rows of all journals in a folder, sorted by key, without duplicates.
 pub fn rows(folder: &Path) -> anyhow::Result<Vec<SweepRow>> {
     // Sorted by key, the rows do not depend on which shard finished first.
     let mut found = std::collections::BTreeMap::new();
@@ -86,7 +87,7 @@ pub fn rows(folder: &Path) -> anyhow::Result<Vec<SweepRow>> {
         let text =
             std::fs::read(&path).with_context(|| format!("{} cannot be read", path.display()))?;
 
-        // Another shard may be in the middle of its last line: only lines that end are read.
+        // Another shard may be writing its last line: read only complete lines.
         let whole = text
             .iter()
             .rposition(|&byte| byte == b'\n')

@@ -25,8 +25,8 @@ pub struct Layers {
     /// The room; give it several times for means over rooms
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
-    /// Feature sets by name, or by the part of their names before a hyphen; by default all of the
-    /// room's
+    /// Feature sets by name, or by the part of their names before a hyphen; all of the room's if
+    /// omitted
     #[arg(long, value_delimiter = ',')]
     features: Vec<String>,
     /// Frames from the source to the target of a pair, in M3 and M4
@@ -35,32 +35,32 @@ pub struct Layers {
     /// How frames are split into training and test, in M3 and M4
     #[arg(long, value_parser = one_of::<SplitChoice>(), default_value = "time")]
     split: SplitChoice,
-    /// The training preset of M4
+    /// Training preset of M4
     #[arg(long, value_parser = one_of::<Preset>(), default_value = "paper-base")]
     preset: Preset,
-    /// Epochs of M4, in place of the preset's
+    /// Epochs of M4, instead of the preset's
     #[arg(long)]
     epochs: Option<usize>,
-    /// How many adapters M4 trains, with seeds from 0 on
+    /// Number of adapters that M4 trains, with seeds from 0 on
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1_000))]
     seeds: u64,
-    /// How many frames M1 compares
+    /// Number of frames that M1 compares
     #[arg(long, default_value_t = 256)]
     m1_frames: usize,
     /// Stride between the frames that M1 compares
     #[arg(long, default_value_t = 1)]
     m1_stride: usize,
-    /// Neighbours of a frame in M1, k
+    /// Neighbors of a frame in M1, k
     #[arg(long, default_value_t = 10)]
     m1_k: usize,
-    /// Frames to each side that do not count as neighbours, in M1
+    /// Frames to each side that do not count as neighbors, in M1
     #[arg(long, default_value_t = 10)]
     m1_exclusion: usize,
-    /// Frames to each side that do not count as neighbours, in M2; the paper's 0 measures the path
+    /// Frames to each side that do not count as neighbors, in M2; the paper's 0 measures the path
     /// rather than the room
     #[arg(long, default_value_t = 10)]
     m2_gap: usize,
-    /// Also print one line per encoder, by its best layer: to compare checkpoints of one encoder
+    /// Also print one line per encoder, with its best layer, to compare checkpoints of one encoder
     #[arg(long)]
     by_encoder: bool,
     #[command(flatten)]
@@ -77,7 +77,7 @@ impl Layers {
 
         ensure!(
             self.split != SplitChoice::One(Split::Whole),
-            "--split whole sets no test pairs apart; take another split"
+            "--split whole has no test pairs; choose another split"
         );
 
         let store = Store::open(&self.store)?;
@@ -135,7 +135,7 @@ impl Layers {
         let split = self.split.name();
         let preset = self.preset;
 
-        // The table alone would not say how its numbers were measured.
+        // Print the protocol with the table.
         say(format_args!(
             "{} rooms; M1: {} frames at stride {}, k {}, exclusion {}; M2: gap {}; M3, M4: stride {}, split {split}; \
              M4: {}, {} seeds",
@@ -161,10 +161,9 @@ impl Layers {
         Ok(())
     }
 
-    /// The names of the feature sets that were asked for. Every room must have them, from one
-    /// source.
+    /// Names of the selected feature sets. Every room must have them, with the same source.
     fn names(&self, rooms: &[StoredRoom]) -> anyhow::Result<Vec<String>> {
-        // `dinov2` means `dinov2-7` and `dinov2-9`, but not `dinov2b-7`.
+        // `dinov2` selects `dinov2-7` and `dinov2-9`, but not `dinov2b-7`.
         let calls_for = |given: &str, name: &str| {
             name == given
                 || name
@@ -186,7 +185,7 @@ impl Layers {
             .map(|&name| name.to_owned())
             .collect();
 
-        // A name that matches nothing is a typing error, and would otherwise be passed over.
+        // A name that matches nothing is a typo, and must not be ignored.
         let missing = self
             .features
             .iter()
@@ -215,7 +214,7 @@ impl Layers {
                     let a = rooms[0].room.id();
                     let b = stored.room.id();
                     bail!(
-                        "features '{name}' of rooms '{a}' and '{b}' were not made alike; name others with --features"
+                        "features '{name}' of rooms '{a}' and '{b}' have different sources; choose others with --features"
                     );
                 }
 

@@ -20,7 +20,7 @@ enum SweepKind {
     /// Adapters over a grid of latent sizes, charts, learning rates, losses and seeds; resumable
     /// and shardable, one row per run
     Adapters(adapters::Adapters),
-    /// The adapter side by side with the paper's alternatives A to D
+    /// Compare the adapter with the paper's alternatives A to D
     Formulations(formulations::Formulations),
 }
 

@@ -1,4 +1,4 @@
-//! The answers of a stream as an MCAP file.
+//! Writes the answers of a stream as an MCAP file.
 
 use anyhow::Context;
 
@@ -12,8 +12,8 @@ pub fn recorded(heard: &ReceivedAnswers, seen: &[RecordedView]) -> anyhow::Resul
     let names = &heard.names;
     let mut recording = McapRecording::new()?;
     for update in &heard.updates {
-        // Each frame gives the transforms map → odom → camera, and the pose in map on a topic of
-        // its own.
+        // Each frame gives the transforms map → odom → camera, and the pose in map on a separate
+        // topic.
         let time = update.timestamp_ns;
         if let Some(pose) = odom(update) {
             recording.transform(time, &names.odom, &names.camera, &pose)?;
@@ -38,7 +38,7 @@ pub fn recorded(heard: &ReceivedAnswers, seen: &[RecordedView]) -> anyhow::Resul
             recording.odometry("/odometry", time, &odometry)?;
         }
 
-        // The sequence number leads back to the input row, and so to the image file.
+        // The sequence number identifies the input row, and hence the image file.
         let row = usize::try_from(update.sequence)
             .unwrap_or(usize::MAX)
             .saturating_sub(1);

@@ -20,7 +20,7 @@ use seese3_core::geometry::Pose;
 use seese3_data::datasets::read_features;
 use seese3_data::export::tum_trajectory;
 
-/// The number of requests that may be buffered before they are sent.
+/// Capacity of the queue of unsent requests.
 const WAITING: usize = 32;
 
 #[derive(Debug, Args)]
@@ -50,7 +50,7 @@ pub struct Track {
     /// Frame rate, frames per second: frame i gets the timestamp i / hz seconds
     #[arg(long, default_value_t = 30.0)]
     hz: f64,
-    /// Dead reckoning only: never correct the drift by frames of the map
+    /// Dead reckoning only: no drift correction from the map
     #[arg(long)]
     no_fusion: bool,
     /// Continue an earlier stream from the resume token in this file, which --save-token wrote
@@ -59,7 +59,7 @@ pub struct Track {
     /// Write the resume token of the last answer to this file
     #[arg(long, value_name = "FILE")]
     save_token: Option<PathBuf>,
-    /// Write the camera's trajectory in the frame `map`, which is the room's world, as a TUM file
+    /// Write the camera's trajectory in the frame `map`, the room's world frame, as a TUM file
     #[arg(long, value_name = "FILE")]
     tum: Option<PathBuf>,
     /// Write the camera's trajectory in the frame `odom`, continuous but drifting, as a TUM file
@@ -89,7 +89,7 @@ impl Track {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
 
-        // An output path that cannot be written is reported before the stream, not after it.
+        // Check the output paths before the stream starts.
         for path in [&self.save_token, &self.tum, &self.odom_tum, &self.recording]
             .into_iter()
             .flatten()
@@ -112,7 +112,7 @@ impl Track {
 
         let config = self.config()?;
 
-        // The sending task takes the views; the MCAP file needs the image paths again afterwards.
+        // The sending task consumes the views; the MCAP file needs the image paths afterwards.
         let images = views.clone();
         let client = self.server.connect().await?;
         let (sender, requests) = tokio::sync::mpsc::channel(WAITING);
@@ -120,8 +120,8 @@ impl Track {
         let from = self.from;
         let hz = self.hz;
 
-        // A task of its own sends the frames while this one reads answers: if nobody read them,
-        // the server would stop accepting frames.
+        // A separate task sends the frames while this one reads answers: with unread answers, the
+        // server would stop accepting frames.
         tokio::spawn(async move {
             let frames =
                 (from..end).map(|row| Some(Message::Frame(frame(row, views[row].view()?, hz))));
@@ -155,15 +155,15 @@ impl Track {
             let answer = match answers.message().await {
                 Ok(Some(answer)) => answer,
                 Ok(None) => break,
-                // Keep the answers so far: with their last token, another server can continue the
-                // stream.
+                // Keep the answers received so far: with the last token, another server can
+                // continue the stream.
                 Err(status) => {
                     ended = Err(seese3_client::Error::from(status));
                     break;
                 }
             };
 
-            // A token holds the tracker's state after its answer; only the newest is of use.
+            // A token holds the tracker's state after its answer; only the newest is needed.
             if !answer.resume_token.is_empty() {
                 heard.token = answer.resume_token;
             }
@@ -190,8 +190,7 @@ impl Track {
 
         progress.finish_and_clear();
 
-        // What was received is printed and written even if the stream broke off; only then is the
-        // error returned.
+        // Report what was received even if the stream failed; then return the error.
         self.report(&heard, &images)?;
         ended?;
 
@@ -233,7 +232,7 @@ impl Track {
             }
         }
 
-        // Names give the order of the frames, so they need numbers of equal length.
+        // Frames are ordered by name, so the numbers in the names need equal length.
         files.sort();
         if files.is_empty() {
             bail!("{} has no .jpg, .jpeg or .png file", folder.display());
@@ -247,7 +246,7 @@ impl Track {
             let resume_token = std::fs::read(file)
                 .with_context(|| format!("{} cannot be read", file.display()))?;
             if resume_token.is_empty() {
-                bail!("{} is empty: it has no token", file.display());
+                bail!("{} is empty; it needs a resume token", file.display());
             }
 
             // A token carries the configuration of its stream, so every other field has to be
@@ -258,8 +257,7 @@ impl Track {
             });
         }
 
-        // Anchors are frames of the map that look like the view; they correct the drift of dead
-        // reckoning.
+        // Anchors are mapped frames similar to the view; they correct the drift of dead reckoning.
         let fusion = if self.no_fusion {
             pb::Fusion::None
         } else {
@@ -270,14 +268,14 @@ impl Track {
             room: self.room.clone().unwrap_or_default(),
             adapter: self.adapter.clone().unwrap_or_default(),
             fusion: fusion as i32,
-            // Tokens are most of an answer's bytes, and are kept only where they are asked for.
+            // Tokens are most of an answer's bytes, so they are requested only for --save-token.
             token_every: self.save_token.is_none().then_some(0),
             ..pb::TrackConfig::default()
         })
     }
 
     fn report(&self, heard: &ReceivedAnswers, seen: &[RecordedView]) -> anyhow::Result<()> {
-        // Only changes of the tracking status are printed, each with its reason.
+        // Print only changes of the tracking status, each with its reason.
         let mut before = None;
         for update in &heard.updates {
             if before != Some(update.status()) {
@@ -317,8 +315,8 @@ impl Track {
 
         for (file, of) in [(&self.tum, map as PoseOf), (&self.odom_tum, odom as PoseOf)] {
             if let Some(file) = file {
-                // Frames without a pose in that frame are left out, for instance in `map` before
-                // the camera has been located.
+                // Frames without a pose in that frame are omitted, for example in `map` before the
+                // camera has been localized.
                 let known = heard
                     .updates
                     .iter()
@@ -355,7 +353,7 @@ enum RecordedView {
 }
 
 impl RecordedView {
-    /// The view as it is sent; none if the image file cannot be read.
+    /// The view in wire format; `None` if the image file cannot be read.
     fn view(&self) -> Option<pb::view::View> {
         match self {
             Self::Feature(values) => Some(pb::view::View::Feature(pb::Feature {
@@ -387,7 +385,7 @@ fn odom(update: &pb::TrackUpdate) -> Option<Pose> {
     plain(update.odom_from_camera.clone())
 }
 
-/// Converts a pose without checking its frame names, which the caller already knows.
+/// Converts a pose without checking its frame names, which the caller knows.
 fn plain(pose: Option<pb::Pose>) -> Option<Pose> {
     convert::pose(&pose?).ok()
 }

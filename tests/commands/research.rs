@@ -182,7 +182,7 @@ fn cross_room_compares_with_identity_room_by_room() {
             "--test",
             "*",
         ],
-        &["both learned from and held out"],
+        &["is in both --train and --test"],
     );
 
     refuses(

@@ -338,7 +338,7 @@ fn a_corrupt_image_is_named_or_left_out() {
         "pixels",
     ];
 
-    refuses(&encode, &["frame-000030.png", "goes on from there"]);
+    refuses(&encode, &["frame-000030.png", "again to resume"]);
     let skipping = succeeds(&[&encode[..], &["--skip-bad"]].concat());
     assert!(
         skipping.contains("left out frame 30") && skipping.contains("left out 1 frames in all"),
@@ -631,7 +631,7 @@ fn inverted_poses_are_named_at_import_and_by_check() {
 
     // The camera is on a tripod, which is said, and nothing else.
     let is_clean = |warned: &str| {
-        warned.starts_with("warning: all positions are the same") && warned.lines().count() == 1
+        warned.starts_with("warning: all positions are identical") && warned.lines().count() == 1
     };
     assert!(is_clean(&import("right", &["--strict"])));
     assert!(check("right").status.success());

@@ -77,9 +77,9 @@ def mistakes(poses: np.ndarray, other: np.ndarray) -> dict[str, tuple[np.ndarray
         "images turned by 90": (turned(poses, 1), named, "--images-turned 90"),
         "images turned by 180": (turned(poses, 2), named, "--images-turned 180"),
         "scalar first": (scalar_first(poses), named, "--quaternions wxyz"),
-        "millimetres": (with_translations(poses, 1000 * t), "warning", "millimetres"),
-        "centimetres": (with_translations(poses, 100 * t), "warning", "centimetres"),
-        "a scale of .137": (with_translations(poses, 0.137 * t), "warning", "in metres?"),
+        "millimetres": (with_translations(poses, 1000 * t), "warning", "millimeters"),
+        "centimetres": (with_translations(poses, 100 * t), "warning", "centimeters"),
+        "a scale of .137": (with_translations(poses, 0.137 * t), "warning", "in meters?"),
         "y and z exchanged": (with_translations(poses, t[:, [0, 2, 1]]), "other_translations", "(x, z, y)"),
         "translations of the inverse": (
             with_translations(poses, inverse(poses)[:, :3, 3]),
@@ -91,7 +91,7 @@ def mistakes(poses: np.ndarray, other: np.ndarray) -> dict[str, tuple[np.ndarray
         "shuffled": (poses[RANDOM.permutation(len(poses))], "unrelated", ""),
         f"{ROWS_LATE} rows late": (np.roll(poses, ROWS_LATE, axis=0), "other_rows", ""),
         "another room's": (another(poses, other), "unrelated", ""),
-        "all the same": (np.tile(poses[:1], (len(poses), 1, 1)), "warning", "all poses are the same"),
+        "all the same": (np.tile(poses[:1], (len(poses), 1, 1)), "warning", "all poses are identical"),
         "ten identities": (lost(poses), "warning", "10 poses are exactly the identity"),
     }
 
