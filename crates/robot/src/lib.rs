@@ -1,21 +1,21 @@
-//! What a robot uses beyond the paper: tracking, planning, calibration, adapters fitted to one room,
+//! Robot functions beyond the paper: tracking, planning, calibration, adapters fitted to one room,
 //! and motion between two views. Part of [seese3](https://docs.rs/seese3).
 //!
-//! # The map
+//! # Modules
 //!
-//! The modules are listed from the lowest layer up: each uses only those listed before it, and a test
-//! enforces it.
+//! Listed from the lowest layer up: each module uses only those listed before it; a test enforces
+//! this.
 //!
-//! | module | what |
+//! | module | purpose |
 //! | --- | --- |
-//! | [`tracking`] | a camera followed frame by frame, with covariances |
-//! | [`planning`] | a way from a view to a goal, over a room's frames |
-//! | [`calibration`] | how large an adapter's errors are in rooms that it did not learn from |
-//! | [`fitting`] | an adapter fitted to one mapped room, and single views located in it |
-//! | [`two_view`] | the motion between two views from matched image cells |
+//! | [`tracking`] | tracks a camera frame by frame, with covariances |
+//! | [`planning`] | plans a route from a view to a goal, over a room's frames |
+//! | [`calibration`] | measures an adapter's errors in rooms that it was not trained on |
+//! | [`fitting`] | fits an adapter to one mapped room and localizes single views in it |
+//! | [`two_view`] | estimates the motion between two views from matched image cells |
 //!
-//! Conventions are those of [`seese3_core`]. Nothing here reads files, the network, the clock or the
-//! environment; randomness enters as a seed.
+//! Conventions are those of [`seese3_core`]. This crate does not access files, the network, the
+//! clock or the environment. Random numbers come from explicit seeds.
 
 pub mod tracking;
 pub mod two_view;

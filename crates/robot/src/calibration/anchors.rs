@@ -1,4 +1,4 @@
-//! Errors of poses that are read from a matching frame, by how far the match is.
+//! Errors of poses estimated from a matching frame, as a function of the match distance.
 
 use nalgebra::Vector6;
 use ndarray::Array2;
@@ -13,26 +13,26 @@ use seese3_core::index::{ExactIndex, Exclusion, Index};
 use seese3_core::room::FrameId;
 use seese3_core::statistics::median;
 
-/// Frames to each side of a query that are left out of the map, one round each, so that matches of
-/// every distance occur.
+/// Exclusion radii in frames: one pass per radius excludes the frames within it of the query, so
+/// that matches of all distances occur.
 const LEFT_OUT_RADII: [u32; 10] = [0, 1, 2, 4, 6, 8, 10, 15, 20, 30];
-/// Strata of about as many matches each, by distance.
+/// Number of distance bins, each with about the same number of matches.
 const STRATA: usize = 8;
-/// A covariance of six components needs more errors than that.
+/// A six-dimensional covariance needs more errors than this.
 const FEWEST_ERRORS: usize = 6;
 
-/// One match: its distance, and the motion from the matching frame to the query.
+/// One match: its distance and the motion from the matching frame to the query.
 struct Match {
     /// In standard deviations of frame noise.
     distance: f64,
-    /// The motion that the adapter reads.
+    /// Motion predicted by the adapter.
     read: Vector6<f64>,
-    /// The true motion.
+    /// True motion.
     truth: Vector6<f64>,
 }
 
-/// The errors of poses read from matches, in strata by distance; `whitened` are the rooms' whitened
-/// latents, row by frame.
+/// Error table of poses estimated from matches, binned by distance. `whitened` holds the whitened
+/// latents of each room, one row per frame.
 pub fn anchor_errors(
     adapter: &Adapter,
     rooms: &[EmbeddedRoom<'_>],
@@ -44,8 +44,7 @@ pub fn anchor_errors(
     }
     matches.sort_by(|a, b| a.distance.total_cmp(&b.distance));
 
-    // Components are compared in deviations of the trained motions, so that metres do not drown
-    // radians.
+    // Units of one standard deviation of the trained motions make meters and radians comparable.
     let scale = adapter.scale().deviation;
 
     let mut strata: Vec<Stratum> = Vec::new();
@@ -55,8 +54,7 @@ pub fn anchor_errors(
         let gain = share_to_believe(part.iter().map(|found| (&found.truth, &found.read)), &scale);
         let residuals: Vec<Vector6<f64>> = part.iter().map(|found| found.residual(gain)).collect();
 
-        // Repeated images are at no distance at all: their stratum is left out, so that distances
-        // rise from stratum to stratum.
+        // Repeated images have distance 0. Their bin is skipped: distances must increase strictly.
         let previous = strata.last().map_or(0.0, |last| last.at);
         if at > previous && residuals.len() > FEWEST_ERRORS {
             strata.push(Stratum {
@@ -70,7 +68,7 @@ pub fn anchor_errors(
     Ok(ErrorTable::new(strata)?)
 }
 
-/// Matches every frame of a room with the rest of the room, once for each radius left out.
+/// Matches every frame of a room with the rest of the room, once per exclusion radius.
 fn add_matches(
     adapter: &Adapter,
     room: &EmbeddedRoom<'_>,
@@ -102,7 +100,7 @@ fn add_matches(
 }
 
 impl Match {
-    /// The error of the pose that is read with a gain, in its body frame.
+    /// Error of the pose estimated with this gain, in its body frame.
     fn residual(&self, gain: f64) -> Vector6<f64> {
         let found = exp(&Twist::from_vector(&(self.read * gain)));
         let truth = exp(&Twist::from_vector(&self.truth));

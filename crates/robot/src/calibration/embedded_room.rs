@@ -1,15 +1,15 @@
-//! A room as an adapter embeds it.
+//! A room's poses and latents.
 
 use ndarray::Array2;
 
 use seese3_core::geometry::Pose;
 
-/// A room as the adapter sees it.
+/// Poses and latents of one room.
 pub struct EmbeddedRoom<'a> {
-    /// `world_from_camera`, row by frame.
+    /// `world_from_camera`, one per frame.
     pub poses: &'a [Pose],
-    /// Latents, row by frame, shape (n, k).
+    /// Latents, one row per frame, shape (n, k).
     pub latents: Array2<f64>,
-    /// The columns of the latents that distances are taken of, shape (n, c).
+    /// Columns of the latents that distances use, shape (n, c).
     pub coordinates: Array2<f64>,
 }

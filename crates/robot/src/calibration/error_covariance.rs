@@ -1,4 +1,4 @@
-//! The second moment of an adapter's errors in rooms that it did not learn from.
+//! The second moment of an adapter's motion errors in rooms that it was not trained on.
 
 use nalgebra::Matrix6;
 
@@ -8,17 +8,17 @@ use seese3_core::geometry::body_twist;
 use seese3_core::splits::{self, Pair, Split};
 use seese3_core::training::{self, RoomData};
 
-/// Every fifth stride of a range is measured: neighbouring strides have nearly the same errors.
+/// Step between the measured strides of a range: neighboring strides have nearly the same errors.
 const STRIDE_STEP: usize = 5;
-/// A covariance of six components needs at least as many errors.
+/// A six-dimensional covariance needs at least this many errors.
 const FEWEST_PAIRS: usize = 6;
 
-/// The second moment of the errors of motions without μ, Σ = mean r rᵀ with r = ΔP − σ⊙W(g₂ − g₁),
-/// on (v, ω), metres and radians, over all pairs of the rooms at the trained stride or at every
-/// fifth one of a trained range.
+/// Second moment of motion errors without μ: Σ = mean r rᵀ with r = ΔP − σ⊙W(g₂ − g₁), on (v, ω),
+/// meters and radians. The mean is over all pairs of the rooms at the trained stride, or at every
+/// fifth stride of a trained range.
 ///
 /// # Errors
-/// [`Error`] when a room is too short to have a pair.
+/// [`Error`] if a room is too short to have a pair.
 pub fn error_covariance(
     adapter: &Adapter,
     record: &TrainingRecord,
@@ -54,8 +54,7 @@ pub fn error_covariance(
     Ok(sum / count as f64)
 }
 
-/// The strides that are measured: the trained one, or of a range every fifth from the lowest on and
-/// the highest.
+/// Measured strides: the trained stride; for a range, every fifth from the lowest, and the highest.
 fn trained_strides(plan: &PairPlan) -> Vec<u32> {
     match plan {
         PairPlan::Stride(stride) => vec![*stride],

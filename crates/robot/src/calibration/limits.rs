@@ -1,4 +1,4 @@
-//! How far frames of a room and of other rooms are from its map: the limits that tell them apart.
+//! Distance limits that separate frames of a room from frames of other rooms.
 
 use ndarray::{Array2, ArrayView1};
 
@@ -9,32 +9,31 @@ use seese3_core::room::FrameId;
 use seese3_core::splits::is_in_left_out_block;
 use seese3_core::statistics::{median, quantile};
 
-/// Every so many frames of another room are matched with a room.
+/// Stride at which frames of other rooms are sampled as negatives.
 const OTHER_ROOM_STEP: usize = 4;
-/// The out-of-distribution limit lies between the distance that this share of a room's own frames
-/// is below …
+/// Quantile of own-room distances for the out-of-distribution limit.
 const OWN_SHARE: f64 = 0.97;
-/// … and the distance that this share of other rooms' frames is below.
+/// Quantile of other-room distances for the out-of-distribution limit.
 const OTHERS_SHARE: f64 = 0.02;
-/// The share of other rooms' frames below the limit of certain matches.
+/// Quantile of other-room distances that is the limit of certain matches.
 const OTHERS_SHARE_CERTAIN: f64 = 0.0003;
-/// A jump lies between the distance that this share of a room's own successive views is below …
+/// Quantile of own-room distances between successive views for the jump limit.
 const OWN_JUMP_SHARE: f64 = 0.999;
-/// … and the distance that this share of views cut from one room to another is below.
+/// Quantile of distances across a cut between rooms for the jump limit.
 const OTHERS_JUMP_SHARE: f64 = 0.01;
 
-/// Distances of matches, divided by the room's typical distance.
+/// Limits of match distances, in units of the room's typical distance.
 pub struct MatchLimits {
-    /// Above it a view shows another place.
+    /// A view farther than this is out of distribution.
     pub out_of_distribution: f64,
-    /// Below it a view certainly shows this room.
+    /// A view nearer than this certainly shows this room.
     pub certain: f64,
 }
 
-/// The limits of matches, from the rooms' whitened latents. A room's own frames are those of the
-/// blocks that its map leaves out, so that they are as far from the map as unmapped places are. The
-/// out-of-distribution limit is the geometric mean of a high quantile of own distances and a low
-/// one of other rooms' distances.
+/// Match limits from the rooms' whitened latents. Positives are the frames of the blocks left out
+/// of a room's map, so that their distances are those of unmapped places. The out-of-distribution
+/// limit is the geometric mean of the `OWN_SHARE` quantile of own-room distances and the
+/// `OTHERS_SHARE` quantile of other-room distances.
 pub fn match_limits(rooms: &[Array2<f64>]) -> Result<MatchLimits, Error> {
     let mut own = Vec::new();
     let mut others = Vec::new();
@@ -69,9 +68,9 @@ pub fn match_limits(rooms: &[Array2<f64>]) -> Result<MatchLimits, Error> {
     })
 }
 
-/// The limit of jumps, in standard deviations of frame noise: a view farther than this from all of
-/// the last frames has jumped. It lies between what a moving camera does and what a cut to another
-/// room does.
+/// Jump limit, in standard deviations of frame noise: a view farther than this from each of the
+/// last [`JUMP_WINDOW`] frames has jumped. It is the geometric mean of a high quantile of distances
+/// within a room and a low quantile of distances across a cut to another room.
 pub fn jump_distance(rooms: &[Array2<f64>]) -> Result<f64, Error> {
     let mut own = Vec::new();
     let mut others = Vec::new();
@@ -94,8 +93,8 @@ pub fn jump_distance(rooms: &[Array2<f64>]) -> Result<f64, Error> {
     Ok((longest_own * shortest_cut).sqrt())
 }
 
-/// The median distance from a mapped frame to the nearest other one that is not its neighbour in
-/// time.
+/// Median distance from a mapped frame to its nearest mapped frame more than
+/// [`TEMPORAL_NEIGHBOURS`] rows away.
 fn typical_distance(index: &ExactIndex, room: &Array2<f64>, mapped: &[FrameId]) -> f64 {
     let distances: Vec<f64> = mapped
         .iter()
@@ -112,7 +111,7 @@ fn typical_distance(index: &ExactIndex, room: &Array2<f64>, mapped: &[FrameId]) 
     median(&distances)
 }
 
-/// The distance of a view from the nearest of the frames before `before` in a room.
+/// Distance from a view to the nearest of the [`JUMP_WINDOW`] frames before row `before`.
 fn nearest_before(view: ArrayView1<'_, f64>, room: &Array2<f64>, before: usize) -> f64 {
     let distance = |row: usize| (&view - &room.row(row)).mapv(|x| x * x).sum().sqrt();
     (before.saturating_sub(JUMP_WINDOW)..before)
@@ -128,7 +127,7 @@ fn other_rooms(rooms: &[Array2<f64>], place: usize) -> impl Iterator<Item = &Arr
         .map(|(_, room)| room)
 }
 
-/// Refuses a quantile of nothing: the rooms were too short.
+/// Rejects the quantile of an empty set, which occurs if the rooms are too short.
 fn known(quantile: Option<f64>) -> Result<f64, Error> {
     quantile.ok_or_else(|| adapter::Error::NoPairs.into())
 }

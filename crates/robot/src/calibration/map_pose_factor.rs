@@ -1,4 +1,4 @@
-//! The factor that makes the covariances of corrected map poses those of their errors.
+//! The covariance inflation factor of corrected map poses.
 
 use std::sync::Arc;
 
@@ -12,18 +12,19 @@ use seese3_core::splits::HoldOut;
 use seese3_core::statistics::coverage_deviation;
 use seese3_core::training::RoomData;
 
-/// The smallest factor that is tried.
+/// Smallest factor of the search grid.
 const SMALLEST_FACTOR: f64 = 0.1;
-/// Each factor over the one before.
+/// Ratio of successive factors of the grid.
 const FACTOR_RATIO: f64 = 1.1;
-/// How many factors are tried.
+/// Number of factors of the grid.
 const FACTOR_COUNT: i32 = 40;
 
-/// Replays the rooms, with blocks left out of their maps, through trackers with each factor, and
-/// takes the one whose reported poses have the best coverage. `None` where no place was found.
+/// Finds the factor with the best coverage of reported map poses, by replaying the rooms through
+/// trackers with each factor. The maps leave blocks of frames out. `None` if the tracker was never
+/// localized.
 ///
 /// # Errors
-/// [`Error`] when a room cannot be mapped.
+/// [`Error`] if a room cannot be mapped.
 pub fn map_pose_factor(
     adapter: &Arc<Adapter>,
     rooms: &[RoomData<'_>],
@@ -69,7 +70,7 @@ fn tracker(adapter: &Arc<Adapter>, data: &RoomData<'_>) -> Result<Tracker, Error
     )?)
 }
 
-/// The squared Mahalanobis lengths of the errors of the map poses that are TRACKING in a room.
+/// Squared Mahalanobis lengths of the map-pose errors of frames with status TRACKING.
 fn replayed_surprises(tracker: &Tracker, data: &RoomData<'_>) -> Vec<f64> {
     let segment = Segment {
         latents: tracker.maps()[0].navigator().latents(),

@@ -1,18 +1,16 @@
-//! Calibration: how large an adapter's errors are in rooms that it did not learn from.
+//! Calibration: measures an adapter's errors in rooms that it was not trained on.
 //!
-//! [`calibrate`] measures, in this order; the last step needs the one before it:
+//! [`calibrate`] runs three steps in this order; step 3 needs the result of step 2:
 //!
-//! 1. the second moment of the errors of motions (`error_covariance`), which
-//!    calibrated retrieval weighs motions with;
-//! 2. the error model of a tracker: the noise of latents from frame to frame, the errors of motions
-//!    and of poses read from matching frames, and how far frames of other rooms are (`model`);
-//! 3. the factor of corrected map poses, found by replaying the rooms through a tracker with the
-//!    error model so far (`map_pose_factor`).
+//! 1. `error_covariance`: the second moment of motion errors, used by calibrated retrieval.
+//! 2. `model`: the error model of a tracker: frame-to-frame noise of latents, errors of motions
+//!    and of poses estimated from matches, and the distances of frames of other rooms.
+//! 3. `map_pose_factor`: the covariance inflation of corrected map poses, chosen by replaying the
+//!    rooms through a tracker with the error model of step 2.
 //!
-//! Errors are heavy-tailed and differ from room to room. The covariances of the error model are
-//! therefore fitted by Student's t, and each is then scaled so that the shares of errors inside its
-//! ellipsoids are as near as possible to 68 % and 95 %. The covariance of step 1 is a plain second
-//! moment.
+//! Errors are heavy-tailed and differ between rooms. The covariances of the error model are
+//! therefore Student's t fits. Each is then scaled so that its 68 % and 95 % ellipsoids contain
+//! nearly 68 % and 95 % of the errors. The covariance of step 1 is a plain second moment.
 
 mod anchors;
 mod embedded_room;
@@ -35,8 +33,7 @@ use seese3_core::room::RoomId;
 use seese3_core::training::{self, RoomData, check_rooms};
 use seese3_core::{navigation, statistics};
 
-/// The fewest rooms that a tracker's error model can be measured in: frames of one room have to be
-/// compared with those of another.
+/// Minimum number of rooms for a tracker's error model: it compares frames of different rooms.
 pub const FEWEST_ROOMS_TO_TRACK: usize = 2;
 
 /// Why an adapter cannot be calibrated.
@@ -46,33 +43,33 @@ pub enum Error {
     /// The rooms or their features do not fit together.
     #[error(transparent)]
     Rooms(#[from] training::Error),
-    /// The adapter refused the features, or the errors make no sound model.
+    /// The adapter rejected the features, or the errors give no valid error model.
     #[error(transparent)]
     Adapter(#[from] adapter::Error),
-    /// A room could not be navigated in.
+    /// A navigator could not be built for a room.
     #[error(transparent)]
     Navigation(#[from] navigation::Error),
-    /// A room could not be tracked in.
+    /// A map or a tracker could not be built for a room.
     #[error(transparent)]
     Tracking(#[from] tracking::Error),
-    /// The adapter learned from one of the rooms.
+    /// The adapter was trained on one of the rooms.
     #[error(
-        "room '{room}' was learned from: errors there are not those in rooms never seen; name others"
+        "the adapter was trained on room '{room}': its errors there are too small; name other rooms"
     )]
     LearnedFrom {
         /// The room.
         room: RoomId,
     },
-    /// Too few rooms for what was asked.
-    #[error("{given} rooms are too few to measure in; at least {least} are needed")]
+    /// Too few rooms for an error model.
+    #[error("{given} rooms are too few for an error model; at least {least} are needed")]
     FewRooms {
-        /// The fewest that suffice.
+        /// Minimum number of rooms.
         least: usize,
-        /// How many were given.
+        /// Number of given rooms.
         given: usize,
     },
-    /// No replay found a place.
-    #[error("no place was found in the rooms to calibrate on")]
+    /// The tracker was never localized in any replay.
+    #[error("the tracker was never localized in the calibration rooms")]
     NoPlaceFound,
 }
 
@@ -107,7 +104,7 @@ pub fn calibrate(
     let preliminary = ErrorModel::new(statistics.clone())?;
     let adapter = Arc::new(calibrated.adapter.with_error_model(preliminary)?);
 
-    // The factor of map poses is measured with the tracker that the error model makes.
+    // The map-pose factor is measured with a tracker that uses the preliminary error model.
     let statistics = ErrorStatistics {
         map_pose_factor: map_pose_factor(&adapter, rooms)?.ok_or(Error::NoPlaceFound)?,
         ..statistics
@@ -118,7 +115,7 @@ pub fn calibrate(
     Ok(calibrated)
 }
 
-/// Calibrates an adapter for retrieval alone: measures the second moment of its motions' errors.
+/// Calibrates an adapter for retrieval only: measures the second moment of its motion errors.
 ///
 /// # Errors
 /// As [`calibrate`].
@@ -146,17 +143,17 @@ pub fn calibrate_retrieval(
     })
 }
 
-/// The covariance of errors, see [`statistics::robust_covariance`].
+/// Robust covariance of errors; see [`statistics::robust_covariance`].
 ///
 /// # Errors
-/// [`adapter::Error::ErrorModel`] when the errors do not span six dimensions.
+/// [`adapter::Error::ErrorModel`] if the errors do not span six dimensions.
 pub fn robust_covariance(residuals: &[Vector6<f64>]) -> Result<Matrix6<f64>, adapter::Error> {
     statistics::robust_covariance(residuals).ok_or(adapter::Error::ErrorModel {
         what: "the covariance of errors",
     })
 }
 
-/// Refuses a room that an adapter learned from: its errors there are too small.
+/// Rejects a room that the adapter was trained on, because its errors there are too small.
 ///
 /// # Errors
 /// [`Error::LearnedFrom`].

@@ -1,4 +1,4 @@
-//! The statistics of a tracker's error model, but for the factor of map poses.
+//! The statistics of a tracker's error model, except the map-pose factor.
 
 use ndarray::{Array2, s};
 
@@ -13,11 +13,11 @@ use seese3_core::splits::Split;
 use seese3_core::statistics::mean;
 use seese3_core::training::RoomData;
 
-/// Measures an adapter's errors in two or more rooms. The factor of map poses is left at 1.
+/// Measures an adapter's errors in two or more rooms. The map-pose factor stays at 1.
 ///
 /// # Errors
-/// [`Error::FewRooms`], or [`Error::Adapter`] when the rooms are too short or their errors make no
-/// sound covariance.
+/// [`Error::FewRooms`], or [`Error::Adapter`] if the rooms are too short or their errors give no
+/// valid covariance.
 pub fn measure(
     adapter: &Adapter,
     record: &TrainingRecord,
@@ -33,8 +33,7 @@ pub fn measure(
     let embedded = embed(adapter, rooms)?;
     let strides = fibonacci_strides(&record.pairs);
 
-    // Two successive frames each carry the noise of one latent, so half the second moment of their
-    // difference is that of one.
+    // The difference of two successive latents has twice the noise of one latent.
     let frame_noise = second_moment(&embedded, &pairs_at(rooms, 1))? * 0.5;
     let measured_pairs: Vec<RoomPair> = strides
         .iter()
@@ -49,7 +48,7 @@ pub fn measure(
         .collect();
     let motion_errors = motion_errors(adapter, &embedded, &pairs_by_stride, &spread_whitener)?;
 
-    // Everything about matches is measured in standard deviations of frame noise.
+    // Match distances are in standard deviations of frame noise.
     let noise_whitener = Whitener::new(frame_noise.view())?;
     let whitened: Vec<Array2<f64>> = embedded
         .iter()
@@ -90,7 +89,7 @@ fn embed<'a>(adapter: &Adapter, rooms: &'a [RoomData<'_>]) -> Result<Vec<Embedde
     Ok(embedded)
 }
 
-/// Every pair of every room at a stride; rooms that are too short have none.
+/// All pairs of all rooms at one stride; a room that is too short contributes none.
 fn pairs_at(rooms: &[RoomData<'_>], stride: u32) -> Vec<RoomPair> {
     let mut all = Vec::new();
     for (room, data) in rooms.iter().enumerate() {

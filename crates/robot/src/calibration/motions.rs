@@ -1,4 +1,4 @@
-//! Errors of the motions that an adapter reads between two frames.
+//! Errors of the motions that an adapter predicts between two frames.
 
 use nalgebra::Vector6;
 use ndarray::{Array2, Axis};
@@ -10,22 +10,22 @@ use seese3_core::adapter::{self, Adapter, ErrorTable, MotionErrors, PairPlan, St
 use seese3_core::geometry::body_twist;
 use seese3_core::splits::Pair;
 
-/// u₀ of [`MotionErrors`]: chosen, not measured, about the squared length u between successive
-/// frames; it matters only where u is near zero.
+/// u₀ of [`MotionErrors`]: chosen by hand, near the squared length u between successive frames.
+/// It matters only if u is near zero.
 const FLOOR: f64 = 0.05;
 
-/// A pair of frames of one of several rooms.
+/// A pair of frames of one calibration room.
 #[derive(Debug, Clone, Copy)]
 pub struct RoomPair {
-    /// The room's place among the rooms.
+    /// Index into the calibration rooms.
     pub room: usize,
-    /// Its two frames.
+    /// The two frames.
     pub pair: Pair,
 }
 
-/// The strides that a tracker's motions are measured at: the Fibonacci numbers 1, 2, 3, 5, 8, …
-/// below the longest stride that the adapter was trained on, and that one. Errors change with the
-/// logarithm of the stride, so that short strides are measured more closely than long ones.
+/// Strides at which motion errors are measured: the Fibonacci numbers 1, 2, 3, 5, 8, … below the
+/// longest trained stride, then that stride. Errors change with the logarithm of the stride, so
+/// short strides are sampled more densely.
 pub fn fibonacci_strides(plan: &PairPlan) -> Vec<u32> {
     let longest = match plan {
         PairPlan::Stride(stride) => *stride,
@@ -44,7 +44,10 @@ pub fn fibonacci_strides(plan: &PairPlan) -> Vec<u32> {
     strides
 }
 
-/// The second moment of the differences of latents of pairs, mean d dᵀ, shape (c, c).
+/// Second moment of the latent differences d of the pairs, mean d dᵀ, shape (c, c).
+///
+/// # Errors
+/// [`adapter::Error::NoPairs`] unless there are more pairs than columns.
 pub fn second_moment(rooms: &[EmbeddedRoom<'_>], pairs: &[RoomPair]) -> Result<Array2<f64>, Error> {
     let size = rooms[0].coordinates.ncols();
     if pairs.len() <= size {
@@ -64,7 +67,8 @@ pub fn second_moment(rooms: &[EmbeddedRoom<'_>], pairs: &[RoomPair]) -> Result<A
     Ok((&moment + &moment.t()) * 0.5)
 }
 
-/// The gains and covariances of motions by stride; `spread` is the whitener of the motion spread.
+/// Gains and covariances of motion errors by stride; `spread` is the whitener of the motion
+/// spread.
 pub fn motion_errors(
     adapter: &Adapter,
     rooms: &[EmbeddedRoom<'_>],
@@ -81,7 +85,7 @@ pub fn motion_errors(
         let read = motions.iter().map(|pair| (&pair.truth, &pair.read));
         let gain = share_to_believe(read, &scale);
 
-        // Divided by √(u + u₀), what is left has the covariance S(n).
+        // Residuals divided by √(u + u₀) have the covariance S(n).
         let residuals: Vec<Vector6<f64>> = motions
             .iter()
             .map(|pair| (pair.truth - pair.read * gain) / (pair.squared_length + FLOOR).sqrt())
@@ -99,8 +103,9 @@ pub fn motion_errors(
     })
 }
 
-/// The share of read motions to be believed: the slope of the regression of truth on reading through
-/// the origin, 0 to 1. `scale` makes metres and radians comparable.
+/// Shrinkage gain of predicted motions: the slope of the regression of true on predicted motions
+/// through the origin, clamped to 0 to 1. `pairs` are (truth, prediction); `scale` makes meters
+/// and radians comparable.
 pub fn share_to_believe<'a>(
     pairs: impl Iterator<Item = (&'a Vector6<f64>, &'a Vector6<f64>)>,
     scale: &Vector6<f64>,
@@ -121,11 +126,11 @@ pub fn share_to_believe<'a>(
     }
 }
 
-/// A true motion and what was read of it.
+/// A true motion and the adapter's prediction.
 struct ReadPair {
     truth: Vector6<f64>,
     read: Vector6<f64>,
-    /// u, the squared length of the difference of the latents.
+    /// u: squared length of the latent difference in the motion spread.
     squared_length: f64,
 }
 

@@ -1,4 +1,4 @@
-//! Fits an adapter to the mapped frames of one room, and measures how far it may be believed.
+//! Fits an adapter to the mapped frames of one room and cross-validates its motion estimates.
 
 use std::sync::Arc;
 
@@ -17,37 +17,39 @@ use seese3_core::room::FrameId;
 use seese3_core::splits::{Split, StrideRange};
 use seese3_core::training::{RoomData, check_rooms};
 
-/// The fewest mapped frames that an adapter is fitted to.
+/// Minimum number of mapped frames for a fit.
 pub const FEWEST_MAPPED_FRAMES: usize = 20;
-/// What the record of a fitted adapter names as its preset.
+/// Preset name in the training record of a fitted adapter.
 pub const FITTED_PRESET: &str = "fitted";
-/// Passes over the pairs, about 590 steps in all.
+/// Epochs of one training, about 590 steps in total.
 const EPOCHS: usize = 10;
 
-/// Epochs of a fit in all: of the adapter itself, and of one for each of the four folds.
+/// Total epochs of a fit: one training for the adapter and one for each of the four folds.
 pub const FITTING_EPOCHS: u64 = 5 * EPOCHS as u64;
 
-/// An adapter that was fitted to a room, and how far it may be believed there.
+/// An adapter fitted to a room, with its cross-validated reading rules.
 #[derive(Debug, Clone)]
 pub struct Fitted {
     /// The adapter.
     pub adapter: Arc<Adapter>,
-    /// What was measured on mapped frames that were left out.
+    /// Rules measured on held-out mapped frames.
     pub rules: ReadingRules,
-    /// How it was trained.
+    /// Training record of the adapter.
     pub record: TrainingRecord,
 }
 
-/// Fits an adapter to the mapped frames of a room, in rising order. It goes on from the weights of
-/// `base`, an adapter of other rooms, if that has one chart, and begins anew otherwise; `base` also
-/// stays a reader of its own, see [`ReadingRules`]. `progress` hears of every epoch of every
-/// training, of which there are five.
+/// Fits an adapter to the mapped frames of a room; `mapped` must be in ascending order.
+///
+/// Training continues from the weights of `base`, an adapter of other rooms, if that has one chart;
+/// otherwise it starts from new weights. `base` also remains a motion estimator of its own, see
+/// [`ReadingRules`]. `progress` is called once per epoch; five models are trained in parallel.
 ///
 /// # Errors
-/// [`Error::FewFrames`] or [`Error::MappedFrames`] for the mapped frames, [`Error::Training`] when
-/// features and room do not fit together, [`Error::Adapter`] when `base` is for other features or
-/// training fails, among others because the camera does not move, [`Error::AllAlike`] when the
-/// mapped frames cannot be told apart.
+/// - [`Error::FewFrames`] or [`Error::MappedFrames`] for invalid mapped frames.
+/// - [`Error::Training`] if features and room do not match.
+/// - [`Error::Adapter`] if `base` has another feature source or training fails, for example because
+///   the camera does not move.
+/// - [`Error::AllAlike`] if the features of the mapped frames are identical.
 pub fn fit(
     data: &RoomData<'_>,
     mapped: &[FrameId],
@@ -61,7 +63,7 @@ pub fn fit(
         base.check_source(data.features.source())?;
     }
 
-    // The adapter itself and those without some of the frames are independent: all cores train.
+    // The adapter and the models of the folds are independent: train them in parallel.
     let folds = folds(mapped);
     let tried = |fold: &Fold| trials(data, fold, base, seed, progress);
     let (trained, tried) = std::thread::scope(|scope| {
@@ -96,8 +98,8 @@ pub fn fit(
     })
 }
 
-/// The settings of the training: more steps of a wider network than for many rooms, since a view is
-/// to be told from its neighbours, and noise, since the frames are few.
+/// Training settings. The network is wider and trains for more steps than for many rooms, to
+/// distinguish neighboring views. Noise regularizes the small number of frames.
 fn config(seed: u64) -> TrainConfig {
     TrainConfig {
         epochs: EPOCHS,
@@ -112,7 +114,7 @@ fn config(seed: u64) -> TrainConfig {
     }
 }
 
-/// An adapter trained on these frames, and its samples.
+/// Trains an adapter on the given mapped frames; returns it with its samples.
 fn trained(
     data: &RoomData<'_>,
     mapped: &[FrameId],
@@ -146,7 +148,7 @@ fn trained(
     Ok((adapter, samples))
 }
 
-/// Locates the frames that a fold leaves out, with an adapter that did not learn from them.
+/// Estimates the motions of a fold's held-out frames with an adapter trained without them.
 fn trials(
     data: &RoomData<'_>,
     fold: &Fold,
@@ -189,7 +191,7 @@ fn record(
         })
         .collect();
 
-    // Nothing is held out of the adapter itself, so that there are no test scores.
+    // The final adapter is trained on all mapped frames, so there are no test scores.
     let untested = MotionScores::of(&[], &[]);
     let truth = samples.twists();
     Ok(TrainingRecord {

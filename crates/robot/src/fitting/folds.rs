@@ -1,25 +1,25 @@
-//! Parts of a map that are left out in turn, to measure how views are located that are not mapped.
+//! Cross-validation folds of a map's frames.
 
 use seese3_core::room::FrameId;
 
-/// Blocks that a map is cut into for the folds that leave out a fifth.
+/// Number of blocks of a map in the folds that leave out a fifth.
 const BLOCKS: usize = 10;
 
-/// The rule that leaves out every second frame.
+/// Index of the rule that leaves out every second frame.
 const INTERLEAVED: usize = 0;
 
-/// A map without some of its frames, and these frames.
+/// One split of a map into training and held-out frames.
 pub struct Fold {
-    /// The frames that stay.
+    /// Frames that stay in the map.
     pub mapped: Vec<FrameId>,
-    /// The frames that are left out, to be located.
+    /// Held-out frames.
     pub left_out: Vec<FrameId>,
-    /// Whether each of them has mapped frames right before and after it.
+    /// Whether each held-out frame lies directly between two frames of `mapped`.
     pub is_interleaved: bool,
 }
 
-/// The folds of a map: every second frame, two fifths in blocks, and a quarter in one piece are
-/// left out, so that there are views at all distances from what is mapped.
+/// The four folds of a map. One leaves out every second frame, two leave out a fifth in two blocks,
+/// one leaves out a contiguous quarter. Held-out frames thus occur at all distances from the map.
 pub fn folds(mapped: &[FrameId]) -> Vec<Fold> {
     let count = mapped.len();
     let block = |at: usize| at * BLOCKS / count.max(1) % 5;
@@ -53,7 +53,7 @@ pub fn folds(mapped: &[FrameId]) -> Vec<Fold> {
 mod tests {
     use super::*;
 
-    /// Oracle: by hand, of 40 frames: 20, 8, 8 and 10 are left out; none is both.
+    /// Oracle: by hand: of 40 frames the folds leave out 20, 8, 8 and 10; the parts are disjoint.
     #[test]
     fn what_is_left_out_is_not_mapped() {
         let mapped: Vec<FrameId> = (0..80).step_by(2).map(FrameId).collect();

@@ -3,22 +3,22 @@
 use seese3_core::geometry::Twist;
 use seese3_core::index::Neighbour;
 
-/// What tells how a view's camera stands to the mapped frame that it resembles most.
+/// Source of the relative pose between a view and its most similar mapped frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MotionReader {
-    /// Nothing: the view is taken to be where the mapped frame is.
+    /// Zero motion: the pose of the mapped frame is the estimate.
     NearestFrame,
-    /// The adapter that learned from other rooms.
+    /// The adapter trained on other rooms.
     ZeroShot,
-    /// The adapter that was fitted to this room.
+    /// The adapter fitted to this room.
     Fitted,
 }
 
 impl MotionReader {
-    /// Every reader.
+    /// All variants.
     pub const ALL: [Self; 3] = [Self::NearestFrame, Self::ZeroShot, Self::Fitted];
 
-    /// Its name in reports, on the wire and on disk.
+    /// Name in reports, on the wire and on disk.
     pub fn name(self) -> &'static str {
         match self {
             Self::NearestFrame => "nearest-frame",
@@ -28,42 +28,43 @@ impl MotionReader {
     }
 }
 
-/// The reader of one part of a motion, and the share of its reading that is believed.
+/// Estimator and shrinkage gain for the translation or the rotation of a motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PartRule {
-    /// The reader.
+    /// The estimator.
     pub reader: MotionReader,
-    /// The share of its reading that is believed, 0 to 1; 0 for [`MotionReader::NearestFrame`].
+    /// Factor on its estimate, 0 to 1; 0 for [`MotionReader::NearestFrame`] only.
     pub gain: f64,
 }
 
 impl PartRule {
-    /// The mapped frame's own pose.
+    /// Zero motion from the mapped frame.
     pub(super) const NONE: Self = Self {
         reader: MotionReader::NearestFrame,
         gain: 0.0,
     };
 }
 
-/// What the readers say of a view.
+/// Estimates of a view's motion from its most similar mapped frame, one per estimator.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionHypotheses {
-    /// The mapped frame that the view resembles most.
+    /// Most similar mapped frame.
     pub nearest: Neighbour,
-    /// Its distance, in deviations of a feature column.
+    /// Distance of that frame, in standard deviations of a feature column.
     pub distance: f64,
-    /// The motion from it to the view, as the adapter of other rooms reads it.
+    /// Motion from that frame to the view, estimated by the adapter of other rooms.
     pub zero_shot: Option<Twist>,
-    /// The same, as the fitted adapter reads it.
+    /// Motion from that frame to the view, estimated by the fitted adapter.
     pub fitted: Option<Twist>,
-    /// How far apart the view's poses are when it is read from other mapped frames than the
-    /// nearest, by the best informed reader: the median over the next ones, ‖(v, ω)‖, metres and
-    /// radians mixed. The size of an error is expected from it.
+    /// Spread of the view's pose estimates, which predicts the size of the error. It is the median
+    /// ‖(v, ω)‖ from the estimate relative to the nearest frame to those relative to the next
+    /// frames, meters and radians mixed. The fitted adapter is used if there is one, else the
+    /// zero-shot adapter.
     pub disagreement: f64,
 }
 
 impl MotionHypotheses {
-    /// The motion that a reader says; none of a reader that is not there.
+    /// Motion estimated by `reader`; `None` if that adapter is missing.
     pub fn by(&self, reader: MotionReader) -> Option<Twist> {
         match reader {
             MotionReader::NearestFrame => Some(Twist::default()),
@@ -72,7 +73,7 @@ impl MotionHypotheses {
         }
     }
 
-    /// The motion whose translation and rotation come from these readers.
+    /// Combines translation and rotation from the estimators of two rules, each times its gain.
     pub fn combined(&self, translation: PartRule, rotation: PartRule) -> Twist {
         let read = |rule: PartRule| {
             let motion = self.by(rule.reader).unwrap_or_default();

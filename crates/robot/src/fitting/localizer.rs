@@ -1,4 +1,4 @@
-//! Where the camera of a single view is in a mapped room.
+//! Localization of a single view in a mapped room.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ use seese3_core::room::FrameId;
 use seese3_core::statistics::median;
 use seese3_core::training::RoomData;
 
-/// Locates views by the mapped frame that they resemble most and the motion from it.
+/// Localizes views relative to their most similar mapped frame.
 pub struct Localizer {
     poses: Vec<Pose>,
     standardisation: Standardisation,
@@ -24,27 +24,26 @@ pub struct Localizer {
     fitted: Option<Embedded>,
 }
 
-/// How many mapped frames a view is read from, to see whether they agree.
+/// Number of nearest mapped frames from which the pose is estimated, to measure the disagreement.
 const WITNESSES: usize = 4;
 
-/// Where a view's camera is.
+/// Estimated pose of a view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LocatedView {
-    /// The mapped frame that the view resembles most; its distance is in deviations of a feature
-    /// column.
+    /// Most similar mapped frame; its distance is in standard deviations of a feature column.
     pub nearest: Neighbour,
     /// `world_from_camera`, with the covariance of its error in its body frame.
     pub pose: PoseWithCovariance,
-    /// What told the translation from that frame.
+    /// Estimator of the translation from that frame.
     pub translation: PartRule,
-    /// What told the rotation from that frame.
+    /// Estimator of the rotation from that frame.
     pub rotation: PartRule,
 }
 
-/// Features in units in which their distances compare between rooms.
+/// Z-scoring of features, so that distances are comparable between rooms.
 struct Standardisation {
     mean: Array1<f64>,
-    /// The columns' deviations times √d, so that a distance is the root mean square over columns.
+    /// Standard deviation of each column times √d: a distance is a root mean square over columns.
     scale: Array1<f64>,
 }
 
@@ -60,7 +59,7 @@ impl Standardisation {
     }
 }
 
-/// An adapter and the latents of the room's frames under it.
+/// An adapter and its latents of the room's frames.
 struct Embedded {
     adapter: Arc<Adapter>,
     latents: Array2<f64>,
@@ -73,8 +72,8 @@ impl Embedded {
         Ok(Self { adapter, latents })
     }
 
-    /// The motion from a frame to a view. A half turn has no unique logarithm, and no camera makes
-    /// one between two frames that look alike: nothing was read.
+    /// Motion from a frame to a view; zero if the estimate is a half turn, which has no unique
+    /// logarithm and is implausible between similar views.
     fn motion(&self, from: FrameId, feature: &[f32]) -> Result<Twist, adapter::Error> {
         let latent = self.adapter.embed_one(feature)?;
         let motion = self
@@ -90,12 +89,13 @@ impl Embedded {
 }
 
 impl Localizer {
-    /// A localizer over the mapped frames of a room, in rising order. `zero_shot` is an adapter
-    /// that learned from other rooms, `fitted` one that was fitted to these frames.
+    /// Builds a localizer over the mapped frames of a room, in ascending order. `zero_shot` is an
+    /// adapter trained on other rooms, `fitted` an adapter fitted to these frames.
     ///
     /// # Errors
-    /// [`Error::MappedFrames`] or [`Error::FewFrames`] when there is no mapped frame or one does not
-    /// exist, [`Error::Adapter`] when the features are not those of an adapter.
+    /// - [`Error::FewFrames`] if there is no mapped frame.
+    /// - [`Error::MappedFrames`] if the frames do not exist or are not in ascending order.
+    /// - [`Error::Adapter`] if the room's features have another source than an adapter's.
     pub fn new(
         data: &RoomData<'_>,
         mapped: &[FrameId],
@@ -123,7 +123,7 @@ impl Localizer {
         })
     }
 
-    /// About how much memory it holds, bytes, besides the adapters.
+    /// Approximate memory use without the adapters, bytes.
     pub fn memory_bytes(&self) -> usize {
         let embedded = self.zero_shot.iter().chain(&self.fitted);
         let latents: usize = embedded.map(|embedded| embedded.latents.len()).sum();
@@ -131,10 +131,11 @@ impl Localizer {
         size_of_val(self.poses.as_slice()) + latents * size_of::<f64>() + self.index.memory_bytes()
     }
 
-    /// What the readers say of a view, given by its raw feature of shape (d,).
+    /// Estimates a view's motion from its nearest mapped frame with each adapter. `feature` is the
+    /// raw feature, shape (d,).
     ///
     /// # Errors
-    /// [`Error::Adapter`] when the feature has another width or a number that is not finite.
+    /// [`Error::Adapter`] if the feature has the wrong width or a value is not finite.
     pub fn read(&self, feature: &[f32]) -> Result<MotionHypotheses, Error> {
         let expected = self.standardisation.mean.len();
         if feature.len() != expected {
@@ -179,8 +180,8 @@ impl Localizer {
         Ok(motion.transpose()?)
     }
 
-    /// How far the poses of a view that are read from other frames are from the one that is read
-    /// from the first.
+    /// Median distance from the pose estimated relative to the first witness to the poses estimated
+    /// relative to the others; see [`MotionHypotheses::disagreement`].
     fn disagreement(&self, witnesses: &[Neighbour], feature: &[f32]) -> Result<f64, Error> {
         let best_informed = if self.fitted.is_some() {
             &self.fitted
@@ -205,7 +206,7 @@ impl Localizer {
         })
     }
 
-    /// The adapters that read motions here: that of other rooms, and the fitted one.
+    /// The adapters in use: zero-shot, then fitted.
     pub fn adapters(&self) -> impl Iterator<Item = &Arc<Adapter>> {
         let readers = [&self.zero_shot, &self.fitted];
         readers
@@ -214,12 +215,12 @@ impl Localizer {
             .map(|embedded| &embedded.adapter)
     }
 
-    /// The pose of a mapped frame, `world_from_camera`.
+    /// Pose of a frame, `world_from_camera`.
     pub fn pose(&self, frame: FrameId) -> &Pose {
         &self.poses[frame.row()]
     }
 
-    /// Where the camera of a view is, by the rules that were measured for this map.
+    /// Estimates the pose of a view from its raw feature, with the rules measured for this map.
     ///
     /// # Errors
     /// As [`Localizer::read`].
@@ -227,7 +228,7 @@ impl Localizer {
         Ok(self.located(&self.read(feature)?, rules))
     }
 
-    /// Where the camera of a view is, from what the readers say of it.
+    /// Estimates the pose of a view from its motion hypotheses.
     pub fn located(&self, readings: &MotionHypotheses, rules: &ReadingRules) -> LocatedView {
         let rule = rules.at(readings.distance);
         let motion = readings.combined(rule.translation, rule.rotation);

@@ -1,14 +1,14 @@
-//! An adapter fitted to the one room that it serves, and single views located in that room.
+//! Fits an adapter to one mapped room and localizes single views in that room.
 //!
-//! An adapter that learned from other rooms reads motions in a new one badly. [`fit`] trains one on
-//! the mapped frames of the room itself. Near a mapped frame it reads better than anything else;
-//! where nothing near is mapped it can be worse than no reading at all. So it is measured: networks
-//! that were fitted without some of the mapped frames locate those, and [`ReadingRules`] keep, by
-//! the distance of a view from the map, which reader to believe and how far. A [`Localizer`]
-//! answers by these rules.
+//! An adapter trained on other rooms estimates motions in a new room poorly. [`fit`] trains one on
+//! the mapped frames of the room itself. Near a mapped frame it is the best estimator; far from the
+//! map it can be worse than the pose of the nearest frame. The fit is therefore cross-validated:
+//! models trained without some of the mapped frames localize those frames. [`ReadingRules`] hold
+//! the result: for each range of distances from the map, an estimator, its gain and a covariance.
+//! A [`Localizer`] applies these rules.
 //!
-//! Distances are those of features, z-scored by the mapped frames, so that all readers start from
-//! the same mapped frame.
+//! Distances are between features, z-scored over the mapped frames, so that all estimators start
+//! from the same mapped frame.
 
 mod fit;
 mod folds;
@@ -27,39 +27,39 @@ pub use rules::{ReadingRule, ReadingRules};
 use seese3_core::room::{FrameId, Room};
 use seese3_core::{adapter, training};
 
-/// Why an adapter cannot be fitted to a room, or a view cannot be located in it.
+/// Why an adapter cannot be fitted to a room, or a view cannot be localized.
 #[derive(Debug, thiserror::Error, PartialEq)]
 #[non_exhaustive]
 pub enum Error {
-    /// Too few frames to fit on and to measure errors with.
+    /// Too few mapped frames.
     #[error("{given} mapped frames are too few to fit an adapter to; at least {least} are needed")]
     FewFrames {
-        /// The fewest that suffice.
+        /// Minimum number of mapped frames.
         least: usize,
-        /// How many were given.
+        /// Number of given frames.
         given: usize,
     },
-    /// A row that the room does not have, or one that is named twice.
-    #[error("the mapped frames must be rows of the room in rising order")]
+    /// Mapped frames that do not exist, repeat, or are not in ascending order.
+    #[error("the mapped frames must be rows of the room in ascending order, without repeats")]
     MappedFrames,
-    /// No view can be told from another.
-    #[error("the features of the mapped frames are all alike: no view can be told from another")]
+    /// All mapped frames have the same features.
+    #[error("the features of the mapped frames are identical: views cannot be distinguished")]
     AllAlike,
-    /// The rules were stored in a form that makes no sense.
-    #[error("the rules of a fitted adapter are not sound: {what}")]
+    /// Stored reading rules that are invalid.
+    #[error("invalid reading rules of a fitted adapter: {what}")]
     Rules {
-        /// What is wrong.
+        /// What is invalid.
         what: &'static str,
     },
     /// The room and its features do not fit together.
     #[error(transparent)]
     Training(#[from] training::Error),
-    /// An adapter refused its input, or training failed.
+    /// An adapter rejected its input, or training failed.
     #[error(transparent)]
     Adapter(#[from] adapter::Error),
 }
 
-/// Refuses mapped frames that are too few, unknown, or not in rising order.
+/// Rejects mapped frames that are too few, do not exist, or are not in ascending order.
 fn check_mapped(room: &Room, mapped: &[FrameId], least: usize) -> Result<(), Error> {
     if mapped.len() < least {
         return Err(Error::FewFrames {

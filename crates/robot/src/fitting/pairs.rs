@@ -1,4 +1,4 @@
-//! The pairs of mapped frames that a fitted adapter learns from.
+//! Training pairs of mapped frames for a fitted adapter.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -7,16 +7,16 @@ use seese3_core::geometry::Pose;
 use seese3_core::room::{FrameId, Room};
 use seese3_core::statistics::median;
 
-/// How many pairs are drawn.
+/// Number of pairs drawn.
 pub const PAIRS: usize = 30_000;
-/// Pairs that follow one another in time reach over so many rows, as the paper's longest do …
+/// Longest temporal pair in rows, as in the paper.
 const LONGEST_ROWS: f64 = 40.0;
-/// … but over so many mapped frames at least.
+/// Minimum length of the longest temporal pair in mapped frames; overrides [`LONGEST_ROWS`].
 const FEWEST_STEPS: usize = 5;
 
-/// Rows of mapped frames, drawn with replacement from two kinds of pairs: frames that follow one
-/// another in a sequence, and frames whose poses are near, whenever they were taken. The second
-/// kind is what a view has to be read from when a camera comes back.
+/// Draws training pairs, as rows of mapped frames, with replacement. The pool holds temporal pairs
+/// of one sequence and pairs with near poses at any time. The second kind trains the case of a
+/// camera that returns to a place.
 pub fn pairs(room: &Room, mapped: &[FrameId], seed: u64) -> Vec<[usize; 2]> {
     let steps = steps(mapped);
     let mut pool = following(room, mapped, steps);
@@ -31,8 +31,7 @@ pub fn pairs(room: &Room, mapped: &[FrameId], seed: u64) -> Vec<[usize; 2]> {
         .collect()
 }
 
-/// The longest distance in rows between two frames that follow one another: what a record of the
-/// training says of the pairs.
+/// Length of the longest temporal pair in rows, for the training record.
 pub fn longest_rows(mapped: &[FrameId]) -> u32 {
     let longest = mapped
         .windows(steps(mapped) + 1)
@@ -41,7 +40,7 @@ pub fn longest_rows(mapped: &[FrameId]) -> u32 {
     longest.unwrap_or(1)
 }
 
-/// How many mapped frames a pair in time reaches over.
+/// Length of the longest temporal pair in mapped frames.
 fn steps(mapped: &[FrameId]) -> usize {
     let spacings: Vec<f64> = mapped
         .windows(2)
@@ -55,7 +54,7 @@ fn steps(mapped: &[FrameId]) -> usize {
     )
 }
 
-/// Pairs of mapped frames at most `steps` mapped frames apart, in one sequence.
+/// Temporal pairs: at most `steps` mapped frames apart, in one sequence.
 fn following(room: &Room, mapped: &[FrameId], steps: usize) -> Vec<[usize; 2]> {
     let mut pairs = Vec::new();
     for (at, &source) in mapped.iter().enumerate() {
@@ -67,7 +66,7 @@ fn following(room: &Room, mapped: &[FrameId], steps: usize) -> Vec<[usize; 2]> {
     pairs
 }
 
-/// Each mapped frame with the `count` others whose poses are nearest, metres and radians alike.
+/// Spatial pairs: each mapped frame with the `count` mapped frames of nearest pose, by [`apart`].
 fn near(poses: &[Pose], mapped: &[FrameId], count: usize) -> Vec<[usize; 2]> {
     let mut pairs = Vec::new();
     for &source in mapped {
@@ -92,7 +91,7 @@ fn near(poses: &[Pose], mapped: &[FrameId], count: usize) -> Vec<[usize; 2]> {
     pairs
 }
 
-/// How far two poses are apart: metres plus radians.
+/// Distance between two poses: meters plus radians.
 fn apart(a: &Pose, b: &Pose) -> f64 {
     let metres = (a.translation.vector - b.translation.vector).norm();
     metres + a.rotation.angle_to(&b.rotation)
@@ -103,7 +102,7 @@ mod tests {
     use super::*;
     use seese3_core::room::{Frames, Provenance, RoomId};
 
-    /// A camera that walks along x and comes back on the same way.
+    /// A camera that moves along x and returns on the same path.
     fn there_and_back(count: usize) -> Room {
         let x = |row: usize| row.min(count - 1 - row) as f64;
         let frames = Frames {
@@ -115,8 +114,8 @@ mod tests {
         Room::new(RoomId::new("r").unwrap(), frames, Provenance::default()).unwrap()
     }
 
-    /// Oracle: by hand. Of the frames 0, 10, … the pairs in time reach over five, and the frame at
-    /// the same place on the way back is among the nearest.
+    /// Oracle: by hand. Every tenth frame is mapped, so temporal pairs span up to five mapped
+    /// frames. The frame at the same place on the way back is among the nearest.
     #[test]
     fn pairs_join_neighbours_in_time_and_in_place() {
         let room = there_and_back(200);

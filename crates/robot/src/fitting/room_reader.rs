@@ -1,4 +1,4 @@
-//! A room's localizer with the rules that were measured for it: what reads single views of the room.
+//! A room's localizer with its cross-validated reading rules.
 
 use std::sync::Arc;
 
@@ -8,17 +8,17 @@ use seese3_core::adapter::Adapter;
 use seese3_core::room::FrameId;
 use seese3_core::training::RoomData;
 
-/// Locates single views of one room, by an adapter that was fitted to it.
+/// Localizes single views of one room with an adapter fitted to it.
 pub struct RoomReader {
-    /// Reads where a view is from the frame that it resembles most.
+    /// Estimates motions from the most similar mapped frame.
     pub localizer: Localizer,
-    /// How far it is believed.
+    /// Estimator, gain and covariance by distance from the map.
     pub rules: ReadingRules,
 }
 
 impl RoomReader {
-    /// The reader of an adapter that was fitted to these mapped frames; `base` is the adapter that
-    /// it began from.
+    /// Builds the reader of an adapter fitted to these mapped frames; `base` is the adapter that
+    /// the fit started from.
     ///
     /// # Errors
     /// As [`Localizer::new`].
@@ -34,7 +34,7 @@ impl RoomReader {
         })
     }
 
-    /// Where the camera of a view is, from its raw feature of shape (d,).
+    /// Estimates the pose of a view from its raw feature, shape (d,).
     ///
     /// # Errors
     /// As [`Localizer::read`].
@@ -44,8 +44,8 @@ impl RoomReader {
 }
 
 impl PoseReader for RoomReader {
-    /// None also for a view that is further from the map than any that the rules were made for:
-    /// what is read there errs more than its covariance says.
+    /// `None` also if the view is farther from the map than all held-out views of the rules:
+    /// there the errors exceed the covariance.
     fn read_pose(&self, feature: &[f32]) -> Option<PoseWithCovariance> {
         let view = self.locate(feature).ok()?;
         let furthest = self.rules.rules().last()?.up_to;

@@ -1,4 +1,4 @@
-//! Which reader of motions to believe, and how far, by the distance of a view from the map.
+//! Reading rules: the motion estimator, its gain and covariance, by the distance from the map.
 
 use nalgebra::{Matrix6, Vector3, Vector6};
 
@@ -8,36 +8,36 @@ use crate::calibration::robust_covariance;
 use seese3_core::geometry::{Pose, Twist, body_twist, exp};
 use seese3_core::statistics::{Rate, median};
 
-/// The fewest matches that one rule is made from.
+/// Minimum number of held-out views per rule.
 const FEWEST_MATCHES: usize = 25;
-/// The largest number of rules.
+/// Maximum number of rules.
 const MOST_RULES: usize = 8;
-/// An error, metres or radians, that is assumed once in every direction.
+/// Size of the pseudo-error added in each direction, meters or radians.
 const LEAST_ERROR: f64 = 1e-3;
-/// Gains that are tried: tenths.
+/// Number of candidate gains: 0.1, 0.2, …, 1.
 const GAINS: usize = 10;
 
-/// What holds for views up to a distance from the map.
+/// Estimators and covariance for views up to a distance from the map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReadingRule {
-    /// The largest distance that the rule was made for, in deviations of a feature column.
+    /// Largest distance of the held-out views of the rule, in standard deviations of a feature
+    /// column.
     pub up_to: f64,
-    /// What tells the translation.
+    /// Estimator of the translation.
     pub translation: PartRule,
-    /// What tells the rotation.
+    /// Estimator of the rotation.
     pub rotation: PartRule,
-    /// The covariance of the located pose's error in its body frame, on (v, ω), metres and radians,
-    /// over u² + u₀²: the squares of the [`MotionHypotheses::disagreement`] and of `least_disagreement`.
+    /// Covariance of the pose error in its body frame, on (v, ω), meters and radians, divided by
+    /// u² + u₀². Here u is [`MotionHypotheses::disagreement`] and u₀ is `least_disagreement`.
     pub covariance: Matrix6<f64>,
-    /// u₀: a quarter of the median disagreement of the trials, so that errors are not taken for
-    /// zero where readings happen to agree.
+    /// u₀: a quarter of the median disagreement of the held-out views. It keeps covariances above
+    /// zero if the estimates happen to agree.
     pub least_disagreement: f64,
 }
 
 impl ReadingRule {
-    /// The covariance of the error of a pose that was located at a distance from the map, by
-    /// readings that disagree so far. Beyond the distance that the rule was made for, errors are
-    /// taken to grow with it.
+    /// Covariance of a pose error at a distance from the map and a disagreement of the estimates.
+    /// Beyond `up_to`, the standard deviation grows in proportion to the distance.
     pub fn covariance_at(&self, distance: f64, disagreement: f64) -> Matrix6<f64> {
         let beyond = (distance / self.up_to).max(1.0);
         self.covariance * (self.squared_size(disagreement) * beyond * beyond)
@@ -48,36 +48,36 @@ impl ReadingRule {
     }
 }
 
-/// Rules by rising distance; the last one also holds beyond its own.
+/// Rules in order of increasing distance; the last one also applies beyond its distance.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReadingRules(Vec<ReadingRule>);
 
-/// What the readers said of a view whose true place is known.
+/// Motion hypotheses for a held-out view with known pose.
 pub struct HeldOutView {
-    /// What they said.
+    /// Estimated motions from the mapped frame to the view.
     pub readings: MotionHypotheses,
-    /// The true motion from the mapped frame to the view.
+    /// True motion from the mapped frame to the view.
     pub truth: Twist,
-    /// Whether the view lies between two mapped frames of one path.
+    /// Whether the view lies directly between two mapped frames, see `Fold::is_interleaved`.
     pub is_interleaved: bool,
 }
 
 impl ReadingRules {
-    /// Checks rules that were stored.
+    /// Validates stored rules.
     ///
     /// # Errors
-    /// [`Error::Rules`], which says what is wrong.
+    /// [`Error::Rules`], which names the problem.
     pub fn new(rules: Vec<ReadingRule>) -> Result<Self, Error> {
         let unsound = |what| Err(Error::Rules { what });
         if rules.is_empty() {
-            return unsound("there is none");
+            return unsound("there are no rules");
         }
         if !rules.is_sorted_by(|a, b| a.up_to < b.up_to)
             || rules
                 .iter()
                 .any(|rule| rule.up_to.is_nan() || rule.up_to < 0.0)
         {
-            return unsound("their distances do not rise");
+            return unsound("the distances do not increase");
         }
 
         for rule in &rules {
@@ -99,31 +99,30 @@ impl ReadingRules {
         Ok(Self(rules))
     }
 
-    /// The rules, by rising distance.
+    /// The rules, in order of increasing distance.
     pub fn rules(&self) -> &[ReadingRule] {
         &self.0
     }
 
-    /// The rule for a view at a distance from the map.
+    /// The rule for a view at this distance from the map.
     pub fn at(&self, distance: f64) -> &ReadingRule {
         let next = self.0.partition_point(|rule| rule.up_to < distance);
         &self.0[next.min(self.0.len() - 1)]
     }
 
-    /// The rules that trials speak for.
+    /// Fits rules to held-out views (trials), sorted by distance into bins of equal size.
     ///
-    /// A reader is believed only where it comes nearer to the truth than the mapped frame itself in
-    /// more than half of the trials, and surely so (Wilson's lower bound).
+    /// An adapter is used only if it is nearer to the truth than the mapped frame in significantly
+    /// more than half of the trials (Wilson lower bound above 0.5).
     ///
-    /// Between two mapped frames of one path a view is located better than anywhere else at the
-    /// same distance. Covariances are therefore those of the other trials, wherever these are
-    /// enough.
+    /// Interleaved views have smaller errors than other views at the same distance. Covariances
+    /// therefore use only the other views, if a bin has enough.
     ///
     /// # Errors
-    /// [`Error::AllAlike`] when no trial is at a distance, [`Error::Adapter`] when the errors make no
-    /// covariance.
+    /// [`Error::AllAlike`] if all trials have distance 0, [`Error::Adapter`] if the errors give no
+    /// valid covariance.
     pub(super) fn measured(mut trials: Vec<HeldOutView>) -> Result<Self, Error> {
-        // Between repeated images there is nothing to read.
+        // A trial with distance 0 is a repeated image: there is no motion to estimate.
         trials.retain(|trial| trial.readings.distance > 0.0);
         if trials.is_empty() {
             return Err(Error::AllAlike);
@@ -153,9 +152,8 @@ impl ReadingRules {
                 part.iter().collect()
             };
 
-            // A view between mapped frames is located better than one beyond them, also where their
-            // features are as far: errors are measured in the size that the disagreement of
-            // readings lets expect.
+            // At the same feature distance, errors between mapped frames are smaller than errors
+            // beyond them. The disagreement captures this, so errors are normalized by it.
             let mut residuals: Vec<Vector6<f64>> = judging
                 .into_iter()
                 .map(|trial| {
@@ -164,12 +162,13 @@ impl ReadingRules {
                 })
                 .collect();
 
-            // A robot on wheels has no error in some directions; a covariance needs one in each.
+            // A wheeled robot has no error in some directions. One pseudo-error per direction keeps
+            // the covariance positive definite.
             let size = rule.squared_size(rule.least_disagreement).sqrt();
             residuals.extend((0..6).map(|axis| Vector6::ith(axis, LEAST_ERROR / size)));
             rule.covariance = robust_covariance(&residuals)?;
 
-            // Trials at one distance may fall into two parts: the later one is as good.
+            // Trials with equal distance may fall into two bins; keep the rule of the later bin.
             match rules.last_mut() {
                 Some(last) if last.up_to >= rule.up_to => *last = rule,
                 _ => rules.push(rule),
@@ -180,7 +179,7 @@ impl ReadingRules {
     }
 }
 
-/// A quarter of the median disagreement; above zero.
+/// A quarter of the median disagreement, bounded to be positive.
 fn least_disagreement(trials: &[HeldOutView]) -> f64 {
     let found: Vec<f64> = trials
         .iter()
@@ -189,7 +188,7 @@ fn least_disagreement(trials: &[HeldOutView]) -> f64 {
     (0.25 * median(&found)).max(f64::MIN_POSITIVE.sqrt())
 }
 
-/// The reader and the gain with the smallest median error of one part of the motion.
+/// Estimator and gain with the smallest median error, for one part of the motion.
 fn best_reader(trials: &[HeldOutView], part: fn(&Twist) -> Vector3<f64>) -> PartRule {
     let unread: Vec<f64> = trials
         .iter()
@@ -227,7 +226,7 @@ fn best_reader(trials: &[HeldOutView], part: fn(&Twist) -> Vector3<f64>) -> Part
     best
 }
 
-/// The error of the located pose, in its body frame.
+/// Error of the estimated pose, in its body frame.
 fn residual(trial: &HeldOutView, translation: PartRule, rotation: PartRule) -> Vector6<f64> {
     let located = exp(&trial.readings.combined(translation, rotation));
     let truth: Pose = exp(&trial.truth);
@@ -240,7 +239,7 @@ mod tests {
     use seese3_core::index::Neighbour;
     use seese3_core::room::FrameId;
 
-    /// Trials in which the fitted reader is right near the map and misleads far from it.
+    /// Trials in which the fitted adapter is accurate near the map and wrong far from it.
     fn trials(count: usize) -> Vec<HeldOutView> {
         let mut random = <rand_chacha::ChaCha8Rng as rand::SeedableRng>::seed_from_u64(1);
         (0..count)
@@ -278,7 +277,7 @@ mod tests {
             .collect()
     }
 
-    /// Oracle: the way the trials were made: right below a distance of .6, misleading above.
+    /// Oracle: the construction of the trials: accurate below a distance of 0.6, wrong above.
     #[test]
     fn a_reader_is_believed_where_it_is_right() {
         let rules = ReadingRules::measured(trials(800)).unwrap();
@@ -295,7 +294,7 @@ mod tests {
             assert_eq!(rule.rotation.reader, reader, "{distance}");
         }
 
-        // What is read errs by a tenth of what is not; all trials disagree alike.
+        // Fitted estimates have a tenth of the other errors; all trials have the same disagreement.
         let near = rules.at(0.2).covariance_at(0.2, 1.0)[(0, 0)].sqrt();
         let far = rules.at(1.0).covariance_at(1.0, 1.0)[(0, 0)].sqrt();
         assert!(
@@ -304,7 +303,7 @@ mod tests {
         );
     }
 
-    /// Oracle: the words of the error's documentation.
+    /// Oracle: the documented conditions of [`Error::Rules`].
     #[test]
     fn rules_that_make_no_sense_are_refused() {
         let rule = ReadingRules::measured(trials(100)).unwrap().rules()[0].clone();

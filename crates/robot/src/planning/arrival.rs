@@ -1,4 +1,4 @@
-//! Where a camera arrives that drives a way without looking again.
+//! The probability of arrival when a route is driven open loop.
 
 use nalgebra::{Cholesky, Vector6};
 use rand::SeedableRng;
@@ -8,13 +8,15 @@ use crate::tracking::PoseWithCovariance;
 use seese3_core::geometry::{Pose, PoseError, Twist, exp};
 use seese3_core::statistics::normal_deviates;
 
-/// Errors that are drawn.
+/// Number of Monte Carlo samples of the start error.
 const SAMPLES: usize = 400;
 
-/// The probability that a camera ends within a tolerance of a goal when it drives from where it is
-/// believed to be to a planned last pose, by motions without any error: only the error of the believed
-/// start counts, and a turned start turns the whole way. From 400 errors that are always the same;
-/// 0 if the covariance is not positive definite. Poses are `world_from_camera`.
+/// Probability that a camera ends within the tolerances of `goal` when it drives from `start` to
+/// the planned pose `last` without corrections.
+///
+/// The motions are assumed exact; only the error of the start pose counts, and a rotation error
+/// rotates the whole route. The estimate uses 400 samples with a fixed seed. It is 0 if the
+/// covariance is not positive definite. Poses are `world_from_camera`.
 pub fn arrival_probability(
     start: &PoseWithCovariance,
     last: &Pose,
@@ -45,9 +47,9 @@ mod tests {
 
     use super::*;
 
-    /// Oracle: the normal distribution and trigonometry. A start that is unsure by 0.1 m along x alone
-    /// ends within 0.1 m in 68 %; one that is turned about y by 0.1 rad, and drives two metres along
-    /// its axis, ends 0.2 m beside the goal for each such deviation.
+    /// Oracle: the normal distribution and trigonometry. With a standard deviation of 0.1 m along x
+    /// alone, 68 % end within 0.1 m. With one of 0.1 rad about y and a route of 2 m along z, the
+    /// standard deviation at the goal is 0.2 m, so that 38 % end within 0.1 m.
     #[test]
     fn errors_of_the_start_are_carried_to_the_end() {
         let start = |along: f64, about: f64| PoseWithCovariance {

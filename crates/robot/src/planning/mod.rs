@@ -1,9 +1,9 @@
-//! Ways for a camera to drive: from what it sees to a goal in the room, over the room's frames.
+//! Route planning over a room's frames, from a view to a goal.
 //!
-//! - [`BelievedStart`] says where the camera is believed to be.
-//! - A [`PoseGraph`] finds the shortest way in hops.
-//! - [`plan`] puts the two together, and says with which probability a camera arrives that drives the
-//!   way without looking again. It plans nothing from a start that is as good as unknown.
+//! - [`BelievedStart`] is the estimated start pose.
+//! - [`PoseGraph`] finds the shortest route in hops.
+//! - [`plan`] combines both and computes the probability of arrival when the route is driven open
+//!   loop. It returns no route if the start pose is too uncertain.
 
 mod arrival;
 mod pose_graph;
@@ -19,47 +19,49 @@ use seese3_core::geometry::Pose;
 use seese3_core::navigation::Navigator;
 use seese3_core::room::FrameId;
 
-/// Unless another one is asked for, nothing is planned where the camera would arrive with a smaller
-/// probability. Chosen on six calibration rooms: of 0, 0.2, 0.3, 0.5 and 0.7 the smallest with which no
-/// view of another room started a way.
+/// Default minimum arrival probability of a planned route.
+///
+/// Chosen on six calibration rooms from 0, 0.2, 0.3, 0.5 and 0.7: the smallest value for which no
+/// view of another room started a route.
 pub const LEAST_ARRIVAL_PROBABILITY: f64 = 0.2;
 
-/// What comes of planning.
+/// Result of planning.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Planned {
-    /// There is a way.
+    /// A route was found.
     Way {
-        /// The way.
+        /// The route.
         route: Route,
-        /// The probability that a camera that drives it without looking again ends within the
-        /// tolerance; none where it is not known how surely the start is.
+        /// Probability of ending within the tolerance when the route is driven open loop; `None`
+        /// if the start has no covariance.
         arrival_probability: Option<f64>,
     },
-    /// The view does not tell where the camera is.
+    /// The start pose is unknown or too uncertain.
     StartUnknown(StartUnknown),
-    /// The start is known, and there is no way.
+    /// The start pose is known, but no route leads to the goal.
     NoRoute(NoRoute),
 }
 
-/// Why a view does not tell where the camera is.
+/// Why the start pose cannot be used.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum StartUnknown {
-    /// It looks like no place of the room.
+    /// The view is out of distribution: it matches no place of the room.
     FarFromRoom {
-        /// Its distance over the room's limit, above 1.
+        /// Distance of the view divided by the room's limit, above 1.
         out_of_distribution: f64,
     },
-    /// It looks like several places, or not much like any: not enough for this way and this tolerance.
+    /// The start covariance is too large for this route and tolerance, for example because several
+    /// places look alike.
     Unsure {
-        /// With which probability a camera would arrive; below what was asked for.
+        /// Arrival probability, below the requested minimum.
         arrival_probability: f64,
     },
 }
 
-/// Plans a way over all frames of a room to a goal, `world_from_camera`.
+/// Plans a route over all frames of a room to `goal`, `world_from_camera`.
 ///
 /// # Errors
-/// [`Cancelled`] when nobody waits for the answer any more.
+/// [`Cancelled`] once `cancel` is set.
 pub fn plan(
     navigator: &Navigator,
     start: &BelievedStart,

@@ -1,9 +1,7 @@
-//! Routes over the frames of a room: from where a camera is to a goal, in hops that are short enough
-//! to drive.
+//! Shortest routes over the frames of a room, from a pose to a goal, in hops of bounded length.
 //!
-//! The frames are the nodes of a graph. Two of them are joined where the motion from one to the other
-//! is no longer than the longest hop. Frames that no hop joins are not reached, and the answer says how
-//! long the longest hop would have to be.
+//! The frames are the nodes of a graph. An edge joins two frames if the motion between them is at
+//! most the longest hop. If no route exists, the result holds the hop length that would suffice.
 
 use ndarray::{ArrayView1, s};
 
@@ -13,101 +11,101 @@ use seese3_core::index::Neighbour;
 use seese3_core::navigation::{Feedback, Navigator, RetrievedFrame};
 use seese3_core::room::FrameId;
 
-/// A straight line may come out longer than the hop by this part of it.
+/// Relative rounding tolerance of the straight-line lower bound of a hop.
 const ROUNDING: f64 = 1e-9;
 
-/// The frames that a route may lead over; at least one.
+/// Graph of the frames that a route may use; at least one frame.
 #[derive(Debug, Clone, Copy)]
 pub struct PoseGraph<'a> {
     poses: &'a [Pose],
     frames: &'a [FrameId],
 }
 
-/// What is asked of a route.
+/// Constraints of a route.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RouteBounds {
-    /// How long its hops may be.
+    /// Limit of the hop length.
     pub hops: Hops,
-    /// Distance from the goal, metres, within which it counts as reached.
+    /// Position tolerance at the goal, meters.
     pub tolerance_m: f64,
-    /// Angle from the goal, radians, within which it counts as reached.
+    /// Rotation tolerance at the goal, radians.
     pub tolerance_rad: f64,
-    /// Nothing is planned where the camera would arrive with a smaller probability, 0 to 1.
+    /// Minimum arrival probability, 0 to 1; used by [`super::plan`] only.
     pub least_arrival_probability: f64,
 }
 
 impl RouteBounds {
-    /// Whether a camera this far from the goal has reached it.
+    /// Whether a pose error relative to the goal is within both tolerances.
     fn are_met(&self, left: &PoseError) -> bool {
         left.translation_m <= self.tolerance_m && left.rotation_rad <= self.tolerance_rad
     }
 }
 
-/// How long hops may be, ‖(v, ω)‖ with metres and radians mixed; above 0.
+/// Limit of the hop length ‖(v, ω)‖, meters and radians mixed; above 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Hops {
-    /// No longer than this.
+    /// Hops are at most this long.
     AtMost(f64),
-    /// No longer than this if there is such a way; else as long as the way needs whose longest hop is
-    /// shortest.
+    /// Hops are at most this long if such a route exists. Otherwise the limit is the longest hop of
+    /// the bottleneck-shortest path.
     Preferably(f64),
 }
 
-/// A way to the goal.
+/// A route to the goal.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Route {
-    /// The frames in order, without the start. A start within the tolerance of the goal has one hop at
-    /// most, to a frame that is nearer.
+    /// Frames in order, without the start. If the start is within the tolerance of the goal, there
+    /// is at most one hop, to a frame nearer to the goal.
     pub frames: Vec<FrameId>,
-    /// The sum of all hops, ‖(v, ω)‖ with metres and radians mixed.
+    /// Sum of the hop lengths ‖(v, ω)‖, meters and radians mixed.
     pub length: f64,
 }
 
-/// Why there is no way to the goal.
+/// Why no route leads to the goal.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum NoRoute {
     /// No frame lies within the tolerance of the goal.
     GoalNotMapped {
-        /// The frame that is nearest to the goal.
+        /// Frame nearest to the goal.
         nearest: FrameId,
-        /// How far that frame is from the goal.
+        /// Distance from that frame to the goal.
         off: PoseError,
     },
-    /// Every way to the goal has a longer hop than is allowed.
+    /// Every route to the goal has a hop longer than the limit.
     HopTooLong {
-        /// The shortest allowance with which there is a way.
+        /// Smallest limit for which a route exists.
         needed: f64,
     },
 }
 
-/// How the lengths of hops add up to what a search makes as small as possible.
+/// Path cost that a search minimizes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Measure {
-    /// Their sum.
+    /// Sum of the hop lengths.
     Sum,
-    /// The longest of them.
+    /// Longest hop (bottleneck).
     Longest,
 }
 
-/// What Dijkstra's algorithm has found, by place among the frames.
+/// Result of Dijkstra's algorithm, indexed by position in [`PoseGraph::frames`].
 struct Search {
-    /// What the way there measures; infinite where no way leads.
+    /// Path cost from the start; infinite if unreachable.
     cost: Vec<f64>,
-    /// The frame before, by place; none where the way comes from the start.
+    /// Index of the preceding frame; `None` if that is the start.
     before: Vec<Option<usize>>,
 }
 
 impl<'a> PoseGraph<'a> {
-    /// A graph over some frames of a room whose poses are `world_from_camera`, row by frame.
+    /// A graph over some frames of a room. `poses` are `world_from_camera` of all its frames.
     pub fn new(poses: &'a [Pose], frames: &'a [FrameId]) -> Self {
         Self { poses, frames }
     }
 
-    /// The shortest way from a pose to the frame nearest to the goal among those within the tolerance
-    /// that can be reached. Takes a time that grows with the square of the number of frames.
+    /// Finds the shortest route from `start` to the reachable frame nearest to `goal`, among the
+    /// frames within the tolerance. Time is quadratic in the number of frames.
     ///
     /// # Errors
-    /// [`Cancelled`] when nobody waits for the answer any more.
+    /// [`Cancelled`] once `cancel` is set.
     pub fn route(
         &self,
         start: &Pose,
@@ -144,8 +142,8 @@ impl<'a> PoseGraph<'a> {
         Ok(route.ok_or(NoRoute::HopTooLong { needed }))
     }
 
-    /// The way of a camera that is within the tolerance already: one hop to the frame nearest to the goal,
-    /// if that is nearer and one hop away.
+    /// Route of a camera already within the tolerance: one hop to the frame nearest to the goal, if
+    /// that is nearer than the start and within the hop limit; otherwise empty.
     fn last_hop(
         &self,
         start: &Pose,
@@ -167,7 +165,7 @@ impl<'a> PoseGraph<'a> {
         }
     }
 
-    /// The way to the first of these places that is reached.
+    /// Route to the first reachable target.
     fn route_of(&self, found: &Search, targets: &[(usize, f64)]) -> Option<Route> {
         let is_reached = |target: &&(usize, f64)| found.cost[target.0].is_finite();
         let &(place, _) = targets.iter().find(is_reached)?;
@@ -178,8 +176,8 @@ impl<'a> PoseGraph<'a> {
         })
     }
 
-    /// The frames that a motion of at most `longest_hop` leads to from a frame, ‖(v, ω)‖ with metres and
-    /// radians mixed, with that motion; at most `most`, the nearest first.
+    /// Neighbors of a frame within `longest_hop`, with the motions to them; at most `most`, nearest
+    /// first. The length is ‖(v, ω)‖, meters and radians mixed.
     pub fn neighbours(
         &self,
         from: FrameId,
@@ -205,8 +203,8 @@ impl<'a> PoseGraph<'a> {
         found
     }
 
-    /// The frames within the tolerance of the goal, by place, with the motion that is left from there;
-    /// the nearest first.
+    /// Indices of the frames within the tolerance of the goal with their distances ‖(v, ω)‖ to it,
+    /// nearest first.
     fn targets(&self, goal: &Pose, bounds: RouteBounds) -> Vec<(usize, f64)> {
         let mut targets: Vec<(usize, f64)> = (0..self.frames.len())
             .filter(|&place| bounds.are_met(&PoseError::between(self.pose(place), goal)))
@@ -228,7 +226,7 @@ impl<'a> PoseGraph<'a> {
         }
     }
 
-    /// Dijkstra's algorithm without a heap: nearly every frame may be joined with every other.
+    /// Dijkstra's algorithm without a heap, since the graph can be nearly complete.
     fn search(
         &self,
         start: &Pose,
@@ -250,8 +248,8 @@ impl<'a> PoseGraph<'a> {
             for &place in &open {
                 let to = self.pose(place);
 
-                // A hop is never shorter than its straight line, but for rounding: most frames are
-                // ruled out by that.
+                // The straight line is a lower bound of the hop, up to rounding. It excludes most
+                // frames cheaply.
                 let line = (to.translation.vector - pose.translation.vector).norm();
                 let line = line * (1.0 - ROUNDING);
                 if line > longest_hop || measure.with(cost, line) >= found.cost[place] {
@@ -294,7 +292,7 @@ impl<'a> PoseGraph<'a> {
 }
 
 impl Measure {
-    /// The measure of a way that is made longer by a hop.
+    /// Cost of a path extended by a hop.
     fn with(self, way: f64, hop: f64) -> f64 {
         match self {
             Self::Sum => way + hop,
@@ -304,7 +302,7 @@ impl Measure {
 }
 
 impl Route {
-    /// The longest hop, from the start on; `poses` are those of all frames, row by frame.
+    /// Longest hop, including the first one from `start`; `poses` holds all frames of the room.
     pub fn longest_hop(&self, start: &Pose, poses: &[Pose]) -> f64 {
         let stops: Vec<&Pose> = std::iter::once(start)
             .chain(self.frames.iter().map(|frame| &poses[frame.row()]))
@@ -315,8 +313,8 @@ impl Route {
         hops.fold(0.0, f64::max)
     }
 
-    /// What is reported of a route before its first hop and after each: for a camera with this latent,
-    /// of shape (k,), and this pose. A frame's distance is that of its latent from the one before.
+    /// Feedback before the first hop and after each hop, for a camera that starts with this latent,
+    /// shape (k,), and pose. A frame's distance is the latent distance from the previous frame.
     pub fn feedback(
         &self,
         navigator: &Navigator,
@@ -388,8 +386,8 @@ mod tests {
             .unwrap()
     }
 
-    /// Oracle: by hand. Frames stand on three sides of a square of two metres, one metre apart; across
-    /// its open side the goal is two metres away.
+    /// Oracle: by hand. Frames lie 1 m apart on three sides of a square of 2 m. The goal is 2 m
+    /// away, across the open side.
     #[test]
     fn a_route_goes_round_what_no_hop_crosses() {
         let poses = [
@@ -414,15 +412,15 @@ mod tests {
         assert!((diagonal.length - (2.0 + 2.0 * 2_f64.sqrt())).abs() < 1e-12);
     }
 
-    /// Oracle: by hand: the widest gap of the only way is three metres; nothing is mapped at the goal;
-    /// and a camera at the goal has nowhere to go.
+    /// Oracle: by hand. The widest gap of the only route is 3 m; an unmapped goal gives
+    /// [`NoRoute::GoalNotMapped`]; a camera at the goal gets an empty route.
     #[test]
     fn what_keeps_a_route_from_the_goal_is_said() {
         let poses = [at(1.0, 0.0), at(4.0, 0.0), at(5.0, 0.0)];
         let start = at(0.0, 0.0);
 
         let Err(NoRoute::HopTooLong { needed }) = routed(&poses, &start, &at(5.0, 0.0), 2.0) else {
-            panic!("three metres are no hop of two");
+            panic!("a hop of 3 m must exceed a limit of 2 m");
         };
         assert!((needed - 3.0).abs() < 1e-12);
         assert!(routed(&poses, &start, &at(5.0, 0.0), needed).is_ok());
@@ -438,7 +436,7 @@ mod tests {
 
         let unmapped = routed(&poses, &start, &at(2.0, 0.0), 9.0);
         let Err(NoRoute::GoalNotMapped { nearest, off }) = unmapped else {
-            panic!("the nearest frame is a metre off");
+            panic!("the nearest frame is 1 m from the goal, outside the tolerance");
         };
         assert_eq!(nearest, FrameId(0));
         assert!((off.translation_m - 1.0).abs() < 1e-12);
@@ -446,7 +444,7 @@ mod tests {
         let there = routed(&poses, &at(5.0, 0.0), &at(5.0, 0.0), 2.0).unwrap();
         assert!(there.frames.is_empty());
 
-        // Nearer to an unmapped goal than any frame is not there yet; within the tolerance of it is.
+        // Being nearer to an unmapped goal than any frame is not enough; the tolerance decides.
         assert!(routed(&poses, &at(2.1, 0.0), &at(2.0, 0.0), 9.0).is_err());
         let within = routed(&poses, &at(2.04, 0.0), &at(2.0, 0.0), 9.0).unwrap();
         assert!(within.frames.is_empty());
@@ -456,8 +454,8 @@ mod tests {
         assert!(no_hop.frames.is_empty());
     }
 
-    /// Oracle: the metric of tolerances, by hand. The frame is within 0.25 m and 0.25 rad of the goal, and
-    /// further off than the start by metres and radians mixed, which is 0.27 m off and not there.
+    /// Oracle: the tolerances, by hand. The frame is within 0.25 m and 0.25 rad of the goal. The
+    /// start is 0.27 m away: nearer by ‖(v, ω)‖, but outside the tolerance.
     #[test]
     fn a_start_outside_the_tolerance_is_not_there() {
         let frame = Pose::new(Vector3::new(0.2, 0.0, 0.0), Vector3::new(0.0, 0.2, 0.0));
@@ -478,8 +476,8 @@ mod tests {
     }
 
     proptest! {
-        /// Oracle: the algorithm of Floyd and Warshall, over all pairs; with the longest hop in place
-        /// of the sum it gives the smallest step that suffices.
+        /// Oracle: the Floyd–Warshall algorithm over all pairs. With the longest hop in place of
+        /// the sum it gives the bottleneck, the smallest sufficient hop limit.
         #[test]
         fn a_route_is_the_shortest(
             twists in prop::collection::vec(prop::array::uniform6(-1.0..1.0), 4..12),

@@ -1,4 +1,4 @@
-//! Where a camera is believed to be before it is planned for.
+//! The estimated start pose of a route.
 
 use nalgebra::Matrix6;
 use ndarray::ArrayView1;
@@ -7,34 +7,34 @@ use crate::tracking::{Map, MapQuery, PoseReader, PoseWithCovariance};
 use seese3_core::geometry::Pose;
 use seese3_core::navigation::Navigator;
 
-/// What tells where the view of a camera is in a room.
+/// The localizers of one room.
 #[derive(Clone, Copy)]
 pub struct KnownRoom<'a> {
-    /// The room under an adapter.
+    /// The room with an adapter's latents.
     pub navigator: &'a Navigator,
-    /// Its map, if the adapter is calibrated.
+    /// Map of the room, if the adapter is calibrated.
     pub map: Option<&'a Map>,
-    /// What reads raw features of this room, if an adapter was fitted to it.
+    /// Localizer from raw features, if an adapter was fitted to the room.
     pub reader: Option<&'a dyn PoseReader>,
 }
 
-/// The believed pose of a camera.
+/// Estimated start pose of a camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BelievedStart {
     /// `world_from_camera`.
     pub pose: Pose,
-    /// The covariance of its error in its own body frame, where it is known: of a pose that the
-    /// view tells, by a calibrated adapter.
+    /// Covariance of the pose error in its own body frame. Present only if the pose was estimated
+    /// from the view by a fitted or calibrated adapter.
     pub covariance: Option<Matrix6<f64>>,
-    /// The view's distance over the room's limit, where that is known: above 1 it looks like
-    /// another place.
+    /// Distance of the view divided by the room's limit, if known: above 1 the view is out of
+    /// distribution.
     pub out_of_distribution: Option<f64>,
-    /// Whether the view told the pose. Else it was recorded or given.
+    /// Whether the pose was estimated from the view, not recorded or given.
     is_seen: bool,
 }
 
 impl BelievedStart {
-    /// A pose that is recorded.
+    /// A start at a recorded pose, for example that of a mapped frame.
     pub fn recorded(pose: Pose) -> Self {
         Self {
             pose,
@@ -44,7 +44,7 @@ impl BelievedStart {
         }
     }
 
-    /// A pose that the caller gives for a view with this latent, of shape (k,).
+    /// A start at a pose given by the caller, for a view with this latent, shape (k,).
     pub fn given(pose: Pose, room: KnownRoom<'_>, latent: ArrayView1<'_, f64>) -> Self {
         let matched = room
             .map
@@ -55,17 +55,19 @@ impl BelievedStart {
         }
     }
 
-    /// The pose that a view tells, by its latent of shape (k,) and, if it is known, its raw feature
-    /// of shape (d,): as the adapter reads it that was fitted to the room, as far as that was
-    /// measured; else between the frames that look most like it; else, without a calibrated
-    /// adapter, that of the nearest frame.
+    /// Estimates the start pose from a view: its latent, shape (k,), and its raw feature, shape
+    /// (d,), if known.
+    ///
+    /// The pose comes from the fitted adapter, within its validated range. Otherwise it is blended
+    /// from the most similar frames of the map. Without a calibrated adapter it is the pose of the
+    /// nearest frame.
     pub fn seen(room: KnownRoom<'_>, latent: ArrayView1<'_, f64>, feature: Option<&[f32]>) -> Self {
         let query = MapQuery { latent, feature };
         let matched = room.map.map(|map| map.match_view(query, 1));
         let reader = room.reader.zip(feature);
         let read = reader.and_then(|(reader, feature)| reader.read_pose(feature));
 
-        // Without a calibrated adapter the range of the reader tells what is not of this room.
+        // Without a calibrated adapter, the validated range of the reader is the limit.
         let out_of_distribution = match &matched {
             Some(found) => Some(found.out_of_distribution),
             None => reader.and_then(|(reader, feature)| reader.distance_over_range(feature)),
@@ -73,7 +75,7 @@ impl BelievedStart {
 
         let belief: Option<PoseWithCovariance> = read.or(matched.map(|found| found.anchor.belief));
         Self {
-            // A room has frames, so that one is nearest.
+            // A room has at least one frame, so the list of nearest frames is not empty.
             pose: match &belief {
                 Some(belief) => belief.pose,
                 None => room.navigator.nearest(latent, 1)[0].pose,
@@ -84,8 +86,8 @@ impl BelievedStart {
         }
     }
 
-    /// How many times as far from the room as its limit the view is, if it is and its pose was told
-    /// by the view: that pose means nothing.
+    /// Out-of-distribution ratio, if it is above 1 and the pose was estimated from the view. Such a
+    /// pose must not be used.
     pub fn beyond_limit(&self) -> Option<f64> {
         self.out_of_distribution
             .filter(|far| *far > 1.0 && self.is_seen)

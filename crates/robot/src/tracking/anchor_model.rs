@@ -1,10 +1,10 @@
-//! The pose of a view by the mapped frames that look most like it, and how wrong that is in this
-//! very room.
+//! Estimates a view's pose from its most similar mapped frames, with a covariance calibrated on
+//! this room by leave-one-out.
 //!
-//! The three nearest frames are blended: a view between two mapped frames lies between them. How
-//! far off the blend is shows in the distances of the frames, and above all in whether they agree.
-//! What that means in this room its own frames tell: each is looked for when it and its neighbours
-//! are left out, and its true pose is known.
+//! The pose is a weighted mean (blend) of the three nearest frames. The size of its error is
+//! predicted from the distances of the frames and, above all, from their disagreement. This
+//! relation is fitted on the room itself: each sampled frame is queried with itself and its
+//! neighbors removed from the map.
 
 use nalgebra::{Matrix5, Matrix6, Vector5, Vector6};
 use ndarray::{Array2, ArrayView1};
@@ -19,127 +19,126 @@ use seese3_core::navigation::Navigator;
 use seese3_core::room::FrameId;
 use seese3_core::statistics::{median, robust_covariance};
 
-/// Frames that are blended.
+/// Number of blended frames.
 const BLENDED: usize = 3;
-/// Frames that a blend looks at: those, and one whose distance is compared with the nearest's.
+/// Number of nearest frames a blend needs: the blended ones, and one more to compare the distance
+/// of the nearest with.
 pub const LOOKED_AT: usize = BLENDED + 1;
-/// Frames further than this from the nearest are not blended with it, ‖(v, ω)‖, metres and radians
-/// mixed.
+/// Largest motion from the nearest frame to a blended one, ‖(v, ω)‖, meters and radians mixed.
 const SAME_PLACE: f64 = 0.5;
-/// A frame's weight falls with this power of its distance.
+/// Exponent of the inverse-distance weights.
 const POWER: i32 = 4;
-/// Added to distances, in the unit of the coordinates, and to lengths of motions, metres and
-/// radians mixed, before their logarithms are taken.
+/// Offset added before logarithms: to distances, in the unit of the coordinates, and to lengths of
+/// motions, meters and radians mixed.
 const LEAST: f64 = 1e-3;
 
-/// At most so many mapped frames are left out.
+/// Maximum number of pairs of mapped frames that are left out.
 const SAMPLES: usize = 150;
-/// Rows to each side that are left out with a frame, one round each; in a last round its whole
-/// sequence is.
+/// Exclusion radii in rows, one round each. A last round excludes the whole sequence of the frame.
 const LEFT_OUT_ROWS: [u32; 9] = [0, 1, 2, 4, 8, 15, 30, 60, 120];
-/// A frame with so many rows to each side left out stands for a view of a place that was not
-/// mapped.
+/// Exclusion radius in rows from which a left-out frame represents an unmapped place.
 const UNSEEN_ROWS: u32 = 8;
-/// Strata of about as many blends each, by the size that their errors are expected to have.
+/// Number of bins of about equally many blends, by predicted error size.
 const STRATA: usize = 8;
-/// A room whose frames give fewer blends than this tells nothing of its errors.
+/// Minimum number of left-out blends for an anchor model of the room.
 const FEWEST_BLENDS: usize = 240;
 
-/// Errors of blends in this many of the strata are independent from frame to frame: they come from
-/// which mapped frames a view lies between. Chosen on calibration rooms.
+/// Number of lowest bins with errors that are independent between frames, since they depend on the
+/// mapped frames around the view. Chosen on calibration rooms.
 const INDEPENDENT_STRATA: usize = 3;
-/// Where mapped frames follow one another faster than this, seconds, such errors average out. Chosen on
-/// calibration rooms.
+/// Interval of mapped frames, seconds, up to which independent errors average out completely.
+/// Chosen on calibration rooms.
 const DENSE_STEP_S: f64 = 0.14;
-/// Where they follow more slowly than this, a camera sees the same two frames for a while,
+/// Interval of mapped frames, seconds, from which [`LASTING_ON_SPARSE_MAPS`] applies in full: a
+/// camera then stays between the same two frames for a while.
 const SPARSE_STEP_S: f64 = 0.2;
-/// and this share of the covariance stays, however many views there are.
+/// Fraction of the anchor covariance treated as correlated if mapped frames are at least
+/// [`SPARSE_STEP_S`] apart.
 const LASTING_ON_SPARSE_MAPS: f64 = 0.15;
-/// A view of a camera that passes between mapped frames is nearer to them than a mapped frame is to
-/// its neighbours: the variances of the lowest strata are this share of what the left-out frames
-/// show. Chosen on calibration rooms.
+/// Factors on the covariances of the lowest bins. A camera that passes between mapped frames is
+/// nearer to them than a left-out mapped frame to its neighbors. Chosen on calibration rooms.
 const SHARE_OF_LOWEST: [f64; 2] = [0.5, 0.7];
-/// No map is known better than this, metres and radians: five millimetres and a third of a degree.
+/// Standard deviation added to each component for errors of the map, meters and radians: 5 mm and
+/// 0.3°.
 const LEAST_DEVIATION: f64 = 0.005;
-/// Errors are remembered for this long where the room does not tell, seconds.
+/// Default correlation time of anchor errors, seconds, if the room has no anchor model.
 const ASSUMED_MEMORY_S: f64 = 0.5;
-/// Beyond the highest stratum, standard deviations grow with the expected size up to this factor.
+/// Maximum factor by which standard deviations grow above the highest bin.
 const MOST_GROWTH: f64 = 3.0;
-/// Below the lowest one they fall to this factor at least.
+/// Minimum factor by which standard deviations shrink below the lowest bin.
 const LEAST_SHRINKAGE: f64 = 0.7;
 
-/// Which of a blend's predictors tells how far the second opinion is from it.
+/// Index in `predictors` of the log distance to the latent-based pose.
 const DISAGREEMENT: usize = 4;
 
-/// What the frames most like a view say of its pose.
+/// Weighted mean of the poses of the frames most similar to a view.
 #[derive(Debug, Clone)]
 pub struct Blend {
     /// `world_from_camera`.
     pose: Pose,
-    /// The motion from there to the view, as the adapter reads it.
+    /// Motion from `pose` to the view, predicted by the adapter.
     read: Vector6<f64>,
-    /// The distance of the nearest frame, in the unit of the coordinates.
+    /// Distance of the nearest frame, in the unit of the coordinates.
     distance: f64,
-    /// What the size of the error is expected from.
+    /// Predictors of the error size.
     predictors: Vector5<f64>,
 }
 
-/// A pose that was told by mapped frames.
+/// A pose estimated from retrieved map frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MapAnchor {
     /// `world_from_camera`.
     pub belief: PoseWithCovariance,
-    /// The errors of later anchors of this kind resemble this one's for about so long, seconds.
+    /// Correlation time of anchor errors, seconds.
     pub memory_s: f64,
-    /// The share of the covariance that no number of anchors takes away, 0 to 1.
+    /// Fraction of the covariance that does not average out over anchors, 0 to 1.
     pub lasting_share: f64,
 }
 
-/// How wrong blends are in one room.
+/// Calibrated errors of blends in one room.
 #[derive(Debug, Clone)]
 pub struct AnchorModel {
-    /// Of the predictors, for the logarithm of the size of the error.
+    /// Coefficients of the predictors for the log error size.
     coefficients: Vector5<f64>,
     strata: Vec<Stratum>,
-    /// Of anchors whose errors are independent.
+    /// Lasting fraction of the covariance of anchors with independent errors.
     lasting_share: f64,
 }
 
-/// How wrong blends are in one room, for views with and without a latent that looks like the room.
+/// Anchor models of one room for views with and without a latent in distribution.
 #[derive(Debug, Clone)]
 pub struct AnchorModels {
-    /// The latent gives a second opinion on the place, and the motion from there to the view.
+    /// The latent gives a second pose estimate, and the motion from the blend to the view.
     pub with_latent: AnchorModel,
-    /// It gives neither.
+    /// The latent is not used.
     pub without_latent: AnchorModel,
 }
 
-/// Blends whose errors are expected to be of about one size.
+/// Bin of blends with similar predicted error size.
 #[derive(Debug, Clone)]
 struct Stratum {
-    /// The expected size.
+    /// Predicted error size.
     size: f64,
-    /// The share of the read motion to be believed, 0 to 1.
+    /// Shrinkage gain of the predicted motion, 0 to 1.
     gain: f64,
     covariance: Matrix6<f64>,
     memory_s: f64,
 }
 
-/// A left-out frame's blend, and its true error.
+/// Blend of a left-out frame, with its true error.
 struct LeftOut {
     blend: Blend,
-    /// The motion from the blend to the frame.
+    /// Motion from the blend to the frame.
     error: Vector6<f64>,
-    /// The same of the next mapped frame.
+    /// The error of the next mapped frame.
     next_error: Vector6<f64>,
-    /// The time between the two, seconds.
+    /// Time between the two frames, seconds.
     seconds: f64,
 }
 
 impl Blend {
-    /// The blend of the frames nearest to a view, in order of their distance; there is at least
-    /// one. `second_opinion` is the pose that the same view has by another measure of likeness, if
-    /// there is one.
+    /// Blends the frames nearest to a view; `nearest` is in order of distance and not empty.
+    /// `second_opinion` is the view's pose by another similarity measure, if there is one.
     pub fn of(
         navigator: &Navigator,
         nearest: &[Neighbour],
@@ -149,7 +148,7 @@ impl Blend {
         let poses = navigator.room().poses();
         let first = poses[nearest[0].frame.row()];
 
-        // Everything is said in the body frame of the nearest frame.
+        // All motions are relative to the nearest frame.
         let blended = &nearest[..nearest.len().min(BLENDED)];
         let weights: Vec<f64> = blended
             .iter()
@@ -167,8 +166,7 @@ impl Blend {
         let motions: Vec<Vector6<f64>> = motions.collect();
         let weighted = || motions.iter().zip(&weights);
 
-        // Frames of another place than the nearest are no reason to place the view in between, but
-        // a reason to doubt.
+        // Frames at another place than the nearest do not enter the mean, but increase the spread.
         let same_place = || weighted().filter(|(motion, _)| motion.norm() <= SAME_PLACE);
         let sum_here: f64 = same_place().map(|(_, weight)| weight).sum();
         let mean: Vector6<f64> = same_place()
@@ -205,12 +203,12 @@ impl Blend {
         }
     }
 
-    /// `world_from_camera`, without the read motion.
+    /// `world_from_camera`, without the predicted motion.
     pub fn pose(&self) -> &Pose {
         &self.pose
     }
 
-    /// The same of a view whose latent says nothing: neither on the place, nor on the motion there.
+    /// The same blend without the terms that depend on the latent.
     #[must_use]
     pub fn without_latent(mut self) -> Self {
         self.read = Vector6::zeros();
@@ -218,14 +216,14 @@ impl Blend {
         self
     }
 
-    /// The pose when a share of the read motion is believed.
+    /// The pose after the predicted motion times `gain`.
     fn pose_with(&self, gain: f64) -> Pose {
         self.pose * exp(&Twist::from_vector(&(self.read * gain)))
     }
 }
 
 impl AnchorModel {
-    /// Measures the errors in a room. None if too few of its frames are mapped.
+    /// Fits the error model of a room. `None` if too few frames are mapped.
     pub fn measured(
         navigator: &Navigator,
         likeness: Likeness<'_>,
@@ -234,7 +232,7 @@ impl AnchorModel {
         Self::of(&left_out_blends(navigator, likeness, mapped))
     }
 
-    /// Two models of the same blends: with the views' latents, and without them.
+    /// Fits two error models to the same blends: with the views' latents, and without.
     pub fn measured_with_and_without(
         navigator: &Navigator,
         likeness: Likeness<'_>,
@@ -288,7 +286,7 @@ impl AnchorModel {
         })
     }
 
-    /// The pose that a blend tells, and how sure it is.
+    /// The anchor of a blend: its pose with the calibrated covariance.
     pub fn anchor(&self, blend: &Blend) -> MapAnchor {
         let size = blend.predictors.dot(&self.coefficients).exp();
         let Stratum {
@@ -312,7 +310,7 @@ impl AnchorModel {
         }
     }
 
-    /// The errors of blends whose errors are expected to be of a size.
+    /// Errors at a predicted size, interpolated between the bins in the logarithm of the size.
     fn at(&self, size: f64) -> Stratum {
         let first = &self.strata[0];
         let last = &self.strata[self.strata.len() - 1];
@@ -321,7 +319,7 @@ impl AnchorModel {
             ..stratum.clone()
         };
 
-        // A size that is not one is answered with the largest errors, the safe answer.
+        // NaN gets the largest errors, to be safe.
         if size.is_nan() {
             return scaled(last, MOST_GROWTH);
         }
@@ -346,8 +344,8 @@ impl AnchorModel {
     }
 }
 
-/// The pose that a blend tells where the room tells nothing of its errors: with those of the rooms
-/// that the adapter was calibrated in.
+/// The anchor of a blend in a room without an anchor model: with the errors of the calibration
+/// rooms.
 pub fn calibrated_anchor(error_model: &ErrorModel, blend: &Blend) -> MapAnchor {
     let errors = error_model.anchor_errors(blend.distance);
     MapAnchor {
@@ -360,19 +358,19 @@ pub fn calibrated_anchor(error_model: &ErrorModel, blend: &Blend) -> MapAnchor {
     }
 }
 
-/// The share of independent errors that lasts, in a map with so many seconds from frame to frame.
+/// Lasting fraction of independent errors, for a map with frames `step_s` seconds apart.
 fn lasting_share(step_s: f64) -> f64 {
     let sparseness = (step_s - DENSE_STEP_S) / (SPARSE_STEP_S - DENSE_STEP_S);
     LASTING_ON_SPARSE_MAPS * sparseness.clamp(0.0, 1.0)
 }
 
 impl Stratum {
-    /// Of blends with the sizes that their errors are expected to have; none if the errors do not
-    /// span six dimensions.
+    /// Fits a bin to blends with their predicted error sizes. `None` if the errors do not span six
+    /// dimensions.
     fn of(part: &[(f64, &LeftOut)]) -> Option<Self> {
         let sizes: Vec<f64> = part.iter().map(|(size, _)| *size).collect();
 
-        // The slope of truth on reading. Errors in metres and radians are of about one size here.
+        // Regression slope of true on predicted motions. Meters and radians have similar size here.
         let on_read = |(_, found): &(f64, &LeftOut)| found.error.dot(&found.blend.read);
         let read_on_read = |(_, found): &(f64, &LeftOut)| found.blend.read.norm_squared();
         let slope =
@@ -397,7 +395,7 @@ impl Stratum {
     }
 }
 
-/// How long errors are remembered, from how alike those of successive frames are, seconds.
+/// Correlation time of errors, seconds, from the correlation between successive frames.
 fn memory(part: &[(f64, &LeftOut)], covariance: &Matrix6<f64>) -> Option<f64> {
     let inverse = covariance.cholesky()?.inverse();
     let length = |error: &Vector6<f64>| error.dot(&(inverse * error)).sqrt();
@@ -406,7 +404,7 @@ fn memory(part: &[(f64, &LeftOut)], covariance: &Matrix6<f64>) -> Option<f64> {
     let mut square = 0.0;
     let mut seconds = 0.0;
     for (_, found) in part {
-        // Errors far out in the tail count for little.
+        // Downweight errors in the tail.
         let weight = (1.0 + length(&found.error).powi(2)).recip();
         product += weight * found.error.dot(&(inverse * found.next_error));
         square += weight * length(&found.error) * length(&found.next_error);
@@ -421,9 +419,9 @@ fn memory(part: &[(f64, &LeftOut)], covariance: &Matrix6<f64>) -> Option<f64> {
     })
 }
 
-/// The coefficients that predict the logarithm of the size of errors best, by least squares.
+/// Least-squares coefficients that predict the log error size.
 fn size_coefficients(left_out: &[LeftOut]) -> Option<Vector5<f64>> {
-    // A little of the identity keeps predictors that do not vary from having any weight.
+    // The ridge term keeps the system solvable if a predictor is constant.
     let mut moment = Matrix5::identity() * 1e-6;
     let mut product = Vector5::zeros();
     for found in left_out {
@@ -435,8 +433,7 @@ fn size_coefficients(left_out: &[LeftOut]) -> Option<Vector5<f64>> {
     Some(moment.cholesky()?.solve(&product))
 }
 
-/// Blends of mapped frames, each and the mapped frame after it, when they and their neighbours are
-/// left out.
+/// Leave-one-out blends of pairs of successive mapped frames, for all exclusion radii.
 fn left_out_blends(
     navigator: &Navigator,
     likeness: Likeness<'_>,
@@ -471,20 +468,19 @@ fn left_out_blends(
     left_out
 }
 
-/// By what mapped frames are alike: coordinates, row by frame; frames are alike that lie near to
-/// one another.
+/// Coordinates of the room's frames in which distance measures dissimilarity, row by frame.
 #[derive(Clone, Copy)]
 pub struct Likeness<'a> {
-    /// Those by which frames are found.
+    /// Coordinates used for retrieval.
     pub coordinates: &'a Array2<f64>,
-    /// For each part of the mapped frames, those that know nothing of the part, if the first were
-    /// made from these very frames.
+    /// Coordinates fitted without one fold of the mapped frames, one array per fold. `None` if
+    /// `coordinates` were not fitted to the mapped frames.
     pub without_part: Option<&'a [Array2<f64>]>,
-    /// Others, by which frames are found a second time.
+    /// Other coordinates, for a second pose estimate.
     pub second_opinion: Option<&'a Array2<f64>>,
 }
 
-/// How far the mapped frames are from one of them.
+/// Distances of all mapped frames from one of them.
 fn distances_from(coordinates: &Array2<f64>, mapped: &[FrameId], frame: FrameId) -> Vec<Neighbour> {
     // Rows of an array in standard layout are slices.
     let coordinates = coordinates.as_standard_layout();
@@ -497,8 +493,8 @@ fn distances_from(coordinates: &Array2<f64>, mapped: &[FrameId], frame: FrameId)
     mapped.iter().map(of).collect()
 }
 
-/// The blends of a mapped frame with their errors, one for each round of what is left out; none
-/// where too few frames are left.
+/// Blends of a mapped frame with their errors, one per exclusion round. An element is `None` if too
+/// few frames remain.
 fn blends_without(
     navigator: &Navigator,
     likeness: Likeness<'_>,
@@ -530,7 +526,8 @@ fn blends_without(
             (left.len() == LOOKED_AT).then_some(left)
         };
 
-        // A frame with neighbours is told from them by coordinates that were made for its place.
+        // Use the full PCA while neighbors remain in the map; otherwise the PCA without the frame's
+        // fold.
         let is_unseen = rows.is_none_or(|rows| rows >= UNSEEN_ROWS);
         let distances = match &distances_unseen {
             Some(distances_unseen) if is_unseen => distances_unseen,

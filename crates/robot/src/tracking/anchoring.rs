@@ -1,4 +1,4 @@
-//! Correction: the mapped frame that looks like the view, taken as an anchor of the map pose.
+//! Correction of the map pose by anchors: poses estimated from matching mapped frames.
 
 use nalgebra::Matrix6;
 
@@ -12,28 +12,26 @@ use super::tracker::Tracker;
 use super::{MapAnchor, PoseVelocity, PoseWithCovariance};
 use seese3_core::geometry::Twist;
 
-/// 99 % of χ² with six degrees of freedom: an anchor whose surprise is larger counts for less.
+/// Gate: 99 % quantile of χ² with six degrees of freedom. Above it, an anchor is downweighted.
 const GATE: f64 = 16.81;
-/// An anchor whose surprise is larger than this many times the gate is refused.
+/// Rejection threshold for the surprise of an anchor, as a multiple of [`GATE`].
 const REFUSED_BEYOND: f64 = 4.0;
-/// Anchors in a row that must agree on a place before it replaces another one, or is believed where
-/// none was.
+/// Number of consecutive anchors that must agree before their pose becomes the map pose.
 pub const ANCHORS_TO_AGREE: u32 = 10;
-/// Anchors are taken to be as far apart in time at most, seconds: after a pause the next one is as
-/// good as an independent one.
+/// Upper bound of the time between two anchors, seconds: after such a pause they are independent.
 const LONGEST_PAUSE_S: f64 = 10.0;
 
-/// An anchor as it counts beside those before it.
+/// An anchor with its covariance inflated for time correlation.
 #[derive(Debug, Clone, Copy)]
 struct InflatedAnchor {
-    /// Its covariance is multiplied for the likeness of its error to those of anchors before it.
+    /// Pose with the inflated covariance.
     belief: PoseWithCovariance,
-    /// The covariance of its error, if that lasts; else zero.
+    /// Covariance of the time-correlated part of the error; zero if uncorrelated.
     lasting: Matrix6<f64>,
 }
 
 impl InflatedAnchor {
-    /// The anchor as one of several of one time, which together tell as much as one.
+    /// Multiplies the covariance by `count`: simultaneous anchors together count as one.
     fn shared_by(self, count: usize) -> Self {
         Self {
             belief: PoseWithCovariance {
@@ -45,11 +43,11 @@ impl InflatedAnchor {
     }
 }
 
-/// What an anchor did to the map pose.
+/// Result of a correction.
 pub(super) struct Correction {
     /// Whether the anchor was applied.
     pub is_applied: bool,
-    /// The squared Mahalanobis distance of the anchor from the believed pose, if there was one.
+    /// Squared Mahalanobis distance of the anchor from the believed pose, if both exist.
     pub surprise: Option<f64>,
 }
 
@@ -61,7 +59,8 @@ impl Correction {
     };
 }
 
-/// Corrects the map pose by an anchor that is within the gate of it; else nothing changes.
+/// Corrects the believed map pose by an anchor. Nothing changes if there is no believed pose in the
+/// room, or the surprise is above the rejection threshold.
 fn correct_believed(
     state: &mut State,
     poses: &mut Poses,
@@ -81,8 +80,7 @@ fn correct_believed(
         };
     }
 
-    // Motions and errors have heavier tails than a Gaussian: a surprising anchor is believed less,
-    // but believed.
+    // Errors have heavier tails than a Gaussian: downweight an anchor above the gate.
     let doubted = PoseWithCovariance {
         covariance: anchor.covariance * (surprise / GATE).max(1.0).powi(2),
         ..anchor
@@ -96,7 +94,7 @@ fn correct_believed(
     }
 }
 
-/// The squared Mahalanobis distance of an anchor from a believed pose.
+/// Squared Mahalanobis distance of an anchor from a believed pose.
 fn surprise_at(believed: &PoseWithCovariance, anchor: &PoseWithCovariance) -> f64 {
     believed
         .innovation(anchor)
@@ -104,7 +102,7 @@ fn surprise_at(believed: &PoseWithCovariance, anchor: &PoseWithCovariance) -> f6
 }
 
 impl MatchedView<'_> {
-    /// Whether the view is tried as an anchor at all.
+    /// Whether the view may serve as an anchor.
     fn may_correct(&self, health: TrackingHealth) -> bool {
         if self.matches_room() {
             self.is_clear
@@ -113,11 +111,12 @@ impl MatchedView<'_> {
         }
     }
 
-    /// Whether the view is tried as an anchor although it does not look like the room: images that
-    /// are blurred, noisy or partly hidden do not, and their features still tell where they were
-    /// taken. Only where the camera is known to be in the room, and only if the features tell more
-    /// than a view of an unmapped part does. The limit was chosen on calibration rooms and the
-    /// kitchen: at three times [`PoseWithCovariance::tells_a_place`] unmapped parts make poses worse.
+    /// Whether an out-of-distribution view may still serve as an anchor, because its feature gives
+    /// a usable pose. This covers blurred, noisy or partly occluded images.
+    ///
+    /// It requires confirmed health and an anchor uncertainty that views of unmapped parts exceed.
+    /// The limit, twice that of [`PoseWithCovariance::tells_a_place`], was chosen on calibration
+    /// rooms and the kitchen. At three times, unmapped parts make poses worse.
     fn is_hint(&self, health: TrackingHealth) -> bool {
         health.is_confirmed()
             && self.matched.is_by_feature
@@ -126,8 +125,8 @@ impl MatchedView<'_> {
 }
 
 impl Tracker {
-    /// Corrects the map pose by what all cameras see: first by the view that leads, which may find the
-    /// camera at another place, then by the others, which may not, and cannot object.
+    /// Corrects the map pose by the views of all cameras. The leading view comes first and may
+    /// start or confirm a candidate. The other views can only correct the believed pose.
     pub(super) fn correct_by_views(
         &self,
         state: &mut State,
@@ -142,15 +141,14 @@ impl Tracker {
         };
         let others: Vec<&MatchedView<'_>> = seen.beside.iter().filter(beside).collect();
 
-        // Cameras on one robot see the same part of the map, or of what is not mapped: several count
-        // as much as one.
+        // Simultaneous views of one robot have correlated errors: together they count as one.
         let of_others = others.iter().map(|view| {
             let anchor = self.anchor(state, frame, view, gravity);
             anchor.shared_by(1 + others.len())
         });
         let of_others: Vec<InflatedAnchor> = of_others.collect();
 
-        // An image that is repeated tells nothing new.
+        // A repeated image has no new information.
         let correction = if leading.is_repeated || leading.sight != Sight::Clear {
             Correction::NONE
         } else {
@@ -164,7 +162,7 @@ impl Tracker {
             let lasting = poses.lasting;
             let applied = correct_believed(state, poses, frame, leading.room, anchor).is_applied;
 
-            // Of the anchors of one frame, the lasting error is that of the best.
+            // Of the anchors of one frame, keep the smallest correlated error.
             if applied && is_corrected && lasting.trace() < poses.lasting.trace() {
                 poses.lasting = lasting;
             }
@@ -174,9 +172,8 @@ impl Tracker {
         correction
     }
 
-    /// Tries the match of the view that leads as an anchor: one that looks clearly like one map may
-    /// speak for another place than the believed one; a hint may not, see
-    /// [`MatchedView::is_hint`].
+    /// Tries the leading match as an anchor. A match in distribution may start a candidate at
+    /// another place; a hint, see [`MatchedView::is_hint`], may only correct the believed pose.
     fn correct_by_leading(
         &self,
         state: &mut State,
@@ -196,10 +193,11 @@ impl Tracker {
         }
     }
 
-    /// The pose of the stream's camera by a view: by the reader of its room if there is one and the
-    /// view certainly shows the room, else by the frames that it matches: beyond the mapped part a
-    /// reader is surer than it should be. Its covariance is that with which it counts beside the
-    /// anchors before it.
+    /// Anchor of the stream's camera from a view, with a covariance inflated for time correlation.
+    ///
+    /// The pose comes from the room's [`super::PoseReader`] if there is one and the match is
+    /// certain; otherwise from the matched frames. Outside the mapped part a reader is
+    /// overconfident.
     fn anchor(
         &self,
         state: &State,
@@ -226,9 +224,8 @@ impl Tracker {
             belief = belief.levelled(gravity);
         }
 
-        // Anchors whose errors are alike tell less than independent ones: a row of them with the
-        // correlation ρ from one to the next tells as much as independent ones of (1 + ρ)/(1 − ρ)
-        // times the covariance.
+        // Anchors with correlated errors have less information. With the correlation ρ between
+        // successive anchors, the covariance is inflated by (1 + ρ)/(1 − ρ).
         let pause = state.corrected_ns.map_or(LONGEST_PAUSE_S, |before| {
             (frame.time_ns.abs_diff(before) as f64 * 1e-9).min(LONGEST_PAUSE_S)
         });
@@ -248,9 +245,9 @@ impl Tracker {
         }
     }
 
-    /// Corrects the map pose by an anchor. An anchor within the gate of the believed pose is
-    /// applied at once. Any other one, and each one where nothing is believed, becomes a candidate,
-    /// which is applied once several anchors in a row agree.
+    /// Corrects the map pose by an anchor. An anchor below the rejection threshold is applied at
+    /// once. Otherwise, or without a believed pose, the anchor supports a candidate. The candidate
+    /// is applied once [`ANCHORS_TO_AGREE`] consecutive anchors agree.
     fn correct(
         &self,
         state: &mut State,
@@ -261,9 +258,8 @@ impl Tracker {
     ) -> Correction {
         let anchor = counted.belief;
 
-        // While a stream is lost no place is a candidate. Frames that miss the room or match
-        // several rooms do not come here, so that anchors "in a row" may have such frames between
-        // them.
+        // A lost stream has no candidate. Frames that match no room, or several, are not passed to
+        // this function, so they do not interrupt a series of anchors.
         let earlier_candidate = state.candidate.take();
         if state.health.is_lost() {
             return Correction::NONE;
@@ -274,7 +270,7 @@ impl Tracker {
             return within_gate;
         }
 
-        // The earlier candidate was seen some frames ago: carry it to this frame, then compare.
+        // Predict the earlier candidate at this frame, then compare.
         let carried = earlier_candidate
             .filter(|candidate| candidate.room == room)
             .map(|candidate| self.carried_candidate(state, candidate, frame));
@@ -310,14 +306,14 @@ impl Tracker {
         }
     }
 
-    /// Where a candidate's camera would be at this frame, and how many anchors agreed on it.
+    /// Predicts a candidate's pose at this frame; returns it with the number of agreeing anchors.
     fn carried_candidate(
         &self,
         state: &State,
         candidate: Candidate,
         frame: &Observation,
     ) -> (PoseWithCovariance, u32) {
-        // Where another camera speaks for the place, the stream's own may see no motion.
+        // If the candidate came from another camera, this camera may be frozen or covered.
         let sight = Sight::of(frame.is_blank, state.unchanged_frames);
         let seen = candidate.latent.filter(|_| sight == Sight::Clear);
         let (motion, covariance) = match &seen {

@@ -1,9 +1,8 @@
-//! What the views of one room differ in: the principal components of its own features.
+//! Principal components of a room's features, used to retrieve mapped frames.
 //!
-//! A latent holds what tells motion in any room, and little of what tells two places of this room
-//! apart. In six calibration rooms of which every second frame was mapped the frame that was
-//! nearest by its latent was .035 m off, by its feature .015 m, and by 32 components of the feature
-//! .017 m.
+//! Latents encode motion in any room, but distinguish the places of one room poorly. In six
+//! calibration rooms with every second frame mapped, the frame nearest by latent was 0.035 m away.
+//! By feature it was 0.015 m away, and by 32 components of the feature 0.017 m.
 
 use nalgebra::SymmetricEigen;
 use ndarray::{Array1, Array2, ArrayView2, ArrayViewMut1, Axis};
@@ -11,40 +10,39 @@ use ndarray::{Array1, Array2, ArrayView2, ArrayViewMut1, Axis};
 use seese3_core::matrices::to_nalgebra;
 use seese3_core::room::FrameId;
 
-/// Components that are kept.
+/// Number of principal components.
 const COMPONENTS: usize = 32;
-/// So many mapped frames are decomposed, at most.
+/// Maximum number of mapped frames used for the PCA.
 const SAMPLED: usize = 128;
-/// Of fewer frames nothing is told.
+/// Minimum number of mapped frames for the PCA.
 const FEWEST: usize = 48;
-/// A component is divided by the root of its standard deviation, to which this share of the largest
-/// one is added: those that vary little count for more than they would by themselves, and for less
-/// than if all varied alike. Chosen on calibration rooms, where it makes little difference.
+/// Regularization of the component scale, as a fraction of the largest standard deviation. A
+/// component is divided by the square root of (its standard deviation + this term): a compromise
+/// between no scaling and whitening. Chosen on calibration rooms; it has little effect.
 const LEAST_SHARE: f64 = 0.05;
-/// The root mean square of the coordinates of mapped frames.
+/// Root mean square length of the coordinates of mapped frames.
 const SPREAD: f64 = 10.0;
-/// Components with a smaller share of the largest variance are rounding.
+/// Components below this fraction of the largest variance are rounding errors.
 const ROUNDING: f64 = 1e-9;
-/// Features at length 1 that vary less than this, variance, are alike up to rounding.
+/// Largest variance of unit-length features that are identical up to rounding.
 const LEAST_VARIANCE: f64 = 1e-12;
-/// Contiguous parts of the mapped frames that are left out of the components in turn.
+/// Number of contiguous cross-validation folds of the mapped frames.
 const FOLDS: usize = 5;
 
-/// The coordinates of mapped frames, row by frame.
+/// PCA coordinates of a room's mapped frames, row by frame.
 pub struct RoomAppearance {
-    /// By the components of all mapped frames.
+    /// PCA of all mapped frames.
     pub appearance: Appearance,
-    /// By those components, shape (n, c).
+    /// Coordinates by that PCA, shape (n, c).
     pub coordinates: Array2<f64>,
-    /// By the components without one part of the mapped frames, a part each. A view of a place that
-    /// was not mapped is nearer to mapped frames than one whose neighbours the components were made
-    /// for.
+    /// Coordinates by the PCA without one fold of the mapped frames, one array per fold. They
+    /// measure errors at unmapped places, since such views were not part of the PCA.
     pub without_part: Vec<Array2<f64>>,
 }
 
 impl RoomAppearance {
-    /// Of the mapped frames of a room, whose features have shape (n, d). None if they are few or
-    /// all alike.
+    /// PCA of the mapped frames of a room; `features` has shape (n, d). `None` if the frames are
+    /// too few or identical.
     pub fn of(features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Option<Self> {
         let features = MappedFeatures::at_length_one(features, mapped);
         let places: Vec<usize> = (0..mapped.len()).collect();
@@ -64,12 +62,12 @@ impl RoomAppearance {
     }
 }
 
-/// The features of mapped frames at length 1.
+/// Unit-length features of the mapped frames.
 struct MappedFeatures<'a> {
     mapped: &'a [FrameId],
-    /// How many frames the room has, mapped or not.
+    /// Number of frames of the room, mapped or not.
     frame_count: usize,
-    /// A row per mapped frame, shape (m, d).
+    /// One row per mapped frame, shape (m, d).
     rows: Array2<f64>,
 }
 
@@ -88,8 +86,8 @@ impl<'a> MappedFeatures<'a> {
         }
     }
 
-    /// The coordinates of the mapped frames, row by frame of the room, shape (n, c); those of other
-    /// frames are zeros.
+    /// Coordinates, one row per frame of the room, shape (n, c); zero for frames that are not
+    /// mapped.
     fn coordinates(&self, appearance: &Appearance) -> Array2<f64> {
         let Appearance { mean, components } = appearance;
         let of_mapped = self.rows.dot(&components.t()) - components.dot(mean);
@@ -102,23 +100,23 @@ impl<'a> MappedFeatures<'a> {
     }
 }
 
-/// The part that the frame at this place of `count` mapped frames belongs to.
+/// Fold of the mapped frame at index `place` of `count`.
 pub fn part_of(place: usize, count: usize) -> usize {
     place * FOLDS / count
 }
 
-/// Coordinates in which nearby views of one room lie near to one another.
+/// Scaled PCA of features: nearby views of one room have nearby coordinates.
 #[derive(Debug, Clone)]
 pub struct Appearance {
-    /// Of the features at length 1, shape (d,).
+    /// Mean of the unit-length features, shape (d,).
     mean: Array1<f64>,
-    /// A component per row, scaled, shape (c, d): a view's coordinates are then products of rows,
-    /// which is five times as fast as products of columns, and asked for with every frame.
+    /// Scaled components, one per row, shape (c, d). Row products are five times as fast as column
+    /// products, and are computed for every frame.
     components: Array2<f64>,
 }
 
 impl Appearance {
-    /// The components of the mapped frames at these places. None if they are few or all alike.
+    /// PCA of the mapped frames at these indices. `None` if they are too few or identical.
     fn of(features: &MappedFeatures<'_>, places: &[usize]) -> Option<Self> {
         let every = places.len().div_ceil(SAMPLED).max(1);
         let sampled: Vec<usize> = places.iter().copied().step_by(every).collect();
@@ -130,8 +128,8 @@ impl Appearance {
         let mean = centred.mean_axis(Axis(0))?;
         centred -= &mean;
 
-        // The products of frames have the same eigenvalues as those of columns, of which there are
-        // more.
+        // The Gram matrix of the frames has the same nonzero eigenvalues as the larger covariance
+        // of the columns.
         let count = sampled.len() as f64;
         let products = centred.dot(&centred.t()) / count;
         let eigen = SymmetricEigen::new(to_nalgebra(products.view()));
@@ -145,8 +143,8 @@ impl Appearance {
         order.retain(|place| eigen.eigenvalues[*place] > ROUNDING * largest);
         order.truncate(COMPONENTS);
 
-        // A component is a sum of centred frames: the weights make it a unit vector, divided by the
-        // root of its scale.
+        // A component is a weighted sum of centered frames. The weights give it unit length,
+        // divided by the square root of its scale.
         let mut weights = Array2::zeros((sampled.len(), order.len()));
         let mut mean_square = 0.0;
         for (mut column, place) in weights.columns_mut().into_iter().zip(order) {
@@ -169,20 +167,20 @@ impl Appearance {
         Some(Self { mean, components })
     }
 
-    /// The coordinates of a feature of shape (d,).
+    /// Coordinates of a feature of shape (d,).
     pub fn coordinates(&self, feature: &[f32]) -> Array1<f64> {
         let mut row: Array1<f64> = feature.iter().copied().map(f64::from).collect();
         to_length_one(&mut row.view_mut());
         self.components.dot(&(row - &self.mean))
     }
 
-    /// About how much memory it holds, bytes.
+    /// Approximate memory use, bytes.
     pub fn memory_bytes(&self) -> usize {
         (self.mean.len() + self.components.len()) * size_of::<f64>()
     }
 }
 
-/// Divides a feature by its length; a feature of zeros stays as it is.
+/// Normalizes a feature to unit length; a zero feature is unchanged.
 fn to_length_one(feature: &mut ArrayViewMut1<'_, f64>) {
     let length = feature.dot(feature).sqrt();
     if length > 0.0 {
@@ -198,9 +196,8 @@ mod tests {
         (0..count as u32).map(FrameId).collect()
     }
 
-    /// Oracle: by hand. Features turn a little in a plane, besides a length that says nothing:
-    /// nearly all that varies is the sine of the angle, scaled to a root mean square of 10, and
-    /// lengths do not matter.
+    /// Oracle: by hand. Features rotate a little in a plane and have arbitrary lengths. Nearly all
+    /// variation is the sine of the angle, scaled to a root mean square of 10; lengths are ignored.
     #[test]
     fn coordinates_tell_what_varies_and_no_length() {
         let angle = |row: usize| 0.001 * (row as f64 - 49.5);
@@ -221,7 +218,7 @@ mod tests {
         let mean_square: f64 = coordinates.iter().map(square).sum::<f64>() / 100.0;
         assert!((mean_square.sqrt() - 10.0).abs() < 1e-3, "{mean_square}");
 
-        // The sines are odd in the angle, so that their mean is zero.
+        // The sine is odd and the angles are symmetric, so the mean is zero.
         let sines: f64 = (0..100).map(|row| angle(row).sin().powi(2)).sum();
         let scale = 10.0 / (sines / 100.0).sqrt();
         for (row, found) in coordinates.iter().enumerate() {
@@ -234,7 +231,7 @@ mod tests {
         assert!(off.dot(&off).sqrt() < 1e-4, "{off}");
     }
 
-    /// Oracle: the definition: nothing can be told of frames that are few or all alike.
+    /// Oracle: the definition: there is no PCA of identical frames or of fewer than [`FEWEST`].
     #[test]
     fn nothing_is_told_of_frames_that_are_few_or_alike() {
         let alike = Array2::from_elem((100, 5), 2.0);

@@ -3,10 +3,10 @@
 use seese3_core::room::{FrameId, Room};
 use seese3_core::statistics::median;
 
-/// Seconds between the rows of a recording without timestamps: a camera at 30 Hz.
+/// Default frame period of a recording without timestamps, seconds: 30 Hz.
 pub const ASSUMED_PERIOD_S: f64 = 1.0 / 30.0;
 
-/// Seconds from one frame of a room to a later one: by their timestamps where the recording has them.
+/// Seconds from one frame of a room to a later one, from timestamps or else [`ASSUMED_PERIOD_S`].
 pub fn seconds_between(room: &Room, from: FrameId, to: FrameId) -> f64 {
     let times = room.timestamps_ns();
     match (times.get(from.row()), times.get(to.row())) {
@@ -15,8 +15,8 @@ pub fn seconds_between(room: &Room, from: FrameId, to: FrameId) -> f64 {
     }
 }
 
-/// The median time from one row to the next in the same sequence, seconds; [`ASSUMED_PERIOD_S`] where
-/// the recording does not tell.
+/// Median frame period within sequences, seconds; [`ASSUMED_PERIOD_S`] if the recording has no
+/// usable timestamps.
 pub fn frame_period_s(room: &Room) -> f64 {
     let steps: Vec<f64> = (1..room.frame_count() as u32)
         .map(|row| (FrameId(row - 1), FrameId(row)))
@@ -48,8 +48,8 @@ mod tests {
         Room::new(RoomId::new("r").unwrap(), frames, Provenance::default()).unwrap()
     }
 
-    /// Oracle: by hand. A pause between two sequences is no period; a recording without times, or with
-    /// one time for all frames, is taken to have 30 Hz.
+    /// Oracle: by hand. A pause between two sequences is not counted. A recording without
+    /// timestamps, or with one for all frames, has the default of 30 Hz.
     #[test]
     fn the_period_is_that_within_sequences() {
         let tenth = 100_000_000;

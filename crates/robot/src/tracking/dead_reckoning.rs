@@ -1,7 +1,6 @@
-//! Dead reckoning: the motion that the views say the camera made since the last keyframe, and where
-//! it leads.
+//! Dead reckoning: predicts the poses of a frame from the motion since the keyframe and the place.
 //!
-//! Motions are read without the mean training motion μ: a camera that stands still must not drift.
+//! Motions are predicted without the mean training motion μ: a camera at rest must not drift.
 
 use nalgebra::Matrix6;
 use ndarray::{ArrayView1, s};
@@ -14,27 +13,25 @@ use super::{MotionPrior, PoseVelocity, PoseWithCovariance};
 use seese3_core::adapter::MotionErrors;
 use seese3_core::geometry::{Pose, Twist, adjoint, body_twist, exp};
 
-/// The deviation of a stream's own origin, metres and radians: it is zero by definition, but a
-/// covariance has to be positive definite.
+/// Standard deviation of a stream's origin, meters and radians. The origin is exact by definition,
+/// but a covariance must be positive definite.
 const ORIGIN_DEVIATION: f64 = 1e-6;
 
-/// Motions are read only where calibration found that at least this share of a reading is to be
-/// believed: with less, how cameras move tells more, and a reading that shrinks every motion would
-/// stop the camera.
+/// Minimum calibrated gain for which predicted motions are used. Below it the motion prior is the
+/// better estimate, and the shrinkage would stop the camera.
 const LEAST_GAIN: f64 = 0.5;
 
-/// Longer pauses than this say no more of where a camera may be, seconds: a day.
+/// Upper bound of the time in the motion prior, seconds: one day.
 const LONGEST_CARRY_S: f64 = 86_400.0;
 
-/// How much of the motion before a frame was seen.
+/// Observability of the motion before a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum MotionReading {
-    /// All of it.
+    /// The views are continuous.
     Complete,
-    /// Frames of it are missing, but the view after them matches the map, where latents are known
-    /// to be read well.
+    /// There is a gap, but the view after it matches the map, where latents are reliable.
     Partial,
-    /// Nothing that can be relied on: the view jumped, or a gap led away from the map.
+    /// No usable views: a jump, a gap that ends away from the map, or a blank or frozen image.
     Unseen,
 }
 
@@ -48,37 +45,37 @@ impl MotionReading {
     }
 }
 
-/// An earlier frame that a motion is read from.
+/// An earlier frame, the start of a predicted motion.
 #[derive(Clone, Copy)]
 pub(super) struct EarlierView<'a> {
     pub latent: &'a [f64],
     pub time_ns: i64,
 }
 
-/// How a belief comes to a frame.
+/// Input of a prediction from an earlier frame.
 struct Carried {
-    /// The room that the stream is in, if that is known.
+    /// Room of the stream, if known.
     room: Option<usize>,
     from_ns: i64,
     to_ns: i64,
-    /// The motion in between, if it is read.
+    /// Motion between the frames, if it is usable.
     read: Option<ReadMotion>,
 }
 
 /// The poses of a stream at one frame.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Poses {
-    /// `odom_from_camera` and the velocity as readings alone tell it.
+    /// `odom_from_camera` and the velocity, from dead reckoning alone.
     pub odom: PoseVelocity,
-    /// `map_from_camera` and the velocity as the filter believes them.
+    /// Filter state: `map_from_camera` and the velocity.
     pub map_pose: Option<PoseVelocity>,
-    /// The covariance of the lasting error of the anchor that corrected the map pose last.
+    /// Covariance of the time-correlated error of the last anchor.
     pub lasting: Matrix6<f64>,
-    /// `map_from_camera` as it is reported.
+    /// Reported `map_from_camera`.
     pub reported_pose: Option<PoseWithCovariance>,
 }
 
-/// A motion since the keyframe, the covariance of its error, and where it leads.
+/// Motion since the keyframe with the covariance of its error, and the predicted poses.
 pub(super) struct Prediction {
     pub motion: Twist,
     pub covariance: Matrix6<f64>,
@@ -86,7 +83,7 @@ pub(super) struct Prediction {
 }
 
 impl Tracker {
-    /// The motion from the keyframe to this frame, and the poses that it leads to.
+    /// Predicts the motion from the keyframe to this frame, and the poses at this frame.
     pub(super) fn predict(
         &self,
         state: &State,
@@ -107,8 +104,8 @@ impl Tracker {
             covariance += self.error_model.unread_errors();
         }
 
-        // A motion that was not seen cannot be read from the views at its ends: the camera is taken
-        // to be where it was at the last frame, with the errors of any motion.
+        // An unobserved motion cannot be predicted from the views. Assume that the camera has not
+        // moved since the last frame, with the errors of an arbitrary motion.
         if reading == MotionReading::Unseen {
             let last_odom = state
                 .last
@@ -117,7 +114,7 @@ impl Tracker {
             motion = body_twist(&keyframe.odom.pose, &last_odom);
         }
 
-        // What another sensor measured needs no view.
+        // Odometry of another sensor replaces the predicted motion.
         if let Some(measured) = state
             .measured
             .motion_since_keyframe(frame.measured.as_ref())
@@ -151,7 +148,7 @@ impl Tracker {
             self.carried(&place.belief, way)
         });
 
-        // An error is carried to the new body frame by the adjoint of the motion since then.
+        // The adjoint transforms the error covariance to the new body frame.
         let lasting = state.place.as_ref().zip(map_pose.as_ref());
         let lasting = lasting.map_or_else(Matrix6::zeros, |(place, now)| {
             let back = adjoint(&now.pose.inv_mul(&place.belief.pose));
@@ -175,9 +172,11 @@ impl Tracker {
         }
     }
 
-    /// `odom` at this frame: the sum of what was measured, if it was. Else, where readings are worth it,
-    /// it is read at every frame and with one gain: with a gain that grows with the time since the
-    /// keyframe it would lag behind and jump. Else it stays.
+    /// Predicts `odom` at this frame: from measured odometry if available, else from the motion
+    /// since the keyframe if its gain suffices; else `odom` is unchanged.
+    ///
+    /// The predicted motion uses a single gain. A gain that depends on the time since the keyframe
+    /// would make `odom` lag behind and jump.
     fn carried_odom(
         &self,
         state: &State,
@@ -197,7 +196,7 @@ impl Tracker {
             .motion_since_keyframe(frame.measured.as_ref())
         {
             let odom = self.driven(&keyframe.odom, &measured, state, frame);
-            // A frame before that brought no pose has left odom where the views took it.
+            // Frames without odometry left `odom` unchanged, and this step spans the gap.
             let step = state.measured.step(frame.measured.as_ref());
             let last = state
                 .last
@@ -220,7 +219,8 @@ impl Tracker {
             .adapter()
             .motion_without_mean(ArrayView1::from(from.latent), frame.latent.view());
         odom.pose = match &state.last {
-            // Beside measured motions, read ones would be counted from another frame.
+            // Once odometry was measured, `odom` contains its steps. A motion predicted from the
+            // keyframe would be inconsistent with them.
             _ if is_read && read.is_unique_logarithm() && state.measured.last.is_none() => {
                 keyframe.odom.pose * exp(&read.scaled(gain))
             }
@@ -235,7 +235,7 @@ impl Tracker {
         odom
     }
 
-    /// The first frame, which is the origin of `odom`.
+    /// The prediction of the first frame, the origin of `odom`.
     fn origin(&self, state: &State) -> Prediction {
         let origin =
             PoseWithCovariance::known(Pose::identity(), ORIGIN_DEVIATION, ORIGIN_DEVIATION);
@@ -253,8 +253,8 @@ impl Tracker {
         }
     }
 
-    /// A belief of an earlier view at a frame: by how cameras move, and by the motion in between where
-    /// one is known.
+    /// Predicts the filter state of an earlier frame at a later one, with the motion prior and, if
+    /// present, the predicted motion.
     fn carried(&self, belief: &PoseVelocity, way: Carried) -> PoseVelocity {
         let Carried {
             room,
@@ -267,8 +267,8 @@ impl Tracker {
         belief.moved(self.prior(room), seconds, read.as_ref())
     }
 
-    /// A belief of an earlier frame at this one, by a measured motion alone: how cameras move on average
-    /// says nothing beside it. The velocity is that of the last step.
+    /// Predicts the filter state of an earlier frame at this one from measured odometry, without
+    /// the motion prior. The velocity is that of the last step.
     fn driven(
         &self,
         belief: &PoseVelocity,
@@ -279,7 +279,7 @@ impl Tracker {
         let place = belief.place().moved(measured.motion, &measured.covariance);
         let moving = PoseVelocity::at(place, self.prior(state.room));
 
-        // The step is from the last frame that brought a pose, which may not be the last one.
+        // The step starts at the last frame with odometry, which may not be the last frame.
         let step = state.measured.step(frame.measured.as_ref());
         let last_ns = state
             .measured
@@ -295,7 +295,7 @@ impl Tracker {
         }
     }
 
-    /// The motion from an earlier view to this frame, as the adapter reads it.
+    /// The motion from an earlier view to this frame, predicted by the adapter.
     fn read_motion(
         &self,
         room: Option<usize>,
@@ -306,26 +306,26 @@ impl Tracker {
         ReadMotion { motion, covariance }
     }
 
-    /// How many frames of the calibration rooms a time takes: errors were measured over these.
+    /// Time between two frames in frame periods of the calibration rooms, the unit of the errors.
     pub(super) fn frames_between(&self, from_ns: i64, to_ns: i64) -> u64 {
         self.error_model
             .frames_in(from_ns.abs_diff(to_ns) as f64 * 1e-9)
     }
 
-    /// The errors of motions: in a known room those that its own frames showed.
+    /// The motion errors of a room, or the calibrated ones if the room is unknown.
     fn motion_errors(&self, room: Option<usize>) -> &MotionErrors {
         room.map_or(&self.error_model.statistics().motion_errors, |room| {
             self.maps[room].motion_errors()
         })
     }
 
-    /// How the camera of a room moves; where no room is known, that of the first.
+    /// The motion prior of a room; that of the first map if the room is unknown.
     pub(super) fn prior(&self, room: Option<usize>) -> &MotionPrior {
         self.maps[room.unwrap_or(0)].motion_prior()
     }
 
-    /// A believed map pose as it is reported: with the covariance that such poses were measured to
-    /// have.
+    /// The reported pose of a believed one. Its covariance is the filter's, times the map-pose
+    /// factor, plus the time-correlated error.
     pub(super) fn reported(
         &self,
         believed: &PoseVelocity,
@@ -338,7 +338,7 @@ impl Tracker {
         }
     }
 
-    /// The motion from an earlier view to this frame, and the covariance of its error.
+    /// Predicts the motion from an earlier view to this frame, with the covariance of its error.
     pub(super) fn motion_between(
         &self,
         room: Option<usize>,
@@ -360,7 +360,7 @@ impl Tracker {
             return (motion, covariance);
         }
 
-        // No camera turns by half between two frames that are compared: nothing was read.
+        // A half turn between two compared frames is implausible: discard the prediction.
         let covariance = covariance + self.error_model.unread_errors();
         (Twist::default(), covariance)
     }

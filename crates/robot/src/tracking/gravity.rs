@@ -1,20 +1,18 @@
-//! Which way is down: what an accelerometer tells of a camera's tilt.
+//! Corrections of the camera's tilt by measured gravity.
 //!
-//! A view says little of a camera's tilt: one that is rolled by ten degrees is most like the mapped
-//! views of a level camera at the same place. Gravity tells the tilt and nothing else: neither the
-//! heading nor the position.
+//! Views constrain the tilt poorly: a view rolled by 10° is most similar to mapped views of a level
+//! camera at the same place. Gravity constrains the tilt, but neither the heading nor the position.
 
 use nalgebra::{Cholesky, Matrix3, SMatrix, SVector, Unit, Vector3};
 
 use super::{Observation, PoseVelocity, PoseWithCovariance, State};
 use seese3_core::geometry::{Pose, Twist, exp};
 
-/// 99 % of χ² with two degrees of freedom, those of a tilt.
+/// Gate of a tilt: 99 % quantile of χ² with two degrees of freedom.
 const GATE: f64 = 9.21;
-/// For how long the error of a measured direction is correlated, seconds: it is mostly that of a
-/// robot that speeds up or brakes.
+/// Correlation time of direction errors, seconds. They come mostly from accelerations of the robot.
 const MEMORY_S: f64 = 2.0;
-/// The largest multiple of the gate by which a contradiction is counted.
+/// Upper bound of the ratio of surprise to gate.
 const MOST_DOUBT: f64 = 1e6;
 
 /// The direction of gravity, as an accelerometer measures it in the camera's frame.
@@ -28,27 +26,27 @@ pub struct MeasuredGravity {
     pub deviation_rad: f64,
 }
 
-/// A measured direction as it counts beside those before it.
+/// A measured direction with its variance inflated for time correlation.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CountedGravity {
     measured: MeasuredGravity,
-    /// The variance that its error has, radians².
+    /// Variance of the measurement error, radians².
     variance: f64,
-    /// The larger variance with which it counts: those before it had about the same error.
+    /// Variance inflated for correlation with earlier measurements, radians².
     counted_variance: f64,
 }
 
-/// How a pose is tilted against measured gravity.
+/// Tilt error of a pose relative to measured gravity.
 struct Tilt {
-    /// The rotation that would take the pose's own direction of gravity to the measured one, in the
-    /// camera's body frame, radians.
+    /// Rotation of the camera that aligns expected with measured gravity, in the camera's body
+    /// frame, radians.
     turn: Vector3<f64>,
-    /// Takes an error of rotation, in the camera's body frame, to its part across the vertical.
+    /// Projects a rotation error in the camera's body frame onto the plane across the vertical.
     projection: Matrix3<f64>,
 }
 
 impl MeasuredGravity {
-    /// The direction that a frame brings, as it counts; the stream remembers when that was.
+    /// Inflates the variance by the time since the last measurement, and stores this frame's time.
     pub(super) fn after(self, state: &mut State, frame: &Observation) -> CountedGravity {
         let seconds = state.gravity_ns.map_or(f64::INFINITY, |before| {
             frame.time_ns.abs_diff(before) as f64 * 1e-9
@@ -57,9 +55,8 @@ impl MeasuredGravity {
         self.counted_after(seconds)
     }
 
-    /// The direction as it counts some seconds after another. A row of measurements with the
-    /// correlation ρ from one to the next tells as much as independent ones of (1 + ρ)/(1 − ρ)
-    /// times the variance.
+    /// Inflates the variance for a measurement that follows another after some seconds. With the
+    /// correlation ρ between successive measurements, the factor is (1 + ρ)/(1 − ρ).
     fn counted_after(self, seconds: f64) -> CountedGravity {
         let correlation = (-seconds / MEMORY_S).exp();
         let variance = self.deviation_rad.powi(2);
@@ -74,8 +71,8 @@ impl MeasuredGravity {
         let expected = pose.rotation.inverse() * self.in_world.into_inner();
         let measured = self.in_camera.into_inner();
 
-        // A camera that is turned by ω sees a direction h at h − ω × h: the turn is about measured ×
-        // expected. Where the two are opposite, any perpendicular axis will do.
+        // A camera rotated by ω measures a direction h as h − ω × h, so the axis is measured ×
+        // expected. If the two are opposite, use any perpendicular axis.
         let across = measured.cross(&expected);
         let angle = across.norm().atan2(measured.dot(&expected));
         let axis = across.try_normalize(1e-9).unwrap_or_else(|| {
@@ -91,19 +88,20 @@ impl MeasuredGravity {
 }
 
 impl Tilt {
-    /// The squared Mahalanobis length of the turn; infinite if the covariances are not positive
-    /// definite.
+    /// Squared Mahalanobis length of the tilt; infinite if the sum of the covariances is not
+    /// positive definite.
     fn surprise(&self, of_rotation: &Matrix3<f64>, measured_variance: f64) -> f64 {
         let sum = self.projection * of_rotation * self.projection.transpose()
             + Matrix3::identity() * measured_variance;
         Cholesky::new(sum).map_or(f64::INFINITY, |sum| self.turn.dot(&sum.solve(&self.turn)))
     }
 
-    /// The step of an error whose rotation is at 3, 4 and 5, and its covariance after the tilt was
-    /// measured, in the body frame before the step; none if the covariances are not positive
-    /// definite. Heading and position are left alone: that they are correlated with the tilt comes
-    /// from views that are taken for one another, and does not hold for a camera that is mounted
-    /// askew.
+    /// Kalman update of an error state with rotation in rows 3 to 5. Returns the step and the
+    /// covariance after it, in the body frame before the step. `None` if a covariance is not
+    /// positive definite.
+    ///
+    /// Only the tilt changes. Its correlation with heading and position comes from mismatched views
+    /// and does not hold for a camera with a tilted mount.
     fn update<const N: usize>(
         &self,
         covariance: &SMatrix<f64, N, N>,
@@ -131,17 +129,16 @@ impl Tilt {
 }
 
 impl CountedGravity {
-    /// The tilt of a pose with this covariance of rotation, and the factor by which this measurement
-    /// counts for less: the more, the further beyond 99 % the two contradict one another. A robot
-    /// that brakes measures another direction, and so does one whose sensor is mounted otherwise
-    /// than it was told.
+    /// Tilt of a pose with this rotation covariance, and the factor on the measurement variance.
+    /// The factor grows with the surprise above the gate: the robot may accelerate, or the sensor's
+    /// extrinsics may be wrong.
     fn against(&self, pose: &Pose, of_rotation: &Matrix3<f64>) -> (Tilt, f64) {
         let tilt = self.measured.tilt(pose);
         let excess = tilt.surprise(of_rotation, self.variance) / GATE;
         (tilt, excess.clamp(1.0, MOST_DOUBT).powi(2))
     }
 
-    /// By how much it contradicts a pose, radians; none if it does not.
+    /// Angle between measured gravity and that of a pose, radians, if it is outside the gate.
     pub(super) fn contradicts(&self, pose: &PoseWithCovariance) -> Option<f64> {
         let tilt = self.measured.tilt(&pose.pose);
         let of_rotation = pose.covariance.fixed_view::<3, 3>(3, 3).into_owned();
@@ -151,8 +148,8 @@ impl CountedGravity {
 }
 
 impl PoseWithCovariance {
-    /// The pose of a view, corrected by the gravity that was measured beside it: however many views
-    /// there are, each is turned at most to where gravity says.
+    /// Corrects the tilt of a view's pose by the gravity of the same frame, without inflation for
+    /// time correlation.
     #[must_use]
     pub(super) fn levelled(&self, gravity: &CountedGravity) -> Self {
         let of_rotation = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
@@ -172,7 +169,7 @@ impl PoseWithCovariance {
 }
 
 impl PoseVelocity {
-    /// The belief when gravity was measured.
+    /// Corrects the tilt of the filter state by gravity, with inflation for time correlation.
     #[must_use]
     pub(super) fn levelled(&self, gravity: &CountedGravity) -> Self {
         let of_rotation = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
@@ -201,7 +198,7 @@ mod tests {
 
     const DOWN: Vector3<f64> = Vector3::new(0.0, 1.0, 0.0);
 
-    /// What a camera at this pose measures exactly, in a world whose y axis points down.
+    /// Noise-free gravity measured by a camera at this pose; the world's y axis points down.
     fn gravity_at(pose: &Pose, deviation_rad: f64) -> MeasuredGravity {
         let down = Unit::new_unchecked(DOWN);
         MeasuredGravity {
@@ -211,7 +208,7 @@ mod tests {
         }
     }
 
-    /// The same, as the first that a stream brings.
+    /// The same as the first measurement of a stream.
     fn first_at(pose: &Pose, deviation_rad: f64) -> CountedGravity {
         gravity_at(pose, deviation_rad).counted_after(f64::INFINITY)
     }
@@ -220,9 +217,9 @@ mod tests {
         Pose::new(Vector3::new(1.0, 2.0, 3.0), axis * angle_rad)
     }
 
-    /// Oracle: by hand. A camera that is believed to stand level is rolled by 10 degrees about its
-    /// optical axis: gravity, which is much surer, turns it so, about no other axis. Its tilt is
-    /// known afterwards; neither its position nor its heading are known better.
+    /// Oracle: by hand. The estimate is level; the camera is rolled by 10° about its optical axis.
+    /// A precise gravity measurement corrects the roll and no other axis. Afterwards the tilt is
+    /// known; the uncertainty of position and heading is unchanged.
     #[test]
     fn gravity_tells_the_tilt_and_nothing_else() {
         let level = turned(DOWN, 0.7);
@@ -231,7 +228,7 @@ mod tests {
         let (right, down) = (Vector3::x(), truth.rotation.inverse() * DOWN);
 
         let independent = PoseWithCovariance::known(level, 0.1, 0.2);
-        // Also where errors of roll went along with those of position and heading.
+        // A second case correlates the roll error with those of position and heading.
         let mut together = independent;
         for other in [0, 4] {
             let covariance = &mut together.covariance;
@@ -260,11 +257,11 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand. A view that is sure to stand level to .005 rad and a gravity of .02 rad that
-    /// says .2 rad differ by .2² / (.005² + .02²) = 94.118 squared deviations, 10.219 times the 9.21
-    /// of χ²: gravity counts with 104.43 times its variance, .04177, and turns the view by the share
-    /// 25e-6 / .041797 of .2, which is .0001196 rad. And that is a contradiction of .2 rad, while one
-    /// of .02 rad is none.
+    /// Oracle: by hand. A level view has a deviation of 0.005 rad; gravity, with 0.02 rad, is 0.2
+    /// rad off. The surprise is 0.2² / (0.005² + 0.02²) = 94.118, or 10.219 times the gate of 9.21.
+    /// The variance of gravity grows by 10.219² = 104.43 to 0.04177. It turns the view by 0.2 ·
+    /// 25e-6 / 0.041797 = 0.0001196 rad. An angle of 0.2 rad is outside the gate, 0.02 rad is
+    /// inside.
     #[test]
     fn gravity_that_a_sure_view_contradicts_is_doubted() {
         let view = PoseWithCovariance::known(turned(DOWN, -0.4), 0.005, 0.005);
@@ -283,8 +280,7 @@ mod tests {
         assert!(pitched(0.02).contradicts(&view).is_none());
     }
 
-    /// Oracle: the definition: where a camera is upside down it was turned by half, about an axis
-    /// across.
+    /// Oracle: the definition: an upside-down camera has a tilt of π about a horizontal axis.
     #[test]
     fn upside_down_is_a_turn_by_half() {
         let pose = turned(DOWN, 0.3);
@@ -298,9 +294,9 @@ mod tests {
         assert!(tilt.turn.dot(&down.in_camera).abs() < 1e-9);
     }
 
-    /// Oracle: by hand. The first direction, as sure as what is believed, takes the camera half of
-    /// the way. One that comes a tenth of a second later, with the correlation e^(−1/20) = .951,
-    /// counts with 39.7 times the variance, and takes it 1/40.7 of the way.
+    /// Oracle: by hand. A first direction with the variance of the estimate corrects half of the
+    /// error. One that follows after 0.1 s, with correlation e^(−1/20) = 0.951, has about 40 times
+    /// the variance and corrects 1/41.01 of the error.
     #[test]
     fn directions_in_a_row_count_as_few() {
         let prior = MotionPrior::assumed();

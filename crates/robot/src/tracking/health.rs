@@ -1,68 +1,66 @@
-//! Tracking health: whether a stream's frames follow from one another and match the room. It tells
-//! a camera that is lost from one that explores a part of the room that is not mapped.
+//! Tracking health: whether a stream's frames are continuous and match the room. It distinguishes a
+//! lost camera from one that explores an unmapped part of the room.
 //!
-//! A frame far from every mapped frame can mean two things. If the stream was confirmed to be in
-//! the room, and each view follows from the one before, the camera has only left the mapped part.
-//! If the stream was never confirmed, or the view jumped, nobody knows where the camera is.
+//! A frame far from every mapped frame has two explanations. If the stream was confirmed in the
+//! room and each view is continuous with the previous one, the camera has left the mapped part. If
+//! the stream was never confirmed, or the view jumped, the camera is lost.
 
-/// Frames in a row that must match the room with certainty before a lost stream's health is
-/// consistent again.
+/// Number of consecutive certain matches after which a lost stream is consistent again.
 pub const FRAMES_TO_RECOVER: u32 = 5;
-/// The score at which a stream is confirmed to be in the room: each matching frame adds one, each
-/// other frame takes away [`MISMATCH_COST`].
+/// Score at which a stream is confirmed in the room: a match adds 1, a mismatch subtracts
+/// [`MISMATCH_COST`].
 const CONFIRMED_SCORE: i32 = 20;
-/// What a frame that does not match the room takes away from the score of an unconfirmed stream.
+/// Amount that a mismatch subtracts from the score of an unconfirmed stream.
 const MISMATCH_COST: i32 = 2;
 
-/// What the frames of a stream say so far about whether its place in the room can be known.
+/// Health of a stream, updated with every frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub enum TrackingHealth {
     /// No frame was observed yet.
     #[default]
     NotStarted,
-    /// Each frame follows from the one before, back to one that matched the room or whose pose was
-    /// given.
+    /// The frames are continuous, back to one that matched the room or had a given pose.
     Consistent {
-        /// Matching frames, less two for each other one; not counted on once the stream is
+        /// Number of matches minus twice the number of mismatches; frozen once the stream is
         /// confirmed.
         score: i32,
-        /// Whether the stream is certainly in this room, so that frames unlike the map show parts
-        /// of the room that are not mapped.
+        /// Whether the stream is certainly in this room. Frames that do not match then show
+        /// unmapped parts of the room.
         confirmed: bool,
     },
-    /// The frames do not match the room, or do not follow from one another.
+    /// The frames do not match the room, or are not continuous.
     Lost {
-        /// Frames in a row, up to now, that match the room with certainty.
+        /// Number of consecutive certain matches so far.
         certain_matches: u32,
     },
 }
 
-/// What one frame says about the health of its stream.
+/// Evidence of one frame about the health of its stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FrameEvidence {
-    /// Whether the frame is near enough to the map to be of this room.
+    /// Whether the frame matches the room: it is within the out-of-distribution limit.
     pub matches_room: bool,
-    /// Whether the frame is so near that hardly any frame of another room would be.
+    /// Whether the match is certain: hardly any frame of another room is that near.
     pub matches_certainly: bool,
-    /// How the frame follows from those before it.
+    /// Continuity with the previous frames.
     pub continuity: Continuity,
 }
 
-/// How a frame follows from the frames before it.
+/// Continuity of a frame with the previous frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Continuity {
-    /// The view changed no more than a moving camera's view can.
+    /// The view changed no more than the view of a moving camera can.
     Continuous,
-    /// So many frames are missing before this one, [`JUMP_WINDOW`](seese3_core::adapter::JUMP_WINDOW) or
-    /// more, that a jump could not be noticed.
+    /// A jump could not be detected: [`JUMP_WINDOW`](seese3_core::adapter::JUMP_WINDOW) or more
+    /// frames were dropped, or the pause, or the time without a new image, was too long.
     Gap,
-    /// The view changed by more than a camera can move between the two frames.
+    /// The view changed more than the view of a moving camera can.
     Jump,
 }
 
 impl TrackingHealth {
-    /// The health of a stream whose pose was given: it is in the room by assumption.
+    /// Health of a stream with a given pose: it is in the room by assumption.
     pub fn confirmed() -> Self {
         Self::Consistent {
             score: CONFIRMED_SCORE,
@@ -83,13 +81,13 @@ impl TrackingHealth {
         }
     }
 
-    /// Whether the frames contradict the room or one another. A [`Status`](super::Status) can be
-    /// LOST for another reason too: a position that is too uncertain.
+    /// Whether the frames do not match the room or are not continuous. A
+    /// [`Status`](super::Status) can also be LOST because the position is too uncertain.
     pub fn is_lost(self) -> bool {
         matches!(self, Self::Lost { .. })
     }
 
-    /// Whether the stream was certainly in the room once and has not been lost since.
+    /// Whether the stream was confirmed in the room and has had no gap or jump since.
     pub fn is_confirmed(self) -> bool {
         matches!(
             self,
@@ -100,7 +98,7 @@ impl TrackingHealth {
         )
     }
 
-    /// One frame matched the room, and nothing is known of those before it.
+    /// One match, with no usable frames before it.
     const ONE_MATCH: Self = Self::Consistent {
         score: 1,
         confirmed: false,
@@ -111,7 +109,7 @@ impl TrackingHealth {
     fn after_consistent(score: i32, confirmed: bool, evidence: FrameEvidence) -> Self {
         match evidence.continuity {
             Continuity::Jump => return Self::NEWLY_LOST,
-            // The missing frames may hide a jump, so this frame has to show the room anew.
+            // The gap may hide a jump, so this frame must match the room again.
             Continuity::Gap if evidence.matches_room => return Self::ONE_MATCH,
             Continuity::Gap => return Self::NEWLY_LOST,
             Continuity::Continuous => {}
@@ -203,25 +201,25 @@ mod tests {
         let fresh = TrackingHealth::NotStarted;
         assert_eq!(lost_after_each(fresh, &[MISMATCH; 3]), [true; 3]);
 
-        // One matching frame makes an unconfirmed stream, which the next other frame ends.
+        // One match makes the stream consistent but unconfirmed; the next mismatch makes it lost.
         assert_eq!(
             lost_after_each(fresh, &[MATCH, MISMATCH, MATCH]),
             [false, true, true]
         );
 
-        // Five in a row end the loss.
+        // Five consecutive certain matches make the stream consistent.
         let frames = [&[MISMATCH][..], &[MATCH; 6]].concat();
         assert_eq!(
             lost_after_each(fresh, &frames),
             [true, true, true, true, true, false, false]
         );
 
-        // Twenty confirm the stream, which then may explore.
+        // Twenty matches confirm the stream, which may then leave the mapped part.
         let frames = [&[MATCH; 20][..], &[MISMATCH; 9]].concat();
         assert!(lost_after_each(fresh, &frames).iter().all(|lost| !lost));
     }
 
-    /// Oracle: the rules by hand: behind a gap even a confirmed stream has to show the room again.
+    /// Oracle: the rules by hand: after a gap even a confirmed stream must match the room again.
     #[test]
     fn a_gap_ends_confirmation() {
         let gap = |evidence: FrameEvidence| {

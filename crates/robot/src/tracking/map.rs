@@ -1,4 +1,4 @@
-//! A room as a tracker matches views against it.
+//! The map of a room, against which a tracker matches views.
 
 use std::sync::Arc;
 
@@ -17,34 +17,33 @@ use seese3_core::navigation::Navigator;
 use seese3_core::room::FrameId;
 use seese3_core::statistics::median;
 
-/// How many mapped frames are asked, at most, how far their nearest others are.
+/// Maximum number of mapped frames sampled for the typical distance.
 const SAMPLED_FRAMES: usize = 1_000;
 
-/// Reads where a view is in one room better than the adapter that several rooms share.
+/// Localizer of one room, more accurate than the adapter shared between rooms.
 pub trait PoseReader: Send + Sync {
-    /// The pose of a view, `world_from_camera`, from its raw feature of shape (d,); none if the
-    /// feature cannot be read.
+    /// Estimates the pose of a view, `world_from_camera`, from its raw feature, shape (d,). `None`
+    /// if that is not possible.
     fn read_pose(&self, feature: &[f32]) -> Option<PoseWithCovariance>;
 
-    /// How far a view is from the map, over the furthest that the reader was tried at: above 1 it
-    /// reads nothing. None if it does not know such a distance.
+    /// Distance of a view from the map divided by the largest validated distance: above 1 there is
+    /// no pose. `None` if unknown.
     fn distance_over_range(&self, _feature: &[f32]) -> Option<f64> {
         None
     }
 }
 
-/// A view as a map looks for it.
+/// Query of a map for a view.
 #[derive(Debug, Clone, Copy)]
 pub struct MapQuery<'a> {
-    /// Its latent, shape (k,).
+    /// Latent, shape (k,).
     pub latent: ArrayView1<'a, f64>,
-    /// Its raw feature, shape (d,), if it is known. It finds the mapped frames that are nearest
-    /// better than the latent does.
+    /// Raw feature, shape (d,), if known: it retrieves nearer frames than the latent does.
     pub feature: Option<&'a [f32]>,
 }
 
 impl<'a> MapQuery<'a> {
-    /// A view of which the latent alone is known.
+    /// A query by latent only.
     pub fn of_latent(latent: ArrayView1<'a, f64>) -> Self {
         Self {
             latent,
@@ -53,7 +52,7 @@ impl<'a> MapQuery<'a> {
     }
 }
 
-/// The mapped frames by what the views of the room differ in.
+/// Index of the mapped frames by PCA of the room's features, with its anchor models.
 struct AppearanceMap {
     appearance: Appearance,
     index: ExactIndex,
@@ -61,7 +60,7 @@ struct AppearanceMap {
 }
 
 impl AppearanceMap {
-    /// The mapped frames whose features are most like one of shape (d,).
+    /// The mapped frames most similar to a feature of shape (d,).
     fn nearest(&self, feature: &[f32], count: usize) -> Vec<Neighbour> {
         let coordinates = self.appearance.coordinates(feature).to_vec();
         self.index.nearest(&coordinates, count, None)
@@ -76,38 +75,40 @@ pub struct Map {
     typical_distance: f64,
     extent_m: f64,
     motion_errors: MotionErrors,
-    /// None where too few frames are mapped: the calibrated errors are taken.
+    /// `None` if too few frames are mapped; the calibrated errors are then used.
     anchor_model: Option<AnchorModel>,
     motion_prior: MotionPrior,
     pose_reader: Option<Arc<dyn PoseReader>>,
     by_appearance: Option<AppearanceMap>,
 }
 
-/// How a view matches a map.
+/// Match of a view with a map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MapMatch {
-    /// The mapped frames that look most alike, the most alike first, each with the distance of its
-    /// latent in standard deviations of frame noise; at least one.
+    /// Most similar mapped frames, best first; at least one. The distances are those of latents, in
+    /// standard deviations of frame noise.
     pub nearest: Vec<Neighbour>,
-    /// The distance of the nearest latent, in standard deviations of frame noise: it compares
-    /// between rooms.
+    /// Distance of the nearest latent, in standard deviations of frame noise, comparable between
+    /// rooms.
     pub distance: f64,
-    /// That distance over the room's limit: above 1 the view looks like another place.
+    /// `distance` divided by the room's limit: above 1 the view is out of distribution.
     pub out_of_distribution: f64,
-    /// Whether the view is so near that hardly any frame of another room would be.
+    /// Whether the match is certain: hardly any frame of another room is that near.
     pub is_certain: bool,
-    /// The pose that the nearest frames tell.
+    /// Pose estimated from the nearest frames.
     pub anchor: MapAnchor,
-    /// Whether that was found by the view's raw feature; else by its latent.
+    /// Whether the frames were retrieved by raw feature, not by latent.
     pub is_by_feature: bool,
 }
 
 impl Map {
-    /// A map of the frames `mapped` of a room, given in order.
+    /// Builds a map of the frames `mapped` of a room, given in order.
     ///
     /// # Errors
-    /// [`Error::NotCalibrated`] when the adapter has no error model, [`Error::SmallMap`] when no
-    /// mapped frame has another one that is not its neighbour in time.
+    /// - [`Error::NotCalibrated`] if the adapter has no error model.
+    /// - [`Error::RoomErrors`] if the motion errors in this room give no valid error model.
+    /// - [`Error::SmallMap`] if no mapped frame has a distinct one outside its temporal
+    ///   neighborhood.
     pub fn new(navigator: Arc<Navigator>, mapped: &[FrameId]) -> Result<Self, Error> {
         let error_model = navigator
             .adapter()
@@ -115,15 +116,15 @@ impl Map {
             .ok_or(Error::NotCalibrated)?
             .clone();
 
-        // Distances are taken in standard deviations of frame noise, so that they compare between
-        // rooms and adapters.
+        // Distances in standard deviations of frame noise are comparable between rooms and
+        // adapters.
         let coordinates = s![.., ..navigator.adapter().coordinate_count()];
         let whitened = error_model
             .frame_noise()
             .whitened(navigator.latents().slice(coordinates));
         let index = ExactIndex::new(whitened.view(), mapped);
 
-        // As many rows as the neighbours in time took in the rooms where limits were measured.
+        // The temporal neighborhood covers the same time as in the calibration rooms.
         let rows_per_frame =
             error_model.statistics().frame_period_s / frame_period_s(navigator.room());
         let neighbours = (f64::from(TEMPORAL_NEIGHBOURS) * rows_per_frame)
@@ -137,8 +138,7 @@ impl Map {
             });
         }
 
-        // How large the adapter's errors are in this very room is told by its own frames, whose
-        // poses are known.
+        // Measure the adapter's errors in this room on its mapped frames, which have known poses.
         let motion_errors = room_errors::motion_errors(&navigator, &error_model, mapped)
             .map_err(Error::RoomErrors)?;
         let by_latent = Likeness {
@@ -162,9 +162,9 @@ impl Map {
         })
     }
 
-    /// The same map with the raw features of its room, shape (n, d), of which the frames `mapped`
-    /// are mapped: a view whose feature is known is looked for by it. A room with few frames, or of
-    /// which they tell too little, stays as it is.
+    /// Adds retrieval by raw feature. `features` has shape (n, d), `mapped` holds the mapped
+    /// frames. Without enough frames for the PCA and the anchor models, retrieval by latent
+    /// remains.
     #[must_use]
     pub fn with_features(self, features: ArrayView2<'_, f32>, mapped: &[FrameId]) -> Self {
         let measured = || {
@@ -201,8 +201,8 @@ impl Map {
         }
     }
 
-    /// The same map with a reader of its own room, which gives anchors wherever a frame brings its
-    /// raw feature.
+    /// Adds a localizer of this room; the tracker uses it for anchors of certain matches with a raw
+    /// feature.
     #[must_use]
     pub fn with_pose_reader(self, pose_reader: Arc<dyn PoseReader>) -> Self {
         Self {
@@ -211,7 +211,8 @@ impl Map {
         }
     }
 
-    /// The pose of a view by the reader of this room; none without one, or without a feature.
+    /// Estimates the pose of a view with the localizer of this room; `None` without a localizer or
+    /// a feature, or if the localizer gives no pose.
     pub(super) fn pose_by_reader(&self, feature: Option<&[f32]>) -> Option<PoseWithCovariance> {
         self.pose_reader.as_ref()?.read_pose(feature?)
     }
@@ -221,7 +222,7 @@ impl Map {
         &self.navigator
     }
 
-    /// About how much memory it holds, bytes, besides the navigator.
+    /// Approximate memory use without the navigator, bytes.
     pub fn memory_bytes(&self) -> usize {
         let by_appearance = self.by_appearance.as_ref().map_or(0, |map| {
             map.appearance.memory_bytes() + map.index.memory_bytes()
@@ -229,26 +230,26 @@ impl Map {
         self.index.memory_bytes() + by_appearance
     }
 
-    /// The errors of motions read in this room, scaled by what its mapped frames show.
+    /// Motion errors in this room: the calibrated ones, scaled by its mapped frames.
     pub fn motion_errors(&self) -> &MotionErrors {
         &self.motion_errors
     }
 
-    /// How the camera that mapped the room moved.
+    /// Velocity statistics of the camera that mapped the room.
     pub fn motion_prior(&self) -> &MotionPrior {
         &self.motion_prior
     }
 
-    /// The diagonal of the box around the mapped camera positions, metres.
+    /// Diagonal of the bounding box of the mapped camera positions, meters.
     pub fn extent_m(&self) -> f64 {
         self.extent_m
     }
 
-    /// Matches a view with the `count` mapped frames that look most alike.
+    /// Matches a view with its `count` most similar mapped frames.
     pub fn match_view(&self, query: MapQuery<'_>, count: usize) -> MapMatch {
         let whitened = self.whitened(query.latent);
         let mut by_latent = self.index.nearest(&whitened, count.max(LOOKED_AT), None);
-        // A map has frames, or it would not have a typical distance.
+        // Not reachable: a map without frames has no typical distance and is rejected.
         if by_latent.is_empty() {
             by_latent.push(Neighbour {
                 frame: FrameId(0),
@@ -267,8 +268,8 @@ impl Map {
             Some((map, feature)) => {
                 let alike = map.nearest(feature, count.max(LOOKED_AT));
 
-                // A latent that looks like another place says nothing of this one: images that are
-                // blurred, noisy or partly hidden spoil latents before they spoil features.
+                // Ignore a latent that is out of distribution. Blurred, noisy or partly occluded
+                // images degrade latents more than features.
                 let second = Some(blend.pose());
                 let blend = Blend::of(&self.navigator, &alike, query.latent, second);
                 let models = &map.anchor_models;
@@ -300,7 +301,7 @@ impl Map {
         }
     }
 
-    /// The same frames, with the distances of their latents from a whitened one.
+    /// The same frames with the distances of their latents from a whitened latent.
     fn with_latent_distances(&self, frames: &[Neighbour], whitened: &[f64]) -> Vec<Neighbour> {
         let latents = self.navigator.latents();
         let of_latent = |found: &Neighbour| {
@@ -314,7 +315,7 @@ impl Map {
         frames.iter().map(of_latent).collect()
     }
 
-    /// A latent of shape (k,) in standard deviations of frame noise.
+    /// Whitens a latent of shape (k,): the result is in standard deviations of frame noise.
     fn whitened(&self, latent: ArrayView1<'_, f64>) -> Vec<f64> {
         let coordinates = latent.slice(s![..self.navigator.adapter().coordinate_count()]);
         self.error_model
@@ -325,9 +326,8 @@ impl Map {
     }
 }
 
-/// The median distance from a mapped frame to the nearest other one that is not among its
-/// `neighbours` before and after it in time: how far apart views of this room lie when a camera
-/// comes back.
+/// Median distance from a mapped frame to its nearest mapped frame more than `neighbours` rows
+/// away: the typical distance between views when a camera returns to a place.
 fn typical_distance(
     index: &ExactIndex,
     whitened: &Array2<f64>,
@@ -351,7 +351,7 @@ fn typical_distance(
     median(&distances)
 }
 
-/// The diagonal of the box around the mapped camera positions, metres.
+/// Diagonal of the bounding box of the mapped camera positions, meters.
 fn extent(navigator: &Navigator, mapped: &[FrameId]) -> f64 {
     let mut low = nalgebra::Vector3::repeat(f64::INFINITY);
     let mut high = nalgebra::Vector3::repeat(f64::NEG_INFINITY);

@@ -1,11 +1,12 @@
-//! From what a camera sees to how it moves, and where it is.
+//! Tracking: estimates a camera's motion, and its pose in a mapped room.
 //!
-//! - [`motion`] reads the motion between two views.
-//! - [`relocalize`] names the room that a few views show, and the place in it.
-//! - A [`Tracker`] follows a stream of frames; its whole memory of a stream is a [`State`].
-//! - [`replay`] runs a recording through a tracker and compares the answers with the true path.
+//! - [`motion`] estimates the motion between two views.
+//! - [`relocalize`] finds the room that a few views show, and the pose in it.
+//! - A [`Tracker`] tracks a stream of frames; all state of a stream is in a [`State`].
+//! - [`replay`] runs a recording through a tracker and compares its output with the ground truth.
 //!
-//! A [`PoseWithCovariance`] is a pose with the covariance of its error in its own body frame, on (v, ω).
+//! A [`PoseWithCovariance`] is a pose with the covariance of its error in its own body frame, on
+//! (v, ω).
 
 mod anchor_model;
 mod anchoring;
@@ -55,16 +56,16 @@ pub use wheel_odometry::{Drift, LastMeasured, MeasuredPose, OdometryAccumulator,
 use seese3_core::adapter;
 use seese3_core::room::RoomId;
 
-/// Whether a stream's place in the room is known.
+/// Localization status of a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Status {
-    /// The place is known, and recent frames confirm it.
+    /// The map pose is known and confirmed by recent frames.
     Tracking,
-    /// The place was known, but recent frames match no mapped frame, or speak for another place.
+    /// There is a map pose, but it is unconfirmed, contradicted or too uncertain.
     Degraded,
-    /// The frames do not match the room, or the place is known too badly to be of use.
+    /// The frames do not match the room, or the position is too uncertain to be useful.
     Lost,
-    /// The frames match the room, but not enough of them agree on a place yet.
+    /// The frames match the room, but not enough anchors agree on a pose yet.
     Relocalizing,
 }
 
@@ -78,29 +79,29 @@ pub enum Error {
     /// No view was given.
     #[error("at least one view is needed")]
     NoView,
-    /// Nobody waits for the answer any more.
+    /// The caller cancelled the request.
     #[error("cancelled")]
     Cancelled,
-    /// Latents of different adapters cannot be compared.
-    #[error("rooms of several adapters cannot be looked in together: their latents do not compare")]
+    /// The maps have different adapters.
+    #[error("the rooms have different adapters: their latents are not comparable")]
     Adapters,
     /// The adapter has no error model.
     #[error(
-        "the adapter's errors were not measured in two or more rooms that it did not learn from (train --calibrate-on)"
+        "the adapter is not calibrated for tracking: its errors were not measured in two or more rooms outside its \
+         training (train --calibrate-on)"
     )]
     NotCalibrated,
-    /// The errors that a room's frames show make no sound error model.
-    #[error("the errors of the adapter in this room cannot be used: {0}")]
+    /// The errors measured in a room give no valid error model.
+    #[error("the adapter's errors in this room give no valid error model: {0}")]
     RoomErrors(#[source] adapter::Error),
-    /// No mapped frame has another one nearby in place but not in time.
+    /// No mapped frame has a distinct match outside its temporal neighborhood.
     #[error(
-        "room '{room}' has {frames} mapped frames, none with another that is not beside it in time: too few to tell it \
-         from other places"
+        "room '{room}' has {frames} mapped frames: too few distinct frames that are not neighbors in time"
     )]
     SmallMap {
         /// The room.
         room: RoomId,
-        /// How many frames of it are mapped.
+        /// Number of mapped frames.
         frames: usize,
     },
 }

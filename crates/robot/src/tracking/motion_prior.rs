@@ -1,8 +1,8 @@
-//! How a camera moves when nothing is read of it: as the camera did that mapped the room.
+//! Motion prior: the velocity statistics of the camera that mapped the room.
 //!
-//! Its velocity is a random walk that is pulled back to zero (an Ornstein–Uhlenbeck process): over a
-//! short time the camera goes on as it did, over a long time it may have turned round, and is expected
-//! where it would have come to rest. Everything is a function of seconds, not of frames.
+//! The velocity is an Ornstein–Uhlenbeck process, a random walk with mean reversion to zero. Over a
+//! short time the expected velocity is constant; over a long time it decays to zero. All times are
+//! in seconds, not in frames.
 
 use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
 
@@ -10,70 +10,68 @@ use super::clock::seconds_between;
 use seese3_core::geometry::{Twist, body_twist};
 use seese3_core::room::{FrameId, Room};
 
-/// A covariance of a pose and a velocity.
+/// Covariance of a pose and a velocity.
 pub(super) type Matrix12 = SMatrix<f64, 12, 12>;
 
-/// Velocities are compared over about this time to see how long they last, seconds.
+/// Approximate lag of the velocity autocorrelation, seconds.
 const LAG_S: f64 = 0.2;
-/// Mapped frames further apart in time than this tell no velocity, seconds.
+/// Longest interval of mapped frames from which a velocity is computed, seconds.
 const LONGEST_STEP_S: f64 = 0.25;
-/// With fewer velocities than this nothing is known of the room's camera.
+/// Minimum number of velocities for a prior of the room; otherwise the default is used.
 const FEWEST_VELOCITIES: usize = 20;
-/// A velocity lasts at least and at most this long, seconds.
+/// Range of the velocity's correlation time, seconds.
 const DURATION_RANGE_S: (f64, f64) = (0.05, 5.0);
-/// The variances of a camera that hardly moved are not below these, (m/s)² and (rad/s)²: one
-/// centimetre and half a degree a second.
+/// Variance added to each velocity component, (m/s)² and (rad/s)²: 1 cm/s and about 0.6°/s.
 const LEAST_VARIANCE: f64 = 1e-4;
-/// What is assumed of a camera of which too little is known: half a metre and half a radian a second
-/// along every axis, for half a second.
+/// Default prior: 0.5 m/s and 0.5 rad/s along every axis, with a correlation time of 0.5 s.
 const ASSUMED_VARIANCE: f64 = 0.25;
 const ASSUMED_DURATION_S: f64 = 0.5;
 
-/// The statistics of a camera's velocity in its body frame, on (v, ω).
+/// Statistics of a camera's velocity in its body frame, on (v, ω).
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionPrior {
     linear: Part,
     angular: Part,
 }
 
-/// The velocity of translation, or that of rotation.
+/// Statistics of the linear or the angular velocity.
 #[derive(Debug, Clone, PartialEq)]
 struct Part {
-    /// Its second moment, m²/s² or rad²/s².
+    /// Second moment, m²/s² or rad²/s².
     variance: Matrix3<f64>,
-    /// The time after which it is correlated by 1/e, seconds.
+    /// Correlation time (decay to 1/e), seconds.
     duration_s: f64,
 }
 
-/// What becomes of a velocity over a time.
+/// Transition of the process over a time, per component.
 struct Decay {
-    /// The share of the velocity that is left.
+    /// Expected final velocity divided by the initial velocity.
     left: f64,
-    /// The seconds that the camera goes on with the velocity it had.
+    /// Expected displacement divided by the initial velocity, seconds.
     reach_s: f64,
-    /// The variance of the way, its covariance with the velocity at the end, and the variance of that
-    /// velocity, for a velocity of unit variance.
+    /// Variance of the displacement, its covariance with the final velocity, and the variance of
+    /// the final velocity, for a known initial velocity and a stationary variance of 1.
     way: f64,
     way_velocity: f64,
     velocity: f64,
 }
 
-/// What a prior says of the motion over a time.
+/// Predicted motion over a time.
 pub(super) struct Drift {
-    /// The motion that is expected.
+    /// Expected motion.
     pub motion: Twist,
-    /// The velocity that is expected at its end.
+    /// Expected final velocity.
     pub velocity: Twist,
-    /// The derivatives of motion and final velocity by the velocity at the beginning, as the factors
-    /// of identity for (v, ω).
+    /// Derivatives of motion and final velocity with respect to the initial velocity, as factors of
+    /// the identity for (v, ω).
     pub reach_s: [f64; 2],
     pub left: [f64; 2],
-    /// The covariance of (motion, final velocity) for a known velocity at the beginning.
+    /// Covariance of (motion, final velocity) for a known initial velocity.
     pub noise: Matrix12,
 }
 
 impl MotionPrior {
-    /// The prior of the camera that took the mapped frames of a room, given in order.
+    /// Estimates the prior from the mapped frames of a room, given in order.
     pub fn of_path(room: &Room, mapped: &[FrameId]) -> Self {
         let steps: Vec<Option<(f64, Twist)>> = mapped
             .windows(2)
@@ -97,7 +95,7 @@ impl MotionPrior {
         }
     }
 
-    /// The prior of a camera of which nothing is known.
+    /// Default prior.
     pub(super) fn assumed() -> Self {
         let part = Part {
             variance: Matrix3::identity() * ASSUMED_VARIANCE,
@@ -109,7 +107,7 @@ impl MotionPrior {
         }
     }
 
-    /// The covariance of the velocity of a camera that was not observed, on (v, ω).
+    /// Stationary covariance of the velocity, on (v, ω).
     pub fn velocity_covariance(&self) -> Matrix6<f64> {
         let mut covariance = Matrix6::zeros();
         for (part, at) in [(&self.linear, 0), (&self.angular, 3)] {
@@ -120,7 +118,7 @@ impl MotionPrior {
         covariance
     }
 
-    /// What becomes of a camera with a velocity over a time, seconds.
+    /// Predicts the motion of a camera with an initial velocity over a time, seconds.
     pub(super) fn over(&self, velocity: &Twist, seconds: f64) -> Drift {
         let parts = [&self.linear, &self.angular];
         let decays = parts.map(|part| Decay::over(seconds, part.duration_s));
@@ -165,8 +163,8 @@ impl Decay {
         let left = (-ratio).exp();
         let square = duration_s * duration_s;
 
-        // The closed form of the way's variance cancels to third order where the time is short: its
-        // series is taken there.
+        // For short times the closed form of the displacement variance loses precision by
+        // cancellation; use its series.
         let way = if ratio < 5e-3 {
             ratio.powi(3) * (2.0 / 3.0 - ratio / 2.0 + 7.0 / 30.0 * ratio * ratio)
         } else {
@@ -182,7 +180,7 @@ impl Decay {
     }
 }
 
-/// The time and the velocity between two mapped frames, if they follow one another.
+/// Time and velocity between two mapped frames, if they are successive in one sequence.
 fn velocity(room: &Room, from: FrameId, to: FrameId) -> Option<(f64, Twist)> {
     let seconds = seconds_between(room, from, to);
     let follows = room.timeline().joins(from, to) && seconds > 0.0 && seconds <= LONGEST_STEP_S;
@@ -202,8 +200,7 @@ fn second_moment(velocities: impl Iterator<Item = Vector3<f64>>) -> Matrix3<f64>
     sum / count + Matrix3::identity() * LEAST_VARIANCE
 }
 
-/// How long a velocity lasts, from its correlation with the velocity `lag` steps later, which are
-/// `seconds` apart.
+/// Correlation time, seconds, from the correlation of velocities `lag` steps or `seconds` apart.
 fn duration(
     steps: &[Option<(f64, Twist)>],
     lag: usize,
@@ -239,8 +236,8 @@ mod tests {
     use seese3_core::room::{Frames, Provenance, RoomId};
     use seese3_core::statistics::normal_deviates;
 
-    /// Oracle: the definition of a Markov process: what is said of two times one after the other is
-    /// what is said of both together.
+    /// Oracle: the definition of a Markov process: two successive transitions equal one over the
+    /// total time.
     #[test]
     fn two_times_are_one_longer_time() {
         let duration_s = 0.7;
@@ -248,7 +245,7 @@ mod tests {
             let [a, b, both] =
                 [first, second, first + second].map(|time| Decay::over(time, duration_s));
 
-            // The way of the second part begins with the velocity at the end of the first.
+            // The second transition starts with the final velocity of the first.
             let way = a.way
                 + 2.0 * b.reach_s * a.way_velocity
                 + b.reach_s * b.reach_s * a.velocity
@@ -271,8 +268,8 @@ mod tests {
         }
     }
 
-    /// Oracle: a drawn path of known statistics: 0.4 m/s along every axis for 0.8 s, and 0.3 rad/s for
-    /// 0.3 s, seen at 15 Hz.
+    /// Oracle: a simulated path with known statistics, sampled at 15 Hz: 0.4 m/s per axis with 0.8
+    /// s correlation time, and 0.3 rad/s with 0.3 s.
     #[test]
     fn a_path_tells_how_its_camera_moves() {
         let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(5);
@@ -281,7 +278,7 @@ mod tests {
         let mut pose = Pose::identity();
         let mut poses = Vec::new();
 
-        // Steps are a hundredth of what is seen, so that the velocity is the path's own.
+        // Simulate with 100 steps per sample, so that discretization errors are negligible.
         let step = period / 100.0;
         for number in 0..400_000 {
             if number % 100 == 0 {
@@ -324,7 +321,7 @@ mod tests {
         assert_eq!(few, MotionPrior::assumed());
     }
 
-    /// Oracle: the definition: a velocity that never changes lasts as long as any may.
+    /// Oracle: the definition: a constant velocity has the maximum correlation time.
     #[test]
     fn a_constant_velocity_lasts() {
         let twist = Twist {

@@ -8,19 +8,19 @@ use seese3_core::geometry::{Pose, Twist, adjoint, exp, log};
 
 type Matrix18 = SMatrix<f64, 18, 18>;
 
-/// A person turns and stops more abruptly than a Gaussian velocity of the same variance and
-/// duration: the variance that is added on the way is multiplied by this. Chosen on calibration
-/// rooms, from 1 to 16: 1 follows late, from 8 on velocities are worse.
+/// Factor on the process noise of the motion prior, since a person turns and stops more abruptly
+/// than the Gaussian process. Chosen on calibration rooms from 1 to 16: with 1 the filter lags;
+/// from 8 on velocities are worse.
 const ABRUPTNESS: f64 = 4.0;
 
-/// A pose and a velocity with the covariance of their errors: the pose's δ in its body frame, true
-/// = pose · exp(δ), and the velocity's, each ordered (v, ω); metres, radians and seconds.
+/// A pose and a velocity with the covariance of their errors. The pose error δ is in the body
+/// frame, true = pose · exp(δ). Both are ordered (v, ω), in meters, radians and seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct PoseVelocity {
     /// `parent_from_camera`.
     pub pose: Pose,
-    /// In the camera's body frame, metres and radians per second.
+    /// In the camera's body frame, meters and radians per second.
     pub velocity: Twist,
     /// Of (pose, velocity); symmetric and positive definite.
     #[cfg_attr(
@@ -30,7 +30,7 @@ pub struct PoseVelocity {
     pub covariance: SMatrix<f64, 12, 12>,
 }
 
-/// A motion that was read between two views.
+/// A motion between two frames, predicted or measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct ReadMotion {
     pub motion: Twist,
@@ -38,7 +38,7 @@ pub(super) struct ReadMotion {
 }
 
 impl PoseVelocity {
-    /// A camera whose place is known and whose velocity is not.
+    /// A state with a known pose and unknown velocity: zero, with the covariance of the prior.
     pub fn at(place: PoseWithCovariance, prior: &MotionPrior) -> Self {
         let mut covariance = Matrix12::zeros();
         covariance
@@ -55,7 +55,7 @@ impl PoseVelocity {
         }
     }
 
-    /// Where the camera is, without its velocity.
+    /// The pose without the velocity.
     pub fn place(&self) -> PoseWithCovariance {
         PoseWithCovariance {
             pose: self.pose,
@@ -63,8 +63,8 @@ impl PoseVelocity {
         }
     }
 
-    /// The belief some seconds later. `read` is the motion that the views at both ends show, if
-    /// they show any: it is combined with what the prior expects, each by its covariance.
+    /// Predicts the state some seconds later. `read` is an estimate of the motion in between, if
+    /// there is one; it is fused with the prior by their covariances.
     #[must_use]
     pub(super) fn moved(
         &self,
@@ -74,8 +74,8 @@ impl PoseVelocity {
     ) -> Self {
         let drift = prior.over(&self.velocity, seconds);
 
-        // The errors of three things, in this order: the pose before, the motion, the velocity
-        // after. The motion's is in the body frame after it.
+        // Joint covariance of three errors: the initial pose, the motion, the final velocity. The
+        // motion error is in the final body frame.
         let mut spread = SMatrix::<f64, 18, 12>::zeros();
         for axis in 0..6 {
             let part = axis / 3;
@@ -103,7 +103,7 @@ impl PoseVelocity {
         let motion = exp(&drift.motion) * exp(&part(6));
         let velocity = drift.velocity.to_vector() + change.fixed_rows::<6>(12);
 
-        // The error of the pose after: that of the pose before, carried along, and the motion's.
+        // Final pose error: the initial pose error in the new body frame, plus the motion error.
         let mut merged = SMatrix::<f64, 12, 18>::zeros();
         merged
             .fixed_view_mut::<6, 6>(0, 0)
@@ -120,15 +120,15 @@ impl PoseVelocity {
         }
     }
 
-    /// How far a measured pose is from this one; none when the sum of the covariances is not
-    /// positive definite.
+    /// Innovation of a measured pose; `None` if the sum of the covariances is not positive
+    /// definite.
     pub fn innovation(&self, measured: &PoseWithCovariance) -> Option<Innovation> {
         self.place().innovation(measured)
     }
 
-    /// Fuses a measured pose by the Kalman gain, to first order in the innovation; the velocity
-    /// follows by its correlation with the pose. Where the sum of the covariances is not positive
-    /// definite, this belief is returned unchanged.
+    /// Kalman update with a measured pose, to first order in the innovation. The velocity changes
+    /// through its correlation with the pose. If the sum of the covariances is not positive
+    /// definite, `self` is returned unchanged.
     #[must_use]
     pub fn corrected(&self, measured: &PoseWithCovariance) -> Self {
         let place = self.place();
@@ -172,10 +172,10 @@ mod tests {
         MotionPrior::assumed()
     }
 
-    /// Oracle: the stationary Ornstein–Uhlenbeck process in closed form: after a time t the
-    /// variance of the way is 2σ²τ²(t/τ − 1 + e^(−t/τ)), its covariance with the velocity σ²τ(1 −
-    /// e^(−t/τ)). What of that comes from the velocity at the beginning is taken once, the rest as
-    /// abruptly as a person moves. And Kalman's gain by hand.
+    /// Oracle: the stationary Ornstein–Uhlenbeck process in closed form, and the Kalman gain by
+    /// hand. After a time t the variance of the displacement is 2σ²τ²(t/τ − 1 + e^(−t/τ)), and its
+    /// covariance with the velocity σ²τ(1 − e^(−t/τ)). The part due to the initial velocity counts
+    /// once, the rest [`ABRUPTNESS`] times.
     #[test]
     fn a_measured_pose_tells_the_velocity() {
         let (variance, duration, time) = (0.25, 0.5, 0.1_f64);
@@ -207,9 +207,8 @@ mod tests {
         assert!(corrected.velocity.linear.yz().norm() < 1e-12);
     }
 
-    /// Oracle: the definition: a motion that is read exactly is the motion, and leaves the errors
-    /// that were there before, carried to the new body frame; one of which nothing is known changes
-    /// nothing.
+    /// Oracle: the definition. An exact motion estimate determines the motion and leaves only the
+    /// initial error, in the new body frame. An estimate with infinite variance changes nothing.
     #[test]
     fn a_reading_counts_as_much_as_it_is_sure() {
         let start = PoseVelocity::at(
@@ -237,7 +236,7 @@ mod tests {
         assert!((unsure.pose.to_homogeneous() - without.pose.to_homogeneous()).amax() < 1e-9);
     }
 
-    /// Oracle: the definition of positive definite, over a long stream with corrections.
+    /// Oracle: the definition of positive definite, over many predictions and corrections.
     #[test]
     fn a_covariance_stays_positive_definite() {
         let mut belief = PoseVelocity::at(

@@ -4,13 +4,12 @@ use nalgebra::{Cholesky, Matrix6, Vector6};
 
 use seese3_core::geometry::{Pose, Twist, adjoint, exp, left_jacobian_inverse, log};
 
-/// A pose of larger deviations than these is of little use: 2.5 of them are half a metre, or 15
-/// degrees.
+/// Largest standard deviations of a usable pose: 2.5 of them are 0.5 m or 15°.
 pub(super) const PLACE_DEVIATION_M: f64 = 0.2;
 const PLACE_DEVIATION_RAD: f64 = 0.105;
 
 /// A pose with the covariance of its error δ in its own body frame: true = pose · exp(δ), δ ordered
-/// (v, ω), metres and radians.
+/// (v, ω), meters and radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct PoseWithCovariance {
@@ -24,13 +23,13 @@ pub struct PoseWithCovariance {
     pub covariance: Matrix6<f64>,
 }
 
-/// The difference between a belief and a measured pose.
+/// Difference between a predicted and a measured pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Innovation {
     /// log(pose⁻¹ measured).
     pub twist: Vector6<f64>,
-    /// Its squared Mahalanobis length under the sum of both covariances; distributed as χ² with six
-    /// degrees of freedom if both covariances are right.
+    /// Squared Mahalanobis length of `twist` under the sum of both covariances: χ² with six degrees
+    /// of freedom if both covariances are correct.
     pub squared_length: f64,
 }
 
@@ -47,8 +46,8 @@ impl PoseWithCovariance {
         }
     }
 
-    /// The belief after a motion that was read with an error r, true = exp(motion + r); `noise` is
-    /// the covariance of r.
+    /// Prediction after a motion with error r, true = exp(motion + r); `noise` is the covariance of
+    /// r.
     ///
     /// Source: P' = Ad P Adᵀ + J_r Q J_rᵀ with Ad of exp(−ξ); Barfoot, State Estimation for
     /// Robotics, ch. 8.
@@ -70,8 +69,8 @@ impl PoseWithCovariance {
         }
     }
 
-    /// The pose of another body that is fixed to this one at `body_from_other`. The error is in the
-    /// body's own frame, so that it is carried over by the adjoint.
+    /// Pose of another body, rigidly attached to this one at `body_from_other`. The covariance is
+    /// transformed by the adjoint.
     #[must_use]
     pub fn of_attached(&self, body_from_other: &Pose) -> Self {
         let other = adjoint(&body_from_other.inverse());
@@ -81,8 +80,8 @@ impl PoseWithCovariance {
         }
     }
 
-    /// How far a measured pose is from this one; none when the sum of the covariances is not
-    /// positive definite.
+    /// Innovation of a measured pose; `None` if the sum of the covariances is not positive
+    /// definite.
     pub fn innovation(&self, measured: &PoseWithCovariance) -> Option<Innovation> {
         let twist = log(&self.pose.inv_mul(&measured.pose)).to_vector();
         let sum = Cholesky::new(self.covariance + measured.covariance)?;
@@ -93,9 +92,9 @@ impl PoseWithCovariance {
         })
     }
 
-    /// Fuses both beliefs by the Kalman gain, to first order in the innovation. The covariance is
-    /// in Joseph's form, which stays positive definite under rounding. Where the sum of the
-    /// covariances is not positive definite, this belief is returned unchanged.
+    /// Kalman update with a measured pose, to first order in the innovation. The covariance uses
+    /// Joseph's form, which stays positive definite under rounding. If the sum of the covariances
+    /// is not positive definite, `self` is returned unchanged.
     #[must_use]
     pub fn corrected(&self, measured: &PoseWithCovariance) -> Self {
         let Some(sum) = Cholesky::new(self.covariance + measured.covariance) else {
@@ -118,7 +117,7 @@ impl PoseWithCovariance {
     }
 
     /// The covariance in the order and frame of `geometry_msgs/PoseWithCovariance`: x, y, z, then
-    /// rotations about x, y, z, about the parent's fixed axes. Row-major, metres and radians.
+    /// rotations about x, y, z, about the parent's fixed axes. Row-major, meters and radians.
     ///
     /// Source: ROS REP-103; δ_parent = R δ_body for both halves, to first order.
     pub fn ros_covariance(&self) -> Matrix6<f64> {
@@ -130,19 +129,19 @@ impl PoseWithCovariance {
         symmetric(&(turn * self.covariance * turn.transpose()))
     }
 
-    /// The squared Mahalanobis length of its error against the true pose; none if the covariance is
-    /// not positive definite.
+    /// Squared Mahalanobis length of the error relative to the true pose; `None` if the covariance
+    /// is not positive definite.
     pub fn squared_error(&self, truth: &Pose) -> Option<f64> {
         let error = log(&self.pose.inv_mul(truth)).to_vector();
         Some(error.dot(&self.covariance.cholesky()?.solve(&error)))
     }
 
-    /// Whether it may be relied on to half a metre and 15 degrees.
+    /// Whether the uncertainty is at most 0.5 m and 15°, at 2.5 standard deviations.
     pub fn tells_a_place(&self) -> bool {
         self.is_within(1.0)
     }
 
-    /// Whether it may be relied on to a metre and 30 degrees.
+    /// Whether the uncertainty is at most 1 m and 30°, at 2.5 standard deviations.
     pub(super) fn hints_at_a_place(&self) -> bool {
         self.is_within(2.0)
     }
@@ -152,7 +151,7 @@ impl PoseWithCovariance {
             && self.rotation_deviation_rad() <= factor * PLACE_DEVIATION_RAD
     }
 
-    /// The largest standard deviation of the position along any direction, metres.
+    /// The largest standard deviation of the position along any direction, meters.
     pub fn position_deviation_m(&self) -> f64 {
         self.largest_deviation(0)
     }
@@ -193,7 +192,7 @@ mod tests {
         Cholesky::new(*covariance).unwrap().l() * Vector6::from_iterator(normal_deviates(random, 6))
     }
 
-    /// Oracle: ten thousand drawn motions; the covariance of their ends is the predicted one.
+    /// Oracle: Monte Carlo with 10,000 samples: their covariance is the predicted one.
     #[test]
     fn a_moved_covariance_is_that_of_drawn_motions() {
         let mut random = ChaCha8Rng::seed_from_u64(1);
@@ -221,8 +220,8 @@ mod tests {
         );
     }
 
-    /// Oracle: by hand. Two equally sure poses along one axis meet in the middle with half the
-    /// variance; the squared length of a 2 m innovation with variances 1 + 1 is 2.
+    /// Oracle: by hand. Two poses with equal covariance meet in the middle with half the variance.
+    /// The squared Mahalanobis length of a 2 m innovation with variances 1 + 1 is 2.
     #[test]
     fn two_equally_sure_poses_meet_in_the_middle() {
         let ours = PoseWithCovariance::known(Pose::identity(), 1.0, 0.1);
@@ -235,8 +234,8 @@ mod tests {
         assert!((ours.position_deviation_m() - 1.0).abs() < 1e-12);
     }
 
-    /// Oracle: ROS's definition, by hand: a camera turned a quarter about z that is unsure along
-    /// its own x is unsure along the parent's y; its unsure roll about x is one about y.
+    /// Oracle: ROS's definition, by hand. For a camera rotated by 90° about z, the variance along
+    /// its own x axis is along the parent's y axis. The same holds for the rotation about x.
     #[test]
     fn covariances_for_ros_are_about_the_parents_axes() {
         let turn = Pose::rotation(Vector3::z() * std::f64::consts::FRAC_PI_2);
@@ -251,7 +250,7 @@ mod tests {
         assert!((found - expected).amax() < 1e-12, "{found}");
     }
 
-    /// Oracle: the definition of positive definite, after a long walk with corrections.
+    /// Oracle: the definition of positive definite, over many predictions and corrections.
     #[test]
     fn a_covariance_stays_positive_definite() {
         let mut random = ChaCha8Rng::seed_from_u64(2);

@@ -1,27 +1,27 @@
-//! How sure the matches of the last views were.
+//! Running uncertainty of recent matches, a lower bound for that of the next one.
 //!
-//! Where nothing near is mapped, most views are known to be placed badly; in a few the frames that
-//! look most alike agree by chance, so that a view seems to be placed to two centimetres and is ten
-//! centimetres off. How well the views just before it were placed tells better what to think of it.
+//! Far from the map most anchors have a large covariance. In a few, the nearest frames agree by
+//! chance: the covariance claims 2 cm while the error is 10 cm. The uncertainty of the preceding
+//! anchors then predicts the error better.
 
 use super::PoseWithCovariance;
 
-/// Views are remembered for about so long, seconds. Chosen on calibration rooms, from 0.3 to 1.2,
-/// where it makes little difference.
+/// Time constant of the running mean, seconds. Chosen on calibration rooms from 0.3 to 1.2; it has
+/// little effect.
 const MEMORY_S: f64 = 0.4;
 
-/// The running mean of how sure the matches of a stream are.
+/// Exponential running mean of the match uncertainty of a stream.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct RecentMatches {
-    /// When the newest view was taken, nanoseconds on the sensor's clock.
+    /// Timestamp of the newest view, nanoseconds on the sensor's clock.
     pub time_ns: i64,
-    /// The mean logarithm of the standard deviation of the position, metres.
+    /// Mean natural logarithm of the position's standard deviation in meters.
     pub log_deviation: f64,
 }
 
 impl RecentMatches {
-    /// As it is after one more match; `before` is none for the first.
+    /// Updates the mean with one more match; `before` is `None` for the first.
     pub(super) fn after(before: Option<Self>, time_ns: i64, anchor: &PoseWithCovariance) -> Self {
         let log_deviation = anchor.position_deviation_m().ln();
         let Some(before) = before else {
@@ -39,7 +39,7 @@ impl RecentMatches {
         }
     }
 
-    /// An anchor that is no surer than the matches lately were.
+    /// Inflates the covariance of an anchor to at least the running uncertainty.
     pub(super) fn tempered(&self, anchor: PoseWithCovariance) -> PoseWithCovariance {
         let factor = self.log_deviation.exp() / anchor.position_deviation_m();
         PoseWithCovariance {
@@ -58,9 +58,9 @@ mod tests {
         PoseWithCovariance::known(Pose::identity(), deviation, deviation)
     }
 
-    /// Oracle: by hand. After matches of 16 cm one of 1 cm comes a tenth of a second later: the mean
-    /// logarithm goes by 1 − e^(−1/4) of the way, and that is how sure the match counts. After ten
-    /// seconds of such matches it counts as it is, and a worse one always does.
+    /// Oracle: by hand. A match of 1 cm follows matches of 16 cm after 0.1 s: the mean logarithm
+    /// moves by the fraction 1 − e^(−1/4), which is the uncertainty used. After 10 s the match is
+    /// used unchanged. A match worse than the mean is always used unchanged.
     #[test]
     fn one_sure_match_among_others_is_not_believed() {
         let before = RecentMatches::after(None, 0, &known(0.16));

@@ -1,48 +1,48 @@
-//! Which of several rooms a camera is in, and where, from what it sees and nothing else.
+//! Relocalization: finds the room and the pose of a camera from its views alone.
 
 use std::sync::Arc;
 
 use super::{Error, Map, MapMatch, MapQuery};
 use seese3_core::cancel::Cancellation;
 
-/// A room is only named if its nearest frame is this much nearer than that of any other room.
+/// Ratio test between rooms: the distance to the best room must be at most this fraction of the
+/// distance to the second.
 pub const ROOM_RATIO: f64 = 0.9;
 
-/// Rooms in the order in which a camera's views match them.
+/// Rooms ranked by how well a camera's views match them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Relocalization {
-    /// The rooms, the best match first.
+    /// The rooms, best match first.
     pub rooms: Vec<RoomMatch>,
-    /// The second room's distance over the best one's; infinite with one room.
+    /// Distance to the second room divided by the distance to the best; infinite with one room.
     pub margin: f64,
-    /// Whether the best room should not be relied on: another one matches nearly as well, or none
-    /// matches, or the view does not tell where in the room it is.
+    /// Whether the best room must not be used: it is out of distribution, another room matches
+    /// nearly as well, or the pose is too uncertain.
     pub ambiguous: bool,
-    /// Why it is ambiguous, in words; empty if it is not.
+    /// Reason of the ambiguity, as text; empty if there is none.
     pub reason: String,
 }
 
-/// How well views match a room.
+/// Match of the views with one room.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RoomMatch {
-    /// The room's place among the maps.
+    /// Index into the maps.
     pub map: usize,
-    /// The mean distance of the views from their nearest frames, in standard deviations of frame
-    /// noise.
+    /// Mean distance of the views from their nearest frames, in standard deviations of frame noise.
     pub distance: f64,
-    /// The mean of the views' distances over the room's limit: above 1 they look like another
-    /// place.
+    /// Mean of the views' distances divided by the room's limit: above 1 they are out of
+    /// distribution.
     pub out_of_distribution: f64,
-    /// How the last view matches.
+    /// Match of the newest view.
     pub last: MapMatch,
 }
 
-/// Ranks rooms by one or more views of a camera that hardly moved between them, the newest last.
-/// `top_k` frames are returned for the newest view.
+/// Ranks rooms by one or more views, newest last; the camera must hardly move between them. `top_k`
+/// frames are returned for the newest view.
 ///
 /// # Errors
-/// [`Error::NoMap`] without a map, [`Error::NoView`] without a view, [`Error::Adapters`] when the
-/// maps have several adapters, [`Error::Cancelled`] when nobody waits any more.
+/// [`Error::NoMap`] without a map, [`Error::NoView`] without a view, [`Error::Adapters`] if the
+/// maps have different adapters, [`Error::Cancelled`] once `cancel` is set.
 pub fn relocalize(
     maps: &[Arc<Map>],
     views: &[MapQuery<'_>],
@@ -86,7 +86,7 @@ pub fn relocalize(
     Ok(judged(rooms))
 }
 
-/// Ranked rooms, with the judgement whether the first may be relied on.
+/// Adds to ranked rooms whether the first one is ambiguous, and why.
 fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
     let best = &rooms[0];
     let margin = rooms
@@ -99,15 +99,15 @@ fn judged(rooms: Vec<RoomMatch>) -> Relocalization {
     let is_vague = !best.last.anchor.belief.tells_a_place();
     let reason = if is_far {
         format!(
-            "the best room is {:.2} times as far as its limit",
+            "the distance to the best room is {:.2} times the room's limit",
             best.out_of_distribution
         )
     } else if has_rival {
-        format!("the second room is only {margin:.2} times as far as the best")
+        format!("the second-best room is only {margin:.2} times as far as the best")
     } else if is_vague {
         let belief = &best.last.anchor.belief;
         format!(
-            "the view is known to {:.2} m and {:.0}° only in the best room, 2.5 standard deviations",
+            "the pose uncertainty in the best room is {:.2} m and {:.0}° (2.5 standard deviations)",
             2.5 * belief.position_deviation_m(),
             2.5 * belief.rotation_deviation_rad().to_degrees()
         )

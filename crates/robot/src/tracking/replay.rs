@@ -1,4 +1,4 @@
-//! Replays of recordings through a tracker, and how far its answers are from the true path.
+//! Replays recordings through a tracker and compares its output with the ground truth.
 
 use ndarray::ArrayView2;
 
@@ -8,19 +8,19 @@ use seese3_core::geometry::{Pose, PoseError, body_twist, log};
 use seese3_core::room::{FrameId, Room};
 use seese3_core::trajectory::Trajectory;
 
-/// How surely a given initial pose is known: metres and radians, standard deviations by axis.
+/// Standard deviation per axis of a given initial pose, meters and radians.
 const INITIAL_DEVIATION: f64 = 1e-3;
-/// A map pose within this distance of the truth, metres, counts as found.
+/// Largest position error of a successful relocalization, meters.
 const FOUND_WITHIN_M: f64 = 0.5;
-/// A map pose within this angle of the truth, degrees, counts as found.
+/// Largest rotation error of a successful relocalization, degrees.
 const FOUND_WITHIN_DEG: f64 = 15.0;
 
-/// Some frames of a recording.
+/// Frames of a recording to replay.
 #[derive(Debug, Clone)]
 pub struct Segment<'a> {
     /// Latents of the whole recording under the tracker's adapter, row by frame, shape (n, k).
     pub latents: ArrayView2<'a, f64>,
-    /// Raw features of the same frames, shape (n, d), if the streams are to bring them.
+    /// Raw features of the whole recording, shape (n, d), if observations should include them.
     pub features: Option<ArrayView2<'a, f32>>,
     /// Poses of the whole recording, `world_from_camera`, row by frame.
     pub poses: &'a [Pose],
@@ -31,36 +31,36 @@ pub struct Segment<'a> {
 /// One frame of a stream to replay.
 #[derive(Debug, Clone)]
 pub struct Played {
-    /// What the tracker is given.
+    /// Input of the tracker.
     pub frame: Observation,
-    /// Where the camera truly is, `world_from_camera`.
+    /// True pose, `world_from_camera`.
     pub truth: Pose,
 }
 
-/// What a tracker is told at the beginning of a stream.
+/// Initial pose of a replayed stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InitialPose {
-    /// The true pose, to a millimetre and a milliradian.
+    /// The true pose, with standard deviations of 1 mm and 1 mrad.
     Given,
-    /// Nothing.
+    /// No initial pose.
     Unknown,
 }
 
-/// A replayed stream: the true path, and the tracker's answers along it.
+/// A replayed stream: ground truth and tracker output.
 #[derive(Debug, Clone)]
 pub struct Replay {
-    /// The true path, one pose per answer.
+    /// Ground truth, one pose per update.
     pub truth: Trajectory,
-    /// The frames' numbers, with gaps where the recording's rows were left out.
+    /// Sequence numbers of the frames, with gaps for rows that were left out.
     pub sequences: Vec<u64>,
-    /// The tracker's answers, frame by frame.
+    /// Tracker output, one update per accepted frame.
     pub updates: Vec<Update>,
-    /// The rows in which a stream begins, in order; the first is 0.
+    /// First row of each stream, in order; the first is 0.
     pub beginnings: Vec<usize>,
 }
 
-/// Replays segments one after the other, as if no frame lay between them. Frames of successive rows
-/// are `period_ns` nanoseconds apart.
+/// Replays segments one after the other, without a gap between them. Successive rows are
+/// `period_ns` nanoseconds apart.
 pub fn replay(
     tracker: &Tracker,
     segments: &[Segment<'_>],
@@ -73,7 +73,8 @@ pub fn replay(
     for segment in segments {
         let mut previous: Option<FrameId> = None;
         for &frame in segment.frames {
-            // Rows that were left out are missing numbers; between segments no number is missing.
+            // Rows left out within a segment leave gaps in the numbers; there is none between
+            // segments.
             sequence += previous.map_or(1, |before| u64::from(frame.0 - before.0));
             previous = Some(frame);
 
@@ -108,7 +109,7 @@ pub fn replay_frames(tracker: &Tracker, frames: &[Played], initial_pose: Initial
     };
 
     for Played { frame, truth } in frames {
-        // A frame of another adapter, or out of order, is refused and left out.
+        // Rejected frames (another adapter, or out of order) are skipped.
         if let Ok(update) = tracker.observe(&mut state, frame) {
             found.truth.times_ns.push(frame.time_ns);
             found.truth.poses.push(*truth);
@@ -120,8 +121,8 @@ pub fn replay_frames(tracker: &Tracker, frames: &[Played], initial_pose: Initial
     found
 }
 
-/// Replays frames of a room, each of its sequences as a stream of its own. Times are those of the
-/// recording, or those of a camera with [`ASSUMED_PERIOD_S`] if it has none.
+/// Replays frames of a room, one stream per sequence. The frame period of a stream is the mean of
+/// the recording, see [`period_ns`].
 pub fn replay_streams(
     tracker: &Tracker,
     segment: Segment<'_>,
@@ -144,8 +145,7 @@ pub fn replay_streams(
     joined(streams)
 }
 
-/// Several streams as one replay, each with the mean time from one frame of its camera to the next,
-/// nanoseconds.
+/// Joins several streams into one replay. Each comes with its mean frame period, nanoseconds.
 pub fn joined(streams: impl Iterator<Item = (Replay, i64)>) -> Replay {
     let mut joined = Replay {
         truth: Trajectory::default(),
@@ -155,7 +155,7 @@ pub fn joined(streams: impl Iterator<Item = (Replay, i64)>) -> Replay {
     };
 
     for (replayed, period_ns) in streams {
-        // Numbers and times go on from stream to stream, so that each frame has its own.
+        // Continue numbers and times from stream to stream, so that they are unique.
         let number = joined.sequences.last().map_or(0, |last| last + 1);
         let time = joined
             .truth
@@ -179,7 +179,8 @@ pub fn joined(streams: impl Iterator<Item = (Replay, i64)>) -> Replay {
     joined
 }
 
-/// The mean time from one row of a recording to the next, nanoseconds.
+/// Mean time between successive rows of a recording, nanoseconds; [`ASSUMED_PERIOD_S`] if there are
+/// no usable timestamps.
 pub fn period_ns(room: &Room, frames: &[FrameId]) -> i64 {
     let assumed = (ASSUMED_PERIOD_S * 1e9).round() as i64;
     let (Some(&first), Some(&last)) = (frames.first(), frames.last()) else {
@@ -211,25 +212,23 @@ fn start(tracker: &Tracker, frames: &[Played], initial_pose: InitialPose) -> Sta
 /// The map poses of a replay.
 #[derive(Debug, Clone)]
 pub struct MapPath {
-    /// `map_from_camera` of the frames for which a map pose was reported, LOST and RELOCALIZING
-    /// ones included.
+    /// Reported `map_from_camera`, including frames with status LOST or RELOCALIZING.
     pub path: Trajectory,
     /// The rows of those frames in the replay.
     pub rows: Vec<usize>,
 }
 
-/// The error of one read motion against its stated covariance.
+/// Error of one predicted motion, normalized by its reported covariance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionSurprise {
-    /// The length of the read motion, ‖(v, ω)‖, metres and radians mixed.
+    /// Length of the predicted motion, ‖(v, ω)‖, meters and radians mixed.
     pub length: f64,
-    /// The squared Mahalanobis length of its error.
+    /// Squared Mahalanobis length of the error.
     pub squared_error: f64,
 }
 
 impl Replay {
-    /// `map_from_camera` of the frames for which a map pose was reported, LOST and RELOCALIZING
-    /// ones included.
+    /// Reported `map_from_camera`, including frames with status LOST or RELOCALIZING.
     pub fn map_path(&self) -> MapPath {
         let mut path = Trajectory::default();
         let mut rows = Vec::new();
@@ -244,7 +243,7 @@ impl Replay {
         MapPath { path, rows }
     }
 
-    /// `odom_from_camera`, moved so that each stream begins at its true first pose.
+    /// `odom_from_camera`, transformed so that each stream starts at its true first pose.
     pub fn odom_path(&self) -> Trajectory {
         let updates = self.updates.iter().enumerate();
         let poses = updates.map(|(row, update)| self.first_pose(row) * update.odom.pose);
@@ -264,12 +263,12 @@ impl Replay {
         self.truth.poses[beginning]
     }
 
-    /// The squared Mahalanobis lengths of the errors of all map poses.
+    /// Squared Mahalanobis lengths of the errors of all map poses.
     pub fn map_pose_surprises(&self) -> Vec<f64> {
         self.map_pose_surprises_where(|_| true)
     }
 
-    /// The squared Mahalanobis lengths of the errors of the map poses in rows that `keep` accepts.
+    /// Squared Mahalanobis lengths of the errors of the map poses in rows selected by `keep`.
     pub fn map_pose_surprises_where(&self, keep: impl Fn(usize) -> bool) -> Vec<f64> {
         let mut surprises = Vec::new();
         for (row, (update, truth)) in self.updates.iter().zip(&self.truth.poses).enumerate() {
@@ -284,7 +283,7 @@ impl Replay {
         surprises
     }
 
-    /// The errors of all motions but those of exactly zero, each from its keyframe.
+    /// Errors of all motions from their keyframes, except motions of exactly zero.
     pub fn motion_surprises(&self) -> Vec<MotionSurprise> {
         let mut surprises = Vec::new();
         for (update, truth) in self.updates.iter().zip(&self.truth.poses) {
@@ -292,8 +291,9 @@ impl Replay {
                 continue;
             };
 
-            // A motion of exactly zero was not read: the stream's first frame, or a half turn.
-            // Motions over a jump are counted, with the covariance of a motion that was not seen.
+            // A motion of exactly zero is no prediction: the first frame of a stream, or a
+            // discarded half turn. Motions over a jump count, with the covariance of an unobserved
+            // motion.
             let length = update.motion.norm();
             if length > 0.0 {
                 let true_motion = body_twist(&self.truth.poses[keyframe], truth);
@@ -309,14 +309,14 @@ impl Replay {
         surprises
     }
 
-    /// The share of frames that were answered with a status.
+    /// Fraction of frames with a status.
     pub fn share(&self, status: Status) -> f64 {
         let has_status = |update: &&Update| update.status == status;
         self.updates.iter().filter(has_status).count() as f64 / self.updates.len() as f64
     }
 
-    /// How many frames it took until the tracker was TRACKING within half a metre and 15 degrees of
-    /// the truth; none if it never was.
+    /// Number of frames until the tracker was TRACKING within 0.5 m and 15° of the truth; `None` if
+    /// it never was.
     pub fn frames_to_relocalise(&self) -> Option<usize> {
         let is_found = |(update, truth): (&Update, &Pose)| {
             let Some(map_pose) = &update.map_pose else {
@@ -334,7 +334,7 @@ impl Replay {
     }
 }
 
-/// eᵀ Σ⁻¹ e; none if Σ is not positive definite.
+/// eᵀ Σ⁻¹ e; `None` if Σ is not positive definite.
 fn squared_mahalanobis(
     error: &nalgebra::Vector6<f64>,
     covariance: &nalgebra::Matrix6<f64>,

@@ -1,10 +1,8 @@
-//! Several cameras on one robot: what each of them sees at one time, and which of them looks most
-//! like the room.
+//! Multi-camera rigs: matches the simultaneous views of all cameras of a robot.
 //!
-//! A stream has one camera of its own, whose pose is told and whose motion is read. What other
-//! cameras see at the same time, from known places beside it, tells where the robot is as well: the
-//! view that looks most like the room leads, and may find the robot; the others correct what is
-//! believed.
+//! The stream's own camera is the one for which pose and motion are estimated. Other cameras have
+//! known extrinsics. The view most similar to the room leads: only this view may relocalize the
+//! robot. The other views only correct the believed pose.
 
 use ndarray::{Array1, ArrayView1};
 
@@ -15,56 +13,56 @@ use super::tracker::Tracker;
 use super::{MapQuery, PoseWithCovariance, ROOM_RATIO, RecentMatches};
 use seese3_core::geometry::Pose;
 
-/// What another camera on the same robot saw at the time of a frame.
+/// View of another camera on the same robot, simultaneous with a frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OtherView {
-    /// Which camera it is: always the same number for the same one.
+    /// Camera number, constant over the stream.
     pub camera: u32,
-    /// Its pose in the frame of the stream's own camera, metres.
+    /// Pose of the other camera in the frame of the stream's own camera, meters.
     pub camera_from_other: Pose,
-    /// Its latent under the tracker's adapter, shape (k,).
+    /// Latent under the tracker's adapter, shape (k,).
     pub latent: Array1<f64>,
-    /// The raw feature of that latent, shape (d,), if it is known.
+    /// Raw feature of that latent, shape (d,), if known.
     pub feature: Option<Vec<f32>>,
-    /// Whether the image is known to show nothing.
+    /// Whether the image is known to be blank.
     pub is_blank: bool,
 }
 
-/// What a stream remembers of another camera.
+/// State of another camera.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct OtherCamera {
-    /// Which one.
+    /// Camera number.
     pub camera: u32,
-    /// The latent of its last view that was not blank, in standard deviations of frame noise.
+    /// Whitened latent of its last view that was not blank.
     pub last: Vec<f64>,
-    /// Views in a row that showed exactly what the one before did.
+    /// Number of consecutive views identical to their predecessor.
     pub unchanged_frames: u32,
 }
 
-/// A view, and the map that it matches best.
+/// A view with its best match among the maps.
 pub(super) struct MatchedView<'a> {
-    /// The other camera that it is of; none for the stream's own.
+    /// The other camera's view; `None` for the stream's own camera.
     pub other: Option<&'a OtherView>,
-    /// Its raw feature, if it is known.
+    /// Raw feature, if known.
     pub feature: Option<&'a [f32]>,
     pub sight: Sight,
-    /// Whether it shows exactly what its camera's view before did, and so tells nothing new.
+    /// Whether the view is identical to the previous view of its camera.
     pub is_repeated: bool,
-    /// An index of [`Tracker::maps`].
+    /// The matched map, an index of [`Tracker::maps`].
     pub room: usize,
-    /// Whether no other map matches nearly as well.
+    /// Whether no other map matches nearly as well, by [`ROOM_RATIO`].
     pub is_clear: bool,
     pub matched: MapMatch,
 }
 
 impl MatchedView<'_> {
-    /// Whether it looks like the room.
+    /// Whether the view is usable and in distribution.
     pub(super) fn matches_room(&self) -> bool {
         self.sight == Sight::Clear && self.matched.out_of_distribution <= 1.0
     }
 
-    /// Where the mapped frames that it resembles place the stream's own camera.
+    /// Pose of the stream's own camera estimated from the match.
     pub(super) fn placed(&self) -> PoseWithCovariance {
         let belief = self.matched.anchor.belief;
         match self.other {
@@ -73,8 +71,8 @@ impl MatchedView<'_> {
         }
     }
 
-    /// How little it resembles the room, for the choice of the view that leads: one that shows
-    /// nothing, nothing new, or what several rooms show as well, leads only if all do.
+    /// Criterion for the leading view, lowest first. It is infinite for views that are unusable,
+    /// repeated, or ambiguous between rooms.
     fn strangeness(&self) -> f64 {
         if self.sight == Sight::Clear && !self.is_repeated && self.is_clear {
             self.matched.out_of_distribution
@@ -84,21 +82,21 @@ impl MatchedView<'_> {
     }
 }
 
-/// What all cameras see at one time.
+/// Matches of the simultaneous views of all cameras.
 pub(super) struct RigMatches<'a> {
-    /// The view that looks most like a room: the stream's own, if none looks more like it.
+    /// Best match; the stream's own view if no other is better.
     pub leading: MatchedView<'a>,
-    /// Whether the stream's own view looks like a room.
+    /// Whether the stream's own view matches a room.
     pub own_matches_room: bool,
-    /// Whether another camera's view certainly shows the room.
+    /// Whether another camera's view matches the room with certainty.
     pub is_seen_by_other: bool,
-    /// The others that may correct what is believed: those that show something.
+    /// The other usable views that are not repeated.
     pub beside: Vec<MatchedView<'a>>,
 }
 
 impl Tracker {
-    /// Matches all views of a frame. The stream's own has been recorded before; those of other cameras
-    /// are recorded here.
+    /// Matches all views of a frame, and records the views of other cameras in the state. The
+    /// stream's own view was recorded before.
     pub(super) fn look<'a>(&self, state: &mut State, frame: &'a Observation) -> RigMatches<'a> {
         let own = View {
             latent: frame.latent.view(),
@@ -143,7 +141,7 @@ impl Tracker {
         }
     }
 
-    /// Records another camera's view; how many views in a row have been identical to it.
+    /// Records another camera's view; returns its number of consecutive identical views.
     fn record_other(&self, state: &mut State, other: &OtherView) -> u32 {
         let mut cameras = state.other_cameras.iter_mut();
         let known = cameras.find(|known| known.camera == other.camera);
@@ -170,8 +168,7 @@ impl Tracker {
         known.unchanged_frames
     }
 
-    /// How a view matches the believed room or, if no room is believed yet, the one of all maps that
-    /// it matches best.
+    /// Matches a view with the stream's room or, if that is unknown, with the best of all maps.
     fn matched<'a>(
         &self,
         room: Option<usize>,
@@ -210,7 +207,7 @@ impl Tracker {
     }
 }
 
-/// What one camera sees.
+/// A view of one camera.
 struct View<'a> {
     latent: ArrayView1<'a, f64>,
     feature: Option<&'a [f32]>,

@@ -1,5 +1,4 @@
-//! How large the errors of an adapter's motions are in one room, compared with the rooms it was
-//! calibrated in: the poses of a map's frames are known, so its own frames tell.
+//! Scales the calibrated motion errors to one room, with the known poses of its mapped frames.
 
 use ndarray::s;
 
@@ -10,16 +9,15 @@ use seese3_core::navigation::Navigator;
 use seese3_core::room::FrameId;
 use seese3_core::statistics::balancing_factor;
 
-/// At most so many pairs per stride are evaluated.
+/// Maximum number of pairs per stride.
 const SAMPLES: usize = 200;
-/// With fewer errors than this no factor is estimated.
+/// Minimum number of errors for a factor; otherwise it is 1.
 const FEWEST_ERRORS: usize = 30;
-/// Factors of covariances are kept within these: deviations from half to ten times those of the
-/// calibration rooms.
+/// Range of covariance factors: standard deviations from 0.5 to 10 times the calibrated ones.
 const FACTOR_RANGE: std::ops::RangeInclusive<f64> = 0.25..=100.0;
 
-/// The errors of motions in a room: those of the calibration, each stratum times its factor in this
-/// room. `mapped` are the room's mapped frames in order.
+/// Motion errors of a room: the calibrated table with a factor per stratum. `mapped` holds the
+/// mapped frames in order.
 pub fn motion_errors(
     navigator: &Navigator,
     error_model: &ErrorModel,
@@ -27,7 +25,7 @@ pub fn motion_errors(
 ) -> Result<MotionErrors, Error> {
     let calibrated = &error_model.statistics().motion_errors;
 
-    // A stratum is of so many frames of the calibration rooms: here that may be more or fewer rows.
+    // Strata are in frame periods of the calibration rooms; convert them to rows of this room.
     let rows_per_frame = error_model.statistics().frame_period_s / frame_period_s(navigator.room());
 
     let mut strata = Vec::with_capacity(calibrated.shapes.strata().len());
@@ -46,7 +44,7 @@ pub fn motion_errors(
     })
 }
 
-/// The factor that makes covariances fit errors of these squared Mahalanobis lengths.
+/// Covariance factor that calibrates errors with these squared Mahalanobis lengths.
 fn factor_of(mut squared_lengths: Vec<f64>) -> f64 {
     if squared_lengths.len() < FEWEST_ERRORS {
         return 1.0;
@@ -69,7 +67,7 @@ fn motion_surprises(
     let latents = navigator.latents();
     let coordinates = s![..adapter.coordinate_count()];
 
-    // Where every second frame is mapped, no two are one row apart: the next one is taken instead.
+    // If every second frame is mapped, no two are an odd number of rows apart: try the next row.
     let is_mapped = |frame: &FrameId| mapped.binary_search(frame).is_ok();
     let partner = |from: FrameId| {
         (stride..=stride + 1)

@@ -1,27 +1,26 @@
-//! What a frame shows: something, nothing, or exactly what the frame before it showed.
+//! Usability of a view: clear, blank, or frozen.
 
-/// Views this near to one another, in deviations of frame noise, are the same image: the noise of a
-/// camera that stands still is some tenths.
+/// Largest distance between identical images, in standard deviations of frame noise. The noise of a
+/// camera at rest is some tenths.
 pub(super) const UNCHANGED_DISTANCE: f64 = 0.01;
 
-/// After so many frames that are the same image a camera is taken to be frozen. Recordings hold
-/// pairs of the same image where a frame was dropped.
+/// Number of repetitions of an image after which a camera counts as frozen. Fewer occur in
+/// recordings in which a dropped frame was replaced by a copy.
 const FROZEN_FRAMES: u32 = 5;
 
-/// What a frame shows of the world.
+/// Usability of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Sight {
-    /// Something.
+    /// Usable.
     Clear,
-    /// Nothing: the image is blank.
+    /// The image is blank.
     Nothing,
-    /// Exactly what the frames before it showed, which the noise of a real camera rules out: it is
-    /// frozen.
+    /// The camera is frozen: identical images, which the noise of a real camera rules out.
     Unchanged,
 }
 
 impl Sight {
-    /// Of a view that showed exactly what the `unchanged_frames` before it did.
+    /// Classifies a view that is identical to the `unchanged_frames` views before it.
     pub(super) fn of(is_blank: bool, unchanged_frames: u32) -> Self {
         if is_blank {
             Self::Nothing
@@ -33,7 +32,7 @@ impl Sight {
     }
 }
 
-/// The Euclidean distance of two whitened latents.
+/// Euclidean distance between two whitened latents.
 pub(super) fn distance(a: &[f64], b: &[f64]) -> f64 {
     let squares = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b));
     squares.sum::<f64>().sqrt()

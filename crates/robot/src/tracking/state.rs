@@ -1,4 +1,4 @@
-//! What a tracker knows of a stream, what it is given for each frame, and what it answers.
+//! Input, state and output of a tracker.
 
 use nalgebra::Matrix6;
 use ndarray::Array1;
@@ -14,27 +14,27 @@ use seese3_core::index::Neighbour;
 /// One frame of a stream.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
-    /// When it was taken, nanoseconds on the sensor's clock.
+    /// Timestamp, nanoseconds on the sensor's clock.
     pub time_ns: i64,
-    /// The sender's number of the frame. Numbers that are missing are frames that are missing.
+    /// Sequence number set by the sender. Gaps in the numbers are dropped frames.
     pub sequence: u64,
-    /// Its latent under the tracker's adapter, shape (k,).
+    /// Latent under the tracker's adapter, shape (k,).
     pub latent: Array1<f64>,
-    /// The raw feature of that latent, shape (d,), if it is known: mapped frames are found by it,
-    /// and the [`super::PoseReader`] of a map reads it.
+    /// Raw feature of the latent, shape (d,), if known: used to retrieve mapped frames, and by the
+    /// [`super::PoseReader`] of a map.
     pub feature: Option<Vec<f32>>,
-    /// Whether the image is known to show nothing: it is blank, or all bright or dark.
+    /// Whether the image is known to be blank: nearly uniform brightness.
     pub is_blank: bool,
-    /// Where another sensor says that the camera is, in an odometry frame of its own.
+    /// Camera pose from wheel or inertial odometry, in the odometry frame of that sensor.
     pub measured: Option<MeasuredPose>,
-    /// Which way is down, if a sensor tells.
+    /// Direction of gravity, if measured.
     pub gravity: Option<MeasuredGravity>,
-    /// What other cameras on the same robot saw at the same time.
+    /// Simultaneous views of other cameras on the same robot.
     pub other_views: Vec<OtherView>,
 }
 
 impl Observation {
-    /// A view with this latent, of which nothing else is known.
+    /// An observation with a latent only.
     pub fn new(time_ns: i64, sequence: u64, latent: Array1<f64>) -> Self {
         Self {
             time_ns,
@@ -49,42 +49,42 @@ impl Observation {
     }
 }
 
-/// Everything that a tracker knows of a stream.
+/// Complete state of a tracked stream.
 #[derive(Debug, Clone, PartialEq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct State {
-    /// The only map or, of several, the one that the camera was found in; an index of
-    /// [`super::Tracker::maps`].
+    /// Map of the camera, an index of [`super::Tracker::maps`]: the only map, or the one in which
+    /// the camera was localized.
     pub room: Option<usize>,
-    /// The last frame that was accepted.
+    /// Last accepted frame.
     pub last: Option<LastFrame>,
-    /// The frame that motions are read from.
+    /// Reference frame of predicted motions.
     pub keyframe: Option<Keyframe>,
-    /// Where the camera was when its map pose was last corrected, if it is believed.
+    /// Filter state at the last corrected frame, or at a later frame once that is too old.
     pub place: Option<Place>,
-    /// The pose that was given from outside, until the first frame arrives: `world_from_camera`.
+    /// Pose set by the client before the first frame, `world_from_camera`.
     pub initial_pose: Option<PoseWithCovariance>,
-    /// Whitened latents of the last frames, the newest last: what a jump of the view is told by.
+    /// Whitened latents of the last frames, newest last; used to detect jumps of the view.
     pub recent: Vec<Vec<f64>>,
-    /// Whether the frames follow from one another and match the room.
+    /// Whether the frames are continuous and match the room.
     pub health: TrackingHealth,
-    /// A map pose that recent anchors agree on and that is not believed yet.
+    /// Hypothesis for the map pose on which recent anchors agree.
     pub candidate: Option<Candidate>,
-    /// Frames since the last one that matched the map.
+    /// Number of frames since the last match.
     pub frames_off_map: u32,
-    /// Frames in a row that showed exactly what the one before did.
+    /// Number of consecutive frames identical to their predecessor.
     pub unchanged_frames: u32,
-    /// When an anchor last corrected the map pose, nanoseconds on the sensor's clock.
+    /// Time of the last correction by an anchor, nanoseconds on the sensor's clock.
     pub corrected_ns: Option<i64>,
-    /// What other sensors measured since the keyframe and the last place.
+    /// Odometry of other sensors since the keyframe and the last place.
     pub measured: OdometryAccumulator,
-    /// What is remembered of the robot's other cameras.
+    /// State of the robot's other cameras.
     pub other_cameras: Vec<OtherCamera>,
-    /// When its own camera last showed anything new, nanoseconds on the sensor's clock.
+    /// Time of the last new image of the stream's own camera, nanoseconds on the sensor's clock.
     pub seen_ns: Option<i64>,
-    /// When gravity was last measured, nanoseconds on the sensor's clock.
+    /// Time of the last gravity measurement, nanoseconds on the sensor's clock.
     pub gravity_ns: Option<i64>,
-    /// How sure the matches of its own camera lately were.
+    /// Running uncertainty of the recent matches of the stream's own camera.
     pub recent_matches: Option<RecentMatches>,
 }
 
@@ -92,46 +92,45 @@ pub struct State {
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct LastFrame {
-    /// When it was taken, nanoseconds on the sensor's clock.
+    /// Timestamp, nanoseconds on the sensor's clock.
     pub time_ns: i64,
-    /// The sender's number.
+    /// Sequence number set by the sender.
     pub sequence: u64,
-    /// Its latent.
+    /// Latent.
     pub latent: Vec<f64>,
     /// `odom_from_camera`.
     pub odom: PoseWithCovariance,
 }
 
-/// The frame that motions are read from.
+/// Reference frame of predicted motions.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Keyframe {
-    /// When it was taken, nanoseconds on the sensor's clock.
+    /// Timestamp, nanoseconds on the sensor's clock.
     pub time_ns: i64,
-    /// The sender's number.
+    /// Sequence number set by the sender.
     pub sequence: u64,
-    /// Its latent.
+    /// Latent.
     pub latent: Vec<f64>,
-    /// `odom_from_camera` at this frame and the camera's velocity, of which nothing is known but
-    /// what motions were read.
+    /// `odom_from_camera` and the velocity at this frame, from dead reckoning alone.
     pub odom: PoseVelocity,
-    /// `map_from_camera` as it is reported: with the covariance that its errors were measured to
-    /// have, and also after the tracker stopped believing it.
+    /// Reported `map_from_camera`, with its calibrated covariance. It is kept after the filter
+    /// state is dropped.
     pub reported_pose: Option<PoseWithCovariance>,
 }
 
-/// Where the camera is believed to have been at a frame: what anchors are compared with.
+/// Filter state at an earlier frame: the prior of later anchors.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Place {
-    /// When the frame was taken, nanoseconds on the sensor's clock.
+    /// Timestamp of the frame, nanoseconds on the sensor's clock.
     pub time_ns: i64,
-    /// Its latent; none if the camera was covered or frozen, and another one told the place.
+    /// Latent of the frame; `None` if the camera was covered or frozen and another camera was used.
     pub latent: Option<Vec<f64>>,
     /// `map_from_camera` and the camera's velocity.
     pub belief: PoseVelocity,
-    /// The covariance of the lasting error of the anchor that corrected it last, which the filter
-    /// cannot average away; zero where its errors do not last.
+    /// Covariance of the time-correlated error of the last anchor, which the filter cannot average
+    /// out; zero if that error is uncorrelated.
     #[cfg_attr(
         feature = "serde",
         serde(with = "seese3_core::matrices::upper_triangle")
@@ -139,84 +138,83 @@ pub struct Place {
     pub lasting: Matrix6<f64>,
 }
 
-/// A map pose that recent anchors agree on.
+/// Hypothesis for the map pose on which recent anchors agree.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Candidate {
     /// The map, an index of [`super::Tracker::maps`].
     pub room: usize,
-    /// When the newest frame was taken that spoke for it, nanoseconds on the sensor's clock.
+    /// Timestamp of the newest supporting frame, nanoseconds on the sensor's clock.
     pub time_ns: i64,
-    /// That frame's number.
+    /// Sequence number of that frame.
     pub sequence: u64,
-    /// That frame's latent; none if the camera was covered or frozen, and another one spoke.
+    /// Latent of that frame; `None` if the camera was covered or frozen and another camera was
+    /// used.
     pub latent: Option<Vec<f64>>,
     /// `map_from_camera` at that frame.
     pub map_pose: PoseWithCovariance,
-    /// How many anchors in a row agreed.
+    /// Number of consecutive anchors that agree.
     pub agreeing_anchors: u32,
 }
 
-/// What a tracker answers to a frame.
+/// Output of a tracker for one frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Update {
-    /// The motion from the keyframe to this frame, in the keyframe's body frame.
+    /// Motion from the keyframe to this frame, in the keyframe's body frame.
     pub motion: Twist,
-    /// The covariance of that motion's error on (v, ω), metres and radians.
+    /// Covariance of the motion's error on (v, ω), meters and radians.
     pub motion_covariance: Matrix6<f64>,
-    /// The keyframe's number.
+    /// Sequence number of the keyframe.
     pub keyframe_sequence: u64,
-    /// Whether this frame is the keyframe from now on.
+    /// Whether this frame became the new keyframe.
     pub is_keyframe: bool,
     /// `odom_from_camera`.
     pub odom: PoseWithCovariance,
-    /// `map_from_camera` as it is reported; the map's frame is the room's world. The last pose is
-    /// still given, less and less surely, while a stream is LOST or RELOCALIZING in a single room,
-    /// and where it is LOST because its position became too uncertain: look at `status` before
-    /// using it.
+    /// Reported `map_from_camera`; the map frame is the room's world. Check `status` before use: a
+    /// stream that is LOST or RELOCALIZING in a single room still reports its last pose, with
+    /// growing covariance. So does a stream that is LOST because of its position uncertainty.
     pub map_pose: Option<PoseWithCovariance>,
-    /// The camera's velocity in its body frame, metres and radians per second: that of the fused
-    /// pose where one is believed, else what readings alone tell; none for the first frame.
+    /// Camera velocity in its body frame, meters and radians per second; `None` for the first
+    /// frame. It is the velocity of the fused map pose, or of dead reckoning if there is none.
     pub velocity: Option<Twist>,
-    /// Whether the place is known, and confirmed by recent frames.
+    /// Localization status.
     pub status: Status,
-    /// Why the status is what it is, in words.
+    /// Reason of the status, as text.
     pub reason: String,
-    /// The distance to the nearest mapped frame over the room's own limit: above 1 the frame looks
-    /// like another place.
+    /// Distance to the nearest mapped frame divided by the room's limit: above 1 the frame is out
+    /// of distribution.
     pub out_of_distribution: f64,
-    /// The only map or, of several, the one that the camera was found in.
+    /// The only map, or the one in which the camera was localized.
     pub room: Option<usize>,
-    /// The map and the mapped frame that the view resembles most.
+    /// Map and mapped frame that are most similar to the view.
     pub best_match: (usize, Neighbour),
-    /// Which of the robot's other cameras saw that view; none for the stream's own.
+    /// The other camera of that view; `None` for the stream's own camera.
     pub best_camera: Option<u32>,
-    /// Whether that frame corrected the pose.
+    /// Whether that match corrected the map pose.
     pub match_used: bool,
-    /// The squared Mahalanobis distance of the best match from the expected place, if an anchor was
-    /// tried and a place was expected.
+    /// Squared Mahalanobis distance of the anchor from the predicted map pose, if both exist.
     pub surprise: Option<f64>,
-    /// A map pose that recent anchors agree on and that is not believed yet.
+    /// Hypothesis for the map pose on which recent anchors agree.
     pub candidate: Option<Candidate>,
 }
 
-/// Why a frame was refused. The state of the stream is as if it had never arrived.
+/// Why a frame was rejected. A rejected frame does not change the state of the stream.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Refusal {
     /// The frame is not newer than the one before.
-    #[error("timestamp {time_ns} ns is not later than that of the frame before, {last_ns} ns")]
+    #[error("timestamp {time_ns} ns is not later than that of the previous frame, {last_ns} ns")]
     Late {
-        /// The frame's time.
+        /// Timestamp of the frame.
         time_ns: i64,
-        /// The time of the frame before.
+        /// Timestamp of the previous frame.
         last_ns: i64,
     },
-    /// The frame's number is not larger than the last one's.
-    #[error("sequence {sequence} is not larger than that of the frame before, {last}")]
+    /// The frame's sequence number is not larger than the previous one.
+    #[error("sequence {sequence} is not larger than that of the previous frame, {last}")]
     Duplicate {
-        /// The frame's number.
+        /// Sequence number of the frame.
         sequence: u64,
-        /// The number of the frame before.
+        /// Sequence number of the previous frame.
         last: u64,
     },
     /// The latent does not fit the tracker's adapter.

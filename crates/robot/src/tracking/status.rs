@@ -1,4 +1,4 @@
-//! The status of a stream: whether its pose should be trusted, and why.
+//! The localization status of a stream, with its reason.
 
 use super::health::{FRAMES_TO_RECOVER, TrackingHealth};
 use super::map::MapMatch;
@@ -9,13 +9,13 @@ use super::state::State;
 use super::tracker::Tracker;
 use super::{ANCHORS_TO_AGREE, PoseWithCovariance, Status};
 
-/// Frames without a match after which a known place is in doubt.
+/// Number of frames without a match after which a stream is DEGRADED.
 const FRAMES_UNTIL_DOUBT: u32 = 10;
 
 impl Tracker {
-    /// The status after a frame, and the reason in words. `reported_pose` is where the frame was
-    /// taken, if that is believed; `gravity_error_rad` is by how much measured gravity contradicts it,
-    /// radians.
+    /// The status after a frame, with its reason as text. `reported_pose` is the frame's map pose
+    /// while the filter has one. `gravity_error_rad` is the angle between measured and expected
+    /// gravity, if it is outside the gate.
     pub(super) fn status(
         &self,
         state: &State,
@@ -39,18 +39,18 @@ impl Tracker {
             let reason = if self.settings.fuse {
                 format!("{agreeing} of {ANCHORS_TO_AGREE} anchors agree on a place")
             } else {
-                "nothing is corrected: only a pose that is set tells the place".to_owned()
+                "corrections are disabled: the stream needs a pose set by the client".to_owned()
             };
             return (Status::Relocalizing, reason);
         };
 
-        // A position that is known to no better than the size of the room says nothing, unless the
-        // room was mapped on the spot.
+        // A position uncertainty above the extent of the room is useless. The lower bound covers
+        // rooms mapped without translation.
         let deviation = reported_pose.position_deviation_m();
         let extent = state.room.map_or(0.0, |room| self.maps[room].extent_m());
         if deviation > extent.max(PLACE_DEVIATION_M) {
             let reason = format!(
-                "the position is known to {deviation:.1} m, the room is {extent:.1} m wide"
+                "the position uncertainty is {deviation:.1} m, the room is {extent:.1} m wide"
             );
             return (Status::Lost, reason);
         }
@@ -62,16 +62,16 @@ impl Tracker {
 
         if agreeing > 0 {
             let reason = format!(
-                "{agreeing} of {ANCHORS_TO_AGREE} anchors speak for another place than the one that is believed"
+                "{agreeing} of {ANCHORS_TO_AGREE} anchors agree on a place other than the current map pose"
             );
             return (Status::Degraded, reason);
         }
 
-        // What is called TRACKING may be relied on to half a metre and 15 degrees.
+        // TRACKING requires an uncertainty of at most 0.5 m and 15°, at 2.5 standard deviations.
         if !reported_pose.tells_a_place() {
             let turn = reported_pose.rotation_deviation_rad().to_degrees();
             let reason = format!(
-                "the pose is known to {:.2} m and {:.0}° only, 2.5 standard deviations",
+                "the pose uncertainty is {:.2} m and {:.0}° (2.5 standard deviations)",
                 2.5 * deviation,
                 2.5 * turn
             );
@@ -80,34 +80,29 @@ impl Tracker {
 
         if let Some(angle) = gravity_error_rad {
             let reason = format!(
-                "gravity is measured {:.0}° from where the views place it: the robot speeds up or brakes, or gravity_in_map or the sensor's axes are not what was said",
+                "measured gravity differs by {:.0}° from the estimated pose: the robot accelerates, or gravity_in_map or the sensor's axes are wrong",
                 angle.to_degrees()
             );
             return (Status::Degraded, reason);
         }
 
         match state.frames_off_map {
-            0..FRAMES_UNTIL_DOUBT => (
-                Status::Tracking,
-                "recent frames look like mapped places".to_owned(),
-            ),
+            0..FRAMES_UNTIL_DOUBT => (Status::Tracking, "recent frames match the map".to_owned()),
             frames => (
                 Status::Degraded,
-                format!("no mapped place for {frames} frames"),
+                format!("no frame has matched the map for {frames} frames"),
             ),
         }
     }
 }
 
-/// Why a view shows nothing, if it does not.
+/// The reason why a view cannot be used; `None` if it can.
 fn reason_of_blindness(sight: Sight, unchanged_frames: u32) -> Option<String> {
     match sight {
         Sight::Clear => None,
-        Sight::Nothing => {
-            Some("the image shows nothing: it is blank, or all bright or dark".to_owned())
-        }
+        Sight::Nothing => Some("the image is blank: it has nearly uniform brightness".to_owned()),
         Sight::Unchanged => Some(format!(
-            "{} frames in a row are the same image: the camera is frozen, or a simulation without noise stands still",
+            "{} consecutive frames are identical: the camera is frozen, or a noise-free simulation stands still",
             unchanged_frames + 1
         )),
     }
@@ -115,13 +110,13 @@ fn reason_of_blindness(sight: Sight, unchanged_frames: u32) -> Option<String> {
 
 fn reason_of_loss(certain_matches: u32, matched: &MapMatch) -> String {
     if matched.out_of_distribution > 1.0 {
-        return "the frames do not look like the room".to_owned();
+        return "the frames do not match the room".to_owned();
     }
 
     match certain_matches {
-        0 => "the view jumped, or nothing is sure of the room yet".to_owned(),
+        0 => "the view jumped, or no frame matches the room with certainty yet".to_owned(),
         count => {
-            format!("{count} of {FRAMES_TO_RECOVER} frames in a row look like the room again")
+            format!("{count} of {FRAMES_TO_RECOVER} consecutive frames match the room again")
         }
     }
 }

@@ -1,18 +1,17 @@
-//! Tracking a camera frame by frame: dead reckoning from keyframes, corrected by mapped frames that
-//! look alike.
+//! Frame-by-frame tracking: dead reckoning from keyframes, corrected by matching mapped frames.
 //!
-//! Start reading at [`Tracker::observe`], which hands a frame to `step`, the whole algorithm in six
-//! paragraphs. Its third one is in `dead_reckoning.rs`, the fourth in `anchoring.rs`.
+//! Start reading at [`Tracker::observe`]. It passes a frame to `step`, the algorithm in six steps.
+//! Step 3 is in `dead_reckoning.rs`, step 4 in `anchoring.rs`.
 //!
-//! - A tracker keeps nothing: all that it knows of a stream is its [`State`], and the same state
-//!   and frame give the same answer to the bit.
-//! - A robot may have several cameras: what they see at the same time is in `rig.rs`.
+//! - A tracker is stateless: all data of a stream are in its [`State`]. The same state and frame
+//!   give a bit-identical result.
+//! - A robot may have several cameras; `rig.rs` matches their simultaneous views.
 //! - `odom_from_camera` is continuous: motions are composed and never corrected. `map_from_camera`
 //!   is corrected and may jump.
-//! - The map pose is kept twice. The *believed* pose is the filter's own, with the covariance that
-//!   the filter computes; anchors are compared with it. The *reported* pose is what clients are
-//!   told, with the covariance that its errors were measured to have. While both exist they are the
-//!   same pose and differ in covariance alone; where health is lost only the reported one remains.
+//! - There are two map poses. The *believed* pose is the filter state, with the filter's
+//!   covariance; anchors are compared with it. The *reported* pose is sent to clients, with a
+//!   calibrated covariance. While both exist, they differ only in covariance. When health is lost,
+//!   only the reported pose remains.
 
 use nalgebra::Matrix6;
 
@@ -26,13 +25,13 @@ use super::tracker::Tracker;
 use super::{PoseVelocity, PoseWithCovariance};
 use seese3_core::adapter::JUMP_WINDOW;
 
-/// After a longer pause than this, in frames of the calibration rooms, a jump could not be noticed:
-/// half a second at 30 Hz.
+/// Longest pause after which a jump can still be detected, in frame periods of the calibration
+/// rooms: 0.5 s at 30 Hz.
 const LONGEST_GAP: u64 = 15;
 
 impl Tracker {
-    /// The state of a stream before its first frame: in the only map, or in one that is to be
-    /// found. `initial_pose` is `world_from_camera` of the first frame, if it is known.
+    /// State of a stream before its first frame. With several maps, the room is still to be found.
+    /// `initial_pose` is `world_from_camera` of the first frame, if known.
     pub fn start(&self, initial_pose: Option<PoseWithCovariance>) -> State {
         let health = if initial_pose.is_some() {
             TrackingHealth::confirmed()
@@ -48,14 +47,14 @@ impl Tracker {
         }
     }
 
-    /// Sets where a stream's camera is, `world_from_camera`; `odom` continues as it was.
+    /// Sets the map pose of a stream, `world_from_camera`; `odom` stays continuous.
     pub fn set_pose(&self, state: &mut State, pose: PoseWithCovariance) {
         state.health = TrackingHealth::confirmed();
         state.candidate = None;
         state.frames_off_map = 0;
 
         match &state.last {
-            // The pose is that of the last frame, which becomes the keyframe.
+            // The pose applies to the last frame, which becomes the keyframe.
             Some(last) => {
                 state.keyframe = Some(Keyframe {
                     time_ns: last.time_ns,
@@ -76,11 +75,10 @@ impl Tracker {
         }
     }
 
-    /// Takes one frame. The state changes only if the frame is accepted.
+    /// Processes one frame. The state changes only if the frame is accepted.
     ///
     /// # Errors
-    /// [`Refusal`] for a frame that is late or a duplicate, or whose latent does not fit the
-    /// adapter.
+    /// [`Refusal`] if the frame is late or a duplicate, or a latent does not fit the adapter.
     pub fn observe(&self, state: &mut State, frame: &Observation) -> Result<Update, Refusal> {
         if let Some(last) = &state.last {
             if frame.sequence <= last.sequence {
@@ -108,15 +106,14 @@ impl Tracker {
     }
 
     fn step(&self, state: &mut State, frame: &Observation) -> Update {
-        // 1. What the frame looks like: whether the view follows from the views before, and the view
-        //    of the robot's cameras that looks most like a map, with the mapped frame nearest to it.
+        // 1. Matching: the continuity of the view, and the best match of all cameras with a map.
         let continuity = self.record_view(state, frame);
         let sight = Sight::of(frame.is_blank, state.unchanged_frames);
         let seen = self.look(state, frame);
         let matches_room = seen.leading.matches_room();
 
-        // 2. What that says of the stream's health. The own view may jump, as when something covers
-        //    the lens and goes, while another camera certainly sees the room.
+        // 2. Health. A jump of the stream's own view is ignored while another camera certainly
+        //    shows the room: the lens may have been covered for a moment.
         state.health = state.health.after(FrameEvidence {
             matches_room,
             matches_certainly: matches_room && seen.leading.matched.is_certain,
@@ -131,7 +128,7 @@ impl Tracker {
             state.frames_off_map.saturating_add(1)
         };
 
-        // 3. Dead reckoning: the motion since the keyframe carries every pose forward.
+        // 3. Dead reckoning: predict every pose from the motion since the keyframe.
         let reading = match sight {
             Sight::Clear => MotionReading::of(continuity, seen.own_matches_room),
             Sight::Nothing | Sight::Unchanged => MotionReading::Unseen,
@@ -147,13 +144,13 @@ impl Tracker {
             *believed = believed.levelled(gravity);
         }
 
-        // 4. Correction: the mapped frames that look alike are tried as an anchor.
+        // 4. Correction: try the matching mapped frames as an anchor.
         let correction = self.correct_by_views(state, &mut poses, frame, &seen, gravity.as_ref());
         if let Some(believed) = &poses.map_pose {
             poses.reported_pose = Some(self.reported(believed, &poses.lasting));
         }
 
-        // 5. What is remembered for the next frame.
+        // 5. Update the state for the next frame.
         let keyframe_sequence = state
             .keyframe
             .as_ref()
@@ -161,7 +158,7 @@ impl Tracker {
         let believed = poses.map_pose.as_ref().unwrap_or(&poses.odom);
         let velocity = state.last.as_ref().map(|_| believed.velocity);
 
-        // Motions cannot be read from a blank image.
+        // Motions cannot be estimated from a blank image.
         let shows = sight != Sight::Nothing || state.keyframe.is_none();
         let is_keyframe = shows && self.is_keyframe_due(state, frame.time_ns, &prediction);
         let is_corrected = state.corrected_ns == Some(frame.time_ns);
@@ -169,8 +166,8 @@ impl Tracker {
         remember(state, frame, &poses, is_keyframe, is_place);
         state.measured = state.measured.after(frame, is_keyframe, is_place);
 
-        // 6. The answer. The status judges the reported pose, but only while the filter still
-        //    believes one.
+        // 6. Output. The status depends on the reported pose, but only while there is a believed
+        //    pose.
         let judged_pose = poses.map_pose.and(poses.reported_pose);
 
         let best = &seen.leading;
@@ -198,8 +195,8 @@ impl Tracker {
         }
     }
 
-    /// Adds the frame's view to the recent ones, and says how it follows from them. A blank view is
-    /// none: it neither follows nor jumps.
+    /// Adds the view to the recent views and returns its continuity with them. A blank view is not
+    /// recorded and counts as continuous.
     fn record_view(&self, state: &mut State, frame: &Observation) -> Continuity {
         if frame.is_blank {
             return Continuity::Continuous;
@@ -222,8 +219,8 @@ impl Tracker {
             0
         };
 
-        // How far the views of a moving camera lie apart grows slowly with the time from one to the
-        // other, about as its cube root.
+        // The distance between views of a moving camera grows about with the cube root of the time
+        // between them.
         let periods = state
             .last
             .as_ref()
@@ -231,7 +228,7 @@ impl Tracker {
         let jump = self.error_model.statistics().jump_distance;
         let limit = jump * (periods as f64).cbrt();
 
-        // A camera that was covered or frozen meanwhile may have been moved like one that was silent.
+        // A covered or frozen camera may have moved unnoticed, as during a gap in the stream.
         let unseen = state
             .seen_ns
             .map_or(1, |seen_ns| self.frames_between(seen_ns, frame.time_ns));
@@ -249,8 +246,8 @@ impl Tracker {
             Continuity::Continuous
         };
 
-        // A gap comes first: after one even a near view may hide a jump. After either, the views
-        // before say nothing of those that follow.
+        // A gap takes precedence: a jump may be hidden even if the view is near. After a gap or a
+        // jump, the earlier views are no longer comparable.
         if continuity != Continuity::Continuous {
             state.recent.clear();
         } else if state.recent.len() == JUMP_WINDOW {
@@ -261,9 +258,9 @@ impl Tracker {
         continuity
     }
 
-    /// Stops believing the map pose of a lost stream. In a single room the last pose is still
-    /// reported, less and less surely, but anchors have to agree before it is believed again; with
-    /// several rooms even the room is open again.
+    /// Drops the believed map pose of a lost stream. In a single room the last pose is still
+    /// reported, with growing covariance, until enough anchors agree on a new one. With several
+    /// rooms the room is also unknown again.
     fn stop_believing(&self, state: &mut State, poses: &mut Poses) {
         poses.map_pose = None;
         state.candidate = None;
@@ -274,7 +271,7 @@ impl Tracker {
         }
     }
 
-    /// Whether the last place is so old that motions from it were not measured, or there is none.
+    /// Whether there is no place, or its age has reached the keyframe interval.
     fn is_place_old(&self, state: &State, time_ns: i64) -> bool {
         let place = state.place.as_ref();
         place.is_none_or(|place| self.is_old(place.time_ns, time_ns))
@@ -294,8 +291,7 @@ impl Tracker {
     }
 }
 
-/// Keeps the frame, takes it as the keyframe if one is due, and keeps where the camera is believed
-/// to be if that is new.
+/// Stores the frame, and the keyframe and the place if they are due.
 fn remember(
     state: &mut State,
     frame: &Observation,
@@ -338,8 +334,8 @@ fn remember(
     });
 }
 
-/// By how much measured gravity contradicts where a view that looks like the room was taken, or the
-/// pose that several views told, radians; none if it does not.
+/// Angle between measured gravity and that of the leading match, or else of the reported pose,
+/// radians; `None` if both are within the gate.
 fn gravity_error_rad(
     gravity: &CountedGravity,
     view: &MatchedView<'_>,
@@ -350,8 +346,7 @@ fn gravity_error_rad(
     by_view.or_else(|| gravity.contradicts(poses.reported_pose.as_ref()?))
 }
 
-/// How many frames the camera took since the last accepted one, this one included: numbers that are
-/// missing are frames that are missing.
+/// Number of frames since the last accepted one, including this one and dropped frames.
 fn frames_since_last(state: &State, frame: &Observation) -> u64 {
     state
         .last

@@ -1,4 +1,4 @@
-//! A tracker: the maps that it tracks in, its settings, and the adapter's error model.
+//! The tracker: its maps, its settings and the adapter's error model.
 
 use std::sync::Arc;
 
@@ -10,23 +10,22 @@ use seese3_core::adapter::{Adapter, ErrorModel};
 /// Settings of a tracker.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackerSettings {
-    /// A new keyframe is taken after the time that so many frames took in the rooms where the
-    /// adapter's errors were measured; at least 1.
+    /// Keyframe interval, in frame periods of the calibration rooms; at least 1.
     pub keyframe_frames: u32,
-    /// A new keyframe is taken after a motion of this length, ‖(v, ω)‖, metres and radians mixed;
+    /// Motion since the keyframe that triggers a new one, ‖(v, ω)‖, meters and radians mixed;
     /// above 0.
     pub keyframe_displacement: f64,
-    /// Whether mapped frames that look alike correct the pose.
+    /// Whether matching mapped frames correct the map pose.
     pub fuse: bool,
 }
 
 impl TrackerSettings {
-    /// Settings that keep motions within those that the adapter was trained for and its errors were
-    /// measured over: a keyframe after as many frames as the longest of them, or after twice the
-    /// root mean square of their lengths.
+    /// Default settings for an adapter. They keep motions within the trained and calibrated range:
+    /// the keyframe interval is the longest calibrated motion, and the displacement is twice the
+    /// root mean square length of the trained motions.
     ///
-    /// Differences of latents add up, so many keyframes read a path no better than few; the
-    /// measured errors only hold while a single motion is read since the last map pose.
+    /// Latent differences add up, so more keyframes do not improve the path. The measured errors
+    /// hold only for a single predicted motion since the last map pose.
     pub fn of(adapter: &Adapter) -> Self {
         let scale = adapter.scale();
         let mean_square = scale.mean.norm_squared() + scale.deviation.norm_squared();
@@ -51,11 +50,11 @@ pub struct Tracker {
 }
 
 impl Tracker {
-    /// A tracker over one or more maps that share an adapter.
+    /// Builds a tracker over one or more maps that share an adapter.
     ///
     /// # Errors
-    /// [`Error::NoMap`] without a map, [`Error::Adapters`] when the maps have several adapters,
-    /// [`Error::NotCalibrated`] when the adapter has no error model.
+    /// [`Error::NoMap`] without a map, [`Error::Adapters`] if the maps have different adapters,
+    /// [`Error::NotCalibrated`] if the adapter has no error model.
     pub fn new(maps: Vec<Arc<Map>>, settings: TrackerSettings) -> Result<Self, Error> {
         let adapter = maps
             .first()
@@ -81,8 +80,7 @@ impl Tracker {
         })
     }
 
-    /// The same tracker with another factor of the covariances of corrected map poses. Calibration
-    /// searches the right one with it.
+    /// Replaces the map-pose factor of the error model; used by calibration to search the factor.
     #[must_use]
     pub fn with_map_pose_factor(self, map_pose_factor: f64) -> Self {
         Self {
@@ -91,7 +89,7 @@ impl Tracker {
         }
     }
 
-    /// The maps that cameras are tracked in.
+    /// The maps.
     pub fn maps(&self) -> &[Arc<Map>] {
         &self.maps
     }
@@ -105,7 +103,7 @@ impl Tracker {
         self.maps[0].navigator().adapter()
     }
 
-    /// A latent of shape (k,) in standard deviations of frame noise.
+    /// Whitens a latent of shape (k,): the result is in standard deviations of frame noise.
     pub(super) fn whitened(&self, latent: ArrayView1<'_, f64>) -> Vec<f64> {
         let coordinates = latent.slice(s![..self.adapter().coordinate_count()]);
         self.error_model

@@ -1,11 +1,11 @@
-//! What a camera saw, and the motion between two views.
+//! Views, and the motion between two views.
 
 use ndarray::Array1;
 
 use seese3_core::adapter::{Adapter, Error};
 use seese3_core::geometry::Twist;
 
-/// What a camera saw, without saying where.
+/// A camera observation without a pose.
 #[derive(Debug, Clone, PartialEq)]
 pub enum View {
     /// A raw feature of the adapter's source, shape (d,).
@@ -18,7 +18,7 @@ impl View {
     /// The view's latent, shape (k,).
     ///
     /// # Errors
-    /// [`Error`] when the feature or the latent does not fit the adapter.
+    /// [`Error`] if the feature or the latent does not fit the adapter.
     pub fn latent(&self, adapter: &Adapter) -> Result<Array1<f64>, Error> {
         match self {
             Self::Feature(feature) => adapter.embed_one(feature),
@@ -30,10 +30,10 @@ impl View {
     }
 }
 
-/// The camera's motion from the first view to the second, in the first camera's body frame.
+/// Estimates the motion from the first view to the second, in the first camera's body frame.
 ///
 /// # Errors
-/// [`Error`] when a view does not fit the adapter.
+/// [`Error`] if a view does not fit the adapter.
 ///
 /// Source: SeeSE3, Sec. A.2.
 pub fn motion(adapter: &Adapter, first: &View, second: &View) -> Result<Twist, Error> {

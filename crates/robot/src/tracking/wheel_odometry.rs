@@ -1,9 +1,10 @@
-//! Motions that another sensor has measured: wheels, or an inertial unit.
+//! Wheel or inertial odometry.
 //!
-//! The sensor reports the camera's pose in an odometry frame of its own, which drifts and never jumps.
-//! The motion between two such poses counts in place of what the adapter reads, also where a view
-//! shows nothing. A frame that brings no pose is told by its view alone; the next one that brings a
-//! pose covers both. A keyframe or place at a frame without a pose waits for the next one with it.
+//! The sensor reports the camera's pose in its own odometry frame, which drifts but never jumps.
+//! The motion between two such poses replaces the motion predicted by the adapter, also for blank
+//! views. Frames without odometry use vision for the map pose; the next odometry pose spans the
+//! gap. A keyframe or place without odometry has no measured motion until the next one with
+//! odometry.
 
 use nalgebra::{Matrix6, Vector6};
 
@@ -11,65 +12,65 @@ use super::pose_velocity::ReadMotion;
 use super::state::Observation;
 use seese3_core::geometry::{Pose, Twist, body_twist, exp, log};
 
-/// Standard deviations that a motion has besides its shares: a millimetre, and half a milliradian.
+/// Constant part of the standard deviations of a motion: 1 mm and 0.5 mrad.
 const LEAST_DEVIATION_M: f64 = 1e-3;
 const LEAST_DEVIATION_RAD: f64 = 5e-4;
 
-/// Where another sensor says that the camera is.
+/// Camera pose measured by another sensor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasuredPose {
-    /// In the sensor's own odometry frame: `sensor_odom_from_camera`.
+    /// Pose in the sensor's own odometry frame: `sensor_odom_from_camera`.
     pub pose: Pose,
-    /// How fast it drifts.
+    /// Drift rate of the sensor.
     pub drift: Drift,
 }
 
-/// How fast a sensor's odometry drifts, as standard deviations by axis. Errors are taken to last, as
-/// those of a wheel of the wrong size do: they grow with the way, however many frames it takes.
+/// Drift rate of odometry, as standard deviations per axis. Errors are modeled as fully correlated,
+/// like that of a wrong wheel radius: they grow with the distance, at any frame rate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Drift {
-    /// Metres per metre of translation, above 0.
+    /// Meters per meter of translation, above 0.
     pub translation_share: f64,
-    /// Radians per radian of rotation, and radians per metre of translation; above 0.
+    /// Radians per radian of rotation, and radians per meter of translation; above 0.
     pub rotation_share: f64,
 }
 
-/// What was driven from an earlier frame to the last one that brought a pose.
+/// Accumulated odometry from an earlier frame to the last frame with odometry.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct OdometryDelta {
-    /// The later camera's pose in the earlier one.
+    /// Pose of the later camera in the earlier one.
     pub pose: Pose,
-    /// The length of the way, metres.
+    /// Path length, meters.
     pub way_m: f64,
-    /// The sum of all turns, radians.
+    /// Sum of all rotation angles, radians.
     pub turns_rad: f64,
 }
 
-/// The last frame that brought a pose.
+/// The last frame with odometry.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct LastMeasured {
-    /// When it was taken, nanoseconds on the camera's clock.
+    /// Timestamp, nanoseconds on the camera's clock.
     pub time_ns: i64,
-    /// Its pose in the sensor's odometry frame.
+    /// Camera pose in the sensor's odometry frame.
     pub pose: Pose,
 }
 
-/// What was measured up to the last frame that brought a pose.
+/// Odometry accumulated up to the last frame with odometry.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct OdometryAccumulator {
-    /// That frame.
+    /// The last frame with odometry.
     pub last: Option<LastMeasured>,
-    /// OdometryDelta since the keyframe; none if that brought no pose.
+    /// Odometry since the keyframe; `None` if the keyframe has none.
     pub keyframe: Option<OdometryDelta>,
-    /// OdometryDelta since the frame of the last place; none if that brought no pose.
+    /// Odometry since the frame of the last place; `None` if that frame has none.
     pub place: Option<OdometryDelta>,
 }
 
 impl OdometryAccumulator {
-    /// As it is when the frame of this time, the last of its stream, has become keyframe and place.
+    /// Restarts both deltas at the last frame of the stream, which became keyframe and place.
     #[must_use]
     pub(super) fn begun(self, time_ns: i64) -> Self {
         let brought_pose = self.last.filter(|last| last.time_ns == time_ns);
@@ -81,7 +82,7 @@ impl OdometryAccumulator {
         }
     }
 
-    /// As it is after a frame, which may have become keyframe or place.
+    /// Adds a frame, which may have become keyframe or place.
     #[must_use]
     pub(super) fn after(self, frame: &Observation, is_keyframe: bool, is_place: bool) -> Self {
         let measured = frame.measured.as_ref();
@@ -104,7 +105,7 @@ impl OdometryAccumulator {
         }
     }
 
-    /// The motion from the keyframe to this frame, if both brought a pose.
+    /// The motion from the keyframe to this frame, if both have odometry.
     pub(super) fn motion_since_keyframe(
         &self,
         measured: Option<&MeasuredPose>,
@@ -112,12 +113,12 @@ impl OdometryAccumulator {
         self.known(self.keyframe, measured)
     }
 
-    /// The motion from the last place to this frame, if both brought a pose.
+    /// The motion from the last place to this frame, if both have odometry.
     pub(super) fn motion_since_place(&self, measured: Option<&MeasuredPose>) -> Option<ReadMotion> {
         self.known(self.place, measured)
     }
 
-    /// The motion from the last frame that brought a pose to this one, if it does too.
+    /// The motion from the last frame with odometry to this one, if it has odometry.
     pub(super) fn step(&self, measured: Option<&MeasuredPose>) -> Option<Twist> {
         let (last, measured) = self.last.zip(measured)?;
         let motion = body_twist(&last.pose, &measured.pose);
@@ -140,7 +141,7 @@ impl OdometryAccumulator {
 }
 
 impl OdometryDelta {
-    /// From a frame to itself.
+    /// The delta from a frame to itself.
     fn zero() -> Self {
         Self {
             pose: Pose::identity(),
@@ -159,8 +160,8 @@ impl OdometryDelta {
 }
 
 impl Drift {
-    /// The covariance of the error of what was driven, on (v, ω) in the later camera's body frame. A
-    /// heading that is wrong more and more leads aside by half of what it is wrong at the end.
+    /// Covariance of the error of an odometry delta, on (v, ω) in the later camera's body frame.
+    /// The mean of a linearly growing heading error is half its final value, hence the factor 0.5.
     fn over(self, driven: OdometryDelta) -> Matrix6<f64> {
         let OdometryDelta {
             way_m, turns_rad, ..
@@ -186,8 +187,8 @@ mod tests {
         rotation_share: 0.02,
     };
 
-    /// A way of three metres along x that turns by 0.3 rad about y, in so many frames; without a pose
-    /// in the frames that `is_silent` says.
+    /// A path of 3 m along x with a rotation of 0.3 rad about y, in `frames` frames. Frames for
+    /// which `is_silent` holds have no odometry.
     fn ridden(frames: u32, is_silent: impl Fn(u32) -> bool) -> Option<ReadMotion> {
         let whole = Twist {
             linear: Vector3::new(3.0, 0.0, 0.0),
@@ -218,8 +219,8 @@ mod tests {
         since.motion_since_place(measured(frames).as_ref())
     }
 
-    /// Oracle: the definition, by hand: shares of the way, whatever the rate and whatever is missing in
-    /// between.
+    /// Oracle: the definition, by hand: errors are fractions of the path, at any frame rate and
+    /// with missing odometry in between.
     #[test]
     fn errors_grow_with_the_way_and_not_with_the_frames() {
         let rotation = 5e-4 + 0.02 * (0.3 + 3.0);
@@ -236,8 +237,8 @@ mod tests {
         }
     }
 
-    /// Oracle: the rules: what began without a pose is not known, and a frame without one has no
-    /// measured motion.
+    /// Oracle: the rules: there is no measured motion if the first or the last frame has no
+    /// odometry.
     #[test]
     fn nothing_is_measured_from_or_to_a_silent_frame() {
         assert!(ridden(30, |frame| frame == 0).is_none());
@@ -245,7 +246,7 @@ mod tests {
         assert!(ridden(30, |frame| frame == 29).is_some());
     }
 
-    /// Oracle: the rule, by hand: a place that is set at a frame without a pose is not measured from.
+    /// Oracle: the rule, by hand: a place set at a frame without odometry has no measured motion.
     #[test]
     fn a_place_at_a_silent_frame_begins_nothing() {
         let since = OdometryAccumulator {

@@ -1,4 +1,4 @@
-//! Matches between the cells of two feature maps, to a fraction of a cell.
+//! Subcell matches between two feature maps.
 
 use nalgebra::Vector2;
 use ndarray::{Array2, ArrayView3, Axis};
@@ -6,18 +6,19 @@ use ndarray::{Array2, ArrayView3, Axis};
 use super::Match;
 use seese3_core::geometry::Pinhole;
 
-/// Standard deviation of a match of usual margin and curvature, image widths: 0.8 pixels of 320.
+/// Standard deviation of a match with reference margin and curvature, in image widths: 0.8 of 320
+/// pixels.
 const DEVIATION: f64 = 0.8 / 320.0;
 
-/// The deviation of a match is [`DEVIATION`] · (margin / 0.1)^−0.7 · (curvature / 0.05)^−0.5: the
-/// usual values, and the powers.
+/// Reference values and exponents of the margin and the curvature of a match. Its deviation is
+/// [`DEVIATION`] · (margin / 0.1)^−0.7 · (curvature / 0.05)^−0.5.
 const MARGIN: (f64, f64) = (0.1, 0.7);
 const CURVATURE: (f64, f64) = (0.05, 0.5);
 
-/// The least and the largest factor of [`DEVIATION`].
+/// Minimum and maximum of the factor on [`DEVIATION`].
 const FACTORS: (f64, f64) = (0.4, 8.0);
 
-/// The factor up to which a match is sharp.
+/// Largest factor on [`DEVIATION`] of a sharp match.
 const SHARP: f64 = 2.0;
 
 /// The shape of a feature map.
@@ -27,7 +28,7 @@ struct Cells {
     columns: usize,
 }
 
-/// Matches of cells that are each other's most similar ones.
+/// Mutual nearest-neighbor matches of the cells, refined to subcell accuracy.
 pub(super) fn matches(
     first: ArrayView3<'_, f32>,
     second: ArrayView3<'_, f32>,
@@ -71,7 +72,7 @@ pub(super) fn matches(
         .collect()
 }
 
-/// The place of the first of the largest values.
+/// Index of the largest value; of the first one if there are several.
 fn argmax<'a>(values: impl Iterator<Item = &'a f32>) -> usize {
     let mut best = (0, f32::NEG_INFINITY);
     for (place, &value) in values.enumerate() {
@@ -83,10 +84,10 @@ fn argmax<'a>(values: impl Iterator<Item = &'a f32>) -> usize {
     best.0
 }
 
-/// The cosine between every cell of the first map and every cell of the second, averaged over the
-/// three by three cells around both: shape (cells of the first, cells of the second).
+/// Cosine similarity between every cell of the first map and every cell of the second, averaged
+/// over the 3 × 3 cells around both: shape (cells of the first, cells of the second).
 ///
-/// Neighbours beyond the edge of a map count as 0.
+/// Neighbors beyond the edge of a map count as 0.
 fn similarity(
     first: ArrayView3<'_, f32>,
     second: ArrayView3<'_, f32>,
@@ -96,7 +97,7 @@ fn similarity(
     let Cells { rows, columns } = cells;
     let count = rows * columns;
 
-    // A step down is one row of cells further in both maps.
+    // Sum over vertical neighbors: one row up and one row down in both maps.
     let mut down = single.clone();
     for from in 0..count {
         let mut sums = down.row_mut(from);
@@ -112,7 +113,7 @@ fn similarity(
         }
     }
 
-    // A step aside is one column further in both, within a row of cells.
+    // Sum over horizontal neighbors: one column left and right in both maps, within a row.
     let mut all = down.clone();
     for from in 0..count {
         for row in 0..rows {
@@ -135,7 +136,7 @@ fn similarity(
     all / 9.0
 }
 
-/// The cells of a map as columns of length 1, shape (channels, cells).
+/// Cells of a map as unit-length columns, shape (channels, cells).
 fn unit_columns(map: ArrayView3<'_, f32>) -> Array2<f32> {
     let channels = map.shape()[0];
     let cells = map.shape()[1] * map.shape()[2];
@@ -151,20 +152,20 @@ fn unit_columns(map: ArrayView3<'_, f32>) -> Array2<f32> {
     columns
 }
 
-/// The peak of a cell's similarity in the second map.
+/// Peak of a cell's similarity in the second map.
 struct Peak {
-    /// Its place, in cells; cell 0 has its middle at 0.
+    /// Position in cells; the center of cell 0 is at 0.
     column: f64,
     row: f64,
-    /// How much less similar the best cell elsewhere is.
+    /// Similarity of the best cell minus that of the best cell elsewhere.
     margin: f64,
-    /// The smallest curvature at the peak, per cell².
+    /// Smaller of the two principal curvatures at the peak, per cell².
     curvature: f64,
 }
 
 impl Peak {
-    /// The peak near cell `best`, by the quadratic that fits the nine cells around it best. None at
-    /// the very edge, behind which the peak may lie.
+    /// Refines the peak near cell `best` with a least-squares quadratic over nine cells. `None` at
+    /// the edge of the map, where the true peak may lie outside.
     fn of(similar: &[f32], best: usize, cells: Cells) -> Option<Self> {
         let Cells { rows, columns } = cells;
         let best_row = best / columns;
@@ -172,7 +173,7 @@ impl Peak {
         let row = best_row.clamp(1, rows - 2);
         let column = best_column.clamp(1, columns - 2);
 
-        // Least squares on the nine cells: each coefficient is a sum of its own.
+        // Least squares on nine cells: the coefficients are independent weighted sums.
         let mut slope = Vector2::zeros();
         let [mut second_xx, mut second_xy, mut second_yy] = [0.0; 3];
         for (dy, dx) in (-1i32..=1).flat_map(|dy| (-1i32..=1).map(move |dx| (dy, dx))) {
@@ -211,8 +212,8 @@ impl Peak {
         (inside(peak.column, columns) && inside(peak.row, rows)).then_some(peak)
     }
 
-    /// How many times less exact than usual the place is: a peak that is flat, or has a rival, is less
-    /// exact.
+    /// Factor on [`DEVIATION`]: larger for a flat peak, or one with a second peak of similar
+    /// height.
     fn factor(&self) -> f64 {
         let less = |value: f64, (usual, power): (f64, f64)| (value.max(0.003) / usual).powf(-power);
         let (least, most) = FACTORS;
@@ -221,7 +222,7 @@ impl Peak {
     }
 }
 
-/// The largest similarity of a cell that is more than two cells away from `best`.
+/// Largest similarity of a cell more than two rows or columns away from `best`.
 fn elsewhere(similar: &[f32], best: usize, cells: Cells) -> f32 {
     let Cells { rows, columns } = cells;
     let best_row = best / columns;

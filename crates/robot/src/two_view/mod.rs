@@ -1,20 +1,19 @@
-//! The motion between two views of a room that nobody has mapped, read from where things are in
-//! both images.
+//! Relative pose of two views in a room without a map, estimated from matched image cells.
 //!
-//! The paper reads a motion from two averaged features, which know little of where things are. Here
-//! the cells of two unpooled feature maps are matched (`matching`), and the motion is what explains
-//! the matches best (`solver`):
+//! The paper predicts a motion from two pooled features, which lose most of the image positions.
+//! Here the cells of two unpooled feature maps are matched (`matching`), and the most probable
+//! motion is fitted to the matches (`solver`):
 //!
-//! - A match says that the direction b in the first image is the point u of the second. Under the
-//!   motion (R, t), a point at inverse depth ρ is seen in the direction Rᵀ(b − ρt).
-//! - Each ρ is unknown. Its logarithm has a prior whose mean depends on the place in the image: what
-//!   is at the edges of an image of a room is nearer than what is in its middle. This prior alone
-//!   gives the translation its length in metres.
-//! - The most probable motion is found by Levenberg–Marquardt steps, each ρ eliminated, with
-//!   Student-t weights against wrong matches.
+//! - A match pairs the direction b in the first image with the point u of the second. Under the
+//!   motion (R, t), a point at inverse depth ρ has the direction Rᵀ(b − ρt) in the second camera.
+//! - Each ρ is unknown. Its logarithm has a prior with a mean that depends on the image position:
+//!   in rooms, the edges of an image are nearer than its center. Only this prior determines the
+//!   length of the translation in meters.
+//! - The motion is found by Levenberg–Marquardt steps with every ρ eliminated. Student-t weights
+//!   downweight wrong matches.
 //!
-//! Where the images say little, the translation is drawn towards none, and the covariance grows. How
-//! the parameters were chosen is in `docs/two-views.md`.
+//! If the images constrain the translation poorly, it is shrunk towards zero and the covariance
+//! grows. `docs/two-views.md` describes how the parameters were chosen.
 
 mod matching;
 mod solver;
@@ -24,7 +23,7 @@ use ndarray::ArrayView3;
 
 use seese3_core::geometry::{Pinhole, Pose, Twist, log};
 
-/// Why two views are refused.
+/// Why two feature maps are rejected.
 #[derive(Debug, thiserror::Error, PartialEq)]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
@@ -38,37 +37,37 @@ pub enum Error {
     },
 }
 
-/// The smallest number of rows and of columns of a feature map.
+/// Minimum number of rows and of columns of a feature map.
 const LEAST_CELLS: usize = 8;
 
-/// Sharp matches, as a share of the map's cells, below which nothing is read: images without texture
-/// match only by the border of the map, which moves with no camera.
+/// Minimum number of sharp matches, as a fraction of the map's cells. Images without texture match
+/// only by the border artifacts of the map, which do not move with the camera.
 const LEAST_SHARP: f64 = 1.0 / 12.0;
 
-/// Sum of the matches' weights, as a share of the map's cells, below which nothing is read: the
-/// matches are few or contradict each other.
+/// Minimum sum of the match weights, as a fraction of the map's cells. Below it the matches are too
+/// few or contradict each other.
 const LEAST_SUPPORT: f64 = 160.0 / 1_200.0;
 
-/// Standard deviation of each component of a motion that was not read, metres and radians.
+/// Standard deviation of each component if no motion was estimated, meters and radians.
 const UNREAD_DEVIATION: f64 = 0.3;
 
-/// The motion between two views.
+/// Estimated motion between two views.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionEstimate {
-    /// The second camera in the frame of the first, metres.
+    /// Pose of the second camera in the frame of the first, meters.
     pub motion: Pose,
-    /// Covariance of ξ in true = motion · exp(ξ), ordered (v, ω), metres and radians.
+    /// Covariance of ξ in true = motion · exp(ξ), ordered (v, ω), meters and radians.
     pub covariance: Matrix6<f64>,
-    /// Whether the images show the motion. If not, it is no motion, with a wide covariance.
+    /// Whether a motion was estimated. If not, `motion` is the identity with a wide covariance.
     pub is_estimated: bool,
-    /// How many cells were matched.
+    /// Number of matched cells.
     pub match_count: usize,
-    /// How many of these agree with the motion: the sum of their weights, 0 to 1 each.
+    /// Effective number of inlier matches: the sum of their weights, 0 to 1 each.
     pub support: f64,
 }
 
 impl MotionEstimate {
-    /// The motion as a twist, in the body frame of the first camera.
+    /// The motion as a twist in the body frame of the first camera.
     pub fn twist(&self) -> Twist {
         log(&self.motion)
     }
@@ -84,21 +83,21 @@ impl MotionEstimate {
     }
 }
 
-/// Where one thing is in both images.
+/// One point matched between both images.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Match {
-    /// Its direction in the first image, scaled to depth 1.
+    /// Direction in the first camera, scaled to depth 1.
     direction: Vector3<f64>,
-    /// Its point on the second image's plane at distance 1.
+    /// Point in the second image, in normalized coordinates (plane at distance 1).
     point: Vector2<f64>,
-    /// Standard deviation of that point.
+    /// Standard deviation of `point`, in normalized coordinates.
     deviation: f64,
-    /// Whether the match is about as exact as usual.
+    /// Whether the deviation is at most twice the usual one.
     is_sharp: bool,
 }
 
-/// Reads the motion between two views of one camera from their feature maps, (channels, rows,
-/// columns), whose cells cover the whole image.
+/// Estimates the motion between two views of one camera from their feature maps, shape (channels,
+/// rows, columns). The cells must cover the whole image.
 ///
 /// # Errors
 /// [`Error::Shape`] if the maps differ in shape or are too small.
@@ -123,7 +122,7 @@ pub fn read(
     ))
 }
 
-/// The motion that explains the matches of a map of `cell_count` cells best.
+/// Fits the motion to the matches of a map with `cell_count` cells.
 fn estimate(matches: &[Match], cell_count: usize) -> MotionEstimate {
     let sharp = matches.iter().filter(|matched| matched.is_sharp).count();
     if (sharp as f64) < LEAST_SHARP * cell_count as f64 {
@@ -157,8 +156,8 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
     use seese3_core::geometry::{PixelCamera, exp};
 
-    /// Four hundred matches under a known motion, at depths of 1.2 to 3.2 m; `noise` on the image
-    /// plane, and every seventh match wrong if `is_wrong`.
+    /// 400 matches under a known motion, at depths of 1.2 to 3.2 m. `noise` is added on the image
+    /// plane; every seventh match is an outlier if `is_wrong`.
     fn matches(motion: &Twist, noise: f64, is_wrong: bool) -> Vec<Match> {
         let motion = exp(motion);
         (0..400)
@@ -190,7 +189,7 @@ mod tests {
             .collect()
     }
 
-    /// A camera whose focal length is the width of its images of 4 by 3.
+    /// A 4:3 camera with a focal length of one image width.
     fn camera() -> Pinhole {
         Pinhole::new(PixelCamera {
             width: 320.0,
@@ -240,8 +239,8 @@ mod tests {
         assert!((reading.covariance[(0, 2)] - 1.879_037e-3).abs() < 1e-7);
     }
 
-    /// Oracle: the motion that made the matches. Its rotation and the direction of its translation
-    /// are told by the images; its length only by the depths that rooms have.
+    /// Oracle: the motion that generated the matches. The images determine the rotation and the
+    /// direction of the translation. Only the depth prior determines the length.
     #[test]
     fn rotation_and_direction_come_from_the_images() {
         let truth = exp(&known_motion());
@@ -259,14 +258,14 @@ mod tests {
         assert!((0.5..1.5).contains(&length), "{length}");
     }
 
-    /// A map of random cells, in which no two are alike.
+    /// A map of distinct random cells.
     fn random_map(seed: u64) -> Array3<f32> {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         Array3::from_shape_simple_fn((16, 24, 32), || random.random_range(-1.0..1.0))
     }
 
-    /// Oracle: the definition of a turn: all directions turn alike, whatever their depths, and the
-    /// camera stays where it is.
+    /// Oracle: the definition of a rotation: all directions rotate equally at any depth, and the
+    /// translation is zero.
     #[test]
     fn a_turn_on_the_spot_is_no_translation() {
         let turn = Twist {
@@ -280,8 +279,8 @@ mod tests {
         assert!(reading.motion.translation.vector.norm() < 0.005);
     }
 
-    /// Oracle: by hand. Every cell of a map that is shifted to the right by two cells of 32 is found
-    /// two cells further right, by a camera whose focal length is a width 1/16 further on the plane.
+    /// Oracle: by hand. The map is shifted to the right by 2 of 32 cells. With a focal length of
+    /// one image width, that is 1/16 in normalized coordinates.
     #[test]
     fn the_cells_of_a_shifted_map_are_found_again() {
         let first = random_map(4);
@@ -292,7 +291,8 @@ mod tests {
         let found = matching::matches(first.view(), second.view(), &camera);
         assert!(found.len() > 500, "{} matches", found.len());
 
-        // Cells of noise have no slope between them, so that the peak may be half a cell off.
+        // Random cells have no correlation with their neighbors: the peak may be off by half a
+        // cell.
         for matched in &found {
             let shift = matched.point - matched.direction.xy();
             let is_near = (shift - Vector2::new(1.0 / 16.0, 0.0)).norm() < 0.5 / 32.0;
@@ -301,8 +301,8 @@ mod tests {
         }
     }
 
-    /// Oracle: by hand. Images of 16 by 9 on a map of 24 by 32 cells have cells that are wider than
-    /// high: a shift by three rows is 3 / 24 of 9 / 16 of a width.
+    /// Oracle: by hand. With 16:9 images and 24 rows of 32 cells, cells are wider than high. A
+    /// shift by 3 rows is 3/24 of the height, which is 9/16 of the width.
     #[test]
     fn cells_need_not_be_square() {
         let wide = Pinhole::new(PixelCamera {
@@ -330,8 +330,8 @@ mod tests {
         }
     }
 
-    /// Oracle: the definitions. The same image twice shows no motion, and two unrelated images show
-    /// nothing.
+    /// Oracle: the definitions. Identical images give zero motion; unrelated images give no
+    /// estimate.
     #[test]
     fn equal_images_stand_still_and_unrelated_ones_tell_nothing() {
         let camera = camera();
@@ -346,9 +346,8 @@ mod tests {
         assert_eq!(unrelated.covariance[(0, 0)], 0.09);
     }
 
-    /// Oracle: blank images have no features, and an encoder's answer to its own border, which is the
-    /// same in all images without texture, is no place in a room. Maps of two encoders have no common
-    /// place either.
+    /// Oracle: the definitions. Blank images give no estimate. Nor do images without texture, which
+    /// match only by the encoder's border artifacts. Maps of different shapes are rejected.
     #[test]
     fn blank_and_foreign_maps_are_answered_or_refused() {
         let camera = camera();

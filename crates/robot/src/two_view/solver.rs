@@ -1,7 +1,7 @@
-//! The motion that explains matches best, and how sure that is.
+//! Maximum a posteriori motion from matches, with its covariance.
 //!
-//! A motion (R, t) is `first_from_second`: the second camera in the frame of the first; small steps
-//! (v, ω) follow it.
+//! A motion (R, t) is `first_from_second`, the pose of the second camera in the first. Small steps
+//! (v, ω) are applied on its right.
 
 use nalgebra::{
     Cholesky, Matrix2x6, Matrix3, Matrix6, Rotation3, Translation3, UnitQuaternion, Vector2,
@@ -11,20 +11,20 @@ use nalgebra::{
 use super::Match;
 use seese3_core::geometry::Pose;
 
-/// The prior of log ρ, ρ the inverse depth per metre, at a place (x, y) of the image plane: the
-/// factors of 1, x, y, x², xy and y².
+/// Prior mean of log ρ, ρ the inverse depth in 1/m, at a point (x, y) in normalized coordinates:
+/// coefficients of 1, x, y, x², xy and y².
 const LOG_INVERSE_DEPTH: [f64; 6] = [-0.9446, -0.1065, -0.0705, 0.4672, 0.0214, 0.2502];
 
-/// Standard deviations of log ρ about that prior: the one that explains the matches best is taken.
+/// Candidate standard deviations of log ρ; the solution with the lowest cost is kept.
 const DEPTH_SPREADS: [f64; 2] = [0.15, 0.3];
 
 /// Degrees of freedom of the Student-t distribution of a match.
 const DEGREES_OF_FREEDOM: f64 = 4.0;
 
-/// Standard deviation of the rotation before anything is seen, radians.
+/// Prior standard deviation of the rotation, radians.
 const ROTATION_PRIOR: f64 = 1.0;
 
-/// Translations that the search begins at, metres.
+/// Initial translations of the search, meters.
 const STARTS: [[f64; 3]; 5] = [
     [0.0, 0.0, 0.0],
     [0.2, 0.0, 0.0],
@@ -33,75 +33,76 @@ const STARTS: [[f64; 3]; 5] = [
     [0.0, 0.0, -0.2],
 ];
 
-/// The matches' deviations are first taken as larger, so that the search passes over small dips:
-/// factors, and the most steps with each.
+/// Annealing schedule: a factor on the match deviations and the maximum number of steps with it.
+/// Larger deviations smooth out local minima.
 const ANNEALING: [(f64, usize); 2] = [(8.0, 4), (3.0, 4)];
 
-/// How many of the best ends of these searches are followed to the bottom, and the most steps.
+/// Number of the best annealed solutions that are refined, and the maximum number of steps.
 const FINISHED: usize = 2;
 const LAST_STEPS: usize = 12;
 
-/// The Cauchy scale of the first rotation: a match that is farther off counts little, radians.
+/// Cauchy scale of the initial rotation fit, radians.
 const FIRST_GUESS_SCALE: f64 = 0.05;
 
-/// Neighbouring matches err together: so many count as one.
+/// Number of matches that count as one independent match, since errors of neighbors are correlated.
 const DEPENDENCE: f64 = 300.0;
 
-/// Where the images leave the translation open it goes towards none: its spread before anything is
-/// seen, as a share of the translation found, and metres.
+/// Zero-mean prior of the translation: its standard deviation as a fraction of the estimated
+/// length, and in meters. It shrinks a translation that the matches constrain poorly.
 const SHRINKAGE: (f64, f64) = (0.8, 0.02);
 
-/// The covariance beside what the matches say.
+/// Scale factors and additional terms of the final covariance.
 mod spread {
-    /// Factor of the covariance of the matches.
+    /// Factor on the covariance from the matches.
     pub const MATCHES: f64 = 0.47;
-    /// The length of the translation, as a share of it: the depths have a scale of their own.
+    /// Standard deviation of the scale of the translation, as a fraction of its length: scene
+    /// depths differ from the prior by a common factor.
     pub const SCALE: f64 = 0.31;
-    /// Every component of the translation: as a share of it, and metres.
+    /// Standard deviation of each translation component: fraction of the length, and meters.
     pub const SHARE: f64 = 0.10;
     pub const METRES: f64 = 0.006;
-    /// Every component of the rotation: as a share of it, and radians.
+    /// Standard deviation of each rotation component: fraction of the angle, and radians.
     pub const TURN_SHARE: f64 = 0.06;
     pub const RADIANS: f64 = 0.004;
-    /// Factor of all.
+    /// Factor on the sum of all terms.
     pub const ALL: f64 = 1.165;
 }
 
-/// A motion, and what each match says of it.
+/// A motion hypothesis with the residuals of all matches.
 pub(super) struct Found<'a> {
     matches: &'a [Match],
-    /// Factor of the matches' deviations.
+    /// Factor on the deviations of the matches.
     factor: f64,
     depth_spread: f64,
     rotation: Rotation3<f64>,
     translation: Vector3<f64>,
     seen: Vec<MatchedPoint>,
-    /// Twice the negative logarithm of the posterior density.
+    /// Twice the negative log posterior density, up to a constant.
     cost: f64,
 }
 
-/// A match under a motion.
+/// A match evaluated under a motion hypothesis.
 #[derive(Clone, Copy)]
 struct MatchedPoint {
-    /// log ρ, beyond its prior mean.
+    /// log ρ minus its prior mean.
     excess: f64,
     inverse_depth: f64,
-    /// The direction in the second camera, scaled to depth 1 in the first.
+    /// Vector to the point in the second camera's frame, in units of the depth in the first.
     direction: Vector3<f64>,
-    /// The depth in the second camera, of depth 1 in the first; at least 0.05.
+    /// Depth in the second camera, in units of the depth in the first; at least 0.05.
     depth: f64,
-    /// Where it should be seen, and the match's point relative to that.
+    /// Predicted point in the second image, and the residual of the match.
     expected: Vector2<f64>,
     residual: Vector2<f64>,
-    /// Derivative of `expected` by log ρ.
+    /// Derivative of `expected` with respect to log ρ.
     by_depth: Vector2<f64>,
-    /// The variance that the unknown depth gives to the point, relative to the match's own.
+    /// Variance of the point due to the unknown depth, divided by the match's own variance.
     depth_share: f64,
-    /// Weight of the match, of (ν + 2) / ν at most.
+    /// Student-t weight of the match, at most (ν + 2) / ν.
     weight: f64,
 }
 
-/// The most probable motion for the matches.
+/// Finds the most probable motion for the matches.
 pub(super) fn solve(matches: &[Match]) -> Found<'_> {
     let rotation = rotation_alone(matches);
     let unmoved = Guess {
@@ -142,7 +143,7 @@ pub(super) fn solve(matches: &[Match]) -> Found<'_> {
     best
 }
 
-/// A motion, and how far the logarithm of each match's inverse depth is from its prior mean.
+/// A motion, with each match's log inverse depth minus its prior mean.
 #[derive(Clone)]
 struct Guess {
     rotation: Rotation3<f64>,
@@ -150,8 +151,8 @@ struct Guess {
     excess: Vec<f64>,
 }
 
-/// The rotation between the directions of the matches, as if there were no translation: Wahba's
-/// problem, with Cauchy weights against what does not fit.
+/// Fits a rotation to the directions of the matches with zero translation: Wahba's problem, with
+/// Cauchy weights against outliers.
 fn rotation_alone(matches: &[Match]) -> Rotation3<f64> {
     let ends: Vec<[Vector3<f64>; 2]> = matches
         .iter()
@@ -171,7 +172,7 @@ fn rotation_alone(matches: &[Match]) -> Rotation3<f64> {
             sum += first * second.transpose() * (weight / matched.deviation.powi(2));
         }
 
-        // The orthogonal factor, with the weakest axis turned where it would be a mirror.
+        // Nearest rotation by SVD; flip the weakest axis if the result is a reflection.
         let svd = sum.svd(true, true);
         let (Some(left), Some(right)) = (svd.u, svd.v_t) else {
             return rotation;
@@ -189,7 +190,7 @@ fn rotation_alone(matches: &[Match]) -> Rotation3<f64> {
 }
 
 impl<'a> Found<'a> {
-    /// The matches under a motion, each with the depth that suits it best, sought from the guess on.
+    /// Evaluates the matches under a motion; each depth is optimized, starting from the guess.
     fn at(matches: &'a [Match], factor: f64, depth_spread: f64, guess: Guess) -> Self {
         let Guess {
             rotation,
@@ -231,7 +232,7 @@ impl<'a> Found<'a> {
         }
     }
 
-    /// The motion and the depths, from which another search can go on.
+    /// The motion and the depths, as the start of another search.
     fn guess(&self) -> Guess {
         Guess {
             rotation: self.rotation,
@@ -240,7 +241,7 @@ impl<'a> Found<'a> {
         }
     }
 
-    /// Goes downhill by Levenberg–Marquardt steps.
+    /// Minimizes the cost by Levenberg–Marquardt, with at most `steps` steps.
     fn descend(&mut self, steps: usize) {
         let mut damping = 1e-4;
         for _ in 0..steps {
@@ -274,7 +275,7 @@ impl<'a> Found<'a> {
         }
     }
 
-    /// The same matches under this motion followed by a small one, ordered (v, ω).
+    /// Evaluates the matches under this motion followed by a small step, ordered (v, ω).
     fn moved(&self, step: &Vector6<f64>) -> Self {
         let linear = step.fixed_rows::<3>(0).into_owned();
         let angular = step.fixed_rows::<3>(3).into_owned();
@@ -287,8 +288,9 @@ impl<'a> Found<'a> {
         Self::at(self.matches, self.factor, self.depth_spread, guess)
     }
 
-    /// The matches' information on a small motion that follows, ordered (v, ω), with every depth
-    /// eliminated; what the variance by unknown depths adds to it; and the gradient downhill.
+    /// Normal equations of a small step on the right, ordered (v, ω), with every depth eliminated:
+    /// the information matrix, the additional curvature due to the unknown depths, and the negative
+    /// gradient.
     fn normal_equations(&self) -> (Matrix6<f64>, Matrix6<f64>, Vector6<f64>) {
         let shift = self.rotation.inverse() * self.translation;
         let mut information = Matrix6::zeros();
@@ -310,7 +312,7 @@ impl<'a> Found<'a> {
             gradient +=
                 seen.weight * (rows.transpose() * seen.residual / variance - mixed * (slope / own));
 
-            // The determinant of the variance, whose depth share is k |(I, −h) shift|².
+            // Log-determinant term: the depth share is k |(I, −h) shift|², with h = `expected`.
             let share = (seen.inverse_depth * self.depth_spread / seen.depth).powi(2)
                 / variance
                 / (1.0 + seen.depth_share);
@@ -334,14 +336,14 @@ impl<'a> Found<'a> {
         (information, depth_curvature, gradient)
     }
 
-    /// How many matches agree with the motion: the sum of their weights, 0 to 1 each.
+    /// Effective number of inlier matches: the sum of their weights, 0 to 1 each.
     pub fn support(&self) -> f64 {
         let most = (DEGREES_OF_FREEDOM + 2.0) / DEGREES_OF_FREEDOM;
         self.seen.iter().map(|seen| seen.weight / most).sum()
     }
 
-    /// The motion, drawn towards no translation where the matches leave it open, and the covariance
-    /// of ξ in true = motion · exp(ξ), ordered (v, ω). None if the matches are degenerate.
+    /// The motion after shrinkage of the translation, and the covariance of ξ in
+    /// true = motion · exp(ξ), ordered (v, ω). `None` if the matches are degenerate.
     pub fn shrunk_with_covariance(&self) -> Option<(Pose, Matrix6<f64>)> {
         let (share, metres) = SHRINKAGE;
         let (information, ..) = self.normal_equations();
@@ -382,8 +384,8 @@ impl<'a> Found<'a> {
 }
 
 impl MatchedPoint {
-    /// A match whose direction in the second camera's axes is `turned`, seen from `shift` away in
-    /// these axes, with the depth that suits it best.
+    /// Evaluates a match at its most probable depth. `turned` is its direction and `shift` the
+    /// translation, both in the axes of the second camera.
     fn of(
         matched: &Match,
         turned: Vector3<f64>,
@@ -429,12 +431,13 @@ impl MatchedPoint {
         seen
     }
 
-    /// The squared Mahalanobis distance of the point and of the depth from what is expected.
+    /// Squared Mahalanobis distance of the point from its prediction and of log ρ from its prior
+    /// mean.
     fn distance(&self, deviation: f64, depth_spread: f64) -> f64 {
         self.residual.norm_squared() / deviation.powi(2) + (self.excess / depth_spread).powi(2)
     }
 
-    /// Derivative of `expected` by a small motion that follows, ordered (v, ω).
+    /// Derivative of `expected` with respect to a small step on the right, ordered (v, ω).
     fn by_motion(&self) -> Matrix2x6<f64> {
         let mut rows = Matrix2x6::zeros();
         for axis in 0..2 {
@@ -453,7 +456,7 @@ impl MatchedPoint {
     }
 }
 
-/// The mean of log ρ in the direction of a point of the image plane.
+/// Prior mean of log ρ in a direction of depth 1.
 fn log_inverse_depth(direction: Vector3<f64>) -> f64 {
     let [x, y] = [direction.x, direction.y];
     let terms = [1.0, x, y, x * x, x * y, y * y];
