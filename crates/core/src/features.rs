@@ -34,6 +34,7 @@ pub const UNSPECIFIED: &str = "unspecified";
 /// The source of features: encoder, layer, pooling and preprocessing. Features of different sources
 /// are never mixed: an adapter accepts only those of its training source.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct FeatureSource {
     /// Short name of the features in a room, for instance `effnet-block14`.
     pub name: String,
@@ -52,6 +53,7 @@ pub struct FeatureSource {
     /// Image preprocessing, as text that ends in its hash, or `unspecified`.
     pub preprocess: String,
     /// The number of columns of a feature.
+    #[cfg_attr(feature = "serde", serde(default))]
     pub dim: usize,
 }
 

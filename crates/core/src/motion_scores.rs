@@ -14,23 +14,43 @@ pub const LEAST_DIRECTED_M: f64 = 1e-3;
 /// R² = 1 − Σ(y − ŷ)² / Σ(y − ȳ)², with ȳ the mean of the evaluated targets (scikit-learn's
 /// `r2_score`).
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct MotionScores {
     /// Number of pairs.
     pub n: usize,
     /// R² of each component, (v, ω); NaN for a constant component.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "nulls_as_nan"))]
     pub components: [f64; 6],
     /// Mean of the components' R².
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "null_as_nan"))]
     pub overall: f64,
     /// Mean over the components of v.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "null_as_nan"))]
     pub translation: f64,
     /// Mean over the components of ω.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "null_as_nan"))]
     pub rotation: f64,
     /// Mean R² of the components of v/|v|, over pairs with |v| > 1 mm.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "null_as_nan"))]
     pub direction: f64,
     /// R² of |v|.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "null_as_nan"))]
     pub magnitude: f64,
     /// Number of pairs excluded from `direction`, with |v| of at most 1 mm.
     pub direction_pairs_dropped: usize,
+}
+
+/// An undefined score is NaN, which JSON writes as null.
+#[cfg(feature = "serde")]
+fn null_as_nan<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    let score: Option<f64> = serde::Deserialize::deserialize(deserializer)?;
+    Ok(score.unwrap_or(f64::NAN))
+}
+
+#[cfg(feature = "serde")]
+fn nulls_as_nan<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<[f64; 6], D::Error> {
+    let scores: [Option<f64>; 6] = serde::Deserialize::deserialize(deserializer)?;
+    Ok(scores.map(|score| score.unwrap_or(f64::NAN)))
 }
 
 impl MotionScores {

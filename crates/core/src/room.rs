@@ -55,6 +55,11 @@ pub const MAX_FRAMES: usize = 10_000_000;
 
 /// The name of a room, which is also the name of its folder in the store.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(try_from = "String", into = "String")
+)]
 pub struct RoomId(String);
 
 impl RoomId {
@@ -75,6 +80,20 @@ impl RoomId {
     /// The name.
     pub fn as_str(&self) -> &str {
         &self.0
+    }
+}
+
+impl TryFrom<String> for RoomId {
+    type Error = Error;
+
+    fn try_from(name: String) -> Result<Self, Error> {
+        Self::new(&name)
+    }
+}
+
+impl From<RoomId> for String {
+    fn from(room: RoomId) -> Self {
+        room.0
     }
 }
 
@@ -113,6 +132,7 @@ impl fmt::Display for FrameId {
 
 /// Origin of a room.
 #[derive(Debug, Clone, PartialEq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Provenance {
     /// Source format, for instance `7scenes`.
     pub format: String,
@@ -123,6 +143,10 @@ pub struct Provenance {
     /// Largest entry of |RRᵀ − I| over all rotations, before the projection onto SO(3).
     pub worst_rotation_deviation: f64,
     /// The camera that took the images, if known.
+    #[cfg_attr(
+        feature = "serde",
+        serde(default, skip_serializing_if = "Option::is_none")
+    )]
     pub camera: Option<Pinhole>,
 }
 

@@ -93,14 +93,11 @@ pub(super) fn assembled(
 
     let tensors = TensorReader::new(file, bytes)?;
     let error_model = error_model::read(&tensors, file)?;
-    let mixing = body
-        .training
-        .mixing()
-        .map_err(|problem| damaged(problem.into()))?;
 
     // The tensor names follow from the number of charts and their mixing, both stored in the
     // manifest.
-    let network = Mixture::from_tensors(body.training.charts, mixing, |name| {
+    let config = &body.training.config;
+    let network = Mixture::from_tensors(config.charts, config.mixing, |name| {
         read_weights(&tensors, name)
     });
     let network = network.map_err(|error| error.within(file))?;
@@ -119,7 +116,7 @@ pub(super) fn assembled(
     let correctors = read_correctors(&tensors, &body.training, network.coordinate_count(), file)?;
 
     // Each optional part is checked as it is added.
-    let adapter = Adapter::new(body.source.into(), network, scale)
+    let adapter = Adapter::new(body.source, network, scale)
         .and_then(|adapter| adapter.with_correctors(correctors))
         .and_then(|adapter| match error_covariance {
             Some(covariance) => adapter.with_error_covariance(covariance),
@@ -134,10 +131,7 @@ pub(super) fn assembled(
     // The checksums prove that the file is intact. The golden vectors prove that this program, on
     // this machine, still computes the same function.
     check_golden(&adapter, &tensors, file)?;
-    let record = body.training.record().map_err(|word| Error::Damaged {
-        file: manifest.to_owned(),
-        problem: format!("has {word}, which this program does not know").into(),
-    })?;
+    let record = body.training.into();
 
     let room_fit = match body.fitted_to {
         Some(entry) => Some(room_fit::read(entry, &tensors, file)?),
@@ -191,11 +185,7 @@ fn read_correctors(
     coordinate_count: usize,
     file: &str,
 ) -> Result<Vec<Corrector<f32>>, Error> {
-    let corrector = |name: &String| {
-        let kind = CorrectorKind::from_name(name).ok_or_else(|| Error::Damaged {
-            file: file.to_owned(),
-            problem: format!("has a corrector '{name}', which this program does not know").into(),
-        })?;
+    let corrector = |&kind: &CorrectorKind| {
         let read = |tensor: &str| read_weights(tensors, &corrector_tensor(kind, tensor));
 
         Corrector::from_tensors(kind, coordinate_count, read).map_err(|error| error.within(file))

@@ -98,7 +98,7 @@ impl Store {
         let bytes = adapter_file(name, adapter, features, room_fit)?;
         let body = AdapterBody {
             schema: SCHEMA,
-            source: adapter.source().into(),
+            source: adapter.source().clone(),
             twist_frame: TWIST_FRAME.to_owned(),
             // σ of the targets is divided by n, not by n − 1.
             deviation_ddof: 0,

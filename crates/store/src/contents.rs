@@ -142,7 +142,7 @@ fn room_summary(body: &RoomBody) -> ManifestSummary {
     let features: Vec<&str> = body
         .features
         .iter()
-        .map(|entry| entry.source.name())
+        .map(|entry| entry.source.name.as_str())
         .collect();
     let features = match features.as_slice() {
         [] => "no features".to_owned(),
@@ -157,7 +157,7 @@ fn room_summary(body: &RoomBody) -> ManifestSummary {
 }
 
 fn adapter_summary(body: &AdapterBody) -> ManifestSummary {
-    let features = body.source.name();
+    let features = body.source.name.as_str();
     let about = match &body.fitted_to {
         Some(fit) => format!(
             "for {features}, fitted to rooms/{}/revisions/{}",

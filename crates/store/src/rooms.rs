@@ -93,7 +93,7 @@ fn features_to_keep(newest: &RoomBody, published: &[FeaturesEntry]) -> Vec<Featu
     let is_published = |entry: &&FeaturesEntry| {
         published
             .iter()
-            .any(|other| other.source.name() == entry.source.name())
+            .any(|other| other.source.name == entry.source.name)
     };
 
     newest
@@ -184,7 +184,7 @@ impl Store {
                 frame_names: objects.frame_names.clone(),
                 images: objects.images.clone(),
                 features: objects.features.clone(),
-                provenance: room.provenance().into(),
+                provenance: room.provenance().clone(),
             };
 
             // Row i of the features belongs to frame i, so earlier features remain valid while the
@@ -211,7 +211,7 @@ impl Store {
 
             // A fixed order makes equal content compare equal.
             body.features
-                .sort_by(|a, b| a.source.name().cmp(b.source.name()));
+                .sort_by(|a, b| a.source.name.cmp(&b.source.name));
 
             if let Some(unchanged) = unchanged(&folder, &body, newest) {
                 return Ok(unchanged);
@@ -297,7 +297,7 @@ impl Store {
                 .write_object(folder, &stem, "safetensors", features_file(set)?)
                 .await?;
             entries.push(FeaturesEntry {
-                source: set.source().into(),
+                source: set.source().clone(),
                 object,
             });
         }
@@ -355,7 +355,7 @@ impl Store {
         let known: Vec<String> = body
             .features
             .iter()
-            .map(|entry| entry.source.name().to_owned())
+            .map(|entry| entry.source.name.to_owned())
             .collect();
 
         let unknown = |wanted: &str| Error::UnknownFeatures {
@@ -467,7 +467,7 @@ impl Store {
     ) -> Result<RoomSummary, Error> {
         let (folder, revision) = self.resolve(Kind::Room, name, revision).await?;
         let body = self.room_body(&folder, revision).await?;
-        let sources = body.features.into_iter().map(|entry| entry.source.into());
+        let sources = body.features.into_iter().map(|entry| entry.source);
 
         Ok(RoomSummary {
             room: body.room,
@@ -475,7 +475,7 @@ impl Store {
             created: body.created,
             frame_count: body.frame_count,
             features: sources.collect(),
-            provenance: body.provenance.into(),
+            provenance: body.provenance,
         })
     }
 
@@ -603,19 +603,18 @@ impl Store {
 
         // The checksums prove that the files are intact; `Room::new` checks that they form a valid
         // room, for instance that all columns have the same length.
-        let room =
-            Room::new(id, frames, body.provenance.into()).map_err(|error| damaged(error.into()))?;
+        let room = Room::new(id, frames, body.provenance).map_err(|error| damaged(error.into()))?;
         let mut features = Vec::new();
 
         // `only` selects one feature set by name; without it, all are loaded.
         for entry in body
             .features
             .into_iter()
-            .filter(|entry| only.is_none_or(|name| name == entry.source.name()))
+            .filter(|entry| only.is_none_or(|name| name == entry.source.name))
         {
             let (file, bytes) = self.read_object(&folder, &entry.object).await?;
             let rows = read_features(&file, &bytes)?;
-            let set = Features::new(entry.source.into(), rows).map_err(|error| Error::Damaged {
+            let set = Features::new(entry.source, rows).map_err(|error| Error::Damaged {
                 file: file.clone(),
                 problem: error.into(),
             })?;

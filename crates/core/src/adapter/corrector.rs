@@ -15,12 +15,19 @@ use super::{Adapter, At, Error, Network, Objective, Reading, Real, Samples, Trai
 
 /// The architecture of a corrector.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(rename_all = "kebab-case")
+)]
 pub enum CorrectorKind {
     /// One linear layer.
     Linear,
     /// One hidden layer of width 64.
+    #[cfg_attr(feature = "serde", serde(rename = "mlp-2"))]
     Mlp2,
     /// Two hidden layers of width 128.
+    #[cfg_attr(feature = "serde", serde(rename = "mlp-3"))]
     Mlp3,
     /// One attention block over two tokens, the latent and the motion.
     Attention,

@@ -9,9 +9,15 @@ const COSINE_EPS: f64 = 1e-8;
 
 /// The training loss. Source: SeeSE3, Sec. A.6.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(rename_all = "kebab-case")
+)]
 pub enum Loss {
     /// The mean over batch and components of (y − t)², the paper's default.
     #[default]
+    #[cfg_attr(feature = "serde", serde(rename = "mse"))]
     MeanSquaredError,
     /// The mean over the batch of 1 − cos(y, t), both as vectors of six numbers.
     Cosine,

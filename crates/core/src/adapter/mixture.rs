@@ -26,6 +26,11 @@ struct Gate<T> {
 
 /// How charts are mixed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(rename_all = "kebab-case")
+)]
 pub enum Mixing {
     /// Weights from a gate that is trained together with the charts, as in the paper. A single
     /// chart has no gate.

@@ -12,6 +12,7 @@ use super::{At, Error, LATENT_DIM, Loss, Mixing, Mixture, Objective, Real, Sampl
 
 /// Training settings. They are recorded with the adapter.
 #[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct TrainConfig {
     /// Number of passes over the pairs.
     pub epochs: usize,

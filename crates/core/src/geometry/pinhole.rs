@@ -41,10 +41,49 @@ pub struct PixelCamera {
 
 /// A pinhole camera with square pixels. Lengths are in image widths, independent of the image size.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(try_from = "PinholeFields", into = "PinholeFields")
+)]
 pub struct Pinhole {
     focal: f64,
     height: f64,
     centre: Vector2<f64>,
+}
+
+/// The serialized form of a [`Pinhole`]. Unit: image widths.
+#[cfg(feature = "serde")]
+#[derive(serde::Serialize, serde::Deserialize)]
+struct PinholeFields {
+    focal: f64,
+    height: f64,
+    centre: [f64; 2],
+}
+
+#[cfg(feature = "serde")]
+impl TryFrom<PinholeFields> for Pinhole {
+    type Error = PinholeError;
+
+    fn try_from(fields: PinholeFields) -> Result<Self, PinholeError> {
+        Self::new(PixelCamera {
+            width: 1.0,
+            height: fields.height,
+            focal: fields.focal,
+            centre: Some(fields.centre.into()),
+        })
+    }
+}
+
+#[cfg(feature = "serde")]
+impl From<Pinhole> for PinholeFields {
+    fn from(camera: Pinhole) -> Self {
+        Self {
+            focal: camera.focal,
+            height: camera.height,
+            centre: camera.centre.into(),
+        }
+    }
 }
 
 impl Pinhole {

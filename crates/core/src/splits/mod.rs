@@ -50,6 +50,11 @@ pub struct Pair {
 
 /// Split of frames or pairs into a training side and a test side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(try_from = "String", into = "String")
+)]
 pub enum Split {
     /// The first 80 % of the frames train, the rest test; both frames of a pair are on the same
     /// side. The paper's split.
@@ -69,6 +74,20 @@ pub enum Split {
     /// Every pair is both a training and a test pair: for rooms that are trained on, or held out,
     /// as a whole.
     Whole,
+}
+
+impl TryFrom<String> for Split {
+    type Error = String;
+
+    fn try_from(name: String) -> Result<Self, String> {
+        Self::from_name(&name).ok_or_else(|| format!("'{name}' is not a split"))
+    }
+}
+
+impl From<Split> for String {
+    fn from(split: Split) -> Self {
+        split.name().to_owned()
+    }
 }
 
 impl Split {

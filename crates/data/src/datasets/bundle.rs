@@ -53,19 +53,8 @@ struct Bundle {
     /// image widths, if known.
     #[serde(default)]
     camera: Option<[f64; 4]>,
-    features: Vec<Made>,
-}
-
-/// The source of `features_NAME.npy`, see [`FeatureSource`].
-#[derive(Clone, Debug, Serialize, Deserialize)]
-struct Made {
-    name: String,
-    encoder: String,
-    layer: String,
-    base: String,
-    norm: String,
-    pooling: String,
-    preprocess: String,
+    /// The source of each `features_NAME.npy`.
+    features: Vec<FeatureSource>,
 }
 
 /// Reads a folder of NumPy files, of which only `poses.npy` is required.
@@ -201,7 +190,11 @@ fn stated_camera(camera: Pinhole) -> [f64; 4] {
 
 /// Replaces the placeholder source of every array by the one in `bundle.json`. The arrays and the
 /// list must match: an unlisted array is an error, and so is a missing listed one.
-fn with_sources(read: Vec<Features>, stated: &[Made], file: &Path) -> Result<Vec<Features>, Error> {
+fn with_sources(
+    read: Vec<Features>,
+    stated: &[FeatureSource],
+    file: &Path,
+) -> Result<Vec<Features>, Error> {
     let malformed = |problem: Cause| Error::Malformed {
         file: file.to_owned(),
         problem,
@@ -210,35 +203,16 @@ fn with_sources(read: Vec<Features>, stated: &[Made], file: &Path) -> Result<Vec
     let mut features: Vec<Features> = Vec::with_capacity(read.len());
     for set in read {
         let array = &set.source().name;
-        let made = stated.iter().find(|made| made.name == *array);
-        let made =
-            made.ok_or_else(|| malformed(format!("does not list features_{array}.npy").into()))?;
+        let source = stated.iter().find(|source| source.name == *array);
+        let source = source
+            .ok_or_else(|| malformed(format!("does not list features_{array}.npy").into()))?;
 
-        // Destructured with no `..`, so that a new field breaks the build here.
-        let Made {
-            name,
-            encoder,
-            layer,
-            base,
-            norm,
-            pooling,
-            preprocess,
-        } = made.clone();
-        let source = FeatureSource {
-            name,
-            encoder,
-            layer,
-            base,
-            norm,
-            pooling,
-            preprocess,
-            dim: set.source().dim,
-        };
-        features.push(checked(source, set.rows().to_owned(), file)?);
+        features.push(checked(source.clone(), set.rows().to_owned(), file)?);
     }
 
-    let is_missing = |made: &&Made| features.iter().all(|set| set.source().name != made.name);
-    if let Some(Made { name, .. }) = stated.iter().find(is_missing) {
+    let is_missing =
+        |source: &&FeatureSource| features.iter().all(|set| set.source().name != source.name);
+    if let Some(FeatureSource { name, .. }) = stated.iter().find(is_missing) {
         return Err(malformed(
             format!("names features '{name}', but features_{name}.npy is missing").into(),
         ));
@@ -346,30 +320,7 @@ fn described(room: &Room, features: &[Features]) -> Bundle {
         held_out: frames.held_out.clone(),
         worst_rotation_deviation: provenance.worst_rotation_deviation,
         camera: provenance.camera.map(stated_camera),
-        features: features.iter().map(|set| made(set.source())).collect(),
-    }
-}
-
-fn made(source: &FeatureSource) -> Made {
-    let FeatureSource {
-        name,
-        encoder,
-        layer,
-        base,
-        norm,
-        pooling,
-        preprocess,
-        dim: _,
-    } = source.clone();
-
-    Made {
-        name,
-        encoder,
-        layer,
-        base,
-        norm,
-        pooling,
-        preprocess,
+        features: features.iter().map(|set| set.source().clone()).collect(),
     }
 }
 
