@@ -3,7 +3,7 @@
 
 use tonic::{Request, Response, Status};
 
-use super::odometry::{EmbeddedView, ViewReader};
+use super::embedding::RequestAdapter;
 use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
@@ -42,28 +42,31 @@ fn answer(
         ));
     }
 
-    let reader = ViewReader::of(snapshot, &room, &adapter)?;
+    let chosen = RequestAdapter::of(snapshot, &room, &adapter)?;
+    let embedder = chosen.embedder(snapshot);
     let mut encoded = Vec::with_capacity(views.len());
     for (position, view) in views.into_iter().enumerate() {
         cancel.check()?;
-        let EmbeddedView { latent, feature } =
-            reader.embedded(&format!("views[{position}]"), Some(view))?;
+        let embedded = embedder.embed(&format!("views[{position}]"), Some(view))?;
 
         encoded.push(pb::EncodedView {
             latent: Some(pb::Latent {
-                values: latent.to_vec(),
+                values: embedded.latent.to_vec(),
             }),
-            feature: feature.filter(|_| with_features).map(|values| pb::Feature {
-                values,
-                source_name: reader.stored.adapter.source().name.clone(),
-            }),
+            feature: embedded
+                .feature
+                .filter(|_| with_features)
+                .map(|values| pb::Feature {
+                    values,
+                    source_name: chosen.stored.adapter.source().name.clone(),
+                }),
         });
     }
 
     Ok(pb::EncodeResponse {
         adapter: Some(pb::Revision {
-            name: reader.stored.name.clone(),
-            revision: reader.stored.revision,
+            name: chosen.stored.name.clone(),
+            revision: chosen.stored.revision,
         }),
         views: encoded,
     })

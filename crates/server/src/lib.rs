@@ -25,6 +25,7 @@ mod telemetry;
 mod two_views;
 mod snapshot;
 mod convert;
+mod embedding;
 mod reload;
 mod catalog;
 mod evaluation;

@@ -1,24 +1,19 @@
 //! OdometryService: EstimateMotion, which estimates the motion between two views. Track is in
 //! `track`, Encode in `encoding`.
 
-use std::sync::Arc;
-
 use ndarray::Array1;
 use tonic::{Request, Response, Status};
 
 use super::convert;
-use super::snapshot::ServedNavigator;
-use super::status::view_error;
+use super::embedding::RequestAdapter;
 use super::workers::Lane;
 use super::{Error, Handlers, Snapshot};
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::odometry_service_server::OdometryService;
 use seese3_core::cancel::Cancellation;
 use seese3_core::geometry::{body_twist, exp};
-use seese3_core::navigation::{Source, StepError};
+use seese3_core::navigation::StepError;
 use seese3_core::room::FrameId;
-use seese3_robot::tracking::View;
-use seese3_store::StoredAdapter;
 
 #[tonic::async_trait]
 impl OdometryService for Handlers {
@@ -93,8 +88,9 @@ fn by_adapter(
 
     let thresholds = convert::thresholds(thresholds)?;
 
-    let reader = ViewReader::of(snapshot, &room, &adapter)?;
-    let stored = reader.stored.clone();
+    let chosen = RequestAdapter::of(snapshot, &room, &adapter)?;
+    let embedder = chosen.embedder(snapshot);
+    let stored = chosen.stored.clone();
 
     // If both views are stored frames, the recorded motion between them is reported too.
     let frame_of =
@@ -106,7 +102,7 @@ fn by_adapter(
 
     let latent = |field: &str, given| -> Result<Array1<f64>, Error> {
         cancel.check()?;
-        Ok(reader.embedded(field, given)?.latent)
+        Ok(embedder.embed(field, given)?.latent)
     };
 
     let first = latent("first", first)?;
@@ -114,7 +110,7 @@ fn by_adapter(
     let twist = stored.adapter.motion(first.view(), second.view());
 
     // `latent` has checked that both frames exist.
-    let truth = reader
+    let truth = chosen
         .served
         .as_ref()
         .zip(frames)
@@ -199,95 +195,5 @@ fn image(view: Option<&pb::View>) -> Option<&[u8]> {
     match view?.view.as_ref()? {
         pb::view::View::Image(image) => Some(image),
         _ => None,
-    }
-}
-
-/// Embeds views with one adapter. Stored frames are looked up in its room, if it has one.
-pub(super) struct ViewReader<'a> {
-    snapshot: &'a Snapshot,
-    served: Option<Arc<ServedNavigator>>,
-    pub stored: Arc<StoredAdapter>,
-}
-
-/// A view embedded by an adapter.
-pub(super) struct EmbeddedView {
-    /// Shape (k,).
-    pub latent: Array1<f64>,
-    /// The raw feature, shape (d,); `None` for a latent or a stored frame.
-    pub feature: Option<Vec<f32>>,
-}
-
-impl<'a> ViewReader<'a> {
-    /// A reader for an adapter and, if `room` is not empty, that room. Only stored frames need a
-    /// room.
-    pub fn of(snapshot: &'a Snapshot, room: &str, adapter: &str) -> Result<Self, Error> {
-        if room.is_empty() {
-            return Ok(Self {
-                snapshot,
-                served: None,
-                stored: adapter_without_room(snapshot, adapter)?.clone(),
-            });
-        }
-
-        let served = snapshot.navigator(room, adapter)?;
-        Ok(Self {
-            snapshot,
-            stored: served.adapter.clone(),
-            served: Some(served),
-        })
-    }
-
-    /// Embeds one view. Errors name its `field`.
-    pub fn embedded(&self, field: &str, view: Option<pb::View>) -> Result<EmbeddedView, Error> {
-        let adapter = &self.stored.adapter;
-        let source = convert::source(field, view, &self.stored, self.snapshot)?;
-        let latent = |view: View| {
-            view.latent(adapter)
-                .map_err(|error| view_error(&error).within(field))
-        };
-
-        match source {
-            Source::Feature(feature) => Ok(EmbeddedView {
-                latent: latent(View::Feature(feature.clone()))?,
-                feature: Some(feature),
-            }),
-            Source::Latent(values) => Ok(EmbeddedView {
-                latent: latent(View::Latent(values))?,
-                feature: None,
-            }),
-            Source::Frame(frame) => {
-                let served = self.served.as_ref().ok_or_else(|| {
-                    Error::invalid("room", format!("is required: {field} is a frame"))
-                })?;
-
-                let unknown = |_| Error::no_frame(&format!("{field}.frame_id"), frame);
-                served.navigator.room().pose(frame).map_err(unknown)?;
-                Ok(EmbeddedView {
-                    latent: served.navigator.latents().row(frame.row()).to_owned(),
-                    feature: None,
-                })
-            }
-        }
-    }
-}
-
-/// The adapter of a request without a room: the named one, or the only one.
-fn adapter_without_room<'a>(
-    snapshot: &'a Snapshot,
-    adapter: &str,
-) -> Result<&'a Arc<StoredAdapter>, Error> {
-    if !adapter.is_empty() {
-        return snapshot.adapter(adapter);
-    }
-
-    match snapshot.adapters().len() {
-        1 => snapshot.adapters().values().next().ok_or(Error::Internal),
-        count => {
-            let problem = format!(
-                "is required when no room is named: the server has {count} adapters; with a two-view model, two images \
-                 with `camera` need no adapter"
-            );
-            Err(Error::invalid("adapter", problem))
-        }
     }
 }

@@ -3,19 +3,18 @@
 
 use std::sync::Arc;
 
-use ndarray::Array1;
 use tonic::{Request, Response, Status};
 
 use super::convert;
+use super::embedding::{EmbeddedView, StoredFrames, ViewEmbedder};
 use super::localization::{located_by, rooms_under};
 use super::snapshot::{ServedNavigator, ServedRoom, Snapshot};
-use super::status::view_error;
 use super::workers::Lane;
 use super::{Error, Handlers};
 use seese3_client::proto::v1 as pb;
 use seese3_core::cancel::Cancellation;
-use seese3_core::navigation::{RetrievedFrame, Source};
-use seese3_robot::tracking::{self, Map, MapQuery, RoomMatch, View, relocalize};
+use seese3_core::navigation::RetrievedFrame;
+use seese3_robot::tracking::{self, Map, MapQuery, RoomMatch, relocalize};
 use seese3_store::StoredAdapter;
 
 /// Default number of rooms in an answer.
@@ -102,13 +101,6 @@ fn answer(
     })
 }
 
-/// A view embedded by the adapter.
-struct EmbeddedView {
-    latent: Array1<f64>,
-    /// The raw feature; `None` if the view was a latent.
-    feature: Option<Vec<f32>>,
-}
-
 /// Embeds the views of a request. Checks for cancellation before each view, because encoding an
 /// image takes time.
 fn embedded(
@@ -117,30 +109,16 @@ fn embedded(
     snapshot: &Snapshot,
     cancel: &Cancellation,
 ) -> Result<Vec<EmbeddedView>, Error> {
+    let embedder = ViewEmbedder {
+        adapter: stored,
+        snapshot,
+        frames: StoredFrames::Refused,
+    };
+
     let mut embedded = Vec::with_capacity(views.len());
     for (position, view) in views.into_iter().enumerate() {
         cancel.check()?;
-        let field = format!("views[{position}]");
-
-        let view = match convert::source(&field, Some(view), stored, snapshot)? {
-            Source::Feature(feature) => View::Feature(feature),
-            Source::Latent(latent) => View::Latent(latent),
-            Source::Frame(_) => {
-                return Err(Error::invalid(
-                    format!("{field}.frame_id"),
-                    "is a stored frame; give a feature, a latent or an image of the camera",
-                ));
-            }
-        };
-
-        let latent = view
-            .latent(&stored.adapter)
-            .map_err(|error| view_error(&error).within(&field))?;
-        let feature = match view {
-            View::Feature(feature) => Some(feature),
-            View::Latent(_) => None,
-        };
-        embedded.push(EmbeddedView { latent, feature });
+        embedded.push(embedder.embed(&format!("views[{position}]"), Some(view))?);
     }
 
     Ok(embedded)

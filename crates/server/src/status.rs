@@ -313,12 +313,7 @@ impl From<navigation::Error> for Error {
             E::FeatureRows { .. } | E::Features(_) => return Self::Internal,
             E::SourceFrame(_) => "source.frame_id",
             E::TargetFrame(_) => "displacement.target_frame_id",
-            E::Adapter(
-                adapter::Error::NoCorrector { .. }
-                | adapter::Error::NoErrorCovariance
-                | adapter::Error::GatedMotion
-                | adapter::Error::WhitenedColumns { .. },
-            ) => "navigator",
+            E::Adapter(problem) if lacks_method(problem) => "navigator",
             E::Adapter(problem) => return view_error(problem).within("source"),
             E::Refit(_) | E::Pairs(_) => return Self::Precondition(error.to_string()),
             E::Steps { .. } => "steps",
@@ -330,6 +325,15 @@ impl From<navigation::Error> for Error {
 
         Self::invalid(field, error)
     }
+}
+
+/// Whether the adapter cannot do what the navigator asks for.
+fn lacks_method(error: &adapter::Error) -> bool {
+    use adapter::Error as E;
+    matches!(
+        error,
+        E::NoCorrector { .. } | E::NoErrorCovariance | E::GatedMotion | E::WhitenedColumns { .. }
+    )
 }
 
 /// An error for a feature or latent that does not fit the adapter. Its field is relative to the
@@ -358,17 +362,11 @@ impl From<eval::Error> for Error {
             E::Cancelled(_) | E::Navigation(navigation::Error::Cancelled(_)) => {
                 return Self::Cancelled;
             }
-            E::Navigation(navigation::Error::Adapter(
-                adapter::Error::NoCorrector { .. }
-                | adapter::Error::NoErrorCovariance
-                | adapter::Error::GatedMotion
-                | adapter::Error::WhitenedColumns { .. },
-            ))
-            | E::Adapter(
-                adapter::Error::NoErrorCovariance
-                | adapter::Error::GatedMotion
-                | adapter::Error::WhitenedColumns { .. },
-            ) => "navigators",
+            E::Navigation(navigation::Error::Adapter(problem)) | E::Adapter(problem)
+                if lacks_method(problem) =>
+            {
+                "navigators"
+            }
             E::Navigation(navigation::Error::Refit(_)) => {
                 return Self::Precondition(error.to_string());
             }

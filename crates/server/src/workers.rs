@@ -139,43 +139,23 @@ impl Workers {
         budget: Duration,
         work: impl FnOnce(&Cancellation) -> Result<T, Error> + Send + 'static,
     ) -> Result<T, Error> {
-        let pool = self.pool(lane).clone();
-        let admitted = pool.admitted.try_acquire_owned();
+        let admitted = self.pool(lane).admitted.clone().try_acquire_owned();
         let admitted = admitted.map_err(|_| self.full(lane.full()))?;
 
         // If the caller goes away, this future is dropped and the guard cancels the running work.
         let cancel = Arc::new(Cancellation::default());
         let guard = CancelOnDrop(cancel.clone());
 
-        let computed = async {
-            let thread = pool.threads.acquire_owned().await;
-            let thread = thread.map_err(|_| Error::Internal)?;
-
-            // Both permits move into the blocking task: it outlives this future if that is dropped,
-            // and the permits must be held until the computation ends.
-            let span = tracing::Span::current();
-            let task = tokio::task::spawn_blocking(move || {
-                let _thread = thread;
-                let _admitted = admitted;
-                span.in_scope(|| work(&cancel))
-            });
-
-            task.await.unwrap_or_else(|error| {
-                tracing::error!(%error, "a request panicked");
-                Err(Error::Internal)
-            })
-        };
-
-        let mut halted = self.halted.subscribe();
+        // The permit moves into the blocking task: it outlives this future if that is dropped.
+        let computed = self.on_thread(lane, move || {
+            let _admitted = admitted;
+            work(&cancel)
+        });
 
         // The budget includes the time in the queue.
-        let result = tokio::select! {
-            result = tokio::time::timeout(budget, computed) => result.unwrap_or(Err(Error::Deadline)),
-            _ = halted.wait_for(|halted| *halted) => Err(Error::Loading),
-        };
-
+        let result = tokio::time::timeout(budget, computed).await;
         drop(guard);
-        result
+        result.unwrap_or(Err(Error::Deadline))?
     }
 
     /// Runs a short piece of a stream's work on a blocking thread. The stream was admitted when it
@@ -189,14 +169,24 @@ impl Workers {
         lane: Lane,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, Error> {
+        // Short work is not cancelled; dropping the future only discards its result.
+        self.on_thread(lane, work).await
+    }
+
+    /// Runs `work` on a blocking thread of the lane as soon as one is free.
+    async fn on_thread<T: Send + 'static>(
+        &self,
+        lane: Lane,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, Error> {
         let mut halted = self.halted.subscribe();
+        let threads = self.pool(lane).threads.clone();
 
         let computed = async {
-            let threads = self.pool(lane).threads.clone();
             let thread = threads.acquire_owned().await;
             let thread = thread.map_err(|_| Error::Internal)?;
 
-            // Short work is not cancelled; dropping the future only discards its result.
+            // The permit is held until the computation ends, even if this future is dropped.
             let span = tracing::Span::current();
             let task = tokio::task::spawn_blocking(move || {
                 let _thread = thread;

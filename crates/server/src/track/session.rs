@@ -3,13 +3,11 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ndarray::Array1;
-
 use super::super::Error;
 use super::super::convert;
+use super::super::embedding::{EmbeddedView, StoredFrames, ViewEmbedder};
 use super::super::relocalization::maps;
 use super::super::snapshot::{ServedNavigator, Snapshot};
-use super::super::status::view_error;
 use super::Overtaken;
 use super::configuration::{StreamFrames, back_pressure, rooms, settings};
 use super::sealed::Sealed;
@@ -17,9 +15,8 @@ use super::sensors::Sensors;
 use super::token::TokenKey;
 use super::wire;
 use seese3_client::proto::v1 as pb;
-use seese3_core::navigation::Source;
 use seese3_robot::tracking::{
-    Observation, OtherView, PoseWithCovariance, Refusal, State, Tracker, Update, View,
+    Observation, OtherView, PoseWithCovariance, Refusal, State, Tracker, Update,
 };
 
 const FIELD: &str = "config";
@@ -355,42 +352,13 @@ impl Session {
     }
 
     /// Encodes the view in `field`. Only an image can be detected as blank.
-    fn encoded_view(&self, field: &str, view: Option<pb::View>) -> Result<SeenView, Error> {
-        let adapter = &self.served[0].adapter;
-        let (view, is_blank) = match view {
-            Some(pb::View {
-                view: Some(pb::view::View::Image(image)),
-            }) => {
-                let field = format!("{field}.image");
-                let encoder = self.encoders.image_encoder(adapter)?;
-                let pixels = encoder.decoded(&field, &image)?;
-                let is_blank = pixels.is_blank();
-                (View::Feature(encoder.feature_of(&field, pixels)?), is_blank)
-            }
-            view => match convert::source(field, view, adapter, &self.encoders)? {
-                Source::Feature(feature) => (View::Feature(feature), false),
-                Source::Latent(latent) => (View::Latent(latent), false),
-                Source::Frame(_) => {
-                    return Err(Error::invalid(
-                        format!("{field}.frame_id"),
-                        "is a stored frame; give a feature, a latent or an image of the camera",
-                    ));
-                }
-            },
+    fn encoded_view(&self, field: &str, view: Option<pb::View>) -> Result<EmbeddedView, Error> {
+        let embedder = ViewEmbedder {
+            adapter: &self.served[0].adapter,
+            snapshot: &self.encoders,
+            frames: StoredFrames::Refused,
         };
-
-        let latent = view
-            .latent(&adapter.adapter)
-            .map_err(|error| view_error(&error).within(field))?;
-        let feature = match view {
-            View::Feature(feature) => Some(feature),
-            View::Latent(_) => None,
-        };
-        Ok(SeenView {
-            latent,
-            feature,
-            is_blank,
-        })
+        embedder.embed(field, view)
     }
 
     /// Encodes the views of a frame's other cameras.
@@ -409,7 +377,7 @@ impl Session {
                 ));
             }
 
-            let SeenView {
+            let EmbeddedView {
                 latent,
                 feature,
                 is_blank,
@@ -449,7 +417,7 @@ impl Session {
             }
         };
 
-        let SeenView {
+        let EmbeddedView {
             latent,
             feature,
             is_blank,
@@ -508,13 +476,6 @@ fn without_token(answer: pb::track_response::Answer) -> pb::TrackResponse {
         answer: Some(answer),
         resume_token: Vec::new(),
     }
-}
-
-/// An encoded camera view.
-struct SeenView {
-    latent: Array1<f64>,
-    feature: Option<Vec<f32>>,
-    is_blank: bool,
 }
 
 /// Reason for a frame without an update.
