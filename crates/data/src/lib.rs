@@ -1,6 +1,31 @@
 //! Import and export of recordings, and a check of poses against images. Part of
 //! [seese3](https://docs.rs/seese3).
 //!
+//! ```
+//! use seese3_core::room::{Provenance, Room, RoomId};
+//! use seese3_data::datasets::{Reader, Unusable, read_tum};
+//! use seese3_data::pose_check::check_room;
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! # let folder = tempfile::tempdir()?;
+//! # let folder = folder.path();
+//! # std::fs::write(folder.join("groundtruth.txt"), "1.0 0 0 0 0 0 0 1\n2.0 0.1 0 0 0 0 0 1\n")?;
+//! # std::fs::write(folder.join("rgb.txt"), "1.0 rgb/1.png\n2.0 rgb/2.png\n")?;
+//! // A recording of the TUM RGB-D benchmark, as a room.
+//! let mut reader = Reader {
+//!     unusable: Unusable::Drop,
+//!     progress: &mut |_, _| (),
+//! };
+//! let recording = read_tum(folder, &mut reader)?;
+//! let room = Room::new(RoomId::new("desk")?, recording.frames, Provenance::default())?;
+//! assert_eq!(room.frame_count(), 2);
+//!
+//! // The camera moves from 0 to 0.1 m, and nothing is wrong with its path.
+//! let report = check_room(&room, None);
+//! assert!(!report.is_wrong(), "{:?}", report.warnings);
+//! # Ok(()) }
+//! ```
+//!
 //! # The map
 //!
 //! The modules are listed from the lowest layer up: each uses only those listed before it, and a test

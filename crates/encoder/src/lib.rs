@@ -4,6 +4,22 @@
 //!   output of each layer is pooled to one row.
 //! - The [`FeatureSource`] of features records everything that determines them, so that the
 //!   [`Encoder`] can be rebuilt from a source and the model's file alone.
+//!
+//! ```
+//! use seese3_core::image::RgbImage;
+//! use seese3_encoder::{BUILTIN_DIM, Encoder};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! // The built-in encoder needs no model file. A clip is one image here.
+//! let image = RgbImage {
+//!     width: 64,
+//!     height: 48,
+//!     bytes: vec![128; 64 * 48 * 3],
+//! };
+//! let features = Encoder::builtin().encode(&[vec![&image]])?;
+//! assert_eq!(features.dim(), (1, BUILTIN_DIM));
+//! # Ok(()) }
+//! ```
 
 mod builtin;
 mod decode;

@@ -1,6 +1,27 @@
 //! The laboratory of [seese3](https://docs.rs/seese3): experiments for researchers, not used by the
 //! service.
 //!
+//! ```
+//! use ndarray::Array2;
+//! use seese3_core::geometry::Pose;
+//! use seese3_lab::probes::{MutualKnn, mutual_knn};
+//!
+//! // Probe M1. Features that are the positions on a circle have the same neighbors as the poses.
+//! let angle = |frame: usize| frame as f64 / 50.0;
+//! let poses: Vec<Pose> = (0..300)
+//!     .map(|frame| {
+//!         let (sin, cos) = angle(frame).sin_cos();
+//!         Pose::new(nalgebra::Vector3::new(cos, sin, 0.0), nalgebra::Vector3::zeros())
+//!     })
+//!     .collect();
+//! let features = Array2::from_shape_fn((300, 2), |(frame, axis)| {
+//!     let (sin, cos) = angle(frame).sin_cos();
+//!     [cos, sin][axis] as f32
+//! });
+//! let score = mutual_knn(features.view(), &poses, &MutualKnn::default()).unwrap();
+//! assert!(score > 0.9, "{score}");
+//! ```
+//!
 //! The modules are listed from the lowest layer up. Each uses only those listed before it; a test
 //! enforces this.
 //!

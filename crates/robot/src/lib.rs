@@ -1,6 +1,35 @@
 //! Robot functions beyond the paper: tracking, planning, calibration, adapters fitted to one room,
 //! and motion between two views. Part of [seese3](https://docs.rs/seese3).
 //!
+//! ```
+//! use std::sync::Arc;
+//!
+//! use seese3_core::adapter::{Adapter, TrainingRecord};
+//! use seese3_core::features::Features;
+//! use seese3_core::navigation::{IndexKind, Navigator};
+//! use seese3_core::room::{FrameId, Room};
+//! use seese3_core::training::RoomData;
+//! use seese3_robot::calibration::calibrate;
+//! use seese3_robot::tracking::{Map, Tracker, TrackerSettings};
+//!
+//! /// A tracker in a mapped room, from a trained adapter and rooms that it was not trained on.
+//! fn tracker(
+//!     adapter: Adapter,
+//!     record: TrainingRecord,
+//!     calibration_rooms: &[RoomData<'_>],
+//!     room: Room,
+//!     features: &Features,
+//! ) -> Result<Tracker, Box<dyn std::error::Error>> {
+//!     let calibrated = calibrate(adapter, record, calibration_rooms)?;
+//!     let adapter = Arc::new(calibrated.adapter);
+//!
+//!     let mapped: Vec<FrameId> = (0..room.frame_count() as u32).map(FrameId).collect();
+//!     let navigator = Navigator::new(Arc::new(room), features, adapter.clone(), IndexKind::Exact)?;
+//!     let map = Map::new(Arc::new(navigator), &mapped)?;
+//!     Ok(Tracker::new(vec![Arc::new(map)], TrackerSettings::of(&adapter))?)
+//! }
+//! ```
+//!
 //! # Modules
 //!
 //! Listed from the lowest layer up: each module uses only those listed before it; a test enforces

@@ -5,6 +5,19 @@
 //! - Computation runs on a bounded number of blocking threads. A panic fails only its request.
 //! - Long work regularly checks for cancellation: it stops after the deadline, or when the caller
 //!   has gone.
+//!
+//! ```no_run
+//! use seese3_server::{Config, run};
+//! use seese3_store::Store;
+//!
+//! # async fn serve() -> Result<(), Box<dyn std::error::Error>> {
+//! let listener = tokio::net::TcpListener::bind("127.0.0.1:50051").await?;
+//! let stop = async {
+//!     let _ = tokio::signal::ctrl_c().await;
+//! };
+//! run(listener, Store::open("store")?, Config::default(), stop).await?;
+//! # Ok(()) }
+//! ```
 
 mod health;
 mod holding_body;

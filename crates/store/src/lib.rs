@@ -11,6 +11,28 @@
 //!
 //! Tensors are safetensors files; Python reads them with `safetensors.numpy.load_file(path)`.
 //! Published revisions never change.
+//!
+//! ```
+//! use seese3_core::geometry::Pose;
+//! use seese3_core::room::{Frames, Provenance, Room, RoomId};
+//! use seese3_store::Store;
+//!
+//! # #[tokio::main]
+//! # async fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! # let folder = tempfile::tempdir()?;
+//! # let location = folder.path().to_str().unwrap();
+//! let frames = Frames {
+//!     poses: vec![Pose::default(); 3],
+//!     ..Frames::default()
+//! };
+//! let room = Room::new(RoomId::new("hall")?, frames, Provenance::default())?;
+//!
+//! let store = Store::create(location)?;
+//! let published = store.publish_room(&room, &[]).await?;
+//! assert!(published.is_new && published.revision == 1);
+//! assert_eq!(store.load_room("hall", None).await?.room.frame_count(), 3);
+//! # Ok(()) }
+//! ```
 
 pub mod fit_stored_room;
 mod bucket;

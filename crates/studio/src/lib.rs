@@ -4,6 +4,15 @@
 //! - World axes: x and y along the floor, z up, metres. The floor is z = 0, and one corner of the
 //!   room is at (0, 0).
 //! - Everything is deterministic for a seed. The camera is a pinhole with square pixels.
+//!
+//! ```
+//! use seese3_studio::{Camera, Scene, camera_path, render};
+//!
+//! let scene = Scene::new(7);
+//! let path = camera_path(&scene, 3, 7);
+//! let image = render(&scene, Camera::small(), &path[0]);
+//! assert_eq!(image.bytes.len(), image.width * image.height * 3);
+//! ```
 
 mod camera_path;
 mod candidates;

@@ -1,0 +1,180 @@
+//! Embedding of the views in requests: features, latents, images and stored frames to latents of one
+//! adapter.
+
+use std::sync::Arc;
+
+use ndarray::Array1;
+
+use super::snapshot::{ServedNavigator, Snapshot};
+use super::status::view_error;
+use super::{Error, convert};
+use seese3_client::proto::v1 as pb;
+use seese3_core::navigation::Source;
+use seese3_robot::tracking::View;
+use seese3_store::StoredAdapter;
+
+/// Embeds views with one adapter.
+pub struct ViewEmbedder<'a> {
+    pub adapter: &'a StoredAdapter,
+    /// The encoders of images.
+    pub snapshot: &'a Snapshot,
+    pub frames: StoredFrames<'a>,
+}
+
+/// What a view that is a stored frame means.
+#[derive(Clone, Copy)]
+pub enum StoredFrames<'a> {
+    /// A frame of this room.
+    Of(&'a ServedNavigator),
+    /// An error: the request names no room.
+    RoomMissing,
+    /// An error: the view must be one of the camera.
+    Refused,
+}
+
+/// A view embedded by an adapter.
+pub struct EmbeddedView {
+    /// Shape (k,).
+    pub latent: Array1<f64>,
+    /// The raw feature, shape (d,); `None` for a latent or a stored frame.
+    pub feature: Option<Vec<f32>>,
+    /// Whether the view is an image without contrast.
+    pub is_blank: bool,
+}
+
+impl ViewEmbedder<'_> {
+    /// Embeds one view. `field` is its field in the request, for errors.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] if the view is missing or does not fit the adapter, if an image cannot be
+    /// decoded, or if it is a stored frame that [`StoredFrames`] does not allow;
+    /// [`Error::Precondition`] if the server has no encoder for images.
+    pub fn embed(&self, field: &str, view: Option<pb::View>) -> Result<EmbeddedView, Error> {
+        if let Some(pb::view::View::Image(image)) =
+            view.as_ref().and_then(|view| view.view.as_ref())
+        {
+            let image_field = format!("{field}.image");
+            let encoder = self.snapshot.image_encoder(self.adapter)?;
+            let pixels = encoder.decoded(&image_field, image)?;
+            let is_blank = pixels.is_blank();
+
+            let feature = encoder.feature_of(&image_field, pixels)?;
+            return self.embed_feature(field, feature, is_blank);
+        }
+
+        match convert::source(field, view, self.adapter, self.snapshot)? {
+            Source::Feature(feature) => self.embed_feature(field, feature, false),
+            Source::Latent(values) => Ok(EmbeddedView {
+                latent: self.latent(field, &View::Latent(values))?,
+                feature: None,
+                is_blank: false,
+            }),
+            Source::Frame(frame) => {
+                let frame_field = format!("{field}.frame_id");
+                let served = match self.frames {
+                    StoredFrames::Of(served) => served,
+                    StoredFrames::RoomMissing => {
+                        let problem = format!("is required: {field} is a frame");
+                        return Err(Error::invalid("room", problem));
+                    }
+                    StoredFrames::Refused => {
+                        let problem = "is a stored frame; give a feature, a latent or an image of the \
+                                       camera";
+                        return Err(Error::invalid(frame_field, problem));
+                    }
+                };
+
+                let unknown = |_| Error::no_frame(&frame_field, frame);
+                served.navigator.room().pose(frame).map_err(unknown)?;
+                Ok(EmbeddedView {
+                    latent: served.navigator.latents().row(frame.row()).to_owned(),
+                    feature: None,
+                    is_blank: false,
+                })
+            }
+        }
+    }
+
+    fn embed_feature(
+        &self,
+        field: &str,
+        feature: Vec<f32>,
+        is_blank: bool,
+    ) -> Result<EmbeddedView, Error> {
+        let view = View::Feature(feature);
+        let latent = self.latent(field, &view)?;
+        let View::Feature(feature) = view else {
+            return Err(Error::Internal);
+        };
+        Ok(EmbeddedView {
+            latent,
+            feature: Some(feature),
+            is_blank,
+        })
+    }
+
+    fn latent(&self, field: &str, view: &View) -> Result<Array1<f64>, Error> {
+        view.latent(&self.adapter.adapter)
+            .map_err(|error| view_error(&error).within(field))
+    }
+}
+
+/// The adapter of a request, and its room if the request names one.
+pub struct RequestAdapter {
+    pub stored: Arc<StoredAdapter>,
+    pub served: Option<Arc<ServedNavigator>>,
+}
+
+impl RequestAdapter {
+    /// The adapter named `adapter`, or the default of `room`; both names may be empty.
+    ///
+    /// # Errors
+    /// [`Error::Invalid`] on `adapter` if it is needed; otherwise as [`Snapshot::navigator`].
+    pub fn of(snapshot: &Snapshot, room: &str, adapter: &str) -> Result<Self, Error> {
+        if room.is_empty() {
+            return Ok(Self {
+                stored: adapter_without_room(snapshot, adapter)?.clone(),
+                served: None,
+            });
+        }
+
+        let served = snapshot.navigator(room, adapter)?;
+        Ok(Self {
+            stored: served.adapter.clone(),
+            served: Some(served),
+        })
+    }
+
+    /// An embedder of the request's views.
+    pub fn embedder<'a>(&'a self, snapshot: &'a Snapshot) -> ViewEmbedder<'a> {
+        ViewEmbedder {
+            adapter: &self.stored,
+            snapshot,
+            frames: match &self.served {
+                Some(served) => StoredFrames::Of(served),
+                None => StoredFrames::RoomMissing,
+            },
+        }
+    }
+}
+
+/// The adapter of a request without a room: the named one, or the only one.
+fn adapter_without_room<'a>(
+    snapshot: &'a Snapshot,
+    adapter: &str,
+) -> Result<&'a Arc<StoredAdapter>, Error> {
+    if !adapter.is_empty() {
+        return snapshot.adapter(adapter);
+    }
+
+    match snapshot.adapters().len() {
+        1 => snapshot.adapters().values().next().ok_or(Error::Internal),
+        count => {
+            let problem = format!(
+                "is required when no room is named: the server has {count} adapters; with a two-view model, two images \
+                 with `camera` need no adapter"
+            );
+            Err(Error::invalid("adapter", problem))
+        }
+    }
+}
