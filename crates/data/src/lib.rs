@@ -11,6 +11,9 @@
 //! # let folder = folder.path();
 //! # std::fs::write(folder.join("groundtruth.txt"), "1.0 0 0 0 0 0 0 1\n2.0 0.1 0 0 0 0 0 1\n")?;
 //! # std::fs::write(folder.join("rgb.txt"), "1.0 rgb/1.png\n2.0 rgb/2.png\n")?;
+//! # std::fs::create_dir(folder.join("rgb"))?;
+//! # std::fs::write(folder.join("rgb/1.png"), "")?;
+//! # std::fs::write(folder.join("rgb/2.png"), "")?;
 //! // A recording of the TUM RGB-D benchmark, as a room.
 //! let mut reader = Reader {
 //!     unusable: Unusable::Drop,
