@@ -129,9 +129,7 @@ enum Preprocessing {
 }
 
 fn preprocessing(text: &str) -> Result<Preprocessing, String> {
-    let family = Preprocess::ALL
-        .into_iter()
-        .find(|family| family.name() == text);
+    let family: Option<Preprocess> = text.parse().ok();
     let file = || {
         let file = PathBuf::from(text);
         file.is_file().then_some(Preprocessing::File(file))

@@ -2,11 +2,12 @@
 
 use anyhow::Context;
 use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
-use super::named::{ClosedSet, one_of};
+use super::named::{one_of, possible_values};
 
 use seese3_core::adapter::{Loss, Mixing, PairPlan, Preset};
-use seese3_core::splits::{Fifth, Split, StrideRange};
+use seese3_core::splits::{Split, StrideRange};
 use seese3_core::training::TrainingPlan;
 
 /// A training preset, with options that override single settings.
@@ -20,7 +21,7 @@ pub struct ProtocolOptions {
     #[arg(long, default_value_t = 40)]
     stride: u32,
     /// How training and test pairs are kept apart
-    #[arg(long, value_parser = one_of::<SplitChoice>(), default_value = "time")]
+    #[arg(long, value_parser = split_choice(), default_value = "time")]
     split: SplitChoice,
     /// Number of epochs, 1 to 100000; the preset's if omitted
     #[arg(long)]
@@ -208,33 +209,6 @@ const MAX_STRIDE: u32 = 100_000;
 /// The largest number of training pairs that is accepted.
 const MAX_PAIRS: usize = 10_000_000;
 
-impl ClosedSet for Preset {
-    fn all() -> Vec<Self> {
-        Self::ALL.to_vec()
-    }
-
-    fn name(self) -> &'static str {
-        self.name()
-    }
-
-    fn help(self) -> &'static str {
-        match self {
-            Self::Base => {
-                "As paper-base, but with enough epochs for 400 optimizer steps, at least 10"
-            }
-            Self::PaperBase => {
-                "The paper's base protocol: all training pairs at one stride, 10 epochs"
-            }
-            Self::PaperRange => {
-                "The paper's range protocol: 30,000 pairs with strides 10 to 40, 200 epochs"
-            }
-            Self::Steady => {
-                "Not from the paper, for rooms outside the training set: 17 epochs of 30,000 pairs with strides 1 to 40 (about 1,000 steps), z-scored features with noise, averaged weights"
-            }
-        }
-    }
-}
-
 /// Train/test split of a command that trains its own adapters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SplitChoice {
@@ -244,6 +218,14 @@ pub enum SplitChoice {
 }
 
 impl SplitChoice {
+    /// Name of the split; `folds` for the five folds.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::One(split) => split.name(),
+            Self::Folds => "folds",
+        }
+    }
+
     /// The splits, in order.
     pub fn splits(self) -> Vec<Split> {
         match self {
@@ -253,93 +235,17 @@ impl SplitChoice {
     }
 }
 
-impl ClosedSet for SplitChoice {
-    fn all() -> Vec<Self> {
-        let one = Split::ALL.into_iter().map(Self::One);
-        one.chain([Self::Folds]).collect()
-    }
+/// The parser of a split, or `folds`.
+pub fn split_choice() -> impl TypedValueParser<Value = SplitChoice> {
+    let folds = PossibleValue::new("folds").help(
+        "Five-fold cross-validation: each contiguous fifth of the frames is tested once, by adapters \
+         trained on the other four; the test pairs of all five are scored together. Only for probe, \
+         sweep layers and sweep formulations",
+    );
+    let possible = possible_values::<Split>().chain([folds]);
 
-    fn name(self) -> &'static str {
-        match self {
-            Self::One(split) => split.name(),
-            Self::Folds => "folds",
-        }
-    }
-
-    fn help(self) -> &'static str {
-        match self {
-            Self::One(split) => split.help(),
-            Self::Folds => {
-                "Five-fold cross-validation: each contiguous fifth of the frames is tested once, by adapters trained on the other four; the test pairs of all five are scored together. Only for probe, sweep layers and sweep formulations"
-            }
-        }
-    }
-}
-
-impl ClosedSet for Split {
-    fn all() -> Vec<Self> {
-        Self::ALL.to_vec()
-    }
-
-    fn name(self) -> &'static str {
-        self.name()
-    }
-
-    fn help(self) -> &'static str {
-        match self {
-            Self::Time => "Train on the first 80 % of the frames, test on the rest",
-            Self::Fold(Fifth::First) => "Test on the first fifth of the frames, train on the rest",
-            Self::Fold(Fifth::Second) => "Test on the second fifth, train on the others",
-            Self::Fold(Fifth::Third) => "Test on the third fifth, train on the others",
-            Self::Fold(Fifth::Fourth) => "Test on the fourth fifth, train on the others",
-            Self::Fold(Fifth::Last) => "Test on the last fifth, train on the others: as time",
-            Self::Blocks => "Test on every fifth block of 50 frames, train on the others",
-            Self::Pairs => {
-                "Every fifth source frame gives a test pair. Training and test pairs share frames: only for checking an implementation, not for measuring generalization"
-            }
-            Self::Dataset => "The recording's own split, if it has one",
-            Self::Whole => {
-                "Use every pair for training and for testing: for rooms that are training or held-out rooms as a whole"
-            }
-        }
-    }
-}
-
-impl ClosedSet for Mixing {
-    fn all() -> Vec<Self> {
-        Self::ALL.to_vec()
-    }
-
-    fn name(self) -> &'static str {
-        self.name()
-    }
-
-    fn help(self) -> &'static str {
-        match self {
-            Self::Gate => "By a gate trained with the charts, as in the paper",
-            Self::Even => {
-                "By their mean: an ensemble of adapters, each trained for its share of the epochs"
-            }
-        }
-    }
-}
-
-impl ClosedSet for Loss {
-    fn all() -> Vec<Self> {
-        Self::ALL.to_vec()
-    }
-
-    fn name(self) -> &'static str {
-        self.name()
-    }
-
-    fn help(self) -> &'static str {
-        match self {
-            Self::MeanSquaredError => "Mean squared error over all six components, as in the paper",
-            Self::Cosine => {
-                "One minus the cosine between predicted and true motion, as vectors of six numbers"
-            }
-            Self::Rotation => "Mean squared error of the three rotation components only",
-        }
-    }
+    PossibleValuesParser::new(possible).try_map(|name| match name.as_str() {
+        "folds" => Ok(SplitChoice::Folds),
+        split => split.parse().map(SplitChoice::One),
+    })
 }

@@ -8,10 +8,11 @@ use anyhow::{Context, bail};
 use clap::Args;
 use rayon::prelude::*;
 use serde_json::json;
+use strum::VariantArray;
 
 use super::encode::{by_layer, check_names, has, same_poses};
 use super::encoder::{EncoderOptions, RuntimeOptions};
-use super::named::{ClosedSet, one_of};
+use super::named::one_of;
 use super::output::{JsonOutput, check_writable, say, write_file};
 use super::progress::bar;
 use seese3_core::cancel::Cancellation;
@@ -268,10 +269,10 @@ impl Studio {
         film: &Film,
         (width, height): (usize, usize),
     ) -> anyhow::Result<Room> {
-        let without: String = Variation::ALL
+        let without: String = Variation::VARIANTS
             .iter()
             .filter(|variation| self.without.contains(variation))
-            .map(|variation| format!(" without {}", variation.name()))
+            .map(|variation| format!(" without {variation}"))
             .collect();
         let mut provenance = Provenance {
             format: format!("studio {}{without}", film.kind),
@@ -397,47 +398,6 @@ impl Studio {
         ));
 
         Ok(())
-    }
-}
-
-impl ClosedSet for Variation {
-    fn all() -> Vec<Self> {
-        Self::ALL.to_vec()
-    }
-
-    fn name(self) -> &'static str {
-        self.name()
-    }
-
-    fn help(self) -> &'static str {
-        match self {
-            Self::Light => "Day, dusk or night, and the color of lamps",
-            Self::Exposure => "Exposure and white balance",
-            Self::Lens => "Motion blur, noise and vignetting",
-            Self::FieldOfView => "The camera's field of view",
-            Self::Clutter => "Moved objects, and passers-by",
-            Self::Detail => "Fine detail of all surfaces",
-        }
-    }
-}
-
-impl ClosedSet for Suite {
-    fn all() -> Vec<Self> {
-        Self::ALL.to_vec()
-    }
-
-    fn name(self) -> &'static str {
-        self.name()
-    }
-
-    fn help(self) -> &'static str {
-        match self {
-            Self::Visits => {
-                "Two handheld visits to each room in different light: photographs with blur, noise and \
-                 per-visit exposure"
-            }
-            Self::Walks => "One smooth walk per room, plain images: the hard class",
-        }
     }
 }
 

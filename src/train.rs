@@ -186,7 +186,7 @@ fn correctors(names: &[String]) -> anyhow::Result<Vec<CorrectorKind>> {
 
     let kind = |name: &String| {
         let known = CorrectorKind::ALL.map(CorrectorKind::name).join(", ");
-        CorrectorKind::from_name(name)
+        name.parse()
             .with_context(|| format!("--correctors: '{name}' is not one of {known}"))
     };
 

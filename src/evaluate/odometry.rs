@@ -18,7 +18,7 @@ use seese3_lab::report::{
 };
 use seese3_robot::tracking::{Replay, TrackerSettings};
 
-use super::super::named::{ClosedSet, one_of};
+use super::super::named::one_of;
 use super::super::output::{JsonOutput, say, write_file};
 use super::super::progress::bar;
 use super::super::rooms::{data, load_rooms};
@@ -38,7 +38,7 @@ pub struct Odometry {
     #[arg(long)]
     adapter: String,
     /// Which frames are mapped and which are replayed
-    #[arg(long, alias = "course", value_parser = one_of::<HoldOut>(), default_value = "blocks")]
+    #[arg(long, value_parser = one_of::<HoldOut>(), default_value = "blocks")]
     hold_out: HoldOut,
     /// Keyframe interval, frames; derived from the adapter's training if omitted
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
@@ -199,23 +199,5 @@ fn only_mean(table: &str) -> String {
     match lines.as_slice() {
         [head, .., last] => format!("{head}\n{last}\n"),
         _ => table.to_owned(),
-    }
-}
-
-impl ClosedSet for HoldOut {
-    fn all() -> Vec<Self> {
-        Self::ALL.to_vec()
-    }
-
-    fn name(self) -> &'static str {
-        self.name()
-    }
-
-    fn help(self) -> &'static str {
-        match self {
-            Self::Interleaved => "Map every second frame, replay the others",
-            Self::Blocks => "As interleaved, but a fifth of the path stays unmapped",
-            Self::Time => "Map the first four fifths, replay the last",
-        }
     }
 }

@@ -1,6 +1,7 @@
 //! `seese3 sweep formulations`: the adapter and the paper's alternatives A to D.
 
 use clap::Args;
+use strum::VariantArray;
 
 use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
@@ -58,7 +59,7 @@ impl Formulations {
             RoomPooling::RoomByRoom
         };
 
-        let count = Formulation::ALL.len() as u64 * self.seeds;
+        let count = Formulation::VARIANTS.len() as u64 * self.seeds;
         let progress = bar(count, "formulations");
         let comparison = compare(
             &room_data,

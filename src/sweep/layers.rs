@@ -4,10 +4,10 @@ use anyhow::{Context, bail, ensure};
 use clap::Args;
 use rayon::prelude::*;
 
-use super::super::named::{ClosedSet, one_of};
+use super::super::named::one_of;
 use super::super::output::{JsonOutput, say};
 use super::super::progress::bar;
-use super::super::protocol::SplitChoice;
+use super::super::protocol::{SplitChoice, split_choice};
 use seese3_core::adapter::Preset;
 use seese3_core::features::Features;
 use seese3_core::splits::Split;
@@ -33,7 +33,7 @@ pub struct Layers {
     #[arg(long, default_value_t = 40)]
     stride: u32,
     /// How frames are split into training and test, in M3 and M4
-    #[arg(long, value_parser = one_of::<SplitChoice>(), default_value = "time")]
+    #[arg(long, value_parser = split_choice(), default_value = "time")]
     split: SplitChoice,
     /// Training preset of M4
     #[arg(long, value_parser = one_of::<Preset>(), default_value = "paper-base")]

@@ -6,6 +6,7 @@
 use fast_image_resize::images::{Image, ImageRef};
 use fast_image_resize::{FilterType, PixelType, ResizeAlg, ResizeOptions, Resizer};
 use sha2::{Digest, Sha256};
+use strum::{Display, EnumString};
 
 use super::Error;
 use seese3_core::Cause;
@@ -28,7 +29,12 @@ pub enum Resize {
 }
 
 /// The interpolation filter of a resize.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, EnumString)]
+#[strum(
+    serialize_all = "lowercase",
+    parse_err_fn = unknown_filter,
+    parse_err_ty = Error
+)]
 pub enum Filter {
     /// A triangle kernel.
     Bilinear,
@@ -147,7 +153,7 @@ impl Preparation {
         let three = |[r, g, b]: [f32; 3]| format!("{r},{g},{b}");
         format!(
             "resize={resize} filter={} crop={crop} divisor={} mean={} std={} window={window}",
-            self.filter.name(),
+            self.filter,
             self.divisor,
             three(self.mean),
             three(self.deviation)
@@ -238,28 +244,11 @@ fn digest(text: &str) -> String {
         .collect()
 }
 
-impl Filter {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Bilinear => "bilinear",
-            Self::Bicubic => "bicubic",
-            Self::Lanczos3 => "lanczos3",
-        }
-    }
-}
-
-impl std::str::FromStr for Filter {
-    type Err = Error;
-
-    fn from_str(text: &str) -> Result<Self, Error> {
-        [Self::Bilinear, Self::Bicubic, Self::Lanczos3]
-            .into_iter()
-            .find(|filter| filter.name() == text)
-            .ok_or_else(|| Error::Option {
-                what: "filter",
-                given: text.to_owned(),
-                problem: "is not bilinear, bicubic or lanczos3".into(),
-            })
+fn unknown_filter(given: &str) -> Error {
+    Error::Option {
+        what: "filter",
+        given: given.to_owned(),
+        problem: "is not bilinear, bicubic or lanczos3".into(),
     }
 }
 

@@ -1,9 +1,12 @@
 //! Image preparations of the common encoder families, by name.
 
+use strum::{Display, EnumString};
+
 use super::{Error, Filter, Preparation, Resize};
 
 /// A family of encoders with the same image preparation.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, EnumString)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Preprocess {
     /// torchvision and most of timm: ImageNet's mean and deviation, a central crop of 7/8.
     Imagenet,
@@ -20,19 +23,6 @@ pub enum Preprocess {
 const USUAL_SIDE: usize = 224;
 
 impl Preprocess {
-    /// All families.
-    pub const ALL: [Self; 4] = [Self::Imagenet, Self::Clip, Self::Half, Self::Unit];
-
-    /// Its name.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Imagenet => "imagenet",
-            Self::Clip => "clip",
-            Self::Half => "half",
-            Self::Unit => "unit",
-        }
-    }
-
     /// The preparation for a model with input images of this size (width, height).
     ///
     /// # Errors
@@ -50,7 +40,7 @@ impl Preprocess {
         if is_middle && width != height {
             return Err(Error::Option {
                 what: "--preprocess",
-                given: self.name().to_owned(),
+                given: self.to_string(),
                 problem: format!(
                     "crops the central square of an image, but the model takes {width}x{height}; give \
                      --divisor, --mean, --std and --resize {width}x{height} instead"

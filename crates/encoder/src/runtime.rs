@@ -3,11 +3,13 @@
 use std::path::PathBuf;
 
 use ndarray::ArrayD;
+use strum::IntoStaticStr;
 
 use super::Error;
 
 /// The library that runs a model.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr)]
+#[strum(serialize_all = "lowercase")]
 pub enum RuntimeKind {
     /// Written in Rust and compiled in; needs no library on the system.
     Tract,
@@ -18,10 +20,7 @@ pub enum RuntimeKind {
 impl RuntimeKind {
     /// Its name.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Tract => "tract",
-            Self::OnnxRuntime => "onnxruntime",
-        }
+        self.into()
     }
 
     /// Whether this program was built with it.

@@ -17,6 +17,7 @@ use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 use prost::Message;
 use prost_types::FileDescriptorSet;
+use strum::{IntoStaticStr, VariantArray};
 
 use super::status::Full;
 use seese3_client::proto::v1::TrackStatus;
@@ -69,23 +70,12 @@ struct OutcomeLabels {
 }
 
 /// Outcome of checking the store for changes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "kebab-case")]
 pub enum ReloadOutcome {
     Changed,
     Unchanged,
     Failed,
-}
-
-impl ReloadOutcome {
-    const ALL: [Self; 3] = [Self::Changed, Self::Unchanged, Self::Failed];
-
-    fn name(self) -> &'static str {
-        match self {
-            Self::Changed => "changed",
-            Self::Unchanged => "unchanged",
-            Self::Failed => "failed",
-        }
-    }
 }
 
 /// Buckets from 0.25 ms to 131 s.
@@ -141,12 +131,12 @@ impl Default for Metrics {
 impl Inner {
     /// Creates the counters that alerts watch, so that the first event is a change from zero.
     fn begin_at_zero(&self) {
-        for full in Full::ALL {
+        for &full in Full::VARIANTS {
             let full = full.words();
             drop(self.refusals.get_or_create(&FullLabels { full }));
         }
-        for outcome in ReloadOutcome::ALL {
-            let outcome = outcome.name();
+        for outcome in ReloadOutcome::VARIANTS {
+            let outcome = outcome.into();
             drop(self.reloads.get_or_create(&OutcomeLabels { outcome }));
         }
         for status in [
@@ -330,7 +320,7 @@ impl Metrics {
 
     /// Counts a check of the store for changes.
     pub(super) fn reloaded(&self, outcome: ReloadOutcome) {
-        let outcome = outcome.name();
+        let outcome = outcome.into();
         self.0
             .reloads
             .get_or_create(&OutcomeLabels { outcome })

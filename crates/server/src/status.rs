@@ -1,5 +1,6 @@
 //! Errors as gRPC statuses. This is the only place where status codes are chosen.
 
+use strum::{Display, IntoStaticStr, VariantArray};
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
@@ -13,69 +14,47 @@ const NEARLY: f64 = 0.75;
 const DOMAIN: &str = "seese3.v1";
 
 /// A limit that refuses requests when it is reached.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
 pub enum Full {
     /// The lane of short requests.
+    #[strum(serialize = "short requests")]
     ShortRequests,
     /// The lane of requests with images.
+    #[strum(serialize = "requests with images")]
     Images,
     /// The lane of batches and evaluations.
+    #[strum(serialize = "batches and evaluations")]
     LongRequests,
     /// The server's Track streams.
+    #[strum(serialize = "Track streams")]
     Streams,
     /// The Track streams of one caller.
+    #[strum(serialize = "Track streams of this caller")]
     CallersStreams,
     /// The requests and streams of one caller.
+    #[strum(serialize = "requests of this caller")]
     CallersRequests,
     /// The connections. A refused connection is closed without an error message.
+    #[strum(serialize = "connections")]
     Connections,
     /// The bytes of all uploads in progress.
+    #[strum(serialize = "bytes of uploads")]
     Uploads,
     /// The fits in progress; only one runs at a time.
+    #[strum(serialize = "fits")]
     Fits,
     /// The memory of requests in progress.
+    #[strum(serialize = "bytes of requests")]
     Memory,
     /// The queued changes of the catalog.
+    #[strum(serialize = "changes")]
     Changes,
 }
 
 impl Full {
-    /// All of them.
-    pub const ALL: [Self; 11] = [
-        Self::ShortRequests,
-        Self::Images,
-        Self::LongRequests,
-        Self::Streams,
-        Self::CallersStreams,
-        Self::CallersRequests,
-        Self::Connections,
-        Self::Uploads,
-        Self::Fits,
-        Self::Memory,
-        Self::Changes,
-    ];
-
     /// The name in messages and metrics.
     pub fn words(self) -> &'static str {
-        match self {
-            Self::ShortRequests => "short requests",
-            Self::Images => "requests with images",
-            Self::LongRequests => "batches and evaluations",
-            Self::Streams => "Track streams",
-            Self::CallersStreams => "Track streams of this caller",
-            Self::CallersRequests => "requests of this caller",
-            Self::Connections => "connections",
-            Self::Uploads => "bytes of uploads",
-            Self::Fits => "fits",
-            Self::Memory => "bytes of requests",
-            Self::Changes => "changes",
-        }
-    }
-}
-
-impl std::fmt::Display for Full {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(self.words())
+        self.into()
     }
 }
 

@@ -1,5 +1,7 @@
 //! Listing of a store's contents, by revision.
 
+use strum::VariantArray;
+
 use super::defaults::Defaults;
 use super::format::{AdapterBody, RoomBody};
 use super::{Error, Kind, ResourceName, Store, folder_of};
@@ -49,7 +51,7 @@ impl Store {
         let defaults = self.defaults().await?;
         let mut contents = Vec::new();
 
-        for kind in Kind::ALL {
+        for &kind in Kind::VARIANTS {
             for (name, numbers) in self.numbered(kind).await? {
                 let resource = ResourceName {
                     kind,

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use object_store::path::Path;
 use serde::{Deserialize, Serialize};
+use strum::VariantArray;
 
 use super::manifest::{self, SCHEMA};
 use super::{ATTEMPTS, Error, Kind, ResourceName, Store, manifest_name};
@@ -131,7 +132,7 @@ impl Defaults {
     /// All resources that the defaults refer to.
     pub(super) fn named(&self) -> Vec<ResourceName> {
         let mut named: Vec<ResourceName> = Vec::new();
-        for kind in Kind::ALL {
+        for &kind in Kind::VARIANTS {
             let resource = |(name, revision): (&String, &u64)| ResourceName {
                 kind,
                 name: name.clone(),

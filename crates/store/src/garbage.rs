@@ -7,6 +7,7 @@ use std::time::Duration;
 use chrono::{DateTime, Utc};
 use object_store::path::Path;
 use object_store::{ObjectMeta, ObjectStoreExt};
+use strum::VariantArray;
 use tokio_stream::StreamExt;
 
 use super::format::{AdapterBody, RoomBody};
@@ -52,7 +53,7 @@ impl Store {
         let mut garbage = Garbage::default();
         let before = written_before(older_than);
 
-        for kind in Kind::ALL {
+        for &kind in Kind::VARIANTS {
             for (_, folder) in self.folders(kind).await? {
                 self.find_objects(kind, &folder, before, &mut garbage)
                     .await?;

@@ -4,9 +4,11 @@ use std::fmt;
 use std::str::FromStr;
 
 use seese3_core::room::is_plain_name;
+use strum::{IntoStaticStr, VariantArray};
 
 /// The two kinds of content in a store.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Kind {
     /// A recording of one place, with features.
     Room,
@@ -15,15 +17,9 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// Every kind.
-    pub const ALL: [Self; 2] = [Self::Room, Self::Adapter];
-
     /// Singular name, for messages.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Room => "room",
-            Self::Adapter => "adapter",
-        }
+        self.into()
     }
 
     /// Collection name, which is also the folder name.
@@ -117,8 +113,9 @@ impl FromStr for ResourceName {
             _ => return Err(unfit()),
         };
 
-        let kind = Kind::ALL
-            .into_iter()
+        let kind = Kind::VARIANTS
+            .iter()
+            .copied()
             .find(|kind| kind.collection() == collection)
             .ok_or_else(unfit)?;
         if !is_plain_name(name) {

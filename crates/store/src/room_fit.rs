@@ -2,6 +2,7 @@
 
 use nalgebra::Matrix6;
 use ndarray::ArrayView1;
+use strum::VariantArray;
 
 use super::Error;
 use super::error_model::sized;
@@ -14,7 +15,7 @@ use seese3_robot::fitting::{MotionReader, PartRule, ReadingRule, ReadingRules};
 
 /// One row per rule: the largest distance; the reader and gain for translation, then those for
 /// rotation; the minimum disagreement; and the covariance on (v, ω), 36 entries in row-major order.
-/// A reader is stored as its index in [`MotionReader::ALL`].
+/// A reader is stored as its index in [`MotionReader::VARIANTS`].
 const RULES: &str = "fit.rules";
 /// Number of columns of [`RULES`] before the covariance.
 const COLUMNS_BEFORE_COVARIANCE: usize = 6;
@@ -22,7 +23,7 @@ const COLUMNS: usize = COLUMNS_BEFORE_COVARIANCE + 36;
 
 pub fn write(tensors: &mut TensorWriter, rules: &ReadingRules) {
     let part = |rule: PartRule| {
-        let position = MotionReader::ALL
+        let position = MotionReader::VARIANTS
             .iter()
             .position(|reader| *reader == rule.reader);
         [position.unwrap_or_default() as f64, rule.gain]
@@ -51,12 +52,12 @@ pub fn read(entry: FittedEntry, tensors: &TensorReader<'_>, file: &str) -> Resul
     };
 
     let part = |reader: f64, gain: f64| {
-        let known = MotionReader::ALL
-            .into_iter()
+        let known = MotionReader::VARIANTS
+            .iter()
             .enumerate()
             .find(|(position, _)| *position as f64 == reader);
         match known {
-            Some((_, reader)) => Ok(PartRule { reader, gain }),
+            Some((_, &reader)) => Ok(PartRule { reader, gain }),
             None => Err(damaged(
                 format!("names a reader {reader}, which this program does not know").into(),
             )),

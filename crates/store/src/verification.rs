@@ -2,6 +2,8 @@
 
 use std::collections::BTreeSet;
 
+use strum::VariantArray;
+
 use super::manifest::ObjectRef;
 use super::{Error, Kind, ResourceName, Store, folder_of};
 
@@ -27,7 +29,7 @@ impl Store {
     ) -> Result<Vec<Finding>, Error> {
         let mut findings = Vec::new();
 
-        for kind in Kind::ALL {
+        for &kind in Kind::VARIANTS {
             for (name, numbers) in self.numbered(kind).await? {
                 // Revisions share objects. A revision without new objects needs only its manifest
                 // checked.

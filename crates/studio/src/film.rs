@@ -1,6 +1,7 @@
 //! Recordings of synthetic rooms: camera poses, and an image at each pose.
 
 use nalgebra::Isometry3;
+use strum::{Display, EnumMessage, EnumString, IntoStaticStr, VariantArray};
 
 use super::photograph::{Shot, photograph};
 use super::render::{Camera, Sampling, radiance};
@@ -12,45 +13,25 @@ use seese3_core::image::RgbImage;
 /// Field of view of a camera without variation: the middle of the range of 55° to 80°.
 pub(super) const FIELD_OF_VIEW_RAD: f64 = 67.5 * std::f64::consts::PI / 180.0;
 
-/// Variations that make synthetic photographs differ like real ones.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// Variations that make synthetic photographs differ like real ones: of the field of view per room,
+/// of light, exposure and objects per visit.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, EnumMessage, EnumString, VariantArray, Display, IntoStaticStr,
+)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Variation {
-    /// Day, dusk or night, and the color of the lamp, per visit.
+    /// Day, dusk or night, and the color of lamps.
     Light,
-    /// Exposure and white balance, per visit.
+    /// Exposure and white balance.
     Exposure,
     /// Motion blur, noise and vignetting.
     Lens,
-    /// Field of view, per room.
+    /// The camera's field of view.
     FieldOfView,
-    /// Objects moved between visits, and people walking by.
+    /// Moved objects, and passers-by.
     Clutter,
     /// Fine detail of all surfaces.
     Detail,
-}
-
-impl Variation {
-    /// All variations.
-    pub const ALL: [Self; 6] = [
-        Self::Light,
-        Self::Exposure,
-        Self::Lens,
-        Self::FieldOfView,
-        Self::Clutter,
-        Self::Detail,
-    ];
-
-    /// The name of the variation.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Light => "light",
-            Self::Exposure => "exposure",
-            Self::Lens => "lens",
-            Self::FieldOfView => "field-of-view",
-            Self::Clutter => "clutter",
-            Self::Detail => "detail",
-        }
-    }
 }
 
 /// A recording of one room, with one or more visits in sequence.
@@ -268,14 +249,17 @@ mod tests {
         let frame = whole.visits[1].passer_by.as_ref().unwrap().frames.start;
         let images = |film: &Film| [frame, 59].map(|frame| film.image(frame, 64, 48).bytes);
 
-        for variation in Variation::ALL {
+        for &variation in Variation::VARIANTS {
             let without = whole.clone().without(variation);
             assert_eq!(without.poses, whole.poses, "{variation:?}");
-            let name = variation.name();
-            assert_ne!(images(&without), images(&whole), "{name} changes nothing");
+            assert_ne!(
+                images(&without),
+                images(&whole),
+                "{variation} changes nothing"
+            );
 
             let twice = without.clone().without(variation);
-            assert_eq!(images(&twice), images(&without), "{name}");
+            assert_eq!(images(&twice), images(&without), "{variation}");
         }
 
         let walk = Suite::Walks.film(5, 0, 10);

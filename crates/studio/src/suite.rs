@@ -8,6 +8,7 @@
 use nalgebra::{Point3, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use strum::IntoStaticStr;
 
 use super::camera_path::{Way, along, around};
 use super::texture::Colour;
@@ -15,7 +16,8 @@ use super::{Floor, Light, Scene, Shell, Wallpaper, furniture};
 use seese3_core::geometry::Pose;
 
 /// How the camera moves through a room.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Walk {
     /// Circles in the middle of a room: every position is visited several times.
     Revisits,
@@ -23,17 +25,6 @@ pub enum Walk {
     SinglePass,
     /// Walks along a corridor once.
     Corridor,
-}
-
-impl Walk {
-    /// The name of the kind of walk.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Revisits => "revisits",
-            Self::SinglePass => "single-pass",
-            Self::Corridor => "corridor",
-        }
-    }
 }
 
 /// One room of a suite.

@@ -1,32 +1,29 @@
 //! The suites of synthetic rooms.
 
+use strum::{EnumMessage, EnumString, IntoStaticStr, VariantArray};
+
 use super::film::Film;
 use super::render::Camera;
 use super::{SuiteRoom, visits};
 
 /// A suite of rooms, with a style of images and of camera motion.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, EnumMessage, EnumString, VariantArray, IntoStaticStr,
+)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Suite {
-    /// Rooms filmed twice with a hand-held camera in different light. Photographs have blur, noise
-    /// and varying exposure; objects move between visits, and people walk by.
+    /// Two handheld visits to each room in different light: photographs with blur, noise and
+    /// per-visit exposure.
+    ///
+    /// Objects move between visits, and people walk by.
     Visits,
-    /// Plain images of one calm walk each, which hardly covers what its last fifth sees: the hard
-    /// class.
+    /// One smooth walk per room, plain images: the hard class.
+    ///
+    /// The walk hardly covers what its last fifth sees.
     Walks,
 }
 
 impl Suite {
-    /// All suites.
-    pub const ALL: [Self; 2] = [Self::Visits, Self::Walks];
-
-    /// The name of the suite.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Visits => "visits",
-            Self::Walks => "walks",
-        }
-    }
-
     /// The recording of room `number` of the suite with `seed`. Rooms do not depend on each other.
     pub fn film(self, seed: u64, number: u32, frame_count: usize) -> Film {
         match self {
@@ -36,7 +33,7 @@ impl Suite {
                 let poses = room.path(frame_count);
 
                 Film {
-                    kind: room.walk.name(),
+                    kind: room.walk.into(),
                     field_of_view_rad: Camera::small().field_of_view_rad,
                     poses,
                     visits: Vec::new(),

@@ -5,6 +5,7 @@
 //! heads or the scaling of the input; they are our choice.
 
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis, concatenate};
+use strum::{EnumString, IntoStaticStr};
 
 use super::attention::Attention;
 use super::layers::Dense;
@@ -14,7 +15,8 @@ use super::train::{EpochProgress, fit};
 use super::{Adapter, At, Error, Network, Objective, Reading, Real, Samples, TrainConfig};
 
 /// The architecture of a corrector.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, EnumString, IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 #[cfg_attr(
     feature = "serde",
     derive(serde::Serialize, serde::Deserialize),
@@ -24,9 +26,11 @@ pub enum CorrectorKind {
     /// One linear layer.
     Linear,
     /// One hidden layer of width 64.
+    #[strum(serialize = "mlp-2")]
     #[cfg_attr(feature = "serde", serde(rename = "mlp-2"))]
     Mlp2,
     /// Two hidden layers of width 128.
+    #[strum(serialize = "mlp-3")]
     #[cfg_attr(feature = "serde", serde(rename = "mlp-3"))]
     Mlp3,
     /// One attention block over two tokens, the latent and the motion.
@@ -39,17 +43,7 @@ impl CorrectorKind {
 
     /// Its name on the command line, in tables and in files.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Linear => "linear",
-            Self::Mlp2 => "mlp-2",
-            Self::Mlp3 => "mlp-3",
-            Self::Attention => "attention",
-        }
-    }
-
-    /// The kind with this [`CorrectorKind::name`].
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|kind| kind.name() == name)
+        self.into()
     }
 
     /// Whether the output is a residual, added to g + W⁺ΔP. Otherwise it is ĝ itself.

@@ -2,6 +2,7 @@
 
 use nalgebra::{DMatrix, Vector6};
 use ndarray::{Array1, Array2, ArrayView2};
+use strum::{Display, EnumMessage, EnumString, IntoStaticStr, VariantArray};
 
 use super::{Error, TargetScale};
 use crate::geometry::Twist;
@@ -12,30 +13,23 @@ use crate::matrices::to_nalgebra;
 const RANK_TOLERANCE: f64 = 1e-5;
 
 /// How μ and σ, the z-scoring of the training targets, enter the inverse.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Display, EnumMessage, EnumString, IntoStaticStr, VariantArray,
+)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Reading {
-    /// W⁺((ΔP − μ)/σ): the exact inverse of the trained predictor. Unless μ is zero, a zero motion
-    /// changes the latent.
+    /// Inverts the trained predictor exactly; zero motion changes the latent.
+    ///
+    /// W⁺((ΔP − μ)/σ). If μ is zero, zero motion does not change the latent.
     Affine,
-    /// W⁺(ΔP/σ): a zero motion leaves the latent as it is, and the steps of equal parts of a motion
-    /// add up to the step of the whole. The service's default.
+    /// Zero motion keeps the latent; equal parts add up to the whole.
+    ///
+    /// W⁺(ΔP/σ). The service's default.
     Homogeneous,
-    /// W⁺ΔP, as printed in the paper, without μ and σ.
+    /// As printed in the paper.
+    ///
+    /// W⁺ΔP, without μ and σ.
     Literal,
-}
-
-impl Reading {
-    /// All readings.
-    pub const ALL: [Self; 3] = [Self::Affine, Self::Homogeneous, Self::Literal];
-
-    /// Name on the command line and in reports.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Affine => "affine",
-            Self::Homogeneous => "homogeneous",
-            Self::Literal => "literal",
-        }
-    }
 }
 
 /// W⁺, the pseudo-inverse of W by truncated SVD, together with μ and σ for the three readings.

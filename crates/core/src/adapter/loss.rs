@@ -1,6 +1,7 @@
 //! Training losses on z-scored twists, each with its gradient with respect to the prediction.
 
 use ndarray::{Array2, ArrayView2, Axis, Zip, s};
+use strum::{EnumMessage, EnumString, IntoStaticStr, VariantArray};
 
 use super::Real;
 
@@ -8,39 +9,31 @@ use super::Real;
 const COSINE_EPS: f64 = 1e-8;
 
 /// The training loss. Source: SeeSE3, Sec. A.6.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Default, EnumMessage, EnumString, IntoStaticStr, VariantArray,
+)]
+#[strum(serialize_all = "kebab-case")]
 #[cfg_attr(
     feature = "serde",
     derive(serde::Serialize, serde::Deserialize),
     serde(rename_all = "kebab-case")
 )]
 pub enum Loss {
-    /// The mean over batch and components of (y − t)², the paper's default.
+    /// Mean squared error over all six components, as in the paper.
     #[default]
+    #[strum(serialize = "mse")]
     #[cfg_attr(feature = "serde", serde(rename = "mse"))]
     MeanSquaredError,
-    /// The mean over the batch of 1 − cos(y, t), both as vectors of six numbers.
+    /// One minus the cosine between predicted and true motion, as vectors of six numbers.
     Cosine,
-    /// Mean squared error of the three components of ω alone.
+    /// Mean squared error of the three rotation components only.
     Rotation,
 }
 
 impl Loss {
-    /// All losses.
-    pub const ALL: [Self; 3] = [Self::MeanSquaredError, Self::Cosine, Self::Rotation];
-
     /// Name on the command line and in a manifest.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::MeanSquaredError => "mse",
-            Self::Cosine => "cosine",
-            Self::Rotation => "rotation",
-        }
-    }
-
-    /// The loss with this [`Loss::name`].
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|loss| loss.name() == name)
+        self.into()
     }
 
     /// The loss of predictions (n, 6) against targets (n, 6), and its gradient with respect to the

@@ -8,6 +8,7 @@
 //!   the K gate weights α.
 
 use ndarray::{Array1, Array2, ArrayView1, Axis, concatenate, s};
+use strum::{EnumMessage, EnumString, IntoStaticStr, VariantArray};
 
 use super::phi::Widths;
 use super::seeded::Seeded;
@@ -25,36 +26,29 @@ struct Gate<T> {
 }
 
 /// How charts are mixed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Default, EnumMessage, EnumString, IntoStaticStr, VariantArray,
+)]
+#[strum(serialize_all = "kebab-case")]
 #[cfg_attr(
     feature = "serde",
     derive(serde::Serialize, serde::Deserialize),
     serde(rename_all = "kebab-case")
 )]
 pub enum Mixing {
-    /// Weights from a gate that is trained together with the charts, as in the paper. A single
-    /// chart has no gate.
+    /// By a gate trained with the charts, as in the paper.
+    ///
+    /// A single chart has no gate.
     #[default]
     Gate,
-    /// Equal weights: an ensemble of separately trained charts.
+    /// By their mean: an ensemble of adapters, each trained for its share of the epochs.
     Even,
 }
 
 impl Mixing {
-    /// All kinds of mixing.
-    pub const ALL: [Self; 2] = [Self::Gate, Self::Even];
-
     /// Name on the command line and in a manifest.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Gate => "gate",
-            Self::Even => "even",
-        }
-    }
-
-    /// The mixing with this [`Mixing::name`].
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|mixing| mixing.name() == name)
+        self.into()
     }
 }
 

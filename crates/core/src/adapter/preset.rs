@@ -1,22 +1,31 @@
 //! Named training protocols: two of the paper and two of ours.
 
+use strum::{EnumMessage, EnumString, IntoStaticStr, VariantArray};
+
 use super::TrainConfig;
 use crate::room::Timeline;
 use crate::splits::{Error as PairError, Pair, Split, StrideRange};
 
 /// A training protocol.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, EnumMessage, EnumString, IntoStaticStr, VariantArray,
+)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Preset {
-    /// The paper's base protocol with at least 400 optimizer steps. In a short recording, ten
-    /// epochs can be only ten steps, which is too few.
+    /// As paper-base, but with enough epochs for 400 optimizer steps, at least 10.
+    ///
+    /// In a short recording, ten epochs can be only ten steps, which is too few.
     Base,
-    /// All training pairs at one stride, for 10 epochs.
+    /// The paper's base protocol: all training pairs at one stride, 10 epochs.
     PaperBase,
-    /// 30,000 pairs with strides 10 to 40, for 200 epochs: the paper's "optimal config".
+    /// The paper's range protocol: 30,000 pairs with strides 10 to 40, 200 epochs.
+    ///
+    /// Its "optimal config".
     PaperRange,
-    /// Ours, for adapters that are used outside their training rooms: 30,000 pairs with strides 1
-    /// to 40, 17 epochs (about 1,000 steps). Features are z-scored with added noise, weights are
-    /// averaged, μ = 0.
+    /// Not from the paper, for rooms outside the training set: 17 epochs of 30,000 pairs with
+    /// strides 1 to 40 (about 1,000 steps), z-scored features with noise, averaged weights.
+    ///
+    /// μ = 0.
     Steady,
 }
 
@@ -30,17 +39,9 @@ pub enum PairPlan {
 }
 
 impl Preset {
-    /// All presets.
-    pub const ALL: [Self; 4] = [Self::Base, Self::PaperBase, Self::PaperRange, Self::Steady];
-
     /// Name on the command line and in a manifest.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Base => "base",
-            Self::PaperBase => "paper-base",
-            Self::PaperRange => "paper-range",
-            Self::Steady => "steady",
-        }
+        self.into()
     }
 
     /// Optimizer settings, with the given seed.

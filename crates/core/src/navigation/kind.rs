@@ -1,5 +1,7 @@
 //! Names of navigators, as used in tables, JSON, the command line and the wire.
 
+use strum::VariantArray;
+
 use super::{Refit, RetrievalMetric, StepKind};
 use crate::adapter::{Adapter, CorrectorKind, Reading};
 
@@ -28,7 +30,8 @@ impl NavigatorKind {
         // latent step exactly to ΔP.
         let homogeneous = StepKind::InversePoincare(Reading::Homogeneous);
         let steps = StepKind::all().into_iter();
-        let steps = steps.flat_map(|step| RetrievalMetric::ALL.map(|metric| (step, metric)));
+        let metrics = RetrievalMetric::VARIANTS.iter();
+        let steps = steps.flat_map(|step| metrics.clone().map(move |&metric| (step, metric)));
         let steps = steps
             .filter(|&(step, metric)| metric != RetrievalMetric::Calibrated || step == homogeneous);
         let steps = steps.map(|(step, metric)| Self::Step(step, metric));
@@ -69,7 +72,8 @@ impl NavigatorKind {
             .filter(|&metric| !(gated && metric == RetrievalMetric::Motion));
 
         let mut rows = vec![Self::Identity, Self::Random, Self::Oracle];
-        rows.extend(Reading::ALL.map(|reading| full(StepKind::InversePoincare(reading))));
+        let readings = Reading::VARIANTS.iter().copied();
+        rows.extend(readings.map(StepKind::InversePoincare).map(full));
         rows.extend(adapter.correctors().map(|known| corrector(known.kind())));
         rows.extend([
             refit(true, false),
@@ -95,8 +99,8 @@ impl NavigatorKind {
             Self::Identity => "identity".to_owned(),
             Self::Random => "random".to_owned(),
             Self::Oracle => "oracle".to_owned(),
-            Self::Step(step, RetrievalMetric::Full) => step.name().to_owned(),
-            Self::Step(step, metric) => format!("{}{UNDER}{}", step.name(), metric.name()),
+            Self::Step(step, RetrievalMetric::Full) => step.name(),
+            Self::Step(step, metric) => format!("{}{UNDER}{metric}", step.name()),
         }
     }
 
@@ -107,7 +111,7 @@ impl NavigatorKind {
 
     /// All names in one sentence, for error messages about an unknown name.
     pub fn known_names() -> String {
-        let steps: Vec<&str> = StepKind::all().into_iter().map(StepKind::name).collect();
+        let steps: Vec<String> = StepKind::all().into_iter().map(StepKind::name).collect();
         format!(
             "identity, random, oracle, {}; ways to step also with +row-space, +whitened or +motion, and \
              inverse-poincare-homogeneous with +calibrated",

@@ -1,6 +1,7 @@
 //! The walk: one motion, divided into equal steps in latent space.
 
 use ndarray::{Array1, ArrayView2};
+use strum::{EnumMessage, EnumString, IntoStaticStr, VariantArray};
 
 use super::{Error, Search, Stepper};
 use crate::adapter::Adapter;
@@ -10,26 +11,25 @@ use crate::index::{Exclusion, Neighbour};
 use crate::room::FrameId;
 
 /// How the steps of one motion are chained.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, EnumMessage, EnumString, IntoStaticStr, VariantArray,
+)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Mode {
-    /// All steps are added in latent space; retrieved frames do not affect later steps. The paper's
-    /// mode.
+    /// Steps add up in latent space, without feedback.
+    ///
+    /// Retrieved frames do not affect later steps. The paper's mode.
     OpenLoop,
-    /// Each step starts from the latent of the frame that the previous step retrieved.
+    /// Each step starts from the frame that the previous step retrieved.
     Snap,
-    /// Like [`Mode::Snap`], but the remaining motion to the goal is recomputed from the retrieved
-    /// frame's pose.
+    /// As snap, and the remaining motion to the goal is replanned from the retrieved frame's pose.
     ClosedLoop,
 }
 
 impl Mode {
     /// Name on the command line and in reports.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::OpenLoop => "open-loop",
-            Self::Snap => "snap",
-            Self::ClosedLoop => "closed-loop",
-        }
+        self.into()
     }
 }
 

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2};
+use strum::VariantArray;
 
 use super::{
     Displacement, Error, FitOn, IndexKind, Leg, Limits, Plan, Query, Refit, RefitData,
@@ -83,7 +84,7 @@ pub struct Navigator {
     /// The search under [`RetrievalMetric::Full`].
     search: Search,
     /// Searches under the other metrics, indexed by `metric as usize`, built on first use.
-    other_searches: [OnceLock<Search>; RetrievalMetric::ALL.len()],
+    other_searches: [OnceLock<Search>; RetrievalMetric::VARIANTS.len()],
     /// Cache of fitted refits, by variant and pairs.
     refits: Mutex<Vec<(Refit, FitOn, Arc<Stepper>)>>,
     /// Held while a search is built, so that no two threads build the same search.

@@ -2,6 +2,7 @@
 
 use nalgebra::{DMatrix, SymmetricEigen};
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis, s};
+use strum::{Display, VariantArray};
 
 use crate::adapter::{Adapter, Error};
 use crate::index::{Audit, ExactIndex, Exclusion, Index, Neighbour};
@@ -17,7 +18,8 @@ const RANK_TOLERANCE: f64 = 1e-5;
 const MOST_WHITENED: usize = 512;
 
 /// Distance for the retrieval of frames.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Display, VariantArray)]
+#[strum(serialize_all = "kebab-case")]
 pub enum RetrievalMetric {
     /// Euclidean distance over all coordinates, as in the paper.
     #[default]
@@ -35,33 +37,6 @@ pub enum RetrievalMetric {
     /// from the source to ĝ is exactly ΔP. Ours, not the paper's. Not available for charts with a
     /// gate.
     Calibrated,
-}
-
-impl RetrievalMetric {
-    /// All metrics.
-    pub const ALL: [Self; 5] = [
-        Self::Full,
-        Self::RowSpace,
-        Self::Whitened,
-        Self::Motion,
-        Self::Calibrated,
-    ];
-
-    /// Name in tables and on the wire.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Full => "full",
-            Self::RowSpace => "row-space",
-            Self::Whitened => "whitened",
-            Self::Motion => "motion",
-            Self::Calibrated => "calibrated",
-        }
-    }
-
-    /// The metric with this [`RetrievalMetric::name`].
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|metric| metric.name() == name)
-    }
 }
 
 /// Kind of the nearest-neighbor index.

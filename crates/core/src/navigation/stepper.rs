@@ -1,6 +1,7 @@
 //! Steppers: methods that turn a motion into a step in latent space.
 
 use ndarray::{Array1, Array2, ArrayView1, ArrayView2, s};
+use strum::VariantArray;
 
 use super::Error;
 use crate::adapter::{Adapter, CorrectorKind, Reading};
@@ -38,7 +39,7 @@ pub struct Refit {
 impl StepKind {
     /// All methods, inverse Poincaré first.
     pub fn all() -> Vec<Self> {
-        let readings = Reading::ALL.map(Self::InversePoincare);
+        let readings = Reading::VARIANTS.iter().copied().map(Self::InversePoincare);
         let correctors = CorrectorKind::ALL.map(Self::Corrector);
 
         let refit = |bits: u8| Refit {
@@ -55,35 +56,17 @@ impl StepKind {
     }
 
     /// Name in tables, JSON and on the wire.
-    pub fn name(self) -> &'static str {
+    pub fn name(self) -> String {
         match self {
-            Self::InversePoincare(Reading::Affine) => "inverse-poincare-affine",
-            Self::InversePoincare(Reading::Homogeneous) => "inverse-poincare-homogeneous",
-            Self::InversePoincare(Reading::Literal) => "inverse-poincare-literal",
-            Self::Corrector(CorrectorKind::Linear) => "corrector-linear",
-            Self::Corrector(CorrectorKind::Mlp2) => "corrector-mlp-2",
-            Self::Corrector(CorrectorKind::Mlp3) => "corrector-mlp-3",
-            Self::Corrector(CorrectorKind::Attention) => "corrector-attention",
-            Self::Refit(Refit {
-                z_scored,
-                intercept,
-                in_sample,
-            }) => match (z_scored, intercept, in_sample) {
-                (false, false, false) => "ridge-refit",
-                (false, false, true) => "ridge-refit-in-sample",
-                (true, false, false) => "ridge-refit-z-scored",
-                (true, false, true) => "ridge-refit-z-scored-in-sample",
-                (false, true, false) => "ridge-refit-intercept",
-                (false, true, true) => "ridge-refit-intercept-in-sample",
-                (true, true, false) => "ridge-refit-z-scored-intercept",
-                (true, true, true) => "ridge-refit-z-scored-intercept-in-sample",
-            },
+            Self::InversePoincare(reading) => format!("inverse-poincare-{reading}"),
+            Self::Corrector(kind) => format!("corrector-{}", kind.name()),
+            Self::Refit(refit) => {
+                let z_scored = if refit.z_scored { "-z-scored" } else { "" };
+                let intercept = if refit.intercept { "-intercept" } else { "" };
+                let in_sample = if refit.in_sample { "-in-sample" } else { "" };
+                format!("ridge-refit{z_scored}{intercept}{in_sample}")
+            }
         }
-    }
-
-    /// The method with this [`StepKind::name`].
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::all().into_iter().find(|kind| kind.name() == name)
     }
 }
 

@@ -1,5 +1,7 @@
 //! Splits of a recording into mapped frames and frames that are tracked against the map.
 
+use strum::{EnumMessage, EnumString, IntoStaticStr, VariantArray};
+
 use crate::room::FrameId;
 
 /// Number of blocks of a recording for [`HoldOut::Blocks`].
@@ -10,27 +12,25 @@ const BLOCK_PERIOD: usize = 5;
 const LEFT_OUT_BLOCK: usize = 2;
 
 /// Split of a recording into mapped and tracked frames.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, EnumMessage, EnumString, IntoStaticStr, VariantArray,
+)]
+#[strum(serialize_all = "kebab-case")]
 pub enum HoldOut {
-    /// Mapped: every second frame. Tracked: the others, from first to last.
+    /// Map every second frame, replay the others.
     Interleaved,
-    /// As interleaved, but 4 of 20 blocks of the recording (every fifth) have no mapped frames.
+    /// As interleaved, but a fifth of the path stays unmapped.
+    ///
+    /// 4 of 20 blocks of the recording (every fifth) have no mapped frames.
     Blocks,
-    /// Mapped: the first four fifths of the recording. Tracked: the last fifth.
+    /// Map the first four fifths, replay the last.
     Time,
 }
 
 impl HoldOut {
-    /// All hold-outs.
-    pub const ALL: [Self; 3] = [Self::Interleaved, Self::Blocks, Self::Time];
-
     /// Name on the command line and in reports.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Interleaved => "interleaved",
-            Self::Blocks => "blocks",
-            Self::Time => "time",
-        }
+        self.into()
     }
 
     /// The mapped frames of a recording with `frame_count` frames, in order.
@@ -85,7 +85,7 @@ mod tests {
     /// Oracle: the definition: mapped and tracked frames are disjoint.
     #[test]
     fn what_is_tracked_is_not_mapped() {
-        for hold_out in HoldOut::ALL {
+        for &hold_out in HoldOut::VARIANTS {
             let name = hold_out.name();
             let mapped = hold_out.mapped(400);
             let tracked = hold_out.tracked(400);

@@ -2,14 +2,13 @@
 //!
 //! A pair (i, j) is two frames of one room, j = i + stride: the source i and the target j.
 
-mod fifth;
 mod hold_out;
 
-pub use fifth::Fifth;
 pub use hold_out::{HoldOut, is_in_left_out_block};
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use strum::{Display, EnumMessage, EnumString, IntoStaticStr, VariantArray};
 
 use crate::room::{FrameId, Timeline};
 
@@ -49,86 +48,65 @@ pub struct Pair {
 }
 
 /// Split of frames or pairs into a training side and a test side.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Display, EnumMessage, EnumString, IntoStaticStr, VariantArray,
+)]
+#[strum(serialize_all = "lowercase")]
 #[cfg_attr(
     feature = "serde",
     derive(serde::Serialize, serde::Deserialize),
-    serde(try_from = "String", into = "String")
+    serde(rename_all = "lowercase")
 )]
 pub enum Split {
-    /// The first 80 % of the frames train, the rest test; both frames of a pair are on the same
-    /// side. The paper's split.
+    /// Train on the first 80 % of the frames, test on the rest.
+    ///
+    /// Both frames of a pair are on the same side. The paper's split.
     Time,
-    /// One contiguous fifth of the frames tests, the others train; both frames of a pair are on the
-    /// same side. The last fold equals [`Split::Time`].
-    Fold(Fifth),
-    /// Blocks of 50 frames; block b tests if b mod 5 = 2. A test pair lies within one block; both
-    /// frames of a training pair lie outside the test blocks.
+    /// Test on the first fifth of the frames, train on the rest.
+    ///
+    /// Fold k tests the frames ⌊(k−1)N/5⌋ to ⌊kN/5⌋ − 1 of N. Both frames of a pair are on the same
+    /// side.
+    Fold1,
+    /// Test on the second fifth, train on the others.
+    Fold2,
+    /// Test on the third fifth, train on the others.
+    Fold3,
+    /// Test on the fourth fifth, train on the others.
+    Fold4,
+    /// Test on the last fifth, train on the others: as time.
+    Fold5,
+    /// Test on every fifth block of 50 frames, train on the others.
+    ///
+    /// Block b tests if b mod 5 = 2. A test pair lies within one block; both frames of a training
+    /// pair lie outside the test blocks.
     Blocks,
-    /// The pair (i, j) tests if i mod 5 = 2. Both sides share frames: a deliberate leak for checks
-    /// of an implementation, not a measure of generalization.
+    /// Every fifth source frame gives a test pair. Training and test pairs share frames: only for
+    /// checking an implementation, not for measuring generalization.
+    ///
+    /// The pair (i, j) tests if i mod 5 = 2.
     Pairs,
-    /// The recording's own split: 7-Scenes' TestSplit, 12-Scenes' first sequence. Both frames of a
-    /// pair are on the same side.
+    /// The recording's own split, if it has one.
+    ///
+    /// 7-Scenes' TestSplit, 12-Scenes' first sequence. Both frames of a pair are on the same side.
     Dataset,
-    /// Every pair is both a training and a test pair: for rooms that are trained on, or held out,
+    /// Use every pair for training and for testing: for rooms that are training or held-out rooms
     /// as a whole.
     Whole,
 }
 
-impl TryFrom<String> for Split {
-    type Error = String;
-
-    fn try_from(name: String) -> Result<Self, String> {
-        Self::from_name(&name).ok_or_else(|| format!("'{name}' is not a split"))
-    }
-}
-
-impl From<Split> for String {
-    fn from(split: Split) -> Self {
-        split.name().to_owned()
-    }
-}
-
 impl Split {
-    /// All splits.
-    pub const ALL: [Self; 10] = [
-        Self::Time,
-        Self::FOLDS[0],
-        Self::FOLDS[1],
-        Self::FOLDS[2],
-        Self::FOLDS[3],
-        Self::FOLDS[4],
-        Self::Blocks,
-        Self::Pairs,
-        Self::Dataset,
-        Self::Whole,
-    ];
-
     /// The five folds of a recording; each frame is tested in exactly one.
     pub const FOLDS: [Self; 5] = [
-        Self::Fold(Fifth::First),
-        Self::Fold(Fifth::Second),
-        Self::Fold(Fifth::Third),
-        Self::Fold(Fifth::Fourth),
-        Self::Fold(Fifth::Last),
+        Self::Fold1,
+        Self::Fold2,
+        Self::Fold3,
+        Self::Fold4,
+        Self::Fold5,
     ];
 
     /// Name on the command line, on the wire and in a manifest.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Time => "time",
-            Self::Fold(fifth) => fifth.fold_name(),
-            Self::Blocks => "blocks",
-            Self::Pairs => "pairs",
-            Self::Dataset => "dataset",
-            Self::Whole => "whole",
-        }
-    }
-
-    /// The split with this [`Split::name`].
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|split| split.name() == name)
+        self.into()
     }
 
     /// Training pairs at one stride, ordered by source frame.
@@ -200,7 +178,7 @@ impl Split {
                     frame_count,
                     stride: low,
                     split: self,
-                    side: Side::Train.name(),
+                    side: Side::Train.into(),
                 });
             }
         }
@@ -235,7 +213,7 @@ impl Split {
                 frame_count,
                 stride,
                 split: self,
-                side: side.name(),
+                side: side.into(),
             });
         }
 
@@ -263,7 +241,7 @@ impl Split {
             } else {
                 Side::Train
             }),
-            Self::Time | Self::Fold(_) | Self::Blocks | Self::Dataset | Self::Whole => {
+            _ => {
                 match (tested(pair.source), tested(pair.target)) {
                     (false, false) => Some(Side::Train),
                     // Training blocks lie between test blocks, so a test pair must stay within one
@@ -280,19 +258,22 @@ impl Split {
     }
 
     fn tests_frame(self, timeline: &Timeline, frame: FrameId) -> bool {
+        let is_in_fifth = |k: usize| {
+            let begin = timeline.frame_count * k / 5;
+            let end = timeline.frame_count * (k + 1) / 5;
+            (begin..end).contains(&frame.row())
+        };
+
         match self {
-            Self::Time => Fifth::Last.holds(frame, timeline.frame_count),
-            Self::Fold(fifth) => fifth.holds(frame, timeline.frame_count),
+            Self::Fold1 => is_in_fifth(0),
+            Self::Fold2 => is_in_fifth(1),
+            Self::Fold3 => is_in_fifth(2),
+            Self::Fold4 => is_in_fifth(3),
+            Self::Time | Self::Fold5 => is_in_fifth(4),
             Self::Dataset => timeline.held_out.get(frame.row()).copied().unwrap_or(false),
             Self::Blocks => (frame.row() / BLOCK_FRAMES) % 5 == 2,
             Self::Pairs | Self::Whole => false,
         }
-    }
-}
-
-impl std::fmt::Display for Split {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(self.name())
     }
 }
 
@@ -307,19 +288,12 @@ pub struct StrideRange {
     pub count: usize,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr)]
 enum Side {
+    #[strum(serialize = "training")]
     Train,
+    #[strum(serialize = "test")]
     Test,
-}
-
-impl Side {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Train => "training",
-            Self::Test => "test",
-        }
-    }
 }
 
 fn frames(count: usize) -> impl Iterator<Item = FrameId> {

@@ -1,12 +1,14 @@
 //! Alignment of an estimated trajectory with the reference.
 
 use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use strum::{Display, IntoStaticStr, VariantArray};
 
 use super::{Error, Trajectory};
 use crate::geometry::Pose;
 
 /// Alignment of an estimated trajectory with the reference before the comparison.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Alignment {
     /// None: both trajectories are in the same world frame.
     None,
@@ -20,19 +22,6 @@ pub enum Alignment {
 }
 
 impl Alignment {
-    /// All alignments.
-    pub const ALL: [Self; 4] = [Self::None, Self::Origin, Self::Se3, Self::Sim3];
-
-    /// Name.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::None => "none",
-            Self::Origin => "origin",
-            Self::Se3 => "se3",
-            Self::Sim3 => "sim3",
-        }
-    }
-
     /// The aligned estimate. Both trajectories must be associated: pose i of one belongs to pose i
     /// of the other.
     ///

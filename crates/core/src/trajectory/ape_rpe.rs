@@ -1,13 +1,15 @@
 //! Absolute and relative pose errors.
 
 use nalgebra::Matrix4;
+use strum::{Display, IntoStaticStr, VariantArray};
 
 use super::{Error, Trajectory};
 use crate::geometry::{Pose, PoseError};
 use crate::statistics::{mean, median};
 
 /// Measure of a pose error.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Relation {
     /// The distance, meters.
     Translation,
@@ -18,18 +20,6 @@ pub enum Relation {
 }
 
 impl Relation {
-    /// All relations.
-    pub const ALL: [Self; 3] = [Self::Translation, Self::Rotation, Self::Full];
-
-    /// Name.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Translation => "translation",
-            Self::Rotation => "rotation",
-            Self::Full => "full",
-        }
-    }
-
     /// The measure of a pose error E.
     fn of(self, error: &Pose) -> f64 {
         let parts = PoseError::between(&Pose::identity(), error);

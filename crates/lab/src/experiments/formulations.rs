@@ -1,6 +1,7 @@
 //! Compares the adapter with the paper's alternatives A to D and the constant, over several seeds.
 
 use rayon::prelude::*;
+use strum::VariantArray;
 
 use seese3_core::motion_scores::{MotionScores, ReadMotions};
 use seese3_core::splits::Split;
@@ -53,9 +54,9 @@ pub fn compare(
     room_pooling: RoomPooling,
     done: &(dyn Fn() + Sync),
 ) -> Result<Comparison, Error> {
-    let tasks: Vec<(Formulation, u64)> = Formulation::ALL
-        .into_iter()
-        .flat_map(|which| (0..seeds).map(move |seed| (which, seed)))
+    let tasks: Vec<(Formulation, u64)> = Formulation::VARIANTS
+        .iter()
+        .flat_map(|&which| (0..seeds).map(move |seed| (which, seed)))
         .collect();
 
     let runs: Vec<(Formulation, MotionScores, f64)> = tasks
@@ -75,7 +76,7 @@ pub fn compare(
         .collect::<Result<_, Error>>()?;
 
     // Group the runs of all tasks by formulation.
-    let scores_of = |which: Formulation| FormulationScores {
+    let scores_of = |&which: &Formulation| FormulationScores {
         name: which.name(),
         runs: runs
             .iter()
@@ -85,7 +86,7 @@ pub fn compare(
     };
 
     Ok(Comparison {
-        formulations: Formulation::ALL.map(scores_of).to_vec(),
+        formulations: Formulation::VARIANTS.iter().map(scores_of).collect(),
         // The constant is the same for every formulation and seed.
         constant_r2: runs.first().map_or(f64::NAN, |&(_, _, constant)| constant),
     })

@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use seese3_core::trajectory::{
     Alignment, Error, Matches, Relation, RpePairs, Statistics, Trajectory, ape, rpe,
 };
+use strum::VariantArray;
 
 /// Settings of the relative pose error.
 #[derive(Debug, Clone, Copy)]
@@ -24,10 +25,10 @@ pub struct PathComparison {
     pub unmatched_reference: usize,
     /// Number of estimated poses without a matching reference.
     pub unmatched_estimate: usize,
-    /// Absolute errors by alignment, one entry per relation of [`Relation::ALL`]. An alignment
+    /// Absolute errors by alignment, one entry per [`Relation`]. An alignment
     /// that is undefined for the path holds the reason instead.
     pub absolute: Vec<(Alignment, Result<[Statistics; 3], Error>)>,
-    /// Relative errors, one entry per relation of [`Relation::ALL`], or why they are undefined.
+    /// Relative errors, one entry per [`Relation`], or why they are undefined.
     pub relative: Result<[Statistics; 3], Error>,
     /// The settings of the relative error.
     pub protocol: PathProtocol,
@@ -51,11 +52,11 @@ impl PathComparison {
 
         // An alignment may be undefined, as for positions on a line; the others are still
         // reported.
-        for alignment in Alignment::ALL {
+        for &alignment in Alignment::VARIANTS {
             let errors = match alignment.apply(&of_reference, &of_estimate) {
                 Ok(aligned) => {
                     let mut by_relation = [Statistics::of(&[]); 3];
-                    for (statistics, relation) in by_relation.iter_mut().zip(Relation::ALL) {
+                    for (statistics, &relation) in by_relation.iter_mut().zip(Relation::VARIANTS) {
                         *statistics = Statistics::of(&ape(&of_reference, &aligned, relation)?);
                     }
 
@@ -68,8 +69,9 @@ impl PathComparison {
         }
 
         // Relative errors do not depend on the choice of the world frame and need no alignment.
-        let relative = Relation::ALL
-            .map(|relation| {
+        let relative = Relation::VARIANTS
+            .iter()
+            .map(|&relation| {
                 rpe(
                     &of_reference,
                     &of_estimate,
@@ -78,7 +80,6 @@ impl PathComparison {
                     protocol.pairs,
                 )
             })
-            .into_iter()
             .map(|errors| errors.map(|errors| Statistics::of(&errors)))
             .collect::<Result<Vec<_>, Error>>()
             .map(|found| [found[0], found[1], found[2]]);

@@ -14,6 +14,7 @@ use std::sync::Arc;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
+use strum::{IntoStaticStr, VariantArray};
 
 use seese3_core::adapter::{Adapter, Reading};
 use seese3_core::cancel::Cancellation;
@@ -31,8 +32,9 @@ use super::simple_planners::{greedy, pose_graph, topological};
 /// Number of query views from each other room.
 const OTHER_ROOM_VIEWS: usize = 5;
 
-/// A planner that is evaluated.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+/// A planner that is evaluated, in the order of tables.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "snake_case")]
 pub enum Planner {
     /// The server's planner: the shortest path over the room's frames from the estimated pose.
     Ours,
@@ -46,18 +48,6 @@ pub enum Planner {
     Topological,
     /// The robot does not move.
     StandingStill,
-}
-
-impl Planner {
-    /// Every planner, in the order of tables.
-    pub const ALL: [Self; 6] = [
-        Self::Ours,
-        Self::Latent,
-        Self::Greedy,
-        Self::PoseGraph,
-        Self::Topological,
-        Self::StandingStill,
-    ];
 }
 
 /// Scores of one planner.
@@ -208,7 +198,7 @@ pub fn evaluate(
             let goal = mapped.any_frame(&mut random);
             let question = question(data, adapter, frame, goal)?;
             let truth = &data.room.poses()[frame.row()];
-            for planner in Planner::ALL {
+            for &planner in Planner::VARIANTS {
                 let way = answer(&mapped, planner, &question)?;
                 scores
                     .entry(planner)
@@ -225,7 +215,7 @@ pub fn evaluate(
                 let frame = FrameId(random.random_range(0..other.room.frame_count() as u32));
                 let goal = mapped.any_frame(&mut random);
                 let question = question(other, adapter, frame, goal)?;
-                for planner in Planner::ALL {
+                for &planner in Planner::VARIANTS {
                     let says_reached = answer(&mapped, planner, &question)?.says_reached;
                     let scores = scores.entry(planner).or_default();
                     scores.other_questions += 1;

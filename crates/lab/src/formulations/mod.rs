@@ -19,6 +19,7 @@ pub use world_pose::{AbsolutePose, UnanchoredMotion, WorldPose};
 
 use nalgebra::Vector6;
 use ndarray::ArrayView2;
+use strum::{IntoStaticStr, VariantArray};
 
 use seese3_core::adapter::building_blocks::{Seeded, fit};
 use seese3_core::adapter::{EpochProgress, Objective, Samples, TargetScale, TrainConfig, Widths};
@@ -30,39 +31,29 @@ use seese3_core::training::{
 };
 
 /// A model that predicts a motion from two features.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Formulation {
     /// The adapter: W(φ(z₂) − φ(z₁)).
     Poincare,
     /// A: ψ(z₂) ψ(z₁)⁻¹, trained on motions in the world frame.
+    #[strum(serialize = "a-unanchored")]
     Unanchored,
     /// B: the same ψ, trained on absolute poses.
+    #[strum(serialize = "b-absolute")]
     Absolute,
     /// C: a pose head on φ(z₂) − φ(z₁).
+    #[strum(serialize = "c-se3-mlp")]
     GeodesicHead,
     /// D: W φ(z₂ − z₁).
+    #[strum(serialize = "d-difference-input")]
     DifferenceInput,
 }
 
 impl Formulation {
-    /// The adapter, then the paper's four alternatives.
-    pub const ALL: [Self; 5] = [
-        Self::Poincare,
-        Self::Unanchored,
-        Self::Absolute,
-        Self::GeodesicHead,
-        Self::DifferenceInput,
-    ];
-
     /// Its name in tables and on the command line.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Poincare => "poincare",
-            Self::Unanchored => "a-unanchored",
-            Self::Absolute => "b-absolute",
-            Self::GeodesicHead => "c-se3-mlp",
-            Self::DifferenceInput => "d-difference-input",
-        }
+        self.into()
     }
 }
 

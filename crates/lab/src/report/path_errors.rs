@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
+use strum::VariantArray;
 
 use super::table::aligned;
 use crate::experiments::path_comparison::PathComparison;
@@ -28,11 +29,11 @@ pub fn path_errors_table(errors: &PathComparison) -> String {
     for (name, found) in rows(errors) {
         match found {
             Ok(found) => {
-                for (statistics, relation) in found.iter().zip(Relation::ALL) {
+                for (statistics, relation) in found.iter().zip(Relation::VARIANTS) {
                     let s = statistics;
                     let numbers = [s.rmse, s.mean, s.median, s.deviation, s.least, s.largest];
                     let cells = numbers.map(|number| format!("{number:.6}"));
-                    let start = [name.clone(), relation.name().to_owned()];
+                    let start = [name.clone(), relation.to_string()];
 
                     lines.push(
                         start
@@ -57,7 +58,7 @@ fn rows(errors: &PathComparison) -> Vec<(String, &Result<[Statistics; 3], Error>
     let absolute = errors
         .absolute
         .iter()
-        .map(|(alignment, found)| (format!("APE {}", alignment.name()), found));
+        .map(|(alignment, found)| (format!("APE {alignment}"), found));
     let relative = format!("RPE Δ {}", errors.protocol.delta);
 
     absolute.chain([(relative, &errors.relative)]).collect()
@@ -108,7 +109,7 @@ pub fn path_errors_json(errors: &PathComparison) -> PathErrorsJson {
         ape: errors
             .absolute
             .iter()
-            .map(|(alignment, found)| (alignment.name(), errors_json(found)))
+            .map(|(alignment, found)| (alignment.into(), errors_json(found)))
             .collect(),
         ape_formula: APE_FORMULA,
         rpe: errors_json(&errors.relative),
@@ -132,10 +133,10 @@ fn errors_json(found: &Result<[Statistics; 3], Error>) -> ErrorsJson {
 
     match found {
         Ok(found) => {
-            let named = Relation::ALL.iter().zip(found);
+            let named = Relation::VARIANTS.iter().zip(found);
             ErrorsJson::Found(
                 named
-                    .map(|(relation, found)| (relation.name(), statistics(found)))
+                    .map(|(relation, found)| (relation.into(), statistics(found)))
                     .collect(),
             )
         }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
+use strum::VariantArray;
 
 use super::table::aligned;
 use crate::experiments::planning::{Planner, PlannerScores, PlanningProtocol, RoomPlanning};
@@ -22,7 +23,7 @@ pub fn planning_table(rooms: &[RoomPlanning]) -> String {
     ];
 
     let mut lines = vec![head.map(str::to_owned).to_vec()];
-    for planner in Planner::ALL {
+    for &planner in Planner::VARIANTS {
         let scores = all(rooms, planner);
         let there = Rate::of(scores.truly_there, scores.questions);
         let wrong = scores.says_reached - scores.truly_there;
@@ -66,18 +67,6 @@ impl Planner {
             Self::PoseGraph => "pose graph",
             Self::Topological => "topological graph",
             Self::StandingStill => "standing still",
-        }
-    }
-
-    /// Its key in JSON.
-    fn key(self) -> &'static str {
-        match self {
-            Self::Ours => "ours",
-            Self::Latent => "latent",
-            Self::Greedy => "greedy",
-            Self::PoseGraph => "pose_graph",
-            Self::Topological => "topological",
-            Self::StandingStill => "standing_still",
         }
     }
 }
@@ -147,9 +136,9 @@ pub fn planning_json(
     adapter: &str,
 ) -> PlanningJson {
     let by_planner = |scores: &dyn Fn(Planner) -> PlannerScores| {
-        Planner::ALL
-            .into_iter()
-            .map(|planner| (planner.key(), PlannerJson::of(&scores(planner))))
+        Planner::VARIANTS
+            .iter()
+            .map(|&planner| (planner.into(), PlannerJson::of(&scores(planner))))
             .collect()
     };
 

@@ -90,7 +90,7 @@ fn is_best(compared: &Comparison) -> Option<bool> {
         return None;
     }
 
-    // The adapter comes first in `Formulation::ALL`.
+    // The adapter comes first in `Formulation::VARIANTS`.
     let (adapter, alternatives) = by_formulation.split_first()?;
     let is_above: Vec<Option<bool>> = alternatives
         .iter()

@@ -2,9 +2,11 @@
 
 use seese3_core::geometry::Twist;
 use seese3_core::index::Neighbour;
+use strum::{IntoStaticStr, VariantArray};
 
 /// Source of the relative pose between a view and its most similar mapped frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "kebab-case")]
 pub enum MotionReader {
     /// Zero motion: the pose of the mapped frame is the estimate.
     NearestFrame,
@@ -15,16 +17,9 @@ pub enum MotionReader {
 }
 
 impl MotionReader {
-    /// All variants.
-    pub const ALL: [Self; 3] = [Self::NearestFrame, Self::ZeroShot, Self::Fitted];
-
     /// Name in reports, on the wire and on disk.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::NearestFrame => "nearest-frame",
-            Self::ZeroShot => "zero-shot",
-            Self::Fitted => "fitted",
-        }
+        self.into()
     }
 }
 

@@ -23,11 +23,13 @@ use std::time::SystemTime;
 
 use issuers::Issuer;
 use serde::Deserialize;
+use strum::IntoStaticStr;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 /// The permission that an RPC requires; each RPC requires one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, IntoStaticStr)]
 #[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "lowercase")]
 pub enum Verb {
     /// NavigationService.
     Navigate,
@@ -46,14 +48,7 @@ pub enum Verb {
 impl Verb {
     /// Name in auth files and messages.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Navigate => "navigate",
-            Self::Localize => "localize",
-            Self::Track => "track",
-            Self::Evaluate => "evaluate",
-            Self::Catalog => "catalog",
-            Self::Write => "write",
-        }
+        self.into()
     }
 }
 

@@ -1,6 +1,7 @@
 //! Converts and validates incoming requests. Errors name the invalid field.
 
 use seese3_client::convert::{self, ConvertError};
+use strum::VariantArray;
 
 use super::super::Error;
 use super::super::snapshot::Snapshot;
@@ -336,17 +337,15 @@ pub fn thresholds(given: Vec<f64>) -> Result<Vec<f64>, Error> {
 
 /// The split with this name; `None` if the name is empty.
 pub fn split(name: &str) -> Result<Option<Split>, Error> {
-    match Split::from_name(name) {
-        Some(split) => Ok(Some(split)),
-        None if name.is_empty() => Ok(None),
-        None => {
-            let known = Split::ALL.map(Split::name).join(", ");
-            Err(Error::invalid(
-                "split",
-                format!("'{name}' must be one of {known}"),
-            ))
-        }
+    if name.is_empty() {
+        return Ok(None);
     }
+
+    name.parse().map(Some).map_err(|_| {
+        let known = Split::VARIANTS.iter().map(|split| split.name());
+        let known = known.collect::<Vec<_>>().join(", ");
+        Error::invalid("split", format!("'{name}' must be one of {known}"))
+    })
 }
 
 /// The named navigators of an evaluation. An empty list selects the default navigators.

@@ -117,7 +117,7 @@ pub fn navigator_names(adapter: &Adapter) -> Vec<String> {
     StepKind::all()
         .into_iter()
         .filter(has)
-        .map(|step| step.name().to_owned())
+        .map(StepKind::name)
         .collect()
 }
 

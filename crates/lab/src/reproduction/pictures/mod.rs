@@ -9,6 +9,7 @@ mod walks;
 use std::sync::Arc;
 
 use serde::Serialize;
+use strum::VariantArray;
 
 use seese3_core::training::RoomData;
 
@@ -44,7 +45,7 @@ pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Pictures
 
     // A held-out synthetic room, with a short, a middle and a long motion.
     let drawn = set.test.iter().filter(is_drawn).find(has_images);
-    for length in Length::ALL {
+    for &length in Length::VARIANTS {
         if let Some(data) = drawn {
             walks.push(walks::add(&mut section, given, data, &adapter, length)?);
         }

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use serde::Serialize;
+use strum::{Display, IntoStaticStr, VariantArray};
 
 use seese3_core::adapter::{Adapter, Reading};
 use seese3_core::cancel::Cancellation;
@@ -26,7 +27,8 @@ const STEPS: u32 = 4;
 const FAR: u32 = 50;
 
 /// Length of a walk, as a quantile of the translations of a room's pairs.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Display, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "kebab-case")]
 pub enum Length {
     Short,
     Middle,
@@ -34,16 +36,6 @@ pub enum Length {
 }
 
 impl Length {
-    pub const ALL: [Self; 3] = [Self::Short, Self::Middle, Self::Long];
-
-    fn name(self) -> &'static str {
-        match self {
-            Self::Short => "short",
-            Self::Middle => "middle",
-            Self::Long => "long",
-        }
-    }
-
     fn share(self) -> f64 {
         match self {
             Self::Short => 0.1,
@@ -87,12 +79,12 @@ pub fn add(
     let still = between(pair.source.0, pair.target.0);
 
     let shown: Vec<u32> = frames.iter().copied().chain([pair.target.0]).collect();
-    let name = format!("walk-{}-{}", data.room.id(), length.name());
+    let name = format!("walk-{}-{length}", data.room.id());
     let caption = format!(
         "Room {}, a {} motion ({:.2} m and {:.0}°): source, {STEPS} steps in an open loop, target; the last step is {:.2} m \
          and {:.0}° from it",
         data.room.id(),
-        length.name(),
+        length,
         still.translation_m,
         still.rotation_rad.to_degrees(),
         off.translation_m,
@@ -114,7 +106,7 @@ pub fn add(
 
     Ok(WalkRecord {
         room: data.room.id().to_string(),
-        length: length.name(),
+        length: length.into(),
         frames: shown,
         metres_off: off.translation_m,
         degrees_off: off.rotation_rad.to_degrees(),
@@ -184,11 +176,7 @@ fn plan(data: &RoomData<'_>, pair: Pair, frames: &[u32], length: Length) -> Path
     });
 
     PathPlot {
-        title: format!(
-            "{}: a {} motion, {STEPS} steps",
-            data.room.id(),
-            length.name()
-        ),
+        title: format!("{}: a {} motion, {STEPS} steps", data.room.id(), length),
         map: poses
             .iter()
             .map(|pose| {
