@@ -6,10 +6,10 @@ use anyhow::bail;
 use clap::{Args, Subcommand};
 
 use super::encode::images_root;
-use super::output::{JsonOutput, say};
+use super::output::say;
 use super::pose_report::{PosesFrom, check_with_images, report_json, say_report};
+use super::store_option::StoreAndJson;
 use seese3_data::pose_check::check_room;
-use seese3_store::Store;
 
 #[derive(Debug, Args)]
 pub struct Check {
@@ -26,17 +26,14 @@ enum What {
 
 #[derive(Debug, Args)]
 struct CheckRoom {
-    /// The store: a folder, or a URL of a bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
-    store: String,
+    #[command(flatten)]
+    common: StoreAndJson,
     /// Name of the room
     #[arg(long)]
     room: String,
     /// Folder of the images, if they were moved since the import
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
-    #[command(flatten)]
-    json: JsonOutput,
 }
 
 impl Check {
@@ -48,8 +45,7 @@ impl Check {
 
 impl CheckRoom {
     async fn run(self) -> anyhow::Result<()> {
-        self.json.begin()?;
-        let store = Store::open(&self.store)?;
+        let store = self.common.open()?;
         let room = store.load_room(&self.room, None).await?.room;
 
         let from = PosesFrom::Store;
@@ -60,7 +56,7 @@ impl CheckRoom {
             check_with_images(&room, &root, room.poses(), from)
         };
 
-        self.json.write(&report_json(&report, &room, from))?;
+        self.common.json.write(&report_json(&report, &room, from))?;
         say(format_args!(
             "room '{}': {} frames",
             room.id(),

@@ -6,10 +6,11 @@ use serde::Serialize;
 
 use super::evaluate::navigators_named;
 use super::named::one_of;
-use super::output::{JsonOutput, say};
+use super::output::say;
 use super::progress::bar;
 use super::protocol::ProtocolOptions;
 use super::rooms::{data, load_rooms, room_words};
+use super::store_option::StoreAndJson;
 use seese3_core::adapter::Reading;
 use seese3_core::eval::{Protocol, check_thresholds};
 use seese3_core::features::Features;
@@ -23,13 +24,12 @@ use seese3_lab::experiments::cross_room::{
 use seese3_lab::report::{
     CrossRoomJson, cross_room_json, cross_room_table, rooms_table, scaling_table,
 };
-use seese3_store::{Store, StoredRoom};
+use seese3_store::StoredRoom;
 
 #[derive(Debug, Args)]
 pub struct CrossRoom {
-    /// The store: a folder, or a URL of a bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
-    store: String,
+    #[command(flatten)]
+    common: StoreAndJson,
     /// Training rooms: names, or patterns with *; may be given several times
     #[arg(long, required = true)]
     train: Vec<String>,
@@ -46,7 +46,7 @@ pub struct CrossRoom {
     sizes: Vec<usize>,
     /// Number of rooms in each count that are used for calibration instead of training: the
     /// adapter's errors are measured there for +calibrated navigators
-    #[arg(long, alias = "aside", default_value_t = 0)]
+    #[arg(long, default_value_t = 0)]
     calibration_rooms: usize,
     /// Number of adapters trained per room count, with seeds --seed, --seed + 1, …; 1 to 1000
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000))]
@@ -78,8 +78,6 @@ pub struct CrossRoom {
     /// Also print a table with one line per held-out room
     #[arg(long)]
     rooms: bool,
-    #[command(flatten)]
-    json: JsonOutput,
 }
 
 type Loaded = (StoredRoom, Features);
@@ -106,9 +104,7 @@ impl CrossRoom {
         reason = "one command, from its arguments to what it prints"
     )]
     pub async fn run(self) -> anyhow::Result<()> {
-        self.json.begin()?;
-
-        let store = Store::open(&self.store)?;
+        let store = self.common.open()?;
         let train = load_rooms(&store, &self.train, self.features.as_deref()).await?;
         let source = train[0].1.source().name.clone();
 
@@ -181,7 +177,7 @@ impl CrossRoom {
         self.say(&train, &test, &plan, &runs)?;
 
         // The record includes the protocol, which is needed to interpret the scores.
-        if self.json.is_wanted() {
+        if self.common.json.is_wanted() {
             let record = CrossRoomRecord {
                 results: cross_room_json(&runs, &self.baseline),
                 features: source,
@@ -194,7 +190,7 @@ impl CrossRoom {
                 test_split: protocol.split.name(),
                 threshold: self.threshold,
             };
-            self.json.write(&record)?;
+            self.common.json.write(&record)?;
         }
 
         Ok(())

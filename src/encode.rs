@@ -7,9 +7,10 @@ use anyhow::{Context, bail};
 use clap::Args;
 use serde_json::json;
 
-use super::encoder::{EncoderOptions, RuntimeOptions};
-use super::output::{JsonOutput, say};
+use super::encoder::{EncoderOptions, RuntimeOptions, feature_prefix, say_features};
+use super::output::say;
 use super::progress::bar;
+use super::store_option::StoreAndJson;
 use seese3_core::cancel::Cancellation;
 use seese3_core::features::{FeatureSource, Features};
 use seese3_core::geometry::Pose;
@@ -22,9 +23,8 @@ const NAMED: usize = 20;
 
 #[derive(Debug, Args)]
 pub struct Encode {
-    /// The store: a folder, or a URL of a bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
-    store: String,
+    #[command(flatten)]
+    common: StoreAndJson,
     /// Name of the room; it must have been imported from a recording with images
     #[arg(long)]
     room: String,
@@ -57,21 +57,18 @@ pub struct Encode {
     /// interrupted run can resume; STORE/unfinished if omitted, required for a bucket
     #[arg(long, value_name = "DIR")]
     journal: Option<PathBuf>,
-    #[command(flatten)]
-    json: JsonOutput,
 }
 
 impl Encode {
     pub async fn run(self) -> anyhow::Result<()> {
-        self.json.begin()?;
+        let store = self.common.open()?;
         let runtime = self.runtime.runtime();
         let encoder = self.encoder.open(&self.model, &runtime)?;
-        let store = Store::open(&self.store)?;
         let stored = store.load_room(&self.room, None).await?;
 
         // Names and the image folder are checked first, so that a long run does not fail at its
         // end.
-        let sources = encoder.sources(&self.prefix());
+        let sources = encoder.sources(&feature_prefix(self.prefix.as_deref(), &self.model));
         check_names(&sources)?;
         let root = images_root(&stored.room, self.images.as_deref())?;
 
@@ -175,7 +172,7 @@ impl Encode {
             .map(|(frame, problem)| json!({ "frame": frame, "problem": problem }))
             .collect();
 
-        self.json.write(&json!({
+        self.common.json.write(&json!({
             "room": self.room,
             "revision": revision,
             "features": features,
@@ -184,22 +181,13 @@ impl Encode {
         }))
     }
 
-    fn prefix(&self) -> String {
-        let stem = || {
-            Path::new(&self.model)
-                .file_stem()
-                .map(|stem| stem.to_string_lossy().into_owned())
-        };
-        self.prefix.clone().or_else(stem).unwrap_or_default()
-    }
-
     fn journal_path(&self, key: &str) -> anyhow::Result<PathBuf> {
         let folder = match &self.journal {
             Some(folder) => folder.clone(),
-            None if self.store.contains("://") => {
+            None if self.common.store.contains("://") => {
                 bail!("--journal DIR is required for a store in a bucket")
             }
-            None => Path::new(&self.store).join("unfinished"),
+            None => Path::new(&self.common.store).join("unfinished"),
         };
 
         // Another encoder, room revision or image folder gives another key, and hence a separate
@@ -275,12 +263,7 @@ fn say_encoded(encoded: &Encoded, sources: &[FeatureSource], seconds: f64) {
         encoded.resumed
     ));
 
-    for source in sources {
-        say(format_args!(
-            "features '{}': {} columns",
-            source.name, source.dim
-        ));
-    }
+    say_features(sources);
 }
 
 /// The folder that the room's image paths start from: `given`, or where the images were at import.

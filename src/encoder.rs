@@ -3,19 +3,22 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use clap::{Args, ValueEnum};
+use clap::Args;
 
+use super::named::one_of;
+use super::output::say;
+use seese3_core::features::FeatureSource;
 use seese3_encoder::{
     self, Encoder, EncoderRecipe, Filter, Layer, ModelTask, Pooling, Preparation, Preprocess,
-    Resize, Runtime, RuntimeKind,
+    RECIPES, Resize, Runtime, RuntimeKind,
 };
 
 /// Which runtime runs ONNX models, and on how many threads.
 #[derive(Debug, Clone, Args)]
 pub struct RuntimeOptions {
     /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
-    #[arg(long, value_enum, default_value_t = RuntimeName::Tract, env = "SEESE3_RUNTIME")]
-    runtime: RuntimeName,
+    #[arg(long, value_parser = one_of::<RuntimeKind>(), default_value = "tract", env = "SEESE3_RUNTIME")]
+    runtime: RuntimeKind,
     /// Path of the onnxruntime shared library
     #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
     library: Option<PathBuf>,
@@ -24,28 +27,11 @@ pub struct RuntimeOptions {
     threads: u16,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum RuntimeName {
-    /// Pure Rust, needs no library
-    Tract,
-    /// A shared library, loaded when a model is opened
-    Onnxruntime,
-}
-
-impl From<RuntimeName> for RuntimeKind {
-    fn from(name: RuntimeName) -> Self {
-        match name {
-            RuntimeName::Tract => Self::Tract,
-            RuntimeName::Onnxruntime => Self::OnnxRuntime,
-        }
-    }
-}
-
 impl RuntimeOptions {
     /// The options as the library's type.
     pub fn runtime(&self) -> Runtime {
         Runtime {
-            kind: self.runtime.into(),
+            kind: self.runtime,
             threads: self.threads(),
             library: self.library.clone(),
         }
@@ -62,7 +48,7 @@ impl RuntimeOptions {
 }
 
 /// How images are preprocessed, and which layers are kept and how they are pooled.
-#[derive(Debug, Clone, Args)]
+#[derive(Debug, Clone, PartialEq, Default, Args)]
 pub struct EncoderOptions {
     /// Preprocessing and layer defaults of a known encoder, by a name from `seese3 encoders`; the
     /// options below override single values
@@ -122,7 +108,7 @@ pub struct EncoderOptions {
 }
 
 /// Source of the preprocessing if there is no recipe.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 enum Preprocessing {
     Family(Preprocess),
     File(PathBuf),
@@ -174,7 +160,7 @@ impl EncoderOptions {
             );
         }
 
-        let recipe = self.recipe()?;
+        let recipe = self.recipe.as_deref().map(recipe_named).transpose()?;
         let preparation = self.preparation(recipe, file)?;
 
         // `all` selects the outputs that the file declares, in the file's order.
@@ -238,49 +224,11 @@ impl EncoderOptions {
 
     /// Whether every option was left at its default.
     fn is_plain(&self) -> bool {
-        // Destructured with no `..`, so that a new option breaks the build here.
-        let Self {
-            recipe,
-            preprocess,
-            layers,
-            pool,
-            prefix_tokens,
-            base,
-            norm,
-            window,
-            resize,
-            filter,
-            crop,
-            divisor,
-            mean,
-            std,
-        } = self;
-
-        let words = [recipe, pool, base, norm, resize, filter, crop, mean, std];
-        let numbers = [prefix_tokens.is_some(), window.is_some(), divisor.is_some()];
-
-        preprocess.is_none()
-            && layers == &["all"]
-            && words.iter().all(|word| word.is_none())
-            && numbers == [false; 3]
-    }
-
-    fn recipe(&self) -> anyhow::Result<Option<&'static EncoderRecipe>> {
-        let Some(name) = &self.recipe else {
-            return Ok(None);
-        };
-
-        let known = || {
-            seese3_encoder::RECIPES
-                .iter()
-                .map(|recipe| recipe.name.as_str())
-                .collect::<Vec<_>>()
-                .join(", ")
-        };
-
-        seese3_encoder::recipe(name)
-            .map(Some)
-            .with_context(|| format!("unknown recipe '{name}'; known recipes: {}", known()))
+        *self
+            == Self {
+                layers: vec!["all".to_owned()],
+                ..Self::default()
+            }
     }
 
     fn preparation(
@@ -345,5 +293,32 @@ impl EncoderOptions {
         }
 
         Ok(preparation)
+    }
+}
+
+/// The recipe with this name; the error lists the known names.
+pub fn recipe_named(name: &str) -> anyhow::Result<&'static EncoderRecipe> {
+    seese3_encoder::recipe(name).with_context(|| {
+        let known: Vec<&str> = RECIPES.iter().map(|recipe| recipe.name.as_str()).collect();
+        format!(
+            "unknown recipe '{name}'; known recipes: {}",
+            known.join(", ")
+        )
+    })
+}
+
+/// Prefix of feature names: the given one, else the model's file name without extension.
+pub fn feature_prefix(given: Option<&str>, model: &str) -> String {
+    let stem = || Path::new(model).file_stem().unwrap_or_default();
+    given.map_or_else(|| stem().to_string_lossy().into_owned(), str::to_owned)
+}
+
+/// Prints the names and widths of features.
+pub fn say_features<'a>(sources: impl IntoIterator<Item = &'a FeatureSource>) {
+    for source in sources {
+        say(format_args!(
+            "features '{}': {} columns",
+            source.name, source.dim
+        ));
     }
 }

@@ -3,8 +3,19 @@
 use clap::Args;
 use serde_json::json;
 
+use super::encoder::recipe_named;
 use super::output::{JsonOutput, say};
 use seese3_encoder::{EncoderRecipe, RECIPES, RuntimeKind};
+
+/// Printed above the recipes.
+const WITHOUT_RECIPE: &str = "\
+Without a model:
+  pixels    raw pixels at 320x240, averaged over 16x12 patches, 576 columns
+  builtin   gradient orientations and color, weight-free stand-in, 528 columns
+
+With a model: seese3 encode --model FILE.onnx --recipe NAME. Any ONNX image model with named outputs
+works; without a recipe, give the preprocessing (--resize, --divisor, --mean, --std).
+";
 
 #[derive(Debug, Args)]
 pub struct Encoders {
@@ -20,64 +31,35 @@ impl Encoders {
 
         // With a name, print that recipe with its export script; otherwise print all recipes
         // without scripts.
-        let chosen: Vec<_> = RECIPES
-            .iter()
-            .filter(|recipe| self.name.as_ref().is_none_or(|name| *name == recipe.name))
-            .collect();
-
-        if chosen.is_empty() {
-            let known: Vec<&str> = RECIPES.iter().map(|recipe| recipe.name.as_str()).collect();
-            anyhow::bail!(
-                "unknown recipe '{}'; known recipes: {}",
-                self.name.unwrap_or_default(),
-                known.join(", ")
-            );
-        }
+        let chosen: Vec<&EncoderRecipe> = match &self.name {
+            Some(name) => vec![recipe_named(name)?],
+            None => RECIPES.iter().collect(),
+        };
 
         let records: Vec<_> = chosen.iter().map(|recipe| recipe_json(recipe)).collect();
         self.json.write(&records)?;
 
         if self.name.is_none() {
-            say("Without a model:");
-            say("  pixels    raw pixels at 320x240, averaged over 16x12 patches, 576 columns");
-
-            say("  builtin   gradient orientations and color, weight-free stand-in, 528 columns");
-
-            say("");
-            say(
-                "With a model: seese3 encode --model FILE.onnx --recipe NAME. Any ONNX image model with named outputs",
-            );
-
-            say(
-                "works; without a recipe, give the preprocessing (--resize, --divisor, --mean, --std).",
-            );
-
-            say("");
+            say(WITHOUT_RECIPE);
         }
 
         for recipe in chosen {
             say(format_args!("{}: {}", recipe.name, recipe.about));
-
             say(format_args!(
                 "  images   {}",
                 recipe.preparation.describe(recipe.window)
             ));
-
             say(format_args!(
                 "  layers   {}; base {}, norm {}, {} prefix tokens, pool {}",
                 recipe.layers, recipe.base, recipe.norm, recipe.prefix_tokens, recipe.pooling
             ));
-
             say(format_args!("  paper    {}", recipe.paper));
             say(format_args!("  checked  {}", recipe.checked));
-
             if self.name.is_some() {
                 say("  export");
-
-                recipe
-                    .export
-                    .lines()
-                    .for_each(|line| say(format_args!("    {line}")));
+                for line in recipe.export.lines() {
+                    say(format_args!("    {line}"));
+                }
             }
 
             say("");

@@ -6,10 +6,11 @@ use anyhow::bail;
 use clap::{Args, Subcommand};
 use serde_json::json;
 
-use super::output::{JsonOutput, check_folder, check_writable, say, write_file};
+use super::output::{check_folder, check_writable, say, write_file};
+use super::store_option::StoreAndJson;
 use seese3_data::datasets::write_numpy;
 use seese3_data::export::{kitti_trajectory, tum_trajectory};
-use seese3_store::{Store, StoredRoom};
+use seese3_store::StoredRoom;
 
 #[derive(Debug, Args)]
 pub struct Export {
@@ -30,9 +31,8 @@ enum Format {
 
 #[derive(Debug, Args)]
 struct From {
-    /// The store: a folder, or a URL of a bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
-    store: String,
+    #[command(flatten)]
+    common: StoreAndJson,
     /// Name of the room
     #[arg(long)]
     room: String,
@@ -42,8 +42,6 @@ struct From {
     /// Output path: a folder for numpy, a file for the other formats
     #[arg(long)]
     out: PathBuf,
-    #[command(flatten)]
-    json: JsonOutput,
 }
 
 #[derive(Debug, Args)]
@@ -65,7 +63,7 @@ impl Export {
                 for file in &files {
                     say(format_args!("wrote {}", file.display()));
                 }
-                from.json.write(&json!({ "files": files }))
+                from.common.json.write(&json!({ "files": files }))
             }
             Format::Tum(Timed { from, rate }) => {
                 let stored = from.load().await?;
@@ -105,17 +103,15 @@ impl Export {
 
 impl From {
     async fn load(&self) -> anyhow::Result<StoredRoom> {
-        self.json.begin()?;
         check_folder(&self.out)?;
-        Ok(Store::open(&self.store)?
-            .load_room(&self.room, self.revision)
-            .await?)
+        let store = self.common.open()?;
+        Ok(store.load_room(&self.room, self.revision).await?)
     }
 
     fn write(&self, text: &str) -> anyhow::Result<()> {
         check_writable(&self.out)?;
         write_file(&self.out, text.as_bytes())?;
         say(format_args!("wrote {}", self.out.display()));
-        self.json.write(&json!({ "files": [&self.out] }))
+        self.common.json.write(&json!({ "files": [&self.out] }))
     }
 }

@@ -7,16 +7,15 @@ use serde_json::json;
 use seese3_core::training::RoomData;
 use seese3_robot::fitting::{FITTING_EPOCHS, Fitted, PartRule};
 
-use super::output::{JsonOutput, say, say_published};
+use super::output::{say, say_published};
 use super::progress::bar;
-use seese3_store::Store;
+use super::store_option::StoreAndJson;
 use seese3_store::fit_stored_room::{self, Refit};
 
 #[derive(Debug, Args)]
 pub struct Fit {
-    /// The store: a folder, or a URL of a bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
-    store: String,
+    #[command(flatten)]
+    common: StoreAndJson,
     /// The room; all its frames form the map
     #[arg(long)]
     room: String,
@@ -33,14 +32,11 @@ pub struct Fit {
     /// Name of the fitted adapter in the store; ROOM.FEATURES.fitted if omitted
     #[arg(long)]
     name: Option<String>,
-    #[command(flatten)]
-    json: JsonOutput,
 }
 
 impl Fit {
     pub async fn run(self) -> anyhow::Result<()> {
-        self.json.begin()?;
-        let store = Store::open(&self.store)?;
+        let store = self.common.open()?;
         let request = fit_stored_room::Request {
             room: self.room,
             base: self.adapter,
@@ -58,7 +54,7 @@ impl Fit {
         say_fitted(&fitted, &refit.data());
         say_published(&store, refit.name(), &published);
 
-        self.json.write(&json!({
+        self.common.json.write(&json!({
             "adapter": refit.name(),
             "revision": published.revision,
             "created": published.is_new,

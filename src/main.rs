@@ -8,6 +8,7 @@ mod log;
 mod named;
 mod output;
 mod pose_options;
+mod store_option;
 #[cfg(feature = "lab")]
 mod rooms;
 mod ask;
@@ -112,7 +113,7 @@ pub struct Cli {
     #[command(subcommand)]
     command: Command,
     /// Print only warnings and errors; output files are still written
-    #[arg(short, long, global = true)]
+    #[arg(short, long, global = true, display_order = output::LAST_OPTION + 1)]
     quiet: bool,
 }
 

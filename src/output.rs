@@ -16,6 +16,9 @@ static IS_SILENT: AtomicBool = AtomicBool::new(false);
 /// The first error of a write to standard output.
 static PRINT_PROBLEM: OnceLock<String> = OnceLock::new();
 
+/// Place of `--json` in the help of a command: after the command's own options.
+pub const LAST_OPTION: usize = 900;
+
 /// The path that stands for standard output.
 pub const STANDARD_OUTPUT: &str = "-";
 
@@ -24,7 +27,7 @@ pub const STANDARD_OUTPUT: &str = "-";
 pub struct JsonOutput {
     /// Also write the results as JSON to this file. With "-" or no value, JSON goes to standard
     /// output, and no text is printed
-    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = STANDARD_OUTPUT)]
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = STANDARD_OUTPUT, display_order = LAST_OPTION)]
     json: Option<PathBuf>,
 }
 

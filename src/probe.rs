@@ -4,10 +4,11 @@ use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 
-use super::output::{JsonOutput, say};
+use super::output::say;
 use super::progress::bar;
 use super::protocol::ProtocolOptions;
 use super::rooms::{data, load_rooms, room_words};
+use super::store_option::StoreAndJson;
 use super::with_causes;
 use seese3_core::features::Features;
 use seese3_core::motion_scores::MotionScores;
@@ -17,13 +18,12 @@ use seese3_lab::experiments::probe::{
 };
 use seese3_lab::probes::{Counted, Duplicates, Limit, MutualKnn};
 use seese3_lab::report::{ProbeContext, probe_json, probe_table};
-use seese3_store::{Store, StoredRoom};
+use seese3_store::StoredRoom;
 
 #[derive(Debug, Args)]
 pub struct Probe {
-    /// The store: a folder, or a URL of a bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
-    store: String,
+    #[command(flatten)]
+    common: StoreAndJson,
     /// Rooms to probe: names, or patterns with *; may be given several times
     #[arg(long = "room", required = true)]
     rooms: Vec<String>,
@@ -71,8 +71,6 @@ pub struct Probe {
     /// M2: keep the first of identical rows, instead of dropping all of them
     #[arg(long)]
     m2_keep_first: bool,
-    #[command(flatten)]
-    json: JsonOutput,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -103,9 +101,7 @@ impl Probe {
         reason = "one command, from its arguments to what it prints"
     )]
     pub async fn run(self) -> anyhow::Result<()> {
-        self.json.begin()?;
-
-        let store = Store::open(&self.store)?;
+        let store = self.common.open()?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;
 
         // M3 and M4 are scored on test pairs; M1 and M2 need no split.
@@ -185,14 +181,14 @@ impl Probe {
             );
         }
 
-        if self.json.is_wanted() {
+        if self.common.json.is_wanted() {
             let context = ProbeContext {
                 features: rooms[0].1.source().name.clone(),
                 split: self.protocol.split_name(),
                 preset: base.preset.name(),
                 skipped,
             };
-            self.json.write(&probe_json(&scores, context))?;
+            self.common.json.write(&probe_json(&scores, context))?;
         }
 
         Ok(())

@@ -6,12 +6,13 @@ use serde_json::json;
 use sha2::{Digest, Sha256};
 
 use super::ask::Server;
-use super::output::{JsonOutput, say};
+use super::output::say;
+use super::store_option::StoreAndJson;
 use seese3_client::proto::v1 as pb;
 use seese3_core::features::Features;
 use seese3_core::geometry::Pose;
 use seese3_server::{pinhole_to_wire, source_to_wire};
-use seese3_store::{Kind, ResourceName, Store, StoredRoom};
+use seese3_store::{Kind, ResourceName, StoredRoom};
 
 /// Target size of a message, bytes, well below the servers' limit. A message holds at least one
 /// frame.
@@ -21,9 +22,8 @@ const MESSAGE_BYTES: usize = 1 << 20;
 pub struct Push {
     /// rooms/NAME or adapters/NAME, or one revision: rooms/NAME/revisions/NUMBER
     name: ResourceName,
-    /// The store: a folder, or a URL of a bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
-    store: String,
+    #[command(flatten)]
+    common: StoreAndJson,
     /// The name on the server; the same if omitted
     #[arg(long = "as", value_name = "NAME")]
     renamed: Option<String>,
@@ -42,14 +42,11 @@ pub struct Push {
     validate_only: bool,
     #[command(flatten)]
     server: Server,
-    #[command(flatten)]
-    json: JsonOutput,
 }
 
 impl Push {
     pub async fn run(self) -> anyhow::Result<()> {
-        self.json.begin()?;
-        let store = Store::open(&self.store)?;
+        let store = self.common.open()?;
         let target = target(&self.name, self.renamed.as_deref())?;
         if (self.extend || self.refit) && self.name.kind == Kind::Adapter {
             bail!("--extend and --refit are for rooms; an adapter is published as a whole");
@@ -75,6 +72,7 @@ impl Push {
         let Some(revision) = revision else {
             say(format_args!("{target} would be accepted"));
             return self
+                .common
                 .json
                 .write(&json!({ "name": target.to_string(), "valid": true }));
         };
@@ -105,7 +103,7 @@ impl Push {
             fitted_adapter = Some(json!({ "name": fitted.name, "revision": fitted.revision }));
         }
 
-        self.json.write(&json!({
+        self.common.json.write(&json!({
             "name": target.to_string(),
             "revision": revision.revision,
             "created": created,

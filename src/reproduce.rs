@@ -50,7 +50,7 @@ pub struct Reproduce {
     #[arg(long, value_delimiter = ',', default_values_t = [5, 10, 20, 35, 50, 75, 100])]
     sizes: Vec<usize>,
     /// Number of training rooms used for calibration, in which the adapter's errors are measured
-    #[arg(long, alias = "aside", default_value_t = 20)]
+    #[arg(long, default_value_t = 20)]
     calibration_rooms: usize,
     /// Number of seeds, from 0 on, for tables that average over seeds
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]

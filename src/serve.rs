@@ -9,11 +9,11 @@ use clap::{ArgAction, Args, ValueEnum};
 use tokio::net::TcpListener;
 use tokio::sync::Notify;
 
-use super::encoder::RuntimeName;
 use super::log::{LogFormat, Traces, start_log};
+use super::named::one_of;
 use super::output::say;
 use seese3_core::navigation::{IndexKind, Limits};
-use seese3_encoder::{Bounds, Runtime};
+use seese3_encoder::{Bounds, Runtime, RuntimeKind};
 use seese3_server::{
     Config, ImageEncoders, Keyring, Listeners, Reload, RoomMemory, Tls, TlsFiles, TokenKey, run,
     shutdown_signal,
@@ -93,8 +93,8 @@ pub struct Serve {
     #[arg(long, value_name = "FILE", env = "SEESE3_TWO_VIEW")]
     two_view: Option<PathBuf>,
     /// Runtime for ONNX models: tract needs no library, onnxruntime is faster
-    #[arg(long, env = "SEESE3_RUNTIME", value_enum, default_value_t = RuntimeName::Tract)]
-    runtime: RuntimeName,
+    #[arg(long, env = "SEESE3_RUNTIME", value_parser = one_of::<RuntimeKind>(), default_value = "tract")]
+    runtime: RuntimeKind,
     /// Path of the onnxruntime shared library
     #[arg(long = "onnxruntime", value_name = "FILE", env = "ORT_DYLIB_PATH")]
     library: Option<std::path::PathBuf>,
@@ -130,19 +130,19 @@ pub struct Serve {
     #[arg(long, env = "SEESE3_MAX_MESSAGE_BYTES", default_value_t = Config::default().message_bytes, value_parser = bounded(1_024, 1 << 30))]
     max_message_bytes: usize,
     /// Time limit of a request, seconds, 1 to 86400, regardless of the client's deadline
-    #[arg(long, env = "SEESE3_MAX_REQUEST_SECONDS", default_value_t = 300, value_parser = clap::value_parser!(u64).range(1..=86_400))]
+    #[arg(long, env = "SEESE3_MAX_REQUEST_SECONDS", default_value_t = Config::default().longest.as_secs(), value_parser = clap::value_parser!(u64).range(1..=86_400))]
     max_request_seconds: u64,
     /// Lame-duck time, seconds, 0 to 86400: after SIGTERM or Ctrl-C, requests are still accepted
     /// while health reports NOT_SERVING, so that load balancers notice first
-    #[arg(long, env = "SEESE3_LAME_DUCK_SECONDS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=86_400))]
+    #[arg(long, env = "SEESE3_LAME_DUCK_SECONDS", default_value_t = Config::default().lame_duck.as_secs(), value_parser = clap::value_parser!(u64).range(0..=86_400))]
     lame_duck_seconds: u64,
     /// Time for running requests to finish after that, seconds, 0 to 86400
-    #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = 10, value_parser = clap::value_parser!(u64).range(0..=86_400))]
+    #[arg(long, env = "SEESE3_DRAIN_SECONDS", default_value_t = Config::default().drain.as_secs(), value_parser = clap::value_parser!(u64).range(0..=86_400))]
     drain_seconds: u64,
     /// Interval at which the store is checked for new revisions, seconds, 0 to 86400; they are
     /// served without a restart. With 0, only SIGHUP triggers a check. SIGHUP also retries what was
     /// refused
-    #[arg(long, env = "SEESE3_RELOAD_SECONDS", default_value_t = 5, value_parser = clap::value_parser!(u64).range(0..=86_400))]
+    #[arg(long, env = "SEESE3_RELOAD_SECONDS", default_value_t = Config::default().reload.every.map_or(0, |every| every.as_secs()), value_parser = clap::value_parser!(u64).range(0..=86_400))]
     reload_seconds: u64,
     /// Maximum number of concurrent tracking streams, 1 to 1000000; further ones are refused
     #[arg(long, env = "SEESE3_MAX_STREAMS", default_value_t = Config::default().streams, value_parser = bounded(1, 1_000_000))]
@@ -152,13 +152,15 @@ pub struct Serve {
     /// and tokens are invalid after the server stops
     #[arg(long, value_name = "FILE", env = "SEESE3_TOKEN_KEY_FILE")]
     token_key_file: Option<PathBuf>,
-    /// Number of requests computed concurrently, and of threads of an onnxruntime session, 1 to
-    /// 1024; the number of cores if omitted
+    /// Number of threads for short requests, and as many for requests with images; batches and
+    /// evaluations get half as many, rounded up. Also the number of threads of an onnxruntime
+    /// session. 1 to 1024; the number of cores if omitted
     #[arg(long, env = "SEESE3_THREADS", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
-    /// Maximum number of requests waiting for a thread, 0 to 1000000; further ones are refused
-    #[arg(long, env = "SEESE3_QUEUE", default_value_t = 1_024, value_parser = clap::value_parser!(u32).range(0..=1_000_000))]
-    queue: u32,
+    /// Maximum number of requests of each of these kinds that wait for a thread, 0 to 1000000;
+    /// further ones are refused
+    #[arg(long, env = "SEESE3_QUEUE", default_value_t = Config::default().queue, value_parser = bounded(0, 1_000_000))]
+    queue: usize,
     /// Format of the log, which goes to standard error; RUST_LOG filters it
     #[arg(long, env = "SEESE3_LOG_FORMAT", value_enum, default_value_t = LogFormat::Text)]
     log_format: LogFormat,
@@ -339,7 +341,7 @@ impl Serve {
     fn server_config(&self) -> anyhow::Result<Config> {
         let defaults = Config::default();
 
-        // One number limits both the concurrent requests and the threads of an onnxruntime session.
+        // One number limits the threads of each kind of requests and of an onnxruntime session.
         let threads = self.threads.map_or(defaults.threads, usize::from);
 
         Ok(Config {
@@ -353,7 +355,7 @@ impl Serve {
                     models: self.encoders.clone(),
                     two_view: self.two_view.clone(),
                     runtime: Runtime {
-                        kind: self.runtime.into(),
+                        kind: self.runtime,
                         threads,
                         library: self.library.clone(),
                     },
@@ -375,7 +377,7 @@ impl Serve {
             upload_bytes: self.max_upload_bytes,
             message_bytes: self.max_message_bytes,
             threads,
-            queue: self.queue as usize,
+            queue: self.queue,
             longest: Duration::from_secs(self.max_request_seconds),
             streams: self.max_streams,
             token_key: self.token_key()?,

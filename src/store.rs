@@ -6,9 +6,10 @@ use anyhow::bail;
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 
-use super::output::{JsonOutput, say};
+use super::output::say;
 use super::progress::spinner;
-use seese3_store::{Choice, Contents, Kind, ResourceName, RevisionContents, Store};
+use super::store_option::StoreAndJson;
+use seese3_store::{Choice, Contents, Kind, ResourceName, RevisionContents};
 
 #[derive(Debug, Args)]
 pub struct StoreCommand {
@@ -32,27 +33,10 @@ enum Action {
     Verify(Verify),
 }
 
-/// Options that all actions share.
-#[derive(Debug, Args)]
-struct Common {
-    /// The store: a folder, or a URL of a bucket (feature `cloud`)
-    #[arg(long, env = "SEESE3_STORE")]
-    store: String,
-    #[command(flatten)]
-    json: JsonOutput,
-}
-
-impl Common {
-    fn open(&self) -> anyhow::Result<Store> {
-        self.json.begin()?;
-        Ok(Store::open(&self.store)?)
-    }
-}
-
 #[derive(Debug, Args)]
 struct List {
     #[command(flatten)]
-    common: Common,
+    common: StoreAndJson,
 }
 
 #[derive(Debug, Args)]
@@ -60,7 +44,7 @@ struct Show {
     /// rooms/NAME or adapters/NAME, or one revision: rooms/NAME/revisions/NUMBER
     name: ResourceName,
     #[command(flatten)]
-    common: Common,
+    common: StoreAndJson,
 }
 
 #[derive(Debug, Args)]
@@ -79,7 +63,7 @@ struct Default {
     #[arg(long, conflicts_with_all = ["name", "unset"])]
     back: bool,
     #[command(flatten)]
-    common: Common,
+    common: StoreAndJson,
 }
 
 #[derive(Debug, Args)]
@@ -90,7 +74,7 @@ struct Remove {
     #[arg(long)]
     dry_run: bool,
     #[command(flatten)]
-    common: Common,
+    common: StoreAndJson,
 }
 
 #[derive(Debug, Args)]
@@ -103,13 +87,13 @@ struct CollectGarbage {
     #[arg(long)]
     dry_run: bool,
     #[command(flatten)]
-    common: Common,
+    common: StoreAndJson,
 }
 
 #[derive(Debug, Args)]
 struct Verify {
     #[command(flatten)]
-    common: Common,
+    common: StoreAndJson,
 }
 
 impl StoreCommand {

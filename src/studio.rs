@@ -11,7 +11,7 @@ use serde_json::json;
 use strum::VariantArray;
 
 use super::encode::{by_layer, check_names, has, same_poses};
-use super::encoder::{EncoderOptions, RuntimeOptions};
+use super::encoder::{EncoderOptions, RuntimeOptions, feature_prefix, say_features};
 use super::named::one_of;
 use super::output::{JsonOutput, check_writable, say, write_file};
 use super::progress::bar;
@@ -34,12 +34,7 @@ const SHEET_SIZE: (usize, usize) = (160, 120);
 pub struct Studio {
     /// The store to publish the rooms in: a folder, created if it does not exist, or a URL of a
     /// bucket (feature `cloud`)
-    #[arg(
-        long,
-        env = "SEESE3_STORE",
-        visible_alias = "store",
-        required_unless_present = "sheet"
-    )]
+    #[arg(long, env = "SEESE3_STORE", required_unless_present = "sheet")]
     out: Option<String>,
     /// Kind of rooms and of their recordings
     #[arg(long, default_value = "visits", value_parser = one_of::<Suite>())]
@@ -113,7 +108,7 @@ impl Studio {
         }
 
         let store = Store::create(out)?;
-        let sources = encoder.sources(&self.prefix());
+        let sources = encoder.sources(&feature_prefix(self.prefix.as_deref(), &self.encode));
         check_names(&sources)?;
 
         // Rooms are rendered at the encoder's own input size, so that no image has to be resized.
@@ -145,12 +140,7 @@ impl Studio {
             ));
         }
 
-        for source in &sources {
-            say(format_args!(
-                "features '{}': {} columns",
-                source.name, source.dim
-            ));
-        }
+        say_features(&sources);
 
         let features: Vec<&str> = sources.iter().map(|source| source.name.as_str()).collect();
         self.json.write(&json!({
@@ -231,15 +221,6 @@ impl Studio {
 
     fn out(&self) -> anyhow::Result<&str> {
         self.out.as_deref().context("--out DIR is required")
-    }
-
-    fn prefix(&self) -> String {
-        let stem = || {
-            Path::new(&self.encode)
-                .file_stem()
-                .map(|stem| stem.to_string_lossy().into_owned())
-        };
-        self.prefix.clone().or_else(stem).unwrap_or_default()
     }
 
     fn frame_count(&self) -> usize {

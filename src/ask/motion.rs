@@ -45,7 +45,7 @@ pub struct Motion {
     #[arg(long, value_name = "WIDTHxHEIGHT,FOCAL[,CX,CY]", requires = "images")]
     camera: Option<CameraOption>,
     /// A NumPy file of features, shape (n, d); --rows chooses two
-    #[arg(long, alias = "features", value_name = "FILE", requires = "rows")]
+    #[arg(long, value_name = "FILE", requires = "rows")]
     feature: Option<PathBuf>,
     /// Two rows of the --feature file, A,B, counted from 0
     #[arg(long, value_delimiter = ',', value_name = "A,B")]

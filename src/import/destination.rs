@@ -9,6 +9,7 @@ use serde_json::json;
 use super::frame_summary::{say_dropped, say_frames};
 use crate::camera::CameraOption;
 use crate::encode::same_poses;
+use crate::encoder::say_features;
 use crate::output::{JsonOutput, say};
 use crate::pose_options::{DirectionName, PoseOptions};
 use crate::pose_report::{PosesFrom, check_with_images, report_json, say_report};
@@ -188,13 +189,7 @@ impl Destination {
             "rotations: R Rᵀ differs from the identity by at most {deviation:.1e}; projected onto SO(3)"
         ));
 
-        for set in features {
-            say(format_args!(
-                "features '{}': {} columns",
-                set.source().name,
-                set.source().dim
-            ));
-        }
+        say_features(features.iter().map(Features::source));
 
         say_dropped(&recording.dropped);
     }

@@ -54,7 +54,6 @@ enum Format {
     /// EuRoC MAV: a sequence's folder (mav0/cam0, mav0/state_groundtruth_estimate0)
     Euroc(Euroc),
     /// ROS 2 bag (.mcap, .db3) or Foxglove recording, with images and poses or /tf
-    #[command(visible_alias = "mcap")]
     Bag(BagPath),
     /// NumPy files: poses (n, 4, 4) world_from_camera in meters, features (n, d)
     Numpy(Numpy),
@@ -67,9 +66,7 @@ struct Plain {
     /// The folder or file to read
     path: PathBuf,
     #[command(flatten)]
-    poses: DirectionOption,
-    #[command(flatten)]
-    to: Destination,
+    room: NewRoom,
 }
 
 #[derive(Debug, Args)]
@@ -84,9 +81,7 @@ struct Seven {
     #[arg(long, value_name = "FILE")]
     rgb_from_depth: Option<PathBuf>,
     #[command(flatten)]
-    poses: DirectionOption,
-    #[command(flatten)]
-    to: Destination,
+    room: NewRoom,
 }
 
 #[derive(Debug, Args)]
@@ -97,9 +92,7 @@ struct Colmap {
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
     #[command(flatten)]
-    poses: DirectionOption,
-    #[command(flatten)]
-    to: Destination,
+    room: NewRoom,
 }
 
 #[derive(Debug, Args)]
@@ -113,9 +106,7 @@ struct KittiFiles {
     #[arg(long, value_name = "FILE")]
     times: Option<PathBuf>,
     #[command(flatten)]
-    poses: DirectionOption,
-    #[command(flatten)]
-    to: Destination,
+    room: NewRoom,
 }
 
 #[derive(Debug, Args)]
@@ -125,6 +116,13 @@ struct Euroc {
     /// Name of the camera
     #[arg(long = "device", value_name = "NAME", default_value = "cam0")]
     device: String,
+    #[command(flatten)]
+    room: NewRoom,
+}
+
+/// How the poses are read, and where the room is published.
+#[derive(Debug, Args)]
+struct NewRoom {
     #[command(flatten)]
     poses: DirectionOption,
     #[command(flatten)]
@@ -144,18 +142,54 @@ impl Import {
             Format::TwelveScenes(plain) => {
                 plain.import("12scenes", datasets::read_twelve_scenes).await
             }
-            Format::SevenScenes(seven) => seven.import().await,
+            Format::SevenScenes(seven) => {
+                let choice = SevenScenes {
+                    sequence: seven.sequence,
+                    rgb_from_depth: seven.rgb_from_depth,
+                };
+                seven
+                    .room
+                    .import("7scenes", &seven.path, |path, reader| {
+                        datasets::read_seven_scenes(path, &choice, reader)
+                    })
+                    .await
+            }
             Format::Folder(plain) => {
                 plain
                     .import("folder", |path, _| datasets::read_folder(path))
                     .await
             }
-            Format::Colmap(colmap) => colmap.import().await,
+            Format::Colmap(colmap) => {
+                colmap
+                    .room
+                    .import("colmap", &colmap.path, |path, reader| {
+                        datasets::read_colmap(path, colmap.images.as_deref(), reader)
+                    })
+                    .await
+            }
             Format::Transforms(plain) => {
                 plain.import("transforms", datasets::read_transforms).await
             }
-            Format::Kitti(kitti) => kitti.import().await,
-            Format::Euroc(euroc) => euroc.import().await,
+            Format::Kitti(kitti) => {
+                let beside = Kitti {
+                    images: kitti.images,
+                    times: kitti.times,
+                };
+                kitti
+                    .room
+                    .import("kitti", &kitti.path, |path, reader| {
+                        datasets::read_kitti(path, &beside, reader)
+                    })
+                    .await
+            }
+            Format::Euroc(euroc) => {
+                euroc
+                    .room
+                    .import("euroc", &euroc.path, |path, reader| {
+                        datasets::read_euroc(path, &euroc.device, reader)
+                    })
+                    .await
+            }
             Format::Bag(bag) => bag.import().await,
             Format::Numpy(numpy) => numpy.import().await,
             Format::Bundle(plain) => {
@@ -176,71 +210,27 @@ fn scannet(path: &Path, reader: &mut Reader<'_>) -> Result<Recording, datasets::
     }
 }
 
-impl Seven {
-    async fn import(self) -> anyhow::Result<()> {
-        let choice = SevenScenes {
-            sequence: self.sequence,
-            rgb_from_depth: self.rgb_from_depth,
-        };
-        let read =
-            |reader: &mut Reader<'_>| datasets::read_seven_scenes(&self.path, &choice, reader);
-        let recording = self.to.read(read)?;
-
-        self.to
-            .publish("7scenes", &self.path, recording, self.poses.direction)
-            .await
-    }
-}
-
-impl Colmap {
-    async fn import(self) -> anyhow::Result<()> {
-        let read = |reader: &mut Reader<'_>| {
-            datasets::read_colmap(&self.path, self.images.as_deref(), reader)
-        };
-        let recording = self.to.read(read)?;
-
-        self.to
-            .publish("colmap", &self.path, recording, self.poses.direction)
-            .await
-    }
-}
-
-impl KittiFiles {
-    async fn import(self) -> anyhow::Result<()> {
-        let beside = Kitti {
-            images: self.images,
-            times: self.times,
-        };
-        let read = |reader: &mut Reader<'_>| datasets::read_kitti(&self.path, &beside, reader);
-        let recording = self.to.read(read)?;
-
-        self.to
-            .publish("kitti", &self.path, recording, self.poses.direction)
-            .await
-    }
-}
-
-impl Euroc {
-    async fn import(self) -> anyhow::Result<()> {
-        let read = |reader: &mut Reader<'_>| datasets::read_euroc(&self.path, &self.device, reader);
-        let recording = self.to.read(read)?;
-
-        self.to
-            .publish("euroc", &self.path, recording, self.poses.direction)
-            .await
-    }
-}
-
 impl Plain {
-    /// Reads a recording of one format and publishes it.
     async fn import(
         self,
         format: &str,
         read: impl FnOnce(&Path, &mut Reader<'_>) -> Result<Recording, datasets::Error>,
     ) -> anyhow::Result<()> {
-        let recording = self.to.read(|reader| read(&self.path, reader))?;
+        self.room.import(format, &self.path, read).await
+    }
+}
+
+impl NewRoom {
+    /// Reads a recording of one format and publishes it.
+    async fn import(
+        &self,
+        format: &str,
+        path: &Path,
+        read: impl FnOnce(&Path, &mut Reader<'_>) -> Result<Recording, datasets::Error>,
+    ) -> anyhow::Result<()> {
+        let recording = self.to.read(|reader| read(path, reader))?;
         self.to
-            .publish(format, &self.path, recording, self.poses.direction)
+            .publish(format, path, recording, self.poses.direction)
             .await
     }
 }

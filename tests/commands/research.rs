@@ -229,7 +229,14 @@ fn cross_room_compares_with_identity_room_by_room() {
     let aside = succeeds(
         &[
             &fixed[..],
-            &["--train", "c", "--aside", "1", "--json", text(&file)],
+            &[
+                "--train",
+                "c",
+                "--calibration-rooms",
+                "1",
+                "--json",
+                text(&file),
+            ],
         ]
         .concat(),
     );

@@ -3,17 +3,17 @@
 use std::path::PathBuf;
 
 use ndarray::ArrayD;
-use strum::IntoStaticStr;
+use strum::{EnumMessage, EnumString, IntoStaticStr, VariantArray};
 
 use super::Error;
 
 /// The library that runs a model.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, EnumMessage, EnumString, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "lowercase")]
 pub enum RuntimeKind {
-    /// Written in Rust and compiled in; needs no library on the system.
+    /// Pure Rust, needs no library.
     Tract,
-    /// The shared library onnxruntime, loaded when the first model is opened; faster.
+    /// A shared library, loaded when a model is opened.
     OnnxRuntime,
 }
 

@@ -1,0 +1,23 @@
+//! The options `--store` and `--json`, of commands that work on a store.
+
+use clap::Args;
+
+use super::output::JsonOutput;
+use seese3_store::Store;
+
+#[derive(Debug, Args)]
+pub struct StoreAndJson {
+    /// The store: a folder, or a URL of a bucket (feature `cloud`)
+    #[arg(long, env = "SEESE3_STORE")]
+    pub store: String,
+    #[command(flatten)]
+    pub json: JsonOutput,
+}
+
+impl StoreAndJson {
+    /// Opens the store, after checking that the JSON file can be written.
+    pub fn open(&self) -> anyhow::Result<Store> {
+        self.json.begin()?;
+        Ok(Store::open(&self.store)?)
+    }
+}
