@@ -11,11 +11,9 @@ use super::progress::bar;
 use super::protocol::ProtocolOptions;
 use super::rooms::{data, load_rooms, room_words};
 use super::store_option::StoreAndJson;
-use seese3_core::adapter::Reading;
 use seese3_core::eval::{Protocol, check_thresholds};
 use seese3_core::features::Features;
-use seese3_core::navigation::NavigatorKind;
-use seese3_core::navigation::{Refit, RetrievalMetric, StepKind};
+use seese3_core::navigation::{NavigatorKind, RetrievalMetric, StepKind};
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan};
 use seese3_lab::experiments::cross_room::{
@@ -79,6 +77,9 @@ pub struct CrossRoom {
     #[arg(long)]
     rooms: bool,
 }
+
+/// Inverse Poincaré in the homogeneous reading.
+const INVERSE: &str = "inverse-poincare-homogeneous";
 
 type Loaded = (StoredRoom, Features);
 
@@ -218,42 +219,26 @@ impl CrossRoom {
     }
 
     fn test_protocol(&self) -> anyhow::Result<Protocol> {
-        let full = |step: StepKind| NavigatorKind::Step(step, RetrievalMetric::Full);
-        let refit = |in_sample: bool| {
-            full(StepKind::Refit(Refit {
-                z_scored: true,
-                intercept: false,
-                in_sample,
-            }))
-        };
-
-        let inverse = |reading: Reading, metric: RetrievalMetric| {
-            NavigatorKind::Step(StepKind::InversePoincare(reading), metric)
-        };
-
         // Default table: the Identity baseline, inverse Poincaré, and the refits that the test
         // split allows.
-        let mut navigators = navigators_named(&self.navigators)?;
-        if navigators.is_empty() {
-            navigators = vec![NavigatorKind::Identity];
-
-            navigators.extend(
-                [Reading::Affine, Reading::Homogeneous]
-                    .map(|reading| inverse(reading, RetrievalMetric::Full)),
-            );
+        let mut names = self.navigators.clone();
+        if names.is_empty() {
+            names = ["identity", "inverse-poincare-affine", INVERSE]
+                .map(str::to_owned)
+                .to_vec();
 
             if self.calibration_rooms > 0 {
-                navigators.push(inverse(Reading::Homogeneous, RetrievalMetric::Calibrated));
+                names.push(format!("{INVERSE}+calibrated"));
             }
 
             // A refit is fitted on training pairs of the held-out room; the split `whole` has none.
             // The in-sample refit uses the test pairs instead.
             if self.test_split != Split::Whole {
-                navigators.push(refit(false));
+                names.push("ridge-refit-z-scored".to_owned());
             }
-
-            navigators.push(refit(true));
+            names.push("ridge-refit-z-scored-in-sample".to_owned());
         }
+        let mut navigators = navigators_named(&names)?;
 
         // Reject navigators that no held-out room can evaluate; otherwise every room would be
         // skipped after the training.

@@ -131,14 +131,13 @@ impl Push {
                 .iter()
                 .map(|set| source_to_wire(set.source()))
                 .collect(),
-            encode_for: String::new(),
             format: own(&provenance.format),
             licence: own(&provenance.licence),
             camera: provenance.camera.as_ref().map(pinhole_to_wire),
-            request_id: String::new(),
             validate_only: self.validate_only,
             extend: self.extend,
             drop_other_features: self.drop_other_features,
+            ..pb::RoomUpload::default()
         }
     }
 }

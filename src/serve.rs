@@ -212,33 +212,15 @@ impl Serve {
 
         // The port is opened before the store is loaded: health checks are answered at once,
         // NOT_SERVING until everything is loaded.
-        let listener = TcpListener::bind(&self.listen)
-            .await
-            .with_context(|| format!("cannot listen on {}", self.listen))?;
-
-        // With port 0 the system chooses the port; scripts read it from this line.
-        let address = listener
-            .local_addr()
-            .context("the listener has no address")?;
-        say(format_args!("listening on {address}"));
-
+        let grpc = listener(&self.listen, "listening").await?;
         let operations = match &self.metrics_listen {
             None => None,
             Some(address) => {
-                let listener = TcpListener::bind(address).await;
-                let listener = listener
-                    .with_context(|| format!("--metrics-listen: cannot listen on {address}"))?;
-                let address = listener
-                    .local_addr()
-                    .context("the listener has no address")?;
-                say(format_args!("metrics on {address}"));
-                Some(listener)
+                let opened = listener(address, "metrics").await;
+                Some(opened.context("--metrics-listen")?)
             }
         };
-        let listeners = Listeners {
-            grpc: listener,
-            operations,
-        };
+        let listeners = Listeners { grpc, operations };
 
         let (asked, again) = tokio::sync::oneshot::channel();
         let stopping = async move {
@@ -266,6 +248,20 @@ impl Serve {
 
         Ok(())
     }
+}
+
+/// Opens a port and prints its address: with port 0 the system chooses it, and scripts read it from
+/// this line.
+async fn listener(address: &str, what: &str) -> anyhow::Result<TcpListener> {
+    let listener = TcpListener::bind(address)
+        .await
+        .with_context(|| format!("cannot listen on {address}"))?;
+    let address = listener
+        .local_addr()
+        .context("the listener has no address")?;
+
+    say(format_args!("{what} on {address}"));
+    Ok(listener)
 }
 
 /// File descriptors reserved for the store, the log and the listeners.

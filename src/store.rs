@@ -20,7 +20,7 @@ pub struct StoreCommand {
 #[derive(Debug, Subcommand)]
 enum Action {
     /// List the rooms and adapters, with their revisions and defaults
-    List(List),
+    List(StoreAndJson),
     /// Show every revision of one room or adapter
     Show(Show),
     /// Show or set defaults: the revision that a name stands for, and the adapter of a room
@@ -30,13 +30,7 @@ enum Action {
     /// Remove unreferenced files: from interrupted writes, and of removed revisions
     Gc(CollectGarbage),
     /// Read everything and check it: checksums, golden vectors, references
-    Verify(Verify),
-}
-
-#[derive(Debug, Args)]
-struct List {
-    #[command(flatten)]
-    common: StoreAndJson,
+    Verify(StoreAndJson),
 }
 
 #[derive(Debug, Args)]
@@ -90,42 +84,34 @@ struct CollectGarbage {
     common: StoreAndJson,
 }
 
-#[derive(Debug, Args)]
-struct Verify {
-    #[command(flatten)]
-    common: StoreAndJson,
-}
-
 impl StoreCommand {
     pub async fn run(self) -> anyhow::Result<()> {
         match self.action {
-            Action::List(arguments) => arguments.run().await,
+            Action::List(common) => list(&common).await,
             Action::Show(arguments) => arguments.run().await,
             Action::Default(arguments) => arguments.run().await,
             Action::Rm(arguments) => arguments.run().await,
             Action::Gc(arguments) => arguments.run().await,
-            Action::Verify(arguments) => arguments.run().await,
+            Action::Verify(common) => verify(&common).await,
         }
     }
 }
 
-impl List {
-    async fn run(self) -> anyhow::Result<()> {
-        let store = self.common.open()?;
-        let contents = store.contents().await?;
-        let listed: Vec<Value> = contents.iter().map(contents_json).collect();
-        self.common.json.write(&listed)?;
+async fn list(common: &StoreAndJson) -> anyhow::Result<()> {
+    let store = common.open()?;
+    let contents = store.contents().await?;
+    let listed: Vec<Value> = contents.iter().map(contents_json).collect();
+    common.json.write(&listed)?;
 
-        for held in &contents {
-            let current = held
-                .revisions
-                .iter()
-                .find(|held_revision| held_revision.revision == held.current);
-            let about = current.map_or_else(|| "is missing".to_owned(), about);
-            say(format_args!("{}  {}", headline(held), about));
-        }
-        Ok(())
+    for held in &contents {
+        let current = held
+            .revisions
+            .iter()
+            .find(|held_revision| held_revision.revision == held.current);
+        let about = current.map_or_else(|| "is missing".to_owned(), about);
+        say(format_args!("{}  {}", headline(held), about));
     }
+    Ok(())
 }
 
 impl Show {
@@ -136,10 +122,8 @@ impl Show {
 
         say(headline(&held));
         for revision in &held.revisions {
-            let mark = match revision.revision == held.current {
-                true => "*",
-                false => " ",
-            };
+            let is_current = revision.revision == held.current;
+            let mark = if is_current { "*" } else { " " };
             say(format_args!(
                 "{mark} revisions/{}  {}",
                 revision.revision,
@@ -206,9 +190,10 @@ impl Default {
 impl Remove {
     async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open()?;
-        let removed = match self.dry_run {
-            true => store.check_removable(&self.name).await?,
-            false => store.remove(&self.name).await?,
+        let (removed, word) = if self.dry_run {
+            (store.check_removable(&self.name).await?, "would remove")
+        } else {
+            (store.remove(&self.name).await?, "removed")
         };
 
         self.common.json.write(&json!({
@@ -217,10 +202,6 @@ impl Remove {
             "dry_run": self.dry_run,
         }))?;
 
-        let word = match self.dry_run {
-            true => "would remove",
-            false => "removed",
-        };
         let numbers: Vec<String> = removed.revisions.iter().map(u64::to_string).collect();
         say(format_args!(
             "{word} {}: revisions {}; `seese3 store gc` frees their space",
@@ -235,18 +216,14 @@ impl CollectGarbage {
     async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open()?;
         let older_than = Duration::from_secs(self.older_than);
-        let garbage = match self.dry_run {
-            true => store.find_garbage(older_than).await?,
-            false => store.collect_garbage(older_than).await?,
+        let (garbage, word) = if self.dry_run {
+            (store.find_garbage(older_than).await?, "would free")
+        } else {
+            (store.collect_garbage(older_than).await?, "freed")
         };
 
-        let files: Vec<Value> = garbage
-            .files
-            .iter()
-            .map(|file| json!({ "path": file.path, "bytes": file.bytes }))
-            .collect();
         self.common.json.write(&json!({
-            "files": files,
+            "files": garbage.files,
             "bytes": garbage.bytes(),
             "left_alone": garbage.left_alone,
             "dry_run": self.dry_run,
@@ -258,10 +235,6 @@ impl CollectGarbage {
         for folder in &garbage.left_alone {
             say(format_args!("left alone: {folder}"));
         }
-        let word = match self.dry_run {
-            true => "would free",
-            false => "freed",
-        };
         say(format_args!(
             "{word} {} in {} files",
             size(garbage.bytes()),
@@ -271,44 +244,33 @@ impl CollectGarbage {
     }
 }
 
-impl Verify {
-    async fn run(self) -> anyhow::Result<()> {
-        let store = self.common.open()?;
-        let progress = spinner("verifying");
-        let findings = store
-            .verify(&|resource| progress.set_message(resource.to_string()))
-            .await?;
-        progress.finish_and_clear();
+async fn verify(common: &StoreAndJson) -> anyhow::Result<()> {
+    let store = common.open()?;
+    let progress = spinner("verifying");
+    let findings = store
+        .verify(&|resource| progress.set_message(resource.to_string()))
+        .await?;
+    progress.finish_and_clear();
 
-        let listed: Vec<Value> = findings
-            .iter()
-            .map(|finding| json!({ "name": finding.resource, "problem": finding.problem }))
-            .collect();
-        self.common.json.write(&json!({ "findings": listed }))?;
-        for finding in &findings {
-            say(format_args!("{}: {}", finding.resource, finding.problem));
-        }
+    common.json.write(&json!({ "findings": findings }))?;
+    for finding in &findings {
+        say(format_args!("{}: {}", finding.resource, finding.problem));
+    }
 
-        match findings.len() {
-            0 => {
-                say("everything can be read and is consistent");
-                Ok(())
-            }
-            found => bail!("{found} findings"),
+    match findings.len() {
+        0 => {
+            say("everything can be read and is consistent");
+            Ok(())
         }
+        found => bail!("{found} findings"),
     }
 }
 
 /// The name, the current revision and the defaults.
 fn headline(held: &Contents) -> String {
-    let chosen = match held.is_chosen {
-        true => ", chosen",
-        false => "",
-    };
-    let adapter = match &held.default_adapter {
-        Some(adapter) => format!(", default adapters/{adapter}"),
-        None => String::new(),
-    };
+    let chosen = if held.is_chosen { ", chosen" } else { "" };
+    let adapter = held.default_adapter.as_ref();
+    let adapter = adapter.map_or_else(String::new, |name| format!(", default adapters/{name}"));
     let count = held.revisions.len();
 
     format!(

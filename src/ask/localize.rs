@@ -1,11 +1,10 @@
 //! `seese3 localize`: the mapped frames most similar to a view, and the camera pose.
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use clap::Args;
 
 use super::{
-    FeatureRow, Server, deviations_text, error_text, frame_text, frame_view, pose_text, revision,
-    wire_json,
+    FeatureRow, Server, deviations_text, error_text, frame_text, pose_text, revision, wire_json,
 };
 use crate::output::{JsonOutput, say};
 use seese3_client::proto::v1 as pb;
@@ -35,13 +34,10 @@ pub struct Localize {
 impl Localize {
     pub async fn run(self) -> anyhow::Result<()> {
         self.json.begin()?;
-        let view = match (self.frame, self.feature.view()?) {
-            (Some(frame), _) => frame_view(frame),
-            (None, Some(view)) => view,
-            (None, None) => {
-                bail!("--feature FILE --row ROW, --image FILE or --frame FRAME is required")
-            }
-        };
+        let view = self.feature.or_frame(
+            self.frame,
+            "--feature FILE --row ROW, --image FILE or --frame FRAME is required",
+        )?;
 
         let request = pb::LocalizeRequest {
             rooms: self.rooms,

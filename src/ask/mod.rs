@@ -103,15 +103,14 @@ struct FeatureRow {
 }
 
 impl FeatureRow {
-    fn view(&self) -> anyhow::Result<Option<pb::View>> {
-        if let Some(file) = &self.image {
-            return Ok(Some(image_view(file)?));
-        }
-
-        match (&self.feature, self.row) {
-            (Some(file), Some(row)) => Ok(Some(feature_view(file, row)?)),
-            (None, Some(_)) => bail!("--row needs --feature FILE"),
-            _ => Ok(None),
+    /// The view: a frame of the room if one is given, else the image or the feature.
+    fn or_frame(&self, frame: Option<u32>, missing: &'static str) -> anyhow::Result<pb::View> {
+        match (frame, &self.image, &self.feature, self.row) {
+            (_, _, None, Some(_)) => bail!("--row needs --feature FILE"),
+            (Some(frame), ..) => Ok(frame_view(frame)),
+            (_, Some(file), ..) => image_view(file),
+            (_, _, Some(file), Some(row)) => feature_view(file, row),
+            _ => bail!(missing),
         }
     }
 }

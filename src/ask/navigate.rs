@@ -3,9 +3,7 @@
 use anyhow::bail;
 use clap::Args;
 
-use super::{
-    FeatureRow, Server, error_text, frame_text, frame_view, motion_text, revision, wire_json,
-};
+use super::{FeatureRow, Server, error_text, frame_text, motion_text, revision, wire_json};
 use crate::named::one_of;
 use crate::output::{JsonOutput, say};
 use seese3_client::proto::v1 as pb;
@@ -66,13 +64,10 @@ impl Navigate {
         self.json.begin()?;
 
         // A navigation starts from exactly one view. Clap rejects two; reject none here.
-        let source = match (self.from, self.feature.view()?) {
-            (Some(frame), _) => frame_view(frame),
-            (None, Some(view)) => view,
-            (None, None) => {
-                bail!("--from FRAME, --feature FILE --row ROW or --image FILE is required")
-            }
-        };
+        let source = self.feature.or_frame(
+            self.from,
+            "--from FRAME, --feature FILE --row ROW or --image FILE is required",
+        )?;
 
         let displacement = match (self.to, &self.twist) {
             (Some(frame), _) => Displacement::TargetFrameId(frame),

@@ -58,13 +58,16 @@ impl Full {
     }
 }
 
-/// An error of a request.
-#[derive(Debug, Clone, thiserror::Error, PartialEq)]
+/// An error of a request. Its name is the reason in `google.rpc.ErrorInfo`.
+#[derive(Debug, Clone, thiserror::Error, PartialEq, IntoStaticStr)]
+#[strum(serialize_all = "SCREAMING_SNAKE_CASE")]
 #[allow(missing_docs, reason = "each variant's message says what it is")]
 pub enum Error {
     #[error("{field}: {problem}")]
+    #[strum(serialize = "INVALID_FIELD")]
     Invalid { field: String, problem: String },
     #[error("{field}: '{name}' is not served{}", meant(nearest.as_ref()))]
+    #[strum(serialize = "NOT_SERVED")]
     NotFound {
         field: String,
         name: String,
@@ -76,8 +79,10 @@ pub enum Error {
     #[error("{0}")]
     Precondition(String),
     #[error("the server is not ready: it is loading its store or stopping; try again")]
+    #[strum(serialize = "NOT_READY")]
     Loading,
     #[error("the server is busy: the limit of {what} is reached; try again later")]
+    #[strum(serialize = "BUSY")]
     Full { what: Full },
     #[error("{problem}")]
     Unauthenticated { problem: &'static str },
@@ -192,25 +197,6 @@ impl Error {
             Self::Internal => Code::Internal,
         }
     }
-
-    fn reason(&self) -> &'static str {
-        match self {
-            Self::Invalid { .. } => "INVALID_FIELD",
-            Self::NotFound { .. } => "NOT_SERVED",
-            Self::NotStored { .. } => "NOT_STORED",
-            Self::Precondition(_) => "PRECONDITION",
-            Self::Conflict { .. } => "CONFLICT",
-            Self::Transport { .. } => "TRANSPORT",
-            Self::Loading => "NOT_READY",
-            Self::Full { .. } => "BUSY",
-            Self::Unauthenticated { .. } => "UNAUTHENTICATED",
-            Self::Forbidden { .. } => "FORBIDDEN",
-            Self::OutOfScope { .. } => "OUT_OF_SCOPE",
-            Self::Deadline => "DEADLINE",
-            Self::Cancelled => "CANCELLED",
-            Self::Internal => "INTERNAL",
-        }
-    }
 }
 
 fn meant(nearest: Option<&String>) -> String {
@@ -226,7 +212,7 @@ impl From<Error> for Status {
             Error::Forbidden { verb } => metadata.insert("verb".to_owned(), (*verb).to_owned()),
             _ => None,
         };
-        details.set_error_info(error.reason(), DOMAIN, metadata);
+        details.set_error_info(<&str>::from(&error), DOMAIN, metadata);
 
         // Standard google.rpc details: a client gets the invalid field, the missing resource, or
         // the retry delay without parsing the message.
@@ -420,7 +406,7 @@ mod tests {
         ];
 
         for (error, code) in errors {
-            let row = format!("| `{}` | `{code}` |", error.reason());
+            let row = format!("| `{}` | `{code}` |", <&str>::from(&error));
             assert!(page.contains(&row), "{row}");
         }
     }

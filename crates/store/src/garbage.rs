@@ -27,7 +27,7 @@ pub struct Garbage {
 }
 
 /// An unreferenced file.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
 pub struct GarbageFile {
     /// Its path, relative to the root of the store.
     pub path: String,

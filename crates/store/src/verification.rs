@@ -8,9 +8,10 @@ use super::manifest::ObjectRef;
 use super::{Error, Kind, ResourceName, Store, folder_of};
 
 /// A problem found in a store.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
 pub struct Finding {
     /// The affected resource: a revision, or `defaults`.
+    #[serde(rename = "name")]
     pub resource: String,
     /// Description of the problem, with the file if there is one.
     pub problem: String,
