@@ -167,11 +167,12 @@ impl CrossRoom {
 
         // Held-out rooms may be skipped, for example if they are too short for the stride. A run
         // that skipped all of them has no results.
-        if let Some((room, why)) = runs
+        if let Some(first) = runs
             .iter()
             .find(|run| run.outcomes.is_empty())
             .and_then(|run| run.skipped.first())
         {
+            let (room, why) = (&first.room, &first.why);
             bail!("no held-out room could be evaluated; room '{room}': {why}");
         }
 
@@ -320,14 +321,15 @@ impl CrossRoom {
         ));
 
         for run in runs {
-            for (room, why) in &run.skipped {
+            for skipped in &run.skipped {
+                let (room, why) = (&skipped.room, &skipped.why);
                 say(format_args!("room '{room}' was skipped: {why}"));
             }
         }
 
         // With several room counts or seeds, the scaling curve comes first: one line per run.
         if runs.len() > 1 {
-            say(scaling_table(runs, &self.baseline, self.threshold).trim_end());
+            say(scaling_table(runs, &self.baseline, self.threshold));
         }
 
         // Only the last run is printed by navigator and by room; the JSON file has every run.
@@ -339,9 +341,9 @@ impl CrossRoom {
             last.seed
         ));
 
-        say(cross_room_table(last, &self.baseline, self.threshold).trim_end());
+        say(cross_room_table(last, &self.baseline, self.threshold));
         if self.rooms {
-            say(rooms_table(last).trim_end());
+            say(rooms_table(last));
         }
 
         Ok(())

@@ -110,7 +110,7 @@ impl Demo {
         let rooms = [(stored, features)];
 
         let SeededTraining { adapter, runs } = train_with_progress(&rooms, &plan, 1)?;
-        say(training_table(&runs).trim_end());
+        say(training_table(&runs));
         let name = default_name(&rooms, &plan);
         let adapter_published = store
             .publish_adapter(&name, &adapter, &runs[0].record, rooms[0].1.rows())
@@ -124,7 +124,7 @@ impl Demo {
         // The adapter was trained on the first 80 % of the path; the table scores it on the rest.
         let [(stored, features)] = rooms;
         let room = Arc::new(stored.room);
-        say(score(&room, &features, adapter)?.trim_end());
+        say(score(&room, &features, adapter)?);
 
         say(format_args!(
             "4. Serving the store and querying it over gRPC: one motion of {STRIDE} frames in {STEPS} steps, closed loop"
@@ -271,8 +271,7 @@ async fn serve_and_ask(
     };
 
     say_navigation(&answer);
-    let svg = path_svg(&plot_of(room, &answer)?).map_err(anyhow::Error::msg)?;
-    write_file(picture, svg.as_bytes())?;
+    write_file(picture, &path_svg(&plot_of(room, &answer)?)?)?;
 
     say(format_args!(
         "   the path from above: {}",

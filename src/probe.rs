@@ -17,7 +17,7 @@ use seese3_lab::experiments::probe::{
     DimensionProtocol, DimensionScore, ProbeProtocol, ProbeScores, probe, probe_adapters,
 };
 use seese3_lab::probes::{Counted, Duplicates, Limit, MutualKnn};
-use seese3_lab::report::{ProbeContext, probe_json, probe_table};
+use seese3_lab::report::{ProbeJson, ProbedRooms, probe_table};
 use seese3_store::StoredRoom;
 
 #[derive(Debug, Args)]
@@ -144,7 +144,7 @@ impl Probe {
             self.seeds
         ));
 
-        say(probe_table(&scores).trim_end());
+        say(probe_table(&scores));
         skipped
             .iter()
             .for_each(|why| say(format_args!("skipped: {why}")));
@@ -181,17 +181,13 @@ impl Probe {
             );
         }
 
-        if self.common.json.is_wanted() {
-            let context = ProbeContext {
-                features: rooms[0].1.source().name.clone(),
-                split: self.protocol.split_name(),
-                preset: base.preset.name(),
-                skipped,
-            };
-            self.common.json.write(&probe_json(&scores, context))?;
-        }
-
-        Ok(())
+        self.common.json.write(&ProbeJson {
+            rooms: ProbedRooms::of(&scores),
+            features: &rooms[0].1.source().name,
+            split: self.protocol.split_name(),
+            preset: base.preset.name(),
+            skipped,
+        })
     }
 
     /// One training plan per stride: those of --sweep-strides, else the one of --stride. The probes

@@ -89,18 +89,10 @@ impl LoadedSet {
     }
 }
 
-/// Reads images from the rooms' original folders.
-struct RecordedImages;
-
-impl Images for RecordedImages {
-    fn read(&self, room: &Room, frame: FrameId) -> Result<RgbImage, String> {
-        let root = PathBuf::from(&room.provenance().images_root);
-        read_image(&root, &room.images()[frame.row()]).map_err(|error| error.to_string())
-    }
-
-    fn png(&self, image: &RgbImage) -> Result<Vec<u8>, String> {
-        encode_png(image).map_err(|error| error.to_string())
-    }
+/// Reads the image of a frame from the room's original folder.
+fn recorded_image(room: &Room, frame: FrameId) -> Result<RgbImage, String> {
+    let root = PathBuf::from(&room.provenance().images_root);
+    read_image(&root, &room.images()[frame.row()]).map_err(|error| error.to_string())
 }
 
 impl Reproduce {
@@ -112,7 +104,10 @@ impl Reproduce {
         let reproduction = Reproduction {
             options: self.options(),
             sets: sets.iter().map(LoadedSet::borrowed).collect(),
-            images: &RecordedImages,
+            images: Images {
+                read: &recorded_image,
+                png: &|image| encode_png(image).map_err(|error| error.to_string()),
+            },
         };
 
         // Validate everything before hours of training.

@@ -41,7 +41,7 @@ impl Theory {
         })?;
 
         progress.finish_and_clear();
-        say(theory_table(&found).trim_end());
+        say(theory_table(&found));
         self.json.write(&theory_json(&found))?;
 
         // The table and the file show every check; the exit status reports whether all bounds hold.

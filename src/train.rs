@@ -148,7 +148,7 @@ impl Train {
 
 /// Prints the table of seeds, with its caveats.
 fn say_scores(runs: &[TrainingRun]) {
-    say(training_table(runs).trim_end());
+    say(training_table(runs));
     if let Some(remark) = training_remark(runs) {
         say(remark);
     }

@@ -5,7 +5,7 @@ use clap::Args;
 
 use seese3_core::eval::has_seen;
 use seese3_lab::experiments::localization::{LocalizationProtocol, RuleScores, evaluate};
-use seese3_lab::report::{LocalizationContext, localization_json, localization_table};
+use seese3_lab::report::{LocalizationContext, LocalizationJson, localization_table};
 
 use super::super::fit::fitting_bar;
 use super::super::output::{JsonOutput, say};
@@ -96,14 +96,14 @@ impl Localization {
             found.mapped,
             found.asked
         ));
-        say(localization_table(&found).trim_end());
+        say(localization_table(&found));
 
         if let Some(rules) = &found.rules {
             say_rules(rules);
         }
 
         if self.json.is_wanted() {
-            let context = LocalizationContext {
+            let protocol = LocalizationContext {
                 room: self.room.clone(),
                 features: features.source().name.clone(),
                 adapter: self.adapter.clone(),
@@ -111,7 +111,8 @@ impl Localization {
                 map_blocks: self.map_blocks,
                 seed: self.seed,
             };
-            self.json.write(&localization_json(&found, context))?;
+            let found = &found;
+            self.json.write(&LocalizationJson { found, protocol })?;
         }
 
         Ok(())

@@ -32,8 +32,7 @@ use seese3_core::splits::Split;
 use seese3_core::training::{motions, predictions};
 use seese3_lab::report::{
     AdapterJson, EvaluationContext, MotionBaselines, RoomJson, baselines_text, curve_thresholds,
-    curves_svg, evaluation_csv, evaluation_json, evaluation_latex, evaluation_table, hit_curves,
-    report_at,
+    evaluation_csv, evaluation_json, evaluation_latex, evaluation_table, hit_curves, report_at,
 };
 use seese3_store::{Store, StoredAdapter, StoredRoom};
 
@@ -244,7 +243,7 @@ impl Navigation {
 
         // Print warnings before the table, where they are not overlooked.
         say_caveats(&protocol, &record, navigator.room().id(), leak);
-        say(evaluation_table(&report).trim_end());
+        say(evaluation_table(&report));
 
         let learned_here = trained_on == TrainedOn::TheseFrames;
         let motion = motion_baselines(&navigator, &features, &record, &protocol, learned_here)?;
@@ -310,8 +309,7 @@ impl Navigation {
                 let is_plain = |name: &str| !name.contains('+') && !name.ends_with("-in-sample");
                 drawn.series.retain(|series| is_plain(&series.name));
             }
-            let svg = curves_svg(&drawn)?;
-            write_file(file, svg.as_bytes())?;
+            write_file(file, &drawn.svg()?)?;
             say(format_args!("wrote {}", file.display()));
         }
         Ok(())

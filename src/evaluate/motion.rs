@@ -8,7 +8,7 @@ use seese3_core::features::Features;
 use seese3_core::room::Room;
 use seese3_core::splits::Split;
 use seese3_lab::experiments::motion::{Maps, evaluate};
-use seese3_lab::report::{motion_evaluation_json, motion_table};
+use seese3_lab::report::{MotionEvaluationJson, motion_table};
 
 use super::super::camera::CameraOption;
 use super::super::output::{JsonOutput, say};
@@ -98,15 +98,15 @@ impl Motion {
         if let Some((adapter, _)) = &adapter {
             say_adapter(adapter, in_room == Some(true));
         }
-        say(motion_table(&found).trim_end());
+        say(motion_table(&found));
 
-        if self.json.is_wanted() {
-            let named = self.adapter.as_deref().zip(in_room);
-            let record = motion_evaluation_json(&found, &self.room, named, self.stride);
-            self.json.write(&record)?;
-        }
-
-        Ok(())
+        self.json.write(&MotionEvaluationJson {
+            found: &found,
+            room: &self.room,
+            adapter: self.adapter.as_deref(),
+            stride: self.stride,
+            in_room,
+        })
     }
 
     /// The feature maps of the room's frames, and their camera.

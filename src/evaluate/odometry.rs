@@ -126,20 +126,17 @@ impl Odometry {
             },
         ));
 
-        let table = odometry_table(&tracked);
+        let table = odometry_table(&tracked).to_string();
         let shown = if self.each || tracked.len() == 1 {
             table
         } else {
             only_mean(&table)
         };
-        say(shown.trim_end());
-        say(format_args!(
-            "\ncovariances:\n{}",
-            coverage_table(&tracked).trim_end()
-        ));
+        say(shown);
+        say(format_args!("\ncovariances:\n{}", coverage_table(&tracked)));
 
         if trackers.len() > 1 {
-            say(other_rooms_text(&tracked).trim_end());
+            say(other_rooms_text(&tracked));
         }
         if let Some(found) = &relocalised {
             say(relocalisation_text(found));
@@ -197,7 +194,7 @@ fn write_paths(folder: &Path, room: &str, replay: &Replay) -> anyhow::Result<()>
 fn only_mean(table: &str) -> String {
     let lines: Vec<&str> = table.lines().collect();
     match lines.as_slice() {
-        [head, .., last] => format!("{head}\n{last}\n"),
+        [head, .., last] => format!("{head}\n{last}"),
         _ => table.to_owned(),
     }
 }

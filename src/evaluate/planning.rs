@@ -78,7 +78,7 @@ impl Planning {
             stored.revision,
             self.hold_out.name(),
         ));
-        say(planning_table(&found).trim_end());
+        say(planning_table(&found));
 
         self.json
             .write(&planning_json(&found, &protocol, &stored.name))?;

@@ -116,7 +116,7 @@ impl Robustness {
             stored.revision,
             self.hold_out.name(),
         ));
-        say(robustness_table(&found).trim_end());
+        say(robustness_table(&found));
 
         self.json
             .write(&robustness_json(&found, &stored.name, self.hold_out))?;

@@ -84,7 +84,7 @@ impl EvaluateTrajectory {
             errors.matched, errors.unmatched_reference, errors.unmatched_estimate
         ));
 
-        say(path_errors_table(&errors).trim_end());
+        say(path_errors_table(&errors));
         self.json.write(&path_errors_json(&errors))?;
 
         Ok(())

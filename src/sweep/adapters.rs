@@ -20,7 +20,7 @@ use seese3_core::training::TrainingPlan;
 use seese3_lab::experiments::adapter_sweep::{SweepRow, content, row, run};
 use seese3_lab::experiments::cross_room::nested_choice;
 use seese3_lab::report::{
-    aligned, configurations_rows, difficulty_rows, parts_rows, success_rows, sweep_parquet,
+    configurations_table, difficulty_table, parts_table, success_table, sweep_parquet,
 };
 use seese3_store::{Store, StoredRoom};
 
@@ -179,18 +179,18 @@ impl Adapters {
             base.stride
         ));
 
-        say(aligned(&success_rows(rows)).trim_end());
+        say(success_table(rows));
         say("\nroom difficulty:");
-        say(aligned(&difficulty_rows(rows)).trim_end());
+        say(difficulty_table(rows));
 
         say(format_args!(
             "\nby part of the motion, over {} runs:",
             rows.len()
         ));
 
-        say(aligned(&parts_rows(rows)).trim_end());
+        say(parts_table(rows));
         say("\nthe best configurations by mean R²:");
-        say(aligned(&configurations_rows(rows, SHOWN)).trim_end());
+        say(configurations_table(rows, SHOWN));
 
         // One line per room and reason, however many runs failed for it.
         let mut failures: BTreeMap<(&str, &str), usize> = BTreeMap::new();

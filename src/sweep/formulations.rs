@@ -10,7 +10,7 @@ use super::super::rooms::{data, load_rooms, room_words};
 use seese3_core::training::RoomData;
 use seese3_lab::experiments::formulations::{RoomPooling, compare};
 use seese3_lab::formulations::Formulation;
-use seese3_lab::report::{formulations_json, formulations_table};
+use seese3_lab::report::formulations_table;
 use seese3_store::Store;
 
 #[derive(Debug, Args)]
@@ -88,8 +88,8 @@ impl Formulations {
                 .map_or(0, |run| run.n),
         ));
 
-        say(formulations_table(&comparison).trim_end());
-        self.json.write(&formulations_json(&comparison))?;
+        say(formulations_table(&comparison));
+        self.json.write(&comparison)?;
 
         Ok(())
     }

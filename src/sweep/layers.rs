@@ -1,5 +1,7 @@
 //! `seese3 sweep layers`: M1 to M4 of every layer of an encoder's features.
 
+use std::collections::BTreeMap;
+
 use anyhow::{Context, bail, ensure};
 use clap::Args;
 use rayon::prelude::*;
@@ -14,7 +16,7 @@ use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan};
 use seese3_lab::experiments::layers::{LayerProtocol, LayerScores, score_layer};
 use seese3_lab::probes::MutualKnn;
-use seese3_lab::report::{encoders_table, layers_json, layers_table};
+use seese3_lab::report::{encoders_table, layers_table};
 use seese3_store::{Store, StoredRoom};
 
 #[derive(Debug, Args)]
@@ -150,13 +152,13 @@ impl Layers {
             self.seeds
         ));
 
-        say(layers_table(&scores).trim_end());
+        say(layers_table(&scores));
         if self.by_encoder {
-            say(encoders_table(&scores).trim_end());
+            say(encoders_table(&scores));
         }
 
         say("* the best: M1 highest, M2 nearest to 6 (SE(3)), M3 and M4 highest; means over rooms");
-        self.json.write(&layers_json(&scores))?;
+        self.json.write(&BTreeMap::from([("layers", scores)]))?;
 
         Ok(())
     }

@@ -8,7 +8,9 @@ use strum::{EnumMessage, EnumString, IntoStaticStr, VariantArray};
 use super::Error;
 
 /// The library that runs a model.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, EnumMessage, EnumString, IntoStaticStr, VariantArray)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, EnumMessage, EnumString, IntoStaticStr, VariantArray,
+)]
 #[strum(serialize_all = "lowercase")]
 pub enum RuntimeKind {
     /// Pure Rust, needs no library.

@@ -27,6 +27,7 @@
 //!
 //! | module | what |
 //! | --- | --- |
+//! | `json` | shapes of core results in JSON records |
 //! | [`formulations`] | the paper's alternatives A to D to the adapter |
 //! | [`probes`] | probes M1 to M3 of the SE(3) information in features; M4 trains an adapter |
 //! | [`theory`] | numeric checks of the paper's theorems |
@@ -36,6 +37,7 @@
 //!
 //! This crate reads and writes no files; the program does.
 
+mod json;
 pub mod formulations;
 pub mod probes;
 pub mod theory;

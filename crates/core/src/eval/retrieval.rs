@@ -20,12 +20,14 @@ const POSE_BARS: [(f64, f64); 7] = [
 
 /// Fraction of pairs with the retrieved pose within a distance and an angle of the target pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct PoseRecall {
     /// Bound on the distance, meters.
     pub translation_m: f64,
     /// Bound on the angle, degrees.
     pub rotation_deg: f64,
     /// Fraction of pairs strictly within both bounds.
+    #[cfg_attr(feature = "serde", serde(flatten))]
     pub rate: Rate,
 }
 

@@ -43,10 +43,13 @@ const FACTOR_COUNT: i32 = 620;
 
 /// Fractions of errors inside the confidence ellipsoids of their covariances.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct Coverage {
     /// Fraction inside the 68 % ellipsoid.
+    #[cfg_attr(feature = "serde", serde(rename = "coverage_68"))]
     pub within_68: f64,
     /// Fraction inside the 95 % ellipsoid.
+    #[cfg_attr(feature = "serde", serde(rename = "coverage_95"))]
     pub within_95: f64,
 }
 

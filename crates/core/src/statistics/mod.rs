@@ -20,6 +20,7 @@ const RESAMPLES: usize = 10_000;
 
 /// A success rate with its 95 % interval.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct Rate {
     /// Successes over `n`.
     pub rate: f64,
@@ -28,6 +29,7 @@ pub struct Rate {
     /// Upper end of Wilson's 95 % interval.
     pub high: f64,
     /// The number of trials.
+    #[cfg_attr(feature = "serde", serde(skip))]
     pub n: usize,
 }
 
@@ -126,6 +128,7 @@ pub fn normal_deviates(random: &mut ChaCha8Rng, count: usize) -> impl Iterator<I
 
 /// A mean over rooms with its 95 % bootstrap interval.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct RoomMean {
     /// The mean.
     pub mean: f64,
@@ -167,6 +170,7 @@ pub fn paired_difference(ours: &[f64], theirs: &[f64], seed: u64) -> RoomMean {
 
 /// A median with its 95 % interval.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct RecordedMedian {
     /// The median.
     pub median: f64,

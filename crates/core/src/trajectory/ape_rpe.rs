@@ -105,6 +105,7 @@ fn check(reference: &Trajectory, estimate: &Trajectory) -> Result<(), Error> {
 
 /// Summary statistics of errors, in the errors' unit.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct Statistics {
     /// The root mean square.
     pub rmse: f64,
@@ -113,14 +114,19 @@ pub struct Statistics {
     /// The median.
     pub median: f64,
     /// The population standard deviation.
+    #[cfg_attr(feature = "serde", serde(rename = "std"))]
     pub deviation: f64,
     /// The smallest.
+    #[cfg_attr(feature = "serde", serde(rename = "min"))]
     pub least: f64,
     /// The largest.
+    #[cfg_attr(feature = "serde", serde(rename = "max"))]
     pub largest: f64,
     /// The sum of squares.
+    #[cfg_attr(feature = "serde", serde(rename = "sse"))]
     pub sum_of_squares: f64,
     /// The number of errors.
+    #[cfg_attr(feature = "serde", serde(rename = "n"))]
     pub count: usize,
 }
 

@@ -13,7 +13,7 @@ use seese3_core::training::{RoomData, TrainingPlan, train_adapter};
 const CONTENT_BYTES: usize = 16;
 
 /// The settings and scores of one run. R² values are null if R² is undefined or the run failed.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct SweepRow {
     /// Unique key of the run: room, revision, content hash and all settings.
     pub key: String,
@@ -160,15 +160,7 @@ pub fn row(data: &RoomData<'_>, content: &str, plan: &TrainingPlan) -> SweepRow 
         weight_decay: config.weight_decay,
         hidden: config.hidden,
         seed: config.seed,
-        n: 0,
-        overall: None,
-        translation: None,
-        rotation: None,
-        direction: None,
-        magnitude: None,
-        train_overall: None,
-        seconds: 0.0,
-        failure: String::new(),
+        ..SweepRow::default()
     }
 }
 

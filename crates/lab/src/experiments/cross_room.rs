@@ -3,11 +3,13 @@
 //!
 //! Confidence intervals resample rooms, not pairs, because the pairs of one room are correlated.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
+use serde::{Serialize, Serializer};
 
 use seese3_core::adapter::{Adapter, TrainingRecord};
 use seese3_core::cancel::Cancellation;
@@ -20,24 +22,46 @@ use seese3_core::training::{RoomData, TrainingPlan, motions, predictions, train_
 use seese3_robot::calibration::{Calibrated, calibrate_retrieval};
 
 use super::Error;
+use crate::json;
 
 /// Lower clip of R² in a clipped mean. R² has no lower bound, so one bad room would dominate the
 /// mean.
 pub const CLIPPED_R2: f64 = -1.0;
 
 /// The scores of an adapter in one room.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct RoomOutcome {
     /// The room.
+    #[serde(serialize_with = "json::shown")]
     pub room: RoomId,
-    /// R² of the motions of its test pairs.
-    pub motion: MotionScores,
-    /// One row per navigator.
-    pub rows: Vec<Row>,
     /// Number of candidate frames of retrieval.
+    #[serde(rename = "candidates")]
     pub candidate_count: usize,
+    /// R² of the motions of its test pairs.
+    #[serde(serialize_with = "json::shaped::<json::MotionJson, _, _>")]
+    pub motion: MotionScores,
     /// Baselines to compare R² with.
+    #[serde(serialize_with = "json::shaped::<json::BaselinesJson, _, _>")]
     pub baselines: Baselines,
+    /// One row per navigator; in JSON, the hit rates by navigator.
+    #[serde(rename = "hit", serialize_with = "first_hits")]
+    pub rows: Vec<Row>,
+}
+
+/// Serializes each navigator's Hit@ε at the first threshold, sorted by name.
+fn first_hits<S: Serializer>(rows: &[Row], to: S) -> Result<S::Ok, S::Error> {
+    let hit = |row: &Row| Some((row.name.clone(), row.retrieval.hits.first()?.1));
+    let hits: BTreeMap<String, Rate> = rows.iter().filter_map(hit).collect();
+    hits.serialize(to)
+}
+
+/// A room that could not be evaluated.
+#[derive(Debug, Clone, Serialize)]
+pub struct Skipped {
+    /// The room.
+    pub room: String,
+    /// The reason.
+    pub why: String,
 }
 
 impl RoomOutcome {
@@ -59,8 +83,8 @@ pub struct CrossRoomRun {
     pub seed: u64,
     /// One outcome per held-out room.
     pub outcomes: Vec<RoomOutcome>,
-    /// Rooms that could not be evaluated, each with the reason.
-    pub skipped: Vec<(String, String)>,
+    /// Rooms that could not be evaluated.
+    pub skipped: Vec<Skipped>,
 }
 
 impl CrossRoomRun {
@@ -163,7 +187,10 @@ pub fn train_and_test(
     ) {
         match outcome {
             Ok(outcome) => run.outcomes.push(outcome),
-            Err((room, why)) => run.skipped.push((room.to_string(), why.to_string())),
+            Err((room, why)) => run.skipped.push(Skipped {
+                room: room.to_string(),
+                why: why.to_string(),
+            }),
         }
     }
 
@@ -267,17 +294,20 @@ pub fn wins(outcomes: &[RoomOutcome], navigator: &str) -> Option<Rate> {
 }
 
 /// R² over rooms: what the paper's scaling curves show (Sec. 5).
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct MotionSummary {
     /// Rooms whose overall R² is above 0.
     pub positive: Rate,
     /// Rooms whose overall R² is above 0.3.
+    #[serde(rename = "above_0.3")]
     pub above_0_3: Rate,
     /// The largest overall R².
     pub best: f64,
     /// Mean of max(R², −1), our variant: it still separates bad from worse.
+    #[serde(rename = "clipped_mean")]
     pub clipped: RoomMean,
     /// Mean of max(R², 0), the paper's.
+    #[serde(rename = "clipped_mean_at_0")]
     pub clipped_at_zero: RoomMean,
 }
 

@@ -1,6 +1,7 @@
 //! Compares the adapter with the paper's alternatives A to D and the constant, over several seeds.
 
 use rayon::prelude::*;
+use serde::Serialize;
 use strum::VariantArray;
 
 use seese3_core::motion_scores::{MotionScores, ReadMotions};
@@ -10,9 +11,10 @@ use seese3_core::training::{RoomData, TrainingPlan};
 use super::Error;
 use super::folds::FoldedMotions;
 use crate::formulations::{Formulation, train_formulation};
+use crate::json::{self, PartsJson};
 
 /// Scores of every formulation, and of the constant baseline on the same pairs.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct Comparison {
     /// One entry per formulation, the adapter first.
     pub formulations: Vec<FormulationScores>,
@@ -23,12 +25,26 @@ pub struct Comparison {
 
 /// Scores of one formulation, one per seed. Each is computed over the test pairs of all splits of
 /// a room together, then averaged over rooms.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct FormulationScores {
     /// The formulation's name.
     pub name: &'static str,
+    /// Mean and deviation of each part of the motion over the seeds.
+    pub by_part: PartsJson,
     /// One score per seed, in seed order.
+    #[serde(serialize_with = "json::each::<json::MotionJson, _, _>")]
     pub runs: Vec<MotionScores>,
+}
+
+impl FormulationScores {
+    /// The scores of a formulation, one per seed.
+    pub fn new(name: &'static str, runs: Vec<MotionScores>) -> Self {
+        Self {
+            name,
+            by_part: PartsJson::from(&runs),
+            runs,
+        }
+    }
 }
 
 /// Whether a formulation trains one network per room or one for all rooms.
@@ -76,17 +92,17 @@ pub fn compare(
         .collect::<Result<_, Error>>()?;
 
     // Group the runs of all tasks by formulation.
-    let scores_of = |&which: &Formulation| FormulationScores {
-        name: which.name(),
-        runs: runs
-            .iter()
-            .filter(|(other, ..)| *other == which)
-            .map(|(_, scores, _)| *scores)
-            .collect(),
+    let scores_of = |which: Formulation| {
+        let own = runs.iter().filter(|(other, ..)| *other == which);
+        FormulationScores::new(which.name(), own.map(|(_, scores, _)| *scores).collect())
     };
 
     Ok(Comparison {
-        formulations: Formulation::VARIANTS.iter().map(scores_of).collect(),
+        formulations: Formulation::VARIANTS
+            .iter()
+            .copied()
+            .map(scores_of)
+            .collect(),
         // The constant is the same for every formulation and seed.
         constant_r2: runs.first().map_or(f64::NAN, |&(_, _, constant)| constant),
     })

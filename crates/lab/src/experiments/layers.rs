@@ -1,6 +1,7 @@
 //! Scores M1 to M4 of one feature set in one room: one row of the table over an encoder's layers.
 
 use rayon::prelude::*;
+use serde::Serialize;
 
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::splits::Split;
@@ -27,8 +28,9 @@ pub struct LayerProtocol {
     pub seeds: u64,
 }
 
-/// M1 to M4 of one feature set in one room.
-#[derive(Debug, Clone)]
+/// M1 to M4 of one feature set in one room. R² values are over the test pairs of all splits
+/// together.
+#[derive(Debug, Clone, Serialize)]
 pub struct LayerScores {
     /// The features' name.
     pub features: String,
@@ -37,30 +39,58 @@ pub struct LayerScores {
     /// The room.
     pub room: String,
     /// Width of a feature.
+    #[serde(rename = "columns")]
     pub dim: usize,
-    /// Mutual k-NN score, 0 to 1.
-    pub m1: f64,
-    /// Intrinsic dimension by TwoNN.
-    pub m2_two_nn: f64,
-    /// Intrinsic dimension by maximum likelihood.
-    pub m2_mle: f64,
-    /// Number of duplicate rows that M2 dropped.
-    pub m2_dropped: usize,
-    /// R² of the constant baseline, which always predicts the mean training motion. This and the
-    /// R² values below are over the test pairs of all splits together.
+    /// Mutual k-NN.
+    pub m1: MutualKnnShare,
+    /// The intrinsic dimension.
+    pub m2: LayerDimension,
+    /// Ridge regression.
+    pub m3: RidgeScore,
+    /// The adapter.
+    pub m4: AdapterScores,
+    /// R² of the constant baseline, which always predicts the mean training motion.
     pub constant_r2: f64,
+}
+
+/// M1 of a layer.
+#[derive(Debug, Clone, Serialize)]
+pub struct MutualKnnShare {
+    /// Mutual k-NN score, 0 to 1.
+    pub value: f64,
+}
+
+/// M2 of a layer.
+#[derive(Debug, Clone, Serialize)]
+pub struct LayerDimension {
+    /// Intrinsic dimension by TwoNN.
+    pub twonn: f64,
+    /// Intrinsic dimension by maximum likelihood.
+    pub mle: f64,
+    /// Number of duplicate rows dropped.
+    pub dropped_rows: usize,
+}
+
+/// M3 of a layer.
+#[derive(Debug, Clone, Serialize)]
+pub struct RidgeScore {
     /// R² of ridge regression.
-    pub m3_r2: f64,
-    /// Mean over seeds of the adapter's R².
-    pub m4_r2: f64,
-    /// Mean over seeds of the adapter's R² of translation.
-    pub m4_translation: f64,
-    /// Mean over seeds of the adapter's R² of rotation.
-    pub m4_rotation: f64,
-    /// Sample standard deviation over seeds of the adapter's R².
-    pub m4_deviation: f64,
-    /// The adapter's R², one per seed.
-    pub m4_runs: Vec<f64>,
+    pub r2: f64,
+}
+
+/// M4 of a layer.
+#[derive(Debug, Clone, Serialize)]
+pub struct AdapterScores {
+    /// Mean over seeds of the R².
+    pub r2: f64,
+    /// Mean over seeds of the R² of translation.
+    pub translation: f64,
+    /// Mean over seeds of the R² of rotation.
+    pub rotation: f64,
+    /// Sample standard deviation over seeds of the R².
+    pub deviation: f64,
+    /// The R² of each seed.
+    pub runs: Vec<f64>,
 }
 
 /// Scores one feature set in one room.
@@ -103,16 +133,22 @@ pub fn score_layer(data: &RoomData<'_>, protocol: &LayerProtocol) -> Result<Laye
         encoder: source.encoder.clone(),
         room: room.id().to_string(),
         dim: source.dim,
-        m1,
-        m2_two_nn: m2.two_nn.linear,
-        m2_mle: m2.mle_biased.harmonic,
-        m2_dropped: m2.dropped,
+        m1: MutualKnnShare { value: m1 },
+        m2: LayerDimension {
+            twonn: m2.two_nn.linear,
+            mle: m2.mle_biased.harmonic,
+            dropped_rows: m2.dropped,
+        },
+        m3: RidgeScore {
+            r2: ridge.scores().overall,
+        },
+        m4: AdapterScores {
+            r2: mean(&m4_runs),
+            translation: m4.translation,
+            rotation: m4.rotation,
+            deviation: deviation(&m4_runs),
+            runs: m4_runs,
+        },
         constant_r2: ridge.constant_r2(),
-        m3_r2: ridge.scores().overall,
-        m4_r2: mean(&m4_runs),
-        m4_translation: m4.translation,
-        m4_rotation: m4.rotation,
-        m4_deviation: deviation(&m4_runs),
-        m4_runs,
     })
 }

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use serde::Serialize;
+
 use seese3_core::adapter::{Adapter, EpochProgress};
 use seese3_core::geometry::{Pose, PoseError, exp, log};
 use seese3_core::room::FrameId;
@@ -52,9 +54,10 @@ impl LocalizationProtocol {
 }
 
 /// Median, with its confidence interval, and 90 % quantile of errors.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ErrorQuantiles {
     /// The median, with a bootstrap interval over twenty blocks of the recording.
+    #[serde(flatten)]
     pub median: RecordedMedian,
     /// The 90 % quantile.
     pub p90: f64,
@@ -70,8 +73,8 @@ impl ErrorQuantiles {
     }
 }
 
-/// Errors of the estimated poses.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// Errors of estimated poses or motions.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct LocalizationErrors {
     /// Translation errors, metres.
     pub translation_m: ErrorQuantiles,
@@ -80,24 +83,22 @@ pub struct LocalizationErrors {
 }
 
 impl LocalizationErrors {
-    fn of(errors: &[PoseError]) -> Self {
-        let metres: Vec<f64> = errors.iter().map(|error| error.translation_m).collect();
-        let degrees: Vec<f64> = errors
-            .iter()
-            .map(|error| error.rotation_rad.to_degrees())
-            .collect();
+    /// The quantiles of errors in recording order.
+    pub fn of(errors: &[PoseError]) -> Self {
+        let column = |of: fn(&PoseError) -> f64| errors.iter().map(of).collect::<Vec<f64>>();
 
         Self {
-            translation_m: ErrorQuantiles::of(&metres),
-            rotation_deg: ErrorQuantiles::of(&degrees),
+            translation_m: ErrorQuantiles::of(&column(|error| error.translation_m)),
+            rotation_deg: ErrorQuantiles::of(&column(|error| error.rotation_rad.to_degrees())),
         }
     }
 }
 
 /// The results in one room.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct Localization {
     /// Number of query views.
+    #[serde(rename = "n")]
     pub asked: usize,
     /// Number of mapped frames.
     pub mapped: usize,
@@ -118,13 +119,14 @@ pub struct Localization {
 }
 
 /// How often the rules fell back to the nearest frame, and the coverage of their covariances.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct RuleScores {
     /// Fraction of views that use the nearest frame's translation unchanged.
     pub translation_unread: f64,
     /// Fraction of views that use the nearest frame's rotation unchanged.
     pub rotation_unread: f64,
     /// Fractions of errors within the 68 % and 95 % ellipsoids.
+    #[serde(flatten)]
     pub coverage: Coverage,
 }
 

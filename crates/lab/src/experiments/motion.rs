@@ -3,10 +3,11 @@
 
 use ndarray::ArrayView3;
 use rayon::prelude::*;
+use serde::Serialize;
 
 use seese3_core::adapter::Adapter;
 use seese3_core::features::Features;
-use seese3_core::geometry::{Pinhole, Twist, exp, log};
+use seese3_core::geometry::{Pinhole, PoseError, Twist, exp, log};
 use seese3_core::nalgebra::Cholesky;
 use seese3_core::room::Room;
 use seese3_core::splits::Pair;
@@ -15,49 +16,36 @@ use seese3_core::training::motions;
 use seese3_robot::two_view;
 
 use super::Error;
-use super::localization::ErrorQuantiles;
+use super::localization::LocalizationErrors;
 
-/// Errors of estimated motions.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MotionErrors {
-    /// Distances between the end positions of the estimated and the true motion, metres.
-    pub translation_m: ErrorQuantiles,
-    /// Angles between their end orientations, degrees.
-    pub rotation_deg: ErrorQuantiles,
-}
-
-/// The results in one room.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// The results in one room. Errors are those of the poses at the end of the motions.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct MotionEvaluation {
     /// Number of frame pairs.
     pub n: usize,
-    /// Errors of the adapter, if one was given.
-    pub adapter: Option<AdapterErrors>,
+    /// The adapter's estimate with the mean training motion μ, as `EstimateMotion` returns it.
+    /// This and the next two are `None` without an adapter.
+    pub ours: Option<LocalizationErrors>,
+    /// The adapter's estimate without μ, as trackers use it.
+    pub without_mean: Option<LocalizationErrors>,
+    /// The constant baseline, which always predicts μ.
+    pub constant: Option<LocalizationErrors>,
     /// Errors of the two-view estimator, if feature maps were given.
     pub two_view: Option<TwoViewErrors>,
     /// Errors of the zero-motion baseline.
-    pub no_motion: MotionErrors,
-}
-
-/// The errors of an adapter.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct AdapterErrors {
-    /// The adapter's estimate with the mean training motion μ, as `EstimateMotion` returns it.
-    pub ours: MotionErrors,
-    /// The adapter's estimate without μ, as trackers use it.
-    pub without_mean: MotionErrors,
-    /// The constant baseline, which always predicts μ.
-    pub constant: MotionErrors,
+    pub no_motion: LocalizationErrors,
 }
 
 /// The errors of a two-view estimator.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct TwoViewErrors {
     /// Errors over all pairs; pairs without an estimate count as zero motion.
-    pub ours: MotionErrors,
+    #[serde(flatten)]
+    pub ours: LocalizationErrors,
     /// Fraction of pairs with an estimate.
     pub answered: f64,
     /// Coverage of its covariances, over the pairs with an estimate.
+    #[serde(flatten)]
     pub coverage: Coverage,
 }
 
@@ -86,12 +74,16 @@ pub fn evaluate(
     on_pair_read: &(dyn Fn() + Sync),
 ) -> Result<MotionEvaluation, Error> {
     let truth = motions(room.poses(), pairs);
+    let [ours, without_mean, constant] = match adapter {
+        Some((adapter, features)) => by_adapter(adapter, features, pairs, &truth)?.map(Some),
+        None => [None; 3],
+    };
 
     Ok(MotionEvaluation {
         n: pairs.len(),
-        adapter: adapter
-            .map(|(adapter, features)| by_adapter(adapter, features, pairs, &truth))
-            .transpose()?,
+        ours,
+        without_mean,
+        constant,
         two_view: maps
             .map(|maps| by_two_views(maps, pairs, &truth, on_pair_read))
             .transpose()?,
@@ -99,37 +91,33 @@ pub fn evaluate(
     })
 }
 
+/// Errors of the adapter's estimates, of those without μ, and of μ alone.
 fn by_adapter(
     adapter: &Adapter,
     features: &Features,
     pairs: &[Pair],
     truth: &[Twist],
-) -> Result<AdapterErrors, Error> {
+) -> Result<[LocalizationErrors; 3], Error> {
     adapter.check_source(features.source())?;
     let latents = adapter.embed(features.rows())?;
+    let ends = |pair: &Pair| [pair.source, pair.target].map(|frame| latents.row(frame.row()));
     let read = |of: &dyn Fn(&Pair) -> Twist| {
         let read: Vec<Twist> = pairs.iter().map(of).collect();
         errors(truth, &read)
     };
-    let ends = |pair: &Pair| {
-        (
-            latents.row(pair.source.row()),
-            latents.row(pair.target.row()),
-        )
-    };
-    let mean = Twist::from_vector(&adapter.scale().mean);
 
-    Ok(AdapterErrors {
-        ours: read(&|pair| {
-            let (from, to) = ends(pair);
+    let mean = Twist::from_vector(&adapter.scale().mean);
+    Ok([
+        read(&|pair| {
+            let [from, to] = ends(pair);
             adapter.motion(from, to)
         }),
-        without_mean: read(&|pair| {
-            let (from, to) = ends(pair);
+        read(&|pair| {
+            let [from, to] = ends(pair);
             adapter.motion_without_mean(from, to)
         }),
-        constant: read(&|_| mean),
-    })
+        read(&|_| mean),
+    ])
 }
 
 fn by_two_views(
@@ -183,23 +171,17 @@ fn by_two_views(
     })
 }
 
-fn errors(truth: &[Twist], read: &[Twist]) -> MotionErrors {
-    let apart = truth
-        .iter()
-        .zip(read)
-        .map(|(truth, read)| exp(read).inv_mul(&exp(truth)));
+fn errors(truth: &[Twist], read: &[Twist]) -> LocalizationErrors {
+    let error = |(truth, read): (&Twist, &Twist)| {
+        let apart = exp(read).inv_mul(&exp(truth));
+        PoseError {
+            translation_m: apart.translation.vector.norm(),
+            rotation_rad: apart.rotation.angle(),
+        }
+    };
 
-    let mut metres = Vec::with_capacity(truth.len());
-    let mut degrees = Vec::with_capacity(truth.len());
-    for error in apart {
-        metres.push(error.translation.vector.norm());
-        degrees.push(error.rotation.angle().to_degrees());
-    }
-
-    MotionErrors {
-        translation_m: ErrorQuantiles::of(&metres),
-        rotation_deg: ErrorQuantiles::of(&degrees),
-    }
+    let errors: Vec<PoseError> = truth.iter().zip(read).map(error).collect();
+    LocalizationErrors::of(&errors)
 }
 
 #[cfg(test)]

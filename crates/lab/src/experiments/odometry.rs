@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use ndarray::{ArrayView1, ArrayView2};
 use rayon::prelude::*;
+use serde::{Serialize, Serializer};
 
 use seese3_core::adapter::Adapter;
 use seese3_core::cancel::Cancellation;
@@ -14,6 +15,7 @@ use seese3_core::geometry::{Pose, PoseError};
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::HoldOut;
+use seese3_core::statistics::root_mean_square;
 use seese3_core::training::RoomData;
 use seese3_core::trajectory::{Relation, RpePairs, Statistics, Trajectory, ape, rpe};
 use seese3_robot::fitting::{RoomReader, fit};
@@ -24,6 +26,7 @@ use seese3_robot::tracking::{
 
 use super::tracking_scores::TrackingScores;
 use super::{Error, Within};
+use crate::json;
 
 /// Frame period of replays that contain frames of another room, nanoseconds: 30 Hz.
 const PERIOD_NS: i64 = 33_333_333;
@@ -55,60 +58,100 @@ pub struct TrackedRoom<'a> {
 }
 
 /// Tracking results of one room.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct RoomOdometry {
     /// The room.
     pub room: String,
+    /// Errors of the tracker and of its baselines on the same frames.
+    #[serde(flatten)]
+    pub scores: TrackingScores,
     /// Source format of the recording.
     pub format: String,
     /// Number of mapped frames.
+    #[serde(rename = "mapped")]
     pub mapped_frames: usize,
     /// Number of tracked frames.
+    #[serde(rename = "followed")]
     pub tracked_frames: usize,
-    /// Errors of dead reckoning, aligned to the true first pose.
-    pub odom: PathErrors,
-    /// Errors of the fused path, over the frames with a map pose.
-    pub fused: PathErrors,
-    /// Errors of the tracker and of its baselines on the same frames.
-    pub scores: TrackingScores,
-    /// Squared Mahalanobis lengths of map pose errors, for frames with mapped neighbors in time.
-    pub map_poses_mapped: Vec<f64>,
-    /// The same for frames without mapped neighbors in time.
-    pub map_poses_unmapped: Vec<f64>,
+    /// Errors of both paths.
+    #[serde(flatten)]
+    pub paths: PathErrors,
+    /// Errors of the map poses.
+    #[serde(rename = "coverage_places")]
+    pub map_poses: MapPoseErrors,
     /// Errors of the estimated motions, with the lengths of the motions.
+    #[serde(rename = "coverage_motions", serialize_with = "coverage_of_motions")]
     pub motions: Vec<MotionSurprise>,
     /// Fractions of frames by status.
+    #[serde(flatten)]
     pub statuses: StatusShares,
     /// Results of the same streams without an initial pose.
+    #[serde(flatten)]
     pub unknown_start: UnknownStart,
-    /// LOST counts for frames of other rooms, replayed as the start of a stream.
-    pub other_rooms_from_start: LostFrames,
-    /// LOST counts for frames of other rooms, replayed after this room's own frames.
-    pub other_rooms_after_own: LostFrames,
+    /// LOST counts for frames of other rooms: replayed as the start of a stream, and after this
+    /// room's own frames.
+    #[serde(rename = "foreign")]
+    pub other_rooms: [LostFrames; 2],
 }
 
-/// Root-mean-square errors of a path, without alignment.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// Squared Mahalanobis lengths of map pose errors; in JSON, their coverage.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+#[serde(into = "[f64; 2]")]
+pub struct MapPoseErrors {
+    /// Of frames with mapped neighbors in time.
+    pub mapped: Vec<f64>,
+    /// Of frames without mapped neighbors in time.
+    pub unmapped: Vec<f64>,
+}
+
+impl MapPoseErrors {
+    /// The errors of all frames.
+    pub fn all(&self) -> Vec<f64> {
+        [&self.mapped[..], &self.unmapped].concat()
+    }
+}
+
+impl From<MapPoseErrors> for [f64; 2] {
+    fn from(errors: MapPoseErrors) -> Self {
+        json::covered(&errors.all())
+    }
+}
+
+fn coverage_of_motions<S: Serializer>(found: &[MotionSurprise], to: S) -> Result<S::Ok, S::Error> {
+    json::covered(&squared_errors(found)).serialize(to)
+}
+
+/// The squared Mahalanobis lengths of motion errors.
+pub fn squared_errors(motions: &[MotionSurprise]) -> Vec<f64> {
+    motions.iter().map(|motion| motion.squared_error).collect()
+}
+
+/// Root-mean-square errors of both paths, without alignment; NaN for a path with fewer than two
+/// poses.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct PathErrors {
     /// Absolute translation errors, metres.
-    pub ape_m: f64,
+    #[serde(rename = "ape_translation_rmse_m")]
+    pub ape_m: BothPaths,
     /// Absolute rotation errors, radians.
-    pub ape_rad: f64,
+    #[serde(rename = "ape_rotation_rmse_rad")]
+    pub ape_rad: BothPaths,
     /// Relative translation errors over one frame, metres.
-    pub rpe_m: f64,
+    #[serde(rename = "rpe_translation_rmse_m")]
+    pub rpe_m: BothPaths,
 }
 
-impl PathErrors {
-    /// Errors of a path with fewer than two poses: all NaN.
-    const UNKNOWN: Self = Self {
-        ape_m: f64::NAN,
-        ape_rad: f64::NAN,
-        rpe_m: f64::NAN,
-    };
+/// A figure of both paths.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct BothPaths {
+    /// Dead reckoning, aligned to the true first pose.
+    pub odom: f64,
+    /// The fused path, over the frames with a map pose.
+    pub fused: f64,
 }
 
 /// Fractions of frames by reported status.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct StatusShares {
     /// TRACKING.
     pub tracking: f64,
@@ -120,17 +163,30 @@ pub struct StatusShares {
     pub relocalizing: f64,
 }
 
+impl StatusShares {
+    /// The shares by a function of the status.
+    pub fn of(share: impl Fn(Status) -> f64) -> Self {
+        Self {
+            tracking: share(Status::Tracking),
+            degraded: share(Status::Degraded),
+            lost: share(Status::Lost),
+            relocalizing: share(Status::Relocalizing),
+        }
+    }
+}
+
 /// Results of a stream without an initial pose.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct UnknownStart {
     /// Fraction of frames reported LOST.
+    #[serde(rename = "lost_without_initial_pose")]
     pub lost: f64,
     /// Number of frames until the tracker was TRACKING near the true pose; `None` if it never was.
     pub frames_to_relocalise: Option<usize>,
 }
 
 /// Number of frames of other rooms, and of those reported LOST.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct LostFrames {
     /// Number of replayed frames.
     pub frames: usize,
@@ -139,8 +195,10 @@ pub struct LostFrames {
 }
 
 /// Results of relocalizing single views among several rooms.
-#[derive(Debug, Clone, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Relocalisation {
+    /// Number of candidate rooms.
+    pub rooms: usize,
     /// Number of views located in the right room.
     pub right: usize,
     /// Number of views located in a wrong room.
@@ -149,14 +207,19 @@ pub struct Relocalisation {
     pub ambiguous: usize,
     /// Number of views located in some room when the right room was not among the candidates.
     pub named_without_own: usize,
-    /// Number of candidate rooms.
-    pub rooms: usize,
-    /// Squared Mahalanobis lengths of the pose errors in the right room.
-    pub pose_surprises: Vec<f64>,
-    /// Translation errors of those poses, metres.
+    /// Translation errors of the poses in the right room, metres; in JSON, their root mean square.
+    #[serde(rename = "pose_m", serialize_with = "rms")]
     pub pose_errors_m: Vec<f64>,
     /// Translation errors of the nearest frames' poses, metres.
+    #[serde(rename = "nearest_frame_m", serialize_with = "rms")]
     pub nearest_errors_m: Vec<f64>,
+    /// Squared Mahalanobis lengths of the pose errors in the right room.
+    #[serde(rename = "coverage", serialize_with = "json::coverages")]
+    pub pose_surprises: Vec<f64>,
+}
+
+fn rms<S: Serializer>(errors: &[f64], to: S) -> Result<S::Ok, S::Error> {
+    root_mean_square(errors).serialize(to)
 }
 
 impl TrackedRoom<'_> {
@@ -345,9 +408,13 @@ fn room_odometry(
     let odom = path_errors(&own.odom_path(), &own.truth).within(what)?;
     let fused_path = own.map_path();
     let fused = if fused_path.rows.len() < 2 {
-        PathErrors::UNKNOWN
+        [f64::NAN; 3]
     } else {
         path_errors(&fused_path.path, &own.truth.select(&fused_path.rows))?
+    };
+    let both = |place: usize| BothPaths {
+        odom: odom[place],
+        fused: fused[place],
     };
 
     let unknown = own_replay(room, hold_out, InitialPose::Unknown);
@@ -357,33 +424,33 @@ fn room_odometry(
 
     Ok(RoomOdometry {
         room: room.room.id().to_string(),
-        format: room.room.provenance().format.clone(),
-        mapped_frames: hold_out.mapped(frame_count).len(),
-        tracked_frames: own.updates.len(),
-        odom,
-        fused,
         scores: TrackingScores::of(own, |row| {
             *room.most_alike(room.features.row(tracked[row].row()))
         }),
-        map_poses_mapped: own.map_pose_surprises_where(has_mapped_neighbours),
-        map_poses_unmapped: own.map_pose_surprises_where(|row| !has_mapped_neighbours(row)),
-        motions: own.motion_surprises(),
-        statuses: StatusShares {
-            tracking: own.share(Status::Tracking),
-            degraded: own.share(Status::Degraded),
-            lost: own.share(Status::Lost),
-            relocalizing: own.share(Status::Relocalizing),
+        format: room.room.provenance().format.clone(),
+        mapped_frames: hold_out.mapped(frame_count).len(),
+        tracked_frames: own.updates.len(),
+        paths: PathErrors {
+            ape_m: both(0),
+            ape_rad: both(1),
+            rpe_m: both(2),
         },
+        map_poses: MapPoseErrors {
+            mapped: own.map_pose_surprises_where(has_mapped_neighbours),
+            unmapped: own.map_pose_surprises_where(|row| !has_mapped_neighbours(row)),
+        },
+        motions: own.motion_surprises(),
+        statuses: StatusShares::of(|status| own.share(status)),
         unknown_start: UnknownStart {
             lost: unknown.share(Status::Lost),
             frames_to_relocalise: unknown.frames_to_relocalise(),
         },
-        other_rooms_from_start: lost_frames(room, all, None),
-        other_rooms_after_own: lost_frames(room, all, Some(hold_out)),
+        other_rooms: [None, Some(hold_out)].map(|own| lost_frames(room, all, own)),
     })
 }
 
-fn path_errors(estimate: &Trajectory, reference: &Trajectory) -> Result<PathErrors, Error> {
+/// Absolute translation and rotation errors, and relative translation errors.
+fn path_errors(estimate: &Trajectory, reference: &Trajectory) -> Result<[f64; 3], Error> {
     let absolute = |relation| -> Result<f64, Error> {
         Ok(Statistics::of(&ape(reference, estimate, relation)?).rmse)
     };
@@ -395,11 +462,11 @@ fn path_errors(estimate: &Trajectory, reference: &Trajectory) -> Result<PathErro
         RpePairs::Consecutive,
     )?;
 
-    Ok(PathErrors {
-        ape_m: absolute(Relation::Translation)?,
-        ape_rad: absolute(Relation::Rotation)?,
-        rpe_m: Statistics::of(&relative).rmse,
-    })
+    Ok([
+        absolute(Relation::Translation)?,
+        absolute(Relation::Rotation)?,
+        Statistics::of(&relative).rmse,
+    ])
 }
 
 /// Replays the tracked frames of a room through its own tracker.

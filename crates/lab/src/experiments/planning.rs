@@ -14,7 +14,9 @@ use std::sync::Arc;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
-use strum::{IntoStaticStr, VariantArray};
+use serde::ser::SerializeStruct;
+use serde::{Serialize, Serializer};
+use serde_json::json;
 
 use seese3_core::adapter::{Adapter, Reading};
 use seese3_core::cancel::Cancellation;
@@ -32,25 +34,37 @@ use super::simple_planners::{greedy, pose_graph, topological};
 /// Number of query views from each other room.
 const OTHER_ROOM_VIEWS: usize = 5;
 
-/// A planner that is evaluated, in the order of tables.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, IntoStaticStr, VariantArray)]
-#[strum(serialize_all = "snake_case")]
+/// A planner that is evaluated, by its key in JSON.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Planner {
-    /// The server's planner: the shortest path over the room's frames from the estimated pose.
-    Ours,
-    /// The paper's latent navigation: each step retrieves a frame near the predicted latent.
-    Latent,
     /// Each hop moves to the reachable frame nearest to the goal.
     Greedy,
+    /// The paper's latent navigation: each step retrieves a frame near the predicted latent.
+    Latent,
+    /// The server's planner: the shortest path over the room's frames from the estimated pose.
+    Ours,
     /// The shortest path over the frames' poses, from the pose of the nearest frame.
     PoseGraph,
-    /// The shortest path over visually similar frames.
-    Topological,
     /// The robot does not move.
     StandingStill,
+    /// The shortest path over visually similar frames.
+    Topological,
 }
 
-/// Scores of one planner.
+impl Planner {
+    /// Every planner, in the order of tables.
+    pub const ALL: [Self; 6] = [
+        Self::Ours,
+        Self::Latent,
+        Self::Greedy,
+        Self::PoseGraph,
+        Self::Topological,
+        Self::StandingStill,
+    ];
+}
+
+/// Scores of one planner. In JSON, fractions of the queries.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct PlannerScores {
     /// Number of queries with views of the room.
@@ -73,16 +87,44 @@ pub struct PlannerScores {
     pub other_says_reached: usize,
 }
 
+impl Serialize for PlannerScores {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        let share = |part: usize| part as f64 / self.questions as f64;
+        let known = |part: usize, whole: usize| (whole > 0).then(|| part as f64 / whole as f64);
+
+        // Null for planners without probabilities.
+        let expected_there =
+            (self.expected_there > 0.0).then(|| self.expected_there / self.questions as f64);
+        let other_rooms = json!({
+            "n": self.other_questions,
+            "says_reached": known(self.other_says_reached, self.other_questions),
+        });
+
+        let mut record = to.serialize_struct("PlannerScores", 8)?;
+        record.serialize_field("n", &self.questions)?;
+        record.serialize_field("says_reached", &share(self.says_reached))?;
+        record.serialize_field("truly_there", &share(self.truly_there))?;
+        record.serialize_field("there_anyway", &share(self.there_anyway))?;
+        record.serialize_field("expected_there", &expected_there)?;
+        record.serialize_field("steps", &known(self.steps, self.truly_there))?;
+        record.serialize_field("longest_hop", &self.longest_hop)?;
+        record.serialize_field("other_rooms", &other_rooms)?;
+        record.end()
+    }
+}
+
 /// The scores in one room, by planner.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct RoomPlanning {
     /// The room.
     pub room: String,
     /// Number of mapped frames.
     pub mapped_frames: usize,
     /// The longest allowed hop, ‖(v, ω)‖ with metres and radians mixed.
+    #[serde(rename = "allowed_hop")]
     pub longest_hop: f64,
     /// Scores by planner.
+    #[serde(flatten)]
     pub scores: BTreeMap<Planner, PlannerScores>,
 }
 
@@ -198,7 +240,7 @@ pub fn evaluate(
             let goal = mapped.any_frame(&mut random);
             let question = question(data, adapter, frame, goal)?;
             let truth = &data.room.poses()[frame.row()];
-            for &planner in Planner::VARIANTS {
+            for planner in Planner::ALL {
                 let way = answer(&mapped, planner, &question)?;
                 scores
                     .entry(planner)
@@ -215,7 +257,7 @@ pub fn evaluate(
                 let frame = FrameId(random.random_range(0..other.room.frame_count() as u32));
                 let goal = mapped.any_frame(&mut random);
                 let question = question(other, adapter, frame, goal)?;
-                for &planner in Planner::VARIANTS {
+                for planner in Planner::ALL {
                     let says_reached = answer(&mapped, planner, &question)?.says_reached;
                     let scores = scores.entry(planner).or_default();
                     scores.other_questions += 1;

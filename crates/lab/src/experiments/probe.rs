@@ -3,16 +3,20 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use rayon::prelude::*;
+use serde::ser::SerializeStruct;
+use serde::{Serialize, Serializer};
 
+use seese3_core::eval::Baselines;
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::room::Room;
 use seese3_core::splits::Split;
-use seese3_core::statistics::mean_of_known;
+use seese3_core::statistics::{deviation, mean_of_known};
 use seese3_core::training::{RoomData, TrainingPlan};
 
 use super::folds::{FoldedBaselines, FoldedMotions};
 use super::{Error, Within};
 use crate::formulations::read_by_adapter;
+use crate::json::{self, PartsJson};
 use crate::probes::{
     Duplicates, IntrinsicDimension, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe,
 };
@@ -45,17 +49,48 @@ pub struct DimensionProtocol {
 }
 
 /// Scores at one stride.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct AtStride {
     /// Frames from source to target.
     pub stride: u32,
+    /// The overall R², mean over seeds.
+    pub r2: f64,
+    /// Deviations over seeds; `None` for a single run.
+    #[serde(flatten)]
+    pub spread: Option<SeedSpread>,
+    /// Number of test pairs.
+    pub n: usize,
     /// Scores over the test pairs of all splits together: one for ridge regression, or one per
     /// seed of the adapter.
+    #[serde(serialize_with = "json::each::<json::MotionJson, _, _>")]
     pub runs: Vec<MotionScores>,
-    /// The overall R² under each split, mean over seeds.
-    pub by_split: Vec<(Split, f64)>,
+    /// Baselines over the pairs of all splits together; `None` for several rooms together.
+    #[serde(serialize_with = "json::baselines")]
+    pub baselines: Option<Baselines>,
+    /// One entry per split.
+    pub splits: Vec<UnderSplit>,
+}
+
+/// Deviations over seeds.
+#[derive(Debug, Clone, Serialize)]
+pub struct SeedSpread {
+    /// Sample standard deviation of the overall R².
+    pub sd: f64,
+    /// Mean and deviation of each part of the motion.
+    pub by_part: PartsJson,
+}
+
+/// The score and the baselines under one split.
+#[derive(Debug, Clone, Serialize)]
+pub struct UnderSplit {
+    /// The split.
+    #[serde(serialize_with = "json::shown")]
+    pub split: Split,
+    /// The overall R², mean over seeds.
+    pub r2: f64,
     /// Baselines to compare R² with; `None` for several rooms together.
-    pub baselines: Option<FoldedBaselines>,
+    #[serde(serialize_with = "json::baselines")]
+    pub baselines: Option<Baselines>,
 }
 
 impl AtStride {
@@ -67,32 +102,47 @@ impl AtStride {
         optimiser_steps: u64,
         runs: &[FoldedMotions],
     ) -> Result<Self, Error> {
-        let by_seed: Vec<Vec<f64>> = runs.iter().map(FoldedMotions::r2_by_split).collect();
-        let mean_under = |(at, &split): (usize, &Split)| {
-            let of_seeds: Vec<f64> = by_seed.iter().map(|seed| seed[at]).collect();
-            (split, mean_of_known(&of_seeds))
-        };
-
         // The constant is the same for every seed.
         let constant = runs.first().map_or(f64::NAN, FoldedMotions::constant_r2);
-        let baselines =
-            room.map(|room| FoldedBaselines::of(room, splits, stride, optimiser_steps, constant));
+        let baselines = room
+            .map(|room| FoldedBaselines::of(room, splits, stride, optimiser_steps, constant))
+            .transpose()?;
 
+        let by_seed: Vec<Vec<f64>> = runs.iter().map(FoldedMotions::r2_by_split).collect();
+        let under = |(at, &split): (usize, &Split)| {
+            let of_seeds: Vec<f64> = by_seed.iter().map(|seed| seed[at]).collect();
+            UnderSplit {
+                split,
+                r2: mean_of_known(&of_seeds),
+                baselines: baselines.as_ref().map(|all| all.by_split[at]),
+            }
+        };
+
+        let runs: Vec<MotionScores> = runs.iter().map(FoldedMotions::scores).collect();
+        let overall: Vec<f64> = runs.iter().map(|run| run.overall).collect();
         Ok(Self {
             stride,
-            runs: runs.iter().map(FoldedMotions::scores).collect(),
-            by_split: splits.iter().enumerate().map(mean_under).collect(),
-            baselines: baselines.transpose()?,
+            r2: mean_of_known(&overall),
+            spread: (runs.len() > 1).then(|| SeedSpread {
+                sd: deviation(&overall),
+                by_part: PartsJson::from(&runs),
+            }),
+            n: runs.first().map_or(0, |run| run.n),
+            runs,
+            splits: splits.iter().enumerate().map(under).collect(),
+            baselines: baselines.as_ref().map(|all| all.together),
         })
     }
 }
 
 /// M1 and its settings.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Serialize)]
 pub struct MutualKnnScore {
     /// Mean fraction of feature neighbors that are also pose neighbors, 0 to 1.
+    #[serde(rename = "value")]
     pub share: f64,
     /// How the neighbours were compared.
+    #[serde(flatten)]
     pub options: MutualKnn,
 }
 
@@ -106,18 +156,54 @@ pub struct DimensionScore {
 }
 
 /// Scores of one room, or of several rooms together; skipped scores are `None` or empty.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct ProbeScores {
     /// The room, or the rooms in words.
     pub room: String,
     /// Mutual k-NN.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub m1: Option<MutualKnnScore>,
     /// The intrinsic dimension.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub m2: Option<DimensionScore>,
     /// Ridge regression by stride.
+    #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "by_stride")]
     pub m3: Vec<AtStride>,
     /// The adapter by stride.
+    #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "by_stride")]
     pub m4: Vec<AtStride>,
+}
+
+impl Serialize for DimensionScore {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        let dimension = &self.dimension;
+        let mut record = to.serialize_struct("DimensionScore", 10)?;
+        record.serialize_field("twonn", &dimension.two_nn.linear)?;
+        record.serialize_field("mle", &dimension.mle_biased.harmonic)?;
+        record.serialize_field("twonn_censored", &dimension.two_nn.censored)?;
+        record.serialize_field("twonn_likelihood", &dimension.two_nn.likelihood)?;
+        record.serialize_field("mle_biased", &dimension.mle_biased)?;
+        record.serialize_field("mle_unbiased", &dimension.mle_unbiased)?;
+        record.serialize_field("gap", &self.protocol.gap)?;
+        record.serialize_field("duplicates", &self.protocol.duplicates)?;
+        record.serialize_field("used_rows", &dimension.used)?;
+        record.serialize_field("dropped_rows", &dimension.dropped)?;
+        record.end()
+    }
+}
+
+/// Serializes scores by stride. Those of the first stride are repeated at the top, so that a
+/// client with one stride can ignore `strides`.
+fn by_stride<S: Serializer>(strides: &[AtStride], to: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Strides<'a> {
+        #[serde(flatten)]
+        first: &'a AtStride,
+        strides: &'a [AtStride],
+    }
+
+    let first = &strides[0];
+    Strides { first, strides }.serialize(to)
 }
 
 /// Probes one room.

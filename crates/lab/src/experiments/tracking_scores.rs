@@ -1,36 +1,58 @@
 //! Scores of a tracker: pose and velocity errors beside those of simple baselines on the same
 //! frames, and the calibration of its covariances and statuses.
 
+use serde::Serialize;
+
 use seese3_core::geometry::{Pose, PoseError, body_twist};
 use seese3_core::statistics::{mean, root_mean_square};
 use seese3_robot::tracking::{PoseWithCovariance, Replay, Status};
+
+use crate::json;
 
 /// Translation error above which a pose counts as wrong, metres.
 const WRONG_BEYOND_M: f64 = 0.5;
 /// Rotation error above which a pose counts as wrong, degrees.
 const WRONG_BEYOND_DEG: f64 = 15.0;
 
-/// The scores of one replay.
-#[derive(Debug, Clone, PartialEq)]
+/// The scores of one replay, or of several rooms together.
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TrackingScores {
     /// Absolute position errors over the frames with a map pose, metres.
+    #[serde(rename = "ape_m")]
     pub ape: AnswerErrors,
     /// Absolute rotation errors over the same frames, radians.
+    #[serde(rename = "ape_rad")]
     pub turn: AnswerErrors,
     /// Squared Mahalanobis lengths of the map pose errors in TRACKING frames.
+    #[serde(rename = "coverage", serialize_with = "json::coverages")]
     pub tracking_surprises: Vec<f64>,
     /// The same for `odom_from_camera` in all frames, aligned to the true first pose.
+    #[serde(rename = "coverage_odom", serialize_with = "json::coverages")]
     pub odom_surprises: Vec<f64>,
-    /// Number of TRACKING frames with a map pose.
-    pub tracking: usize,
-    /// Number of those frames with an error above 0.5 m or 15°.
-    pub tracking_wrong: usize,
+    /// Wrong poses in TRACKING frames.
+    pub tracking_wrong: WrongPoses,
     /// Velocity errors, beside those of the zero-velocity baseline.
     pub velocity: VelocityErrors,
 }
 
+/// Number of poses with an error above 0.5 m or 15°; in JSON, their fraction.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[serde(into = "f64")]
+pub struct WrongPoses {
+    /// Number of poses.
+    pub poses: usize,
+    /// Number of wrong poses among them.
+    pub wrong: usize,
+}
+
+impl From<WrongPoses> for f64 {
+    fn from(counted: WrongPoses) -> Self {
+        counted.wrong as Self / counted.poses as Self
+    }
+}
+
 /// Root-mean-square errors of the tracker and of its baselines, over the same frames.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct AnswerErrors {
     /// The map pose.
     pub fused: f64,
@@ -43,7 +65,7 @@ pub struct AnswerErrors {
 }
 
 /// Root-mean-square velocity errors over frames, metres per second.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct VelocityErrors {
     /// Error of the reported velocity.
     pub error_m_s: f64,
@@ -52,6 +74,25 @@ pub struct VelocityErrors {
 }
 
 impl TrackingScores {
+    /// The scores of several rooms together: errors are means over rooms, the rest is over all
+    /// frames.
+    pub fn together<'a>(rooms: impl Iterator<Item = &'a Self> + Clone) -> Self {
+        let all = |of: fn(&Self) -> &Vec<f64>| rooms.clone().flat_map(of).copied().collect();
+        let wrong = rooms.clone().map(|room| room.tracking_wrong);
+
+        Self {
+            ape: AnswerErrors::mean(rooms.clone().map(|room| &room.ape)),
+            turn: AnswerErrors::mean(rooms.clone().map(|room| &room.turn)),
+            tracking_surprises: all(|room| &room.tracking_surprises),
+            odom_surprises: all(|room| &room.odom_surprises),
+            tracking_wrong: wrong.fold(WrongPoses::default(), |sum, room| WrongPoses {
+                poses: sum.poses + room.poses,
+                wrong: sum.wrong + room.wrong,
+            }),
+            velocity: VelocityErrors::mean(rooms.map(|room| &room.velocity)),
+        }
+    }
+
     /// The scores of a replay. `nearest_frame` returns the pose of the mapped frame with the raw
     /// feature most similar to that of a row.
     pub fn of(replay: &Replay, nearest_frame: impl Fn(usize) -> Pose) -> Self {
@@ -69,8 +110,7 @@ impl TrackingScores {
         let mut errors: [Vec<PoseError>; 4] = Default::default();
         let mut tracking_surprises = Vec::new();
         let mut odom_surprises = Vec::new();
-        let mut tracking = 0;
-        let mut tracking_wrong = 0;
+        let mut tracking_wrong = WrongPoses::default();
 
         let answers = replay.updates.iter().zip(&replay.truth.poses).zip(&odom);
         for (row, ((update, truth), odom)) in answers.enumerate() {
@@ -93,8 +133,8 @@ impl TrackingScores {
             }
 
             if update.status == Status::Tracking {
-                tracking += 1;
-                tracking_wrong += usize::from(is_wrong(&map_pose.pose, truth));
+                tracking_wrong.poses += 1;
+                tracking_wrong.wrong += usize::from(is_wrong(&map_pose.pose, truth));
                 tracking_surprises.extend(map_pose.squared_error(truth));
             }
         }
@@ -115,7 +155,6 @@ impl TrackingScores {
             turn: answers(|error| error.rotation_rad),
             tracking_surprises,
             odom_surprises,
-            tracking,
             tracking_wrong,
             velocity: VelocityErrors::of(replay, &keep),
         }

@@ -5,6 +5,7 @@
 
 use ndarray::{ArrayView2, Axis};
 use rayon::prelude::*;
+use serde::Serialize;
 
 use super::Error;
 use seese3_core::statistics::{mean, median};
@@ -15,11 +16,13 @@ const MLE_NEIGHBOURS: usize = 20;
 const DISCARDED: f64 = 0.1;
 
 /// How identical rows are handled.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub enum Duplicates {
     /// A row at distance zero from its nearest neighbor is dropped, as in scikit-dimension.
+    #[serde(rename = "dropped")]
     DropRows,
     /// The first of each group of identical rows is kept.
+    #[serde(rename = "first kept")]
     KeepFirst,
 }
 
@@ -37,7 +40,7 @@ pub struct TwoNn {
 
 /// MLE (Levina and Bickel 2004) over 20 neighbors. The unbiased form normalizes by K − 2, the
 /// biased form by K − 1.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Mle {
     /// The harmonic mean over rows (MacKay and Ghahramani), the usual combination.
     pub harmonic: f64,

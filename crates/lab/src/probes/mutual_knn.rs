@@ -3,12 +3,13 @@
 
 use ndarray::{ArrayView2, Axis};
 use rayon::prelude::*;
+use serde::Serialize;
 
 use super::Error;
 use seese3_core::geometry::Pose;
 
 /// The options of M1.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct MutualKnn {
     /// Number of sampled frames: 0, s, 2s, … of the room.
     pub frames: usize,
@@ -20,22 +21,27 @@ pub struct MutualKnn {
     /// neighbor.
     pub exclusion: usize,
     /// The unit of `exclusion`.
+    #[serde(rename = "exclusion_counts")]
     pub counted: Counted,
     /// Whether a frame at exactly the distance `exclusion` is excluded too.
+    #[serde(rename = "exclusion_is")]
     pub limit: Limit,
 }
 
 /// The unit of a temporal distance.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub enum Counted {
     /// Sampled frames.
+    #[serde(rename = "sampled frames")]
     Sampled,
     /// Frames of the room.
+    #[serde(rename = "room frames")]
     Native,
 }
 
 /// Whether a range includes its limit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Limit {
     /// The limit is included.
     Inclusive,

@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 
 use super::Error;
-use super::columns::{Column, parquet_file};
+use super::columns::ParquetColumn::{Real, Text, Whole};
+use super::columns::parquet_file;
+use super::table::Table;
 use crate::experiments::adapter_sweep::SweepRow;
 use seese3_core::statistics::{deviation, mean, mean_of_known};
 
@@ -12,147 +14,123 @@ use seese3_core::statistics::{deviation, mean, mean_of_known};
 /// # Errors
 /// [`Error::Parquet`] if the library rejects a column.
 pub fn sweep_parquet(rows: &[SweepRow]) -> Result<Vec<u8>, Error> {
-    // One closure per type of column, so that the list below reads as name and field.
-    let text = |of: fn(&SweepRow) -> &str| {
-        Column::Text(rows.iter().map(|row| of(row).to_owned()).collect())
-    };
-
-    let whole =
-        |of: fn(&SweepRow) -> u64| Column::Whole(rows.iter().map(|row| of(row) as i64).collect());
-    let real = |of: fn(&SweepRow) -> f64| Column::Real(rows.iter().map(of).collect());
-
     // The columns have no nulls: a missing score is NaN in the file.
-    let known = |of: fn(&SweepRow) -> Option<f64>| {
-        Column::Real(rows.iter().map(|row| of(row).unwrap_or(f64::NAN)).collect())
-    };
-
-    parquet_file(&[
-        ("key", text(|row| &row.key)),
-        ("room", text(|row| &row.room)),
-        ("room_revision", whole(|row| row.room_revision)),
-        ("format", text(|row| &row.format)),
-        ("frames", whole(|row| row.frames as u64)),
-        ("features", text(|row| &row.features)),
-        ("preset", text(|row| &row.preset)),
-        ("split", text(|row| &row.split)),
-        ("stride", whole(|row| u64::from(row.stride))),
-        ("geo_dim", whole(|row| row.geo_dim as u64)),
-        ("charts", whole(|row| row.charts as u64)),
-        ("mixing", text(|row| &row.mixing)),
-        ("pairs", text(|row| &row.pairs)),
-        ("lr", real(|row| row.lr)),
-        ("loss", text(|row| &row.loss)),
-        ("epochs", whole(|row| row.epochs as u64)),
-        ("batch", whole(|row| row.batch as u64)),
-        ("weight_decay", real(|row| row.weight_decay)),
-        ("hidden", whole(|row| row.hidden as u64)),
-        ("seed", whole(|row| row.seed)),
-        ("n", whole(|row| row.n as u64)),
-        ("r2_overall", known(|row| row.overall)),
-        ("r2_translation", known(|row| row.translation)),
-        ("r2_rotation", known(|row| row.rotation)),
-        ("r2_direction", known(|row| row.direction)),
-        ("r2_magnitude", known(|row| row.magnitude)),
-        ("r2_train", known(|row| row.train_overall)),
-        ("seconds", real(|row| row.seconds)),
-        ("failure", text(|row| &row.failure)),
-    ])
+    parquet_file(
+        rows,
+        &[
+            ("key", Text(|row| &row.key)),
+            ("room", Text(|row| &row.room)),
+            ("room_revision", Whole(|row| row.room_revision)),
+            ("format", Text(|row| &row.format)),
+            ("frames", Whole(|row| row.frames as u64)),
+            ("features", Text(|row| &row.features)),
+            ("preset", Text(|row| &row.preset)),
+            ("split", Text(|row| &row.split)),
+            ("stride", Whole(|row| u64::from(row.stride))),
+            ("geo_dim", Whole(|row| row.geo_dim as u64)),
+            ("charts", Whole(|row| row.charts as u64)),
+            ("mixing", Text(|row| &row.mixing)),
+            ("pairs", Text(|row| &row.pairs)),
+            ("lr", Real(|row| row.lr)),
+            ("loss", Text(|row| &row.loss)),
+            ("epochs", Whole(|row| row.epochs as u64)),
+            ("batch", Whole(|row| row.batch as u64)),
+            ("weight_decay", Real(|row| row.weight_decay)),
+            ("hidden", Whole(|row| row.hidden as u64)),
+            ("seed", Whole(|row| row.seed)),
+            ("n", Whole(|row| row.n as u64)),
+            ("r2_overall", Real(|row| row.overall.unwrap_or(f64::NAN))),
+            (
+                "r2_translation",
+                Real(|row| row.translation.unwrap_or(f64::NAN)),
+            ),
+            ("r2_rotation", Real(|row| row.rotation.unwrap_or(f64::NAN))),
+            (
+                "r2_direction",
+                Real(|row| row.direction.unwrap_or(f64::NAN)),
+            ),
+            (
+                "r2_magnitude",
+                Real(|row| row.magnitude.unwrap_or(f64::NAN)),
+            ),
+            (
+                "r2_train",
+                Real(|row| row.train_overall.unwrap_or(f64::NAN)),
+            ),
+            ("seconds", Real(|row| row.seconds)),
+            ("failure", Text(|row| &row.failure)),
+        ],
+    )
 }
 
 /// The paper's success table (Sec. 5): by recording format and features, the best R² and the
 /// percentage of rooms above 0 and 0.3. A room's score is that of its best run, chosen by test
 /// score, as in the paper's "Max R²".
-pub fn success_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
-    let mut groups: BTreeMap<(String, String), BTreeMap<String, f64>> = BTreeMap::new();
+pub fn success_table(rows: &[SweepRow]) -> Table {
+    let mut groups: BTreeMap<[&str; 2], BTreeMap<&str, f64>> = BTreeMap::new();
     for row in rows.iter().filter(|row| row.failure.is_empty()) {
         // A room without a defined R² still counts, as a failure.
-        let best = groups
-            .entry((row.format.clone(), row.features.clone()))
-            .or_default();
-        let of_room = best.entry(row.room.clone()).or_insert(f64::NEG_INFINITY);
-        *of_room = of_room.max(row.overall.unwrap_or(f64::NEG_INFINITY));
+        let rooms = groups.entry([&row.format, &row.features]).or_default();
+        let best = rooms.entry(&row.room).or_insert(f64::NEG_INFINITY);
+        *best = best.max(row.overall.unwrap_or(f64::NEG_INFINITY));
     }
 
-    let head = [
-        "recorded as",
-        "features",
-        "rooms",
-        "max R²",
-        "% > 0",
-        "% > 0.3",
-    ];
-
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
-    for ((format, features), rooms) in groups {
+    let mut table = Table::new("recorded as | features | rooms | max R² | % > 0 | % > 0.3");
+    for ([format, features], rooms) in groups {
         let best: Vec<f64> = rooms.into_values().collect();
-        lines.push(vec![
-            format,
-            features,
+        let cells = [
+            features.to_owned(),
             best.len().to_string(),
-            format!(
-                "{:.3}",
-                best.iter().copied().fold(f64::NEG_INFINITY, f64::max)
-            ),
+            highest(&best),
             percent(&best, 0.0),
             percent(&best, 0.3),
-        ]);
+        ];
+        table.row(format, cells);
     }
 
-    lines
+    table
 }
 
 /// The paper's difficulty table (Sec. A.4), by recording format over all features. It has the mean
 /// numbers of frames and of test pairs per room, the percentage of rooms with a best run above 0,
 /// and the R² of the best run.
-pub fn difficulty_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
-    let mut groups: BTreeMap<&str, BTreeMap<&str, (usize, usize, f64)>> = BTreeMap::new();
+pub fn difficulty_table(rows: &[SweepRow]) -> Table {
+    let mut groups: BTreeMap<&str, BTreeMap<&str, Vec<&SweepRow>>> = BTreeMap::new();
     for row in rows.iter().filter(|row| row.failure.is_empty()) {
         let rooms = groups.entry(&row.format).or_default();
-
-        // Per room: frames, the largest number of test pairs of its runs, and the best R².
-        let (_, pairs, best) = rooms
-            .entry(&row.room)
-            .or_insert((row.frames, 0, f64::NEG_INFINITY));
-        *pairs = row.n.max(*pairs);
-
-        *best = best.max(row.overall.unwrap_or(f64::NEG_INFINITY));
+        rooms.entry(&row.room).or_default().push(row);
     }
 
-    let head = [
-        "recorded as",
-        "rooms",
-        "frames",
-        "test pairs",
-        "% > 0",
-        "best R²",
-    ];
-
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
+    let mut table = Table::new("recorded as | rooms | frames | test pairs | % > 0 | best R²");
     for (format, rooms) in groups {
-        let column =
-            |of: fn(&(usize, usize, f64)) -> f64| rooms.values().map(of).collect::<Vec<_>>();
-        let best = column(|room| room.2);
+        let over_rooms = |of: fn(&[&SweepRow]) -> f64| {
+            let values = rooms.values().map(|runs| of(runs));
+            values.collect::<Vec<f64>>()
+        };
+        let frames = over_rooms(|runs| runs[0].frames as f64);
+        let pairs = over_rooms(|runs| runs.iter().map(|run| run.n).max().unwrap_or(0) as f64);
+        let best = over_rooms(|runs| {
+            let scores = runs.iter().filter_map(|run| run.overall);
+            scores.fold(f64::NEG_INFINITY, f64::max)
+        });
 
-        lines.push(vec![
-            format.to_owned(),
+        let cells = [
             rooms.len().to_string(),
-            format!("{:.0}", mean(&column(|room| room.0 as f64))),
-            format!("{:.0}", mean(&column(|room| room.1 as f64))),
+            format!("{:.0}", mean(&frames)),
+            format!("{:.0}", mean(&pairs)),
             percent(&best, 0.0),
-            format!(
-                "{:.3}",
-                best.iter().copied().fold(f64::NEG_INFINITY, f64::max)
-            ),
-        ]);
+            highest(&best),
+        ];
+        table.row(format, cells);
     }
 
-    lines
+    table
 }
 
 /// The paper's sweep table: by part of the motion, the best R², the percentage of runs above 0 and
 /// 0.5, and the standard deviation over seeds. The deviation is averaged over all combinations of
 /// room, split, stride and configuration with several seeds.
-pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
+pub fn parts_table(rows: &[SweepRow]) -> Table {
     type Part = fn(&SweepRow) -> Option<f64>;
 
     let parts: [(&str, Part); 5] = [
@@ -163,17 +141,7 @@ pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
         ("magnitude", |row| row.magnitude),
     ];
 
-    let head = [
-        "part",
-        "runs",
-        "best R²",
-        "% > 0",
-        "% > 0.5",
-        "sd over seeds",
-        "mean R²",
-    ];
-
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
+    let mut table = Table::new("part | runs | best R² | % > 0 | % > 0.5 | sd over seeds | mean R²");
     for (name, part) in parts {
         // Failed runs have no scores and drop out here.
         let values: Vec<f64> = rows.iter().filter_map(part).collect();
@@ -191,35 +159,28 @@ pub fn parts_rows(rows: &[SweepRow]) -> Vec<Vec<String>> {
             .filter(|seeds| seeds.len() > 1)
             .map(|seeds| deviation(seeds))
             .collect();
+        let spread = (!spreads.is_empty()).then(|| format!("{:.3}", mean_of_known(&spreads)));
 
-        lines.push(vec![
-            name.to_owned(),
+        let cells = [
             values.len().to_string(),
-            format!(
-                "{:.3}",
-                values.iter().copied().fold(f64::NEG_INFINITY, f64::max)
-            ),
+            highest(&values),
             percent(&values, 0.0),
             percent(&values, 0.5),
-            match spreads.is_empty() {
-                true => "–".to_owned(),
-                false => format!("{:.3}", mean_of_known(&spreads)),
-            },
+            spread.unwrap_or("–".to_owned()),
             format!("{:.3}", mean(&values)),
-        ]);
+        ];
+        table.row(name, cells);
     }
 
-    lines
+    table
 }
 
 /// The `most` best configurations by mean R² over rooms and seeds, best first.
-pub fn configurations_rows(rows: &[SweepRow], most: usize) -> Vec<Vec<String>> {
+pub fn configurations_table(rows: &[SweepRow], most: usize) -> Table {
     let mut by_configuration: BTreeMap<_, Vec<f64>> = BTreeMap::new();
     for row in rows {
-        by_configuration
-            .entry(row.configuration())
-            .or_default()
-            .extend(row.overall);
+        let scores = by_configuration.entry(row.configuration()).or_default();
+        scores.extend(row.overall);
     }
 
     // A configuration whose runs all failed has no mean and cannot be ranked.
@@ -229,34 +190,27 @@ pub fn configurations_rows(rows: &[SweepRow], most: usize) -> Vec<Vec<String>> {
         .collect();
     ranked.sort_by(|a, b| mean_of_known(&b.1).total_cmp(&mean_of_known(&a.1)));
 
-    let head = [
-        "features", "geo_dim", "K", "lr", "loss", "runs", "mean R²", "sd",
-    ];
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
-
+    let mut table = Table::new("features | geo_dim | K | lr | loss | runs | mean R² | sd");
     for ((geo_dim, charts, lr, loss, features), values) in ranked.into_iter().take(most) {
-        let runs = values.len().to_string();
-        let middle = format!("{:.3}", mean_of_known(&values));
-
-        let spread = if values.len() > 1 {
-            format!("{:.3}", deviation(&values))
-        } else {
-            String::new()
-        };
-
-        lines.push(vec![
-            features,
+        let spread = (values.len() > 1).then(|| format!("{:.3}", deviation(&values)));
+        let cells = [
             geo_dim.to_string(),
             charts.to_string(),
             lr,
             loss,
-            runs,
-            middle,
-            spread,
-        ]);
+            values.len().to_string(),
+            format!("{:.3}", mean_of_known(&values)),
+            spread.unwrap_or_default(),
+        ];
+        table.row(features, cells);
     }
 
-    lines
+    table
+}
+
+fn highest(values: &[f64]) -> String {
+    let highest = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    format!("{highest:.3}")
 }
 
 fn percent(values: &[f64], above: f64) -> String {
@@ -270,35 +224,17 @@ mod tests {
 
     fn row(room: &str, seed: u64, overall: Option<f64>) -> SweepRow {
         SweepRow {
-            key: format!("{room}{seed}"),
             room: room.to_owned(),
-            room_revision: 1,
             format: "tum".to_owned(),
             frames: 200,
             features: "f".to_owned(),
-            preset: "paper-base".to_owned(),
-            split: "time".to_owned(),
-            stride: 40,
-            geo_dim: 20,
-            charts: 1,
-            mixing: "gate".to_owned(),
-            pairs: "stride 40".to_owned(),
-            lr: 1e-3,
-            loss: "mse".to_owned(),
-            epochs: 10,
-            batch: 512,
-            weight_decay: 1e-2,
-            hidden: 64,
             seed,
             n: 40,
             overall,
             translation: overall,
             rotation: overall,
-            direction: None,
             magnitude: overall,
-            train_overall: overall,
-            seconds: 0.1,
-            failure: String::new(),
+            ..SweepRow::default()
         }
     }
 
@@ -313,18 +249,18 @@ mod tests {
         ];
 
         assert_eq!(
-            success_rows(&rows)[1],
+            success_table(&rows).cells(0),
             ["tum", "f", "2", "0.400", "50", "50"]
         );
 
         assert_eq!(
-            difficulty_rows(&rows)[1],
+            difficulty_table(&rows).cells(0),
             ["tum", "2", "200", "40", "50", "0.400"]
         );
 
         // The seeds of room a deviate by 1.4/√2; room b has only one successful seed.
         assert_eq!(
-            parts_rows(&rows)[1],
+            parts_table(&rows).cells(0),
             ["overall", "3", "0.400", "33", "0", "0.990", "-0.367"]
         );
     }

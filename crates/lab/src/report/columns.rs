@@ -11,18 +11,17 @@ use parquet::file::properties::WriterProperties;
 use parquet::file::writer::SerializedFileWriter;
 use parquet::schema::types::Type;
 
-/// The values of one column. All columns of a table must have the same length.
-#[derive(Debug, Clone)]
-pub enum Column {
+/// A column of rows of type `R`: the value of a row.
+pub enum ParquetColumn<R> {
     /// Text, stored as UTF-8.
-    Text(Vec<String>),
+    Text(fn(&R) -> &str),
     /// Integers.
-    Whole(Vec<i64>),
+    Whole(fn(&R) -> u64),
     /// Real numbers; NaN stands for a missing value.
-    Real(Vec<f64>),
+    Real(fn(&R) -> f64),
 }
 
-impl Column {
+impl<R> ParquetColumn<R> {
     fn schema(&self, name: &str) -> Result<Type, ParquetError> {
         let (physical, converted) = match self {
             Self::Text(_) => (Physical::BYTE_ARRAY, ConvertedType::UTF8),
@@ -38,11 +37,11 @@ impl Column {
     }
 }
 
-/// The bytes of a Parquet file with the named columns, in order.
+/// The bytes of a Parquet file of rows, with the named columns in order.
 ///
 /// # Errors
 /// [`Error::Parquet`] if the library rejects the schema or a column.
-pub fn parquet_file(columns: &[(&str, Column)]) -> Result<Vec<u8>, Error> {
+pub fn parquet_file<R>(rows: &[R], columns: &[(&str, ParquetColumn<R>)]) -> Result<Vec<u8>, Error> {
     let mut fields = Vec::with_capacity(columns.len());
     for (name, column) in columns {
         fields.push(Arc::new(column.schema(name)?));
@@ -69,17 +68,19 @@ pub fn parquet_file(columns: &[(&str, Column)]) -> Result<Vec<u8>, Error> {
             break;
         };
         match column {
-            Column::Text(values) => {
-                let values: Vec<ByteArray> =
-                    values.iter().map(|value| value.as_str().into()).collect();
+            ParquetColumn::Text(of) => {
+                let values: Vec<ByteArray> = rows.iter().map(|row| of(row).into()).collect();
                 into.typed::<ByteArrayType>()
                     .write_batch(&values, None, None)?;
             }
-            Column::Whole(values) => {
-                into.typed::<Int64Type>().write_batch(values, None, None)?;
+            ParquetColumn::Whole(of) => {
+                let values: Vec<i64> = rows.iter().map(|row| of(row) as i64).collect();
+                into.typed::<Int64Type>().write_batch(&values, None, None)?;
             }
-            Column::Real(values) => {
-                into.typed::<DoubleType>().write_batch(values, None, None)?;
+            ParquetColumn::Real(of) => {
+                let values: Vec<f64> = rows.iter().map(of).collect();
+                into.typed::<DoubleType>()
+                    .write_batch(&values, None, None)?;
             }
         }
 

@@ -30,6 +30,67 @@ pub struct Curves {
     pub diagonal: bool,
 }
 
+impl Series {
+    /// Points joined by a line.
+    pub fn line(name: impl Into<String>, points: Vec<[f64; 2]>) -> Self {
+        Self {
+            name: name.into(),
+            points,
+            joined: true,
+        }
+    }
+}
+
+impl Curves {
+    /// A plot without the line y = x.
+    pub fn new(
+        title: impl Into<String>,
+        x: impl Into<String>,
+        y: impl Into<String>,
+        series: Vec<Series>,
+    ) -> Self {
+        Self {
+            title: title.into(),
+            x: x.into(),
+            y: y.into(),
+            series,
+            diagonal: false,
+        }
+    }
+
+    /// Draws the plot as an SVG file.
+    ///
+    /// # Errors
+    /// [`Error::Picture`] if the drawing library fails.
+    pub fn svg(&self) -> Result<Vec<u8>, Error> {
+        svg(SIZE, &|root| draw(root, self))
+    }
+}
+
+/// What is drawn on a picture, or why the library refused it.
+pub(super) type Drawn = Result<(), Box<dyn std::error::Error>>;
+/// The picture that is drawn on.
+pub(super) type Canvas<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+
+/// An SVG file of a size in pixels, drawn on white by `draw`.
+///
+/// # Errors
+/// [`Error::Picture`] if the drawing library fails.
+pub(super) fn svg(size: (u32, u32), draw: &dyn Fn(&Canvas<'_>) -> Drawn) -> Result<Vec<u8>, Error> {
+    let mut svg = String::new();
+    {
+        let root = SVGBackend::with_string(&mut svg, size).into_drawing_area();
+        let drawn = root.fill(&WHITE).map_err(Into::into);
+        let drawn = drawn.and_then(|()| draw(&root));
+        let drawn = drawn.and_then(|()| root.present().map_err(Into::into));
+        drawn.map_err(|error: Box<dyn std::error::Error>| Error::Picture {
+            problem: error.to_string().into(),
+        })?;
+    }
+
+    Ok(svg.into_bytes())
+}
+
 const SIZE: (u32, u32) = (1_080, 520);
 /// Left edge of the legend, pixels. The legend is beside the plot and covers no points.
 const LEGEND_X: u32 = 800;
@@ -44,27 +105,7 @@ const COLOURS: [RGBColor; 8] = [
     RGBColor(23, 160, 180),
 ];
 
-/// Draws the plot as an SVG document.
-///
-/// # Errors
-/// [`Error::Picture`] if the drawing library fails.
-pub fn curves_svg(curves: &Curves) -> Result<String, Error> {
-    let mut svg = String::new();
-    {
-        let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
-        draw(&root, curves).map_err(|error| Error::Picture {
-            problem: error.to_string().into(),
-        })?;
-    }
-
-    Ok(svg)
-}
-
-fn draw(
-    root: &DrawingArea<SVGBackend<'_>, Shift>,
-    curves: &Curves,
-) -> Result<(), Box<dyn std::error::Error>> {
-    root.fill(&WHITE)?;
+fn draw(root: &Canvas<'_>, curves: &Curves) -> Drawn {
     let (plot, legend) = root.split_horizontally(LEGEND_X);
 
     // Values that are not finite are not drawn and must not affect the axis ranges.
@@ -136,7 +177,6 @@ fn draw(
         ))?;
     }
 
-    root.present()?;
     Ok(())
 }
 
@@ -163,21 +203,10 @@ mod tests {
     #[test]
     fn every_point_is_drawn() {
         let points = vec![[0.0, 1.0], [1.0, 2.0], [2.0, f64::NAN]];
-        let series = vec![Series {
-            name: "grows".to_owned(),
-            points,
-            joined: true,
-        }];
+        let curves = Curves::new("T", "rooms", "hits", vec![Series::line("grows", points)]);
+        let text = |curves: &Curves| String::from_utf8(curves.svg().unwrap()).unwrap();
 
-        let curves = Curves {
-            title: "T".to_owned(),
-            x: "rooms".to_owned(),
-            y: "hits".to_owned(),
-            series,
-            diagonal: false,
-        };
-
-        let svg = curves_svg(&curves).unwrap();
+        let svg = text(&curves);
         assert_eq!(svg.matches("<circle").count(), 2 + 1);
         assert!(svg.contains("grows") && svg.contains("rooms") && svg.contains("hits"));
 
@@ -186,6 +215,6 @@ mod tests {
             ..curves
         };
 
-        assert!(curves_svg(&empty).unwrap().contains("<svg"));
+        assert!(text(&empty).contains("<svg"));
     }
 }

@@ -4,6 +4,8 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
+use super::table::{Table, escaped};
+
 /// A report.
 #[derive(Debug, Clone, Default)]
 pub struct Document {
@@ -27,8 +29,8 @@ pub struct Section {
 pub enum Block {
     /// A paragraph, plain text.
     Text(String),
-    /// A table, row by row; the first row is the head.
-    Table(Vec<Vec<String>>),
+    /// A table.
+    Table(Table),
     /// A picture.
     Picture(Picture),
 }
@@ -58,9 +60,9 @@ impl Section {
         self.blocks.push(Block::Text(text.into()));
     }
 
-    /// Adds a table, row by row; the first row is the head.
-    pub fn table(&mut self, rows: Vec<Vec<String>>) {
-        self.blocks.push(Block::Table(rows));
+    /// Adds a table.
+    pub fn table(&mut self, table: Table) {
+        self.blocks.push(Block::Table(table));
     }
 
     /// Adds a picture.
@@ -97,7 +99,7 @@ impl Document {
 
                 match block {
                     Block::Text(paragraph) => text.push_str(&format!("{paragraph}\n")),
-                    Block::Table(rows) => text.push_str(&markdown_table(rows)),
+                    Block::Table(table) => text.push_str(&table.markdown()),
                     Block::Picture(Picture { name, caption, .. }) => {
                         let path = if folder.is_empty() {
                             name.clone()
@@ -124,7 +126,7 @@ impl Document {
                     Block::Text(paragraph) => {
                         body.push_str(&format!("<p>{}</p>\n", escaped(paragraph)))
                     }
-                    Block::Table(rows) => body.push_str(&html_table(rows)),
+                    Block::Table(table) => body.push_str(&table.html()),
                     Block::Picture(Picture {
                         name,
                         bytes,
@@ -161,52 +163,6 @@ table{border-collapse:collapse;margin:1rem 0;font-variant-numeric:tabular-nums}\
 th,td{border-bottom:1px solid #ccc;padding:.2rem .6rem;text-align:right}\
 th:first-child,td:first-child{text-align:left}figure{margin:1rem 0}img{max-width:100%}figcaption{color:#555}";
 
-fn markdown_table(rows: &[Vec<String>]) -> String {
-    let line = |cells: &[String]| {
-        let cells: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|")).collect();
-        format!("| {} |\n", cells.join(" | "))
-    };
-
-    let Some((head, rest)) = rows.split_first() else {
-        return String::new();
-    };
-
-    // Markdown aligns by column: the first column holds names, the others hold numbers.
-    let rule: Vec<String> = (0..head.len())
-        .map(|column| if column == 0 { "---" } else { "---:" }.to_owned())
-        .collect();
-
-    [line(head), line(&rule)]
-        .into_iter()
-        .chain(rest.iter().map(|row| line(row)))
-        .collect()
-}
-
-fn html_table(rows: &[Vec<String>]) -> String {
-    let line = |cells: &[String], tag: &str| {
-        let cells: String = cells
-            .iter()
-            .map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell)))
-            .collect();
-        format!("<tr>{cells}</tr>\n")
-    };
-
-    let body: String = rows
-        .iter()
-        .enumerate()
-        .map(|(i, row)| line(row, if i == 0 { "th" } else { "td" }))
-        .collect();
-
-    format!("<table>\n{body}</table>\n")
-}
-
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;")
-        .replace('<', "&lt;")
-        .replace('>', "&gt;")
-        .replace('"', "&quot;")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -215,10 +171,9 @@ mod tests {
         let mut section = Section::new("R² < 0?");
         section.text("5 > 3 & so on");
 
-        section.table(vec![
-            vec!["a|b".to_owned(), "n".to_owned()],
-            vec!["x".to_owned(), "1".to_owned()],
-        ]);
+        let mut table = Table::new("a|b | n");
+        table.row("x", ["1".to_owned()]);
+        section.table(table);
 
         section.picture("p.svg", b"<svg/>".to_vec(), "A \"curve\"");
 

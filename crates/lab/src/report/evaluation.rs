@@ -2,79 +2,61 @@
 
 use std::collections::BTreeMap;
 
-use serde::Serialize;
+use serde::ser::SerializeStruct;
+use serde::{Serialize, Serializer};
+use serde_json::json;
 
-use super::json::{BaselinesJson, MotionJson, RateJson};
-use super::table::aligned;
-use seese3_core::eval::{Baselines, PoseRecall, Report, RetrievalScores, Row};
+use super::table::Table;
+use crate::json::{BaselinesJson, MotionJson, shaped};
+use seese3_core::eval::{Baselines, Report, RetrievalScores, Row};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::statistics::Rate;
 
 /// Two tables with one line per navigator. The first has latent scores and Hit@ε with 95 %
 /// intervals; the second has median pose errors and joint recalls.
 pub fn evaluation_table(report: &Report) -> String {
-    let mut head: Vec<String> = ["navigator", "n", "MSE", "R²", "Top-1"]
-        .map(str::to_owned)
-        .to_vec();
+    let thresholds = report.protocol.thresholds.iter();
+    let hits: String = thresholds
+        .map(|epsilon| format!(" | Hit@{epsilon} [95 %]"))
+        .collect();
+    let mut scores = Table::new(&format!("navigator | n | MSE | R² | Top-1{hits}"));
 
-    head.extend(
-        report
-            .protocol
-            .thresholds
-            .iter()
-            .map(|epsilon| format!("Hit@{epsilon} [95 %]")),
-    );
-
-    let mut lines = vec![head];
-    lines.extend(report.rows.iter().map(hit_cells));
-
-    let mut second = vec![
-        [
-            "navigator",
-            "median m",
-            "median °",
-            "5 cm 5°",
-            "10 cm 5°",
-            "50 cm 5°",
-        ]
-        .map(str::to_owned)
-        .to_vec(),
-    ];
-
-    second.extend(report.rows.iter().map(pose_cells));
-    format!("{}\n{}", aligned(&lines), aligned(&second))
-}
-
-fn hit_cells(row: &Row) -> Vec<String> {
-    let latent = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3}"));
-    let mut cells = vec![
-        row.name.clone(),
-        row.n.to_string(),
-        latent(row.latent.map(|latent| latent.mse)),
-        latent(row.latent.map(|latent| latent.r2)),
-        format!("{:.3}", row.retrieval.top1.rate),
-    ];
-
-    cells.extend(row.retrieval.hits.iter().map(|(_, rate)| interval(rate)));
-    cells
-}
-
-fn pose_cells(row: &Row) -> Vec<String> {
-    let mut cells = vec![
-        row.name.clone(),
-        format!("{:.3}", row.retrieval.translation_m_median),
-        format!("{:.2}", row.retrieval.rotation_rad_median.to_degrees()),
-    ];
-
-    // The protocol may contain more recalls; the table shows only these three.
-    let shown = [(0.05, 5.0), (0.1, 5.0), (0.5, 5.0)];
-    for recall in &row.retrieval.pose_recalls {
-        if shown.contains(&(recall.translation_m, recall.rotation_deg)) {
-            cells.push(format!("{:.3}", recall.rate.rate));
-        }
+    for row in &report.rows {
+        let latent =
+            |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3}"));
+        let cells = [
+            row.n.to_string(),
+            latent(row.latent.map(|latent| latent.mse)),
+            latent(row.latent.map(|latent| latent.r2)),
+            format!("{:.3}", row.retrieval.top1.rate),
+        ];
+        let hits = row.retrieval.hits.iter().map(|(_, rate)| interval(rate));
+        scores.row(&row.name, cells.into_iter().chain(hits));
     }
 
-    cells
+    let mut poses = Table::new("navigator | median m | median ° | 5 cm 5° | 10 cm 5° | 50 cm 5°");
+    for row in &report.rows {
+        let RetrievalScores {
+            translation_m_median,
+            rotation_rad_median,
+            pose_recalls,
+            ..
+        } = &row.retrieval;
+        let medians = [
+            format!("{translation_m_median:.3}"),
+            format!("{:.2}", rotation_rad_median.to_degrees()),
+        ];
+
+        // The protocol may contain more recalls; the table shows only these three.
+        let shown = [(0.05, 5.0), (0.1, 5.0), (0.5, 5.0)];
+        let recalls = pose_recalls
+            .iter()
+            .filter(|recall| shown.contains(&(recall.translation_m, recall.rotation_deg)))
+            .map(|recall| format!("{:.3}", recall.rate.rate));
+        poses.row(&row.name, medians.into_iter().chain(recalls));
+    }
+
+    format!("{scores}\n\n{poses}")
 }
 
 fn interval(rate: &Rate) -> String {
@@ -123,11 +105,13 @@ pub struct AdapterJson {
 }
 
 /// R² of the adapter's motions on the test pairs, with the baselines.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Serialize)]
 pub struct MotionBaselines {
     /// R² of the adapter's motions.
+    #[serde(serialize_with = "shaped::<MotionJson, _, _>")]
     pub motion: MotionScores,
     /// The baselines, with the extent of the training data.
+    #[serde(serialize_with = "shaped::<BaselinesJson, _, _>")]
     pub baselines: Baselines,
 }
 
@@ -162,21 +146,21 @@ pub fn baselines_text(found: &MotionBaselines) -> String {
 
 /// The JSON record of `seese3 evaluate`.
 #[derive(Debug, Serialize)]
-pub struct EvaluationJson {
-    motion: MotionJson,
-    baselines: BaselinesJson,
-    navigators: Vec<NavigatorJson>,
-    protocol: ProtocolJson,
+pub struct EvaluationJson<'a> {
+    #[serde(flatten)]
+    motion: MotionBaselines,
+    navigators: Vec<NavigatorJson<'a>>,
+    protocol: ProtocolJson<'a>,
 }
 
 #[derive(Debug, Serialize)]
-struct ProtocolJson {
+struct ProtocolJson<'a> {
     split: &'static str,
     stride: u32,
     n: usize,
     candidates: usize,
     source_excluded: bool,
-    thresholds: Vec<f64>,
+    thresholds: &'a [f64],
     seed: u64,
     steps: u32,
     mode: &'static str,
@@ -185,63 +169,24 @@ struct ProtocolJson {
     context: EvaluationContext,
 }
 
-#[derive(Debug, Serialize)]
-struct NavigatorJson {
-    name: String,
-    n: usize,
-    /// Scores of the predicted latent; null for a navigator that does not predict one.
-    mse: Option<f64>,
-    r2: Option<f64>,
-    r2_uniform: Option<f64>,
-    #[serde(flatten)]
-    retrieval: RetrievalJson,
-}
-
-#[derive(Debug, Serialize)]
-struct RetrievalJson {
-    top1: f64,
-    top1_interval: RateJson,
-    /// Hit rates, keyed by ε as text.
-    hit: BTreeMap<String, RateJson>,
-    twist_error: TwistErrorJson,
-    median_translation_m: f64,
-    median_rotation_deg: f64,
-    recall: Vec<RecallJson>,
-}
-
-#[derive(Debug, Serialize)]
-struct TwistErrorJson {
-    mean: f64,
-    median: f64,
-}
-
-#[derive(Debug, Serialize)]
-struct RecallJson {
-    translation_m: f64,
-    rotation_deg: f64,
-    #[serde(flatten)]
-    rate: RateJson,
-}
-
 /// Builds the JSON record of an evaluation.
-pub fn evaluation_json(
-    report: &Report,
+pub fn evaluation_json<'a>(
+    report: &'a Report,
     motion: &MotionBaselines,
     context: EvaluationContext,
-) -> EvaluationJson {
+) -> EvaluationJson<'a> {
     let protocol = &report.protocol;
 
     EvaluationJson {
-        motion: (&motion.motion).into(),
-        baselines: (&motion.baselines).into(),
-        navigators: report.rows.iter().map(navigator_json).collect(),
+        motion: *motion,
+        navigators: report.rows.iter().map(NavigatorJson).collect(),
         protocol: ProtocolJson {
             split: protocol.split.name(),
             stride: protocol.stride,
             n: report.n,
             candidates: report.candidate_count,
             source_excluded: protocol.exclude_source.is_some(),
-            thresholds: protocol.thresholds.clone(),
+            thresholds: &protocol.thresholds,
             seed: protocol.seed,
             steps: protocol.steps,
             mode: protocol.mode.name(),
@@ -251,38 +196,44 @@ pub fn evaluation_json(
     }
 }
 
-fn navigator_json(row: &Row) -> NavigatorJson {
-    NavigatorJson {
-        name: row.name.clone(),
-        n: row.n,
-        mse: row.latent.map(|latent| latent.mse),
-        r2: row.latent.map(|latent| latent.r2),
-        r2_uniform: row.latent.map(|latent| latent.r2_uniform),
-        retrieval: retrieval_json(&row.retrieval),
-    }
-}
+/// A navigator's scores.
+#[derive(Debug)]
+struct NavigatorJson<'a>(&'a Row);
 
-fn retrieval_json(scores: &RetrievalScores) -> RetrievalJson {
-    let recall = |recall: &PoseRecall| RecallJson {
-        translation_m: recall.translation_m,
-        rotation_deg: recall.rotation_deg,
-        rate: (&recall.rate).into(),
-    };
+impl Serialize for NavigatorJson<'_> {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        let Row {
+            name,
+            n,
+            latent,
+            retrieval,
+        } = self.0;
 
-    RetrievalJson {
-        top1: scores.top1.rate,
-        top1_interval: (&scores.top1).into(),
-        hit: scores
-            .hits
-            .iter()
-            .map(|(epsilon, rate)| (epsilon.to_string(), rate.into()))
-            .collect(),
-        twist_error: TwistErrorJson {
-            mean: scores.twist_error_mean,
-            median: scores.twist_error_median,
-        },
-        median_translation_m: scores.translation_m_median,
-        median_rotation_deg: scores.rotation_rad_median.to_degrees(),
-        recall: scores.pose_recalls.iter().map(recall).collect(),
+        // Hit rates are keyed by ε as text.
+        let hits = retrieval.hits.iter();
+        let hits: BTreeMap<String, Rate> = hits
+            .map(|(epsilon, rate)| (epsilon.to_string(), *rate))
+            .collect();
+        let twist_error = json!({
+            "mean": retrieval.twist_error_mean,
+            "median": retrieval.twist_error_median,
+        });
+        let rotation_deg = retrieval.rotation_rad_median.to_degrees();
+
+        // Scores of the predicted latent are null for a navigator that does not predict one.
+        let mut record = to.serialize_struct("Navigator", 12)?;
+        record.serialize_field("name", name)?;
+        record.serialize_field("n", n)?;
+        record.serialize_field("mse", &latent.map(|latent| latent.mse))?;
+        record.serialize_field("r2", &latent.map(|latent| latent.r2))?;
+        record.serialize_field("r2_uniform", &latent.map(|latent| latent.r2_uniform))?;
+        record.serialize_field("top1", &retrieval.top1.rate)?;
+        record.serialize_field("top1_interval", &retrieval.top1)?;
+        record.serialize_field("hit", &hits)?;
+        record.serialize_field("twist_error", &twist_error)?;
+        record.serialize_field("median_translation_m", &retrieval.translation_m_median)?;
+        record.serialize_field("median_rotation_deg", &rotation_deg)?;
+        record.serialize_field("recall", &retrieval.pose_recalls)?;
+        record.end()
     }
 }

@@ -1,8 +1,7 @@
 //! Files of navigator scores: Hit@ε curves as SVG, tables as CSV and LaTeX.
 
-use std::fmt::Write;
-
 use super::curves::{Curves, Series};
+use super::table::Table;
 use seese3_core::eval::{Report, Row};
 use seese3_core::statistics::Rate;
 
@@ -31,87 +30,86 @@ pub fn report_at(report: &Report, thresholds: &[f64]) -> Report {
 
 /// Plots Hit@ε over ε, one curve per navigator.
 pub fn hit_curves(report: &Report, title: String) -> Curves {
-    let curve = |row: &Row| Series {
-        name: row.name.clone(),
-        points: row
-            .retrieval
-            .hits
-            .iter()
-            .map(|(epsilon, rate)| [*epsilon, rate.rate])
-            .collect(),
-        joined: true,
+    let curve = |row: &Row| {
+        let hits = row.retrieval.hits.iter();
+        Series::line(
+            &row.name,
+            hits.map(|(epsilon, rate)| [*epsilon, rate.rate]).collect(),
+        )
     };
-
-    Curves {
-        title,
-        x: "ε, metres and radians mixed".to_owned(),
-        y: "Hit@ε".to_owned(),
-        series: report.rows.iter().map(curve).collect(),
-        diagonal: false,
-    }
+    let series = report.rows.iter().map(curve).collect();
+    Curves::new(title, "ε, metres and radians mixed", "Hit@ε", series)
 }
 
 /// CSV with one line per navigator and the bounds of the 95 % intervals; undefined values are
 /// empty.
 pub fn evaluation_csv(report: &Report) -> String {
-    let mut text = "navigator,n,mse,r2,top1,top1_low,top1_high".to_owned();
-    for epsilon in &report.protocol.thresholds {
-        let _ = write!(text, ",hit@{epsilon},hit@{epsilon}_low,hit@{epsilon}_high");
-    }
-    text.push_str(",median_m,median_deg\n");
+    let hits = over_thresholds(report, |e| {
+        format!(" | hit@{e} | hit@{e}_low | hit@{e}_high")
+    });
+    let mut table = Table::new(&format!(
+        "navigator | n | mse | r2 | top1 | top1_low | top1_high{hits} | median_m | median_deg"
+    ));
 
     let number = |value: Option<f64>| value.map_or(String::new(), |value| value.to_string());
-    let rate = |rate: &Rate| format!("{},{},{}", rate.rate, rate.low, rate.high);
     for row in &report.rows {
-        let mse = number(row.latent.map(|latent| latent.mse));
-        let r2 = number(row.latent.map(|latent| latent.r2));
-        let top1 = rate(&row.retrieval.top1);
-        let _ = write!(text, "{},{},{mse},{r2},{top1}", row.name, row.n);
-        for (_, hit) in &row.retrieval.hits {
-            let _ = write!(text, ",{}", rate(hit));
-        }
-
-        let degrees = row.retrieval.rotation_rad_median.to_degrees();
-        let metres = row.retrieval.translation_m_median;
-        let _ = writeln!(text, ",{metres},{degrees}");
+        let latent = [
+            row.n.to_string(),
+            number(row.latent.map(|latent| latent.mse)),
+            number(row.latent.map(|latent| latent.r2)),
+        ];
+        let rates = std::iter::once(&row.retrieval.top1)
+            .chain(row.retrieval.hits.iter().map(|(_, rate)| rate))
+            .flat_map(|rate| [rate.rate, rate.low, rate.high]);
+        let rates = rates.chain(medians(row)).map(|value| value.to_string());
+        table.row(&row.name, latent.into_iter().chain(rates));
     }
-    text
+
+    table.csv()
 }
 
 /// LaTeX table for the package `booktabs`: Hit@ε with its 95 % interval in small print.
 pub fn evaluation_latex(report: &Report) -> String {
-    let columns = "r".repeat(3 + report.protocol.thresholds.len());
-    let mut head = "navigator & $R^2$".to_owned();
-    for epsilon in &report.protocol.thresholds {
-        let _ = write!(head, " & Hit@{epsilon}");
-    }
-
-    let mut text = format!(
-        "% {} test pairs, {} candidate frames, split {}, stride {}\n\
-         \\begin{{tabular}}{{l{columns}}}\n\\toprule\n{head} & median m & median $^\\circ$ \\\\\n\\midrule\n",
-        report.n, report.candidate_count, report.protocol.split, report.protocol.stride
-    );
+    let hits = over_thresholds(report, |epsilon| format!(" | Hit@{epsilon}"));
+    let mut table = Table::new(&format!(
+        "navigator | $R^2${hits} | median m | median $^\\circ$"
+    ));
 
     for row in &report.rows {
-        let r2 = row
-            .latent
-            .map_or("--".to_owned(), |latent| format!("{:.3}", latent.r2));
-        let _ = write!(text, "{} & {r2}", row.name);
-        for (_, hit) in &row.retrieval.hits {
+        let r2 = row.latent.map(|latent| format!("{:.3}", latent.r2));
+        let hits = row.retrieval.hits.iter().map(|(_, hit)| {
             let Rate {
                 rate, low, high, ..
             } = hit;
-            let _ = write!(text, " & {rate:.3} {{\\scriptsize [{low:.3}, {high:.3}]}}");
-        }
+            format!("{rate:.3} {{\\scriptsize [{low:.3}, {high:.3}]}}")
+        });
+        let [metres, degrees] = medians(row);
 
-        let _ = writeln!(
-            text,
-            " & {:.3} & {:.2} \\\\",
-            row.retrieval.translation_m_median,
-            row.retrieval.rotation_rad_median.to_degrees()
-        );
+        let cells = std::iter::once(r2.unwrap_or("--".to_owned()))
+            .chain(hits)
+            .chain([format!("{metres:.3}"), format!("{degrees:.2}")]);
+        table.row(&row.name, cells);
     }
 
-    text.push_str("\\bottomrule\n\\end{tabular}\n");
-    text
+    format!(
+        "% {} test pairs, {} candidate frames, split {}, stride {}\n{}",
+        report.n,
+        report.candidate_count,
+        report.protocol.split,
+        report.protocol.stride,
+        table.latex()
+    )
+}
+
+fn over_thresholds(report: &Report, title: fn(&f64) -> String) -> String {
+    report.protocol.thresholds.iter().map(title).collect()
+}
+
+/// Median errors of the retrieved poses, metres and degrees.
+fn medians(row: &Row) -> [f64; 2] {
+    let scores = &row.retrieval;
+    [
+        scores.translation_m_median,
+        scores.rotation_rad_median.to_degrees(),
+    ]
 }

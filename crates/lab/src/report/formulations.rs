@@ -1,91 +1,46 @@
 //! R² of the adapter and of the alternative formulations, in the layout of the paper's table (Sec.
 //! A.5).
 
-use serde::Serialize;
-
-use super::json::{MotionJson, PartsJson};
-use super::table::aligned;
-use crate::experiments::formulations::{Comparison, FormulationScores};
+use super::table::Table;
+use crate::experiments::formulations::Comparison;
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::statistics::{deviation, mean_of_known};
 
 /// One line per formulation: R² by part of the motion, averaged over seeds, and the sample standard
 /// deviation of the overall R². The last line is the constant baseline.
-pub fn formulations_table(comparison: &Comparison) -> String {
-    let head = [
-        "formulation",
-        "overall",
-        "transl.",
-        "rotation",
-        "direct.",
-        "magnit.",
+pub fn formulations_table(comparison: &Comparison) -> Table {
+    let mut table = Table::new("formulation | overall | transl. | rotation | direct. | magnit.");
+    add_formulations(&mut table, comparison, 3);
+    table
+}
+
+/// Adds the rows of [`formulations_table`] to a table with other titles.
+pub fn add_formulations(table: &mut Table, comparison: &Comparison, decimals: usize) {
+    let parts: [fn(&MotionScores) -> f64; 4] = [
+        |run| run.translation,
+        |run| run.rotation,
+        |run| run.direction,
+        |run| run.magnitude,
     ];
 
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
     for score in &comparison.formulations {
+        // One value per seed, already averaged over the rooms.
         let column = |of: fn(&MotionScores) -> f64| score.runs.iter().map(of).collect::<Vec<f64>>();
-        let overall = column(|run| run.overall);
-
-        // A single seed has no standard deviation.
-        let spread = if overall.len() > 1 {
-            format!(" ± {:.3}", deviation(&overall))
-        } else {
-            String::new()
-        };
-
-        let parts = [
-            column(|run| run.translation),
-            column(|run| run.rotation),
-            column(|run| run.direction),
-            column(|run| run.magnitude),
-        ];
-
-        let mut cells = vec![
-            score.name.to_owned(),
-            format!("{:.3}{spread}", mean_of_known(&overall)),
-        ];
-        cells.extend(
-            parts
-                .iter()
-                .map(|part| format!("{:.3}", mean_of_known(part))),
-        );
-
-        lines.push(cells);
+        let parts = parts.map(|of| format!("{:.decimals$}", mean_of_known(&column(of))));
+        let overall = spread_text(&column(|run| run.overall), decimals);
+        table.row(score.name, std::iter::once(overall).chain(parts));
     }
 
-    lines.push(vec![
-        "mean training motion".to_owned(),
-        format!("{:.3}", comparison.constant_r2),
-    ]);
-
-    aligned(&lines)
+    let constant = format!("{:.decimals$}", comparison.constant_r2);
+    table.row("mean training motion", [constant]);
 }
 
-/// The JSON record of `seese3 sweep formulations`, one entry per formulation.
-#[derive(Debug, Serialize)]
-pub struct FormulationsJson {
-    formulations: Vec<FormulationJson>,
-    /// R² of the constant baseline (the mean training motion), averaged over rooms.
-    constant_r2: f64,
-}
-
-#[derive(Debug, Serialize)]
-struct FormulationJson {
-    name: &'static str,
-    by_part: PartsJson,
-    runs: Vec<MotionJson>,
-}
-
-/// Builds the JSON record of a comparison.
-pub fn formulations_json(comparison: &Comparison) -> FormulationsJson {
-    let entry = |score: &FormulationScores| FormulationJson {
-        name: score.name,
-        by_part: PartsJson::of(&score.runs),
-        runs: score.runs.iter().map(MotionJson::from).collect(),
-    };
-
-    FormulationsJson {
-        formulations: comparison.formulations.iter().map(entry).collect(),
-        constant_r2: comparison.constant_r2,
+/// The mean of the defined values and, for several values, the sample standard deviation, as text.
+pub fn spread_text(values: &[f64], decimals: usize) -> String {
+    let middle = format!("{:.decimals$}", mean_of_known(values));
+    if values.len() > 1 {
+        format!("{middle} ± {:.decimals$}", deviation(values))
+    } else {
+        middle
     }
 }

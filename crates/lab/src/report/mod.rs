@@ -1,7 +1,7 @@
 //! Renders results as tables, JSON and pictures.
 //!
-//! Types named `…Json` here, and `…Record` in [`crate::reproduction`], define the JSON files: their
-//! fields are the keys.
+//! Results derive `Serialize`. Types named `…Json` here, and `…Record` in [`crate::reproduction`],
+//! are whole JSON files, or parts that no result has in this shape.
 
 mod adapter_sweep;
 mod columns;
@@ -11,7 +11,6 @@ mod document;
 mod evaluation;
 mod evaluation_files;
 mod formulations;
-mod json;
 mod layers;
 mod localization;
 mod odometry;
@@ -25,14 +24,14 @@ mod theory;
 mod training;
 
 pub use adapter_sweep::{
-    configurations_rows, difficulty_rows, parts_rows, success_rows, sweep_parquet,
+    configurations_table, difficulty_table, parts_table, success_table, sweep_parquet,
 };
-pub use columns::{Column, parquet_file};
+pub use columns::{ParquetColumn, parquet_file};
 pub use cross_room::{
-    CrossRoomJson, cross_room_json, cross_room_table, room_difference_text, room_mean_text,
-    rooms_table, scaling_table,
+    CrossRoomJson, count_text, cross_room_json, cross_room_table, room_difference_text,
+    room_mean_text, rooms_table, scaling_table,
 };
-pub use curves::{Curves, Series, curves_svg};
+pub use curves::{Curves, Series};
 pub use document::{Block, Document, Picture, Section};
 pub use evaluation::{
     AdapterJson, EvaluationContext, EvaluationJson, MotionBaselines, RoomJson, baselines_text,
@@ -41,12 +40,10 @@ pub use evaluation::{
 pub use evaluation_files::{
     curve_thresholds, evaluation_csv, evaluation_latex, hit_curves, report_at,
 };
-pub use formulations::{FormulationsJson, formulations_json, formulations_table};
-pub use json::{BaselinesJson, MotionJson, PartsJson, RateJson, RoomMeanJson};
-pub use layers::{LayersJson, encoders_table, layers_json, layers_table};
+pub use formulations::{add_formulations, formulations_table, spread_text};
+pub use layers::{encoders_table, layers_table};
 pub use localization::{
-    LocalizationContext, LocalizationJson, MotionEvaluationJson, localization_json,
-    localization_table, motion_evaluation_json, motion_table,
+    LocalizationContext, LocalizationJson, MotionEvaluationJson, localization_table, motion_table,
 };
 pub use odometry::{
     OdometryJson, coverage_table, odometry_json, odometry_table, other_rooms_text,
@@ -57,10 +54,10 @@ pub use path_errors::{
 };
 pub use planning::{PlanningJson, planning_json, planning_table};
 pub use plot::{PathPlot, path_svg};
-pub use probe::{ProbeContext, ProbeJson, probe_json, probe_table};
+pub use probe::{ProbeJson, ProbedRooms, probe_table};
 pub use robustness::{RobustnessJson, robustness_json, robustness_table};
-pub use table::aligned;
-pub use theory::{TheoryJson, theory_json, theory_table, theory_table_rows};
+pub use table::{Column, Table, fixed};
+pub use theory::{TheoryJson, theory_json, theory_table};
 pub use training::{TrainingJson, training_json, training_remark, training_table};
 
 /// Why a result could not be rendered.
@@ -77,4 +74,10 @@ pub enum Error {
     /// The Parquet library refused a table.
     #[error("a Parquet table cannot be written")]
     Parquet(#[from] parquet::errors::ParquetError),
+}
+
+impl From<Error> for crate::experiments::Error {
+    fn from(problem: Error) -> Self {
+        Self::Rendering(problem.into())
+    }
 }

@@ -1,11 +1,11 @@
 //! Absolute and relative pose errors (APE and RPE) of an estimated path, with their formulas.
 
 use std::collections::BTreeMap;
-
-use serde::Serialize;
 use strum::VariantArray;
 
-use super::table::aligned;
+use serde::Serialize;
+
+use super::table::{Table, fixed};
 use crate::experiments::path_comparison::PathComparison;
 use seese3_core::trajectory::{Error, Relation, RpePairs, Statistics};
 
@@ -19,39 +19,27 @@ pub const RPE_FORMULA: &str =
 /// One line per error and relation: root mean square, mean, median, standard deviation, smallest
 /// and largest value, and count. The formulas follow the table.
 pub fn path_errors_table(errors: &PathComparison) -> String {
-    let head = [
-        "error", "part", "rmse", "mean", "median", "sd", "least", "largest", "n",
-    ];
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
+    let mut table = Table::new("error | part | rmse | mean | median | sd | least | largest | n");
 
     // Undefined errors are listed below the table, each with the reason.
     let mut undefined = String::new();
     for (name, found) in rows(errors) {
-        match found {
-            Ok(found) => {
-                for (statistics, relation) in found.iter().zip(Relation::VARIANTS) {
-                    let s = statistics;
-                    let numbers = [s.rmse, s.mean, s.median, s.deviation, s.least, s.largest];
-                    let cells = numbers.map(|number| format!("{number:.6}"));
-                    let start = [name.clone(), relation.to_string()];
-
-                    lines.push(
-                        start
-                            .into_iter()
-                            .chain(cells)
-                            .chain([s.count.to_string()])
-                            .collect(),
-                    );
-                }
+        let found = match found {
+            Ok(found) => found,
+            Err(why) => {
+                undefined.push_str(&format!("{name}: none, {why}\n"));
+                continue;
             }
-            Err(why) => undefined.push_str(&format!("{name}: none, {why}\n")),
+        };
+
+        for (s, relation) in found.iter().zip(Relation::VARIANTS) {
+            let numbers = [s.rmse, s.mean, s.median, s.deviation, s.least, s.largest];
+            let cells = std::iter::once(relation.to_string()).chain(fixed(numbers, 6));
+            table.row(&name, cells.chain([s.count.to_string()]));
         }
     }
 
-    format!(
-        "{}{undefined}{APE_FORMULA}\n{RPE_FORMULA}\n",
-        aligned(&lines)
-    )
+    format!("{table}\n{undefined}{APE_FORMULA}\n{RPE_FORMULA}")
 }
 
 fn rows(errors: &PathComparison) -> Vec<(String, &Result<[Statistics; 3], Error>)> {
@@ -83,21 +71,9 @@ pub struct PathErrorsJson {
 #[serde(untagged)]
 enum ErrorsJson {
     /// Statistics by relation.
-    Found(BTreeMap<&'static str, StatisticsJson>),
+    Found(BTreeMap<&'static str, Statistics>),
     /// These errors are undefined for the path.
     Undefined { undefined: String },
-}
-
-#[derive(Debug, Serialize)]
-struct StatisticsJson {
-    rmse: f64,
-    mean: f64,
-    median: f64,
-    std: f64,
-    min: f64,
-    max: f64,
-    sse: f64,
-    n: usize,
 }
 
 /// Builds the JSON record of a path's errors.
@@ -120,25 +96,11 @@ pub fn path_errors_json(errors: &PathComparison) -> PathErrorsJson {
 }
 
 fn errors_json(found: &Result<[Statistics; 3], Error>) -> ErrorsJson {
-    let statistics = |s: &Statistics| StatisticsJson {
-        rmse: s.rmse,
-        mean: s.mean,
-        median: s.median,
-        std: s.deviation,
-        min: s.least,
-        max: s.largest,
-        sse: s.sum_of_squares,
-        n: s.count,
-    };
-
     match found {
         Ok(found) => {
             let named = Relation::VARIANTS.iter().zip(found);
-            ErrorsJson::Found(
-                named
-                    .map(|(relation, found)| (relation.into(), statistics(found)))
-                    .collect(),
-            )
+            let named = named.map(|(relation, found)| (relation.into(), *found));
+            ErrorsJson::Found(named.collect())
         }
         Err(why) => ErrorsJson::Undefined {
             undefined: why.to_string(),

@@ -3,50 +3,43 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
-use strum::VariantArray;
 
-use super::table::aligned;
+use super::table::Column::{self, Number, Text};
+use super::table::Table;
 use crate::experiments::planning::{Planner, PlannerScores, PlanningProtocol, RoomPlanning};
 use seese3_core::statistics::Rate;
 
 /// One line per planner, over the queries of all rooms.
-pub fn planning_table(rooms: &[RoomPlanning]) -> String {
-    let head = [
-        "planner",
-        "says reached",
-        "truly there",
-        "95 %",
-        "says reached, not there",
-        "steps",
-        "longest hop",
-        "other rooms: says reached",
+pub fn planning_table(rooms: &[RoomPlanning]) -> Table {
+    type Row = (Planner, PlannerScores);
+    let of_all_rooms = |planner| (planner, all(rooms, planner));
+
+    let columns: [Column<Row>; 8] = [
+        Text("planner", |(planner, _)| planner.title().to_owned()),
+        Number("says reached", 3, |(_, all)| {
+            share(all.says_reached, all.questions)
+        }),
+        Number("truly there", 3, |(_, all)| {
+            share(all.truly_there, all.questions)
+        }),
+        Text("95 %", |(_, all)| {
+            let there = Rate::of(all.truly_there, all.questions);
+            format!("[{:.3}, {:.3}]", there.low, there.high)
+        }),
+        Number("says reached, not there", 3, |(_, all)| {
+            share(all.says_reached - all.truly_there, all.questions)
+        }),
+        Number("steps", 1, |(_, all)| share(all.steps, all.truly_there)),
+        Number("longest hop", 2, |(_, all)| all.longest_hop),
+        Text("other rooms: says reached", |(_, all)| {
+            match all.other_questions {
+                0 => String::new(),
+                questions => format!("{:.3}", share(all.other_says_reached, questions)),
+            }
+        }),
     ];
 
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
-    for &planner in Planner::VARIANTS {
-        let scores = all(rooms, planner);
-        let there = Rate::of(scores.truly_there, scores.questions);
-        let wrong = scores.says_reached - scores.truly_there;
-        lines.push(vec![
-            planner.title().to_owned(),
-            format!("{:.3}", share(scores.says_reached, scores.questions)),
-            format!("{:.3}", there.rate),
-            format!("[{:.3}, {:.3}]", there.low, there.high),
-            format!("{:.3}", share(wrong, scores.questions)),
-            format!("{:.1}", share(scores.steps, scores.truly_there)),
-            format!("{:.2}", scores.longest_hop),
-            if scores.other_questions == 0 {
-                String::new()
-            } else {
-                format!(
-                    "{:.3}",
-                    share(scores.other_says_reached, scores.other_questions)
-                )
-            },
-        ]);
-    }
-
-    aligned(&lines)
+    Table::of(&Planner::ALL.map(of_all_rooms), &columns)
 }
 
 fn all(rooms: &[RoomPlanning], planner: Planner) -> PlannerScores {
@@ -73,56 +66,20 @@ impl Planner {
 
 /// The file of `seese3 evaluate planning --json`.
 #[derive(Debug, Serialize)]
-pub struct PlanningJson {
+pub struct PlanningJson<'a> {
     /// Scores by planner, over the queries of all rooms.
     #[serde(flatten)]
-    all: BTreeMap<&'static str, PlannerJson>,
-    rooms: Vec<RoomJson>,
-    protocol: ProtocolJson,
+    all: BTreeMap<Planner, PlannerScores>,
+    rooms: &'a [RoomPlanning],
+    protocol: ProtocolJson<'a>,
 }
 
 #[derive(Debug, Serialize)]
-struct RoomJson {
-    room: String,
-    mapped_frames: usize,
-    /// The longest allowed hop, metres and radians mixed.
-    allowed_hop: f64,
-    #[serde(flatten)]
-    planners: BTreeMap<&'static str, PlannerJson>,
-}
-
-#[derive(Debug, Serialize)]
-struct PlannerJson {
-    n: usize,
-    /// Fraction of queries for which the planner reported success.
-    says_reached: f64,
-    /// Fraction of queries with reported success and the robot at the goal.
-    truly_there: f64,
-    /// Fraction of queries with the robot at the goal, whatever the planner reported.
-    there_anyway: f64,
-    /// Mean arrival probability over all queries, 0 where nothing was planned; null for planners
-    /// without probabilities.
-    expected_there: Option<f64>,
-    /// Mean number of hops of the queries counted in `truly_there`; null without any.
-    steps: Option<f64>,
-    longest_hop: f64,
-    other_rooms: OtherRoomsJson,
-}
-
-/// Scores of queries with views of other rooms.
-#[derive(Debug, Serialize)]
-struct OtherRoomsJson {
-    n: usize,
-    /// Fraction of queries with reported success; null without any query.
-    says_reached: Option<f64>,
-}
-
-#[derive(Debug, Serialize)]
-struct ProtocolJson {
+struct ProtocolJson<'a> {
     hold_out: &'static str,
     questions_per_room: usize,
     seed: u64,
-    adapter: String,
+    adapter: &'a str,
     /// Whether an adapter was fitted to the mapped frames.
     fit: bool,
     /// The requested longest hop; null for the adapter's own.
@@ -130,55 +87,23 @@ struct ProtocolJson {
 }
 
 /// Builds the JSON record of an evaluation with the named adapter.
-pub fn planning_json(
-    rooms: &[RoomPlanning],
+pub fn planning_json<'a>(
+    rooms: &'a [RoomPlanning],
     protocol: &PlanningProtocol,
-    adapter: &str,
-) -> PlanningJson {
-    let by_planner = |scores: &dyn Fn(Planner) -> PlannerScores| {
-        Planner::VARIANTS
-            .iter()
-            .map(|&planner| (planner.into(), PlannerJson::of(&scores(planner))))
-            .collect()
-    };
-
-    let room = |room: &RoomPlanning| RoomJson {
-        room: room.room.clone(),
-        mapped_frames: room.mapped_frames,
-        allowed_hop: room.longest_hop,
-        planners: by_planner(&|planner| all(std::slice::from_ref(room), planner)),
-    };
-
+    adapter: &'a str,
+) -> PlanningJson<'a> {
     PlanningJson {
-        all: by_planner(&|planner| all(rooms, planner)),
-        rooms: rooms.iter().map(room).collect(),
+        all: Planner::ALL
+            .map(|planner| (planner, all(rooms, planner)))
+            .into(),
+        rooms,
         protocol: ProtocolJson {
             hold_out: protocol.hold_out.name(),
             questions_per_room: protocol.questions,
             seed: protocol.seed,
-            adapter: adapter.to_owned(),
+            adapter,
             fit: protocol.is_fitted,
             step: protocol.longest_hop,
         },
-    }
-}
-
-impl PlannerJson {
-    fn of(scores: &PlannerScores) -> Self {
-        let known = |part: usize, whole: usize| (whole > 0).then(|| share(part, whole));
-        Self {
-            n: scores.questions,
-            says_reached: share(scores.says_reached, scores.questions),
-            truly_there: share(scores.truly_there, scores.questions),
-            there_anyway: share(scores.there_anyway, scores.questions),
-            expected_there: (scores.expected_there > 0.0)
-                .then(|| scores.expected_there / scores.questions as f64),
-            steps: known(scores.steps, scores.truly_there),
-            longest_hop: scores.longest_hop,
-            other_rooms: OtherRoomsJson {
-                n: scores.other_questions,
-                says_reached: known(scores.other_says_reached, scores.other_questions),
-            },
-        }
     }
 }

@@ -1,7 +1,7 @@
 //! Plan view of a navigation, as SVG.
 
 use super::Error;
-use plotters::coord::Shift;
+use super::curves::{Canvas, Drawn, svg};
 use plotters::prelude::*;
 
 /// Contents of a plan view: positions in metres and headings in radians from the x axis.
@@ -28,26 +28,15 @@ const TARGET_COLOUR: RGBColor = RGBColor(20, 140, 70);
 const REQUESTED_COLOUR: RGBColor = RGBColor(40, 100, 220);
 const RETRIEVED_COLOUR: RGBColor = RGBColor(225, 90, 20);
 
-/// Draws the plan view as an SVG document.
+/// Draws the plan view as an SVG file.
 ///
 /// # Errors
 /// [`Error::Picture`] if the drawing library fails.
-pub fn path_svg(plot: &PathPlot) -> Result<String, Error> {
-    let mut svg = String::new();
-    {
-        let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
-        draw(&root, plot).map_err(|error| Error::Picture {
-            problem: error.to_string().into(),
-        })?;
-    }
-
-    Ok(svg)
+pub fn path_svg(plot: &PathPlot) -> Result<Vec<u8>, Error> {
+    svg(SIZE, &|root| draw(root, plot))
 }
 
-type Drawn = Result<(), Box<dyn std::error::Error>>;
-
-fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, plot: &PathPlot) -> Drawn {
-    root.fill(&WHITE)?;
+fn draw(root: &Canvas<'_>, plot: &PathPlot) -> Drawn {
     let (x_range, y_range) = ranges(plot);
 
     let mut chart = ChartBuilder::on(root)
@@ -130,7 +119,6 @@ fn draw(root: &DrawingArea<SVGBackend<'_>, Shift>, plot: &PathPlot) -> Drawn {
         .border_style(MAP_COLOUR)
         .draw()?;
 
-    root.present()?;
     Ok(())
 }
 

@@ -2,136 +2,76 @@
 
 use serde::Serialize;
 
-use super::odometry::{ScoresJson, scores_json, wrong_share};
-use super::table::aligned;
+use super::table::Column::{self, Number, Text};
+use super::table::Table;
 use crate::experiments::robustness::{DisturbedTracking, Extent};
-use crate::experiments::tracking_scores::{AnswerErrors, TrackingScores, VelocityErrors};
+use crate::json::covered;
 use seese3_core::splits::HoldOut;
-use seese3_core::statistics::coverage;
 
 /// One line per disturbance, over all rooms, in the order of `found`.
-pub fn robustness_table(found: &[DisturbedTracking]) -> String {
-    let head = [
-        "disturbance",
-        "n",
-        "fused m",
-        "nearest frame m",
-        "standing still m",
-        "TRACKING",
-        "DEGRADED",
-        "LOST",
-        "TRACKING wrong",
-        "within 68 %",
-        "within 95 %",
-        "velocity error m/s",
-        "zero-velocity error m/s",
-        "detected after",
+pub fn robustness_table(found: &[DisturbedTracking]) -> Table {
+    let columns: [Column<DisturbedTracking>; 14] = [
+        Text("disturbance", |line| line.disturbance.name()),
+        Text("n", |line| line.frames.to_string()),
+        Number("fused m", 3, |line| line.scores.ape.fused),
+        Number("nearest frame m", 3, |line| line.scores.ape.nearest_frame),
+        Number("standing still m", 3, |line| line.scores.ape.standing_still),
+        Number("TRACKING", 3, |line| line.statuses.tracking),
+        Number("DEGRADED", 3, |line| line.statuses.degraded),
+        Number("LOST", 3, |line| line.statuses.lost),
+        Number("TRACKING wrong", 3, |line| {
+            line.scores.tracking_wrong.into()
+        }),
+        Number("within 68 %", 3, |line| {
+            covered(&line.scores.tracking_surprises)[0]
+        }),
+        Number("within 95 %", 3, |line| {
+            covered(&line.scores.tracking_surprises)[1]
+        }),
+        Number("velocity error m/s", 3, |line| {
+            line.scores.velocity.error_m_s
+        }),
+        Number("zero-velocity error m/s", 3, |line| {
+            line.scores.velocity.zero_m_s
+        }),
+        Text("detected after", |line| {
+            match (line.disturbance.extent(), line.noticed_after) {
+                (Extent::Whole, _) => String::new(),
+                (Extent::Part, Some(frames)) => frames.to_string(),
+                (Extent::Part, None) => "not always".to_owned(),
+            }
+        }),
     ];
 
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
-    lines.extend(by_disturbance(found).iter().map(|rooms| line(rooms)));
-    aligned(&lines)
+    Table::of(&by_disturbance(found), &columns)
 }
 
-/// Groups the results by disturbance, in order of first appearance.
-fn by_disturbance(found: &[DisturbedTracking]) -> Vec<Vec<&DisturbedTracking>> {
+/// The results over all rooms by disturbance, in order of first appearance.
+fn by_disturbance(found: &[DisturbedTracking]) -> Vec<DisturbedTracking> {
     let mut groups: Vec<Vec<&DisturbedTracking>> = Vec::new();
     for one in found {
-        let group = groups
-            .iter_mut()
-            .find(|group| group[0].disturbance == one.disturbance);
-        match group {
+        let mut known = groups.iter_mut();
+        match known.find(|group| group[0].disturbance == one.disturbance) {
             Some(group) => group.push(one),
             None => groups.push(vec![one]),
         }
     }
 
-    groups
-}
-
-fn line(rooms: &[&DisturbedTracking]) -> Vec<String> {
-    let scores = scores_of(rooms);
-    let ape = AnswerErrors::mean(scores.iter().map(|scores| &scores.ape));
-    let velocity = VelocityErrors::mean(scores.iter().map(|scores| &scores.velocity));
-    let surprises: Vec<f64> = scores
+    let together = groups
         .iter()
-        .flat_map(|scores| &scores.tracking_surprises)
-        .copied()
-        .collect();
-    let covered = coverage(&surprises);
-    let status = StatusJson::of(rooms);
-
-    vec![
-        rooms[0].disturbance.name(),
-        frames(rooms).to_string(),
-        format!("{:.3}", ape.fused),
-        format!("{:.3}", ape.nearest_frame),
-        format!("{:.3}", ape.standing_still),
-        format!("{:.3}", status.tracking),
-        format!("{:.3}", status.degraded),
-        format!("{:.3}", status.lost),
-        format!("{:.3}", wrong_share(&scores)),
-        format!("{:.3}", covered.within_68),
-        format!("{:.3}", covered.within_95),
-        format!("{:.3}", velocity.error_m_s),
-        format!("{:.3}", velocity.zero_m_s),
-        match (rooms[0].disturbance.extent(), noticed_after(rooms)) {
-            (Extent::Whole, _) => String::new(),
-            (Extent::Part, Some(frames)) => frames.to_string(),
-            (Extent::Part, None) => "not always".to_owned(),
-        },
-    ]
-}
-
-fn scores_of<'a>(rooms: &[&'a DisturbedTracking]) -> Vec<&'a TrackingScores> {
-    rooms.iter().map(|room| &room.scores).collect()
-}
-
-fn frames(rooms: &[&DisturbedTracking]) -> usize {
-    rooms.iter().map(|room| room.frames).sum()
-}
-
-/// The largest frame count over rooms; `None` if a room did not detect the disturbance.
-fn noticed_after(rooms: &[&DisturbedTracking]) -> Option<usize> {
-    rooms
-        .iter()
-        .try_fold(0, |most, room| Some(most.max(room.noticed_after?)))
+        .map(|rooms| DisturbedTracking::together(rooms));
+    together.collect()
 }
 
 /// The file of `seese3 evaluate robustness --json`.
 #[derive(Debug, Serialize)]
 pub struct RobustnessJson {
     /// One row per disturbance, over all rooms.
-    rows: Vec<RowJson>,
+    rows: Vec<DisturbedTracking>,
     /// One row per disturbance and room.
-    rooms: Vec<RowJson>,
+    rooms: Vec<DisturbedTracking>,
     adapter: String,
     hold_out: &'static str,
-}
-
-#[derive(Debug, Serialize)]
-struct RowJson {
-    disturbance: String,
-    /// The room; absent in rows over all rooms.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    room: Option<String>,
-    /// Number of scored frames.
-    n: usize,
-    #[serde(flatten)]
-    scores: ScoresJson,
-    status: StatusJson,
-    /// Number of disturbed frames until the status left TRACKING. Null if it stayed TRACKING, or
-    /// if the disturbance covers whole streams.
-    noticed_after: Option<usize>,
-}
-
-/// Fractions of the scored frames by status.
-#[derive(Debug, Serialize)]
-struct StatusJson {
-    tracking: f64,
-    degraded: f64,
-    lost: f64,
-    relocalizing: f64,
 }
 
 /// Builds the JSON record of an evaluation with the named adapter.
@@ -140,51 +80,15 @@ pub fn robustness_json(
     adapter: &str,
     hold_out: HoldOut,
 ) -> RobustnessJson {
-    let one = |room: &DisturbedTracking| RowJson {
-        room: Some(room.room.clone()),
-        ..RowJson::of(&[room])
+    let one = |room: &DisturbedTracking| DisturbedTracking {
+        room: room.room.clone(),
+        ..DisturbedTracking::together(&[room])
     };
 
     RobustnessJson {
-        rows: by_disturbance(found)
-            .iter()
-            .map(|rooms| RowJson::of(rooms))
-            .collect(),
+        rows: by_disturbance(found),
         rooms: found.iter().map(one).collect(),
         adapter: adapter.to_owned(),
         hold_out: hold_out.name(),
-    }
-}
-
-impl RowJson {
-    fn of(rooms: &[&DisturbedTracking]) -> Self {
-        Self {
-            disturbance: rooms[0].disturbance.name(),
-            room: None,
-            n: frames(rooms),
-            scores: scores_json(&scores_of(rooms)),
-            status: StatusJson::of(rooms),
-            noticed_after: match rooms[0].disturbance.extent() {
-                Extent::Whole => None,
-                Extent::Part => noticed_after(rooms),
-            },
-        }
-    }
-}
-
-impl StatusJson {
-    fn of(rooms: &[&DisturbedTracking]) -> Self {
-        let count = frames(rooms) as f64;
-        let share = |of: fn(&DisturbedTracking) -> f64| {
-            let counted = rooms.iter().map(|room| of(room) * room.frames as f64);
-            counted.sum::<f64>() / count
-        };
-
-        Self {
-            tracking: share(|room| room.statuses.tracking),
-            degraded: share(|room| room.statuses.degraded),
-            lost: share(|room| room.statuses.lost),
-            relocalizing: share(|room| room.statuses.relocalizing),
-        }
     }
 }

@@ -2,32 +2,25 @@
 
 use serde::Serialize;
 
-use super::table::aligned;
+use super::table::Column::Text;
+use super::table::Table;
 use crate::theory::{Bound, Check};
 
 /// One line per check: the measured value and its bound.
-pub fn theory_table(checks: &[Check]) -> String {
-    aligned(&theory_table_rows(checks))
-}
-
-/// The cells of [`theory_table`], header row first.
-pub fn theory_table_rows(checks: &[Check]) -> Vec<Vec<String>> {
-    let head = ["theorem: what", "measured", "bound", ""];
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
-    for check in checks {
-        let measured = number(check.measured);
-        let verdict = if check.holds() { "" } else { "NOT KEPT" };
-        let what = format!("{}: {}", check.theorem, check.what);
-
-        lines.push(vec![
-            what,
-            measured,
-            bound_text(check.bound),
-            verdict.to_owned(),
-        ]);
-    }
-
-    lines
+pub fn theory_table(checks: &[Check]) -> Table {
+    Table::of(
+        checks,
+        &[
+            Text("theorem: what", |check| {
+                format!("{}: {}", check.theorem, check.what)
+            }),
+            Text("measured", |check| number(check.measured)),
+            Text("bound", |check| bound_text(check.bound)),
+            Text("", |check| {
+                if check.holds() { "" } else { "NOT KEPT" }.to_owned()
+            }),
+        ],
+    )
 }
 
 fn number(value: f64) -> String {
@@ -56,8 +49,8 @@ pub struct TheoryJson {
 
 #[derive(Debug, Serialize)]
 struct CheckJson {
-    theorem: String,
-    what: String,
+    theorem: &'static str,
+    what: &'static str,
     measured: f64,
     /// The bound in words.
     bound: String,
@@ -67,8 +60,8 @@ struct CheckJson {
 /// Builds the JSON record of checks.
 pub fn theory_json(checks: &[Check]) -> TheoryJson {
     let entry = |check: &Check| CheckJson {
-        theorem: check.theorem.to_string(),
-        what: check.what.to_string(),
+        theorem: check.theorem,
+        what: check.what,
         measured: check.measured,
         bound: bound_text(check.bound),
         holds: check.holds(),

@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use serde::Serialize;
+use serde::ser::SerializeStruct;
+use serde::{Serialize, Serializer};
 
-use super::json::{MotionJson, RateJson};
-use super::table::aligned;
+use super::table::Table;
 use crate::experiments::seeds::TrainingRun;
+use crate::json::MotionJson;
 use seese3_core::adapter::{PairPlan, TrainingRecord};
 use seese3_core::eval::LEAST_CONSTANT_R2;
 use seese3_core::statistics::{deviation, mean};
@@ -16,60 +17,35 @@ const FEWEST_TEST_PAIRS: usize = 10;
 
 /// R² by part of the motion, one line per seed; with several seeds also their mean and sample
 /// standard deviation.
-pub fn training_table(runs: &[TrainingRun]) -> String {
-    let head = [
-        "seed",
-        "overall",
-        "transl.",
-        "rotation",
-        "direct.",
-        "magnit.",
-        "train R²",
-        "R² of mean",
-        "Hit@0.1",
-        "s",
+pub fn training_table(runs: &[TrainingRun]) -> Table {
+    let columns: [(&str, fn(&TrainingRun) -> f64); 9] = [
+        ("overall", |run| run.record.test.overall),
+        ("transl.", |run| run.record.test.translation),
+        ("rotation", |run| run.record.test.rotation),
+        ("direct.", |run| run.record.test.direction),
+        ("magnit.", |run| run.record.test.magnitude),
+        ("train R²", |run| run.record.train.overall),
+        ("R² of mean", |run| run.record.train_mean_r2),
+        ("Hit@0.1", |run| run.hit_rate.rate),
+        ("s", |run| run.seconds),
     ];
 
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
-
-    // In the column order, from `overall` on.
-    let numbers = |run: &TrainingRun| {
-        let test = &run.record.test;
-        let hit = run.hit_rate.rate;
-
-        [
-            test.overall,
-            test.translation,
-            test.rotation,
-            test.direction,
-            test.magnitude,
-            run.record.train.overall,
-            run.record.train_mean_r2,
-            hit,
-            run.seconds,
-        ]
-    };
-
+    let titles = columns.map(|(title, _)| title).join(" | ");
+    let mut table = Table::new(&format!("seed | {titles}"));
     for run in runs {
-        let mut cells = vec![run.record.config.seed.to_string()];
-        cells.extend(numbers(run).into_iter().map(number_text));
-        lines.push(cells);
+        let cells = columns.map(|(_, of)| number_text(of(run)));
+        table.row(run.record.config.seed.to_string(), cells);
     }
 
     // A single seed has no standard deviation.
     if runs.len() > 1 {
-        for (label, of) in [("mean", mean as fn(&[f64]) -> f64), ("± sd", deviation)] {
-            let mut cells = vec![label.to_owned()];
-            cells.extend((0..9).map(|column| {
-                let values: Vec<f64> = runs.iter().map(|run| numbers(run)[column]).collect();
-                number_text(of(&values))
-            }));
-
-            lines.push(cells);
+        for (label, over) in [("mean", mean as fn(&[f64]) -> f64), ("± sd", deviation)] {
+            let over_runs = |of| over(&runs.iter().map(of).collect::<Vec<f64>>());
+            table.row(label, columns.map(|(_, of)| number_text(over_runs(of))));
         }
     }
 
-    aligned(&lines)
+    table
 }
 
 /// A warning about the table: the adapter is worse than the constant, or there are too few test
@@ -115,138 +91,114 @@ fn number_text(value: f64) -> String {
 
 /// The JSON record of `seese3 train`: one entry per seed, and the shared protocol.
 #[derive(Debug, Serialize)]
-pub struct TrainingJson {
-    runs: Vec<RunJson>,
-    adapter: PublishedJson,
-    protocol: Option<ProtocolJson>,
+pub struct TrainingJson<'a> {
+    runs: Vec<RunJson<'a>>,
+    adapter: PublishedJson<'a>,
+    protocol: Option<ProtocolJson<'a>>,
 }
 
 #[derive(Debug, Serialize)]
-struct RunJson {
-    seed: u64,
-    test: MotionJson,
-    train: MotionJson,
-    train_mean_r2: f64,
-    /// Test scores by room, in the order of the protocol's rooms.
-    rooms: Vec<MotionJson>,
-    inverse_poincare_affine: HitsJson,
-    seconds: f64,
-}
-
-#[derive(Debug, Serialize)]
-struct HitsJson {
-    /// Hit rates, keyed by ε as text.
-    hit: BTreeMap<&'static str, RateJson>,
-}
-
-#[derive(Debug, Serialize)]
-struct PublishedJson {
-    name: String,
+struct PublishedJson<'a> {
+    name: &'a str,
     revision: u64,
 }
 
 #[derive(Debug, Serialize)]
-struct ProtocolJson {
-    preset: String,
-    split: &'static str,
-    stride: u32,
-    rooms: Vec<TrainedRoomJson>,
-    training_pairs: usize,
-    /// The shortest and the longest stride of training pairs sampled from a range.
-    drawn_from_strides: Option<[u32; 2]>,
-    epochs: usize,
-    optimiser_steps: u64,
-    batch: usize,
-    learning_rate: f64,
-    weight_decay: f64,
-    clip_norm: f64,
-    hidden: usize,
-    latent: usize,
-    charts: usize,
-    mixing: &'static str,
-    loss: &'static str,
-    standardised_features: bool,
-    noise: f64,
-    weight_average: f64,
-    through_zero: bool,
-    calibrated_on: Vec<String>,
-    twist: &'static str,
-    /// Degrees of freedom of the σ that standardizes the training twists: 0, the population
-    /// deviation. Deviations over seeds, elsewhere in these files, are sample deviations.
-    deviation_ddof: u32,
-}
-
-#[derive(Debug, Serialize)]
-struct TrainedRoomJson {
-    room: String,
+struct RoomJson<'a> {
+    room: &'a str,
     revision: u64,
 }
 
 /// Builds the JSON record of a training: the runs of all seeds, and the published adapter.
-pub fn training_json(runs: &[TrainingRun], adapter: &str, revision: u64) -> TrainingJson {
+pub fn training_json<'a>(
+    runs: &'a [TrainingRun],
+    adapter: &'a str,
+    revision: u64,
+) -> TrainingJson<'a> {
     TrainingJson {
-        runs: runs.iter().map(run_json).collect(),
+        runs: runs.iter().map(RunJson).collect(),
         adapter: PublishedJson {
-            name: adapter.to_owned(),
+            name: adapter,
             revision,
         },
         // The runs differ only in their seed, so the protocol of the first run holds for all.
-        protocol: runs.first().map(|run| protocol_json(&run.record)),
+        protocol: runs.first().map(|run| ProtocolJson(&run.record)),
     }
 }
 
-fn run_json(run: &TrainingRun) -> RunJson {
-    RunJson {
-        seed: run.record.config.seed,
-        test: (&run.record.test).into(),
-        train: (&run.record.train).into(),
-        train_mean_r2: run.record.train_mean_r2,
-        rooms: run.record.room_tests.iter().map(MotionJson::from).collect(),
-        inverse_poincare_affine: HitsJson {
-            hit: BTreeMap::from([("0.1", (&run.hit_rate).into())]),
-        },
-        seconds: run.seconds,
+#[derive(Debug)]
+struct RunJson<'a>(&'a TrainingRun);
+
+impl Serialize for RunJson<'_> {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        let TrainingRun {
+            record: training,
+            hit_rate,
+            seconds,
+        } = self.0;
+        let rooms: Vec<MotionJson> = training.room_tests.iter().map(MotionJson::from).collect();
+        let hit = BTreeMap::from([("hit", BTreeMap::from([("0.1", hit_rate)]))]);
+
+        let mut record = to.serialize_struct("Run", 7)?;
+        record.serialize_field("seed", &training.config.seed)?;
+        record.serialize_field("test", &MotionJson::from(&training.test))?;
+        record.serialize_field("train", &MotionJson::from(&training.train))?;
+        record.serialize_field("train_mean_r2", &training.train_mean_r2)?;
+        // Test scores by room, in the order of the protocol's rooms.
+        record.serialize_field("rooms", &rooms)?;
+        record.serialize_field("inverse_poincare_affine", &hit)?;
+        record.serialize_field("seconds", seconds)?;
+        record.end()
     }
 }
 
-fn protocol_json(record: &TrainingRecord) -> ProtocolJson {
-    let config = &record.config;
-    let rooms = record.rooms.iter().map(|(room, revision)| TrainedRoomJson {
-        room: room.to_string(),
-        revision: *revision,
-    });
-    let calibrated_on = record
-        .calibrated_on
-        .iter()
-        .map(|(room, _)| room.to_string());
+#[derive(Debug)]
+struct ProtocolJson<'a>(&'a TrainingRecord);
 
-    ProtocolJson {
-        preset: record.preset.clone(),
-        split: record.split.name(),
-        stride: record.stride,
-        rooms: rooms.collect(),
-        training_pairs: record.pair_count,
-        drawn_from_strides: match &record.pairs {
+impl Serialize for ProtocolJson<'_> {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        let training = self.0;
+        let config = &training.config;
+
+        let rooms = training.rooms.iter().map(|(room, revision)| RoomJson {
+            room: room.as_str(),
+            revision: *revision,
+        });
+        let calibrated_on = training.calibrated_on.iter().map(|(room, _)| room.as_str());
+
+        // The shortest and the longest stride of training pairs sampled from a range.
+        let drawn_from_strides = match &training.pairs {
             PairPlan::Stride(_) => None,
             PairPlan::Range(range) => Some([range.low, range.high]),
-        },
-        epochs: config.epochs,
-        optimiser_steps: record.optimiser_steps(),
-        batch: config.batch,
-        learning_rate: config.learning_rate,
-        weight_decay: config.weight_decay,
-        clip_norm: config.clip_norm,
-        hidden: config.hidden,
-        latent: config.latent,
-        charts: config.charts,
-        mixing: config.mixing.name(),
-        loss: config.loss.name(),
-        standardised_features: config.standardise,
-        noise: config.noise,
-        weight_average: config.average,
-        through_zero: config.through_zero,
-        calibrated_on: calibrated_on.collect(),
-        twist: "body frame, (v, omega), metres and radians",
-        deviation_ddof: 0,
+        };
+
+        let mut record = to.serialize_struct("Protocol", 24)?;
+        record.serialize_field("preset", &training.preset)?;
+        record.serialize_field("split", training.split.name())?;
+        record.serialize_field("stride", &training.stride)?;
+        record.serialize_field("rooms", &rooms.collect::<Vec<_>>())?;
+        record.serialize_field("training_pairs", &training.pair_count)?;
+        record.serialize_field("drawn_from_strides", &drawn_from_strides)?;
+        record.serialize_field("epochs", &config.epochs)?;
+        record.serialize_field("optimiser_steps", &training.optimiser_steps())?;
+        record.serialize_field("batch", &config.batch)?;
+        record.serialize_field("learning_rate", &config.learning_rate)?;
+        record.serialize_field("weight_decay", &config.weight_decay)?;
+        record.serialize_field("clip_norm", &config.clip_norm)?;
+        record.serialize_field("hidden", &config.hidden)?;
+        record.serialize_field("latent", &config.latent)?;
+        record.serialize_field("charts", &config.charts)?;
+        record.serialize_field("mixing", config.mixing.name())?;
+        record.serialize_field("loss", config.loss.name())?;
+        record.serialize_field("standardised_features", &config.standardise)?;
+        record.serialize_field("noise", &config.noise)?;
+        record.serialize_field("weight_average", &config.average)?;
+        record.serialize_field("through_zero", &config.through_zero)?;
+        record.serialize_field("calibrated_on", &calibrated_on.collect::<Vec<_>>())?;
+        record.serialize_field("twist", "body frame, (v, omega), metres and radians")?;
+        // Degrees of freedom of the σ that standardizes the training twists: 0, the population
+        // deviation. Deviations over seeds, elsewhere in these files, are sample deviations.
+        record.serialize_field("deviation_ddof", &0)?;
+        record.end()
     }
 }

@@ -5,57 +5,77 @@ use serde::Serialize;
 use seese3_core::statistics::{RoomMean, bootstrap_mean, paired_difference};
 
 use super::Found;
-use super::claims::{Claim, Verdict, count_words, is_above_zero};
-use super::cross::{AFFINE, HOMOGENEOUS, rate_text};
+use super::claims::{Claim, holds_for_each, is_above_zero};
+use super::cross::{AFFINE, HOMOGENEOUS};
 use super::notes::published_name;
 use super::plans::{MEMBERS, PlanKind, PlanResult, SetResults};
 use crate::experiments::cross_room::{CLIPPED_R2, CrossRoomRun, MotionSummary};
-use crate::report::{RoomMeanJson, Section, room_difference_text, room_mean_text};
+use crate::report::Column::{self, Text};
+use crate::report::{Section, Table, count_text, room_difference_text, room_mean_text};
 
 const CALIBRATED: &str = "inverse-poincare-homogeneous+calibrated";
 
+/// A plan compared with the paper's preset on all rooms: a row of the table and of the record.
+/// Differences are paired by room.
+#[derive(Debug, Serialize)]
+pub struct BetterRecord {
+    features: String,
+    #[serde(serialize_with = "plan_name")]
+    plan: PlanKind,
+    /// The adapter's name in the store.
+    adapter: String,
+    navigator: &'static str,
+    learned_rooms: usize,
+    calibration_rooms: usize,
+    hit: RoomMean,
+    /// Hit rate minus that of the baseline's affine reading.
+    over_affine: RoomMean,
+    /// Hit rate minus that of the baseline's homogeneous reading.
+    over_homogeneous: RoomMean,
+    /// Clipped R² minus that of the baseline.
+    clipped_r2_over_paper_range: RoomMean,
+    #[serde(skip)]
+    r2: Option<MotionSummary>,
+}
+
+fn plan_name<S: serde::Serializer>(plan: &PlanKind, to: S) -> Result<S::Ok, S::Error> {
+    to.serialize_str(plan.name())
+}
+
 /// Builds the section that compares other navigators and presets with the paper's.
 pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<BetterRecord>> {
-    let mut section = Section::new("Better than the paper's navigator and recipe?");
+    // Compare only plans that use all rooms. Plans with calibration rooms train on fewer.
+    let of_set = |set: &SetResults| {
+        let baseline = &set.baseline().run;
+        let plans = set.on_all_rooms.iter();
+        plans
+            .map(|result| compared(&set.features, result, baseline))
+            .collect::<Vec<_>>()
+    };
+    let record: Vec<BetterRecord> = results.iter().flat_map(of_set).collect();
 
-    let head = [
-        "features",
-        "adapter",
-        "navigator",
-        "Hit@0.1 [95 %]",
-        "over affine [95 %]",
-        "over homogeneous [95 %]",
-        "R² > 0",
-        "clipped R² over paper-range [95 %]",
+    let columns: [Column<BetterRecord>; 8] = [
+        Text("features", |row| row.features.clone()),
+        Text("adapter", |row| row.plan.name().to_owned()),
+        Text("navigator", |row| row.navigator.to_owned()),
+        Text("Hit@0.1 [95 %]", |row| room_mean_text(&row.hit)),
+        Text("over affine [95 %]", |row| {
+            room_difference_text(&row.over_affine)
+        }),
+        Text("over homogeneous [95 %]", |row| {
+            room_difference_text(&row.over_homogeneous)
+        }),
+        Text("R² > 0", |row| {
+            row.r2
+                .map_or_else(String::new, |r2| count_text(&r2.positive, 2))
+        }),
+        Text("clipped R² over paper-range [95 %]", |row| {
+            room_difference_text(&row.clipped_r2_over_paper_range)
+        }),
     ];
 
-    let mut rows = vec![head.map(str::to_owned).to_vec()];
-    let mut record = Vec::new();
-    let mut navigator_wins = Vec::new();
-    let mut recipe_wins = Vec::new();
-
-    for set in results {
-        let baseline = &set.baseline().run;
-
-        // Compare only plans that use all rooms. Plans with calibration rooms train on fewer.
-        for result in &set.on_all_rooms {
-            let compared = compared(&set.features, result, baseline);
-            rows.push(compared.row);
-            record.push(compared.record);
-
-            // Two rows decide the claims: the calibrated navigator and preset steady.
-            match result.plan.kind {
-                PlanKind::PaperRangeCalibrated => {
-                    let over = [&compared.over_affine, &compared.over_homogeneous];
-                    navigator_wins.push(all_of(over.map(is_above_zero)));
-                }
-                PlanKind::Steady => recipe_wins.push(is_above_zero(&compared.clipped_r2)),
-                _ => {}
-            }
-        }
-    }
-
-    section.table(rows);
+    let mut section = Section::new("Better than the paper's navigator and recipe?");
+    section.table(Table::of(&record, &columns));
 
     section.text(format!(
         "Every row had the same rooms: those with errors measured aside learn from fewer of them. All are compared, room \
@@ -63,66 +83,32 @@ pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<Bet
          adapter's epochs. No pose of a held-out room is used but to score."
     ));
 
-    claims.push(Claim {
-        claim: "ours: the calibrated navigator hits more often than inverse Poincaré in rooms never seen",
-        verdict: Verdict::of_intervals(&navigator_wins),
-        found: format!(
-            "both differences' intervals are above zero: {}",
-            count_words(&navigator_wins, "feature sets")
-        ),
-    });
+    // Two plans decide the claims: the calibrated navigator and preset steady.
+    let of_plan = |plan: PlanKind| record.iter().filter(move |row| row.plan == plan);
+    let navigator_wins: Vec<Option<bool>> = of_plan(PlanKind::PaperRangeCalibrated)
+        .map(|row| holds_for_each(&[&row.over_affine, &row.over_homogeneous].map(is_above_zero)))
+        .collect();
+    let recipe_wins: Vec<Option<bool>> = of_plan(PlanKind::Steady)
+        .map(|row| is_above_zero(&row.clipped_r2_over_paper_range))
+        .collect();
 
-    claims.push(Claim {
-        claim: "ours: preset steady reads motion better than paper-range in rooms never seen",
-        verdict: Verdict::of_intervals(&recipe_wins),
-        found: format!(
-            "the interval of the difference of clipped R² is above zero: {}",
-            count_words(&recipe_wins, "feature sets")
-        ),
-    });
+    claims.push(Claim::by_intervals(
+        "ours: the calibrated navigator hits more often than inverse Poincaré in rooms never seen",
+        "both differences' intervals are above zero",
+        &navigator_wins,
+        "feature sets",
+    ));
+    claims.push(Claim::by_intervals(
+        "ours: preset steady reads motion better than paper-range in rooms never seen",
+        "the interval of the difference of clipped R² is above zero",
+        &recipe_wins,
+        "feature sets",
+    ));
 
     Found { section, record }
 }
 
-/// Whether both hold: false if one is false, else `None` if one is unknown.
-fn all_of(both: [Option<bool>; 2]) -> Option<bool> {
-    match both {
-        [Some(true), Some(true)] => Some(true),
-        [Some(false), _] | [_, Some(false)] => Some(false),
-        _ => None,
-    }
-}
-
-/// JSON record of a table row.
-#[derive(Debug, Serialize)]
-pub struct BetterRecord {
-    features: String,
-    plan: &'static str,
-    /// The adapter's name in the store.
-    adapter: String,
-    navigator: &'static str,
-    learned_rooms: usize,
-    calibration_rooms: usize,
-    hit: RoomMeanJson,
-    over_affine: RoomMeanJson,
-    over_homogeneous: RoomMeanJson,
-    clipped_r2_over_paper_range: RoomMeanJson,
-}
-
-/// A plan compared with the baseline: its table row, its record, and three differences paired by
-/// room.
-struct Compared {
-    row: Vec<String>,
-    record: BetterRecord,
-    /// Hit rate minus that of the baseline's affine reading.
-    over_affine: RoomMean,
-    /// Hit rate minus that of the baseline's homogeneous reading.
-    over_homogeneous: RoomMean,
-    /// Clipped R² minus that of the baseline.
-    clipped_r2: RoomMean,
-}
-
-fn compared(features: &str, result: &PlanResult, baseline: &CrossRoomRun) -> Compared {
+fn compared(features: &str, result: &PlanResult, baseline: &CrossRoomRun) -> BetterRecord {
     let PlanResult { plan, run } = result;
 
     // An adapter with calibration rooms is shown with the calibrated navigator.
@@ -134,43 +120,20 @@ fn compared(features: &str, result: &PlanResult, baseline: &CrossRoomRun) -> Com
 
     // Both runs have the same rooms in the same order.
     let ours = run.hit_rates(navigator);
-    let hit = bootstrap_mean(&ours, 0);
-    let over_affine = paired_difference(&ours, &baseline.hit_rates(AFFINE), 0);
-    let over_homogeneous = paired_difference(&ours, &baseline.hit_rates(HOMOGENEOUS), 0);
-    let clipped_r2 = paired_difference(&clipped(run), &clipped(baseline), 0);
+    let over = |name: &str| paired_difference(&ours, &baseline.hit_rates(name), 0);
 
-    let positive =
-        MotionSummary::of(&run.r2(), 0).map_or_else(String::new, |s| rate_text(&s.positive));
-    let row = vec![
-        features.to_owned(),
-        plan.kind.name().to_owned(),
-        navigator.to_owned(),
-        room_mean_text(&hit),
-        room_difference_text(&over_affine),
-        room_difference_text(&over_homogeneous),
-        positive,
-        room_difference_text(&clipped_r2),
-    ];
-
-    let record = BetterRecord {
+    BetterRecord {
         features: features.to_owned(),
-        plan: plan.kind.name(),
+        plan: plan.kind,
         adapter: published_name(&plan.adapter_name(), features),
         navigator,
         learned_rooms: run.training_rooms.len(),
         calibration_rooms: run.calibration_rooms.len(),
-        hit: (&hit).into(),
-        over_affine: (&over_affine).into(),
-        over_homogeneous: (&over_homogeneous).into(),
-        clipped_r2_over_paper_range: (&clipped_r2).into(),
-    };
-
-    Compared {
-        row,
-        record,
-        over_affine,
-        over_homogeneous,
-        clipped_r2,
+        hit: bootstrap_mean(&ours, 0),
+        over_affine: over(AFFINE),
+        over_homogeneous: over(HOMOGENEOUS),
+        clipped_r2_over_paper_range: paired_difference(&clipped(run), &clipped(baseline), 0),
+        r2: MotionSummary::of(&run.r2(), 0),
     }
 }
 

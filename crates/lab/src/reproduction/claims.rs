@@ -1,23 +1,47 @@
 //! Verdicts on the paper's claims, and on ours, from the given rooms.
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use seese3_core::statistics::{Rate, RoomMean};
 
-use crate::report::Section;
+use crate::report::Column::{self, Text};
+use crate::report::{Section, Table};
 
 /// A claim and the evidence found for or against it.
+#[derive(Debug, Serialize)]
 pub struct Claim {
     /// The claim, one sentence.
     pub claim: &'static str,
     /// Whether these rooms confirm it.
+    #[serde(serialize_with = "word")]
     pub verdict: Verdict,
     /// The evidence for the verdict, in words.
     pub found: String,
 }
 
+fn word<S: Serializer>(verdict: &Verdict, to: S) -> Result<S::Ok, S::Error> {
+    to.serialize_str(verdict.word())
+}
+
+impl Claim {
+    /// A claim decided by one confidence interval per case; see [`Verdict::of_intervals`]. `found`
+    /// says when it holds in a case, and `of_what` what the cases are.
+    pub fn by_intervals(
+        claim: &'static str,
+        found: &str,
+        cases: &[Option<bool>],
+        of_what: &str,
+    ) -> Self {
+        Self {
+            claim,
+            verdict: Verdict::of_intervals(cases),
+            found: format!("{found}: {}", count_words(cases, of_what)),
+        }
+    }
+}
+
 /// The outcome of testing a claim.
-#[derive(Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
     /// The claim holds in every case.
     Confirmed,
@@ -130,40 +154,13 @@ pub fn count_words(cases: &[Option<bool>], of_what: &str) -> String {
 pub fn section(claims: &[Claim]) -> Section {
     let mut section = Section::new("The paper's claims in these rooms");
 
-    let mut rows = vec![
-        ["claim", "here", "what was found"]
-            .map(str::to_owned)
-            .to_vec(),
+    let columns: [Column<Claim>; 3] = [
+        Text("claim", |claim| claim.claim.to_owned()),
+        Text("here", |claim| claim.verdict.word().to_owned()),
+        Text("what was found", |claim| claim.found.clone()),
     ];
-
-    for claim in claims {
-        rows.push(vec![
-            claim.claim.to_owned(),
-            claim.verdict.word().to_owned(),
-            claim.found.clone(),
-        ]);
-    }
-
-    section.table(rows);
+    section.table(Table::of(claims, &columns));
     section
-}
-
-/// A claim in `record.json`.
-#[derive(Debug, Serialize)]
-pub struct ClaimRecord {
-    claim: &'static str,
-    verdict: &'static str,
-    found: String,
-}
-
-pub fn records(claims: &[Claim]) -> Vec<ClaimRecord> {
-    let record = |claim: &Claim| ClaimRecord {
-        claim: claim.claim,
-        verdict: claim.verdict.word(),
-        found: claim.found.clone(),
-    };
-
-    claims.iter().map(record).collect()
 }
 
 #[cfg(test)]

@@ -3,17 +3,15 @@
 use serde::Serialize;
 
 use seese3_core::adapter::Preset;
-use seese3_core::motion_scores::MotionScores;
 use seese3_core::splits::Split;
 use seese3_core::statistics::{mean_of_known, paired_difference};
 
-use super::claims::{Claim, Verdict, count_words, holds_for_each, is_above_zero};
-use super::render::spread;
+use super::claims::{Claim, holds_for_each, is_above_zero};
 use super::{Error, FeatureSet, Found, Reproduction, paper};
 use seese3_core::training::RoomData;
 
 use crate::experiments::formulations::{Comparison, RoomPooling, compare};
-use crate::report::{FormulationsJson, Section, formulations_json};
+use crate::report::{Section, Table, add_formulations, fixed};
 
 /// Maximum number of single-adapter rooms for the comparison, as in the paper.
 const SCENES: usize = 3;
@@ -24,7 +22,7 @@ pub struct FormulationRecord {
     features: String,
     /// The training of every formulation, in words.
     training: String,
-    scores: FormulationsJson,
+    scores: Comparison,
 }
 
 /// Builds the section that compares the adapter with the alternatives A to D.
@@ -43,7 +41,7 @@ pub fn section(
             set.features,
             training.words(given)
         ));
-        section.table(table_rows(&compared));
+        section.table(table(&compared));
 
         // The paper's training has one seed and no interval, so it does not enter the verdict.
         if training == Training::Base {
@@ -53,7 +51,7 @@ pub fn section(
         record.push(FormulationRecord {
             features: set.features.clone(),
             training: training.words(given),
-            scores: formulations_json(&compared),
+            scores: compared,
         });
     }
 
@@ -64,14 +62,12 @@ pub fn section(
         given.options.stride
     ));
 
-    claims.push(Claim {
-        claim: "the adapter's W(φ(z₂) − φ(z₁)) reads motion better than the alternatives A to D",
-        verdict: Verdict::of_intervals(&best),
-        found: format!(
-            "overall R² above that of each alternative, over seeds: {}",
-            count_words(&best, "feature sets")
-        ),
-    });
+    claims.push(Claim::by_intervals(
+        "the adapter's W(φ(z₂) − φ(z₁)) reads motion better than the alternatives A to D",
+        "overall R² above that of each alternative, over seeds",
+        &best,
+        "feature sets",
+    ));
 
     Ok(Found { section, record })
 }
@@ -101,53 +97,17 @@ fn is_best(compared: &Comparison) -> Option<bool> {
 }
 
 /// One row per formulation, then the row of the constant and the paper's rows.
-fn table_rows(compared: &Comparison) -> Vec<Vec<String>> {
-    let head = [
-        "formulation",
-        "overall",
-        "translation",
-        "rotation",
-        "direction",
-        "magnitude",
-    ];
-
-    let mut rows = vec![head.map(str::to_owned).to_vec()];
-    for score in &compared.formulations {
-        // One value per seed, already averaged over the rooms.
-        let column = |of: fn(&MotionScores) -> f64| score.runs.iter().map(of).collect::<Vec<_>>();
-
-        let parts = [
-            column(|s| s.translation),
-            column(|s| s.rotation),
-            column(|s| s.direction),
-            column(|s| s.magnitude),
-        ];
-
-        let mut row = vec![score.name.to_owned(), spread(&column(|s| s.overall))];
-        row.extend(
-            parts
-                .iter()
-                .map(|part| format!("{:.2}", mean_of_known(part))),
-        );
-
-        rows.push(row);
-    }
-    rows.push(vec![
-        "mean training motion".to_owned(),
-        format!("{:.2}", compared.constant_r2),
-    ]);
+fn table(compared: &Comparison) -> Table {
+    let mut table =
+        Table::new("formulation | overall | translation | rotation | direction | magnitude");
+    add_formulations(&mut table, compared, 2);
 
     // The paper's numbers follow ours as context: its encoders and rooms differ.
     for (name, numbers) in paper::ALTERNATIVES {
-        rows.push(
-            [format!("paper: {name}")]
-                .into_iter()
-                .chain(numbers.map(|x| format!("{x:.2}")))
-                .collect(),
-        );
+        table.row(format!("paper: {name}"), fixed(numbers, 2));
     }
 
-    rows
+    table
 }
 
 /// Training schedules of the formulations.
@@ -194,9 +154,7 @@ impl Training {
             self.scene_names(given)
         )
     }
-}
 
-impl Training {
     fn scene_names(self, given: &Reproduction<'_>) -> String {
         let names: Vec<&str> = scenes(&given.sets[0], self)
             .iter()
@@ -248,19 +206,16 @@ fn compared(
 mod tests {
     use super::*;
     use crate::experiments::formulations::FormulationScores;
+    use seese3_core::motion_scores::MotionScores;
 
     /// A comparison of the adapter with one alternative, from overall R² per seed.
     fn comparison(adapter: &[f64], alternative: &[f64], constant_r2: f64) -> Comparison {
-        let scores = |name, r2: &[f64]| FormulationScores {
-            name,
-            runs: r2
-                .iter()
-                .map(|&overall| MotionScores {
-                    overall,
-                    ..MotionScores::mean(&[])
-                })
-                .collect(),
+        let score = |&overall: &f64| MotionScores {
+            overall,
+            ..MotionScores::mean(&[])
         };
+        let scores =
+            |name, r2: &[f64]| FormulationScores::new(name, r2.iter().map(score).collect());
 
         Comparison {
             formulations: vec![

@@ -13,7 +13,6 @@ mod paper;
 mod pictures;
 mod plans;
 mod probes;
-mod render;
 mod settings;
 mod strides;
 mod success;
@@ -21,9 +20,12 @@ mod success;
 pub use claims::{Claim, Verdict};
 pub use notes::{Notes, ReproducedAdapter, published_name};
 
+use std::collections::BTreeSet;
+
 use serde::Serialize;
 
 use seese3_core::adapter::Preset;
+use seese3_core::features::FeatureSource;
 use seese3_core::image::RgbImage;
 use seese3_core::room::{FrameId, Room};
 use seese3_core::splits::Split;
@@ -31,11 +33,11 @@ use seese3_core::training::{RoomData, TrainingPlan};
 
 use crate::experiments::Error;
 use crate::experiments::adapter_sweep::SweepRow;
-use crate::report::{Document, Section, TheoryJson, theory_json, theory_table_rows};
+use crate::report::{Document, Section, Table, TheoryJson, theory_json, theory_table};
 use crate::theory::{Effort, checks};
 
 /// Settings of a reproduction, besides its rooms and features.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct Options {
     /// Frames from source to target.
     pub stride: u32,
@@ -44,12 +46,14 @@ pub struct Options {
     /// Numbers of training rooms along the scaling curve.
     pub sizes: Vec<usize>,
     /// Number of training rooms that plans with calibration use for calibration instead.
+    #[serde(rename = "aside")]
     pub calibration_rooms: usize,
     /// Number of seeds, from 0, in tables that average over seeds.
     pub seeds: u64,
     /// Number of seeds in the table of the alternatives A to D; the paper uses 15.
     pub formulation_seeds: u64,
     /// Number of epochs that overrides every preset, for a trial run.
+    #[serde(rename = "epochs_instead_of_the_presets")]
     pub epochs: Option<usize>,
 }
 
@@ -71,23 +75,17 @@ pub struct Reproduction<'a> {
     pub options: Options,
     /// One entry per feature set, the control last; each has the same rooms.
     pub sets: Vec<FeatureSet<'a>>,
-    /// Access to the images for the pictures of walks.
-    pub images: &'a dyn Images,
+    /// Reads images for the pictures of walks; this crate reads no files.
+    pub images: Images<'a>,
 }
 
-/// Access to the images of rooms; implemented by the caller, because this crate reads no files.
-pub trait Images: Sync {
-    /// The image of a frame.
-    ///
-    /// # Errors
-    /// The reason why the image cannot be read.
-    fn read(&self, room: &Room, frame: FrameId) -> Result<RgbImage, String>;
-
+/// Functions of the caller that read and write images. Errors are reasons, in words.
+#[derive(Clone, Copy)]
+pub struct Images<'a> {
+    /// Reads the image of a frame.
+    pub read: &'a (dyn Fn(&Room, FrameId) -> Result<RgbImage, String> + Sync),
     /// Encodes an image as a PNG file.
-    ///
-    /// # Errors
-    /// The reason why the image cannot be encoded.
-    fn png(&self, image: &RgbImage) -> Result<Vec<u8>, String>;
+    pub png: &'a (dyn Fn(&RgbImage) -> Result<Vec<u8>, String> + Sync),
 }
 
 /// The report, its machine-readable record, and the trained adapters.
@@ -112,9 +110,9 @@ pub struct ReproductionRecord {
     navigation: Vec<navigation::NavigationRecord>,
     cross_room: Vec<cross::ZeroShotRecord>,
     better: Vec<better::BetterRecord>,
-    pictures: pictures::PicturesRecord,
+    pictures: Vec<pictures::WalkRecord>,
     theory: TheoryJson,
-    claims: Vec<claims::ClaimRecord>,
+    claims: Vec<Claim>,
     protocol: ProtocolRecord,
 }
 
@@ -122,13 +120,8 @@ pub struct ReproductionRecord {
 #[derive(Debug, Serialize)]
 struct ProtocolRecord {
     features: Vec<String>,
-    stride: u32,
-    strides: Vec<u32>,
-    sizes: Vec<usize>,
-    aside: usize,
-    seeds: u64,
-    formulation_seeds: u64,
-    epochs_instead_of_the_presets: Option<usize>,
+    #[serde(flatten)]
+    options: Options,
     train: Vec<(String, u64)>,
     test: Vec<(String, u64)>,
     in_room: Vec<(String, u64)>,
@@ -291,7 +284,7 @@ pub fn reproduce(given: &Reproduction<'_>, done: &dyn Fn()) -> Result<Reproduced
         better: better.record,
         pictures: pictures.record,
         theory: theory.record,
-        claims: claims::records(&notes.claims),
+        claims: notes.claims,
         protocol: protocol(given),
     };
 
@@ -324,9 +317,7 @@ impl Reproduction<'_> {
 
         plan
     }
-}
 
-impl Reproduction<'_> {
     /// The training length of single-room adapters, in words.
     fn training_words(&self) -> String {
         match self.options.epochs {
@@ -337,7 +328,6 @@ impl Reproduction<'_> {
 }
 
 fn protocol(given: &Reproduction<'_>) -> ProtocolRecord {
-    let options = &given.options;
     let names = |rooms: &[RoomData<'_>]| {
         rooms
             .iter()
@@ -349,13 +339,7 @@ fn protocol(given: &Reproduction<'_>) -> ProtocolRecord {
     let set = &given.sets[0];
     ProtocolRecord {
         features: given.sets.iter().map(|set| set.features.clone()).collect(),
-        stride: options.stride,
-        strides: options.strides.clone(),
-        sizes: options.sizes.clone(),
-        aside: options.calibration_rooms,
-        seeds: options.seeds,
-        formulation_seeds: options.formulation_seeds,
-        epochs_instead_of_the_presets: options.epochs,
+        options: given.options.clone(),
         train: names(&set.train),
         test: names(&set.test),
         in_room: names(&set.in_room),
@@ -365,8 +349,8 @@ fn protocol(given: &Reproduction<'_>) -> ProtocolRecord {
 /// The section that lists the rooms and the feature sets.
 fn rooms_and_features(given: &Reproduction<'_>) -> Section {
     let mut section = Section::new("Rooms and features");
-    section.table(room_rows(&given.sets[0]));
-    section.table(feature_rows(&given.sets));
+    section.table(room_table(&given.sets[0]));
+    section.table(feature_table(&given.sets));
 
     section.text(
         "The paper's numbers stand beside these as context: encoders, rooms and sizes differ, and nothing here speaks of \
@@ -383,52 +367,48 @@ fn rooms_and_features(given: &Reproduction<'_>) -> Section {
     section
 }
 
-/// Table rows of the three groups of rooms, the same for every feature set.
-fn room_rows(set: &FeatureSet<'_>) -> Vec<Vec<String>> {
-    let head = ["rooms", "count", "frames", "recorded as"];
-    let mut rows = vec![head.map(str::to_owned).to_vec()];
-
+/// The three groups of rooms, the same for every feature set.
+fn room_table(set: &FeatureSet<'_>) -> Table {
+    let mut table = Table::new("rooms | count | frames | recorded as");
     for (what, rooms) in [
         ("learned together", &set.train),
         ("held out", &set.test),
         ("learned alone", &set.in_room),
     ] {
         let frames: usize = rooms.iter().map(|data| data.room.frame_count()).sum();
-        let mut formats: Vec<&str> = rooms
+        let formats: BTreeSet<&str> = rooms
             .iter()
             .map(|data| data.room.provenance().format.as_str())
             .collect();
-        formats.sort_unstable();
-        formats.dedup();
+        let formats: Vec<&str> = formats.into_iter().collect();
 
-        rows.push(vec![
-            what.to_owned(),
+        let cells = [
             rooms.len().to_string(),
             frames.to_string(),
             formats.join(", "),
-        ]);
+        ];
+        table.row(what, cells);
     }
 
-    rows
+    table
 }
 
-fn feature_rows(sets: &[FeatureSet<'_>]) -> Vec<Vec<String>> {
-    let head = ["features", "encoder", "layer", "pooling", "columns"];
-    let mut rows = vec![head.map(str::to_owned).to_vec()];
-
+fn feature_table(sets: &[FeatureSet<'_>]) -> Table {
+    let mut table = Table::new("features | encoder | layer | pooling | columns");
     for set in sets {
         // All rooms of a set have the same feature source; training on several rooms requires it.
-        let source = set.train[0].features.source();
-        rows.push(vec![
-            set.features.clone(),
-            source.encoder.clone(),
-            source.layer.clone(),
-            source.pooling.clone(),
-            source.dim.to_string(),
-        ]);
+        let FeatureSource {
+            encoder,
+            layer,
+            pooling,
+            dim,
+            ..
+        } = set.train[0].features.source();
+        let words = [encoder, layer, pooling].map(String::clone);
+        table.row(&set.features, words.into_iter().chain([dim.to_string()]));
     }
 
-    rows
+    table
 }
 
 /// The section about the names of the published adapters.
@@ -447,7 +427,7 @@ fn published(notes: &Notes) -> Section {
 fn theory() -> Result<Found<TheoryJson>, Error> {
     let found = checks(Effort::default(), &mut |_| ())?;
     let mut section = Section::new("Theorems, measured against their bounds");
-    section.table(theory_table_rows(&found));
+    section.table(theory_table(&found));
     Ok(Found {
         section,
         record: theory_json(&found),

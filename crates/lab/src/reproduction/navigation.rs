@@ -7,22 +7,21 @@ use serde::Serialize;
 
 use seese3_core::adapter::{CorrectorKind, Preset};
 use seese3_core::cancel::Cancellation;
-use seese3_core::eval::{Protocol, Report, evaluate};
+use seese3_core::eval::{Protocol, Report, Row, evaluate};
 use seese3_core::navigation::{IndexKind, Navigator};
 use seese3_core::splits::Split;
 use seese3_core::statistics::{mean_of_known, paired_difference};
 use seese3_core::training::{RoomData, train_adapter};
 
-use super::claims::{Claim, Verdict, count_words, holds_for_each, is_above_zero};
+use super::claims::{Claim, holds_for_each, is_above_zero};
 use super::notes::{Notes, ReproducedAdapter};
-use super::render::plotted;
 use super::{Error, Found, Reproduction, paper};
-use crate::report::{Curves, Section, Series};
+use crate::report::{Curves, Section, Series, Table, fixed};
 
 /// Number of training epochs for the navigation table, on all pairs at one stride.
 const NAVIGATION_EPOCHS: usize = 200;
 
-/// JSON record of a navigator with one feature set: means over the rooms.
+/// A navigator with one feature set, averaged over the rooms: a row of a table and of the record.
 #[derive(Debug, Serialize)]
 pub struct NavigationRecord {
     features: String,
@@ -39,10 +38,6 @@ pub struct NavigationRecord {
 }
 
 /// Builds the section with the navigation table.
-#[expect(
-    clippy::too_many_lines,
-    reason = "a section of the report: its loop, its table and its claim"
-)]
 pub fn section(
     given: &Reproduction<'_>,
     notes: &mut Notes,
@@ -62,92 +57,23 @@ pub fn section(
 
         // The adapters are published at the end of the run, under the names in every record row.
         notes.adapters.extend(learned);
-        let mut head = ["navigator", "MSE", "R²", "Top-1"]
-            .map(str::to_owned)
-            .to_vec();
-
-        head.extend(
-            reports[0]
-                .protocol
-                .thresholds
-                .iter()
-                .map(|epsilon| format!("Hit@{epsilon}")),
-        );
-
-        let mut rows = vec![head];
-        let mut series = Vec::new();
 
         // All rooms share one protocol, so a row index identifies the same navigator in every room.
-        for place in 0..reports[0].rows.len() {
-            let name = reports[0].rows[place].name.clone();
-            let numbers = averaged(&reports, place);
-
-            rows.push(
-                [name.clone()]
-                    .into_iter()
-                    .chain(numbers.iter().map(|x| format!("{x:.3}")))
-                    .collect(),
-            );
-
-            // The first three numbers are MSE, R² and Top-1; one hit rate per threshold follows.
-            let hits = reports[0]
-                .protocol
-                .thresholds
-                .iter()
-                .zip(&numbers[3..])
-                .map(|(&e, &hit)| [e, hit])
-                .collect();
-
-            series.push(Series {
-                name: name.clone(),
-                points: hits,
-                joined: true,
-            });
-
-            record.push(NavigationRecord {
-                features: set.features.clone(),
-                navigator: name,
-                mse: numbers[0],
-                r2: numbers[1],
-                top1: numbers[2],
-                hits: numbers[3..].to_vec(),
-                adapters: adapters.clone(),
-                n: reports.iter().map(|report| report.n).collect(),
-            });
-        }
-
-        // The paper's rows have the same columns: MSE, R², Top-1 and its four thresholds.
-        for (name, numbers) in paper::NAVIGATION {
-            rows.push(
-                [format!("paper: {name}")]
-                    .into_iter()
-                    .chain(numbers.map(|x| format!("{x:.3}")))
-                    .collect(),
-            );
-        }
+        let thresholds = &reports[0].protocol.thresholds;
+        let rows: Vec<NavigationRecord> = (0..reports[0].rows.len())
+            .map(|place| averaged(&set.features, &adapters, &reports, place))
+            .collect();
 
         section.text(format!("Features {}:", set.features));
-        section.table(rows);
+        section.table(table(thresholds, &rows));
+        section.picture(
+            format!("hits-{position}.svg"),
+            curves(&set.features, thresholds, &rows).svg()?,
+            format!("Hit@ε within a room, features {}", set.features),
+        );
 
         dominates.push(hits_more_than_correctors(&reports));
-
-        // The picture shows only a selection of the rows.
-        let shown = |s: &Series| {
-            ["identity", "oracle", "inverse-poincare-affine"].contains(&s.name.as_str())
-                || s.name.starts_with("corrector")
-                || s.name.ends_with("+motion")
-        };
-
-        let curves = Curves {
-            title: format!("Hit@ε, {}", set.features),
-            x: "ε".to_owned(),
-            y: "share of pairs".to_owned(),
-            series: series.into_iter().filter(shown).collect(),
-            diagonal: false,
-        };
-
-        let caption = format!("Hit@ε within a room, features {}", set.features);
-        section.picture(format!("hits-{position}.svg"), plotted(&curves)?, caption);
+        record.extend(rows);
     }
 
     section.text(format!(
@@ -158,16 +84,54 @@ pub fn section(
         given.options.epochs.unwrap_or(NAVIGATION_EPOCHS)
     ));
 
-    notes.claims.push(Claim {
-        claim: "inverse Poincaré hits more often than every learned corrector (Hit@0.1)",
-        verdict: Verdict::of_intervals(&dominates),
-        found: format!(
-            "the interval of the difference in Hit@0.1 over rooms is above zero for each corrector: {}",
-            count_words(&dominates, "feature sets")
-        ),
-    });
+    notes.claims.push(Claim::by_intervals(
+        "inverse Poincaré hits more often than every learned corrector (Hit@0.1)",
+        "the interval of the difference in Hit@0.1 over rooms is above zero for each corrector",
+        &dominates,
+        "feature sets",
+    ));
 
     Ok(Found { section, record })
+}
+
+/// One row per navigator, then the paper's rows, which have the same columns.
+fn table(thresholds: &[f64], rows: &[NavigationRecord]) -> Table {
+    let hits = thresholds.iter().map(|epsilon| format!(" | Hit@{epsilon}"));
+    let mut table = Table::new(&format!(
+        "navigator | MSE | R² | Top-1{}",
+        hits.collect::<String>()
+    ));
+
+    for row in rows {
+        let numbers = [row.mse, row.r2, row.top1]
+            .into_iter()
+            .chain(row.hits.iter().copied());
+        table.row(&row.navigator, numbers.map(|number| format!("{number:.3}")));
+    }
+    for (name, numbers) in paper::NAVIGATION {
+        table.row(format!("paper: {name}"), fixed(numbers, 3));
+    }
+
+    table
+}
+
+/// Hit@ε of a selection of the navigators.
+fn curves(features: &str, thresholds: &[f64], rows: &[NavigationRecord]) -> Curves {
+    let is_shown = |row: &&NavigationRecord| {
+        ["identity", "oracle", "inverse-poincare-affine"].contains(&row.navigator.as_str())
+            || row.navigator.starts_with("corrector")
+            || row.navigator.ends_with("+motion")
+    };
+    let curve = |row: &NavigationRecord| {
+        let points = thresholds.iter().zip(&row.hits);
+        Series::line(
+            &row.navigator,
+            points.map(|(&epsilon, &hit)| [epsilon, hit]).collect(),
+        )
+    };
+
+    let series = rows.iter().filter(is_shown).map(curve).collect();
+    Curves::new(format!("Hit@ε, {features}"), "ε", "share of pairs", series)
 }
 
 fn navigated(
@@ -225,26 +189,29 @@ fn hits_more_than_correctors(reports: &[Report]) -> Option<bool> {
     holds_for_each(&is_above)
 }
 
-/// MSE, R², Top-1 and hit rates of row `place`, averaged over rooms.
-fn averaged(reports: &[Report], place: usize) -> Vec<f64> {
-    let of_room = |report: &Report| {
-        let row = &report.rows[place];
-
-        // A row without latents has no MSE and no R²; the mean over rooms skips NaN.
-        let latent = row
-            .latent
-            .map_or([f64::NAN; 2], |latent| [latent.mse, latent.r2]);
-
-        let hits = row.retrieval.hits.iter().map(|(_, rate)| rate.rate);
-        latent
-            .into_iter()
-            .chain([row.retrieval.top1.rate])
-            .chain(hits)
-            .collect::<Vec<f64>>()
+/// The scores of row `place`, averaged over rooms.
+fn averaged(
+    features: &str,
+    adapters: &[String],
+    reports: &[Report],
+    place: usize,
+) -> NavigationRecord {
+    let over_rooms = |of: &dyn Fn(&Row) -> f64| {
+        let rows = reports.iter().map(|report| of(&report.rows[place]));
+        mean_of_known(&rows.collect::<Vec<f64>>())
     };
 
-    let all: Vec<Vec<f64>> = reports.iter().map(of_room).collect();
-    (0..all[0].len())
-        .map(|column| mean_of_known(&all.iter().map(|row| row[column]).collect::<Vec<_>>()))
-        .collect()
+    // A row without latents has no MSE and no R²; the mean over rooms skips NaN.
+    NavigationRecord {
+        features: features.to_owned(),
+        navigator: reports[0].rows[place].name.clone(),
+        mse: over_rooms(&|row| row.latent.map_or(f64::NAN, |latent| latent.mse)),
+        r2: over_rooms(&|row| row.latent.map_or(f64::NAN, |latent| latent.r2)),
+        top1: over_rooms(&|row| row.retrieval.top1.rate),
+        hits: (0..reports[0].protocol.thresholds.len())
+            .map(|epsilon| over_rooms(&|row| row.retrieval.hits[epsilon].1.rate))
+            .collect(),
+        adapters: adapters.to_vec(),
+        n: reports.iter().map(|report| report.n).collect(),
+    }
 }

@@ -8,17 +8,16 @@ use seese3_core::statistics::{RoomMean, mean_of_known, paired_difference};
 use seese3_core::training::RoomData;
 
 use super::claims::{Claim, Verdict, is_above_zero};
-use super::render::plotted;
 use super::{Error, Found, Reproduction, paper};
 use crate::experiments::Within;
 use crate::experiments::folds::FoldedMotions;
 use crate::probes::{Duplicates, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
-use crate::report::{Curves, Section, Series, room_difference_text};
+use crate::report::{Curves, Section, Series, Table, fixed, room_difference_text};
 
 /// Maximum number of frames that M1 compares, as in the paper.
 const M1_FRAMES: usize = 256;
 
-/// JSON record of the probes of one room.
+/// The probes of one room: a row of the record.
 #[derive(Debug, Serialize)]
 pub struct ProbeRecord {
     features: String,
@@ -32,100 +31,38 @@ pub struct ProbeRecord {
     constant: f64,
 }
 
-struct Probed {
-    room: String,
-    short: f64,
-    long: f64,
-    twonn: f64,
-    mle: f64,
-    ridge: f64,
-    constant: f64,
+impl ProbeRecord {
+    /// The numbers in table column order.
+    fn numbers(&self) -> [f64; 6] {
+        [
+            self.m1_short,
+            self.m1_long,
+            self.twonn,
+            self.mle,
+            self.m3,
+            self.constant,
+        ]
+    }
 }
 
 /// Builds the section with M1 at a short and a long stride, M2 and M3.
-#[expect(
-    clippy::too_many_lines,
-    reason = "a section of the report: its loop, its table and its claim"
-)]
 pub fn section(
     given: &Reproduction<'_>,
     claims: &mut Vec<Claim>,
 ) -> Result<Found<Vec<ProbeRecord>>, Error> {
-    let mut section = Section::new("Probes: M1, M2, M3");
-    let head = [
-        "features", "room", "M1 short", "M1 long", "TwoNN", "MLE", "M3 R²", "constant",
-    ];
-    let mut rows = vec![head.map(str::to_owned).to_vec()];
-
-    let mut series = Vec::new();
-    let mut record = Vec::new();
+    // Probes use no other rooms, so the held-out rooms are probed too. They train no adapter, so a
+    // room has one value per probe and no spread over seeds.
+    let mut by_set: Vec<Vec<ProbeRecord>> = Vec::new();
     for set in &given.sets {
-        // Probes use no other rooms, so the held-out rooms are probed too.
         let rooms: Vec<&RoomData<'_>> = set.in_room.iter().chain(&set.test).collect();
-        let probed: Vec<Probed> = rooms
+        let probed = rooms
             .into_par_iter()
-            .map(|room| probed(room, given))
-            .collect::<Result<_, Error>>()?;
-
-        // Probes train no adapter, so a room has one value per probe and no spread over seeds.
-        for Probed {
-            room,
-            short,
-            long,
-            twonn,
-            mle,
-            ridge,
-            constant,
-        } in &probed
-        {
-            record.push(ProbeRecord {
-                features: set.features.clone(),
-                room: room.clone(),
-                m1_short: *short,
-                m1_long: *long,
-                twonn: *twonn,
-                mle: *mle,
-                m3: *ridge,
-                constant: *constant,
-            });
-        }
-
-        for alone in &probed[..set.in_room.len()] {
-            rows.push(row(&set.features, &alone.room, &alone.numbers()));
-        }
-        let held_out = &probed[set.in_room.len()..];
-        rows.push(row(
-            &set.features,
-            &format!("mean of {} held out", held_out.len()),
-            &mean_numbers(held_out),
-        ));
-
-        // One point per room: M1 at the short stride against M1 at the long one.
-        let points = probed.iter().map(|p| [p.short, p.long]).collect();
-        series.push(Series {
-            name: set.features.clone(),
-            points,
-            joined: false,
-        });
+            .map(|room| probed(room, &set.features, given));
+        by_set.push(probed.collect::<Result<_, Error>>()?);
     }
 
-    // The paper's rows have only M2 and M3: the cells of the room and of M1 stay empty.
-    for (encoder, numbers) in paper::DIMENSIONS {
-        let empty = [String::new(), String::new()];
-        let numbers = numbers.map(|x| format!("{x:.2}"));
-        let name = [format!("paper: {encoder}"), String::new()];
-        let no_constant = [String::new()];
-        rows.push(
-            name.into_iter()
-                .chain(empty)
-                .chain(numbers)
-                .chain(no_constant)
-                .collect(),
-        );
-    }
-
-    section.table(rows);
-
+    let mut section = Section::new("Probes: M1, M2, M3");
+    section.table(table(given, &by_set));
     section.text(format!(
         "M1: {M1_FRAMES} frames, k 10, 10 of them to each side left out; short is stride 1, long spreads them over the \
          whole recording. M2: no gap, as in the paper. M3 and always answering the mean training motion: stride {}, the \
@@ -133,32 +70,86 @@ pub fn section(
         given.options.stride
     ));
 
+    // One point per room: M1 at the short stride against M1 at the long one.
+    let series = given.sets.iter().zip(&by_set).map(|(set, probed)| Series {
+        name: set.features.clone(),
+        points: probed
+            .iter()
+            .map(|room| [room.m1_short, room.m1_long])
+            .collect(),
+        joined: false,
+    });
     let curves = Curves {
-        title: "Mutual k-NN, short against long stride".to_owned(),
-        x: "short stride".to_owned(),
-        y: "long stride".to_owned(),
-        series,
         diagonal: true,
+        ..Curves::new(
+            "Mutual k-NN, short against long stride",
+            "short stride",
+            "long stride",
+            series.collect(),
+        )
     };
-
     section.picture(
         "m1.svg",
-        plotted(&curves)?,
+        curves.svg()?,
         "M1 at a short and a long stride, a point a room; the line is y = x",
     );
 
-    // By convention the last feature set is the control, which needs no trained encoder.
-    let long = |of: &Series| of.points.iter().map(|point| point[1]).collect::<Vec<f64>>();
-    let (control, trained) = curves
-        .series
-        .split_last()
-        .ok_or_else(|| Error::Input("at least one feature set is required".to_owned()))?;
+    claims.push(claim(given, &by_set)?);
+    let record = by_set.into_iter().flatten().collect();
+    Ok(Found { section, record })
+}
 
-    // Difference of M1 at the long stride between the trained encoder and the control, paired by
-    // room.
+/// One row per single-adapter room, and one for the held-out rooms together; the paper's rows
+/// follow.
+fn table(given: &Reproduction<'_>, by_set: &[Vec<ProbeRecord>]) -> Table {
+    let mut table =
+        Table::new("features | room | M1 short | M1 long | TwoNN | MLE | M3 R² | constant");
+
+    for (set, probed) in given.sets.iter().zip(by_set) {
+        let mut add = |room: String, numbers: [f64; 6]| {
+            table.row(
+                &set.features,
+                std::iter::once(room).chain(fixed(numbers, 3)),
+            );
+        };
+
+        let (alone, held_out) = probed.split_at(set.in_room.len());
+        for room in alone {
+            add(room.room.clone(), room.numbers());
+        }
+        let mean = std::array::from_fn(|column| {
+            let values: Vec<f64> = held_out.iter().map(|room| room.numbers()[column]).collect();
+            mean_of_known(&values)
+        });
+        add(format!("mean of {} held out", held_out.len()), mean);
+    }
+
+    // The paper's rows have only M2 and M3.
+    for (encoder, numbers) in paper::DIMENSIONS {
+        let [twonn, mle, m3] = fixed(numbers, 2);
+        let empty = String::new;
+        table.row(
+            format!("paper: {encoder}"),
+            [empty(), empty(), empty(), twonn, mle, m3, empty()],
+        );
+    }
+
+    table
+}
+
+/// The difference of M1 at the long stride between each trained encoder and the control, paired by
+/// room. By convention the last feature set is the control, which needs no trained encoder.
+fn claim(given: &Reproduction<'_>, by_set: &[Vec<ProbeRecord>]) -> Result<Claim, Error> {
+    let long = |set: &Vec<ProbeRecord>| set.iter().map(|room| room.m1_long).collect::<Vec<f64>>();
+    let (Some(name), Some((control, trained))) = (given.sets.last(), by_set.split_last()) else {
+        return Err(Error::Input(
+            "at least one feature set is required".to_owned(),
+        ));
+    };
+
     let over_control: Vec<RoomMean> = trained
         .iter()
-        .map(|series| paired_difference(&long(series), &long(control), 0))
+        .map(|set| paired_difference(&long(set), &long(control), 0))
         .collect();
     let above: Vec<Option<bool>> = over_control.iter().map(is_above_zero).collect();
     let differences: Vec<String> = over_control.iter().map(room_difference_text).collect();
@@ -167,50 +158,21 @@ pub fn section(
         all => all.join("; "),
     };
 
-    claims.push(Claim {
+    Ok(Claim {
         claim: "topology: a trained encoder's neighbours at a long stride are neighbours by pose, more than raw pixels' (M1)",
         verdict: Verdict::of_intervals(&above),
         found: format!(
-            "M1 at the long stride over that of {}, room by room: {}",
-            control.name,
-            differences
+            "M1 at the long stride over that of {}, room by room: {differences}",
+            name.features
         ),
-    });
-
-    Ok(Found { section, record })
-}
-
-impl Probed {
-    /// The numbers in table column order.
-    fn numbers(&self) -> [f64; 6] {
-        [
-            self.short,
-            self.long,
-            self.twonn,
-            self.mle,
-            self.ridge,
-            self.constant,
-        ]
-    }
-}
-
-/// Mean of each column over the rooms.
-fn mean_numbers(rooms: &[Probed]) -> [f64; 6] {
-    std::array::from_fn(|column| {
-        let values: Vec<f64> = rooms.iter().map(|room| room.numbers()[column]).collect();
-        mean_of_known(&values)
     })
 }
 
-fn row(features: &str, room: &str, numbers: &[f64]) -> Vec<String> {
-    let numbers = numbers.iter().map(|number| format!("{number:.3}"));
-    [features.to_owned(), room.to_owned()]
-        .into_iter()
-        .chain(numbers)
-        .collect()
-}
-
-fn probed(data: &RoomData<'_>, given: &Reproduction<'_>) -> Result<Probed, Error> {
+fn probed(
+    data: &RoomData<'_>,
+    features: &str,
+    given: &Reproduction<'_>,
+) -> Result<ProbeRecord, Error> {
     let room = data.room;
     let rows = data.features.rows();
 
@@ -242,13 +204,14 @@ fn probed(data: &RoomData<'_>, given: &Reproduction<'_>) -> Result<Probed, Error
     })
     .within(what)?;
 
-    Ok(Probed {
+    Ok(ProbeRecord {
+        features: features.to_owned(),
         room: room.id().to_string(),
-        short: at(1)?,
-        long: at(long)?,
+        m1_short: at(1)?,
+        m1_long: at(long)?,
         twonn: dimension.two_nn.linear,
         mle: dimension.mle_biased.harmonic,
-        ridge: ridge.scores().overall,
+        m3: ridge.scores().overall,
         constant: ridge.constant_r2(),
     })
 }

@@ -8,11 +8,11 @@ use seese3_core::motion_scores::MotionScores;
 use seese3_core::splits::Split;
 use seese3_core::training::{RoomData, TrainingPlan};
 
-use super::render::spread;
 use super::{Error, FeatureSet, Found, Reproduction};
 use crate::experiments::folds::FoldedMotions;
 use crate::formulations::read_by_adapter;
-use crate::report::Section;
+use crate::report::Column::{self, Text};
+use crate::report::{Section, Table, spread_text};
 
 /// Latent widths of the grid.
 const GEO_DIMS: [usize; 4] = [6, 20, 80, 320];
@@ -50,37 +50,30 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<SettingsRecord>, Error>
     let set = &given.sets[0];
 
     let losses = losses(given, set)?;
-    let mut rows = vec![
-        ["loss", "translation", "rotation"]
-            .map(str::to_owned)
-            .to_vec(),
+    let columns: [Column<LossRecord>; 3] = [
+        Text("loss", |found| found.loss.to_owned()),
+        Text("translation", |found| spread_text(&found.translation, 2)),
+        Text("rotation", |found| spread_text(&found.rotation, 2)),
     ];
-    for found in &losses {
-        rows.push(vec![
-            found.loss.to_owned(),
-            spread(&found.translation),
-            spread(&found.rotation),
-        ]);
-    }
     section.text(format!(
         "Features {}: the loss on all six components, and on the rotation alone, which leaves the translation untrained:",
         set.features
     ));
-    section.table(rows);
+    section.table(Table::of(&losses, &columns));
 
     let grid = grid(given, set)?;
-    let mut head = vec!["geo_dim".to_owned()];
-    head.extend(LEARNING_RATES.map(|rate| format!("rate {rate}")));
-    let mut rows = vec![head];
+    let rates = LEARNING_RATES
+        .map(|rate| format!("rate {rate}"))
+        .join(" | ");
+    let mut table = Table::new(&format!("geo_dim | {rates}"));
     for of_dim in grid.chunks(LEARNING_RATES.len()) {
-        let mut row = vec![of_dim[0].geo_dim.to_string()];
-        row.extend(of_dim.iter().map(|point| format!("{:.2}", point.r2)));
-        rows.push(row);
+        let scores = of_dim.iter().map(|point| format!("{:.2}", point.r2));
+        table.row(of_dim[0].geo_dim.to_string(), scores);
     }
     section.text(
         "Overall R² by columns of the latent and learning rate, one seed; NaN where the training failed:",
     );
-    section.table(rows);
+    section.table(table);
 
     section.text(format!(
         "Means over the rooms that are learned alone, stride {}: R² over the pairs of all five folds of a recording \

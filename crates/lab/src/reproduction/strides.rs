@@ -4,17 +4,16 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use seese3_core::adapter::Preset;
-use seese3_core::eval::LEAST_CONSTANT_R2;
+use seese3_core::eval::{Baselines, LEAST_CONSTANT_R2};
 use seese3_core::splits::Split;
 use seese3_core::statistics::{mean, mean_of_known};
 use seese3_core::training::RoomData;
 
 use super::claims::{Claim, Verdict, count_words};
-use super::render::{plotted, spread};
 use super::{Error, FeatureSet, Found, Reproduction};
 use crate::experiments::cross_room::CLIPPED_R2;
 use crate::experiments::probe::{ProbeProtocol, probe_adapters};
-use crate::report::{Curves, Section, Series};
+use crate::report::{Curves, Section, Series, Table, spread_text};
 
 /// JSON record of M4 at one stride.
 #[derive(Debug, Serialize)]
@@ -30,86 +29,40 @@ pub struct StrideRecord {
     last_fifth_constant_r2_by_room: Vec<f64>,
 }
 
+/// The scores with one feature set: by stride, then by room.
+struct SetScores<'a> {
+    set: &'a FeatureSet<'a>,
+    by_stride: Vec<Vec<RoomScores>>,
+}
+
 /// Builds the section with M4 by stride.
-#[expect(
-    clippy::too_many_lines,
-    reason = "a section of the report: its loop, its table and its claim"
-)]
 pub fn section(
     given: &Reproduction<'_>,
     claims: &mut Vec<Claim>,
 ) -> Result<Found<Vec<StrideRecord>>, Error> {
+    // Train and test new adapters at every stride.
+    let of_set = |set| {
+        let strides = given.options.strides.iter();
+        let by_stride = strides.map(|&stride| m4(given, set, stride));
+        Ok(SetScores {
+            set,
+            by_stride: by_stride.collect::<Result<_, Error>>()?,
+        })
+    };
+    let scored: Vec<SetScores<'_>> = given
+        .sets
+        .iter()
+        .map(of_set)
+        .collect::<Result<_, Error>>()?;
+
     let mut section = Section::new("M4: the adapter by stride, within a room");
-    let strides = &given.options.strides;
-    let mut head = ["features", "room"].map(str::to_owned).to_vec();
-    head.extend(strides.iter().map(|stride| format!("stride {stride}")));
-    let mut rows = vec![head.clone()];
-    let mut last_rows = vec![head];
-
-    let mut series = Vec::new();
-    let mut record = Vec::new();
-    // One case per room, feature set and stride.
-    let mut positive: Vec<Option<bool>> = Vec::new();
-    for set in &given.sets {
-        let mut points = Vec::new();
-
-        // One row per room; every stride adds a cell to each of them.
-        let mut by_room: Vec<Vec<String>> = set
-            .in_room
-            .iter()
-            .map(|data| vec![set.features.clone(), data.room.id().to_string()])
-            .collect();
-        let mut last_by_room = by_room.clone();
-
-        // Train and test new adapters at every stride.
-        for &stride in strides {
-            let scored = m4(given, set, stride)?;
-            for (row, scores) in by_room.iter_mut().zip(&scored) {
-                row.push(format!(
-                    "{} ({:.2})",
-                    spread(&scores.overall),
-                    scores.constant
-                ));
-            }
-            for (row, scores) in last_by_room.iter_mut().zip(&scored) {
-                let [ours, constant] = scores.last_fifth;
-                row.push(format!("{ours:.2} ({constant:.2})"));
-            }
-
-            // R² has no lower bound: without clipping, one room could dominate the curve.
-            let clipped: Vec<f64> = scored
-                .iter()
-                .map(|scores| scores.mean().max(CLIPPED_R2))
-                .collect();
-            points.push([f64::from(stride), mean(&clipped)]);
-
-            // Test the claim on the mean over seeds; skip cases with a too low constant baseline.
-            positive.extend(scored.iter().map(RoomScores::is_positive));
-            record.push(StrideRecord {
-                features: set.features.clone(),
-                stride,
-                constant_r2_by_room: scored.iter().map(|scores| scores.constant).collect(),
-                last_fifth_r2_by_room: scored.iter().map(|scores| scores.last_fifth[0]).collect(),
-                last_fifth_constant_r2_by_room: scored
-                    .iter()
-                    .map(|scores| scores.last_fifth[1])
-                    .collect(),
-                r2_by_room_and_seed: scored.into_iter().map(|scores| scores.overall).collect(),
-            });
-        }
-
-        rows.extend(by_room);
-        last_rows.extend(last_by_room);
-
-        series.push(Series {
-            name: set.features.clone(),
-            points,
-            joined: true,
-        });
-    }
-
-    section.table(rows);
-
+    section.table(table(given, &scored, |scores| {
+        format!(
+            "{} ({:.2})",
+            spread_text(&scores.overall, 2),
+            scores.constant
+        )
+    }));
     section.text(format!(
         "Test R² over the pairs of all five folds of each recording together, each fold read by adapters that the other \
          four trained: mean ± sd over {} seeds, and in brackets that of always answering the mean training motion. {}",
@@ -118,26 +71,24 @@ pub fn section(
     ));
 
     section.text("The last of these folds by itself, which is the paper's split:");
-    section.table(last_rows);
+    section.table(table(given, &scored, |scores| {
+        let [ours, constant] = scores.last_fifth;
+        format!("{ours:.2} ({constant:.2})")
+    }));
     section.text(
         "Its R² divides by the variance of the last fifth alone. Where the constant in brackets is far below 0, that \
          fifth's motions are unlike the others, and the number says little of an adapter.",
     );
 
-    let curves = Curves {
-        title: "Test R² by stride, five folds (rooms below −1 count as −1)".to_owned(),
-        x: "stride, frames".to_owned(),
-        y: "mean over rooms of max(R², −1)".to_owned(),
-        series,
-        diagonal: false,
-    };
-
     section.picture(
         "strides.svg",
-        plotted(&curves)?,
+        curves(given, &scored).svg()?,
         "M4 by stride, within a room",
     );
 
+    // Test the claim on the mean over seeds; skip cases with a too low constant baseline.
+    let rooms = scored.iter().flat_map(|set| set.by_stride.iter().flatten());
+    let positive: Vec<Option<bool>> = rooms.map(RoomScores::is_positive).collect();
     claims.push(Claim {
         claim: "an adapter reads the motion of frames never seen, within a room (M4: R² > 0)",
         verdict: Verdict::of_telling(&positive),
@@ -147,7 +98,64 @@ pub fn section(
         ),
     });
 
+    let record = scored.iter().flat_map(|set| records(given, set)).collect();
     Ok(Found { section, record })
+}
+
+/// One row per feature set and room, with a cell per stride.
+fn table(
+    given: &Reproduction<'_>,
+    scored: &[SetScores<'_>],
+    cell: fn(&RoomScores) -> String,
+) -> Table {
+    let strides = given.options.strides.iter();
+    let titles: String = strides
+        .map(|stride| format!(" | stride {stride}"))
+        .collect();
+    let mut table = Table::new(&format!("features | room{titles}"));
+
+    for SetScores { set, by_stride } in scored {
+        for (place, data) in set.in_room.iter().enumerate() {
+            let cells = by_stride.iter().map(|rooms| cell(&rooms[place]));
+            let room = std::iter::once(data.room.id().to_string());
+            table.row(&set.features, room.chain(cells));
+        }
+    }
+
+    table
+}
+
+fn curves(given: &Reproduction<'_>, scored: &[SetScores<'_>]) -> Curves {
+    // R² has no lower bound: without clipping, one room could dominate the curve.
+    let point = |(&stride, rooms): (&u32, &Vec<RoomScores>)| {
+        let clipped = rooms.iter().map(|scores| scores.mean().max(CLIPPED_R2));
+        [f64::from(stride), mean(&clipped.collect::<Vec<f64>>())]
+    };
+    let line = |SetScores { set, by_stride }: &SetScores<'_>| {
+        let points = given.options.strides.iter().zip(by_stride).map(point);
+        Series::line(&set.features, points.collect())
+    };
+
+    Curves::new(
+        "Test R² by stride, five folds (rooms below −1 count as −1)",
+        "stride, frames",
+        "mean over rooms of max(R², −1)",
+        scored.iter().map(line).collect(),
+    )
+}
+
+fn records(given: &Reproduction<'_>, scored: &SetScores<'_>) -> Vec<StrideRecord> {
+    let record = |(&stride, rooms): (&u32, &Vec<RoomScores>)| StrideRecord {
+        features: scored.set.features.clone(),
+        stride,
+        r2_by_room_and_seed: rooms.iter().map(|scores| scores.overall.clone()).collect(),
+        constant_r2_by_room: rooms.iter().map(|scores| scores.constant).collect(),
+        last_fifth_r2_by_room: rooms.iter().map(|scores| scores.last_fifth[0]).collect(),
+        last_fifth_constant_r2_by_room: rooms.iter().map(|scores| scores.last_fifth[1]).collect(),
+    };
+
+    let strides = given.options.strides.iter();
+    strides.zip(&scored.by_stride).map(record).collect()
 }
 
 /// The scores of a room's adapters at one stride.
@@ -189,20 +197,16 @@ fn m4(
 
     let of = |room: &RoomData<'_>| {
         let at_strides = probe_adapters(std::slice::from_ref(room), &protocol)?;
-        let (Some(at), Some(last)) = (at_strides.first(), at_strides[0].by_split.last()) else {
+        let (Some(at), Some(last)) = (at_strides.first(), at_strides[0].splits.last()) else {
             return Err(Error::Input("a room without folds".to_owned()));
         };
 
-        let baselines = at.baselines.as_ref();
-        let constant = baselines.map_or(f64::NAN, |all| all.together.constant_r2);
-        let last_constant = baselines
-            .and_then(|all| all.by_split.last())
-            .map_or(f64::NAN, |fold| fold.constant_r2);
-
+        let constant =
+            |baselines: &Option<Baselines>| baselines.map_or(f64::NAN, |all| all.constant_r2);
         Ok(RoomScores {
             overall: at.runs.iter().map(|run| run.overall).collect(),
-            constant,
-            last_fifth: [last.1, last_constant],
+            constant: constant(&at.baselines),
+            last_fifth: [last.r2, constant(&last.baselines)],
         })
     };
 

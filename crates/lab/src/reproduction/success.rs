@@ -10,7 +10,9 @@ use seese3_core::training::RoomData;
 
 use super::{Error, FeatureSet, Found, Reproduction, paper};
 use crate::experiments::adapter_sweep::{SweepRow, content, row, run};
-use crate::report::{Section, configurations_rows, difficulty_rows, parts_rows, success_rows};
+use crate::report::{
+    Section, Table, configurations_table, difficulty_table, parts_table, success_table,
+};
 
 /// Numbers of charts K, as in the paper's mixtures.
 const CHARTS: [usize; 3] = [1, 2, 4];
@@ -31,40 +33,33 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<SweepRow>>, Error> 
     );
 
     // Our rows come first, then the paper's, grouped by its recordings and encoders.
-    let mut success = success_rows(&rows);
+    let mut success = success_table(&rows);
     for (recordings, encoder, [best, above_0, above_0_3]) in paper::SUCCESS {
-        let format = format!("paper: {}", recordings.name);
-        let features = encoder.to_owned();
-
-        let numbers = [
+        let cells = [
+            encoder.to_owned(),
+            recordings.rooms.to_string(),
             format!("{best:.3}"),
             format!("{above_0:.0}"),
             format!("{above_0_3:.0}"),
         ];
-
-        success.push(
-            [format, features, recordings.rooms.to_string()]
-                .into_iter()
-                .chain(numbers)
-                .collect(),
-        );
+        success.row(format!("paper: {}", recordings.name), cells);
     }
 
     section.table(success);
     section.text("How hard the recordings are, over all features:");
-    section.table(difficulty_rows(&rows));
+    section.table(difficulty_table(&rows));
     section.text(
         "How hard they are by what there is to see, over all features: the rooms in three parts by contrast, the median \
          over frames of the standard deviation of the control's columns (of pixels: of an image's brightness):",
     );
-    section.table(contrast_rows(given, &rows));
+    section.table(contrast_table(given, &rows));
     section.text("By charts (K), mean over rooms and strides:");
 
     // Show every configuration: each number of charts with each feature set.
-    section.table(configurations_rows(&rows, CHARTS.len() * given.sets.len()));
+    section.table(configurations_table(&rows, CHARTS.len() * given.sets.len()));
 
     section.text("By part of the motion, over all runs:");
-    section.table(parts_rows(&rows));
+    section.table(parts_table(&rows));
 
     section.text(format!(
         "{} runs: every room that is held out or learned alone, with K of {CHARTS:?}, strides {:?}, time split, one seed. {} \
@@ -93,7 +88,7 @@ pub fn section(given: &Reproduction<'_>) -> Result<Found<Vec<SweepRow>>, Error> 
 }
 
 /// Success rate and median best R² for three groups of rooms by contrast.
-fn contrast_rows(given: &Reproduction<'_>, rows: &[SweepRow]) -> Vec<Vec<String>> {
+fn contrast_table(given: &Reproduction<'_>, rows: &[SweepRow]) -> Table {
     let control = given.sets.last();
     let mut rooms: Vec<(f64, f64)> = control
         .into_iter()
@@ -104,23 +99,23 @@ fn contrast_rows(given: &Reproduction<'_>, rows: &[SweepRow]) -> Vec<Vec<String>
     rooms.retain(|room| room.1.is_finite());
     rooms.sort_by(|a, b| a.0.total_cmp(&b.0));
 
-    let head = ["contrast", "rooms", "% > 0", "median best R²"];
-    let mut lines = vec![head.map(str::to_owned).to_vec()];
+    let mut table = Table::new("contrast | rooms | % > 0 | median best R²");
     let third = |k: usize| rooms.len() * k / 3;
     let parts = (0..3).map(|k| &rooms[third(k)..third(k + 1)]);
     for part in parts.filter(|part| !part.is_empty()) {
         let best: Vec<f64> = part.iter().map(|room| room.1).collect();
         let above = best.iter().filter(|&&r2| r2 > 0.0).count();
 
-        lines.push(vec![
-            format!("{:.3} to {:.3}", part[0].0, part[part.len() - 1].0),
+        let cells = [
             part.len().to_string(),
             format!("{:.0}", 100.0 * above as f64 / part.len() as f64),
             format!("{:.2}", median(&best)),
-        ]);
+        ];
+        let range = format!("{:.3} to {:.3}", part[0].0, part[part.len() - 1].0);
+        table.row(range, cells);
     }
 
-    lines
+    table
 }
 
 /// The best R² of a room's runs; −∞ if all runs failed.

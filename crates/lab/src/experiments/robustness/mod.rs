@@ -8,6 +8,7 @@ mod disturbance;
 
 use nalgebra::{Unit, Vector3};
 use ndarray::ArrayView2;
+use serde::{Serialize, Serializer};
 
 use seese3_core::geometry::Pose;
 use seese3_core::room::FrameId;
@@ -34,22 +35,63 @@ pub struct DisturbedViews<'a> {
     pub is_blank: &'a [bool],
 }
 
-/// Tracking results of one room under one disturbance.
-#[derive(Debug, Clone)]
+/// Tracking results under one disturbance, of one room or of several rooms together.
+#[derive(Debug, Clone, Serialize)]
 pub struct DisturbedTracking {
-    /// The room.
-    pub room: String,
     /// The disturbance.
+    #[serde(serialize_with = "disturbance_name")]
     pub disturbance: Disturbance,
+    /// The room; `None` for several rooms together.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub room: Option<String>,
     /// Number of scored frames.
+    #[serde(rename = "n")]
     pub frames: usize,
     /// Errors of the tracker and of its baselines.
+    #[serde(flatten)]
     pub scores: TrackingScores,
     /// Fractions of the scored frames by status.
+    #[serde(rename = "status")]
     pub statuses: StatusShares,
     /// Number of disturbed frames until the status left TRACKING, in the slowest stream. `None` if
     /// a stream stayed TRACKING, or if the disturbance covers whole streams.
     pub noticed_after: Option<usize>,
+}
+
+fn disturbance_name<S: Serializer>(which: &Disturbance, to: S) -> Result<S::Ok, S::Error> {
+    to.serialize_str(&which.name())
+}
+
+impl DisturbedTracking {
+    /// Results of rooms under one disturbance together; at least one room.
+    pub fn together(rooms: &[&Self]) -> Self {
+        let frames = rooms.iter().map(|room| room.frames).sum();
+        let share = |of: fn(&StatusShares) -> f64| {
+            let counted = rooms
+                .iter()
+                .map(|room| of(&room.statuses) * room.frames as f64);
+            counted.sum::<f64>() / frames as f64
+        };
+
+        Self {
+            disturbance: rooms[0].disturbance,
+            room: None,
+            frames,
+            scores: TrackingScores::together(rooms.iter().map(|room| &room.scores)),
+            statuses: StatusShares {
+                tracking: share(|shares| shares.tracking),
+                degraded: share(|shares| shares.degraded),
+                lost: share(|shares| shares.lost),
+                relocalizing: share(|shares| shares.relocalizing),
+            },
+            noticed_after: slowest(rooms.iter().map(|room| room.noticed_after)),
+        }
+    }
+}
+
+/// The largest number of frames; `None` if one is `None`.
+fn slowest(mut noticed: impl Iterator<Item = Option<usize>>) -> Option<usize> {
+    noticed.try_fold(0, |most, frames| Some(most.max(frames?)))
 }
 
 /// Range of scored frames in one stream, from `begin` up to `end` (exclusive).
@@ -164,24 +206,17 @@ pub fn evaluate(
     let share = |status| share_of(&replay, &scored_rows, status);
 
     Ok(DisturbedTracking {
-        room: room.room().id().to_string(),
         disturbance,
+        room: Some(room.room().id().to_string()),
         frames: scored_rows.iter().filter(|&&scored| scored).count(),
         scores: TrackingScores::of_rows(&replay, keep, |row| {
             *room.most_alike(views.features.row(view_rows[row]))
         }),
-        statuses: StatusShares {
-            tracking: share(Status::Tracking),
-            degraded: share(Status::Degraded),
-            lost: share(Status::Lost),
-            relocalizing: share(Status::Relocalizing),
-        },
+        statuses: StatusShares::of(share),
         // The result is `None` if any stream stayed TRACKING.
         noticed_after: match disturbance.extent() {
             Extent::Whole => None,
-            Extent::Part => noticed
-                .into_iter()
-                .try_fold(0, |most, frames| Some(most.max(frames?))),
+            Extent::Part => slowest(noticed.into_iter()),
         },
     })
 }

@@ -7,8 +7,6 @@ mod unrolled;
 mod walks;
 
 use std::sync::Arc;
-
-use serde::Serialize;
 use strum::VariantArray;
 
 use seese3_core::training::RoomData;
@@ -17,17 +15,11 @@ use super::notes::Notes;
 use super::plans::steady_adapter;
 use super::{Error, Found, Reproduction};
 use crate::report::Section;
-use walks::{Length, WalkRecord};
-
-/// JSON record of the walks.
-#[derive(Debug, Serialize)]
-#[serde(transparent)]
-pub struct PicturesRecord {
-    walks: Vec<WalkRecord>,
-}
+use walks::Length;
+pub use walks::WalkRecord;
 
 /// Builds the section with walks in rooms with images, and with the paths of features and latents.
-pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<PicturesRecord>, Error> {
+pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Vec<WalkRecord>>, Error> {
     let mut section = Section::new("Walks in rooms never seen, and a recording unrolled");
     // Pictures use only the first feature set.
     let set = &given.sets[0];
@@ -94,6 +86,6 @@ pub fn section(given: &Reproduction<'_>, notes: &Notes) -> Result<Found<Pictures
     unrolled::add(&mut section, &set.test[0], &adapter)?;
     Ok(Found {
         section,
-        record: PicturesRecord { walks },
+        record: walks,
     })
 }

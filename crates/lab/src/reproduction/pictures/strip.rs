@@ -10,15 +10,12 @@ use super::super::{Error, Images};
 const WIDTH: usize = 200;
 
 /// Renders frames side by side, as a PNG file.
-pub fn strip(images: &dyn Images, data: &RoomData<'_>, frames: &[u32]) -> Result<Vec<u8>, Error> {
-    let source = images;
-    let mut images = Vec::with_capacity(frames.len());
-    for &frame in frames {
-        let image = source
-            .read(data.room, FrameId(frame))
-            .map_err(Error::Input)?;
-        images.push(smaller(&image));
-    }
+pub fn strip(access: Images<'_>, data: &RoomData<'_>, frames: &[u32]) -> Result<Vec<u8>, Error> {
+    let read = |&frame: &u32| (access.read)(data.room, FrameId(frame)).map_err(Error::Input);
+    let images: Vec<RgbImage> = frames
+        .iter()
+        .map(|frame| Ok(smaller(&read(frame)?)))
+        .collect::<Result<_, Error>>()?;
 
     // The strip has the height of the first image: shorter images are padded with white, taller
     // ones are cropped.
@@ -40,7 +37,7 @@ pub fn strip(images: &dyn Images, data: &RoomData<'_>, frames: &[u32]) -> Result
         height,
         bytes,
     };
-    source.png(&strip).map_err(Error::Input)
+    (access.png)(&strip).map_err(Error::Input)
 }
 
 /// Scales an image to [`WIDTH`]; each pixel is the mean of the source pixels it covers.

@@ -8,7 +8,6 @@ use seese3_core::matrices::to_nalgebra;
 use seese3_core::training::RoomData;
 
 use super::super::Error;
-use super::super::render::plotted;
 use super::plane::Plane;
 use crate::report::{Curves, Section, Series};
 
@@ -32,13 +31,9 @@ pub fn add(section: &mut Section, data: &RoomData<'_>, adapter: &Adapter) -> Res
     ] {
         let laid = laid_over(&truth, &rows);
         let off_m = off(&truth, &laid);
-        let picture = plotted(&Curves {
-            title: format!("{}: {what}", data.room.id()),
-            x: "metres".to_owned(),
-            y: "metres".to_owned(),
-            series: vec![series("true path", &truth), series(what, &laid)],
-            diagonal: false,
-        })?;
+        let title = format!("{}: {what}", data.room.id());
+        let both = vec![series("true path", &truth), series(what, &laid)];
+        let picture = Curves::new(title, "metres", "metres", both).svg()?;
 
         let caption = format!(
             "The true path in its plane, and the two main directions of {what} laid over it: {off_m:.2} m off (root mean \
@@ -58,11 +53,10 @@ fn places(data: &RoomData<'_>) -> Array2<f64> {
 }
 
 fn series(name: &str, rows: &Array2<f64>) -> Series {
-    Series {
-        name: name.to_owned(),
-        points: rows.outer_iter().map(|row| [row[0], row[1]]).collect(),
-        joined: true,
-    }
+    Series::line(
+        name,
+        rows.outer_iter().map(|row| [row[0], row[1]]).collect(),
+    )
 }
 
 /// Procrustes alignment of rows (n, 2) to `truth` (n, 2): rotation, reflection if needed, and

@@ -96,11 +96,10 @@ pub fn add(
         caption,
     );
 
-    let plan = path_svg(&plan(data, pair, &frames, length))
-        .map_err(|problem| Error::Rendering(problem.into()))?;
+    let plan = path_svg(&plan(data, pair, &frames, length))?;
     section.picture(
         format!("{name}.svg"),
-        plan.into_bytes(),
+        plan,
         "The same in the plane of the path",
     );
 

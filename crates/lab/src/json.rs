@@ -1,51 +1,66 @@
-//! Parts shared by several JSON records. Keys are stable; undefined values are null.
+//! Shapes of core results in JSON records, for `serialize_with`. Keys are stable; undefined values
+//! are null.
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use seese3_core::eval::Baselines;
 use seese3_core::motion_scores::MotionScores;
-use seese3_core::statistics::{Rate, RoomMean, deviation, mean, median};
+use seese3_core::statistics::{coverage, deviation, mean, median};
 
-/// A rate with Wilson's 95 % interval.
-#[derive(Debug, Clone, Serialize)]
-pub struct RateJson {
-    rate: f64,
-    low: f64,
-    high: f64,
+/// Serializes a value as a `J`.
+pub fn shaped<'a, J, T, S>(value: &'a T, to: S) -> Result<S::Ok, S::Error>
+where
+    J: From<&'a T> + Serialize,
+    S: Serializer,
+{
+    J::from(value).serialize(to)
 }
 
-impl From<&Rate> for RateJson {
-    fn from(rate: &Rate) -> Self {
-        Self {
-            rate: rate.rate,
-            low: rate.low,
-            high: rate.high,
-        }
+/// Serializes every value of a list as a `J`.
+pub fn each<'a, J, T, S>(values: &'a [T], to: S) -> Result<S::Ok, S::Error>
+where
+    J: From<&'a T> + Serialize,
+    S: Serializer,
+{
+    to.collect_seq(values.iter().map(J::from))
+}
+
+/// Serializes a value as its text.
+pub fn shown<T: ToString, S: Serializer>(value: &T, to: S) -> Result<S::Ok, S::Error> {
+    to.serialize_str(&value.to_string())
+}
+
+/// Serializes baselines, if there are any.
+pub fn baselines<S: Serializer>(found: &Option<Baselines>, to: S) -> Result<S::Ok, S::Error> {
+    found.as_ref().map(BaselinesJson::from).serialize(to)
+}
+
+/// Serializes the coverage of errors with these squared Mahalanobis lengths, by confidence.
+pub fn coverages<S: Serializer>(squared_lengths: &[f64], to: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Coverages {
+        #[serde(rename = "68")]
+        within_68: f64,
+        #[serde(rename = "95")]
+        within_95: f64,
     }
-}
 
-/// A mean over rooms with its 95 % bootstrap interval.
-#[derive(Debug, Clone, Serialize)]
-pub struct RoomMeanJson {
-    mean: f64,
-    low: f64,
-    high: f64,
-    rooms: usize,
-}
-
-impl From<&RoomMean> for RoomMeanJson {
-    fn from(mean: &RoomMean) -> Self {
-        Self {
-            mean: mean.mean,
-            low: mean.low,
-            high: mean.high,
-            rooms: mean.rooms,
-        }
+    let [within_68, within_95] = covered(squared_lengths);
+    Coverages {
+        within_68,
+        within_95,
     }
+    .serialize(to)
+}
+
+/// Fractions of errors inside the 68 % and the 95 % ellipsoid.
+pub fn covered(squared_lengths: &[f64]) -> [f64; 2] {
+    let found = coverage(squared_lengths);
+    [found.within_68, found.within_95]
 }
 
 /// The scores of predicted motions.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Serialize)]
 pub struct MotionJson {
     n: usize,
     r2: R2Json,
@@ -53,7 +68,7 @@ pub struct MotionJson {
 }
 
 /// R² by component and part of the motion.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Serialize)]
 struct R2Json {
     components: [f64; 6],
     overall: f64,
@@ -97,16 +112,14 @@ struct SpreadJson {
     sd: f64,
 }
 
-impl PartsJson {
-    /// The spread of each part over `runs`.
-    pub fn of(runs: &[MotionScores]) -> Self {
+impl From<&Vec<MotionScores>> for PartsJson {
+    fn from(runs: &Vec<MotionScores>) -> Self {
         let spread = |part: fn(&MotionScores) -> f64| {
             let values: Vec<f64> = runs
                 .iter()
                 .map(part)
                 .filter(|value| !value.is_nan())
                 .collect();
-
             SpreadJson {
                 mean: mean(&values),
                 sd: deviation(&values),
@@ -124,7 +137,7 @@ impl PartsJson {
 }
 
 /// Baselines to compare an R² with.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Serialize)]
 pub struct BaselinesJson {
     constant_r2: f64,
     variance_ratio: f64,
@@ -135,7 +148,7 @@ pub struct BaselinesJson {
 }
 
 /// Median distance and angle from the test frames to the nearest training poses.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Serialize)]
 struct NearestPoseJson {
     m: f64,
     deg: f64,
@@ -156,16 +169,16 @@ impl From<&Baselines> for BaselinesJson {
     }
 }
 
-impl BaselinesJson {
-    /// Medians over the held-out rooms of one adapter; `None` without rooms.
-    pub fn medians<'a>(rooms: impl Iterator<Item = &'a Baselines> + Clone) -> Option<Self> {
-        let first = *rooms.clone().next()?;
-        let middle = |of: fn(&Baselines) -> f64| median(&rooms.clone().map(of).collect::<Vec<_>>());
+/// Medians over the held-out rooms of one adapter; `None` without rooms.
+pub fn median_baselines<'a>(
+    rooms: impl Iterator<Item = &'a Baselines> + Clone,
+) -> Option<Baselines> {
+    let first = *rooms.clone().next()?;
+    let middle = |of: fn(&Baselines) -> f64| median(&rooms.clone().map(of).collect::<Vec<_>>());
 
-        Some(Self::from(&Baselines {
-            constant_r2: middle(|room| room.constant_r2),
-            variance_ratio: middle(|room| room.variance_ratio),
-            ..first
-        }))
-    }
+    Some(Baselines {
+        constant_r2: middle(|room| room.constant_r2),
+        variance_ratio: middle(|room| room.variance_ratio),
+        ..first
+    })
 }
