@@ -28,7 +28,7 @@ use seese3_core::splits::Split;
 use seese3_core::training::TrainingPlan;
 use seese3_encoder::{BUILTIN_DIM, builtin_source, encode_builtin};
 use seese3_lab::experiments::seeds::SeededTraining;
-use seese3_lab::report::{PathPlot, evaluation_table, path_svg, training_json, training_table};
+use seese3_lab::report::{Figure, PathPlot, evaluation_table, training_json, training_table};
 use seese3_store::{Store, StoredRoom};
 use seese3_studio::{Camera, Scene, camera_path, render};
 
@@ -271,7 +271,7 @@ async fn serve_and_ask(
     };
 
     say_navigation(&answer);
-    write_file(picture, &path_svg(&plot_of(room, &answer)?)?)?;
+    write_file(picture, &Figure::from(&plot_of(room, &answer)?).svg()?)?;
 
     say(format_args!(
         "   the path from above: {}",

@@ -35,7 +35,8 @@ pub fn cross_room_table(run: &CrossRoomRun, baseline: &str, threshold: f64) -> T
 /// One line per run: the number of training rooms and R² over the held-out rooms.
 pub fn scaling_table(runs: &[CrossRoomRun], baseline: &str, threshold: f64) -> Table {
     let mut table = Table::new(&format!(
-        "rooms | seed | R² > 0 | R² > 0.3 | best R² | mean max(R², −1) | mean max(R², 0) | Hit@{threshold}, {baseline}"
+        "rooms | seed | R² > 0 | R² > 0.3 | best R² | mean max(R², −1) | mean max(R², 0) | \
+         Hit@{threshold}, {baseline}"
     ));
 
     for run in runs {

@@ -1,6 +1,6 @@
 //! Files of navigator scores: Hit@ε curves as SVG, tables as CSV and LaTeX.
 
-use super::curves::{Curves, Series};
+use super::figure::{Figure, Series};
 use super::table::Table;
 use seese3_core::eval::{Report, Row};
 use seese3_core::statistics::Rate;
@@ -29,7 +29,7 @@ pub fn report_at(report: &Report, thresholds: &[f64]) -> Report {
 }
 
 /// Plots Hit@ε over ε, one curve per navigator.
-pub fn hit_curves(report: &Report, title: String) -> Curves {
+pub fn hit_curves(report: &Report, title: String) -> Figure {
     let curve = |row: &Row| {
         let hits = row.retrieval.hits.iter();
         Series::line(
@@ -38,7 +38,7 @@ pub fn hit_curves(report: &Report, title: String) -> Curves {
         )
     };
     let series = report.rows.iter().map(curve).collect();
-    Curves::new(title, "ε, metres and radians mixed", "Hit@ε", series)
+    Figure::new(title, "ε, metres and radians mixed", "Hit@ε", series)
 }
 
 /// CSV with one line per navigator and the bounds of the 95 % intervals; undefined values are

@@ -6,7 +6,7 @@
 mod adapter_sweep;
 mod columns;
 mod cross_room;
-mod curves;
+mod figure;
 mod document;
 mod evaluation;
 mod evaluation_files;
@@ -16,7 +16,6 @@ mod localization;
 mod odometry;
 mod path_errors;
 mod planning;
-mod plot;
 mod probe;
 mod robustness;
 mod table;
@@ -31,7 +30,6 @@ pub use cross_room::{
     CrossRoomJson, count_text, cross_room_json, cross_room_table, room_difference_text,
     room_mean_text, rooms_table, scaling_table,
 };
-pub use curves::{Curves, Series};
 pub use document::{Block, Document, Picture, Section};
 pub use evaluation::{
     AdapterJson, EvaluationContext, EvaluationJson, MotionBaselines, RoomJson, baselines_text,
@@ -40,6 +38,7 @@ pub use evaluation::{
 pub use evaluation_files::{
     curve_thresholds, evaluation_csv, evaluation_latex, hit_curves, report_at,
 };
+pub use figure::{Axes, Figure, PathPlot, Series};
 pub use formulations::{add_formulations, formulations_table, spread_text};
 pub use layers::{encoders_table, layers_table};
 pub use localization::{
@@ -53,7 +52,6 @@ pub use path_errors::{
     APE_FORMULA, PathErrorsJson, RPE_FORMULA, path_errors_json, path_errors_table,
 };
 pub use planning::{PlanningJson, planning_json, planning_table};
-pub use plot::{PathPlot, path_svg};
 pub use probe::{ProbeJson, ProbedRooms, probe_table};
 pub use robustness::{RobustnessJson, robustness_json, robustness_table};
 pub use table::{Column, Table, fixed};

@@ -11,7 +11,7 @@ use super::plans::{PlanResult, SetResults};
 use super::{Error, Found, Reproduction, paper};
 use crate::experiments::cross_room::{CrossRoomRun, MotionSummary, wins};
 use crate::report::{
-    CrossRoomJson, Curves, Section, Series, Table, count_text, cross_room_json, room_mean_text,
+    CrossRoomJson, Figure, Section, Series, Table, count_text, cross_room_json, room_mean_text,
 };
 
 /// The paper's navigator.
@@ -142,7 +142,7 @@ fn add_curves(section: &mut Section, results: &[SetResults]) -> Result<(), Error
                 let points = sizes.map(|result| [result.plan.rooms as f64, of(&result.run)]);
                 Series::line(&set.features, points.collect())
             });
-            let curves = Curves::new(title, "rooms learned from", y, series.collect());
+            let curves = Figure::new(title, "rooms learned from", y, series.collect());
             let caption = format!("{caption} by how many rooms were learned from");
             section.picture(name, curves.svg()?, caption);
             Ok::<(), Error>(())
@@ -175,7 +175,8 @@ fn add_curves(section: &mut Section, results: &[SetResults]) -> Result<(), Error
 /// One row per feature set and navigator, for the adapter of all rooms; the paper's rows follow.
 fn table(results: &[SetResults]) -> Table {
     let mut table = Table::new(
-        "features | navigator | beats Identity in | Hit@0.1 [95 %] | R² > 0 | mean max(R², −1) [95 %] | mean max(R², 0) [95 %]",
+        "features | navigator | beats Identity in | Hit@0.1 [95 %] | R² > 0 | \
+         mean max(R², −1) [95 %] | mean max(R², 0) [95 %]",
     );
 
     for set in results {

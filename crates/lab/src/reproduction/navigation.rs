@@ -16,7 +16,7 @@ use seese3_core::training::{RoomData, train_adapter};
 use super::claims::{Claim, holds_for_each, is_above_zero};
 use super::notes::{Notes, ReproducedAdapter};
 use super::{Error, Found, Reproduction, paper};
-use crate::report::{Curves, Section, Series, Table, fixed};
+use crate::report::{Figure, Section, Series, Table, fixed};
 
 /// Number of training epochs for the navigation table, on all pairs at one stride.
 const NAVIGATION_EPOCHS: usize = 200;
@@ -116,7 +116,7 @@ fn table(thresholds: &[f64], rows: &[NavigationRecord]) -> Table {
 }
 
 /// Hit@ε of a selection of the navigators.
-fn curves(features: &str, thresholds: &[f64], rows: &[NavigationRecord]) -> Curves {
+fn curves(features: &str, thresholds: &[f64], rows: &[NavigationRecord]) -> Figure {
     let is_shown = |row: &&NavigationRecord| {
         ["identity", "oracle", "inverse-poincare-affine"].contains(&row.navigator.as_str())
             || row.navigator.starts_with("corrector")
@@ -131,7 +131,7 @@ fn curves(features: &str, thresholds: &[f64], rows: &[NavigationRecord]) -> Curv
     };
 
     let series = rows.iter().filter(is_shown).map(curve).collect();
-    Curves::new(format!("Hit@ε, {features}"), "ε", "share of pairs", series)
+    Figure::new(format!("Hit@ε, {features}"), "ε", "share of pairs", series)
 }
 
 fn navigated(

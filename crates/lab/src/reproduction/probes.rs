@@ -12,7 +12,7 @@ use super::{Error, Found, Reproduction, paper};
 use crate::experiments::Within;
 use crate::experiments::folds::FoldedMotions;
 use crate::probes::{Duplicates, MutualKnn, intrinsic_dimension, mutual_knn, ridge_probe};
-use crate::report::{Curves, Section, Series, Table, fixed, room_difference_text};
+use crate::report::{Axes, Figure, Section, Series, Table, fixed, room_difference_text};
 
 /// Maximum number of frames that M1 compares, as in the paper.
 const M1_FRAMES: usize = 256;
@@ -71,17 +71,13 @@ pub fn section(
     ));
 
     // One point per room: M1 at the short stride against M1 at the long one.
-    let series = given.sets.iter().zip(&by_set).map(|(set, probed)| Series {
-        name: set.features.clone(),
-        points: probed
-            .iter()
-            .map(|room| [room.m1_short, room.m1_long])
-            .collect(),
-        joined: false,
+    let series = given.sets.iter().zip(&by_set).map(|(set, probed)| {
+        let points = probed.iter().map(|room| [room.m1_short, room.m1_long]);
+        Series::dots(&set.features, points.collect())
     });
-    let curves = Curves {
-        diagonal: true,
-        ..Curves::new(
+    let curves = Figure {
+        axes: Axes::Diagonal,
+        ..Figure::new(
             "Mutual k-NN, short against long stride",
             "short stride",
             "long stride",

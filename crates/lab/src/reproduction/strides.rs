@@ -13,7 +13,7 @@ use super::claims::{Claim, Verdict, count_words};
 use super::{Error, FeatureSet, Found, Reproduction};
 use crate::experiments::cross_room::CLIPPED_R2;
 use crate::experiments::probe::{ProbeProtocol, probe_adapters};
-use crate::report::{Curves, Section, Series, Table, spread_text};
+use crate::report::{Figure, Section, Series, Table, spread_text};
 
 /// JSON record of M4 at one stride.
 #[derive(Debug, Serialize)]
@@ -125,7 +125,7 @@ fn table(
     table
 }
 
-fn curves(given: &Reproduction<'_>, scored: &[SetScores<'_>]) -> Curves {
+fn curves(given: &Reproduction<'_>, scored: &[SetScores<'_>]) -> Figure {
     // R² has no lower bound: without clipping, one room could dominate the curve.
     let point = |(&stride, rooms): (&u32, &Vec<RoomScores>)| {
         let clipped = rooms.iter().map(|scores| scores.mean().max(CLIPPED_R2));
@@ -136,7 +136,7 @@ fn curves(given: &Reproduction<'_>, scored: &[SetScores<'_>]) -> Curves {
         Series::line(&set.features, points.collect())
     };
 
-    Curves::new(
+    Figure::new(
         "Test R² by stride, five folds (rooms below −1 count as −1)",
         "stride, frames",
         "mean over rooms of max(R², −1)",

@@ -9,7 +9,7 @@ use seese3_core::training::RoomData;
 
 use super::super::Error;
 use super::plane::Plane;
-use crate::report::{Curves, Section, Series};
+use crate::report::{Figure, Section, Series};
 
 /// Adds the two pictures of a recording before and after the adapter.
 pub fn add(section: &mut Section, data: &RoomData<'_>, adapter: &Adapter) -> Result<(), Error> {
@@ -33,7 +33,7 @@ pub fn add(section: &mut Section, data: &RoomData<'_>, adapter: &Adapter) -> Res
         let off_m = off(&truth, &laid);
         let title = format!("{}: {what}", data.room.id());
         let both = vec![series("true path", &truth), series(what, &laid)];
-        let picture = Curves::new(title, "metres", "metres", both).svg()?;
+        let picture = Figure::new(title, "metres", "metres", both).svg()?;
 
         let caption = format!(
             "The true path in its plane, and the two main directions of {what} laid over it: {off_m:.2} m off (root mean \

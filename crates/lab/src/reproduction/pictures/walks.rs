@@ -19,7 +19,7 @@ use seese3_core::training::RoomData;
 use super::super::{Error, Reproduction};
 use super::plane::Plane;
 use super::strip::strip;
-use crate::report::{PathPlot, Section, path_svg};
+use crate::report::{Figure, PathPlot, Section};
 
 /// Number of equal steps of a walk, as in the paper.
 const STEPS: u32 = 4;
@@ -96,7 +96,7 @@ pub fn add(
         caption,
     );
 
-    let plan = path_svg(&plan(data, pair, &frames, length))?;
+    let plan = Figure::from(&plan(data, pair, &frames, length)).svg()?;
     section.picture(
         format!("{name}.svg"),
         plan,
