@@ -1,10 +1,12 @@
 //! What the server answers is what the oracles and the definitions say.
 
+use pb::prediction::Prediction;
 use seese3_client::proto::v1 as pb;
 use seese3_server::Config;
 
 use crate::harness::{
-    by_twist, feature, feature_row, frame, latent, oracle, question, start, to_frame, twist,
+    by_twist, by_twists, feature, feature_row, frame, latent, oracle, question, six, start,
+    to_frame, to_pose, twist,
 };
 use seese3_testing::{golden, json, near, number};
 
@@ -13,61 +15,31 @@ fn expected() -> serde_json::Value {
 }
 
 fn compare(what: &str, scores: &pb::NavigatorScores, expected: &serde_json::Value) {
-    let included = &expected["source_included"];
+    let r2 = number(&expected["r2_variance_weighted"]);
     near(what, scores.mse.unwrap(), number(&expected["mse"]), 1e-9);
+    near(what, scores.r2.unwrap(), r2, 1e-8);
 
-    near(
-        what,
-        scores.r2.unwrap(),
-        number(&expected["r2_variance_weighted"]),
-        1e-8,
-    );
-
-    compare_hits(what, scores, included);
+    compare_hits(what, scores, &expected["source_included"]);
 }
 
 fn compare_hits(what: &str, scores: &pb::NavigatorScores, included: &serde_json::Value) {
     assert_eq!(u64::from(scores.n), included["n"].as_u64().unwrap());
 
-    near(
-        what,
-        scores.top1.unwrap().rate,
-        number(&included["top1"]),
-        1e-12,
-    );
-
-    near(
-        what,
-        scores.translation_m_median,
-        number(&included["median_t_m"]),
-        1e-9,
-    );
-
-    near(
-        what,
-        scores.rotation_rad_median,
-        number(&included["median_R_rad"]),
-        1e-9,
-    );
+    for (found, key, bound) in [
+        (scores.top1.unwrap().rate, "top1", 1e-12),
+        (scores.translation_m_median, "median_t_m", 1e-9),
+        (scores.rotation_rad_median, "median_R_rad", 1e-9),
+    ] {
+        near(what, found, number(&included[key]), bound);
+    }
 
     for hit in &scores.hit_rates {
         let key = hit.threshold.to_string();
         let rate = hit.rate.unwrap();
+        let [low, high] = [0, 1].map(|end| number(&included["hit_wilson95"][&key][end]));
         near(what, rate.rate, number(&included["hit"][&key]), 1e-12);
-
-        near(
-            what,
-            rate.low,
-            number(&included["hit_wilson95"][&key][0]),
-            1e-9,
-        );
-
-        near(
-            what,
-            rate.high,
-            number(&included["hit_wilson95"][&key][1]),
-            1e-9,
-        );
+        near(what, rate.low, low, 1e-9);
+        near(what, rate.high, high, 1e-9);
     }
 }
 
@@ -85,26 +57,14 @@ async fn evaluate_streams_progress_and_the_oracles_table() {
     let mut begun = Vec::new();
     let report = server
         .client
-        .evaluate(request, |step| begun.push(step.navigator))
-        .await
-        .unwrap();
-    let names: Vec<&str> = report
-        .navigators
-        .iter()
-        .map(|row| row.name.as_str())
-        .collect();
-
+        .evaluate(request, |step| begun.push(step.navigator));
+    let report = report.await.unwrap();
+    let rows = &report.navigators;
+    let names: Vec<&str> = rows.iter().map(|row| row.name.as_str()).collect();
     assert_eq!(begun, names);
 
-    assert_eq!(
-        (
-            report.n,
-            report.candidate_count,
-            report.in_room,
-            report.leaks
-        ),
-        (80, 120, true, false)
-    );
+    assert_eq!((report.n, report.candidate_count), (80, 120));
+    assert!(report.in_room && !report.leaks);
 
     let expected = expected();
     for (ours, theirs) in [
@@ -114,11 +74,7 @@ async fn evaluate_streams_progress_and_the_oracles_table() {
         ("inverse-poincare-literal", "inverse_literal"),
         ("ridge-refit", "refit_raw_no_intercept_80_20"),
     ] {
-        let row = report
-            .navigators
-            .iter()
-            .find(|row| row.name == ours)
-            .unwrap();
+        let row = rows.iter().find(|row| row.name == ours).unwrap();
         compare(ours, row, &expected["navigators"][theirs]);
     }
 }
@@ -146,23 +102,21 @@ async fn walks_that_snap_can_be_handed_in() {
 
     let mut predictions = Vec::new();
     for source in 0..600 - stride {
-        let walk = pb::NavigateRequest {
-            source: frame(source),
-            displacement: to_frame(source + stride),
-            navigator: "inverse-poincare-affine".to_owned(),
-            steps: Some(steps),
-            mode: pb::Mode::Snap.into(),
-            exclude_source: true,
-            exclude_radius: radius,
-            ..question()
+        let walk = |r: &mut pb::NavigateRequest| {
+            r.source = frame(source);
+            r.displacement = to_frame(source + stride);
+            r.navigator = "inverse-poincare-affine".to_owned();
+            r.steps = Some(steps);
+            r.mode = pb::Mode::Snap.into();
+            (r.exclude_source, r.exclude_radius) = (true, radius);
         };
-        let walked = server.client.navigate(walk).await.unwrap().steps;
+        let walked = server.navigated(walk).await.steps;
         let retrieved = |step: usize| walked[step].frames[0].frame_id;
 
         predictions.push(pb::Prediction {
             source_frame_id: source,
             target_frame_id: source + stride,
-            prediction: Some(pb::prediction::Prediction::RetrievedFrameId(retrieved(2))),
+            prediction: Some(Prediction::RetrievedFrameId(retrieved(2))),
             last_step_frame_id: Some(retrieved(1)),
         });
     }
@@ -177,11 +131,8 @@ async fn walks_that_snap_can_be_handed_in() {
     };
     let scored = server
         .client
-        .score_predictions(request(predictions.clone()))
-        .await
-        .unwrap()
-        .scores
-        .unwrap();
+        .score_predictions(request(predictions.clone()));
+    let scored = scored.await.unwrap().scores.unwrap();
 
     let expected = &report.navigators[0];
     assert_eq!((scored.n, expected.n), (560, 560));
@@ -210,24 +161,15 @@ async fn a_clients_predictions_get_the_oracles_scores() {
         ..pb::Prediction::default()
     };
 
-    let by_latent = latents
-        .outer_iter()
-        .zip(pairs.clone())
-        .map(|(latent, pair)| {
-            prediction(
-                pair,
-                pb::prediction::Prediction::Latent(pb::Latent {
-                    values: latent.to_vec(),
-                }),
-            )
-        });
-
-    let by_frame = frames.iter().zip(pairs).map(|(&frame, pair)| {
-        prediction(
-            pair,
-            pb::prediction::Prediction::RetrievedFrameId(frame as u32),
-        )
+    let by_latent = latents.outer_iter().zip(pairs.clone());
+    let by_latent = by_latent.map(|(latent, pair)| {
+        let values = latent.to_vec();
+        prediction(pair, Prediction::Latent(pb::Latent { values }))
     });
+
+    let by_frame = frames.iter().zip(pairs);
+    let by_frame =
+        by_frame.map(|(&frame, pair)| prediction(pair, Prediction::RetrievedFrameId(frame as u32)));
 
     let expected = &expected()["navigators"]["refit_zscored_intercept_80_20"];
 
@@ -237,26 +179,16 @@ async fn a_clients_predictions_get_the_oracles_scores() {
         predictions,
         ..pb::ScorePredictionsRequest::default()
     };
-    let scored = server
-        .client
-        .score_predictions(request(by_latent.collect()))
-        .await
-        .unwrap();
+    let score = async |predictions| {
+        let scored = server.client.score_predictions(request(predictions));
+        let scored = scored.await.unwrap();
+        assert_eq!(scored.candidate_count, 120);
+        scored.scores.unwrap()
+    };
+    compare("latents", &score(by_latent.collect()).await, expected);
 
-    assert_eq!(scored.candidate_count, 120);
-
-    compare("latents", &scored.scores.unwrap(), expected);
-
-    let scores = server
-        .client
-        .score_predictions(request(by_frame.collect()))
-        .await
-        .unwrap()
-        .scores
-        .unwrap();
-
+    let scores = score(by_frame.collect()).await;
     assert_eq!((scores.mse, scores.r2), (None, None));
-
     compare_hits("frames", &scores, &expected["source_included"]);
 }
 
@@ -276,27 +208,15 @@ async fn estimated_motions_have_pytorchs_r2() {
             ),
         };
 
-        let room = "synthetic".to_owned();
         let request = pb::EstimateMotionRequest {
-            room,
+            room: "synthetic".to_owned(),
             first,
             second,
             ..Default::default()
         };
-
-        let motion = server
-            .client
-            .estimate_motion(request)
-            .await
-            .unwrap()
-            .motion
-            .unwrap();
-
-        let v = motion.linear.unwrap();
-        let w = motion.angular.unwrap();
-        predicted
-            .row_mut(row)
-            .assign(&ndarray::arr1(&[v.x, v.y, v.z, w.x, w.y, w.z]));
+        let estimate = server.client.estimate_motion(request).await.unwrap();
+        let motion = six(&estimate.motion.unwrap());
+        predicted.row_mut(row).assign(&ndarray::arr1(&motion));
     }
 
     let stated = &json(&golden().join("m4_adapter/synthetic_expected.json"))["trained_k1"]["test_r2"]
@@ -309,13 +229,15 @@ async fn estimated_motions_have_pytorchs_r2() {
             (r + (y - p).powi(2), t + (y - mean).powi(2))
         });
 
-        near(
-            "R²",
-            1.0 - residual / total,
-            number(&stated[component]),
-            1e-9,
-        );
+        let r2 = 1.0 - residual / total;
+        near("R²", r2, number(&stated[component]), 1e-9);
     }
+}
+
+fn thresholds_are_met_below_them(error: &pb::PoseError) {
+    assert_eq!(error.thresholds.len(), 4);
+    let is_right = |hit: &pb::ThresholdCheck| hit.met == (error.twist_norm < hit.threshold);
+    assert!(error.thresholds.iter().all(is_right));
 }
 
 /// Oracle: SciPy's twist of the pair, and the definitions: the truth is log(P₁⁻¹P₂), a frame is its
@@ -325,29 +247,22 @@ async fn frames_of_a_room_are_answered_with_the_truth() {
     let server = start(Config::default()).await;
     let truth = oracle("test_twists");
 
-    let request = |second| pb::EstimateMotionRequest {
-        room: "synthetic".to_owned(),
-        first: frame(485),
-        second,
-        ..pb::EstimateMotionRequest::default()
+    let estimate = async |second| {
+        let request = pb::EstimateMotionRequest {
+            room: "synthetic".to_owned(),
+            first: frame(485),
+            second,
+            ..pb::EstimateMotionRequest::default()
+        };
+        server.client.estimate_motion(request).await.unwrap()
     };
-    let answer = server
-        .client
-        .estimate_motion(request(frame(525)))
-        .await
-        .unwrap();
+    let answer = estimate(frame(525)).await;
 
     assert_eq!(answer.reader(), pb::MotionReader::Adapter);
     assert!(answer.covariance.is_empty());
 
-    let six = |twist: pb::Twist| {
-        let v = twist.linear.unwrap();
-        let w = twist.angular.unwrap();
-        [v.x, v.y, v.z, w.x, w.y, w.z]
-    };
-    let found = six(answer.motion.unwrap());
-
-    let stated = six(answer.true_motion.unwrap());
+    let found = six(&answer.motion.unwrap());
+    let stated = six(&answer.true_motion.unwrap());
     let mut squares = 0.0;
     for component in 0..6 {
         near("truth", stated[component], truth[(5, component)], 1e-9);
@@ -357,32 +272,17 @@ async fn frames_of_a_room_are_answered_with_the_truth() {
     let error = answer.error.unwrap();
     near("error", error.twist_norm, squares.sqrt(), 1e-9);
 
-    assert!(
-        error
-            .thresholds
-            .iter()
-            .all(|hit| hit.met == (error.twist_norm < hit.threshold))
-            && error.thresholds.len() == 4
-    );
+    thresholds_are_met_below_them(&error);
 
-    let blind = server
-        .client
-        .estimate_motion(request(feature(feature_row(525))))
-        .await
-        .unwrap();
+    // A feature has no pose.
+    let blind = estimate(feature(feature_row(525))).await;
+    assert!(blind.error.is_none() && blind.true_motion.is_none());
 
-    assert!(
-        blind.error.is_none() && blind.true_motion.is_none(),
-        "a feature has no pose"
-    );
-
-    let request = pb::LocalizeRequest {
-        rooms: vec!["synthetic".to_owned()],
-        view: frame(123),
-        top_k: Some(2),
-        ..pb::LocalizeRequest::default()
-    };
-    let places = server.client.localize(request).await.unwrap().places;
+    let localized = server.localized(|r| {
+        r.rooms = vec!["synthetic".to_owned()];
+        (r.view, r.top_k) = (frame(123), Some(2));
+    });
+    let places = localized.await.places;
 
     assert_eq!(places[0].error.as_ref().unwrap().twist_norm, 0.0);
     assert!(places[1].error.as_ref().unwrap().translation_m > 0.0);
@@ -397,47 +297,23 @@ async fn a_closed_loop_steers_every_motion_to_its_planned_goal() {
     let first = [0.1, 0.0, 0.2, 0.0, 0.1, 0.0];
     let second = [0.2, 0.1, 0.0, 0.1, 0.0, 0.1];
 
-    let ask = |displacement| pb::NavigateRequest {
-        displacement,
-        mode: pb::Mode::ClosedLoop.into(),
-        ..question()
+    let go = async |from: u32, displacement| {
+        let closed_loop = |r: &mut pb::NavigateRequest| {
+            (r.source, r.displacement) = (frame(from), displacement);
+            r.mode = pb::Mode::ClosedLoop.into();
+        };
+        server.navigated(closed_loop).await.steps
     };
-
-    let list = pb::displacement::Displacement::Twists(pb::TwistList {
-        twists: vec![twist(first), twist(second)],
-    });
-    let list = Some(pb::Displacement {
-        displacement: Some(list),
-    });
-    let both = server.client.navigate(ask(list)).await.unwrap();
+    let both = go(500, by_twists(vec![twist(first), twist(second)])).await;
 
     // From the frame that the first motion retrieved, straight to the pose that the list plans.
-    let goal = both.steps[1].requested_pose.clone().unwrap();
-    let to_goal = Some(pb::Displacement {
-        displacement: Some(pb::displacement::Displacement::TargetPose(goal)),
-    });
+    let goal = both[1].requested_pose.clone().unwrap();
+    let reached = both[0].frames[0].frame_id;
+    let direct = go(reached, to_pose(goal)).await;
 
-    let reached = both.steps[0].frames[0].frame_id;
-    let direct = server
-        .client
-        .navigate(pb::NavigateRequest {
-            source: frame(reached),
-            ..ask(to_goal)
-        })
-        .await
-        .unwrap();
-
-    assert_eq!(
-        both.steps[1].frames[0].frame_id,
-        direct.steps[0].frames[0].frame_id
-    );
-
-    near(
-        "distance",
-        both.steps[1].frames[0].distance,
-        direct.steps[0].frames[0].distance,
-        1e-9,
-    );
+    let [ours, theirs] = [&both[1].frames[0], &direct[0].frames[0]];
+    assert_eq!(ours.frame_id, theirs.frame_id);
+    near("distance", ours.distance, theirs.distance, 1e-9);
 }
 
 /// Oracle: the definitions. Zero motion stays put at distance 0; the open loop's end is the same in
@@ -446,86 +322,48 @@ async fn a_closed_loop_steers_every_motion_to_its_planned_goal() {
 async fn equal_questions_have_equal_answers() {
     let server = start(Config::default()).await;
 
-    let still = pb::NavigateRequest {
-        displacement: by_twist([0.0; 6]),
-        steps: Some(3),
-        ..question()
+    let still = |r: &mut pb::NavigateRequest| {
+        (r.displacement, r.steps) = (by_twist([0.0; 6]), Some(3));
     };
-    let answer = server.client.navigate(still).await.unwrap();
-
-    for step in &answer.steps {
-        assert_eq!(
-            (step.frames[0].frame_id, step.frames[0].distance),
-            (500, 0.0)
-        );
+    for step in &server.navigated(still).await.steps {
+        let nearest = &step.frames[0];
+        assert_eq!((nearest.frame_id, nearest.distance), (500, 0.0));
         assert_eq!(step.error.as_ref().unwrap().twist_norm, 0.0);
     }
 
-    let one = server.client.navigate(question()).await.unwrap();
+    let one = server.navigated(|_| ()).await;
     let end = |answer: &pb::NavigateResponse| answer.steps.last().unwrap().clone();
 
-    let eight = pb::NavigateRequest {
-        steps: Some(8),
-        ..question()
-    };
-    let eight = server.client.navigate(eight).await.unwrap();
-
+    let eight = server.navigated(|r| r.steps = Some(8)).await;
     assert_eq!(eight.steps.len(), 8);
 
     let a = end(&one).latent.unwrap().values;
     let b = end(&eight).latent.unwrap().values;
     assert!(a.iter().zip(&b).all(|(a, b)| (a - b).abs() < 1e-12));
 
-    let target = server
-        .client
-        .localize(pb::LocalizeRequest {
-            rooms: vec!["synthetic".to_owned()],
-            view: frame(540),
-            ..pb::LocalizeRequest::default()
-        })
-        .await
-        .unwrap();
+    let target = server.localized(|r| {
+        r.rooms = vec!["synthetic".to_owned()];
+        r.view = frame(540);
+    });
+    let target = target.await;
 
     let pose = target.places[0].frame.clone().unwrap().pose.unwrap();
     assert_eq!(pose.parent_frame, "rooms/synthetic");
 
+    let motion = one.displacement.unwrap();
     for displacement in [
-        pb::displacement::Displacement::TargetPose(pose),
-        pb::displacement::Displacement::Twist(one.displacement.unwrap()),
-        pb::displacement::Displacement::Twists(pb::TwistList {
-            twists: vec![one.displacement.unwrap()],
-        }),
+        to_pose(pose),
+        by_twists(vec![motion]),
+        by_twist(six(&motion)),
     ] {
-        let displacement = Some(pb::Displacement {
-            displacement: Some(displacement),
-        });
+        let same = server.navigated(|r| r.displacement = displacement).await;
+        let [same, one] = [&same, &one].map(end);
+        let [found, expected] = [&same.frames[0], &one.frames[0]];
+        assert_eq!(found.frame_id, expected.frame_id);
+        near("distance", found.distance, expected.distance, 1e-9);
 
-        let same = server
-            .client
-            .navigate(pb::NavigateRequest {
-                displacement,
-                ..question()
-            })
-            .await
-            .unwrap();
-
-        let same = end(&same);
-        let one = end(&one);
-        assert_eq!(same.frames[0].frame_id, one.frames[0].frame_id);
-
-        near(
-            "distance",
-            same.frames[0].distance,
-            one.frames[0].distance,
-            1e-9,
-        );
-
-        near(
-            "error",
-            same.error.unwrap().twist_norm,
-            one.error.unwrap().twist_norm,
-            1e-9,
-        );
+        let [found, expected] = [same, one].map(|step| step.error.unwrap().twist_norm);
+        near("error", found, expected, 1e-9);
     }
 }
 
@@ -535,40 +373,23 @@ async fn equal_questions_have_equal_answers() {
 async fn a_feature_answers_as_its_frame_does_but_knows_no_truth() {
     let server = start(Config::default()).await;
     let numbers = [0.1, 0.0, 0.3, 0.0, -0.2, 0.0];
-    let by_frame = pb::NavigateRequest {
-        displacement: by_twist(numbers),
-        top_k: Some(3),
-        ..question()
+    let from = async |source| {
+        let go = |r: &mut pb::NavigateRequest| {
+            (r.source, r.displacement) = (source, by_twist(numbers));
+            r.top_k = Some(3);
+        };
+        server.navigated(go).await
     };
+    let frame_answer = from(frame(500)).await;
 
-    let frame_answer = server.client.navigate(by_frame.clone()).await.unwrap();
-
-    let still = pb::NavigateRequest {
-        displacement: by_twist([0.0; 6]),
-        ..question()
-    };
-    let latent_of = server.client.navigate(still).await.unwrap().steps[0]
-        .latent
-        .clone()
-        .unwrap()
-        .values;
+    let still = server.navigated(|r| r.displacement = by_twist([0.0; 6]));
+    let latent_of = still.await.steps[0].latent.clone().unwrap().values;
 
     for source in [feature(feature_row(500)), latent(latent_of)] {
-        let answer = server
-            .client
-            .navigate(pb::NavigateRequest {
-                source,
-                ..by_frame.clone()
-            })
-            .await
-            .unwrap();
-
+        let answer = from(source).await;
         let frames = |answer: &pb::NavigateResponse| {
-            answer.steps[0]
-                .frames
-                .iter()
-                .map(|hit| hit.frame_id)
-                .collect::<Vec<_>>()
+            let frames = answer.steps[0].frames.iter();
+            frames.map(|hit| hit.frame_id).collect::<Vec<_>>()
         };
 
         assert_eq!(frames(&answer), frames(&frame_answer));
@@ -576,15 +397,7 @@ async fn a_feature_answers_as_its_frame_does_but_knows_no_truth() {
         assert!(answer.displacement.is_none());
     }
 
-    let error = frame_answer.steps[0].error.clone().unwrap();
-    assert_eq!(error.thresholds.len(), 4);
-
-    assert!(
-        error
-            .thresholds
-            .iter()
-            .all(|hit| hit.met == (error.twist_norm < hit.threshold))
-    );
+    thresholds_are_met_below_them(frame_answer.steps[0].error.as_ref().unwrap());
 }
 
 /// Oracle: the contract of exclusion and of k, and that a list of motions is their composition.
@@ -592,17 +405,11 @@ async fn a_feature_answers_as_its_frame_does_but_knows_no_truth() {
 async fn exclusion_counts_and_lists_of_motions() {
     let server = start(Config::default()).await;
 
-    let excluded = pb::NavigateRequest {
-        displacement: by_twist([0.0; 6]),
-        top_k: Some(20),
-        exclude_source: true,
-        exclude_radius: 3,
-        ..question()
+    let excluded = |r: &mut pb::NavigateRequest| {
+        (r.displacement, r.top_k) = (by_twist([0.0; 6]), Some(20));
+        (r.exclude_source, r.exclude_radius) = (true, 3);
     };
-
-    let hits = server.client.navigate(excluded).await.unwrap().steps[0]
-        .frames
-        .clone();
+    let hits = server.navigated(excluded).await.steps[0].frames.clone();
 
     assert_eq!(hits.len(), 20);
     assert!(hits.iter().all(|hit| hit.frame_id.abs_diff(500) > 3));
@@ -610,31 +417,15 @@ async fn exclusion_counts_and_lists_of_motions() {
 
     let there = twist([0.2, 0.0, 0.1, 0.0, 0.3, 0.0]);
     let back = twist([-0.2, 0.0, -0.1, 0.0, -0.3, 0.0]);
-    let list = pb::displacement::Displacement::Twists(pb::TwistList {
-        twists: vec![there, back],
-    });
-    let displacement = Some(pb::Displacement {
-        displacement: Some(list),
-    });
-
-    let answer = server
-        .client
-        .navigate(pb::NavigateRequest {
-            displacement,
-            steps: Some(2),
-            ..question()
-        })
-        .await
-        .unwrap();
-
+    let list = |r: &mut pb::NavigateRequest| {
+        (r.displacement, r.steps) = (by_twists(vec![there, back]), Some(2));
+    };
+    let answer = server.navigated(list).await;
     assert_eq!(answer.steps.len(), 4);
 
+    // There and back is where it began.
     let last = &answer.steps[3];
-    assert_eq!(
-        last.frames[0].frame_id, 500,
-        "there and back is where it began"
-    );
-
+    assert_eq!(last.frames[0].frame_id, 500);
     assert!(last.error.as_ref().unwrap().twist_norm < 1e-9);
 }
 
@@ -655,9 +446,8 @@ async fn a_batch_answers_as_its_questions_do_and_one_failure_is_alone() {
     };
     let results = server
         .client
-        .batch_navigate(vec![question(), bad, snap.clone()])
-        .await
-        .unwrap();
+        .batch_navigate(vec![question(), bad, snap.clone()]);
+    let results = results.await.unwrap();
 
     let alone = [
         server.client.navigate(question()).await.unwrap(),
@@ -684,25 +474,17 @@ async fn a_batch_answers_as_its_questions_do_and_one_failure_is_alone() {
 async fn a_mapped_feature_is_found_in_its_room() {
     let server = start(Config::default()).await;
 
-    let request = pb::LocalizeRequest {
-        view: feature(feature_row(123)),
-        top_k: Some(5),
-        ..Default::default()
-    };
-    let answer = server.client.localize(request).await.unwrap();
-
+    let localized = server.localized(|r| {
+        (r.view, r.top_k) = (feature(feature_row(123)), Some(5));
+    });
+    let answer = localized.await;
     assert_eq!((answer.room_count, answer.places.len()), (2, 5));
 
     let best = &answer.places[0];
-    assert_eq!(
-        (
-            best.room.as_ref().unwrap().name.as_str(),
-            best.frame.as_ref().unwrap().frame_id
-        ),
-        ("synthetic", 123)
-    );
-
-    assert!(best.frame.as_ref().unwrap().distance < 1e-12);
+    let frame = best.frame.as_ref().unwrap();
+    assert_eq!(best.room.as_ref().unwrap().name, "synthetic");
+    assert_eq!(frame.frame_id, 123);
+    assert!(frame.distance < 1e-12);
 }
 
 /// Oracle: what was published.
@@ -710,46 +492,26 @@ async fn a_mapped_feature_is_found_in_its_room() {
 async fn the_catalog_lists_what_the_store_has() {
     let server = start(Config::default()).await;
     let rooms = server.client.rooms().await.unwrap();
-    let names: Vec<_> = rooms
-        .iter()
-        .map(|room| room.revision.clone().unwrap().name)
-        .collect();
-
+    let names = rooms.iter().map(|room| room.revision.clone().unwrap().name);
+    let names: Vec<_> = names.collect();
     assert_eq!(names, ["synthetic", "synthetic_b"]);
 
-    assert_eq!(
-        (rooms[0].frame_count, rooms[0].adapters.clone()),
-        (600, vec!["oracle".to_owned()])
-    );
-
+    assert_eq!(rooms[0].frame_count, 600);
+    assert_eq!(rooms[0].adapters, ["oracle"]);
     assert_eq!(rooms[0].features[0].dim, 48);
 
     let adapter = server.client.adapter("oracle").await.unwrap().unwrap();
-    assert_eq!(
-        (adapter.latent_dim, adapter.stride, adapter.split.as_str()),
-        (20, 40, "time")
-    );
+    assert_eq!((adapter.latent_dim, adapter.stride), (20, 40));
+    assert_eq!(adapter.split, "time");
 
-    assert_eq!(
-        adapter.test.unwrap().direction,
-        None,
-        "a score without meaning is absent"
-    );
+    // A score without meaning is absent.
+    assert_eq!(adapter.test.unwrap().direction, None);
 
     let expected = json(&golden().join("m4_adapter/synthetic_expected.json"));
-    near(
-        "mu",
-        adapter.target_mean.unwrap().linear.unwrap().x,
-        number(&expected["mu"][0]),
-        1e-12,
-    );
-
-    near(
-        "sd",
-        adapter.target_deviation.unwrap().angular.unwrap().z,
-        number(&expected["sd"][5]),
-        1e-12,
-    );
+    let mean = six(&adapter.target_mean.unwrap());
+    let deviation = six(&adapter.target_deviation.unwrap());
+    near("mu", mean[0], number(&expected["mu"][0]), 1e-12);
+    near("sd", deviation[5], number(&expected["sd"][5]), 1e-12);
 }
 
 /// Oracle: the exact index.
@@ -768,15 +530,12 @@ async fn the_hnsw_index_answers_as_the_exact_one_here_and_says_what_it_is() {
     .await;
 
     for source in (0..560).step_by(40) {
-        let request = pb::NavigateRequest {
-            source: frame(source),
-            displacement: to_frame(source + 40),
-            top_k: Some(10),
-            ..question()
+        let go = |r: &mut pb::NavigateRequest| {
+            (r.source, r.displacement) = (frame(source), to_frame(source + 40));
+            r.top_k = Some(10);
         };
-        let a = exact.client.navigate(request.clone()).await.unwrap();
-
-        let b = hnsw.client.navigate(request).await.unwrap();
+        let a = exact.navigated(go).await;
+        let b = hnsw.navigated(go).await;
         assert_eq!(a.steps, b.steps);
         assert!(a.exact && !b.exact);
     }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use pb::set_default_request::Default;
 use seese3_client::proto::v1 as pb;
 use seese3_client::{Client, Error};
 use seese3_core::features::Features;
@@ -12,8 +13,8 @@ use sha2::{Digest, Sha256};
 use tonic::Code;
 
 use crate::harness::{
-    TestServer, feature, features_of, filled_store, oracle_adapter, question, record, room_of,
-    start_on,
+    TestServer, code_of, feature, features_of, filled_store, publish_oracle, question, refused,
+    room_of, start_on,
 };
 use crate::security::{client_with, principal};
 use seese3_testing::world;
@@ -84,11 +85,8 @@ impl Upload {
     }
 
     fn synthetic(name: &str) -> Self {
-        Self::of(
-            name,
-            &room_of("any", "synthetic"),
-            &features_of("synthetic"),
-        )
+        let room = room_of("any", "synthetic");
+        Self::of(name, &room, &features_of("synthetic"))
     }
 
     fn messages(self) -> Vec<pb::CreateRoomRequest> {
@@ -124,65 +122,35 @@ impl Upload {
     }
 }
 
-fn code_and_field<T: std::fmt::Debug>(answer: Result<T, Error>) -> (Code, String) {
-    let error = answer.unwrap_err();
-    let code = error.code().unwrap_or_else(|| panic!("{error}"));
-    (code, error.field().unwrap_or_default())
-}
-
 /// Oracle: a room that was published from the disk with the same frames and features.
 #[tokio::test]
 async fn an_uploaded_room_answers_as_one_from_the_disk() {
     let (server, store) = start_writable().await;
-    let answer = Upload::synthetic("rooms/uploaded")
-        .send(&server.client)
-        .await
-        .unwrap();
-    assert_eq!(
-        (
-            answer.revision.unwrap().revision,
-            answer.created,
-            answer.served
-        ),
-        (1, true, true)
-    );
+    let uploaded = async |is_new: bool| {
+        let upload = Upload::synthetic("rooms/uploaded");
+        let answer = upload.send(&server.client).await.unwrap();
+        assert_eq!(answer.revision.unwrap().revision, 1);
+        assert_eq!((answer.created, answer.served), (is_new, true));
+    };
+    uploaded(true).await;
 
     // It is served as soon as the upload is answered.
     let asked = |room: &str| {
-        server.client.navigate(pb::NavigateRequest {
-            room: room.to_owned(),
-            top_k: Some(5),
-            ..question()
-        })
+        let room = room.to_owned();
+        server.navigated(|r| (r.room, r.top_k) = (room, Some(5)))
     };
-    let (here, there) = (
-        asked("uploaded").await.unwrap(),
-        asked("synthetic").await.unwrap(),
-    );
+    let (here, there) = (asked("uploaded").await, asked("synthetic").await);
     assert_eq!(here.steps[0].frames.len(), 5);
     for (here, there) in here.steps[0].frames.iter().zip(&there.steps[0].frames) {
         assert_eq!(here.frame_id, there.frame_id);
         assert!((here.distance - there.distance).abs() < 1e-9);
         assert_eq!(here.frame_name, format!("frame-{}", here.frame_id));
-        assert_eq!(
-            here.timestamp_ns,
-            Some(i64::from(here.frame_id) * 33_000_000)
-        );
+        let taken_at = i64::from(here.frame_id) * 33_000_000;
+        assert_eq!(here.timestamp_ns, Some(taken_at));
     }
 
     // The same again is the same revision.
-    let again = Upload::synthetic("rooms/uploaded")
-        .send(&server.client)
-        .await
-        .unwrap();
-    assert_eq!(
-        (
-            again.revision.unwrap().revision,
-            again.created,
-            again.served
-        ),
-        (1, false, true)
-    );
+    uploaded(false).await;
     assert!(store.verify(&|_| ()).await.unwrap().is_empty());
 }
 
@@ -192,111 +160,85 @@ async fn unfit_uploads_are_refused_and_leave_nothing() {
     let (server, store) = start_writable().await;
     let good = Upload::synthetic("rooms/bad");
 
-    let altered = |alter: &dyn Fn(&mut Upload)| {
-        let mut upload = good.clone();
-        alter(&mut upload);
-        upload
-    };
-    let nan_pose = |upload: &mut Upload| {
-        upload.batches[1].poses[..8].copy_from_slice(&f64::NAN.to_le_bytes());
-    };
-    let transposed = |upload: &mut Upload| {
-        // The translation of the first frame moves into its last row.
-        upload.batches[0].poses[96..104].copy_from_slice(&1.0_f64.to_le_bytes());
-    };
-    let nan_feature = |upload: &mut Upload| {
-        upload.batches[2].features[0][..4].copy_from_slice(&f32::NAN.to_le_bytes());
-    };
-
-    for (upload, field) in [
-        (altered(&|u| u.spec.name = "bad".to_owned()), "room.name"),
+    let cases: [(fn(&mut Upload), &str); 26] = [
+        (|u| u.spec.name = "bad".into(), "room.name"),
+        (|u| u.spec.name = "rooms/../x".into(), "room.name"),
         (
-            altered(&|u| u.spec.name = "rooms/../x".to_owned()),
+            |u| u.spec.name = "rooms/bad/revisions/1".into(),
             "room.name",
         ),
+        (|u| u.spec.name = "adapters/bad".into(), "room.name"),
+        (|u| u.spec.features.clear(), "room.features"),
+        (|u| u.spec.features[0].dim = 0, "room.features.dim"),
+        (|u| u.spec.features[0].dim = u32::MAX, "room.features.dim"),
         (
-            altered(&|u| u.spec.name = "rooms/bad/revisions/1".to_owned()),
-            "room.name",
-        ),
-        (
-            altered(&|u| u.spec.name = "adapters/bad".to_owned()),
-            "room.name",
-        ),
-        (altered(&|u| u.spec.features.clear()), "room.features"),
-        (
-            altered(&|u| u.spec.features[0].dim = 0),
-            "room.features.dim",
-        ),
-        (
-            altered(&|u| u.spec.features[0].dim = u32::MAX),
-            "room.features.dim",
-        ),
-        (
-            altered(&|u| u.spec.features[0].name = "a/b".to_owned()),
+            |u| u.spec.features[0].name = "a/b".into(),
             "room.features.name",
         ),
         (
-            altered(&|u| u.spec.encode_for = "adapters/oracle".to_owned()),
+            |u| u.spec.encode_for = "adapters/oracle".into(),
             "room.encode_for",
         ),
+        (|u| u.spec.licence = "x".repeat(2_000), "room.licence"),
         (
-            altered(&|u| u.spec.licence = "x".repeat(2_000)),
-            "room.licence",
-        ),
-        (
-            altered(&|u| {
+            |u| {
                 u.spec.camera = Some(pb::Pinhole {
                     width: 640.0,
                     height: 480.0,
                     focal: f64::NAN,
                     ..pb::Pinhole::default()
                 });
-            }),
+            },
             "room.camera",
         ),
-        (altered(&nan_pose), "frames.poses"),
-        (altered(&transposed), "frames.poses"),
         (
-            altered(&|u| u.batches[0].poses.truncate(127)),
+            |u| u.batches[1].poses[..8].copy_from_slice(&f64::NAN.to_le_bytes()),
             "frames.poses",
         ),
-        (altered(&|u| u.batches[0].poses.clear()), "frames.poses"),
+        // The translation of the first frame moves into its last row.
         (
-            altered(&|u| {
+            |u| u.batches[0].poses[96..104].copy_from_slice(&1.0_f64.to_le_bytes()),
+            "frames.poses",
+        ),
+        (|u| u.batches[0].poses.truncate(127), "frames.poses"),
+        (|u| u.batches[0].poses.clear(), "frames.poses"),
+        (
+            |u| {
                 u.batches[0].features[0].pop();
-            }),
+            },
             "frames.features",
         ),
+        (|u| u.batches[0].features.clear(), "frames.features"),
+        (|u| u.batches[0].images.push(vec![1]), "frames.images"),
         (
-            altered(&|u| u.batches[0].features.clear()),
-            "frames.features",
-        ),
-        (
-            altered(&|u| u.batches[0].images.push(vec![1])),
-            "frames.images",
-        ),
-        (
-            altered(&|u| {
+            |u| {
                 u.batches[1].timestamps_ns.pop();
-            }),
+            },
             "frames.timestamps_ns",
         ),
+        (|u| u.batches[1].frame_names.clear(), "frames.frame_names"),
         (
-            altered(&|u| u.batches[1].frame_names.clear()),
-            "frames.frame_names",
-        ),
-        (
-            altered(&|u| u.batches[1].sequences = vec![0; 100]),
+            |u| u.batches[1].sequences = vec![0; 100],
             "frames.sequences",
         ),
-        (altered(&nan_feature), "frames.features"),
-        (altered(&|u| u.batches.clear()), "frames"),
-        (altered(&|u| u.frame_count = Some(3)), "end.frame_count"),
-        (altered(&|u| u.sha256 = Some(vec![0; 32])), "end.sha256"),
-        (altered(&|u| u.sha256 = Some(Vec::new())), "end.sha256"),
-    ] {
-        let refused = code_and_field(upload.send(&server.client).await);
-        assert_eq!(refused, (Code::InvalidArgument, field.to_owned()));
+        (
+            |u| u.batches[2].features[0][..4].copy_from_slice(&f32::NAN.to_le_bytes()),
+            "frames.features",
+        ),
+        (|u| u.batches.clear(), "frames"),
+        (|u| u.frame_count = Some(3), "end.frame_count"),
+        (|u| u.sha256 = Some(vec![0; 32]), "end.sha256"),
+        (|u| u.sha256 = Some(Vec::new()), "end.sha256"),
+    ];
+    for (alter, field) in cases {
+        let mut upload = good.clone();
+        alter(&mut upload);
+        refused(
+            field,
+            upload.send(&server.client).await,
+            Code::InvalidArgument,
+            field,
+        );
     }
 
     // Messages in the wrong order, and an upload that is broken off.
@@ -313,16 +255,12 @@ async fn unfit_uploads_are_refused_and_leave_nothing() {
         ([&messages[..], &messages[1..2]].concat(), "message"),
     ] {
         let answer = server.client.create_room(tokio_stream::iter(sent)).await;
-        assert_eq!(
-            code_and_field(answer),
-            (Code::InvalidArgument, field.to_owned())
-        );
+        refused(field, answer, Code::InvalidArgument, field);
     }
 
-    let checked = altered(&|u| u.spec.validate_only = true)
-        .send(&server.client)
-        .await
-        .unwrap();
+    let mut checked = good.clone();
+    checked.spec.validate_only = true;
+    let checked = checked.send(&server.client).await.unwrap();
     assert_eq!(checked.revision, None);
 
     assert!(!server.folder.path().join("rooms/bad").exists());
@@ -368,10 +306,7 @@ async fn a_change_that_is_sent_again_is_made_once() {
     assert!(again.created);
 
     let other = upload("rooms/other").send(&server.client).await;
-    assert_eq!(
-        code_and_field(other),
-        (Code::InvalidArgument, "request_id".to_owned())
-    );
+    refused("another room", other, Code::InvalidArgument, "request_id");
 
     let delete = pb::DeleteRoomRequest {
         name: "rooms/new".to_owned(),
@@ -379,19 +314,15 @@ async fn a_change_that_is_sent_again_is_made_once() {
         validate_only: false,
     };
     for _ in 0..2 {
-        assert_eq!(
-            server.client.delete_room(delete.clone()).await.unwrap(),
-            [1]
-        );
+        let deleted = server.client.delete_room(delete.clone()).await;
+        assert_eq!(deleted.unwrap(), [1]);
     }
     let gone = pb::DeleteRoomRequest {
         request_id: "third".to_owned(),
         ..delete
     };
-    assert_eq!(
-        code_and_field(server.client.delete_room(gone).await).0,
-        Code::NotFound
-    );
+    let gone = server.client.delete_room(gone).await;
+    assert_eq!(code_of(gone), Code::NotFound);
 }
 
 /// Oracle: by hand. The newest adapter answers until another one is chosen; what was chosen is
@@ -399,35 +330,23 @@ async fn a_change_that_is_sent_again_is_made_once() {
 #[tokio::test]
 async fn defaults_are_chosen_and_taken_back() {
     let (server, store) = start_writable().await;
-    store
-        .publish_adapter(
-            "trial",
-            &oracle_adapter(),
-            &record(),
-            features_of("synthetic").rows(),
-        )
-        .await
-        .unwrap();
+    publish_oracle(&store, "trial").await;
 
-    let answering = async || {
-        let answer = server.client.navigate(question()).await.unwrap();
-        answer.adapter.unwrap().name
-    };
-    let choose = |default: Option<pb::set_default_request::Default>| {
+    let answering = async || server.navigated(|_| ()).await.adapter.unwrap().name;
+    let choose_for = |name: &str, default: Option<Default>| {
         server.client.set_default(pb::SetDefaultRequest {
-            name: "rooms/synthetic".to_owned(),
+            name: name.to_owned(),
             default,
             ..pb::SetDefaultRequest::default()
         })
     };
-    let adapter = |name: &str| Some(pb::set_default_request::Default::Adapter(name.to_owned()));
+    let choose = |default| choose_for("rooms/synthetic", default);
+    let adapter = |name: &str| Some(Default::Adapter(name.to_owned()));
 
     let defaults = choose(adapter("adapters/trial")).await.unwrap();
     assert_eq!(defaults.len(), 1);
-    assert_eq!(
-        (defaults[0].name.as_str(), defaults[0].adapter.as_str()),
-        ("rooms/synthetic", "adapters/trial")
-    );
+    assert_eq!(defaults[0].name, "rooms/synthetic");
+    assert_eq!(defaults[0].adapter, "adapters/trial");
     assert_eq!(answering().await, "trial");
 
     assert_eq!(choose(None).await.unwrap(), []);
@@ -443,16 +362,11 @@ async fn defaults_are_chosen_and_taken_back() {
             ..pb::DeleteAdapterRequest::default()
         })
     };
-    assert_eq!(
-        code_and_field(delete("adapters/oracle").await).0,
-        Code::FailedPrecondition
-    );
+    let chosen = delete("adapters/oracle").await;
+    assert_eq!(code_of(chosen), Code::FailedPrecondition);
 
-    let rolled_back = server
-        .client
-        .roll_back_default(pb::RollBackDefaultRequest::default())
-        .await
-        .unwrap();
+    let roll_back = pb::RollBackDefaultRequest::default();
+    let rolled_back = server.client.roll_back_default(roll_back).await.unwrap();
     assert_eq!(rolled_back[0].adapter, "adapters/trial");
     assert_eq!(answering().await, "trial");
 
@@ -469,22 +383,12 @@ async fn defaults_are_chosen_and_taken_back() {
         ("adapters/oracle", adapter("adapters/oracle"), "adapter"),
         ("rooms/synthetic/revisions/1", None, "name"),
     ] {
-        let request = pb::SetDefaultRequest {
-            name: name.to_owned(),
-            default,
-            ..pb::SetDefaultRequest::default()
-        };
-        assert_eq!(
-            code_and_field(server.client.set_default(request).await),
-            (Code::InvalidArgument, field.to_owned())
-        );
+        let answer = choose_for(name, default).await;
+        refused(name, answer, Code::InvalidArgument, field);
     }
-    assert_eq!(
-        code_and_field(choose(adapter("adapters/nobody")).await).0,
-        Code::NotFound
-    );
-    let revision = Some(pb::set_default_request::Default::Revision(7));
-    assert_eq!(code_and_field(choose(revision).await).0, Code::NotFound);
+    for unknown in [adapter("adapters/nobody"), Some(Default::Revision(7))] {
+        assert_eq!(code_of(choose(unknown).await), Code::NotFound);
+    }
 }
 
 /// Oracle: the adapter in the store that it came from; damage that the test does.
@@ -503,12 +407,11 @@ async fn an_adapter_moves_from_store_to_server() {
             ..pb::AdapterUpload::default()
         };
         let parts = parts.into_iter().map(Message::Weights);
-        let messages: Vec<_> = std::iter::once(Message::Adapter(upload))
-            .chain(parts)
-            .map(|message| pb::PublishAdapterRequest {
-                message: Some(message),
-            })
-            .collect();
+        let messages = std::iter::once(Message::Adapter(upload)).chain(parts);
+        let messages = messages.map(|message| pb::PublishAdapterRequest {
+            message: Some(message),
+        });
+        let messages: Vec<_> = messages.collect();
         server
             .client
             .publish_adapter(tokio_stream::iter(messages))
@@ -517,16 +420,12 @@ async fn an_adapter_moves_from_store_to_server() {
 
     let halves = weights.chunks(weights.len() / 2 + 1);
     let halves: Vec<Vec<u8>> = halves.map(<[u8]>::to_vec).collect();
-    let answer = send("adapters/copy", manifest.clone(), halves.clone())
-        .await
-        .unwrap();
+    let answer = send("adapters/copy", manifest.clone(), halves.clone()).await;
+    let answer = answer.unwrap();
     assert!(answer.created && answer.served);
 
-    let mut request = question();
-    request.adapter = "oracle".to_owned();
-    let original = server.client.navigate(request.clone()).await.unwrap();
-    request.adapter = "copy".to_owned();
-    let copy = server.client.navigate(request).await.unwrap();
+    let original = server.navigated(|r| r.adapter = "oracle".to_owned()).await;
+    let copy = server.navigated(|r| r.adapter = "copy".to_owned()).await;
     assert_eq!(original.steps, copy.steps);
 
     let mut altered = weights.clone();
@@ -535,44 +434,20 @@ async fn an_adapter_moves_from_store_to_server() {
     let mut altered_manifest = manifest.clone();
     let at = altered_manifest.len() / 2;
     altered_manifest[at] ^= 1;
+    let short = vec![weights[..9].to_vec()];
+    let long = vec![[&weights[..], &[0]].concat()];
+    let whole = &manifest[..];
     for (name, manifest, parts, field) in [
-        (
-            "adapters/x",
-            manifest.clone(),
-            vec![altered],
-            "adapter.manifest",
-        ),
-        (
-            "adapters/x",
-            altered_manifest,
-            halves.clone(),
-            "adapter.manifest",
-        ),
-        (
-            "adapters/x",
-            b"{}".to_vec(),
-            halves.clone(),
-            "adapter.manifest",
-        ),
-        (
-            "adapters/x",
-            manifest.clone(),
-            vec![weights[..9].to_vec()],
-            "weights",
-        ),
-        (
-            "adapters/x",
-            manifest.clone(),
-            vec![[&weights[..], &[0]].concat()],
-            "weights",
-        ),
-        ("rooms/x", manifest.clone(), halves.clone(), "adapter.name"),
-        ("adapters/..", manifest.clone(), halves, "adapter.name"),
+        ("adapters/x", whole, &vec![altered], "adapter.manifest"),
+        ("adapters/x", &altered_manifest, &halves, "adapter.manifest"),
+        ("adapters/x", b"{}", &halves, "adapter.manifest"),
+        ("adapters/x", whole, &short, "weights"),
+        ("adapters/x", whole, &long, "weights"),
+        ("rooms/x", whole, &halves, "adapter.name"),
+        ("adapters/..", whole, &halves, "adapter.name"),
     ] {
-        assert_eq!(
-            code_and_field(send(name, manifest, parts).await),
-            (Code::InvalidArgument, field.to_owned())
-        );
+        let answer = send(name, manifest.to_vec(), parts.clone()).await;
+        refused(name, answer, Code::InvalidArgument, field);
     }
     assert_eq!(server.client.adapters().await.unwrap().len(), 2);
 }
@@ -595,78 +470,55 @@ async fn a_room_is_fitted_on_the_server() {
         ..pb::RefitRoomRequest::default()
     };
     let mut steps = 0;
-    let result = server
-        .client
-        .refit_room(request.clone(), |step| {
-            steps += 1;
-            assert!((1..=step.total).contains(&step.done));
-        })
-        .await
-        .unwrap();
+    let counted = |step: pb::RefitProgress| {
+        steps += 1;
+        assert!((1..=step.total).contains(&step.done));
+    };
+    let result = server.client.refit_room(request.clone(), counted).await;
+    let result = result.unwrap();
     assert!(result.created && result.served && steps > 0);
-    assert_eq!(
-        result.revision.as_ref().unwrap().name,
-        "hall.made-up.fitted"
-    );
+    let revision = result.revision.as_ref().unwrap();
+    assert_eq!(revision.name, "hall.made-up.fitted");
 
-    let located = server
-        .client
-        .localize(pb::LocalizeRequest {
-            rooms: vec!["hall".to_owned()],
-            view: feature(features.rows().row(100).to_vec()),
-            ..pb::LocalizeRequest::default()
-        })
-        .await
-        .unwrap();
-    assert!(located.located.is_some());
+    let located = server.localized(|r| {
+        r.rooms = vec!["hall".to_owned()];
+        r.view = feature(features.rows().row(100).to_vec());
+    });
+    assert!(located.await.located.is_some());
 
     // The same again is answered from memory, without a fit.
     let mut steps = 0;
-    let again = server
-        .client
-        .refit_room(request.clone(), |_| steps += 1)
-        .await;
-    assert_eq!((again.unwrap(), steps), (result, 0));
+    let again = server.client.refit_room(request.clone(), |_| steps += 1);
+    assert_eq!((again.await.unwrap(), steps), (result, 0));
 
-    for (request, code, field) in [
+    let seeded = pb::RefitRoomRequest {
+        seed: u64::MAX,
+        ..request.clone()
+    };
+    let answer = server.client.refit_room(seeded, |_| ()).await;
+    refused("another seed", answer, Code::InvalidArgument, "seed");
+
+    let cases: [(fn(&mut pb::RefitRoomRequest), _, _); 3] = [
+        (|r| r.name = "rooms/nowhere".into(), Code::NotFound, "room"),
         (
-            pb::RefitRoomRequest {
-                name: "rooms/nowhere".to_owned(),
-                request_id: String::new(),
-                ..request.clone()
-            },
-            Code::NotFound,
-            "room",
-        ),
-        (
-            pb::RefitRoomRequest {
-                seed: u64::MAX,
-                ..request.clone()
-            },
-            Code::InvalidArgument,
-            "seed",
-        ),
-        (
-            pb::RefitRoomRequest {
-                features: "none".to_owned(),
-                request_id: String::new(),
-                ..request.clone()
-            },
+            |r| r.features = "none".into(),
             Code::InvalidArgument,
             "features",
         ),
         (
-            pb::RefitRoomRequest {
-                base_adapter: "adapters/hall.made-up.fitted".to_owned(),
-                request_id: String::new(),
-                ..request
-            },
+            |r| r.base_adapter = "adapters/hall.made-up.fitted".into(),
             Code::InvalidArgument,
             "base_adapter",
         ),
-    ] {
-        let refused = server.client.refit_room(request, |_| ()).await;
-        assert_eq!(code_and_field(refused), (code, field.to_owned()));
+    ];
+    for (spoil, code, field) in cases {
+        let mut request = pb::RefitRoomRequest {
+            request_id: String::new(),
+            ..request.clone()
+        };
+        spoil(&mut request);
+        let answer = server.client.refit_room(request, |_| ()).await;
+        refused(field, answer, code, field);
     }
 }
 
@@ -694,10 +546,7 @@ async fn only_those_who_may_change_what_they_may() {
 
     let outcome = async |caller: Option<&str>, room: &str| {
         let client = client_with(&server, caller).await;
-        match Upload::synthetic(room).send(&client).await {
-            Ok(_) => Code::Ok,
-            Err(error) => error.code().unwrap(),
-        }
+        code_of(Upload::synthetic(room).send(&client).await)
     };
     for (caller, room, expected) in [
         (None, "rooms/new-1", Code::Unauthenticated),
@@ -716,10 +565,7 @@ async fn only_those_who_may_change_what_they_may() {
     };
     for (caller, expected) in [("mover", Code::PermissionDenied), ("writer", Code::Ok)] {
         let client = client_with(&server, Some(caller)).await;
-        let code = match client.delete_adapter(delete.clone()).await {
-            Ok(_) => Code::Ok,
-            Err(error) => error.code().unwrap(),
-        };
+        let code = code_of(client.delete_adapter(delete.clone()).await);
         assert_eq!(code, expected, "{caller}");
     }
 }
@@ -736,17 +582,14 @@ async fn many_changes_at_once_are_made_or_refused() {
         changes.spawn(async move {
             let default = match number % 2 {
                 0 => None,
-                _ => Some(pb::set_default_request::Default::Revision(1)),
+                _ => Some(Default::Revision(1)),
             };
             let request = pb::SetDefaultRequest {
                 name: "rooms/synthetic".to_owned(),
                 default,
                 ..pb::SetDefaultRequest::default()
             };
-            match client.set_default(request).await {
-                Ok(_) => Code::Ok,
-                Err(error) => error.code().unwrap(),
-            }
+            code_of(client.set_default(request).await)
         });
     }
 
@@ -772,12 +615,7 @@ async fn a_caller_that_goes_away_leaves_its_change() {
 
     let client = server.client.clone();
     let leaving = tokio::spawn(async move { upload().send(&client).await });
-    let both = Upload::synthetic("rooms/left");
-    let sent_again = {
-        let mut again = both;
-        again.spec.request_id = "left".to_owned();
-        again.send(&server.client).await.unwrap()
-    };
+    let sent_again = upload().send(&server.client).await.unwrap();
     leaving.abort();
     let _ = leaving.await;
 

@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 use tonic::Code;
 
 use crate::harness::{TestServer, feature};
-use crate::tracking::{answers, begin, config, seen, start_followed};
+use crate::tracking::{answers, config, followed, resume, start_followed};
 use seese3_testing::world::served;
 
 async fn server() -> TestServer {
@@ -85,10 +85,7 @@ async fn send(
 #[tokio::test]
 async fn streams_and_tokens_survive_the_growth_of_a_room() {
     let server = server().await;
-    let before: Vec<pb::TrackRequest> = [begin(config())]
-        .into_iter()
-        .chain((0..60).map(seen))
-        .collect();
+    let before = followed(config(), 0..60);
     let first = answers(&server, before).await.unwrap();
     let token = first[60].resume_token.clone();
 
@@ -132,14 +129,7 @@ async fn streams_and_tokens_survive_the_growth_of_a_room() {
         .unwrap();
     assert_eq!(localized.places[0].frame.as_ref().unwrap().frame_id, 340);
 
-    let resume = pb::TrackConfig {
-        resume_token: token,
-        ..pb::TrackConfig::default()
-    };
-    let rest = [begin(resume)]
-        .into_iter()
-        .chain((60..120).map(seen))
-        .collect();
+    let rest = followed(resume(token), 60..120);
     let rest = answers(&server, rest).await.unwrap();
     let (hall, _) = served("hall");
     for (row, answer) in (60..120).zip(&rest[1..]) {

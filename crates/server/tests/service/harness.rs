@@ -1,10 +1,13 @@
 //! A server with the oracle's room and adapter.
 
+use std::fmt::Debug;
+use std::sync::mpsc;
 use std::time::Duration;
 
 use ndarray::Array2;
-use seese3_client::Client;
+use pb::displacement::Displacement;
 use seese3_client::proto::v1 as pb;
+use seese3_client::{Client, Error};
 use seese3_core::adapter::{
     Adapter, PairPlan, Samples, Siamese, TENSOR_NAMES, TrainConfig, TrainingRecord,
 };
@@ -12,13 +15,76 @@ use seese3_core::features::{FeatureSource, Features};
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::room::{Frames, Provenance, Room, RoomId, Timeline};
 use seese3_core::splits::Split;
-use seese3_server::{Config, RunError, run};
+use seese3_server::{Config, Metrics, RunError, run};
 use seese3_store::Store;
 use tokio::net::TcpListener;
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
+use tonic::Code;
 
 use seese3_testing::{Tensors, features, golden, poses};
+
+/// How long an event may take on a busy machine. A test that passes does not wait for it.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+
+/// Waits for an event for at most [`PATIENCE`] of real time, also while tokio's clock is stopped.
+pub async fn soon<T>(what: &str, event: impl Future<Output = T>) -> T {
+    let (_ended, waits) = mpsc::channel::<()>();
+    let patience = tokio::task::spawn_blocking(move || waits.recv_timeout(PATIENCE));
+
+    tokio::select! {
+        happened = event => happened,
+        _ = patience => panic!("never happened: {what}"),
+    }
+}
+
+/// Asks until the answer is as wanted.
+pub async fn until<T>(
+    what: &str,
+    mut ask: impl AsyncFnMut() -> T,
+    is_wanted: impl Fn(&T) -> bool,
+) -> T {
+    let waited = async {
+        loop {
+            let answer = ask().await;
+            if is_wanted(&answer) {
+                return answer;
+            }
+
+            // Spaces out the questions, in real time.
+            let pause = || std::thread::sleep(Duration::from_millis(5));
+            tokio::task::spawn_blocking(pause).await.unwrap();
+        }
+    };
+    soon(what, waited).await
+}
+
+/// Tokio's clock, stopped: time limits end when the test says so, however busy the machine is.
+pub struct StoppedClock(#[expect(dead_code, reason = "ends the blocking task")] mpsc::Sender<()>);
+
+impl StoppedClock {
+    pub fn new() -> Self {
+        // A paused clock jumps to the next timer when every task waits for a socket, but not while
+        // a blocking task runs.
+        let (running, waits) = mpsc::channel();
+        tokio::task::spawn_blocking(move || waits.recv());
+        tokio::time::pause();
+        Self(running)
+    }
+
+    /// Lets some time pass, and a millisecond, because timers end at whole milliseconds.
+    pub async fn advance(&self, by: Duration) {
+        tokio::time::advance(by + Duration::from_millis(1)).await;
+    }
+}
+
+/// The value of the metric that begins with `name`, its labels included; `None` if there is none.
+pub fn metric(metrics: &Metrics, name: &str) -> Option<f64> {
+    let text = metrics.text();
+    let mut lines = text.lines();
+    let value = lines.find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
+    value.map(|value| value.parse().expect(name))
+}
 
 /// A running server; its store is removed with it.
 pub struct TestServer {
@@ -27,6 +93,50 @@ pub struct TestServer {
     pub stop: oneshot::Sender<()>,
     pub ended: JoinHandle<Result<(), RunError>>,
     pub folder: tempfile::TempDir,
+}
+
+impl TestServer {
+    /// The answer to the question with this change.
+    pub async fn navigated(
+        &self,
+        change: impl FnOnce(&mut pb::NavigateRequest),
+    ) -> pb::NavigateResponse {
+        let mut request = question();
+        change(&mut request);
+        self.client.navigate(request).await.unwrap()
+    }
+
+    /// The answer to a localization with this change.
+    pub async fn localized(
+        &self,
+        change: impl FnOnce(&mut pb::LocalizeRequest),
+    ) -> pb::LocalizeResponse {
+        let mut request = pb::LocalizeRequest::default();
+        change(&mut request);
+        self.client.localize(request).await.unwrap()
+    }
+}
+
+/// A twist's numbers, ordered (v, ω).
+pub fn six(twist: &pb::Twist) -> [f64; 6] {
+    let (v, w) = (twist.linear.unwrap(), twist.angular.unwrap());
+    [v.x, v.y, v.z, w.x, w.y, w.z]
+}
+
+/// The code of an answer.
+pub fn code_of<T>(answer: Result<T, Error>) -> Code {
+    match answer {
+        Ok(_) => Code::Ok,
+        Err(error) => error.code().unwrap_or_else(|| panic!("{error}")),
+    }
+}
+
+#[track_caller]
+pub fn refused<T: Debug>(what: &str, answer: Result<T, Error>, code: Code, field: &str) {
+    let error = answer.expect_err(what);
+    assert_eq!(error.code(), Some(code), "{what}: {error}");
+    assert_eq!(error.field().unwrap_or_default(), field, "{what}: {error}");
+    assert!(!error.to_string().contains('\n'), "{what}: one line");
 }
 
 pub fn room_of(name: &str, golden_room: &str) -> Room {
@@ -111,17 +221,16 @@ pub async fn filled_store() -> (tempfile::TempDir, Store) {
             .unwrap();
     }
 
-    store
-        .publish_adapter(
-            "oracle",
-            &oracle_adapter(),
-            &record(),
-            features_of("synthetic").rows(),
-        )
-        .await
-        .unwrap();
-
+    publish_oracle(&store, "oracle").await;
     (folder, store)
+}
+
+/// Publishes the oracle's adapter under this name.
+pub async fn publish_oracle(store: &Store, name: &str) {
+    let features = features_of("synthetic");
+    let (adapter, record) = (oracle_adapter(), record());
+    let published = store.publish_adapter(name, &adapter, &record, features.rows());
+    published.await.unwrap();
 }
 
 /// Starts a server on a free port and waits until it serves.
@@ -139,18 +248,12 @@ pub async fn start_on(folder: tempfile::TempDir, store: Store, config: Config) -
         let _ = stopped.await;
     }));
 
-    let client = Client::connect(&address, Duration::from_secs(20))
-        .await
-        .unwrap();
-    for _ in 0..1_000 {
-        if client.rooms().await.is_ok() {
-            break;
-        }
-
+    let client = Client::connect(&address, PATIENCE).await.unwrap();
+    let serves = async || {
         assert!(!ended.is_finished(), "the server ended");
-
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
+        client.serves("").await.unwrap_or(false)
+    };
+    until("the server serves", serves, |serves| *serves).await;
 
     TestServer {
         address,
@@ -187,10 +290,22 @@ pub fn feature_row(row: usize) -> Vec<f32> {
     features_of("synthetic").rows().row(row).to_vec()
 }
 
-pub fn by_twist(numbers: [f64; 6]) -> Option<pb::Displacement> {
+pub fn displaced(by: Displacement) -> Option<pb::Displacement> {
     Some(pb::Displacement {
-        displacement: Some(pb::displacement::Displacement::Twist(twist(numbers))),
+        displacement: Some(by),
     })
+}
+
+pub fn by_twist(numbers: [f64; 6]) -> Option<pb::Displacement> {
+    displaced(Displacement::Twist(twist(numbers)))
+}
+
+pub fn by_twists(twists: Vec<pb::Twist>) -> Option<pb::Displacement> {
+    displaced(Displacement::Twists(pb::TwistList { twists }))
+}
+
+pub fn to_pose(pose: pb::Pose) -> Option<pb::Displacement> {
+    displaced(Displacement::TargetPose(pose))
 }
 
 pub fn twist([vx, vy, vz, wx, wy, wz]: [f64; 6]) -> pb::Twist {
@@ -202,9 +317,7 @@ pub fn twist([vx, vy, vz, wx, wy, wz]: [f64; 6]) -> pb::Twist {
 }
 
 pub fn to_frame(frame: u32) -> Option<pb::Displacement> {
-    Some(pb::Displacement {
-        displacement: Some(pb::displacement::Displacement::TargetFrameId(frame)),
-    })
+    displaced(Displacement::TargetFrameId(frame))
 }
 
 /// From frame 500 to frame 540, one step.

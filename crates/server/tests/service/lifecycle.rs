@@ -1,12 +1,12 @@
 //! Health, reflection, deadlines, request ids, draining.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use seese3_client::Client;
 use seese3_client::proto::v1 as pb;
 use seese3_client::proto::v1::evaluation_service_client::EvaluationServiceClient;
 use seese3_client::proto::v1::navigation_service_client::NavigationServiceClient;
-use seese3_server::{Config, RunError, run};
+use seese3_server::{Config, Metrics, RunError, run};
 use seese3_store::Store;
 use tokio::net::TcpListener;
 use tokio_stream::StreamExt;
@@ -16,7 +16,9 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-use crate::harness::{filled_store, question, start, start_on};
+use crate::harness::{
+    PATIENCE, StoppedClock, filled_store, metric, question, soon, start, start_on, until,
+};
 
 async fn channel(address: &str) -> Channel {
     Endpoint::from_shared(format!("http://{address}"))
@@ -45,7 +47,12 @@ async fn check(address: &str, service: &str) -> Result<ServingStatus, Code> {
 /// says SERVICE_UNKNOWN and stays open.
 #[tokio::test]
 async fn health_answers_for_the_server_its_services_and_its_rooms() {
-    let server = start(Config::default()).await;
+    // The server does not end because its drain time is over.
+    let config = Config {
+        drain: 10 * PATIENCE,
+        ..Config::default()
+    };
+    let server = start(config).await;
     for name in [
         "",
         "seese3.v1.NavigationService",
@@ -79,6 +86,7 @@ async fn health_answers_for_the_server_its_services_and_its_rooms() {
         ServingStatus::ServiceUnknown
     );
 
+    // Nothing is to come: a slow machine cannot fail this.
     let still_open = tokio::time::timeout(Duration::from_millis(100), unknown.message()).await;
     assert!(still_open.is_err(), "the stream waits");
 
@@ -95,11 +103,8 @@ async fn health_answers_for_the_server_its_services_and_its_rooms() {
         ServingStatus::NotServing
     );
 
-    let ended = tokio::time::timeout(Duration::from_secs(5), server.ended).await;
-    ended
-        .expect("watchers do not keep a server that was told to stop")
-        .unwrap()
-        .unwrap();
+    let what = "watchers do not keep a server that was told to stop";
+    soon(what, server.ended).await.unwrap().unwrap();
 }
 
 /// Oracle: the bounds by hand: a request holds 16 KiB at least, so that an eighth of 2 MB has room
@@ -251,16 +256,11 @@ async fn a_deadline_ends_the_work() {
         .metadata_mut()
         .insert("grpc-timeout", "200m".parse().unwrap());
 
-    let begun = Instant::now();
-    let status = service.navigate(request).await.unwrap_err();
-    assert_eq!(status.code(), Code::DeadlineExceeded, "{status}");
+    let status = soon("the deadline ends it", service.navigate(request)).await;
+    assert_eq!(status.unwrap_err().code(), Code::DeadlineExceeded);
 
-    server.client.navigate(question()).await.unwrap();
-
-    assert!(
-        begun.elapsed() < Duration::from_secs(10),
-        "the thread was given back"
-    );
+    let next = server.client.navigate(question());
+    soon("the thread was given back", next).await.unwrap();
 }
 
 /// Oracle: as above, for a stream whose caller goes away.
@@ -295,13 +295,8 @@ async fn a_caller_that_leaves_an_evaluation_frees_its_thread() {
         unread.push(service.evaluate(request.clone()).await.unwrap());
     }
 
-    let begun = Instant::now();
-    server.client.navigate(question()).await.unwrap();
-
-    assert!(
-        begun.elapsed() < Duration::from_secs(10),
-        "the thread was given back"
-    );
+    let next = server.client.navigate(question());
+    soon("the thread was given back", next).await.unwrap();
 }
 
 /// Oracle: the promise itself: the caller's id comes back, and one is made for a caller without.
@@ -339,9 +334,12 @@ async fn stopping_answers_what_is_in_flight_within_a_bound() {
         frames_in_answer: u64::MAX,
     };
 
+    let metrics = Metrics::default();
+    let in_flight_now = async || metric(&metrics, "seese3_requests_in_flight");
     let server = start(Config {
         limits,
-        drain: Duration::from_secs(20),
+        drain: 10 * PATIENCE,
+        metrics: metrics.clone(),
         ..Config::default()
     })
     .await;
@@ -353,7 +351,7 @@ async fn stopping_answers_what_is_in_flight_within_a_bound() {
     };
     let in_flight = tokio::spawn(async move { client.navigate(slow).await });
 
-    tokio::time::sleep(Duration::from_millis(30)).await;
+    until("it is in flight", in_flight_now, |count| *count == Some(1.0)).await;
     server.stop.send(()).unwrap();
     assert_eq!(in_flight.await.unwrap().unwrap().steps.len(), 30_000);
 
@@ -362,12 +360,12 @@ async fn stopping_answers_what_is_in_flight_within_a_bound() {
     let stuck = start(Config {
         limits,
         drain: Duration::from_millis(200),
+        metrics: metrics.clone(),
         ..Config::default()
     })
     .await;
-    let client = Client::connect(&stuck.address, Duration::from_secs(60))
-        .await
-        .unwrap();
+    let deadline = 10 * PATIENCE;
+    let client = Client::connect(&stuck.address, deadline).await.unwrap();
 
     let endless = pb::NavigateRequest {
         steps: Some(400_000_000),
@@ -375,12 +373,9 @@ async fn stopping_answers_what_is_in_flight_within_a_bound() {
     };
     let in_flight = tokio::spawn(async move { client.navigate(endless).await });
 
-    tokio::time::sleep(Duration::from_millis(50)).await;
-    let begun = Instant::now();
+    until("it is in flight", in_flight_now, |count| *count == Some(1.0)).await;
     stuck.stop.send(()).unwrap();
-    stuck.ended.await.unwrap().unwrap();
-
-    assert!(begun.elapsed() < Duration::from_secs(5), "the bound held");
+    soon("the bound holds", stuck.ended).await.unwrap().unwrap();
 
     let error = in_flight.await.unwrap().unwrap_err();
     assert_eq!(
@@ -403,6 +398,7 @@ async fn stopping_answers_what_is_in_flight_within_a_bound() {
 /// then the server ends.
 #[tokio::test]
 async fn a_lame_duck_still_answers() {
+    let clock = StoppedClock::new();
     let server = start(Config {
         lame_duck: Duration::from_secs(2),
         ..Config::default()
@@ -411,17 +407,15 @@ async fn a_lame_duck_still_answers() {
     assert!(server.client.serves("").await.unwrap());
 
     server.stop.send(()).unwrap();
-    while server.client.serves("").await.unwrap() {
-        tokio::time::sleep(Duration::from_millis(5)).await;
-    }
+    let serves = async || server.client.serves("").await.unwrap();
+    until("health says so", serves, |serves| !*serves).await;
 
     // A connection that begins later is a client that a load balancer still sends here.
-    tokio::time::sleep(Duration::from_millis(500)).await;
-    let late = Client::connect(&server.address, Duration::from_secs(5))
-        .await
-        .unwrap();
+    clock.advance(Duration::from_millis(1_900)).await;
+    let late = Client::connect(&server.address, PATIENCE).await.unwrap();
     assert!(late.navigate(question()).await.is_ok());
-    server.ended.await.unwrap().unwrap();
+    clock.advance(Duration::from_millis(200)).await;
+    soon("the server ends", server.ended).await.unwrap().unwrap();
 }
 
 /// Oracle: the meaning of the flag: a store without a room is of use where rooms can be added.

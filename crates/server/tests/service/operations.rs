@@ -1,7 +1,5 @@
 //! What those who operate a server see: metrics and probes.
 
-use std::time::Duration;
-
 use seese3_client::Client;
 use seese3_client::proto::v1 as pb;
 use seese3_server::{Config, Listeners, run};
@@ -9,7 +7,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 
-use crate::harness::{filled_store, question};
+use crate::harness::{PATIENCE, StoppedClock, filled_store, question, soon, until};
 
 /// The status line and the body of a GET.
 async fn get(address: &str, path: &str) -> (String, String) {
@@ -50,12 +48,9 @@ async fn metrics_count_what_was_asked_and_probes_tell_the_stage() {
         let _ = stopped.await;
     }));
 
-    let client = Client::connect(&address, Duration::from_secs(20))
-        .await
-        .unwrap();
-    while !get(&operated, "/readyz").await.0.contains("200") {
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
+    let client = Client::connect(&address, PATIENCE).await.unwrap();
+    let status = async || get(&operated, "/readyz").await.0;
+    until("it is ready", status, |status| status.contains("200")).await;
     assert_eq!(get(&operated, "/livez").await.1, "alive\n");
 
     for _ in 0..3 {
@@ -90,6 +85,8 @@ async fn metrics_count_what_was_asked_and_probes_tell_the_stage() {
 /// all of which say nothing.
 #[tokio::test]
 async fn silent_connections_do_not_stop_scrapes() {
+    // No time passes after which silent connections are closed.
+    let _clock = StoppedClock::new();
     let (_folder, store) = filled_store().await;
     let operations = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let operated = operations.local_addr().unwrap().to_string();
@@ -109,7 +106,6 @@ async fn silent_connections_do_not_stop_scrapes() {
         silent.push(TcpStream::connect(&operated).await.unwrap());
     }
 
-    // Less than the time after which silent connections are closed.
-    let scrape = tokio::time::timeout(Duration::from_secs(4), get(&operated, "/livez")).await;
-    assert_eq!(scrape.expect("not answered").1, "alive\n");
+    let scraped = soon("a scrape is answered", get(&operated, "/livez")).await;
+    assert_eq!(scraped.1, "alive\n");
 }

@@ -1,829 +1,474 @@
 //! Bad visitors: each gets the right code and the field to change, and the server goes on.
 
+use pb::displacement::Displacement;
+use pb::prediction::Prediction as Scored;
 use seese3_client::Error;
 use seese3_client::proto::v1 as pb;
 use seese3_server::Config;
-use tonic::Code;
+use tonic::Code::{self, InvalidArgument, NotFound};
 
 use crate::harness::{
-    by_twist, feature, feature_row, frame, latent, latent as latent_view, question, start,
-    to_frame, twist,
+    TestServer, by_twist, by_twists, displaced, feature, feature_row, frame, latent, question,
+    refused, start, to_frame, to_pose, twist,
 };
 
-#[track_caller]
-fn refused<T: std::fmt::Debug>(what: &str, answer: Result<T, Error>, code: Code, field: &str) {
-    let error = answer.expect_err(what);
-    assert_eq!(error.code(), Some(code), "{what}: {error}");
-    assert_eq!(error.field().unwrap_or_default(), field, "{what}: {error}");
-    assert!(!error.to_string().contains('\n'), "{what}: one line");
+/// What is bad about a request, how a good one becomes so, and the field that the answer names.
+type Case<R> = (&'static str, fn(&mut R), &'static str);
+
+/// A good request and the call that asks it.
+struct Asked<R, A>(R, A);
+
+impl<R: Clone, T: std::fmt::Debug, A: AsyncFn(R) -> Result<T, Error>> Asked<R, A> {
+    async fn refuses(&self, code: Code, cases: &[Case<R>]) {
+        for &(what, spoil, field) in cases {
+            let mut request = self.0.clone();
+            spoil(&mut request);
+            refused(what, self.1(request).await, code, field);
+        }
+    }
 }
 
-fn target_pose(pose: pb::Pose) -> Option<pb::Displacement> {
-    Some(pb::Displacement {
-        displacement: Some(pb::displacement::Displacement::TargetPose(pose)),
+fn turned(w: f64) -> Option<pb::Quaternion> {
+    Some(pb::Quaternion {
+        w,
+        x: 0.0,
+        y: 0.0,
+        z: 0.0,
     })
 }
 
-fn level(x: f64) -> pb::Pose {
+fn level() -> pb::Pose {
     pb::Pose {
-        position: Some(pb::Vector3 { x, y: 0.0, z: 0.0 }),
-        orientation: Some(pb::Quaternion {
-            w: 1.0,
+        position: Some(pb::Vector3 {
             x: 0.0,
             y: 0.0,
             z: 0.0,
         }),
+        orientation: turned(1.0),
         ..pb::Pose::default()
     }
+}
+
+fn named(source_name: &str) -> Option<pb::View> {
+    let feature = pb::Feature {
+        values: feature_row(3),
+        source_name: source_name.to_owned(),
+    };
+    Some(pb::View {
+        view: Some(pb::view::View::Feature(feature)),
+    })
 }
 
 /// Oracle: a list of bad input, field by field: what each field may be stands in the protos.
 #[tokio::test]
 async fn navigate_names_the_field() {
-    use Code::{InvalidArgument, NotFound};
+    // A request by a view, of which the frame is not known.
+    fn by_view(request: &mut pb::NavigateRequest, source: Option<pb::View>) {
+        request.source = source;
+        request.displacement = by_twist([0.0; 6]);
+    }
 
-    let server = start(Config::default()).await;
-
-    let nan_row = {
-        let mut row = feature_row(3);
-        row[7] = f32::NAN;
-        row
-    };
-
-    let named = Some(pb::View {
-        view: Some(pb::view::View::Feature(pb::Feature {
-            values: feature_row(3),
-            source_name: "clip".to_owned(),
-        })),
-    });
-
-    let no_angular = pb::Twist {
-        angular: None,
-        ..twist([0.0; 6])
-    };
-    let half = Some(pb::Displacement {
-        displacement: Some(pb::displacement::Displacement::Twist(no_angular)),
-    });
-
-    let no_twists = Some(pb::Displacement {
-        displacement: Some(pb::displacement::Displacement::Twists(pb::TwistList {
-            twists: vec![],
-        })),
-    });
-
-    let other_world = pb::Pose {
-        parent_frame: "odom".to_owned(),
-        ..level(0.0)
-    };
-
-    let no_rotation = pb::Pose {
-        orientation: Some(pb::Quaternion {
-            w: 2.0,
-            x: 0.0,
-            y: 0.0,
-            z: 0.0,
-        }),
-        ..level(0.0)
-    };
-
-    let q = question;
-    let cases = [
-        (
-            "no room",
-            pb::NavigateRequest {
-                room: String::new(),
-                ..q()
-            },
-            InvalidArgument,
-            "room",
-        ),
-        (
-            "unknown room",
-            pb::NavigateRequest {
-                room: "x".into(),
-                ..q()
-            },
-            NotFound,
-            "room",
-        ),
-        (
-            "unknown adapter",
-            pb::NavigateRequest {
-                adapter: "x".into(),
-                ..q()
-            },
-            NotFound,
-            "adapter",
-        ),
-        (
-            "no source",
-            pb::NavigateRequest {
-                source: None,
-                ..q()
-            },
-            InvalidArgument,
-            "source",
-        ),
-        (
-            "unknown frame",
-            pb::NavigateRequest {
-                source: frame(600),
-                ..q()
-            },
-            NotFound,
-            "source.frame_id",
-        ),
-        (
-            "unknown target",
-            pb::NavigateRequest {
-                displacement: to_frame(9999),
-                ..q()
-            },
-            NotFound,
-            "displacement.target_frame_id",
-        ),
+    let invalid: [Case<pb::NavigateRequest>; 29] = [
+        ("no room", |r| r.room.clear(), "room"),
+        ("no source", |r| r.source = None, "source"),
         (
             "NaN feature",
-            pb::NavigateRequest {
-                source: feature(nan_row),
-                displacement: by_twist([0.0; 6]),
-                ..q()
+            |r| {
+                let mut row = feature_row(3);
+                row[7] = f32::NAN;
+                by_view(r, feature(row));
             },
-            InvalidArgument,
             "source.feature.values",
         ),
         (
             "narrow feature",
-            pb::NavigateRequest {
-                source: feature(vec![1.0; 47]),
-                displacement: by_twist([0.0; 6]),
-                ..q()
-            },
-            InvalidArgument,
+            |r| by_view(r, feature(vec![1.0; 47])),
             "source.feature.values",
         ),
         (
             "empty feature",
-            pb::NavigateRequest {
-                source: feature(vec![]),
-                displacement: by_twist([0.0; 6]),
-                ..q()
-            },
-            InvalidArgument,
+            |r| by_view(r, feature(vec![])),
             "source.feature.values",
         ),
         (
             "other encoder",
-            pb::NavigateRequest {
-                source: named,
-                displacement: by_twist([0.0; 6]),
-                ..q()
-            },
-            InvalidArgument,
+            |r| by_view(r, named("clip")),
             "source.feature.source_name",
         ),
         (
             "infinite latent",
-            pb::NavigateRequest {
-                source: latent(vec![f64::INFINITY; 20]),
-                displacement: by_twist([0.0; 6]),
-                ..q()
-            },
-            InvalidArgument,
+            |r| by_view(r, latent(vec![f64::INFINITY; 20])),
             "source.latent.values",
         ),
         (
             "wide latent",
-            pb::NavigateRequest {
-                source: latent(vec![0.0; 21]),
-                displacement: by_twist([0.0; 6]),
-                ..q()
-            },
-            InvalidArgument,
+            |r| by_view(r, latent(vec![0.0; 21])),
             "source.latent.values",
         ),
-        (
-            "no displacement",
-            pb::NavigateRequest {
-                displacement: None,
-                ..q()
-            },
-            InvalidArgument,
-            "displacement",
-        ),
+        ("no displacement", |r| r.displacement = None, "displacement"),
         (
             "half a twist",
-            pb::NavigateRequest {
-                displacement: half,
-                ..q()
+            |r| {
+                let half = pb::Twist {
+                    angular: None,
+                    ..twist([0.0; 6])
+                };
+                r.displacement = displaced(Displacement::Twist(half));
             },
-            InvalidArgument,
             "displacement.twist.angular",
         ),
         (
             "NaN twist",
-            pb::NavigateRequest {
-                displacement: by_twist([f64::NAN, 0.0, 0.0, 0.0, 0.0, 0.0]),
-                ..q()
-            },
-            InvalidArgument,
+            |r| r.displacement = by_twist([f64::NAN, 0.0, 0.0, 0.0, 0.0, 0.0]),
             "displacement.twist.linear",
         ),
         (
             "beyond π",
-            pb::NavigateRequest {
-                displacement: by_twist([0.0, 0.0, 0.0, 0.0, 3.2, 0.0]),
-                ..q()
-            },
-            InvalidArgument,
+            |r| r.displacement = by_twist([0.0, 0.0, 0.0, 0.0, 3.2, 0.0]),
             "displacement",
         ),
         (
             "far away",
-            pb::NavigateRequest {
-                displacement: by_twist([1e300, 0.0, 0.0, 0.0, 0.0, 0.0]),
-                ..q()
-            },
-            InvalidArgument,
+            |r| r.displacement = by_twist([1e300, 0.0, 0.0, 0.0, 0.0, 0.0]),
             "displacement",
         ),
         (
             "no twists",
-            pb::NavigateRequest {
-                displacement: no_twists,
-                ..q()
-            },
-            InvalidArgument,
+            |r| r.displacement = by_twists(vec![]),
             "displacement",
         ),
         (
             "another world",
-            pb::NavigateRequest {
-                displacement: target_pose(other_world),
-                ..q()
+            |r| {
+                r.displacement = to_pose(pb::Pose {
+                    parent_frame: "odom".into(),
+                    ..level()
+                })
             },
-            InvalidArgument,
             "displacement.target_pose.parent_frame",
         ),
         (
             "no rotation",
-            pb::NavigateRequest {
-                displacement: target_pose(no_rotation),
-                ..q()
+            |r| {
+                r.displacement = to_pose(pb::Pose {
+                    orientation: turned(2.0),
+                    ..level()
+                })
             },
-            InvalidArgument,
             "displacement.target_pose.orientation",
         ),
-        (
-            "0 steps",
-            pb::NavigateRequest {
-                steps: Some(0),
-                ..q()
-            },
-            InvalidArgument,
-            "steps",
-        ),
-        (
-            "10⁶ steps",
-            pb::NavigateRequest {
-                steps: Some(1_000_000),
-                ..q()
-            },
-            InvalidArgument,
-            "steps",
-        ),
-        (
-            "2³² − 1 steps",
-            pb::NavigateRequest {
-                steps: Some(u32::MAX),
-                ..q()
-            },
-            InvalidArgument,
-            "steps",
-        ),
-        (
-            "0 hits",
-            pb::NavigateRequest {
-                top_k: Some(0),
-                ..q()
-            },
-            InvalidArgument,
-            "top_k",
-        ),
-        (
-            "10⁹ hits",
-            pb::NavigateRequest {
-                top_k: Some(1_000_000_000),
-                ..q()
-            },
-            InvalidArgument,
-            "top_k",
-        ),
+        ("0 steps", |r| r.steps = Some(0), "steps"),
+        ("10⁶ steps", |r| r.steps = Some(1_000_000), "steps"),
+        ("2³² − 1 steps", |r| r.steps = Some(u32::MAX), "steps"),
+        ("0 hits", |r| r.top_k = Some(0), "top_k"),
+        ("10⁹ hits", |r| r.top_k = Some(1_000_000_000), "top_k"),
         (
             "10⁶ frames in one answer",
-            pb::NavigateRequest {
-                steps: Some(1_000),
-                top_k: Some(1_000),
-                ..q()
-            },
-            InvalidArgument,
+            |r| (r.steps, r.top_k) = (Some(1_000), Some(1_000)),
             "top_k",
         ),
-        (
-            "ε of 0",
-            pb::NavigateRequest {
-                thresholds: vec![0.1, 0.0],
-                ..q()
-            },
-            InvalidArgument,
-            "thresholds",
-        ),
-        (
-            "ε NaN",
-            pb::NavigateRequest {
-                thresholds: vec![f64::NAN],
-                ..q()
-            },
-            InvalidArgument,
-            "thresholds",
-        ),
-        (
-            "unknown mode",
-            pb::NavigateRequest { mode: 77, ..q() },
-            InvalidArgument,
-            "mode",
-        ),
-        (
-            "unknown reading",
-            pb::NavigateRequest { reading: -1, ..q() },
-            InvalidArgument,
-            "reading",
-        ),
+        ("ε of 0", |r| r.thresholds = vec![0.1, 0.0], "thresholds"),
+        ("ε NaN", |r| r.thresholds = vec![f64::NAN], "thresholds"),
+        ("unknown mode", |r| r.mode = 77, "mode"),
+        ("unknown reading", |r| r.reading = -1, "reading"),
         (
             "a frame with a pose",
-            pb::NavigateRequest {
-                source_pose: Some(level(0.0)),
-                ..q()
-            },
-            InvalidArgument,
+            |r| r.source_pose = Some(level()),
             "source_pose",
         ),
         (
             "a target without a pose",
-            pb::NavigateRequest {
-                source: feature(feature_row(3)),
-                ..q()
-            },
-            InvalidArgument,
+            |r| r.source = feature(feature_row(3)),
             "source_pose",
         ),
         (
             "all excluded",
-            pb::NavigateRequest {
-                exclude_source: true,
-                exclude_radius: u32::MAX,
-                ..q()
-            },
-            InvalidArgument,
+            |r| (r.exclude_source, r.exclude_radius) = (true, u32::MAX),
             "exclude_radius",
         ),
     ];
+    let unknown: [Case<pb::NavigateRequest>; 4] = [
+        ("unknown room", |r| r.room = "x".into(), "room"),
+        ("unknown adapter", |r| r.adapter = "x".into(), "adapter"),
+        (
+            "unknown frame",
+            |r| r.source = frame(600),
+            "source.frame_id",
+        ),
+        (
+            "unknown target",
+            |r| r.displacement = to_frame(9999),
+            "displacement.target_frame_id",
+        ),
+    ];
 
-    for (what, request, code, field) in cases {
-        refused(what, server.client.navigate(request).await, code, field);
-    }
+    let server = start(Config::default()).await;
+    let ask = async |request| server.client.navigate(request).await;
+    let asked = Asked(question(), ask);
+    asked.refuses(InvalidArgument, &invalid).await;
+    asked.refuses(NotFound, &unknown).await;
 
-    assert!(
-        server.client.navigate(question()).await.is_ok(),
-        "the server goes on"
-    );
+    let next = server.client.navigate(question()).await;
+    assert!(next.is_ok(), "the server goes on");
 }
 
-/// Oracle: as above, for the other calls.
-#[tokio::test]
-async fn the_other_calls_name_the_field() {
-    use Code::{InvalidArgument, NotFound};
-
-    let server = start(Config {
+/// A server with low bounds.
+async fn start_bounded() -> TestServer {
+    start(Config {
         batch: 2,
         predictions: 3,
         ..Config::default()
     })
-    .await;
-    let c = &server.client;
+    .await
+}
 
-    let l = pb::LocalizeRequest::default;
-
-    let rooms = |names: &[&str]| {
-        names
-            .iter()
-            .map(|name| (*name).to_owned())
-            .collect::<Vec<_>>()
-    };
-
-    refused("no view", c.localize(l()).await, InvalidArgument, "view");
-
-    refused(
-        "a frame of many rooms",
-        c.localize(pb::LocalizeRequest {
-            view: frame(1),
-            ..l()
-        })
-        .await,
-        InvalidArgument,
-        "view.frame_id",
-    );
-
-    refused(
-        "a room twice",
-        c.localize(pb::LocalizeRequest {
-            rooms: rooms(&["synthetic", "synthetic"]),
-            adapter: "oracle".into(),
-            view: feature(feature_row(1)),
-            ..l()
-        })
-        .await,
-        InvalidArgument,
-        "rooms",
-    );
-
-    refused(
+/// Oracle: as above.
+#[tokio::test]
+async fn localize_names_the_field() {
+    let invalid: [Case<pb::LocalizeRequest>; 6] = [
+        ("no view", |_| (), "view"),
+        (
+            "a frame of many rooms",
+            |r| r.view = frame(1),
+            "view.frame_id",
+        ),
+        (
+            "a room twice",
+            |r| {
+                r.rooms = vec!["synthetic".into(); 2];
+                r.adapter = "oracle".into();
+                r.view = feature(feature_row(1));
+            },
+            "rooms",
+        ),
+        ("0 hits", |r| r.top_k = Some(0), "top_k"),
+        (
+            "narrow feature",
+            |r| r.view = feature(vec![1.0]),
+            "view.feature.values",
+        ),
+        (
+            "far latent",
+            |r| r.view = latent([vec![0.0; 19], vec![1e300]].concat()),
+            "view.latent.values",
+        ),
+    ];
+    let unknown: [Case<pb::LocalizeRequest>; 1] = [(
         "unknown room",
-        c.localize(pb::LocalizeRequest {
-            rooms: rooms(&["x"]),
-            view: frame(1),
-            ..l()
-        })
-        .await,
-        NotFound,
+        |r| (r.rooms, r.view) = (vec!["x".into()], frame(1)),
         "rooms[0]",
-    );
+    )];
 
-    refused(
-        "0 hits",
-        c.localize(pb::LocalizeRequest {
-            top_k: Some(0),
-            ..l()
-        })
-        .await,
-        InvalidArgument,
-        "top_k",
-    );
+    let server = start_bounded().await;
+    let ask = async |request| server.client.localize(request).await;
+    let asked = Asked(pb::LocalizeRequest::default(), ask);
+    asked.refuses(InvalidArgument, &invalid).await;
+    asked.refuses(NotFound, &unknown).await;
+}
 
-    refused(
-        "narrow feature",
-        c.localize(pb::LocalizeRequest {
-            view: feature(vec![1.0]),
-            ..l()
-        })
-        .await,
-        InvalidArgument,
-        "view.feature.values",
-    );
-
-    let m = pb::EstimateMotionRequest::default;
-    refused(
-        "no first",
-        c.estimate_motion(m()).await,
-        InvalidArgument,
-        "first",
-    );
-
-    refused(
-        "frames without a room",
-        c.estimate_motion(pb::EstimateMotionRequest {
-            first: frame(1),
-            ..m()
-        })
-        .await,
-        InvalidArgument,
-        "room",
-    );
-
-    // A focal length in image widths is refused, whoever would read the motion.
-    refused(
-        "focal length in widths",
-        c.estimate_motion(pb::EstimateMotionRequest {
-            first: feature(feature_row(1)),
-            second: feature(feature_row(2)),
-            camera: Some(pb::Pinhole {
-                width: 640.0,
-                height: 480.0,
-                focal: 0.914,
-                ..pb::Pinhole::default()
-            }),
-            ..m()
-        })
-        .await,
-        InvalidArgument,
-        "camera",
-    );
-
-    refused(
-        "narrow second",
-        c.estimate_motion(pb::EstimateMotionRequest {
-            first: feature(feature_row(1)),
-            second: feature(vec![0.0]),
-            ..m()
-        })
-        .await,
-        InvalidArgument,
-        "second.feature.values",
-    );
-
-    refused(
+/// Oracle: as above.
+#[tokio::test]
+async fn estimate_motion_names_the_field() {
+    let invalid: [Case<pb::EstimateMotionRequest>; 4] = [
+        ("no first", |_| (), "first"),
+        ("frames without a room", |r| r.first = frame(1), "room"),
+        (
+            // It is refused, whoever would read the motion.
+            "focal length in widths",
+            |r| {
+                r.first = feature(feature_row(1));
+                r.second = feature(feature_row(2));
+                r.camera = Some(pb::Pinhole {
+                    width: 640.0,
+                    height: 480.0,
+                    focal: 0.914,
+                    ..pb::Pinhole::default()
+                });
+            },
+            "camera",
+        ),
+        (
+            "narrow second",
+            |r| (r.first, r.second) = (feature(feature_row(1)), feature(vec![0.0])),
+            "second.feature.values",
+        ),
+    ];
+    let unknown: [Case<pb::EstimateMotionRequest>; 1] = [(
         "unknown frame",
-        c.estimate_motion(pb::EstimateMotionRequest {
-            room: "synthetic".into(),
-            first: frame(1),
-            second: frame(600),
-            ..m()
-        })
-        .await,
-        NotFound,
+        |r| {
+            r.room = "synthetic".into();
+            (r.first, r.second) = (frame(1), frame(600));
+        },
         "second.frame_id",
-    );
+    )];
 
-    let e = || pb::EvaluateRequest {
+    let server = start_bounded().await;
+    let ask = async |request| server.client.estimate_motion(request).await;
+    let asked = Asked(pb::EstimateMotionRequest::default(), ask);
+    asked.refuses(InvalidArgument, &invalid).await;
+    asked.refuses(NotFound, &unknown).await;
+}
+
+/// Oracle: as above.
+#[tokio::test]
+async fn evaluate_names_the_field() {
+    let invalid: [Case<pb::EvaluateRequest>; 8] = [
+        ("0 stride", |r| r.stride = Some(0), "stride"),
+        (
+            "a stride longer than the room",
+            |r| r.stride = Some(u32::MAX),
+            "stride",
+        ),
+        ("unknown split", |r| r.split = "random".into(), "split"),
+        (
+            "unknown navigator",
+            |r| r.navigators = vec!["magic".into()],
+            "navigators",
+        ),
+        ("ε below 0", |r| r.thresholds = vec![-0.1], "thresholds"),
+        (
+            "257 thresholds",
+            |r| r.thresholds = vec![0.1; 257],
+            "thresholds",
+        ),
+        (
+            "a navigator twice",
+            |r| r.navigators = vec!["random".into(); 2],
+            "navigators",
+        ),
+        (
+            "a radius without exclusion",
+            |r| r.exclude_radius = 3,
+            "exclude_radius",
+        ),
+    ];
+
+    let server = start_bounded().await;
+    let good = pb::EvaluateRequest {
         room: "synthetic".into(),
-        ..pb::EvaluateRequest::default()
+        ..Default::default()
     };
+    let ask = async |request| server.client.evaluate(request, |_| ()).await;
+    let asked = Asked(good, ask);
+    asked.refuses(InvalidArgument, &invalid).await;
+}
 
-    refused(
-        "0 stride",
-        c.evaluate(
-            pb::EvaluateRequest {
-                stride: Some(0),
-                ..e()
-            },
-            |_| (),
-        )
-        .await,
-        InvalidArgument,
-        "stride",
-    );
+/// Oracle: as above.
+#[tokio::test]
+async fn score_predictions_names_the_field() {
+    fn from_to(source: u32, target: u32, scored: Option<Scored>) -> pb::Prediction {
+        pb::Prediction {
+            source_frame_id: source,
+            target_frame_id: target,
+            prediction: scored,
+            ..Default::default()
+        }
+    }
+    fn retrieved(target: u32, frame: u32) -> pb::Prediction {
+        from_to(500, target, Some(Scored::RetrievedFrameId(frame)))
+    }
+    fn latent(width: usize) -> pb::Prediction {
+        let values = vec![0.0; width];
+        from_to(500, 540, Some(Scored::Latent(pb::Latent { values })))
+    }
 
-    refused(
-        "a stride longer than the room",
-        c.evaluate(
-            pb::EvaluateRequest {
-                stride: Some(u32::MAX),
-                ..e()
-            },
-            |_| (),
-        )
-        .await,
-        InvalidArgument,
-        "stride",
-    );
+    let invalid: [Case<pb::ScorePredictionsRequest>; 9] = [
+        ("none", |_| (), "predictions"),
+        (
+            "too many",
+            |r| r.predictions = vec![retrieved(540, 541); 4],
+            "predictions",
+        ),
+        (
+            "an empty one",
+            |r| r.predictions = vec![retrieved(540, 541), from_to(500, 540, None)],
+            "predictions[1]",
+        ),
+        (
+            "unknown target",
+            |r| r.predictions = vec![retrieved(600, 541)],
+            "predictions[0]",
+        ),
+        (
+            "no candidate",
+            |r| r.predictions = vec![retrieved(540, 3)],
+            "predictions[0]",
+        ),
+        (
+            "narrow latent",
+            |r| r.predictions = vec![latent(19)],
+            "predictions[0]",
+        ),
+        (
+            "a mixture",
+            |r| r.predictions = vec![latent(20), retrieved(540, 541)],
+            "predictions",
+        ),
+        (
+            "the source itself",
+            |r| (r.exclude_source, r.predictions) = (true, vec![retrieved(540, 500)]),
+            "predictions[0]",
+        ),
+        (
+            "no test pair",
+            |r| r.predictions = vec![from_to(1, 41, Some(Scored::RetrievedFrameId(541)))],
+            "predictions[0]",
+        ),
+    ];
 
-    refused(
-        "unknown split",
-        c.evaluate(
-            pb::EvaluateRequest {
-                split: "random".into(),
-                ..e()
-            },
-            |_| (),
-        )
-        .await,
-        InvalidArgument,
-        "split",
-    );
-
-    refused(
-        "unknown navigator",
-        c.evaluate(
-            pb::EvaluateRequest {
-                navigators: rooms(&["magic"]),
-                ..e()
-            },
-            |_| (),
-        )
-        .await,
-        InvalidArgument,
-        "navigators",
-    );
-
-    refused(
-        "ε below 0",
-        c.evaluate(
-            pb::EvaluateRequest {
-                thresholds: vec![-0.1],
-                ..e()
-            },
-            |_| (),
-        )
-        .await,
-        InvalidArgument,
-        "thresholds",
-    );
-
-    refused(
-        "257 thresholds",
-        c.evaluate(
-            pb::EvaluateRequest {
-                thresholds: vec![0.1; 257],
-                ..e()
-            },
-            |_| (),
-        )
-        .await,
-        InvalidArgument,
-        "thresholds",
-    );
-
-    let s = |predictions| pb::ScorePredictionsRequest {
+    let server = start_bounded().await;
+    let good = pb::ScorePredictionsRequest {
         room: "synthetic".into(),
         split: "time".into(),
-        predictions,
         ..Default::default()
     };
+    let ask = async |request| server.client.score_predictions(request).await;
+    let asked = Asked(good, ask);
+    asked.refuses(InvalidArgument, &invalid).await;
+}
 
-    let p = |frame, prediction| pb::Prediction {
-        source_frame_id: 500,
-        target_frame_id: frame,
-        prediction,
-        ..Default::default()
-    };
+/// Oracle: as above.
+#[tokio::test]
+async fn batches_and_the_catalog_name_the_field() {
+    let invalid: [Case<Vec<pb::NavigateRequest>>; 4] = [
+        ("empty batch", Vec::clear, "requests"),
+        ("large batch", |batch| batch.push(question()), "requests"),
+        (
+            "a batch of many frames",
+            |batch| {
+                batch
+                    .iter_mut()
+                    .for_each(|r| (r.steps, r.top_k) = (Some(10), Some(501)))
+            },
+            "requests",
+        ),
+        (
+            "a batch of long lists",
+            |batch| {
+                let list = by_twists(vec![twist([0.0; 6]); 1_000]);
+                batch
+                    .iter_mut()
+                    .for_each(|r| (r.displacement, r.top_k) = (list.clone(), Some(6)));
+            },
+            "requests",
+        ),
+    ];
 
-    let retrieved = |frame| Some(pb::prediction::Prediction::RetrievedFrameId(frame));
-
-    let latent = |width| {
-        Some(pb::prediction::Prediction::Latent(pb::Latent {
-            values: vec![0.0; width],
-        }))
-    };
-
-    refused(
-        "none",
-        c.score_predictions(s(vec![])).await,
-        InvalidArgument,
-        "predictions",
-    );
-
-    refused(
-        "too many",
-        c.score_predictions(s(vec![p(540, retrieved(541)); 4]))
-            .await,
-        InvalidArgument,
-        "predictions",
-    );
-
-    refused(
-        "an empty one",
-        c.score_predictions(s(vec![p(540, retrieved(541)), p(540, None)]))
-            .await,
-        InvalidArgument,
-        "predictions[1]",
-    );
-
-    refused(
-        "unknown target",
-        c.score_predictions(s(vec![p(600, retrieved(541))])).await,
-        InvalidArgument,
-        "predictions[0]",
-    );
-
-    refused(
-        "no candidate",
-        c.score_predictions(s(vec![p(540, retrieved(3))])).await,
-        InvalidArgument,
-        "predictions[0]",
-    );
-
-    refused(
-        "narrow latent",
-        c.score_predictions(s(vec![p(540, latent(19))])).await,
-        InvalidArgument,
-        "predictions[0]",
-    );
-
-    refused(
-        "a mixture",
-        c.score_predictions(s(vec![p(540, latent(20)), p(540, retrieved(541))]))
-            .await,
-        InvalidArgument,
-        "predictions",
-    );
-
-    refused(
-        "empty batch",
-        c.batch_navigate(vec![]).await,
-        InvalidArgument,
-        "requests",
-    );
-
-    refused(
-        "large batch",
-        c.batch_navigate(vec![question(); 3]).await,
-        InvalidArgument,
-        "requests",
-    );
-
-    let wide = pb::NavigateRequest {
-        steps: Some(10),
-        top_k: Some(501),
-        ..question()
-    };
-
-    refused(
-        "a batch of many frames",
-        c.batch_navigate(vec![wide; 2]).await,
-        InvalidArgument,
-        "requests",
-    );
-
-    let twists = vec![twist([0.0; 6]); 1_000];
-    let list = pb::displacement::Displacement::Twists(pb::TwistList { twists });
-    let list = Some(pb::Displacement {
-        displacement: Some(list),
-    });
-    let long = pb::NavigateRequest {
-        displacement: list,
-        top_k: Some(6),
-        ..question()
-    };
-
-    refused(
-        "a batch of long lists",
-        c.batch_navigate(vec![long; 2]).await,
-        InvalidArgument,
-        "requests",
-    );
-
-    let far = vec![0.0; 19].into_iter().chain([1e300]).collect();
-    refused(
-        "far latent",
-        c.localize(pb::LocalizeRequest {
-            view: latent_view(far),
-            ..l()
-        })
-        .await,
-        InvalidArgument,
-        "view.latent.values",
-    );
+    let server = start_bounded().await;
+    let client = &server.client;
+    let ask = async |batch| client.batch_navigate(batch).await;
+    let asked = Asked(vec![question(); 2], ask);
+    asked.refuses(InvalidArgument, &invalid).await;
 
     let long_name = "x".repeat(100_000);
-    refused("long name", c.room(&long_name).await, NotFound, "room");
-
+    refused("long name", client.room(&long_name).await, NotFound, "room");
     refused(
-        "a navigator twice",
-        c.evaluate(
-            pb::EvaluateRequest {
-                navigators: rooms(&["random", "random"]),
-                ..e()
-            },
-            |_| (),
-        )
-        .await,
-        InvalidArgument,
-        "navigators",
+        "unknown adapter",
+        client.adapter("x").await,
+        NotFound,
+        "adapter",
     );
-
-    refused(
-        "a radius without exclusion",
-        c.evaluate(
-            pb::EvaluateRequest {
-                exclude_radius: 3,
-                ..e()
-            },
-            |_| (),
-        )
-        .await,
-        InvalidArgument,
-        "exclude_radius",
-    );
-
-    let excluded = |predictions| pb::ScorePredictionsRequest {
-        exclude_source: true,
-        ..s(predictions)
-    };
-
-    refused(
-        "the source itself",
-        c.score_predictions(excluded(vec![p(540, retrieved(500))]))
-            .await,
-        InvalidArgument,
-        "predictions[0]",
-    );
-
-    let trained = pb::Prediction {
-        source_frame_id: 1,
-        target_frame_id: 41,
-        prediction: retrieved(541),
-        ..Default::default()
-    };
-
-    refused(
-        "no test pair",
-        c.score_predictions(s(vec![trained])).await,
-        InvalidArgument,
-        "predictions[0]",
-    );
-
-    refused("unknown adapter", c.adapter("x").await, NotFound, "adapter");
-    refused("unknown room", c.room("x").await, NotFound, "room");
+    refused("unknown room", client.room("x").await, NotFound, "room");
 }
 
 /// Oracle: the bound itself: a message over it is refused by its size, one under it is read.

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use seese3_client::Client;
@@ -14,12 +14,9 @@ use tokio::sync::Notify;
 use tonic::Code;
 
 use crate::harness::{
-    TestServer, features_of, filled_store, frame, oracle_adapter, question, record, room_of,
-    start_on, to_frame,
+    PATIENCE, TestServer, code_of, features_of, filled_store, frame, metric, publish_oracle,
+    question, room_of, start_on, to_frame, until,
 };
-
-/// How long a change may take to be served on a busy machine.
-const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A server that looks for changes when it is asked to.
 async fn start_watched() -> (TestServer, Store, Arc<Notify>) {
@@ -37,27 +34,6 @@ async fn start_watched() -> (TestServer, Store, Arc<Notify>) {
     (server, store, asked)
 }
 
-/// Asks until the answer is as wanted.
-async fn until<T>(
-    what: &str,
-    mut ask: impl AsyncFnMut() -> T,
-    is_wanted: impl Fn(&T) -> bool,
-) -> T {
-    let waited = async {
-        loop {
-            let answer = ask().await;
-            if is_wanted(&answer) {
-                return answer;
-            }
-            tokio::time::sleep(Duration::from_millis(5)).await;
-        }
-    };
-
-    tokio::time::timeout(PATIENCE, waited)
-        .await
-        .unwrap_or_else(|_| panic!("never happened: {what}"))
-}
-
 async fn revision_of(client: &Client, room: &str) -> Option<u64> {
     let rooms = client.rooms().await.unwrap();
     let revisions = rooms.into_iter().filter_map(|room| room.revision);
@@ -66,6 +42,18 @@ async fn revision_of(client: &Client, room: &str) -> Option<u64> {
         .filter(|revision| revision.name == room)
         .map(|revision| revision.revision)
         .next()
+}
+
+async fn publish_reversed(store: &Store) {
+    let room = room_of("synthetic", "synthetic");
+    let features = [reversed_features()];
+    store.publish_room(&room, &features).await.unwrap();
+}
+
+async fn publish_new(store: &Store) {
+    let room = room_of("new", "synthetic_b");
+    let features = [features_of("synthetic_b")];
+    store.publish_room(&room, &features).await.unwrap();
 }
 
 /// The features of the synthetic room, its frames the other way round.
@@ -90,13 +78,6 @@ fn object(folder: &Path, of: &str, stem: &str) -> PathBuf {
         .unwrap()
 }
 
-fn code_of<T: std::fmt::Debug>(answer: Result<T, seese3_client::Error>) -> Code {
-    match answer.unwrap_err() {
-        seese3_client::Error::Refused(status) => status.code(),
-        other => panic!("{other}"),
-    }
-}
-
 /// Oracle: the store itself: what was published, replaced or removed is what is served next.
 #[tokio::test]
 async fn what_is_published_is_served_without_a_restart() {
@@ -104,17 +85,8 @@ async fn what_is_published_is_served_without_a_restart() {
     let client = &server.client;
     assert_eq!(revision_of(client, "synthetic").await, Some(1));
 
-    store
-        .publish_room(&room_of("synthetic", "synthetic"), &[reversed_features()])
-        .await
-        .unwrap();
-    store
-        .publish_room(
-            &room_of("new", "synthetic_b"),
-            &[features_of("synthetic_b")],
-        )
-        .await
-        .unwrap();
+    publish_reversed(&store).await;
+    publish_new(&store).await;
     std::fs::remove_dir_all(server.folder.path().join("rooms/synthetic_b")).unwrap();
     asked.notify_one();
 
@@ -128,15 +100,7 @@ async fn what_is_published_is_served_without_a_restart() {
     assert_eq!(answer.room.unwrap().revision, 2);
 
     // A new adapter is newer than the one before, and so the room's default.
-    store
-        .publish_adapter(
-            "newer",
-            &oracle_adapter(),
-            &record(),
-            features_of("synthetic").rows(),
-        )
-        .await
-        .unwrap();
+    publish_oracle(&store, "newer").await;
     asked.notify_one();
 
     let default = async || {
@@ -155,30 +119,13 @@ async fn what_is_damaged_is_refused_by_itself() {
     let folder = server.folder.path();
 
     // A second revision of one room, a new room and a new adapter, all of them damaged.
-    store
-        .publish_room(&room_of("synthetic", "synthetic"), &[reversed_features()])
-        .await
-        .unwrap();
+    publish_reversed(&store).await;
     std::fs::write(object(folder, "rooms/synthetic", "features"), b"short").unwrap();
-    store
-        .publish_room(
-            &room_of("new", "synthetic_b"),
-            &[features_of("synthetic_b")],
-        )
-        .await
-        .unwrap();
+    publish_new(&store).await;
     let frames = object(folder, "rooms/new", "frames");
     let intact = std::fs::read(&frames).unwrap();
     std::fs::write(&frames, b"short").unwrap();
-    store
-        .publish_adapter(
-            "broken",
-            &oracle_adapter(),
-            &record(),
-            features_of("synthetic").rows(),
-        )
-        .await
-        .unwrap();
+    publish_oracle(&store, "broken").await;
     std::fs::write(object(folder, "adapters/broken", ""), b"short").unwrap();
     asked.notify_one();
 
@@ -220,37 +167,32 @@ async fn what_is_damaged_is_refused_by_itself() {
 async fn a_server_starts_beside_damage_and_outlives_its_store() {
     let (folder, store) = filled_store().await;
     std::fs::write(object(folder.path(), "rooms/synthetic_b", "frames"), b"x").unwrap();
-    let asked = Arc::new(Notify::new());
-    let reload = Reload {
-        every: Some(Duration::from_millis(20)),
-        requested: asked,
-    };
-    let config = Config {
-        reload,
-        ..Config::default()
-    };
-    let server = start_on(folder, store, config).await;
-
-    assert!(server.client.navigate(question()).await.is_ok());
-    assert!(!server.client.serves("rooms/synthetic_b").await.unwrap());
-
-    let writable = Config {
-        writable: true,
+    let config = |writable| Config {
+        writable,
         reload: Reload {
             every: Some(Duration::from_millis(20)),
             ..Reload::default()
         },
         ..Config::default()
     };
+    let read_only = config(false);
+    let server = start_on(folder, store, read_only.clone()).await;
+
+    assert!(server.client.navigate(question()).await.is_ok());
+    assert!(!server.client.serves("rooms/synthetic_b").await.unwrap());
+
+    let writable = config(true);
     let (other_folder, other_store) = filled_store().await;
-    let other = start_on(other_folder, other_store, writable).await;
+    let other = start_on(other_folder, other_store, writable.clone()).await;
 
     for server in [&server, &other] {
         std::fs::remove_dir_all(server.folder.path().join("rooms")).unwrap();
         std::fs::remove_dir_all(server.folder.path().join("adapters")).unwrap();
     }
-    tokio::time::sleep(Duration::from_millis(200)).await;
-    for server in [&server, &other] {
+    for (server, config) in [(&server, read_only), (&other, writable)] {
+        let name = r#"seese3_reloads_total{outcome="failed"}"#;
+        let failed = async || metric(&config.metrics, name).unwrap();
+        until("a reload fails", failed, |failed| *failed >= 1.0).await;
         assert!(server.client.navigate(question()).await.is_ok());
     }
 }
@@ -260,11 +202,7 @@ async fn a_server_starts_beside_damage_and_outlives_its_store() {
 #[tokio::test]
 async fn damaged_choices_leave_those_before_them() {
     let (server, store, asked) = start_watched().await;
-    let (adapter, rows) = (oracle_adapter(), features_of("synthetic"));
-    store
-        .publish_adapter("trial", &adapter, &record(), rows.rows())
-        .await
-        .unwrap();
+    publish_oracle(&store, "trial").await;
     for adapter in ["oracle", "trial"] {
         let choice = Choice::Adapter {
             room: "synthetic".to_owned(),
@@ -275,8 +213,7 @@ async fn damaged_choices_leave_those_before_them() {
     let choices = server.folder.path().join("defaults/000002.json");
     std::fs::write(choices, b"short").unwrap();
 
-    let (new, new_rows) = (room_of("new", "synthetic_b"), features_of("synthetic_b"));
-    store.publish_room(&new, &[new_rows]).await.unwrap();
+    publish_new(&store).await;
     asked.notify_one();
     let revision = async || revision_of(&server.client, "new").await;
     until("the new room", revision, |found| *found == Some(1)).await;
@@ -327,20 +264,28 @@ async fn answers_are_whole_over(reloads: u64, askers: usize) {
 
     let stop = Arc::new(AtomicBool::new(false));
     let swapping = Arc::new(AtomicBool::new(false));
+    // How many askers were answered while nothing was swapped, and while rooms were.
+    let answered = Arc::new([AtomicUsize::new(0), AtomicUsize::new(0)]);
+    let all_are_answered = async |phase: usize| {
+        let count = async || answered[phase].load(Ordering::Relaxed);
+        until("everyone is answered", count, |count| *count == askers).await;
+    };
     let asking: Vec<_> = (0..askers)
         .map(|_| {
             let (stop, swapping) = (stop.clone(), swapping.clone());
+            let answered = answered.clone();
             let address = server.address.clone();
             let expected = [of_even.clone(), of_odd.clone()];
             tokio::spawn(async move {
                 let client = Client::connect(&address, PATIENCE).await.unwrap();
-                let mut took = Took::default();
+                let mut took = [Vec::new(), Vec::new()];
                 while !stop.load(Ordering::Relaxed) {
                     let begun = Instant::now();
                     let answer = client.navigate(question()).await.unwrap();
-                    match swapping.load(Ordering::Relaxed) {
-                        true => took.swapping.push(begun.elapsed()),
-                        false => took.quiet.push(begun.elapsed()),
+                    let phase = usize::from(swapping.load(Ordering::Relaxed));
+                    took[phase].push(begun.elapsed());
+                    if took[phase].len() == 1 {
+                        answered[phase].fetch_add(1, Ordering::Relaxed);
                     }
                     let (revision, answer) = without_revision(answer);
                     assert_eq!(answer, expected[(revision % 2) as usize], "{revision}");
@@ -350,35 +295,29 @@ async fn answers_are_whole_over(reloads: u64, askers: usize) {
         })
         .collect();
 
-    // The control: the same questions while nothing is swapped.
+    // The control: the same questions while nothing is swapped. The pause is for the percentiles.
     tokio::time::sleep(Duration::from_millis(50 * reloads)).await;
+    all_are_answered(0).await;
     swapping.store(true, Ordering::Relaxed);
     for reload in 0..reloads {
+        if reload + 1 == reloads {
+            all_are_answered(1).await;
+        }
         let features = if reload % 2 == 0 { &forward } else { &backward };
         let revision = publish(features).await;
         served(revision).await;
     }
 
     stop.store(true, Ordering::Relaxed);
-    let mut all = Took::default();
+    let mut all = [Vec::new(), Vec::new()];
     for asker in asking {
-        let Took { quiet, swapping } = asker.await.unwrap();
-        assert!(!quiet.is_empty() && !swapping.is_empty(), "nobody asked");
-        all.quiet.extend(quiet);
-        all.swapping.extend(swapping);
+        for (all, took) in all.iter_mut().zip(asker.await.unwrap()) {
+            all.extend(took);
+        }
     }
-    println!("quiet: {}", percentiles(&mut all.quiet));
-    println!(
-        "while rooms are swapped: {}",
-        percentiles(&mut all.swapping)
-    );
-}
-
-/// How long answers took.
-#[derive(Default)]
-struct Took {
-    quiet: Vec<Duration>,
-    swapping: Vec<Duration>,
+    let [quiet, swapping] = all.each_mut().map(|took| percentiles(took));
+    println!("quiet: {quiet}");
+    println!("while rooms are swapped: {swapping}");
 }
 
 fn percentiles(took: &mut [Duration]) -> String {

@@ -8,7 +8,9 @@ use seese3_server::{Config, Reload, RoomMemory};
 use tokio::sync::Notify;
 use tonic::Code;
 
-use crate::harness::{TestServer, feature, feature_row, filled_store, frame, question, start_on};
+use crate::harness::{
+    TestServer, feature, feature_row, filled_store, frame, question, start_on, until,
+};
 use crate::tracking::{begin, config as in_hall, seen, start_followed};
 
 /// A server with rooms in memory as said, which looks for changes when it is asked to.
@@ -36,12 +38,8 @@ fn in_room(room: &str) -> pb::NavigateRequest {
     }
 }
 
-/// A metric without labels.
 fn metric(config: &Config, name: &str) -> f64 {
-    let text = config.metrics.text();
-    let mut lines = text.lines();
-    let value = lines.find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
-    value.expect(name).parse().expect(name)
+    crate::harness::metric(&config.metrics, name).expect(name)
 }
 
 /// What is answered to a navigation in each room and to a view that may be in any.
@@ -141,13 +139,8 @@ async fn damage_is_noticed_when_a_room_is_first_asked_for() {
 
     std::fs::write(&frames, &intact).unwrap();
     asked.notify_one();
-    let repaired = async {
-        while client.navigate(in_room("synthetic_b")).await.is_err() {
-            tokio::time::sleep(std::time::Duration::from_millis(5)).await;
-        }
-    };
-    let patience = std::time::Duration::from_secs(30);
-    tokio::time::timeout(patience, repaired).await.unwrap();
+    let served = async || client.navigate(in_room("synthetic_b")).await.is_ok();
+    until("the repaired room", served, |served| *served).await;
     assert!(client.serves("rooms/synthetic_b").await.unwrap());
 }
 
@@ -201,13 +194,8 @@ async fn a_stream_holds_its_own_room_alone() {
 
     std::fs::remove_dir_all(server.folder.path().join("rooms/attic")).unwrap();
     asked.notify_one();
-    let one_is_left = async {
-        while metric(&config, "seese3_rooms_in_memory") > 1.0 {
-            tokio::time::sleep(std::time::Duration::from_millis(10)).await;
-        }
-    };
-    let waited = tokio::time::timeout(std::time::Duration::from_secs(30), one_is_left).await;
-    waited.expect("the removed room is still in memory");
+    let in_memory = async || metric(&config, "seese3_rooms_in_memory");
+    until("the removed room is dropped", in_memory, |rooms| *rooms <= 1.0).await;
 
     sender.send(seen(0)).await.unwrap();
     assert!(stream.message().await.unwrap().is_some());

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rcgen::{BasicConstraints, CertificateParams, CertifiedIssuer, IsCa, KeyPair};
 use seese3_client::proto::v1 as pb;
@@ -13,9 +13,11 @@ use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
 use tonic::Code;
 
-use crate::harness::{TestServer, filled_store, frame, question, start_on, to_frame};
+use crate::harness::{
+    PATIENCE, StoppedClock, TestServer, code_of, filled_store, frame, question, soon, start,
+    start_on, to_frame, until,
+};
 
-const DEADLINE: Duration = Duration::from_secs(20);
 const VERBS: [&str; 6] = [
     "navigate", "localize", "track", "evaluate", "catalog", "write",
 ];
@@ -44,11 +46,6 @@ fn credentials() -> String {
     file
 }
 
-async fn start_with(config: Config) -> TestServer {
-    let (folder, store) = filled_store().await;
-    start_on(folder, store, config).await
-}
-
 async fn start_with_credentials() -> TestServer {
     let (folder, store) = filled_store().await;
     let file = folder.path().join("auth.toml");
@@ -64,20 +61,13 @@ async fn start_with_credentials() -> TestServer {
 
 pub async fn client_with(server: &TestServer, token: Option<&str>) -> Client {
     let options = ConnectOptions {
-        deadline: DEADLINE,
+        deadline: PATIENCE,
         token: token.map(str::to_owned),
         tls: None,
     };
     Client::connect_with(&server.address, options)
         .await
         .unwrap()
-}
-
-fn code_of<T: std::fmt::Debug>(answer: Result<T, seese3_client::Error>) -> Code {
-    match answer {
-        Ok(_) => Code::Ok,
-        Err(error) => error.code().unwrap_or_else(|| panic!("{error}")),
-    }
 }
 
 /// Asks one RPC of each verb, in their order.
@@ -340,7 +330,7 @@ async fn tls_client(
     identity: Option<(Vec<u8>, Vec<u8>)>,
 ) -> Result<Client, seese3_client::Error> {
     let options = ConnectOptions {
-        deadline: DEADLINE,
+        deadline: PATIENCE,
         token: None,
         tls: Some(ClientTls {
             authorities: authority.pem(),
@@ -364,14 +354,9 @@ async fn start_tls(config: Config) -> (String, tempfile::TempDir) {
     (address, folder)
 }
 
-async fn serves(client: &Client) -> bool {
-    for _ in 0..1_000 {
-        if client.serves("").await.unwrap_or(false) {
-            return true;
-        }
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
-    false
+async fn until_served(client: &Client) {
+    let serves = async || client.serves("").await.unwrap_or(false);
+    until("the server serves", serves, |serves| *serves).await;
 }
 
 /// Oracle: what TLS promises: a client that trusts the authority is answered, and neither plain
@@ -388,10 +373,10 @@ async fn tls_answers_who_trusts_it_and_takes_a_new_certificate() {
     let (address, _store) = start_tls(config).await;
 
     let client = tls_client(&address, &authority, None).await.unwrap();
-    assert!(serves(&client).await);
+    until_served(&client).await;
     assert!(client.navigate(question()).await.is_ok());
 
-    let plain = Client::connect(&address, DEADLINE).await;
+    let plain = Client::connect(&address, PATIENCE).await;
     assert!(match plain {
         Ok(client) => client.navigate(question()).await.is_err(),
         Err(_) => true,
@@ -401,14 +386,11 @@ async fn tls_answers_who_trusts_it_and_takes_a_new_certificate() {
 
     // The other authority's certificate takes the place of the first; old connections stay.
     other.server_files(folder.path(), false);
-    let began = Instant::now();
-    while tls_client(&address, &other, None).await.is_err() {
-        assert!(
-            began.elapsed() < DEADLINE,
-            "the certificate was never replaced"
-        );
-        tokio::time::sleep(Duration::from_millis(200)).await;
-    }
+    let replaced = async || tls_client(&address, &other, None).await.is_ok();
+    until("the certificate is replaced", replaced, |replaced| {
+        *replaced
+    })
+    .await;
     assert!(client.navigate(question()).await.is_ok());
 }
 
@@ -435,7 +417,7 @@ async fn a_certificate_is_needed_and_says_who_is_calling() {
 
     let robot = tls_client(&address, &authority, Some((robot_cert, robot_key))).await;
     let robot = robot.unwrap();
-    assert!(serves(&robot).await);
+    until_served(&robot).await;
     assert_eq!(code_of(robot.navigate(question()).await), Code::Ok);
     assert_eq!(code_of(robot.rooms().await), Code::PermissionDenied);
 
@@ -455,11 +437,16 @@ async fn a_certificate_is_needed_and_says_who_is_calling() {
 /// say nothing do not hold up the end of the server.
 #[tokio::test]
 async fn silent_connections_are_bounded_and_hold_nobody_up() {
+    // No time passes after which silent connections are closed, or after which a server that
+    // stops gives up.
+    let clock = StoppedClock::new();
+    let lame_duck = Duration::from_secs(1);
     let config = Config {
         connections: 3,
+        lame_duck,
         ..Config::default()
     };
-    let server = start_with(config).await;
+    let server = start(config).await;
 
     // One place is the client's.
     let silent = [
@@ -467,32 +454,19 @@ async fn silent_connections_are_bounded_and_hold_nobody_up() {
         TcpStream::connect(&server.address).await.unwrap(),
     ];
     let mut refused = TcpStream::connect(&server.address).await.unwrap();
-
-    // A silent connection that has a place is closed too, after ten seconds.
-    let at_once = Duration::from_secs(5);
-    let ended = tokio::time::timeout(at_once, refused.read(&mut [0; 1])).await;
-    assert!(
-        !matches!(ended.unwrap(), Ok(1..)),
-        "it is closed and hears nothing"
-    );
+    let ended = soon("it is closed", refused.read(&mut [0; 1])).await;
+    assert!(!matches!(ended, Ok(1..)), "it is closed and hears nothing");
     assert!(server.client.navigate(question()).await.is_ok());
 
     drop(silent);
-    let began = Instant::now();
-    while Client::connect(&server.address, DEADLINE).await.is_err() {
-        assert!(
-            began.elapsed() < DEADLINE,
-            "the places are never free again"
-        );
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
+    let connects = async || Client::connect(&server.address, PATIENCE).await.is_ok();
+    until("the places are free again", connects, |connects| *connects).await;
 
     let _silent = TcpStream::connect(&server.address).await.unwrap();
-    let began = Instant::now();
     server.stop.send(()).unwrap();
-    server.ended.await.unwrap().unwrap();
-    assert!(
-        began.elapsed() < Duration::from_secs(8),
-        "below the drain time of 10 s"
-    );
+    let serves = async || server.client.serves("").await.unwrap();
+    until("health says so", serves, |serves| !*serves).await;
+    clock.advance(lame_duck).await;
+    let ended = soon("the server ends", server.ended).await;
+    ended.unwrap().unwrap();
 }

@@ -9,7 +9,7 @@ use seese3_client::proto::v1::track_response::Answer;
 use seese3_core::geometry::{Pose, PoseError};
 
 use crate::harness::{TestServer, feature};
-use crate::tracking::{answers, begin, config, seen, start_followed};
+use crate::tracking::{answers, begin, config, resume, seen, start_followed};
 use seese3_testing::world::served;
 
 const DOWN: Vector3<f64> = Vector3::new(0.0, 1.0, 0.0);
@@ -257,11 +257,8 @@ async fn a_stream_with_a_rig_and_gravity_goes_on_as_if_it_had_never_been_cut() {
     let whole = [begin(rig.clone())].into_iter().chain(frames(0..40));
     let whole = answers(&server, whole.collect()).await.unwrap();
     for cut in [1, 13, 30] {
-        let resume = pb::TrackConfig {
-            resume_token: whole[cut].resume_token.clone(),
-            ..pb::TrackConfig::default()
-        };
-        let rest = [begin(resume)].into_iter().chain(frames(cut..40));
+        let resumed = resume(whole[cut].resume_token.clone());
+        let rest = [begin(resumed)].into_iter().chain(frames(cut..40));
         let rest = answers(&server, rest.collect()).await.unwrap();
         assert_eq!(rest[1..], whole[cut + 1..], "from {cut}");
     }
