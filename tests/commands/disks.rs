@@ -3,12 +3,10 @@
 
 use std::fs::File;
 use std::io::Write;
-use std::path::Path;
-use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::process::Command;
 
-use crate::kills::{Running, address_of, import, words};
-use crate::program::{refuses, seese3, succeeds, text};
+use crate::kills::import;
+use crate::program::{Place, Running, until};
 
 /// The size of the disk of the store, bytes: for a few revisions.
 const DISK: usize = 2 << 20;
@@ -22,45 +20,39 @@ fn apart(script: &str) -> Command {
     command
 }
 
-/// A server with a small disk of its own, onto which the store at `source` is copied first.
-struct Apart {
+/// A server with a small disk of its own, onto which the store `source` is copied first.
+struct Apart<'a> {
+    here: &'a Place,
     server: Running,
-    address: String,
     /// Where its disk is, as it sees it.
     store: String,
 }
 
-impl Apart {
-    fn start(source: &str, folder: &Path) -> Self {
-        let disk = folder.join("disk");
+impl<'a> Apart<'a> {
+    fn start(here: &'a Place) -> Self {
+        let [disk, source] = ["disk", "source"].map(|name| here.file(name));
         std::fs::create_dir(&disk).unwrap();
-        let store = text(&disk).to_owned();
+        let [store, source] = [disk, source].map(|path| path.to_str().unwrap().to_owned());
 
         let script = format!(
             "mount -t tmpfs -o size={DISK} none '{store}' && cp -r '{source}/.' '{store}' && \
              exec '{}' serve --store '{store}' --listen 127.0.0.1:0 --writable",
             env!("CARGO_BIN_EXE_seese3")
         );
-        let log = File::create(folder.join("log")).unwrap();
-        let child = apart(&script)
-            .env_remove("SEESE3_STORE")
-            .stdout(Stdio::piped())
-            .stderr(log)
-            .spawn()
-            .unwrap();
-
-        let mut server = Running(child);
-        let address = address_of(&mut server);
+        let log = File::create(here.file("log")).unwrap();
+        let mut program = apart(&script);
+        let mut server = Running::start(program.env_remove("SEESE3_STORE").stderr(log));
+        here.until_served(&mut server);
         Self {
+            here,
             server,
-            address,
             store,
         }
     }
 
     /// Runs a program where the server's disk is.
     fn run(&self, program: &[&str]) {
-        let id = self.server.0.id().to_string();
+        let id = self.server.process.id().to_string();
         let entered = Command::new("nsenter")
             .args(["--user", "--mount", "--preserve-credentials", "--target"])
             .arg(id)
@@ -72,41 +64,45 @@ impl Apart {
     }
 
     /// Runs our program where the server's disk is.
-    fn seese3(&self, arguments: &[&str]) {
+    fn seese3(&self, arguments: &str) {
         let program = [env!("CARGO_BIN_EXE_seese3")];
-        self.run(&[&program, arguments, &["--store", &self.store]].concat());
+        let arguments: Vec<&str> = arguments.split(' ').collect();
+        self.run(&[&program, &arguments[..], &["--store", &self.store]].concat());
     }
 
-    /// The arguments that send room `a` of the store at `source` to it.
-    fn push<'a>(&'a self, source: &'a str) -> [&'a str; 6] {
-        [
-            "push",
-            "rooms/a",
-            "--store",
-            source,
-            "--server",
-            &self.address,
-        ]
+    /// The arguments that send room `a` of the store `source` to it.
+    fn push(&self) -> String {
+        format!(
+            "push rooms/a --store source --server {}",
+            self.server.address
+        )
     }
 
     /// It answers a question about room `a`.
     fn answers(&self) {
-        let server = &self.address;
-        let question = ["navigate", "--room", "a", "--from", "1", "--to", "9"];
-        succeeds(&[&question[..], &["--server", server]].concat());
+        let question = "navigate --room a --from 1 --to 9";
+        let address = &self.server.address;
+        self.here
+            .succeeds(&format!("{question} --server {address}"));
     }
-}
 
-/// Waits until the server's log, which is written beside its answers, says this.
-fn until_logged(folder: &Path, words: &str) {
-    let log = || std::fs::read_to_string(folder.join("log")).unwrap();
-    for _ in 0..600 {
-        if log().contains(words) {
-            return;
-        }
-        std::thread::sleep(Duration::from_millis(20));
+    /// A change is refused with a clear error, of which the log, which is written beside the
+    /// answers, says the cause.
+    fn refuses_changes(&self, cause: &str) {
+        let words = ["the store cannot be read or written"];
+        self.here.refuses(&self.push(), &words);
+
+        let log = || std::fs::read_to_string(self.here.file("log")).unwrap();
+        until(cause, || log().contains(cause));
+        self.answers();
     }
-    panic!("{words} is not in the log: {}", log());
+
+    /// What is removed makes room.
+    fn makes_room(&self, revision: &str) {
+        self.seese3(&format!("store rm rooms/a/revisions/{revision}"));
+        self.seese3("store gc --older-than 0");
+        self.here.succeeds(&self.push());
+    }
 }
 
 /// Oracle: the promise: clear errors, serving goes on, and what makes room lets changes through.
@@ -122,59 +118,33 @@ fn a_full_and_a_read_only_disk_stop_changes_and_nothing_else() {
         return;
     }
 
-    let folder = tempfile::tempdir().unwrap();
-    let source = folder.path().join("source");
-    let source = text(&source);
-    succeeds(&words(&import(folder.path(), 0, source)));
-    let train = [
-        "train",
-        "--room",
-        "a",
-        "--preset",
-        "paper-base",
-        "--epochs",
-        "1",
-    ];
-    seese3(&[&train[..], &["--store", source]].concat());
+    let here = Place::new();
+    let publish = |version| here.succeeds(&import(&here, version, "source"));
+    publish(0);
+    here.run("train --room a --preset paper-base --epochs 1 --store source");
 
-    let server = Apart::start(source, folder.path());
+    let server = Apart::start(&here);
     server.answers();
 
     // Until the disk is full.
     let fits = |version: &u32| {
-        succeeds(&words(&import(folder.path(), *version, source)));
-        seese3(&server.push(source)).status.success()
+        publish(*version);
+        here.run(&server.push()).status.success()
     };
     let taken = (1..TOO_MANY).take_while(fits).count();
     assert!((1..TOO_MANY as usize - 1).contains(&taken), "{taken}");
 
-    refuses(
-        &server.push(source),
-        &["the store cannot be read or written"],
-    );
-    until_logged(folder.path(), "No space left on device");
-    server.answers();
-    server.seese3(&["store", "verify"]);
-
-    // What is removed makes room.
-    server.seese3(&["store", "rm", "rooms/a/revisions/1"]);
-    server.seese3(&["store", "gc", "--older-than", "0"]);
-    succeeds(&server.push(source));
+    server.refuses_changes("No space left on device");
+    server.seese3("store verify");
+    server.makes_room("1");
 
     let remount =
         |how: &str| server.run(&["mount", "-o", &format!("remount,{how}"), &server.store]);
     remount("ro");
-    succeeds(&words(&import(folder.path(), TOO_MANY, source)));
-    refuses(
-        &server.push(source),
-        &["the store cannot be read or written"],
-    );
-    until_logged(folder.path(), "Read-only file system");
-    server.answers();
+    publish(TOO_MANY);
+    server.refuses_changes("Read-only file system");
 
     remount("rw");
-    server.seese3(&["store", "rm", "rooms/a/revisions/2"]);
-    server.seese3(&["store", "gc", "--older-than", "0"]);
-    succeeds(&server.push(source));
-    server.seese3(&["store", "verify"]);
+    server.makes_room("2");
+    server.seese3("store verify");
 }

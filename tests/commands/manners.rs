@@ -2,71 +2,52 @@
 //! results are what their names say.
 
 use crate::basics::imported;
-use crate::program::{seese3, succeeds, text};
+use crate::program::{Place, said};
 
-/// A store with a room and an adapter trained in it.
-fn trained(store: &str) {
-    imported(store);
-    let training = ["--preset", "paper-base", "--stride", "20", "--epochs", "1"];
-    succeeds(&[&["train", "--store", store, "--room", "r"], &training[..]].concat());
+/// A place with a room in its store, and an adapter trained in it.
+fn trained() -> Place {
+    let here = imported();
+    let training = "--preset paper-base --stride 20 --epochs 1";
+    here.succeeds(&format!("train --store store --room r {training}"));
+    here
 }
 
 /// Oracle: a JSON parser, which takes nothing before or after the value.
 #[test]
 fn json_on_standard_output_stands_alone() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = folder.path().join("store");
-    let store = text(&store);
-    trained(store);
-
-    let exported = folder.path().join("exported");
-    let cases: [&[&str]; 7] = [
-        &["evaluate", "--store", store, "--room", "r"],
-        &["store", "list", "--store", store],
-        &["store", "verify", "--store", store],
-        &["check", "room", "--store", store, "--room", "r"],
-        &["fit", "--store", store, "--room", "r"],
-        &["encoders"],
-        &[
-            "export",
-            "kitti",
-            "--store",
-            store,
-            "--room",
-            "r",
-            "--out",
-            text(&exported),
-        ],
-    ];
-    for case in cases {
-        let printed = succeeds(&[case, &["--json", "-"]].concat());
-        let value: Result<serde_json::Value, _> = serde_json::from_str(&printed);
-        assert!(
-            value.is_ok_and(|value| !value.is_null()),
-            "{case:?}: {printed}"
-        );
-
-        // Alone, it means the same.
-        let again = succeeds(&[case, &["--json"]].concat());
-        assert!(
-            serde_json::from_str::<serde_json::Value>(&again).is_ok(),
-            "{case:?}: {again}"
-        );
-        assert_eq!(succeeds(&[&["--quiet"], case].concat()), "", "{case:?}");
+    let here = trained();
+    for case in [
+        "evaluate --store store --room r",
+        "store list --store store",
+        "store verify --store store",
+        "check room --store store --room r",
+        "fit --store store --room r",
+        "encoders",
+        "export kitti --store store --room r --out exported",
+    ] {
+        // Alone, the option means the same as with a dash.
+        for json in ["--json -", "--json"] {
+            let printed = here.succeeds(&format!("{case} {json}"));
+            let value: Result<serde_json::Value, _> = serde_json::from_str(&printed);
+            assert!(
+                value.is_ok_and(|value| !value.is_null()),
+                "{case}: {printed}"
+            );
+        }
+        assert_eq!(here.succeeds(&format!("--quiet {case}")), "", "{case}");
     }
 }
 
 #[test]
 fn output_that_cannot_be_written_is_an_error() {
-    let program = || std::process::Command::new(env!("CARGO_BIN_EXE_seese3"));
-    for arguments in [["encoders", "--json"], ["completions", "bash"]] {
+    let here = Place::new();
+    let written = |arguments: &str, to: std::process::Stdio| {
+        here.program(arguments).stdout(to).output().unwrap()
+    };
+    for arguments in ["encoders --json", "completions bash"] {
         let full = std::fs::OpenOptions::new().write(true).open("/dev/full");
-        let output = program()
-            .args(arguments)
-            .stdout(full.unwrap())
-            .output()
-            .unwrap();
-        let error = String::from_utf8(output.stderr).unwrap();
+        let output = written(arguments, full.unwrap().into());
+        let error = said(&output);
         assert_eq!(output.status.code(), Some(1), "{error}");
         assert!(
             error.contains("standard output cannot be written"),
@@ -77,91 +58,58 @@ fn output_that_cannot_be_written_is_an_error() {
     // A reader that has seen enough is no error.
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
-    let output = program()
-        .args(["encoders", "--json"])
-        .stdout(writer)
-        .output();
-    assert!(output.unwrap().status.success());
+    assert!(written("encoders --json", writer.into()).status.success());
 }
 
 #[test]
 fn tables_and_plots_are_what_their_names_say() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = folder.path().join("store");
-    let store = text(&store);
-    trained(store);
-
-    let evaluate = [
-        "evaluate",
-        "--store",
-        store,
-        "--room",
-        "r",
-        "--thresholds",
-        "0.2,0.5",
-    ];
-    let file = |name: &str| folder.path().join(name);
-    let (csv, tex, svg, json) = (file("t.csv"), file("t.tex"), file("p.svg"), file("t.json"));
-    succeeds(
-        &[
-            &evaluate[..],
-            &[
-                "--table",
-                text(&csv),
-                "--plot",
-                text(&svg),
-                "--json",
-                text(&json),
-            ],
-        ]
-        .concat(),
-    );
-    succeeds(&[&evaluate[..], &["--table", text(&tex)]].concat());
+    let here = trained();
+    let evaluate = "evaluate --store store --room r --thresholds 0.2,0.5";
+    let read = |name: &str| std::fs::read_to_string(here.file(name)).unwrap();
+    here.succeeds(&format!(
+        "{evaluate} --table t.csv --plot p.svg --json t.json"
+    ));
+    here.succeeds(&format!("{evaluate} --table t.tex"));
 
     // Oracle: the JSON of the same evaluation.
-    let record = seese3_testing::json(&json);
-    let table = std::fs::read_to_string(csv).unwrap();
+    let record = here.json("t.json");
+    let navigators = record["navigators"].as_array().unwrap();
+    let table = read("t.csv");
     let mut lines = table
         .lines()
         .map(|line| line.split(',').collect::<Vec<_>>());
     let head = lines.next().unwrap();
     let column = |name: &str| head.iter().position(|cell| *cell == name).unwrap();
-    assert_eq!(
-        head.iter().filter(|cell| cell.starts_with("hit@")).count(),
-        6
-    );
-    for (line, row) in lines.zip(record["navigators"].as_array().unwrap()) {
+    let hits = head.iter().filter(|cell| cell.starts_with("hit@"));
+    assert_eq!(hits.count(), 6);
+    for (line, row) in lines.zip(navigators) {
         assert_eq!(line.len(), head.len());
         assert_eq!(line[0], row["name"].as_str().unwrap());
         let hit = line[column("hit@0.5")].parse::<f64>().unwrap();
         assert_eq!(hit, row["hit"]["0.5"]["rate"].as_f64().unwrap());
     }
 
-    let latex = std::fs::read_to_string(tex).unwrap();
+    let latex = read("t.tex");
     let rows = latex.lines().filter(|line| line.ends_with("\\\\")).count();
-    assert_eq!(rows, 1 + record["navigators"].as_array().unwrap().len());
+    assert_eq!(rows, 1 + navigators.len());
 
     // A curve of 50 thresholds: points of the identity, which no suffix follows.
-    let plot = std::fs::read_to_string(svg).unwrap();
+    let plot = read("p.svg");
     assert!(plot.starts_with("<svg") && plot.matches("<circle").count() > 50 * 5);
     assert!(plot.contains("identity") && !plot.contains("in-sample"));
 
-    let other = seese3(&[&evaluate[..], &["--table", "table.xlsx"]].concat());
+    let other = here.run(&format!("{evaluate} --table table.xlsx"));
     assert_eq!(other.status.code(), Some(2));
-    assert!(String::from_utf8_lossy(&other.stderr).contains(".csv or .tex"));
+    assert!(said(&other).contains(".csv or .tex"));
 }
 
 #[test]
 fn shells_and_man_know_the_program() {
-    let script = succeeds(&["completions", "bash"]);
-    assert!(
-        script.contains("relocalize") && script.contains("complete -F"),
-        "{script}"
-    );
+    let here = Place::new();
+    here.prints("completions bash", &["relocalize", "complete -F"]);
 
-    let folder = tempfile::tempdir().unwrap();
-    succeeds(&["man", "--out", text(folder.path())]);
-    let page = std::fs::read_to_string(folder.path().join("seese3-evaluate-odometry.1")).unwrap();
+    here.succeeds("man --out .");
+    let page = std::fs::read_to_string(here.file("seese3-evaluate-odometry.1")).unwrap();
     assert!(
         page.contains(".TH") && page.contains("hold\\-out"),
         "{page}"
@@ -171,16 +119,9 @@ fn shells_and_man_know_the_program() {
 /// Exit codes as the program's help states them.
 #[test]
 fn exit_codes_are_those_of_the_help() {
-    let help = succeeds(&["--help"]);
-    assert!(help.contains("130  stopped by Ctrl-C"), "{help}");
-    assert_eq!(
-        seese3(&["evaluate", "--store", "nowhere", "--room", "r"])
-            .status
-            .code(),
-        Some(1)
-    );
-    assert_eq!(
-        seese3(&["evaluate", "--no-such-option"]).status.code(),
-        Some(2)
-    );
+    let here = Place::new();
+    here.prints("--help", &["130  stopped by Ctrl-C"]);
+    let code = |arguments: &str| here.run(arguments).status.code();
+    assert_eq!(code("evaluate --store nowhere --room r"), Some(1));
+    assert_eq!(code("evaluate --no-such-option"), Some(2));
 }

@@ -1,111 +1,50 @@
 //! The researchers' commands as they are run: probe, cross-room, sweeps, theory.
 
-use std::path::Path;
+use std::fs;
 
-use crate::program::{refuses, succeeds, text};
 use seese3_testing::{golden, json, near, number};
 
-/// A store with the oracle's two rooms, `a` and `b`.
-fn stored(folder: &Path) -> String {
-    let store = text(&folder.join("store")).to_owned();
-    for (room, golden_room) in [("a", "synthetic"), ("b", "synthetic_b")] {
-        let poses = golden().join(format!("rooms/{golden_room}/poses.npy"));
+use crate::program::Place;
 
-        let features = format!(
-            "fourier={}",
-            text(&golden().join(format!("rooms/{golden_room}/features.npy")))
-        );
-
-        succeeds(&[
-            "import",
-            "numpy",
-            "--room",
-            room,
-            "--poses",
-            text(&poses),
-            "--features",
-            &features,
-            "--store",
-            &store,
-        ]);
-    }
-
-    store
+/// A place with the oracle's two rooms, `a` and `b`, in its store.
+fn stored() -> Place {
+    let here = Place::new();
+    here.succeeds(&Place::import("a", "synthetic"));
+    here.succeeds(&Place::import("b", "synthetic_b"));
+    here
 }
 
 /// Oracle: NumPy, scikit-dimension and scikit-learn on the same room; the shape that the manual
 /// promises to scripts.
 #[test]
 fn probe_writes_the_oracles_figures() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = stored(folder.path());
-    let file = folder.path().join("probe.json");
+    let here = stored();
 
-    let fixed = [
-        "probe",
-        "--store",
-        &store,
-        "--room",
-        "a",
-        "--features",
-        "fourier",
-        "--json",
-        text(&file),
-    ];
+    let fixed = "probe --store store --room a --features fourier --json found.json";
+    let short = format!("{fixed} --epochs 1 --seeds 2");
+    here.prints(&short, &["M2 TwoNN", "M4 s40"]);
 
-    let printed = succeeds(&[&fixed[..], &["--epochs", "1", "--seeds", "2"]].concat());
-    assert!(
-        printed.contains("M2 TwoNN") && printed.contains("M4 s40"),
-        "{printed}"
-    );
-
-    let found = json(&file);
-    let m2 = json(&golden().join("m2_intrinsic_dimension/expected.json"));
+    let found = here.json("found.json");
+    let expected = |folder: &str| json(&golden().join(folder).join("expected.json"));
+    let m2 = expected("m2_intrinsic_dimension");
     let formula = &m2["synthetic_all"]["temporal_gap_0"];
+    let m3 = expected("m3_ridge");
+    let ridge = &m3["synthetic"]["stride_40"]["test"];
+    for (metric, key, expected) in [
+        ("m2", "twonn", &formula["twonn_formula"]["linear"]),
+        ("m2", "mle", &formula["mle_formula"]["mle_biased"]),
+        ("m3", "r2", &ridge["overall"]),
+    ] {
+        near(key, number(&found[metric][key]), number(expected), 1e-9);
+    }
 
-    near(
-        "twonn",
-        number(&found["m2"]["twonn"]),
-        number(&formula["twonn_formula"]["linear"]),
-        1e-9,
-    );
-
-    near(
-        "mle",
-        number(&found["m2"]["mle"]),
-        number(&formula["mle_formula"]["mle_biased"]),
-        1e-9,
-    );
-
-    let m3 = json(&golden().join("m3_ridge/expected.json"));
-    near(
-        "m3",
-        number(&found["m3"]["r2"]),
-        number(&m3["synthetic"]["stride_40"]["test"]["overall"]),
-        1e-9,
-    );
-
-    assert!(
-        number(&found["m1"]["value"]) > 0.0 && found["m4"]["runs"].as_array().unwrap().len() == 2
-    );
-
+    assert!(number(&found["m1"]["value"]) > 0.0);
+    assert_eq!(found["m4"]["runs"].as_array().unwrap().len(), 2);
     assert_eq!(found["m2"]["dropped_rows"], 0);
 
-    let two = [
-        &fixed[..],
-        &[
-            "--metrics",
-            "m1,m3",
-            "--sweep-strides",
-            "10,40",
-            "--m1-stride",
-            "2",
-        ],
-    ]
-    .concat();
-
-    succeeds(&two);
-    let found = json(&file);
+    let two = format!("{fixed} --metrics m1,m3 --sweep-strides 10,40 --m1-stride 2");
+    here.succeeds(&two);
+    let found = here.json("found.json");
     assert!(found.get("m2").is_none() && found.get("m4").is_none());
     assert_eq!(found["m3"]["strides"].as_array().unwrap().len(), 2);
 
@@ -114,55 +53,27 @@ fn probe_writes_the_oracles_figures() {
         (&2.into(), &10.into())
     );
 
-    refuses(
-        &[
-            "probe",
-            "--store",
-            &store,
-            "--room",
-            "a",
-            "--m1-frames",
-            "9999",
-        ],
+    here.refuses(
+        "probe --store store --room a --m1-frames 9999",
         &["room 'a'", "M1", "9999"],
     );
 
-    refuses(
-        &["probe", "--store", &store, "--room", "nothing*"],
-        &["nothing*"],
-    );
+    here.refuses("probe --store store --room nothing*", &["nothing*"]);
 }
 
 /// Oracle: the definitions. What is held out is not learned from, the calibrated navigator is there
 /// when rooms are kept aside, and what cannot be answered is refused before anything is trained.
 #[test]
 fn cross_room_compares_with_identity_room_by_room() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = stored(folder.path());
-    let file = folder.path().join("c.json");
+    let here = stored();
 
-    let fixed = [
-        "cross-room",
-        "--store",
-        &store,
-        "--train",
-        "a",
-        "--test",
-        "b",
-        "--split",
-        "whole",
-        "--epochs",
-        "3",
-    ];
+    let fixed = "cross-room --store store --train a --test b --split whole --epochs 3";
+    let by_room = format!("{fixed} --rooms --json found.json");
+    let printed = here.prints(&by_room, &["beats Identity in"]);
+    let is_there = printed.lines().any(|line| line.starts_with("b  "));
+    assert!(is_there, "{printed}");
 
-    let printed = succeeds(&[&fixed[..], &["--rooms", "--json", text(&file)]].concat());
-    assert!(
-        printed.contains("beats Identity in")
-            && printed.lines().any(|line| line.starts_with("b  ")),
-        "{printed}"
-    );
-
-    let run = json(&file)["runs"][0].clone();
+    let run = here.json("found.json")["runs"][0].clone();
     let identity = &run["navigators"][0];
     assert_eq!(
         (&identity["name"], &identity["beats_identity"]["rate"]),
@@ -172,128 +83,57 @@ fn cross_room_compares_with_identity_room_by_room() {
     assert_eq!(run["rooms"][0]["motion"]["n"], 360);
     assert_eq!(run["rooms"][0]["candidates"], 400);
 
-    refuses(
+    let in_both = "cross-room --store store --train a --test *";
+    here.refuses(in_both, &["is in both --train and --test"]);
+    here.refuses_each(
+        fixed,
         &[
-            "cross-room",
-            "--store",
-            &store,
-            "--train",
-            "a",
-            "--test",
-            "*",
+            ("--calibration-rooms 1", &["--calibration-rooms"]),
+            ("--navigators corrector-linear", &["--navigators"]),
+            (
+                "--navigators inverse-poincare-homogeneous+calibrated",
+                &["--navigators"],
+            ),
+            ("--navigators ridge-refit", &["--navigators"]),
+            ("--threshold nan", &["threshold"]),
         ],
-        &["is in both --train and --test"],
     );
 
-    refuses(
-        &[&fixed[..], &["--calibration-rooms", "1"]].concat(),
-        &["--calibration-rooms"],
-    );
+    here.succeeds(&Place::import("c", "synthetic"));
+    let aside = format!("{fixed} --train c --calibration-rooms 1 --json found.json");
+    here.prints(&aside, &["inverse-poincare-homogeneous+calibrated"]);
 
-    for navigator in [
-        "corrector-linear",
-        "inverse-poincare-homogeneous+calibrated",
-        "ridge-refit",
-    ] {
-        refuses(
-            &[&fixed[..], &["--navigators", navigator]].concat(),
-            &["--navigators"],
-        );
+    let run = here.json("found.json")["runs"][0].clone();
+    for rooms in ["learned_rooms", "calibration_rooms"] {
+        assert_eq!(run[rooms].as_array().unwrap().len(), 1, "{rooms}");
     }
 
-    refuses(
-        &[&fixed[..], &["--threshold", "nan"]].concat(),
-        &["threshold"],
-    );
-
-    let poses = golden().join("rooms/synthetic/poses.npy");
-
-    let features = format!(
-        "fourier={}",
-        text(&golden().join("rooms/synthetic/features.npy"))
-    );
-
-    succeeds(&[
-        "import",
-        "numpy",
-        "--room",
-        "c",
-        "--poses",
-        text(&poses),
-        "--features",
-        &features,
-        "--store",
-        &store,
-    ]);
-
-    let aside = succeeds(
-        &[
-            &fixed[..],
-            &[
-                "--train",
-                "c",
-                "--calibration-rooms",
-                "1",
-                "--json",
-                text(&file),
-            ],
-        ]
-        .concat(),
-    );
-
-    assert!(
-        aside.contains("inverse-poincare-homogeneous+calibrated"),
-        "{aside}"
-    );
-
-    let run = json(&file)["runs"][0].clone();
-    assert_eq!(
-        (
-            run["learned_rooms"].as_array().unwrap().len(),
-            run["calibration_rooms"].as_array().unwrap().len()
-        ),
-        (1, 1)
-    );
-
-    refuses(
-        &[&fixed[..], &["--baseline", "best"]].concat(),
-        &["--baseline", "best"],
-    );
+    here.refuses(&format!("{fixed} --baseline best"), &["--baseline", "best"]);
 }
 
-fn sweep<'a>(store: &'a str, out: &'a str, shard: &'a str) -> Vec<&'a str> {
-    let grid = [
-        "--geo-dims",
-        "8,20",
-        "--chart-counts",
-        "1,2",
-        "--lrs",
-        "1e-3",
-        "--losses",
-        "mse,rotation",
-    ];
-
-    let fixed = [
-        "sweep", "adapters", "--store", store, "--room", "a", "--seeds", "2", "--epochs", "2",
-    ];
-    [&fixed[..], &grid, &["--out", out, "--shard", shard]].concat()
+/// A sweep into the folder `out`.
+fn sweep(out: &str, shard: &str) -> String {
+    let fixed = "sweep adapters --store store --room a --seeds 2 --epochs 2";
+    let grid = "--geo-dims 8,20 --chart-counts 1,2 --lrs 1e-3 --losses mse,rotation";
+    format!("{fixed} {grid} --out {out} --shard {shard}")
 }
 
 /// The rows of a sweep by key, without their times.
-fn rows(out: &Path) -> Vec<String> {
-    let mut rows: Vec<String> = std::fs::read_dir(out)
-        .unwrap()
-        .map(|entry| entry.unwrap().path())
-        .filter(|path| text(path).ends_with(".jsonl"))
-        .flat_map(|path| {
-            std::fs::read_to_string(path)
-                .unwrap()
+fn rows(here: &Place, out: &str) -> Vec<String> {
+    let mut rows = Vec::new();
+    for entry in fs::read_dir(here.file(out)).unwrap() {
+        let path = entry.unwrap().path();
+        if path
+            .extension()
+            .is_some_and(|extension| extension == "jsonl")
+        {
+            let text = fs::read_to_string(path).unwrap();
+            let timeless = text
                 .lines()
-                .map(str::to_owned)
-                .collect::<Vec<_>>()
-        })
-        .map(|line| line.split("\"seconds\"").next().unwrap().to_owned())
-        .collect();
+                .map(|line| line.split("\"seconds\"").next().unwrap());
+            rows.extend(timeless.map(str::to_owned));
+        }
+    }
 
     rows.sort();
     rows
@@ -303,137 +143,70 @@ fn rows(out: &Path) -> Vec<String> {
 /// however they are cut.
 #[test]
 fn a_cut_or_sharded_sweep_gives_the_same_rows() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = stored(folder.path());
-    let [whole, cut, shards] = ["whole", "cut", "shards"].map(|name| folder.path().join(name));
-    let printed = succeeds(&sweep(&store, text(&whole), "1/1"));
+    let here = stored();
+    let whole = sweep("whole", "1/1");
+    here.prints(&whole, &["16 runs, 16 of them to be done here"]);
 
-    assert!(
-        printed.contains("16 runs, 16 of them to be done here"),
-        "{printed}"
-    );
-
-    let expected = rows(&whole);
+    let expected = rows(&here, "whole");
     assert_eq!(expected.len(), 16);
 
-    std::fs::create_dir(&cut).unwrap();
-    let journal = "shard-1-of-1.runs.jsonl";
-    let lines = std::fs::read_to_string(whole.join(journal)).unwrap();
+    fs::create_dir(here.file("cut")).unwrap();
+    let journal = |out: &str| here.file(&format!("{out}/shard-1-of-1.runs.jsonl"));
+    let lines = fs::read_to_string(journal("whole")).unwrap();
     let kept: Vec<&str> = lines.lines().take(5).collect();
-    std::fs::write(
-        cut.join(journal),
-        format!("{}\n{}", kept.join("\n"), &kept[0][..40]),
-    )
-    .unwrap();
+    let kept = format!("{}\n{}", kept.join("\n"), &kept[0][..40]);
+    fs::write(journal("cut"), kept).unwrap();
 
-    let printed = succeeds(&sweep(&store, text(&cut), "1/1"));
-    assert!(
-        printed.contains("16 runs, 11 of them to be done here"),
-        "{printed}"
-    );
-
-    assert_eq!(rows(&cut), expected);
+    let cut = sweep("cut", "1/1");
+    here.prints(&cut, &["16 runs, 11 of them to be done here"]);
+    assert_eq!(rows(&here, "cut"), expected);
 
     for shard in ["2/3", "1/3", "3/3"] {
-        succeeds(&sweep(&store, text(&shards), shard));
+        here.succeeds(&sweep("shards", shard));
     }
+    assert_eq!(rows(&here, "shards"), expected);
 
-    assert_eq!(rows(&shards), expected);
+    let shards = sweep("shards", "1/1");
+    here.prints(&shards, &["0 of them to be done here"]);
 
-    let printed = succeeds(&sweep(&store, text(&shards), "1/1"));
-    assert!(printed.contains("0 of them to be done here"), "{printed}");
-
-    let parquet = std::fs::read(shards.join("runs.parquet")).unwrap();
+    let parquet = fs::read(here.file("shards/runs.parquet")).unwrap();
     assert!(parquet.starts_with(b"PAR1") && parquet.ends_with(b"PAR1"));
 
-    refuses(&sweep(&store, text(&shards), "4/3"), &["--shard", "4/3"]);
-
-    refuses(
-        &[&sweep(&store, text(&shards), "1/1")[..], &["--lr", "0.1"]].concat(),
-        &["--lr", "--lrs"],
-    );
-
-    refuses(
-        &[
-            &sweep(&store, text(&shards), "1/1")[..],
-            &["--split", "whole"],
-        ]
-        .concat(),
-        &["--split whole"],
-    );
+    here.refuses(&sweep("shards", "4/3"), &["--shard", "4/3"]);
+    here.refuses(&format!("{shards} --lr 0.1"), &["--lr", "--lrs"]);
+    here.refuses(&format!("{shards} --split whole"), &["--split whole"]);
 
     // Another protocol in the same folder is another table.
-    let other = [
-        &sweep(&store, text(&shards), "1/1")[..],
-        &["--split", "pairs"],
-    ]
-    .concat();
-    let printed = succeeds(&other);
+    let other = format!("{shards} --split pairs");
+    let words = [
+        "16 of them to be done here",
+        "split pairs",
+        "over 16 runs",
+        "(32 rows",
+    ];
+    here.prints(&other, &words);
 
-    assert!(
-        printed.contains("16 of them to be done here") && printed.contains("split pairs"),
-        "{printed}"
-    );
-
-    assert!(
-        printed.contains("over 16 runs") && printed.contains("(32 rows"),
-        "{printed}"
-    );
-
-    std::fs::write(cut.join(journal), "{}\n").unwrap();
-
-    refuses(
-        &sweep(&store, text(&cut), "1/1"),
-        &["shard-1-of-1.runs.jsonl", "line 1"],
-    );
+    fs::write(journal("cut"), "{}\n").unwrap();
+    here.refuses(&cut, &["shard-1-of-1.runs.jsonl", "line 1"]);
 }
 
 /// Oracle: the number of formulations and the order of the paper's table; the adapter's row is what
 /// `train` says.
 #[test]
 fn formulations_stand_beside_the_adapter() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = stored(folder.path());
-    let file = folder.path().join("f.json");
-    let trained = folder.path().join("t.json");
+    let here = stored();
 
-    let common = ["--store", &store, "--room", "a", "--epochs", "3"];
-    let printed = succeeds(
-        &[
-            &[
-                "sweep",
-                "formulations",
-                "--seeds",
-                "1",
-                "--json",
-                text(&file),
-            ][..],
-            &common,
-        ]
-        .concat(),
-    );
+    let common = "--store store --room a --epochs 3";
+    let sweep = format!("sweep formulations --seeds 1 --json found.json {common}");
+    let printed = here.succeeds(&sweep);
+    let lines = printed.lines().skip(2);
+    let names = lines.filter_map(|line| line.split_whitespace().next());
+    let names: Vec<&str> = names.take(5).collect();
+    let expected = "poincare a-unanchored b-absolute c-se3-mlp d-difference-input";
+    assert_eq!(names.join(" "), expected);
 
-    let names: Vec<&str> = printed
-        .lines()
-        .skip(2)
-        .filter_map(|line| line.split_whitespace().next())
-        .take(5)
-        .collect();
-
-    assert_eq!(
-        names,
-        [
-            "poincare",
-            "a-unanchored",
-            "b-absolute",
-            "c-se3-mlp",
-            "d-difference-input"
-        ]
-    );
-
-    succeeds(&[&["train", "--json", text(&trained)][..], &common].concat());
-    let found = json(&file);
-    let trained = json(&trained);
+    here.succeeds(&format!("train --json t.json {common}"));
+    let [found, trained] = ["found.json", "t.json"].map(|name| here.json(name));
 
     assert_eq!(
         found["formulations"][0]["runs"][0]["r2"],
@@ -444,142 +217,66 @@ fn formulations_stand_beside_the_adapter() {
 /// Oracle: the theorems.
 #[test]
 fn theory_keeps_its_bounds() {
-    let folder = tempfile::tempdir().unwrap();
-    let file = folder.path().join("t.json");
+    let here = Place::new();
 
-    let printed = succeeds(&[
-        "theory",
-        "--poses",
-        "400",
-        "--samples",
-        "16",
-        "--json",
-        text(&file),
-    ]);
-
+    let printed = here.succeeds("theory --poses 400 --samples 16 --json found.json");
     assert!(!printed.contains("NOT KEPT"), "{printed}");
 
-    let found = json(&file);
-    assert!(
-        found["checks"]
-            .as_array()
-            .unwrap()
-            .iter()
-            .all(|check| check["holds"] == true)
-    );
+    let found = here.json("found.json");
+    let mut checks = found["checks"].as_array().unwrap().iter();
+    assert!(checks.all(|check| check["holds"] == true));
 }
 
 /// Oracle: by hand: charts, correctors and calibration are asked for, published, and listed by
 /// evaluate's table.
 #[test]
 fn what_is_trained_is_evaluated() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = stored(folder.path());
-    let fixed = [
-        "train", "--store", &store, "--room", "a", "--epochs", "2", "--stride", "20",
-    ];
+    let here = stored();
+    let fixed = "train --store store --room a --epochs 2 --stride 20";
 
-    succeeds(
-        &[
-            &fixed[..],
-            &[
-                "--correctors",
-                "all",
-                "--calibrate-on",
-                "b",
-                "--name",
-                "all",
-            ],
-        ]
-        .concat(),
-    );
+    let all = "--correctors all --calibrate-on b --name all";
+    here.succeeds(&format!("{fixed} {all}"));
 
-    let evaluate = [
-        "evaluate",
-        "--store",
-        &store,
-        "--room",
-        "a",
-        "--adapter",
-        "all",
-    ];
-
-    let printed = succeeds(&evaluate);
-    for row in [
+    let evaluate = "evaluate --store store --room a --adapter all";
+    let rows = [
         "corrector-attention",
         "inverse-poincare-affine+row-space",
         "inverse-poincare-homogeneous+calibrated",
-    ] {
-        assert!(printed.contains(row), "{printed}");
-    }
-
-    let chosen = [
-        "--navigators",
-        "identity,corrector-mlp-2+whitened",
-        "--steps",
-        "3",
-        "--mode",
-        "closed-loop",
     ];
+    here.prints(evaluate, &rows);
 
-    let printed = succeeds(&[&evaluate[..], &chosen].concat());
-    assert!(
-        printed.contains("corrector-mlp-2+whitened") && !printed.contains("ridge-refit"),
-        "{printed}"
+    let chosen = "--navigators identity,corrector-mlp-2+whitened --steps 3 --mode closed-loop";
+    let printed = here.prints(
+        &format!("{evaluate} {chosen}"),
+        &["corrector-mlp-2+whitened"],
     );
+    assert!(!printed.contains("ridge-refit"), "{printed}");
 
-    refuses(
-        &[&evaluate[..], &["--navigators", "best"]].concat(),
-        &["--navigators", "best", "ridge-refit"],
-    );
-
-    refuses(
+    here.refuses_each(
+        evaluate,
         &[
-            &evaluate[..],
-            &["--split", "whole", "--navigators", "ridge-refit"],
-        ]
-        .concat(),
-        &["in-sample"],
+            (
+                "--navigators best",
+                &["--navigators", "best", "ridge-refit"],
+            ),
+            ("--split whole --navigators ridge-refit", &["in-sample"]),
+        ],
     );
 
-    let printed = succeeds(&[
-        "evaluate",
-        "--store",
-        &store,
-        "--room",
-        "b",
-        "--adapter",
-        "all",
-    ]);
+    let in_b = "evaluate --store store --room b --adapter all";
+    here.prints(in_b, &["LEAK", "errors were measured in this room"]);
 
-    assert!(
-        printed.contains("LEAK") && printed.contains("errors were measured in this room"),
-        "{printed}"
-    );
-
-    refuses(
-        &[&fixed[..], &["--calibrate-on", "a"]].concat(),
-        &["'a'", "learned from"],
-    );
-
-    refuses(&[&fixed[..], &["--charts", "0"]].concat(), &["charts"]);
-
-    refuses(
-        &[&fixed[..], &["--geo-dim", "5"]].concat(),
-        &["geo_dim", "5"],
-    );
-
-    refuses(&[&fixed[..], &["--lr", "nan"]].concat(), &["learning rate"]);
-    refuses(&[&fixed[..], &["--strides", "40"]].concat(), &["--strides"]);
-
-    refuses(
-        &[&fixed[..], &["--preset", "steady", "--charts", "2"]].concat(),
-        &["gate"],
-    );
-
-    refuses(
-        &[&fixed[..], &["--correctors", "mlp-9"]].concat(),
-        &["mlp-9", "mlp-3"],
+    here.refuses_each(
+        fixed,
+        &[
+            ("--calibrate-on a", &["'a'", "learned from"]),
+            ("--charts 0", &["charts"]),
+            ("--geo-dim 5", &["geo_dim", "5"]),
+            ("--lr nan", &["learning rate"]),
+            ("--strides 40", &["--strides"]),
+            ("--preset steady --charts 2", &["gate"]),
+            ("--correctors mlp-9", &["mlp-9", "mlp-3"]),
+        ],
     );
 }
 
@@ -587,75 +284,57 @@ fn what_is_trained_is_evaluated() {
 /// its error; a view is located no worse than by the nearest frame; a name that is taken is kept.
 #[test]
 fn an_adapter_is_fitted_and_its_views_are_located() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = stored(folder.path());
-    let file = folder.path().join("found.json");
-    let in_room = |words: &[&str]| {
-        let common = ["--store", &store, "--room", "a", "--json", text(&file)];
-        succeeds(&[words, &common[..]].concat());
-        json(&file)
+    let here = stored();
+    let in_room = |words: &str| {
+        let common = "--store store --room a --json found.json";
+        here.succeeds(&format!("{words} {common}"));
+        here.json("found.json")
     };
 
-    let found = in_room(&["evaluate", "localization", "--fit", "--map-every", "5"]);
+    let found = in_room("evaluate localization --fit --map-every 5");
     for row in ["ours", "nearest_frame", "nearest_pose", "fitted"] {
         for part in ["translation_m", "rotation_deg"] {
             let errors = &found[row][part];
-            assert!(
-                number(&errors["median"]) <= number(&errors["p90"]),
-                "{row} {part}"
-            );
+            let [median, p90] = ["median", "p90"].map(|quantile| number(&errors[quantile]));
+            assert!(median <= p90, "{row} {part}");
         }
     }
-    assert_eq!(
-        found["n"].as_u64().unwrap() + found["mapped"].as_u64().unwrap(),
-        600
-    );
+    let [n, mapped] = ["n", "mapped"].map(|key| found[key].as_u64().unwrap());
+    assert_eq!(n + mapped, 600);
     let median = |row: &str| number(&found[row]["translation_m"]["median"]);
     assert!(median("ours") <= median("nearest_frame"));
 
-    succeeds(&[
-        "train", "--store", &store, "--room", "b", "--epochs", "5", "--name", "b",
-    ]);
-    let motion = in_room(&["evaluate", "motion", "--adapter", "b", "--stride", "10"]);
+    here.succeeds("train --store store --room b --epochs 5 --name b");
+    let motion = in_room("evaluate motion --adapter b --stride 10");
     assert_eq!(motion["n"].as_u64(), Some(590));
     assert!(number(&motion["no_motion"]["translation_m"]["median"]) > 0.0);
     assert!(number(&motion["ours"]["rotation_deg"]["median"]).is_finite());
 
-    let evaluated = in_room(&["evaluate", "--adapter", "b"]);
+    let evaluated = in_room("evaluate --adapter b");
     let baselines = &evaluated["baselines"];
     assert!(number(&baselines["constant_r2"]) < 1.0 && number(&baselines["variance_ratio"]) > 0.0);
-    assert!(
-        baselines["nearest_pose"].is_null(),
-        "the adapter never saw the room"
-    );
+    let nearest = &baselines["nearest_pose"];
+    assert!(nearest.is_null(), "the adapter never saw the room");
     assert!(baselines["optimiser_steps"].as_u64().unwrap() > 0);
 
-    let fit = ["fit", "--store", &store, "--room", "a", "--name", "fitted"];
-    let printed = succeeds(&fit);
-    assert!(
-        printed.contains("published adapter 'fitted' revision 1"),
-        "{printed}"
-    );
-    assert!(succeeds(&fit).contains("unchanged"));
+    let fit = "fit --store store --room a --name fitted";
+    here.prints(fit, &["published adapter 'fitted' revision 1"]);
+    here.prints(fit, &["unchanged"]);
 
-    refuses(
-        &["evaluate", "localization", "--store", &store, "--room", "a"],
+    here.refuses(
+        "evaluate localization --store store --room a",
         &["--adapter", "--fit"],
     );
-    refuses(&["fit", "--store", &store, "--room", "c"], &["'c'"]);
+    here.refuses("fit --store store --room c", &["'c'"]);
 
     // What would be measured too well, or replace another adapter, is refused before it is fitted.
-    let from_b = ["fit", "--store", &store, "--adapter", "b"];
-    refuses(
-        &[&from_b[..], &["--room", "b"]].concat(),
+    here.refuses(
+        "fit --store store --adapter b --room b",
         &["'b'", "was trained on"],
     );
-    refuses(
-        &["fit", "--store", &store, "--room", "a", "--name", "b"],
-        &["'b'", "taken"],
-    );
-    refuses(
-        &["fit", "--store", &store, "--room", "a", "--name", "a/b"],
+    here.refuses("fit --store store --room a --name b", &["'b'", "taken"]);
+    here.refuses(
+        "fit --store store --room a --name a/b",
         &["\"a/b\" cannot name an adapter"],
     );
 }

@@ -2,23 +2,17 @@
 
 use std::path::Path;
 
-use crate::program::{refuses, seese3, succeeds};
+use crate::program::{Place, said};
 use ndarray::{Array2, Array3};
 use seese3_core::image::RgbImage;
 use seese3_encoder::encode_png;
-use seese3_testing::{golden, json, npy};
-
-fn path(folder: &Path, name: &str) -> String {
-    folder.join(name).to_str().unwrap().to_owned()
-}
+use seese3_testing::npy;
 
 /// Oracle: what the oracle keeps and drops, counted; importing again changes nothing; refusing
 /// leaves nothing behind.
 #[test]
 fn recordings_are_imported_once_and_given_back() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = path(folder.path(), "store");
-    let datasets = golden().join("datasets");
+    let here = Place::new();
     for (format, place, room, frames, dropped) in [
         ("tum", "tum", "tum", 6, 1),
         ("7scenes", "sevenscenes/chess", "chess", 8, 4),
@@ -33,273 +27,133 @@ fn recordings_are_imported_once_and_given_back() {
         ("scannet", "scannet_sens/tiny.sens", "tiny", 6, 2),
         ("arkitscenes", "arkit/40000001", "40000001", 6, 3),
     ] {
-        let place = path(&datasets, place);
-        refuses(
-            &["import", format, &place, "--store", &store, "--strict"],
-            &["--strict"],
-        );
+        let import = format!("import {format} golden/datasets/{place} --store store");
+        here.refuses(&format!("{import} --strict"), &["--strict"]);
+        let published = here.file(&format!("store/rooms/{room}"));
+        assert!(!published.exists(), "nothing is left of a refused import");
 
-        assert!(
-            !Path::new(&store).join("rooms").join(room).exists(),
-            "nothing is left of a refused import"
-        );
-
-        let said = succeeds(&["import", format, &place, "--store", &store]);
-        assert!(
-            said.contains(&format!("room '{room}': {frames} frames")),
-            "{said}"
-        );
-
-        assert!(
-            said.contains(&format!("dropped {dropped} frames in all")),
-            "{said}"
-        );
-
-        let again = succeeds(&["import", format, &place, "--store", &store]);
-        assert!(
-            again.contains("already there, unchanged: revision 1"),
-            "{again}"
-        );
+        let counted = format!("room '{room}': {frames} frames");
+        let dropped = format!("dropped {dropped} frames in all");
+        here.prints(&import, &[&counted, &dropped]);
+        here.prints(&import, &["already there, unchanged: revision 1"]);
     }
 
-    refuses(
-        &[
-            "import",
-            "tum",
-            &path(&datasets, "tum"),
-            "--store",
-            &store,
-            "--name",
-            "chess",
-        ],
-        &["--replace"],
+    let tum = "import tum golden/datasets/tum --store store";
+    here.refuses(&format!("{tum} --name chess"), &["--replace"]);
+
+    here.succeeds("encode --store store --room tiny --model pixels");
+
+    // An encoded room is the same room.
+    let tiny = "import scannet golden/datasets/scannet_sens/tiny.sens --store store";
+    here.prints(tiny, &["already there, unchanged: revision 2"]);
+
+    let thinned = format!("{tum} --name thin --every 4 --licence CC-BY");
+    here.prints(
+        &thinned,
+        &["room 'thin': 2 frames with timestamps, every 4 of 6"],
     );
 
-    succeeds(&[
-        "encode", "--store", &store, "--room", "tiny", "--model", "pixels",
-    ]);
+    here.succeeds("export numpy --store store --room thin --out out");
 
-    let tiny = path(&datasets, "scannet_sens/tiny.sens");
-    let again = succeeds(&["import", "scannet", &tiny, "--store", &store]);
+    let timestamps = npy::<i64>(&here.file("out/timestamps.npy"));
+    assert_eq!(timestamps[1], 1_700_000_000_233_400_000);
+
+    here.prints(
+        "import bundle out --store store --name copy",
+        &["room 'copy': 2 frames with timestamps"],
+    );
+    assert_eq!(here.json("out/bundle.json")["licence"], "CC-BY");
+
+    here.succeeds("export tum --store store --room tum --out tum.txt");
+
+    let text = std::fs::read_to_string(here.file("tum.txt")).unwrap();
+    let second = text.lines().nth(1).unwrap();
     assert!(
-        again.contains("already there, unchanged: revision 2"),
-        "an encoded room is the same room: {again}"
-    );
-
-    let thinned = succeeds(&[
-        "import",
-        "tum",
-        &path(&datasets, "tum"),
-        "--store",
-        &store,
-        "--name",
-        "thin",
-        "--every",
-        "4",
-        "--licence",
-        "CC-BY",
-    ]);
-
-    assert!(
-        thinned.contains("room 'thin': 2 frames with timestamps, every 4 of 6"),
-        "{thinned}"
-    );
-
-    let out = path(folder.path(), "out");
-    let trajectory = path(folder.path(), "tum.txt");
-    succeeds(&[
-        "export", "numpy", "--store", &store, "--room", "thin", "--out", &out,
-    ]);
-
-    assert_eq!(
-        npy::<i64>(&Path::new(&out).join("timestamps.npy"))[1],
-        1_700_000_000_233_400_000
-    );
-
-    let copied = succeeds(&[
-        "import", "bundle", &out, "--store", &store, "--name", "copy",
-    ]);
-
-    assert!(
-        copied.contains("room 'copy': 2 frames with timestamps"),
-        "{copied}"
-    );
-
-    assert_eq!(
-        json(&Path::new(&out).join("bundle.json"))["licence"],
-        "CC-BY"
-    );
-
-    succeeds(&[
-        "export",
-        "tum",
-        "--store",
-        &store,
-        "--room",
-        "tum",
-        "--out",
-        &trajectory,
-    ]);
-
-    let text = std::fs::read_to_string(&trajectory).unwrap();
-    assert!(
-        text.lines()
-            .nth(1)
-            .unwrap()
-            .starts_with("1700000000.100000000 0.5 -0.2 1 "),
+        second.starts_with("1700000000.100000000 0.5 -0.2 1 "),
         "{text}"
     );
 
-    refuses(
-        &[
-            "export",
-            "tum",
-            "--store",
-            &store,
-            "--room",
-            "chess",
-            "--out",
-            &trajectory,
-        ],
+    here.refuses(
+        "export tum --store store --room chess --out tum.txt",
         &["--rate"],
     );
 
-    succeeds(&[
-        "export",
-        "kitti",
-        "--store",
-        &store,
-        "--room",
-        "chess",
-        "--out",
-        &trajectory,
-    ]);
+    here.succeeds("export kitti --store store --room chess --out tum.txt");
 
-    assert_eq!(
-        std::fs::read_to_string(&trajectory)
-            .unwrap()
-            .lines()
-            .count(),
-        8
-    );
+    let text = std::fs::read_to_string(here.file("tum.txt")).unwrap();
+    assert_eq!(text.lines().count(), 8);
 
-    refuses(
-        &["import", "tum", "nowhere", "--store", &store],
-        &["nowhere"],
-    );
+    here.refuses("import tum nowhere --store store", &["nowhere"]);
 
-    let short = path(folder.path(), "short");
-    std::fs::create_dir(&short).unwrap();
-
-    for file in ["poses.npy", "timestamps.npy"] {
-        let from = if file == "poses.npy" {
-            golden().join("m1_mutual_knn/tiny_poses.npy")
-        } else {
-            Path::new(&out).join(file)
-        };
-        std::fs::copy(from, Path::new(&short).join(file)).unwrap();
+    std::fs::create_dir(here.file("short")).unwrap();
+    for (from, to) in [
+        ("golden/m1_mutual_knn/tiny_poses.npy", "short/poses.npy"),
+        ("out/timestamps.npy", "short/timestamps.npy"),
+    ] {
+        std::fs::copy(here.file(from), here.file(to)).unwrap();
     }
 
-    refuses(
-        &["import", "numpy", &short, "--store", &store, "--every", "2"],
+    here.refuses(
+        "import numpy short --store store --every 2",
         &["6 poses but 2 timestamps", "short"],
     );
 }
 
-fn features(store: &str, room: &str, name: &str) -> Array2<f32> {
-    let out = tempfile::tempdir().unwrap();
-    let to = path(out.path(), "out");
-    succeeds(&[
-        "export", "numpy", "--store", store, "--room", room, "--out", &to,
-    ]);
-
-    npy(&Path::new(&to).join(format!("features_{name}.npy")))
-        .into_dimensionality()
-        .unwrap()
+fn features(here: &Place, store: &str, room: &str, name: &str) -> Array2<f32> {
+    let to = format!("features-{store}-{name}");
+    here.succeeds(&format!(
+        "export numpy --store {store} --room {room} --out {to}"
+    ));
+    let rows = npy(&here.file(&format!("{to}/features_{name}.npy")));
+    rows.into_dimensionality().unwrap()
 }
+
+/// Draws a room with its images.
+fn draw(here: &Place, frames: usize) {
+    let studio = "studio --out store --rooms 1 --seed 4 --keep-images";
+    here.succeeds(&format!("{studio} --frames {frames}"));
+}
+
+/// Encodes the room that was drawn.
+const ENCODE: &str = "encode --store store --room studio4-0000 --model pixels";
 
 /// Oracle: PNG is lossless, so encoding the kept images gives the features that were encoded as
 /// they were drawn; and a second run finds all of it there.
 #[test]
 fn a_suite_is_drawn_once_and_encodes_as_its_images_do() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = path(folder.path(), "store");
+    let here = Place::new();
 
-    let studio = [
-        "studio",
-        "--out",
-        &store,
-        "--rooms",
-        "2",
-        "--frames",
-        "24",
-        "--seed",
-        "3",
-        "--keep-images",
-    ];
+    let studio = "studio --out store --rooms 2 --frames 24 --seed 3 --keep-images";
+    here.prints(studio, &["2 rooms drawn, 0 were there already"]);
+    here.prints(studio, &["0 rooms drawn, 2 were there already"]);
 
-    assert!(succeeds(&studio).contains("2 rooms drawn, 0 were there already"));
-    assert!(succeeds(&studio).contains("0 rooms drawn, 2 were there already"));
-
-    let streamed = features(&store, "studio3-0001", "builtin");
+    let streamed = features(&here, "store", "studio3-0001", "builtin");
     assert_eq!(streamed.dim(), (24, 528));
 
-    let encode = [
-        "encode",
-        "--store",
-        &store,
-        "--room",
-        "studio3-0001",
-        "--model",
-        "builtin",
-        "--as",
-        "kept",
-    ];
+    let encode = "encode --store store --room studio3-0001 --model builtin --as kept";
+    here.prints(encode, &["encoded 24 frames"]);
+    assert_eq!(features(&here, "store", "studio3-0001", "kept"), streamed);
+    here.prints(encode, &["already there"]);
 
-    assert!(succeeds(&encode).contains("encoded 24 frames"));
-    assert_eq!(features(&store, "studio3-0001", "kept"), streamed);
-    assert!(succeeds(&encode).contains("already there"));
+    let pixels = "studio --out store --rooms 2 --frames 24 --seed 3 --encode pixels";
+    here.refuses(pixels, &["was kept at 64×48", "another store"]);
 
-    let pixels = [
-        "studio", "--out", &store, "--rooms", "2", "--frames", "24", "--seed", "3", "--encode",
-        "pixels",
-    ];
-    refuses(&pixels, &["was kept at 64×48", "another store"]);
-
-    let other = path(folder.path(), "other");
-    succeeds(&[
-        "studio",
-        "--out",
-        &other,
-        "--rooms",
-        "2",
-        "--frames",
-        "24",
-        "--seed",
-        "3",
-        "--threads",
-        "1",
-    ]);
+    here.succeeds("studio --out other --rooms 2 --frames 24 --seed 3 --threads 1");
 
     assert_eq!(
-        features(&other, "studio3-0001", "builtin"),
+        features(&here, "other", "studio3-0001", "builtin"),
         streamed,
         "the same rooms on one thread"
     );
 
-    refuses(
-        &[
-            "studio", "--out", &store, "--rooms", "1", "--frames", "25", "--seed", "3",
-        ],
+    here.refuses(
+        "studio --out store --rooms 1 --frames 25 --seed 3",
         &["other frames"],
     );
 
-    let sheet = path(folder.path(), "sheet.png");
-    succeeds(&[
-        "studio", "--rooms", "3", "--frames", "10", "--sheet", &sheet,
-    ]);
+    here.succeeds("studio --rooms 3 --frames 10 --sheet sheet.png");
 
-    let picture = image::open(&sheet).unwrap();
+    let picture = image::open(here.file("sheet.png")).unwrap();
     assert_eq!((picture.width(), picture.height()), (480, 120));
 }
 
@@ -307,42 +161,17 @@ fn a_suite_is_drawn_once_and_encodes_as_its_images_do() {
 /// when asked; what was done before stays done.
 #[test]
 fn a_corrupt_image_is_named_or_left_out() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = path(folder.path(), "store");
+    let here = Place::new();
 
-    let suite = [
-        "studio",
-        "--out",
-        &store,
-        "--rooms",
-        "1",
-        "--frames",
-        "40",
-        "--seed",
-        "4",
-        "--keep-images",
-    ];
-
-    succeeds(&suite);
-    let bad = Path::new(&store).join("images/studio4-0000/frame-000030.png");
+    draw(&here, 40);
+    let bad = here.file("store/images/studio4-0000/frame-000030.png");
     let whole = std::fs::read(&bad).unwrap();
     std::fs::write(&bad, &whole[..whole.len() / 2]).unwrap();
 
-    let encode = [
-        "encode",
-        "--store",
-        &store,
-        "--room",
-        "studio4-0000",
-        "--model",
-        "pixels",
-    ];
-
-    refuses(&encode, &["frame-000030.png", "again to resume"]);
-    let skipping = succeeds(&[&encode[..], &["--skip-bad"]].concat());
-    assert!(
-        skipping.contains("left out frame 30") && skipping.contains("left out 1 frames in all"),
-        "{skipping}"
+    here.refuses(ENCODE, &["frame-000030.png", "again to resume"]);
+    let skipping = here.prints(
+        &format!("{ENCODE} --skip-bad"),
+        &["left out frame 30", "left out 1 frames in all"],
     );
 
     assert!(
@@ -350,141 +179,69 @@ fn a_corrupt_image_is_named_or_left_out() {
         "it went on: {skipping}"
     );
 
-    assert_eq!(features(&store, "studio4-0000", "pixels").nrows(), 39);
+    assert_eq!(
+        features(&here, "store", "studio4-0000", "pixels").nrows(),
+        39
+    );
 
     assert_eq!(
-        features(&store, "studio4-0000", "builtin").nrows(),
+        features(&here, "store", "studio4-0000", "builtin").nrows(),
         39,
         "the room lost the frame with all its features"
     );
 
-    assert!(
-        std::fs::read_dir(Path::new(&store).join("unfinished"))
-            .unwrap()
-            .next()
-            .is_none(),
-        "no journal is left"
-    );
+    let mut unfinished = std::fs::read_dir(here.file("store/unfinished")).unwrap();
+    assert!(unfinished.next().is_none(), "no journal is left");
 
-    std::fs::remove_dir_all(Path::new(&store).join("images")).unwrap();
-    refuses(&[&encode[..], &["--again"]].concat(), &["--images DIR"]);
+    std::fs::remove_dir_all(here.file("store/images")).unwrap();
+    here.refuses(&format!("{ENCODE} --again"), &["--images DIR"]);
 
-    refuses(
-        &[&encode[..], &["--resize", "64x48"]].concat(),
+    here.refuses(
+        &format!("{ENCODE} --resize 64x48"),
         &["'pixels' is one fixed encoder"],
     );
 
-    refuses(
-        &[&encode[..], &["--as", &"x".repeat(101)]].concat(),
-        &["--as PREFIX"],
-    );
+    let long = "x".repeat(101);
+    here.refuses(&format!("{ENCODE} --as {long}"), &["--as PREFIX"]);
 }
 
 /// Oracle: what was encoded before an image was written anew is not taken for it.
 #[test]
 fn a_run_does_not_go_on_from_rows_of_other_images() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = path(folder.path(), "store");
+    let here = Place::new();
 
-    succeeds(&[
-        "studio",
-        "--out",
-        &store,
-        "--rooms",
-        "1",
-        "--frames",
-        "40",
-        "--seed",
-        "4",
-        "--keep-images",
-    ]);
+    draw(&here, 40);
 
-    let images = Path::new(&store).join("images/studio4-0000");
+    let images = here.file("store/images/studio4-0000");
     let last = images.join("frame-000039.png");
     let whole = std::fs::read(&last).unwrap();
     std::fs::write(&last, &whole[..100]).unwrap();
 
-    let encode = [
-        "encode",
-        "--store",
-        &store,
-        "--room",
-        "studio4-0000",
-        "--model",
-        "pixels",
-    ];
-
-    refuses(&encode, &["frame-000039.png"]);
+    here.refuses(ENCODE, &["frame-000039.png"]);
     std::fs::write(&last, &whole).unwrap();
 
-    std::fs::copy(
-        images.join("frame-000020.png"),
-        images.join("frame-000000.png"),
-    )
-    .unwrap();
+    let frame = |number: u32| images.join(format!("frame-{number:06}.png"));
+    std::fs::copy(frame(20), frame(0)).unwrap();
 
-    assert!(succeeds(&encode).contains(", 0 were done before"));
+    here.prints(ENCODE, &[", 0 were done before"]);
 
-    let rows = features(&store, "studio4-0000", "pixels");
+    let rows = features(&here, "store", "studio4-0000", "pixels");
     assert_eq!(rows.row(0), rows.row(20), "frame 0 was encoded anew");
 }
 
 /// Oracle: the keys that scripts read, and that every layer of the room is scored.
 #[test]
 fn layers_are_swept() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = path(folder.path(), "store");
-    let file = path(folder.path(), "layers.json");
+    let here = Place::new();
 
-    succeeds(&[
-        "studio",
-        "--out",
-        &store,
-        "--rooms",
-        "1",
-        "--frames",
-        "120",
-        "--seed",
-        "4",
-        "--keep-images",
-    ]);
+    draw(&here, 120);
+    here.succeeds(ENCODE);
 
-    succeeds(&[
-        "encode",
-        "--store",
-        &store,
-        "--room",
-        "studio4-0000",
-        "--model",
-        "pixels",
-    ]);
+    let sweep = "sweep layers --store store --room studio4-0000";
+    let short = "--stride 10 --epochs 2 --seeds 2 --m1-frames 100 --json layers.json";
+    here.prints(&format!("{sweep} {short}"), &["builtin", "pixels", "±"]);
 
-    let sweep = [
-        "sweep",
-        "layers",
-        "--store",
-        &store,
-        "--room",
-        "studio4-0000",
-        "--stride",
-        "10",
-        "--epochs",
-        "2",
-        "--seeds",
-        "2",
-        "--m1-frames",
-        "100",
-        "--json",
-        &file,
-    ];
-
-    let said = succeeds(&sweep);
-    assert!(
-        said.contains("builtin") && said.contains("pixels") && said.contains('±'),
-        "{said}"
-    );
-
-    let layers = json(Path::new(&file))["layers"].clone();
+    let layers = here.json("layers.json")["layers"].clone();
     assert_eq!(layers.as_array().unwrap().len(), 2);
 
     for layer in layers.as_array().unwrap() {
@@ -493,21 +250,14 @@ fn layers_are_swept() {
         }
     }
 
-    refuses(&[&sweep[..5], &["nowhere"]].concat(), &["nowhere"]);
-
-    refuses(
-        &[&sweep[..6], &["--room", "studio4-0000"]].concat(),
-        &["given twice"],
-    );
-
-    refuses(
-        &[&sweep[..6], &["--features", "dino"]].concat(),
-        &["no such features", "builtin, pixels"],
-    );
-
-    refuses(
-        &[&sweep[..6], &["--m1-frames", "300"]].concat(),
-        &["300 frames"],
+    here.refuses("sweep layers --store store --room nowhere", &["nowhere"]);
+    here.refuses_each(
+        sweep,
+        &[
+            ("--room studio4-0000", &["given twice"]),
+            ("--features dino", &["no such features", "builtin, pixels"]),
+            ("--m1-frames 300", &["300 frames"]),
+        ],
     );
 }
 
@@ -515,53 +265,36 @@ fn layers_are_swept() {
 /// are listed in both.
 #[test]
 fn models_need_a_build_that_can_run_them() {
-    let said = succeeds(&["encoders"]);
-    for word in [
+    let here = Place::new();
+    let models = [
         "dinov2-b", "dinov2-s", "dinov3-b", "clip-b16", "dust3r", "croco", "vjepa2.1", "pixels",
         "builtin",
-    ] {
-        assert!(said.contains(word), "{word}");
-    }
-
-    assert!(succeeds(&["encoders", "dinov2-b"]).contains("torch.onnx.export"));
-
-    refuses(&["encoders", "nothing"], &["dinov2-b"]);
-    let model = golden().join("encoder/image.onnx");
-
-    let encode = [
-        "encode",
-        "--store",
-        ".",
-        "--room",
-        "r",
-        "--model",
-        model.to_str().unwrap(),
     ];
+    here.prints("encoders", &models);
+    here.prints("encoders dinov2-b", &["torch.onnx.export"]);
+
+    here.refuses("encoders nothing", &["dinov2-b"]);
+    let room = "encode --store . --room r";
+    let encode = format!("{room} --model golden/encoder/image.onnx");
 
     if cfg!(feature = "onnx") {
-        refuses(&encode, &["--recipe NAME"]);
+        here.refuses(&encode, &["--recipe NAME"]);
 
-        refuses(
-            &[&encode[..], &["--recipe", "resnet"]].concat(),
+        here.refuses(
+            &format!("{encode} --recipe resnet"),
             &["resnet", "dinov2-b"],
         );
 
-        refuses(
-            &[&encode[..6], &["nowhere.onnx"]].concat(),
-            &["nowhere.onnx"],
-        );
+        here.refuses(&format!("{room} --model nowhere.onnx"), &["nowhere.onnx"]);
 
-        refuses(
-            &[&encode[..], &["--divisor", "255", "--pool", "max"]].concat(),
-            &["max"],
-        );
+        here.refuses(&format!("{encode} --divisor 255 --pool max"), &["max"]);
     } else {
-        refuses(&encode, &["cargo install --path . --features full"]);
+        here.refuses(&encode, &["cargo install --path . --features full"]);
     }
 
     if !cfg!(feature = "onnxruntime") {
-        refuses(
-            &[&encode[..], &["--runtime", "onnxruntime"]].concat(),
+        here.refuses(
+            &format!("{encode} --runtime onnxruntime"),
             &["--features full"],
         );
     }
@@ -613,38 +346,34 @@ fn looking_about(folder: &Path, is_inverted: bool) {
 /// Oracle: the poses by which the images were drawn, and their inverse.
 #[test]
 fn inverted_poses_are_named_at_import_and_by_check() {
-    let folder = tempfile::tempdir().unwrap();
-    let store = path(folder.path(), "store");
+    let here = Place::new();
     for (name, is_inverted) in [("right", false), ("wrong", true)] {
-        looking_about(&folder.path().join(name), is_inverted);
+        looking_about(&here.file(name), is_inverted);
     }
 
-    let import = |room: &str, more: &[&str]| {
-        let place = path(folder.path(), room);
-        let arguments = ["import", "folder", &place, "--store", &store, "--replace"];
-        let output = seese3(&[&arguments, more].concat());
+    let import = |room: &str, more: &str| {
+        let output = here.run(&format!(
+            "import folder {room} --store store --replace {more}"
+        ));
         assert!(output.status.success());
-        String::from_utf8(output.stderr).unwrap()
+        said(&output)
     };
-    let check =
-        |room: &str| seese3(&["check", "room", "--store", &store, "--room", room, "--json"]);
+    let check = |room: &str| here.run(&format!("check room --store store --room {room} --json"));
 
     // The camera is on a tripod, which is said, and nothing else.
     let is_clean = |warned: &str| {
         warned.starts_with("warning: all positions are identical") && warned.lines().count() == 1
     };
-    assert!(is_clean(&import("right", &["--strict"])));
+    assert!(is_clean(&import("right", "--strict")));
     assert!(check("right").status.success());
 
-    let wrong = path(folder.path(), "wrong");
-    let strict = ["import", "folder", &wrong, "--store", &store, "--strict"];
-    let refused = seese3(&strict);
+    let refused = here.run("import folder wrong --store store --strict");
     assert_eq!(refused.status.code(), Some(1));
-    let refused = String::from_utf8(refused.stderr).unwrap();
+    let refused = said(&refused);
     assert!(refused.contains("nothing was published"), "{refused}");
-    assert!(!Path::new(&store).join("rooms/wrong").exists());
+    assert!(!here.file("store/rooms/wrong").exists());
 
-    let warned = import("wrong", &[]);
+    let warned = import("wrong", "");
     assert!(warned.contains("contradict the poses"), "{warned}");
     assert!(warned.contains("--poses camera_from_world"), "{warned}");
 
@@ -655,9 +384,7 @@ fn inverted_poses_are_named_at_import_and_by_check() {
     assert_eq!(said["images"]["sizes"][0]["count"], 60);
 
     // Read as the warning says, all is well.
-    assert!(is_clean(&import(
-        "wrong",
-        &["--poses", "camera_from_world"]
-    )));
+    let read_right = import("wrong", "--poses camera_from_world");
+    assert!(is_clean(&read_right));
     assert!(check("wrong").status.success());
 }

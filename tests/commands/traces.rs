@@ -1,7 +1,6 @@
 //! Spans of requests as a collector of OpenTelemetry gets them.
 
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
 use opentelemetry_proto::tonic::collector::trace::v1::trace_service_server::{
     TraceService, TraceServiceServer,
@@ -20,8 +19,8 @@ use tokio_stream::wrappers::TcpListenerStream;
 use tonic::transport::Channel;
 use tonic::{Request, Response, Status};
 
-use crate::kills::{import, serve_with, words};
-use crate::program::succeeds;
+use crate::kills::import;
+use crate::program::{Place, until};
 
 /// A collector that keeps what it gets.
 #[derive(Clone, Default)]
@@ -44,15 +43,16 @@ impl TraceService for Collector {
 
 impl Collector {
     /// The span whose parent has this number, once it has arrived.
-    async fn child_of(&self, parent: [u8; 8]) -> Span {
-        for _ in 0..1_500 {
-            let found = |span: &&Span| span.parent_span_id == parent;
-            if let Some(span) = self.0.lock().unwrap().iter().find(found) {
-                return span.clone();
-            }
-            tokio::time::sleep(Duration::from_millis(10)).await;
-        }
-        panic!("no span arrived: {:?}", self.0.lock().unwrap());
+    fn child_of(&self, parent: [u8; 8]) -> Span {
+        let found = || {
+            let spans = self.0.lock().unwrap();
+            spans
+                .iter()
+                .find(|span| span.parent_span_id == parent)
+                .cloned()
+        };
+        tokio::task::block_in_place(|| until("the span arrives", || found().is_some()));
+        found().unwrap()
     }
 }
 
@@ -69,13 +69,12 @@ async fn requests_are_spans_of_their_callers_traces() {
         .serve_with_incoming(TcpListenerStream::new(listener));
     tokio::spawn(serving);
 
-    let folder = tempfile::tempdir().unwrap();
-    let store = folder.path().join("store").to_str().unwrap().to_owned();
-    succeeds(&words(&import(folder.path(), 1, &store)));
-    let options = ["--otlp-endpoint", &endpoint];
-    let (_server, address) = tokio::task::block_in_place(|| serve_with(&store, &options));
+    let here = Place::new();
+    here.succeeds(&import(&here, 1, "store"));
+    let options = format!("--otlp-endpoint {endpoint}");
+    let server = tokio::task::block_in_place(|| here.serve(&options));
 
-    let address = format!("http://{address}");
+    let address = format!("http://{}", server.address);
     let channel = Channel::from_shared(address).unwrap();
     let mut client = CatalogServiceClient::new(channel.connect().await.unwrap());
     let mut ask = async |room: &str, parent: [u8; 8]| {
@@ -92,7 +91,7 @@ async fn requests_are_spans_of_their_callers_traces() {
     assert!(!ask("nowhere", [2; 8]).await);
 
     for (parent, status) in [([1; 8], 0), ([2; 8], 5)] {
-        let span = collector.child_of(parent).await;
+        let span = collector.child_of(parent);
         let trace = span.trace_id.iter().map(|byte| format!("{byte:02x}"));
         assert_eq!(
             trace.collect::<String>(),

@@ -479,6 +479,7 @@ async fn garbage_that_is_published_again_is_not_collected() {
             let store = store.clone();
             let pause = Duration::from_micros(300 * round);
             tokio::spawn(async move {
+                // Only spreads the moments at which the collection begins.
                 tokio::time::sleep(pause).await;
                 store.collect_garbage(Duration::from_secs(3_600)).await
             })
