@@ -11,287 +11,163 @@ const EXIT_CODES: &str = "Exit codes:\n  \
     NO_COLOR=1 turns colors off. Progress goes to standard error: a bar on a terminal, otherwise a line\n\
     every 30 s; --quiet turns it off.";
 
-/// Command paths, each with its examples.
-const EXAMPLES: &[(&[&str], &[&str])] = &[
-    (
-        &["demo"],
-        &["seese3 demo", "seese3 demo --frames 500 --out small"],
-    ),
-    (
-        &["import"],
-        &[
-            "seese3 import folder photos --room kitchen --store store",
-            "seese3 import colmap project --store store --scale 1",
-            "seese3 import bag rosbag2_hall --room hall --store store --image-topic /camera/image/compressed",
-            "seese3 import numpy --poses poses.npy --features mine=features.npy --room kitchen --store store",
-        ],
-    ),
-    (
-        &["import", "folder"],
-        &["seese3 import folder photos --room kitchen --store store"],
-    ),
-    (
-        &["import", "colmap"],
-        &["seese3 import colmap project --room kitchen --store store --scale 0.37"],
-    ),
-    (
-        &["import", "7scenes"],
-        &["seese3 import 7scenes kitchen --store store --every 2"],
-    ),
-    (
-        &["import", "numpy"],
-        &[
-            "seese3 import numpy --poses poses.npy --features mine=features.npy --room kitchen --store store",
-        ],
-    ),
-    (
-        &["import", "bag"],
-        &[
-            "seese3 import bag rosbag2_hall --store store --image-topic /camera/image/compressed --pose-topic /odom",
-            "seese3 import bag drive.mcap --room hall --store store --world-frame map",
-        ],
-    ),
-    (
-        &["check"],
-        &["seese3 check room --store store --room kitchen"],
-    ),
-    (
-        &["check", "room"],
-        &[
-            "seese3 check room --store store --room kitchen",
-            "seese3 check room --store store --room kitchen --json - | jq .warnings",
-        ],
-    ),
-    (
-        &["export"],
-        &[
-            "seese3 export numpy --store store --room kitchen --out kitchen-numpy",
-            "seese3 export tum --store store --room kitchen --out kitchen.tum --rate 30",
-        ],
-    ),
-    (
-        &["encode"],
-        &[
-            "seese3 encode --store store --room kitchen --model pixels",
-            "seese3 encode --store store --room kitchen --model effnetlite0.onnx --recipe effnetlite0 --layers block14",
-            "seese3 encode --store store --room kitchen --model vit.onnx --resize 224x224 --preprocess imagenet --pool cls",
-        ],
-    ),
-    (
-        &["encoders"],
-        &["seese3 encoders", "seese3 encoders dinov2-b"],
-    ),
-    (
-        &["studio"],
-        &["seese3 studio --rooms 20 --frames 400 --seed 7 --out suite --keep-images"],
-    ),
-    (
-        &["train"],
-        &[
-            "seese3 train --store store --room kitchen --features pixels --stride 20 --split blocks",
-            "seese3 train --store suite --room 'studio7-000*' --preset steady --split whole --calibrate-on 'studio7-001*' --name robot",
-        ],
-    ),
-    (
-        &["fit"],
-        &["seese3 fit --store store --room kitchen --adapter robot"],
-    ),
-    (
-        &["evaluate"],
-        &[
-            "seese3 evaluate --store store --room kitchen --exclude-source",
-            "seese3 evaluate --store store --room kitchen --plot hit.svg --table hit.tex --json hit.json",
-            "seese3 evaluate odometry --store store --room kitchen --adapter robot --hold-out blocks",
-        ],
-    ),
-    (
-        &["evaluate", "localization"],
-        &["seese3 evaluate localization --store store --room kitchen --fit --map-blocks"],
-    ),
-    (
-        &["evaluate", "motion"],
-        &["seese3 evaluate motion --store store --room kitchen --adapter robot --stride 5"],
-    ),
-    (
-        &["evaluate", "odometry"],
-        &[
-            "seese3 evaluate odometry --store store --room kitchen --adapter robot --hold-out blocks --json -",
-        ],
-    ),
-    (
-        &["evaluate", "planning"],
-        &["seese3 evaluate planning --store store --room kitchen --adapter robot"],
-    ),
-    (
-        &["evaluate", "robustness"],
-        &[
-            "seese3 evaluate robustness --store store --room kitchen --adapter robot --encoder effnetlite0.onnx",
-        ],
-    ),
-    (
-        &["evaluate", "trajectory"],
-        &["seese3 evaluate trajectory --reference truth.tum --estimate run.tum"],
-    ),
-    (
-        &["probe"],
-        &["seese3 probe --store store --room kitchen --features pixels --stride 20 --split folds"],
-    ),
-    (
-        &["cross-room"],
-        &[
-            "seese3 cross-room --store suite --train 'studio7-000*' --test 'studio7-001*' --sizes 5,10",
-        ],
-    ),
-    (
-        &["sweep"],
-        &[
-            "seese3 sweep layers --store store --room kitchen --stride 20",
-            "seese3 sweep adapters --store store --room kitchen --features pixels --seeds 5 --out sweep",
-        ],
-    ),
-    (
-        &["sweep", "layers"],
-        &["seese3 sweep layers --store store --room kitchen --stride 20 --json layers.json"],
-    ),
-    (
-        &["sweep", "adapters"],
-        &[
-            "seese3 sweep adapters --store store --room kitchen --features pixels --seeds 5 --out sweep --shard 1/2",
-        ],
-    ),
-    (
-        &["sweep", "formulations"],
-        &["seese3 sweep formulations --store store --room kitchen --features pixels --split folds"],
-    ),
-    (
-        &["reproduce"],
-        &[
-            "seese3 reproduce --store suite --train 'studio7-000*' --test 'studio7-001*' --in-room studio7-0000 --features builtin --out report",
-        ],
-    ),
-    (&["theory"], &["seese3 theory --json theory.json"]),
-    (
-        &["serve"],
-        &[
-            "seese3 serve --store store",
-            "seese3 serve --store store --encoder effnetlite0.onnx --listen 0.0.0.0:50051 --writable",
-            "seese3 serve --store store --config server.toml",
-        ],
-    ),
-    (
-        &["store"],
-        &[
-            "seese3 store list --store store",
-            "seese3 store rm --store store rooms/kitchen/revisions/1",
-            "seese3 store gc --store store --dry-run",
-        ],
-    ),
-    (
-        &["store", "list"],
-        &["seese3 store list --store store --json -"],
-    ),
-    (
-        &["store", "show"],
-        &["seese3 store show --store store rooms/kitchen"],
-    ),
-    (
-        &["store", "default"],
-        &[
-            "seese3 store default --store store",
-            "seese3 store default --store store rooms/kitchen adapters/base",
-            "seese3 store default --store store adapters/base/revisions/2",
-            "seese3 store default --store store adapters/base --unset",
-            "seese3 store default --store store --back",
-        ],
-    ),
-    (
-        &["store", "rm"],
-        &["seese3 store rm --store store rooms/kitchen/revisions/1 --dry-run"],
-    ),
-    (
-        &["store", "gc"],
-        &["seese3 store gc --store store --older-than 86400"],
-    ),
-    (&["store", "verify"], &["seese3 store verify --store store"]),
-    (
-        &["push"],
-        &["seese3 push --store store rooms/kitchen --server 127.0.0.1:50051 --refit"],
-    ),
-    (
-        &["config"],
-        &[
-            "seese3 config check --store store --config server.toml",
-            "seese3 config print --store store",
-        ],
-    ),
-    (
-        &["navigate"],
-        &[
-            "seese3 navigate --room kitchen --from 100 --to 140 --steps 4 --mode closed-loop",
-            "seese3 navigate --room kitchen --image photo.jpg --twist 0,0,0.5,0,0,0 --json -",
-        ],
-    ),
-    (
-        &["localize"],
-        &[
-            "seese3 localize --room kitchen --image photo.jpg",
-            "seese3 localize --feature features.npy --row 7 --top-k 3 --json -",
-        ],
-    ),
-    (
-        &["relocalize"],
-        &[
-            "seese3 relocalize --images before.jpg,now.jpg",
-            "seese3 relocalize --room kitchen --features features.npy --rows 3,4,5",
-        ],
-    ),
-    (
-        &["motion"],
-        &[
-            "seese3 motion --images a.jpg,b.jpg --camera 640x480,585",
-            "seese3 motion --room kitchen --from 100 --to 110",
-        ],
-    ),
-    (
-        &["track"],
-        &[
-            "seese3 track --room kitchen --images frames --hz 30 --tum path.tum --mcap run.mcap",
-            "seese3 track --room kitchen --feature features.npy --json - | jq .status",
-        ],
-    ),
-    (
-        &["catalog"],
-        &[
-            "seese3 catalog",
-            "seese3 catalog --server robot:50051 --json -",
-        ],
-    ),
-    (
-        &["health"],
-        &["seese3 health", "seese3 health --name rooms/kitchen"],
-    ),
-    (
-        &["completions"],
-        &["seese3 completions bash > ~/.local/share/bash-completion/completions/seese3"],
-    ),
-    (&["man"], &["seese3 man --out ~/.local/share/man/man1"]),
-];
+/// Command paths, each with its examples below it.
+const EXAMPLES: &str = "\
+demo
+  seese3 demo
+  seese3 demo --frames 500 --out small
+import
+  seese3 import folder photos --room kitchen --store store
+  seese3 import colmap project --store store --scale 1
+  seese3 import bag rosbag2_hall --room hall --store store --image-topic /camera/image/compressed
+  seese3 import numpy --poses poses.npy --features mine=features.npy --room kitchen --store store
+import folder
+  seese3 import folder photos --room kitchen --store store
+import colmap
+  seese3 import colmap project --room kitchen --store store --scale 0.37
+import 7scenes
+  seese3 import 7scenes kitchen --store store --every 2
+import numpy
+  seese3 import numpy --poses poses.npy --features mine=features.npy --room kitchen --store store
+import bag
+  seese3 import bag rosbag2_hall --store store --image-topic /camera/image/compressed --pose-topic /odom
+  seese3 import bag drive.mcap --room hall --store store --world-frame map
+check
+  seese3 check room --store store --room kitchen
+check room
+  seese3 check room --store store --room kitchen
+  seese3 check room --store store --room kitchen --json - | jq .warnings
+export
+  seese3 export numpy --store store --room kitchen --out kitchen-numpy
+  seese3 export tum --store store --room kitchen --out kitchen.tum --rate 30
+encode
+  seese3 encode --store store --room kitchen --model pixels
+  seese3 encode --store store --room kitchen --model effnetlite0.onnx --recipe effnetlite0 --layers block14
+  seese3 encode --store store --room kitchen --model vit.onnx --resize 224x224 --preprocess imagenet --pool cls
+encoders
+  seese3 encoders
+  seese3 encoders dinov2-b
+studio
+  seese3 studio --rooms 20 --frames 400 --seed 7 --out suite --keep-images
+train
+  seese3 train --store store --room kitchen --features pixels --stride 20 --split blocks
+  seese3 train --store suite --room 'studio7-000*' --preset steady --split whole --calibrate-on 'studio7-001*' --name robot
+fit
+  seese3 fit --store store --room kitchen --adapter robot
+evaluate
+  seese3 evaluate --store store --room kitchen --exclude-source
+  seese3 evaluate --store store --room kitchen --plot hit.svg --table hit.tex --json hit.json
+  seese3 evaluate odometry --store store --room kitchen --adapter robot --hold-out blocks
+evaluate localization
+  seese3 evaluate localization --store store --room kitchen --fit --map-blocks
+evaluate motion
+  seese3 evaluate motion --store store --room kitchen --adapter robot --stride 5
+evaluate odometry
+  seese3 evaluate odometry --store store --room kitchen --adapter robot --hold-out blocks --json -
+evaluate planning
+  seese3 evaluate planning --store store --room kitchen --adapter robot
+evaluate robustness
+  seese3 evaluate robustness --store store --room kitchen --adapter robot --encoder effnetlite0.onnx
+evaluate trajectory
+  seese3 evaluate trajectory --reference truth.tum --estimate run.tum
+probe
+  seese3 probe --store store --room kitchen --features pixels --stride 20 --split folds
+cross-room
+  seese3 cross-room --store suite --train 'studio7-000*' --test 'studio7-001*' --sizes 5,10
+sweep
+  seese3 sweep layers --store store --room kitchen --stride 20
+  seese3 sweep adapters --store store --room kitchen --features pixels --seeds 5 --out sweep
+sweep layers
+  seese3 sweep layers --store store --room kitchen --stride 20 --json layers.json
+sweep adapters
+  seese3 sweep adapters --store store --room kitchen --features pixels --seeds 5 --out sweep --shard 1/2
+sweep formulations
+  seese3 sweep formulations --store store --room kitchen --features pixels --split folds
+reproduce
+  seese3 reproduce --store suite --train 'studio7-000*' --test 'studio7-001*' --in-room studio7-0000 --features builtin --out report
+theory
+  seese3 theory --json theory.json
+serve
+  seese3 serve --store store
+  seese3 serve --store store --encoder effnetlite0.onnx --listen 0.0.0.0:50051 --writable
+  seese3 serve --store store --config server.toml
+store
+  seese3 store list --store store
+  seese3 store rm --store store rooms/kitchen/revisions/1
+  seese3 store gc --store store --dry-run
+store list
+  seese3 store list --store store --json -
+store show
+  seese3 store show --store store rooms/kitchen
+store default
+  seese3 store default --store store
+  seese3 store default --store store rooms/kitchen adapters/base
+  seese3 store default --store store adapters/base/revisions/2
+  seese3 store default --store store adapters/base --unset
+  seese3 store default --store store --back
+store rm
+  seese3 store rm --store store rooms/kitchen/revisions/1 --dry-run
+store gc
+  seese3 store gc --store store --older-than 86400
+store verify
+  seese3 store verify --store store
+push
+  seese3 push --store store rooms/kitchen --server 127.0.0.1:50051 --refit
+config
+  seese3 config check --store store --config server.toml
+  seese3 config print --store store
+navigate
+  seese3 navigate --room kitchen --from 100 --to 140 --steps 4 --mode closed-loop
+  seese3 navigate --room kitchen --image photo.jpg --twist 0,0,0.5,0,0,0 --json -
+localize
+  seese3 localize --room kitchen --image photo.jpg
+  seese3 localize --feature features.npy --row 7 --top-k 3 --json -
+relocalize
+  seese3 relocalize --images before.jpg,now.jpg
+  seese3 relocalize --room kitchen --features features.npy --rows 3,4,5
+motion
+  seese3 motion --images a.jpg,b.jpg --camera 640x480,585
+  seese3 motion --room kitchen --from 100 --to 110
+track
+  seese3 track --room kitchen --images frames --hz 30 --tum path.tum --mcap run.mcap
+  seese3 track --room kitchen --feature features.npy --json - | jq .status
+catalog
+  seese3 catalog
+  seese3 catalog --server robot:50051 --json -
+health
+  seese3 health
+  seese3 health --name rooms/kitchen
+completions
+  seese3 completions bash > ~/.local/share/bash-completion/completions/seese3
+man
+  seese3 man --out ~/.local/share/man/man1
+";
+
+/// The command paths, each with its examples.
+fn examples() -> Vec<(Vec<&'static str>, Vec<&'static str>)> {
+    let mut examples: Vec<(Vec<&str>, Vec<&str>)> = Vec::new();
+    for line in EXAMPLES.lines() {
+        match (line.strip_prefix("  "), examples.last_mut()) {
+            (Some(example), Some((_, of_path))) => of_path.push(example),
+            _ => examples.push((line.split(' ').collect(), Vec::new())),
+        }
+    }
+    examples
+}
 
 /// Adds the exit codes and the examples to the help of `command`.
 pub fn with_examples(command: Command) -> Command {
     let mut command = command.after_help(EXIT_CODES);
-    for (path, examples) in EXAMPLES {
-        command = with_text(command, path, &text(examples));
+    for (path, examples) in examples() {
+        let title = if examples.len() == 1 {
+            "Example"
+        } else {
+            "Examples"
+        };
+        let text = format!("{title}:\n  {}", examples.join("\n  "));
+        command = with_text(command, &path, &text);
     }
     command
-}
-
-fn text(examples: &[&str]) -> String {
-    let title = match examples {
-        [_] => "Example:",
-        _ => "Examples:",
-    };
-    format!("{title}\n  {}", examples.join("\n  "))
 }
 
 /// Appends a text to the help of the subcommand at `path`, if this build has it.
@@ -324,8 +200,8 @@ mod tests {
     #[cfg(feature = "lab")]
     #[test]
     fn every_example_is_understood() {
-        for (path, examples) in EXAMPLES {
-            for example in *examples {
+        for (path, examples) in examples() {
+            for example in examples {
                 let before_pipe = example.split(['|', '>']).next().unwrap();
                 let parsed = Cli::command().try_get_matches_from(words(before_pipe));
                 assert!(

@@ -93,7 +93,7 @@ pub fn fitting_bar(is_fitted: bool) -> ProgressBar {
 
 fn part_words(rule: PartRule) -> String {
     if rule.gain == 0.0 {
-        return rule.reader.name().to_owned();
+        return rule.reader.to_string();
     }
-    format!("{} × {:.1}", rule.reader.name(), rule.gain)
+    format!("{} × {:.1}", rule.reader, rule.gain)
 }

@@ -206,9 +206,9 @@ pub(super) fn located_by(
         covariance: convert::matrix_to_wire(&view.pose.ros_covariance()),
         frame_id: view.nearest.frame.0,
         distance: view.nearest.distance,
-        translation_reader: view.translation.reader.name().to_owned(),
+        translation_reader: view.translation.reader.to_string(),
         translation_gain: view.translation.gain,
-        rotation_reader: view.rotation.reader.name().to_owned(),
+        rotation_reader: view.rotation.reader.to_string(),
         rotation_gain: view.rotation.gain,
     })
 }

@@ -132,7 +132,7 @@ impl Inner {
     /// Creates the counters that alerts watch, so that the first event is a change from zero.
     fn begin_at_zero(&self) {
         for &full in Full::VARIANTS {
-            let full = full.words();
+            let full = full.into();
             drop(self.refusals.get_or_create(&FullLabels { full }));
         }
         for outcome in ReloadOutcome::VARIANTS {
@@ -302,7 +302,7 @@ impl Metrics {
 
     /// Counts a request refused because of this limit.
     pub(super) fn shed(&self, full: Full) {
-        let full = full.words();
+        let full = full.into();
         self.0.refusals.get_or_create(&FullLabels { full }).inc();
     }
 

@@ -15,6 +15,7 @@ const DOMAIN: &str = "seese3.v1";
 
 /// A limit that refuses requests when it is reached.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display, IntoStaticStr, VariantArray)]
+#[strum(serialize_all = "lowercase")]
 pub enum Full {
     /// The lane of short requests.
     #[strum(serialize = "short requests")]
@@ -35,27 +36,17 @@ pub enum Full {
     #[strum(serialize = "requests of this caller")]
     CallersRequests,
     /// The connections. A refused connection is closed without an error message.
-    #[strum(serialize = "connections")]
     Connections,
     /// The bytes of all uploads in progress.
     #[strum(serialize = "bytes of uploads")]
     Uploads,
     /// The fits in progress; only one runs at a time.
-    #[strum(serialize = "fits")]
     Fits,
     /// The memory of requests in progress.
     #[strum(serialize = "bytes of requests")]
     Memory,
     /// The queued changes of the catalog.
-    #[strum(serialize = "changes")]
     Changes,
-}
-
-impl Full {
-    /// The name in messages and metrics.
-    pub fn words(self) -> &'static str {
-        self.into()
-    }
 }
 
 /// An error of a request. Its name is the reason in `google.rpc.ErrorInfo`.
@@ -208,7 +199,7 @@ impl From<Error> for Status {
         let mut details = ErrorDetails::new();
         let mut metadata = std::collections::HashMap::new();
         match &error {
-            Error::Full { what } => metadata.insert("full".to_owned(), what.words().to_owned()),
+            Error::Full { what } => metadata.insert("full".to_owned(), what.to_string()),
             Error::Forbidden { verb } => metadata.insert("verb".to_owned(), (*verb).to_owned()),
             _ => None,
         };

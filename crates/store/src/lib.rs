@@ -597,7 +597,7 @@ impl Store {
         let Some(&newest) = revisions.last() else {
             let known = self.names(kind).await?;
             return Err(Error::Unknown {
-                kind: kind.name(),
+                kind: kind.into(),
                 name: name.to_owned(),
                 known,
             });
@@ -607,7 +607,7 @@ impl Store {
             None => Ok((folder, newest)),
             Some(wanted) if revisions.contains(&wanted) => Ok((folder, wanted)),
             Some(revision) => Err(Error::UnknownRevision {
-                kind: kind.name(),
+                kind: kind.into(),
                 name: name.to_owned(),
                 revision,
                 newest,

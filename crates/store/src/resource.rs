@@ -4,10 +4,12 @@ use std::fmt;
 use std::str::FromStr;
 
 use seese3_core::room::is_plain_name;
-use strum::{IntoStaticStr, VariantArray};
+use strum::{Display, IntoStaticStr, VariantArray};
 
 /// The two kinds of content in a store.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, IntoStaticStr, VariantArray)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Display, IntoStaticStr, VariantArray,
+)]
 #[strum(serialize_all = "kebab-case")]
 pub enum Kind {
     /// A recording of one place, with features.
@@ -17,11 +19,6 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// Singular name, for messages.
-    pub fn name(self) -> &'static str {
-        self.into()
-    }
-
     /// Collection name, which is also the folder name.
     pub fn collection(self) -> &'static str {
         match self {

@@ -94,7 +94,7 @@ pub fn compare(
     // Group the runs of all tasks by formulation.
     let scores_of = |which: Formulation| {
         let own = runs.iter().filter(|(other, ..)| *other == which);
-        FormulationScores::new(which.name(), own.map(|(_, scores, _)| *scores).collect())
+        FormulationScores::new(which.into(), own.map(|(_, scores, _)| *scores).collect())
     };
 
     Ok(Comparison {

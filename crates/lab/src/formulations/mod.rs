@@ -50,13 +50,6 @@ pub enum Formulation {
     DifferenceInput,
 }
 
-impl Formulation {
-    /// Its name in tables and on the command line.
-    pub fn name(self) -> &'static str {
-        self.into()
-    }
-}
-
 /// Trains one formulation on all rooms together and predicts the motions of each room's test pairs.
 ///
 /// # Errors

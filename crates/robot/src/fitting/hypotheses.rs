@@ -2,10 +2,10 @@
 
 use seese3_core::geometry::Twist;
 use seese3_core::index::Neighbour;
-use strum::{IntoStaticStr, VariantArray};
+use strum::{Display, VariantArray};
 
 /// Source of the relative pose between a view and its most similar mapped frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr, VariantArray)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, VariantArray)]
 #[strum(serialize_all = "kebab-case")]
 pub enum MotionReader {
     /// Zero motion: the pose of the mapped frame is the estimate.
@@ -14,13 +14,6 @@ pub enum MotionReader {
     ZeroShot,
     /// The adapter fitted to this room.
     Fitted,
-}
-
-impl MotionReader {
-    /// Name in reports, on the wire and on disk.
-    pub fn name(self) -> &'static str {
-        self.into()
-    }
 }
 
 /// Estimator and shrinkage gain for the translation or the rotation of a motion.

@@ -134,7 +134,7 @@ impl Issuer {
 
         let in_scope = |verb: &&Verb| {
             let words = scope.as_deref().map(str::split_whitespace);
-            words.is_none_or(|mut words| words.any(|word| word == verb.name()))
+            words.is_none_or(|mut words| words.any(|word| word == <&str>::from(*verb)))
         };
         let rights = Rights {
             name: format!("{sub}@{}", self.form.issuer),

@@ -135,7 +135,7 @@ impl AuthLayer {
         tracing::Span::current().record("principal", principal.name());
 
         if let Some(verb) = verb.filter(|&verb| !principal.may(verb)) {
-            return Err(Error::Forbidden { verb: verb.name() });
+            return Err(Error::Forbidden { verb: verb.into() });
         }
 
         let full = Full::CallersRequests;

@@ -45,13 +45,6 @@ pub enum Verb {
     Write,
 }
 
-impl Verb {
-    /// Name in auth files and messages.
-    pub fn name(self) -> &'static str {
-        self.into()
-    }
-}
-
 /// The rooms that a caller may access: those that match every list. A list has room names and
 /// prefixes ending in `*`.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -238,7 +238,7 @@ pub fn identity(
 pub fn named(field: &str, text: &str, kind: Kind) -> Result<ResourceName, Error> {
     let resource: ResourceName = text.parse().map_err(|error| Error::invalid(field, error))?;
     if resource.kind != kind {
-        let problem = format!("names no {}; write {}/NAME", kind.name(), kind.collection());
+        let problem = format!("names no {kind}; write {}/NAME", kind.collection());
         return Err(Error::invalid(field, problem));
     }
 
