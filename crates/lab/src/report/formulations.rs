@@ -6,6 +6,14 @@ use crate::experiments::formulations::Comparison;
 use seese3_core::motion_scores::MotionScores;
 use seese3_core::statistics::{deviation, mean_of_known};
 
+/// R² by part of the motion, in the order of tables.
+pub(super) const PARTS: [fn(&MotionScores) -> f64; 4] = [
+    |scores| scores.translation,
+    |scores| scores.rotation,
+    |scores| scores.direction,
+    |scores| scores.magnitude,
+];
+
 /// One line per formulation: R² by part of the motion, averaged over seeds, and the sample standard
 /// deviation of the overall R². The last line is the constant baseline.
 pub fn formulations_table(comparison: &Comparison) -> Table {
@@ -16,17 +24,10 @@ pub fn formulations_table(comparison: &Comparison) -> Table {
 
 /// Adds the rows of [`formulations_table`] to a table with other titles.
 pub fn add_formulations(table: &mut Table, comparison: &Comparison, decimals: usize) {
-    let parts: [fn(&MotionScores) -> f64; 4] = [
-        |run| run.translation,
-        |run| run.rotation,
-        |run| run.direction,
-        |run| run.magnitude,
-    ];
-
     for score in &comparison.formulations {
         // One value per seed, already averaged over the rooms.
         let column = |of: fn(&MotionScores) -> f64| score.runs.iter().map(of).collect::<Vec<f64>>();
-        let parts = parts.map(|of| format!("{:.decimals$}", mean_of_known(&column(of))));
+        let parts = PARTS.map(|of| format!("{:.decimals$}", mean_of_known(&column(of))));
         let overall = spread_text(&column(|run| run.overall), decimals);
         table.row(score.name, std::iter::once(overall).chain(parts));
     }

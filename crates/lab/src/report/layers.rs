@@ -1,11 +1,8 @@
 //! Probe metrics M1 to M4 per encoder layer, for `seese3 sweep layers`.
 
-use super::table::{Table, fixed};
+use super::table::{Table, fixed, grouped};
 use crate::experiments::layers::LayerScores;
 use seese3_core::statistics::mean;
-
-/// The scores of one layer, one per room.
-type Layer<'a> = Vec<&'a LayerScores>;
 
 /// One line per layer with means over rooms. A star marks the best layer of each metric; for the
 /// intrinsic dimension that is the layer nearest to 6. The last column is the R² of the constant
@@ -15,11 +12,12 @@ pub fn layers_table(scores: &[LayerScores]) -> Table {
 
     // SE(3) has six dimensions: features that encode only the camera pose have an intrinsic
     // dimension near six. Larger and smaller values are both worse.
+    type Score = fn(&LayerScores) -> f64;
     type Merit = fn(f64) -> f64;
     let highest: Merit = |value| value;
     let near_six: Merit = |value| -(value - 6.0).abs();
 
-    let metrics: [(fn(&LayerScores) -> f64, Merit); 5] = [
+    let metrics: [(Score, Merit); 5] = [
         (|score| score.m1.value, highest),
         (|score| score.m2.twonn, near_six),
         (|score| score.m2.mle, near_six),
@@ -67,7 +65,7 @@ pub fn encoders_table(scores: &[LayerScores]) -> Table {
 
     for encoder in grouped(scores, |score| &score.encoder) {
         let layers = grouped(encoder.iter().copied(), |score| &score.features);
-        let r2 = |layer: &Layer<'_>| over(layer, |score| score.m4.r2);
+        let r2 = |layer: &Vec<&LayerScores>| over(layer, |score| score.m4.r2);
         let Some(best) = layers.iter().max_by(|a, b| r2(a).total_cmp(&r2(b))) else {
             continue;
         };
@@ -88,27 +86,8 @@ pub fn encoders_table(scores: &[LayerScores]) -> Table {
     table
 }
 
-/// Groups scores by a name, in order of first appearance.
-fn grouped<'a>(
-    scores: impl IntoIterator<Item = &'a LayerScores>,
-    name: fn(&LayerScores) -> &String,
-) -> Vec<Layer<'a>> {
-    let mut groups: Vec<Layer<'a>> = Vec::new();
-    for score in scores {
-        match groups
-            .iter_mut()
-            .find(|group| name(group[0]) == name(score))
-        {
-            Some(group) => group.push(score),
-            None => groups.push(vec![score]),
-        }
-    }
-
-    groups
-}
-
 /// The mean over the rooms of a layer.
-fn over(layer: &Layer<'_>, of: fn(&LayerScores) -> f64) -> f64 {
+fn over(layer: &[&LayerScores], of: fn(&LayerScores) -> f64) -> f64 {
     mean(&layer.iter().map(|score| of(score)).collect::<Vec<_>>())
 }
 

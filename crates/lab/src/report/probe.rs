@@ -2,10 +2,10 @@
 
 use serde::Serialize;
 
+use super::formulations::PARTS;
 use super::table::{Table, fixed};
 use crate::experiments::probe::{AtStride, DimensionScore, MutualKnnScore, ProbeScores};
 use seese3_core::eval::Baselines;
-use seese3_core::motion_scores::MotionScores;
 use seese3_core::statistics::mean_of_known;
 
 /// The JSON record of `seese3 probe`.
@@ -90,17 +90,11 @@ pub fn probe_table(scores: &[ProbeScores]) -> Table {
 }
 
 fn stride_cells(at: &AtStride) -> Vec<String> {
-    let parts: [fn(&MotionScores) -> f64; 4] = [
-        |run| run.translation,
-        |run| run.rotation,
-        |run| run.direction,
-        |run| run.magnitude,
-    ];
     let over_seeds = |of| mean_of_known(&at.runs.iter().map(of).collect::<Vec<f64>>());
     let spread = at.spread.as_ref().map(|spread| format!("{:.3}", spread.sd));
 
     let mut cells = vec![format!("{:.3}", at.r2), spread.unwrap_or_default()];
-    cells.extend(fixed(parts.map(over_seeds), 3));
+    cells.extend(fixed(PARTS.map(over_seeds), 3));
     cells.push(at.n.to_string());
     cells.extend(baseline_cells(at.baselines.as_ref()));
     cells

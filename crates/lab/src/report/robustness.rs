@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::table::Column::{self, Number, Text};
-use super::table::Table;
+use super::table::{Table, grouped};
 use crate::experiments::robustness::{DisturbedTracking, Extent};
 use crate::json::covered;
 use seese3_core::splits::HoldOut;
@@ -48,15 +48,7 @@ pub fn robustness_table(found: &[DisturbedTracking]) -> Table {
 
 /// The results over all rooms by disturbance, in order of first appearance.
 fn by_disturbance(found: &[DisturbedTracking]) -> Vec<DisturbedTracking> {
-    let mut groups: Vec<Vec<&DisturbedTracking>> = Vec::new();
-    for one in found {
-        let mut known = groups.iter_mut();
-        match known.find(|group| group[0].disturbance == one.disturbance) {
-            Some(group) => group.push(one),
-            None => groups.push(vec![one]),
-        }
-    }
-
+    let groups = grouped(found, |one| one.disturbance);
     let together = groups
         .iter()
         .map(|rooms| DisturbedTracking::together(rooms));

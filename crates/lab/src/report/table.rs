@@ -149,6 +149,22 @@ pub fn fixed<const N: usize>(values: [f64; N], decimals: usize) -> [String; N] {
     values.map(|value| format!("{value:.decimals$}"))
 }
 
+/// Groups results by a key, in order of first appearance.
+pub(super) fn grouped<'a, T, K: PartialEq>(
+    results: impl IntoIterator<Item = &'a T>,
+    key: impl Fn(&'a T) -> K,
+) -> Vec<Vec<&'a T>> {
+    let mut groups: Vec<Vec<&T>> = Vec::new();
+    for one in results {
+        match groups.iter_mut().find(|group| key(group[0]) == key(one)) {
+            Some(group) => group.push(one),
+            None => groups.push(vec![one]),
+        }
+    }
+
+    groups
+}
+
 /// Escapes text for HTML.
 pub(super) fn escaped(text: &str) -> String {
     text.replace('&', "&amp;")

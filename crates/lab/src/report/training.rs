@@ -18,7 +18,8 @@ const FEWEST_TEST_PAIRS: usize = 10;
 /// R² by part of the motion, one line per seed; with several seeds also their mean and sample
 /// standard deviation.
 pub fn training_table(runs: &[TrainingRun]) -> Table {
-    let columns: [(&str, fn(&TrainingRun) -> f64); 9] = [
+    type Score = fn(&TrainingRun) -> f64;
+    let columns: [(&str, Score); 9] = [
         ("overall", |run| run.record.test.overall),
         ("transl.", |run| run.record.test.translation),
         ("rotation", |run| run.record.test.rotation),

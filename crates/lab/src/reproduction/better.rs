@@ -92,17 +92,15 @@ pub fn section(results: &[SetResults], claims: &mut Vec<Claim>) -> Found<Vec<Bet
         .map(|row| is_above_zero(&row.clipped_r2_over_paper_range))
         .collect();
 
-    claims.push(Claim::by_intervals(
+    claims.push(Claim::over_feature_sets(
         "ours: the calibrated navigator hits more often than inverse Poincaré in rooms never seen",
         "both differences' intervals are above zero",
         &navigator_wins,
-        "feature sets",
     ));
-    claims.push(Claim::by_intervals(
+    claims.push(Claim::over_feature_sets(
         "ours: preset steady reads motion better than paper-range in rooms never seen",
         "the interval of the difference of clipped R² is above zero",
         &recipe_wins,
-        "feature sets",
     ));
 
     Found { section, record }

@@ -24,18 +24,13 @@ fn word<S: Serializer>(verdict: &Verdict, to: S) -> Result<S::Ok, S::Error> {
 }
 
 impl Claim {
-    /// A claim decided by one confidence interval per case; see [`Verdict::of_intervals`]. `found`
-    /// says when it holds in a case, and `of_what` what the cases are.
-    pub fn by_intervals(
-        claim: &'static str,
-        found: &str,
-        cases: &[Option<bool>],
-        of_what: &str,
-    ) -> Self {
+    /// A claim decided by one confidence interval per feature set; see [`Verdict::of_intervals`].
+    /// `found` says when it holds for a feature set.
+    pub fn over_feature_sets(claim: &'static str, found: &str, cases: &[Option<bool>]) -> Self {
         Self {
             claim,
             verdict: Verdict::of_intervals(cases),
-            found: format!("{found}: {}", count_words(cases, of_what)),
+            found: format!("{found}: {}", count_words(cases, "feature sets")),
         }
     }
 }

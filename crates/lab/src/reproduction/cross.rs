@@ -105,71 +105,78 @@ fn claims_of(results: &[SetResults]) -> [Claim; 4] {
     }
 
     [
-        Claim::by_intervals(
+        Claim::over_feature_sets(
             "zero-shot navigation beats Identity in most rooms never seen (Hit@0.1)",
             "Wilson's interval of the share of rooms is above one half",
             &zero_shot,
-            "feature sets",
         ),
-        Claim::by_intervals(
+        Claim::over_feature_sets(
             "refitting the linear step in the room itself does better than zero-shot",
             "the interval of the difference in Hit@0.1 of the z-scored refit, in sample, is above zero",
             &refitted,
-            "feature sets",
         ),
-        Claim::by_intervals(
+        Claim::over_feature_sets(
             "more training rooms transfer better",
             "the interval of the difference in Hit@0.1 of all rooms over the fewest is above zero",
             &grows,
-            "feature sets",
         ),
-        Claim::by_intervals(
+        Claim::over_feature_sets(
             "and without a plateau",
             "the interval of the difference in Hit@0.1 of all rooms over half of them is above zero",
             &keeps_growing,
-            "feature sets",
         ),
     ]
 }
 
-/// Adds three scaling curves of one preset with increasing numbers of training rooms: hit rates,
-/// the fraction of rooms with R² above 0, and the paper's clipped mean.
-fn add_curves(section: &mut Section, results: &[SetResults]) -> Result<(), Error> {
-    let mut add =
-        |name: &str, title: &str, y: &str, caption: &str, of: fn(&CrossRoomRun) -> f64| {
-            let series = results.iter().map(|set| {
-                let sizes = set.by_size.iter();
-                let points = sizes.map(|result| [result.plan.rooms as f64, of(&result.run)]);
-                Series::line(&set.features, points.collect())
-            });
-            let curves = Figure::new(title, "rooms learned from", y, series.collect());
-            let caption = format!("{caption} by how many rooms were learned from");
-            section.picture(name, curves.svg()?, caption);
-            Ok::<(), Error>(())
-        };
+/// A curve by increasing numbers of training rooms.
+struct ScalingCurve {
+    file: &'static str,
+    title: &'static str,
+    y: &'static str,
+    caption: &'static str,
+    /// The value of a run; NaN if no room has an R².
+    of: fn(&CrossRoomRun) -> f64,
+}
 
-    add(
-        "scaling-hits.svg",
-        "Zero-shot Hit@0.1",
-        "mean over held-out rooms",
-        "Zero-shot Hit@0.1 of inverse Poincaré",
-        |run| mean(&run.hit_rates(AFFINE)),
-    )?;
-    // NaN if no room has an R² at this size.
-    add(
-        "scaling-r2.svg",
-        "Rooms with R² > 0",
-        "share of held-out rooms",
-        "Held-out rooms with R² above 0",
-        |run| MotionSummary::of(&run.r2(), 0).map_or(f64::NAN, |r2| r2.positive.rate),
-    )?;
-    add(
-        "scaling-mean.svg",
-        "R², negative ones as 0",
-        "mean of max(R², 0)",
-        "Mean over held-out rooms of max(R², 0)",
-        |run| MotionSummary::of(&run.r2(), 0).map_or(f64::NAN, |r2| r2.clipped_at_zero.mean),
-    )
+const SCALING_CURVES: [ScalingCurve; 3] = [
+    ScalingCurve {
+        file: "scaling-hits.svg",
+        title: "Zero-shot Hit@0.1",
+        y: "mean over held-out rooms",
+        caption: "Zero-shot Hit@0.1 of inverse Poincaré",
+        of: |run| mean(&run.hit_rates(AFFINE)),
+    },
+    ScalingCurve {
+        file: "scaling-r2.svg",
+        title: "Rooms with R² > 0",
+        y: "share of held-out rooms",
+        caption: "Held-out rooms with R² above 0",
+        of: |run| MotionSummary::of(&run.r2(), 0).map_or(f64::NAN, |r2| r2.positive.rate),
+    },
+    ScalingCurve {
+        file: "scaling-mean.svg",
+        title: "R², negative ones as 0",
+        y: "mean of max(R², 0)",
+        caption: "Mean over held-out rooms of max(R², 0)",
+        of: |run| MotionSummary::of(&run.r2(), 0).map_or(f64::NAN, |r2| r2.clipped_at_zero.mean),
+    },
+];
+
+fn add_curves(section: &mut Section, results: &[SetResults]) -> Result<(), Error> {
+    for curve in &SCALING_CURVES {
+        let line = |set: &SetResults| {
+            let sizes = set.by_size.iter();
+            let points = sizes.map(|result| [result.plan.rooms as f64, (curve.of)(&result.run)]);
+            Series::line(&set.features, points.collect())
+        };
+        let lines = results.iter().map(line).collect();
+        let figure = Figure::new(curve.title, "rooms learned from", curve.y, lines);
+
+        let caption = format!("{} by how many rooms were learned from", curve.caption);
+        section.picture(curve.file, figure.svg()?, caption);
+    }
+
+    Ok(())
 }
 
 /// One row per feature set and navigator, for the adapter of all rooms; the paper's rows follow.

@@ -62,11 +62,10 @@ pub fn section(
         given.options.stride
     ));
 
-    claims.push(Claim::by_intervals(
+    claims.push(Claim::over_feature_sets(
         "the adapter's W(φ(z₂) − φ(z₁)) reads motion better than the alternatives A to D",
         "overall R² above that of each alternative, over seeds",
         &best,
-        "feature sets",
     ));
 
     Ok(Found { section, record })

@@ -46,22 +46,22 @@ pub fn section(
     let mut record = Vec::new();
     let mut dominates = Vec::new();
     for (position, set) in given.sets.iter().enumerate() {
-        let navigated: Vec<(Report, ReproducedAdapter)> = set
-            .in_room
-            .par_iter()
-            .map(|room| navigated(given, room))
-            .collect::<Result<_, Error>>()?;
-        let (reports, learned): (Vec<Report>, Vec<ReproducedAdapter>) =
-            navigated.into_iter().unzip();
-        let adapters: Vec<String> = learned.iter().map(|learned| learned.name.clone()).collect();
+        let rooms = set.in_room.par_iter().map(|room| navigated(given, room));
+        let found: Vec<(Report, ReproducedAdapter)> = rooms.collect::<Result<_, Error>>()?;
+        let (reports, learned): (Vec<Report>, Vec<ReproducedAdapter>) = found.into_iter().unzip();
+        let navigated = Navigated {
+            features: &set.features,
+            adapters: learned.iter().map(|learned| learned.name.clone()).collect(),
+            reports,
+        };
 
         // The adapters are published at the end of the run, under the names in every record row.
         notes.adapters.extend(learned);
 
         // All rooms share one protocol, so a row index identifies the same navigator in every room.
-        let thresholds = &reports[0].protocol.thresholds;
-        let rows: Vec<NavigationRecord> = (0..reports[0].rows.len())
-            .map(|place| averaged(&set.features, &adapters, &reports, place))
+        let thresholds = &navigated.reports[0].protocol.thresholds;
+        let rows: Vec<NavigationRecord> = (0..navigated.reports[0].rows.len())
+            .map(|place| navigated.averaged(place))
             .collect();
 
         section.text(format!("Features {}:", set.features));
@@ -72,7 +72,7 @@ pub fn section(
             format!("Hit@ε within a room, features {}", set.features),
         );
 
-        dominates.push(hits_more_than_correctors(&reports));
+        dominates.push(hits_more_than_correctors(&navigated.reports));
         record.extend(rows);
     }
 
@@ -84,11 +84,10 @@ pub fn section(
         given.options.epochs.unwrap_or(NAVIGATION_EPOCHS)
     ));
 
-    notes.claims.push(Claim::by_intervals(
+    notes.claims.push(Claim::over_feature_sets(
         "inverse Poincaré hits more often than every learned corrector (Hit@0.1)",
         "the interval of the difference in Hit@0.1 over rooms is above zero for each corrector",
         &dominates,
-        "feature sets",
     ));
 
     Ok(Found { section, record })
@@ -189,29 +188,36 @@ fn hits_more_than_correctors(reports: &[Report]) -> Option<bool> {
     holds_for_each(&is_above)
 }
 
-/// The scores of row `place`, averaged over rooms.
-fn averaged(
-    features: &str,
-    adapters: &[String],
-    reports: &[Report],
-    place: usize,
-) -> NavigationRecord {
-    let over_rooms = |of: &dyn Fn(&Row) -> f64| {
-        let rows = reports.iter().map(|report| of(&report.rows[place]));
-        mean_of_known(&rows.collect::<Vec<f64>>())
-    };
+/// The reports of one feature set, one per room.
+struct Navigated<'a> {
+    features: &'a str,
+    /// The adapters' names in the store.
+    adapters: Vec<String>,
+    reports: Vec<Report>,
+}
 
-    // A row without latents has no MSE and no R²; the mean over rooms skips NaN.
-    NavigationRecord {
-        features: features.to_owned(),
-        navigator: reports[0].rows[place].name.clone(),
-        mse: over_rooms(&|row| row.latent.map_or(f64::NAN, |latent| latent.mse)),
-        r2: over_rooms(&|row| row.latent.map_or(f64::NAN, |latent| latent.r2)),
-        top1: over_rooms(&|row| row.retrieval.top1.rate),
-        hits: (0..reports[0].protocol.thresholds.len())
-            .map(|epsilon| over_rooms(&|row| row.retrieval.hits[epsilon].1.rate))
-            .collect(),
-        adapters: adapters.to_vec(),
-        n: reports.iter().map(|report| report.n).collect(),
+impl Navigated<'_> {
+    /// The scores of row `place`, averaged over rooms.
+    fn averaged(&self, place: usize) -> NavigationRecord {
+        let first = &self.reports[0];
+        let over_rooms = |of: &dyn Fn(&Row) -> f64| {
+            let rows = self.reports.iter().map(|report| of(&report.rows[place]));
+            mean_of_known(&rows.collect::<Vec<f64>>())
+        };
+        let hits = 0..first.protocol.thresholds.len();
+
+        // A row without latents has no MSE and no R²; the mean over rooms skips NaN.
+        NavigationRecord {
+            features: self.features.to_owned(),
+            navigator: first.rows[place].name.clone(),
+            mse: over_rooms(&|row| row.latent.map_or(f64::NAN, |latent| latent.mse)),
+            r2: over_rooms(&|row| row.latent.map_or(f64::NAN, |latent| latent.r2)),
+            top1: over_rooms(&|row| row.retrieval.top1.rate),
+            hits: hits
+                .map(|epsilon| over_rooms(&|row| row.retrieval.hits[epsilon].1.rate))
+                .collect(),
+            adapters: self.adapters.clone(),
+            n: self.reports.iter().map(|report| report.n).collect(),
+        }
     }
 }
