@@ -269,7 +269,7 @@ fn what_is_trained_is_evaluated() {
     here.refuses_each(
         fixed,
         &[
-            ("--calibrate-on a", &["'a'", "learned from"]),
+            ("--calibrate-on a", &["'a'", "was trained on"]),
             ("--charts 0", &["charts"]),
             ("--geo-dim 5", &["geo_dim", "5"]),
             ("--lr nan", &["learning rate"]),
