@@ -198,7 +198,7 @@ fn a_corrupt_image_is_named_or_left_out() {
 
     here.refuses(
         &format!("{ENCODE} --resize 64x48"),
-        &["'pixels' is one fixed encoder"],
+        &["'pixels' is a fixed encoder"],
     );
 
     let long = "x".repeat(101);
@@ -362,7 +362,7 @@ fn inverted_poses_are_named_at_import_and_by_check() {
 
     // The camera is on a tripod, which is said, and nothing else.
     let is_clean = |warned: &str| {
-        warned.starts_with("warning: all positions are identical") && warned.lines().count() == 1
+        warned.starts_with("warning: all positions are the same") && warned.lines().count() == 1
     };
     assert!(is_clean(&import("right", "--strict")));
     assert!(check("right").status.success());
