@@ -158,6 +158,19 @@ pub fn near(what: &str, actual: f64, expected: f64, tolerance: f64) {
     );
 }
 
+/// Fails unless each number agrees with the expected one of its key: (key, actual, tolerance).
+#[track_caller]
+pub fn near_each(what: &str, expected: &serde_json::Value, numbers: &[(&str, f64, f64)]) {
+    for &(key, actual, tolerance) in numbers {
+        near(
+            &format!("{what} {key}"),
+            actual,
+            number(&expected[key]),
+            tolerance,
+        );
+    }
+}
+
 /// Defines two tests of `fn name(room: &str, folder: PathBuf)`: on the committed synthetic room,
 /// and on the real room, which needs the folder of large inputs.
 #[macro_export]

@@ -7,18 +7,18 @@ use std::sync::Arc;
 use seese3_core::adapter::{Adapter, Corrector, CorrectorKind, Error};
 use seese3_core::cancel::Cancellation;
 use seese3_core::eval::{Protocol, RetrievalScores, Row, evaluate};
-use seese3_core::geometry::body_twist;
+use seese3_core::geometry::{Twist, body_twist, exp};
 use seese3_core::index::{ExactIndex, Index};
 use seese3_core::navigation::NavigatorKind;
 use seese3_core::navigation::{
     Leg, Mode, Navigator, Plan, Reading, RetrievalMetric, Search, Source, Space, StepKind, Stepper,
     walk,
 };
-use seese3_core::room::Timeline;
+use seese3_core::room::{FrameId, Timeline};
 use seese3_core::splits::{Pair, Split};
 
 use seese3_testing::oracle_room::{adapter_of, navigator};
-use seese3_testing::{Tensors, json, near, number, worst};
+use seese3_testing::{Tensors, json, near, near_each, number, worst};
 
 const STRIDE: u32 = 40;
 
@@ -50,104 +50,44 @@ fn corrected_adapter(folder: &Path, room: &str) -> Arc<Adapter> {
 #[track_caller]
 fn compare(what: &str, row: &Row, expected: &serde_json::Value, side: &str) {
     let latent = row.latent.unwrap();
-    near(
-        &format!("{what} mse"),
-        latent.mse,
-        number(&expected["mse"]),
-        1e-9,
-    );
-
-    near(
-        &format!("{what} r2"),
-        latent.r2,
-        number(&expected["r2_variance_weighted"]),
-        1e-8,
-    );
-
-    near(
-        &format!("{what} uniform r2"),
-        latent.r2_uniform,
-        number(&expected["r2_uniform"]),
-        1e-8,
-    );
+    let numbers = [
+        ("mse", latent.mse, 1e-9),
+        ("r2_variance_weighted", latent.r2, 1e-8),
+        ("r2_uniform", latent.r2_uniform, 1e-8),
+    ];
+    near_each(what, expected, &numbers);
 
     compare_retrieval(&format!("{what} {side}"), &row.retrieval, &expected[side]);
 }
 
 #[track_caller]
 fn compare_retrieval(what: &str, scores: &RetrievalScores, expected: &serde_json::Value) {
-    assert_eq!(
-        scores.top1.n as u64,
-        expected["n"].as_u64().unwrap(),
-        "{what}"
-    );
+    let count = expected["n"].as_u64().unwrap();
+    assert_eq!(scores.top1.n as u64, count, "{what}");
 
-    near(
-        &format!("{what} top1"),
-        scores.top1.rate,
-        number(&expected["top1"]),
-        1e-12,
-    );
+    let numbers = [
+        ("top1", scores.top1.rate, 1e-12),
+        ("twist_error_mean", scores.twist_error_mean, 1e-9),
+        ("twist_error_median", scores.twist_error_median, 1e-9),
+        ("median_t_m", scores.translation_m_median, 1e-9),
+        ("median_R_rad", scores.rotation_rad_median, 1e-9),
+    ];
+    near_each(what, expected, &numbers);
 
     for (epsilon, rate) in &scores.hits {
-        let key = epsilon.to_string();
-        near(
-            &format!("{what} hit {key}"),
-            rate.rate,
-            number(&expected["hit"][&key]),
-            1e-12,
-        );
-
-        near(
-            &format!("{what} low {key}"),
-            rate.low,
-            number(&expected["hit_wilson95"][&key][0]),
-            1e-9,
-        );
-
-        near(
-            &format!("{what} high {key}"),
-            rate.high,
-            number(&expected["hit_wilson95"][&key][1]),
-            1e-9,
-        );
+        let key = &epsilon.to_string()[..];
+        let [low, high] = [0, 1].map(|end| number(&expected["hit_wilson95"][key][end]));
+        near_each(what, &expected["hit"], &[(key, rate.rate, 1e-12)]);
+        near(&format!("{what} low {key}"), rate.low, low, 1e-9);
+        near(&format!("{what} high {key}"), rate.high, high, 1e-9);
     }
-
-    near(
-        &format!("{what} mean error"),
-        scores.twist_error_mean,
-        number(&expected["twist_error_mean"]),
-        1e-9,
-    );
-
-    near(
-        &format!("{what} median error"),
-        scores.twist_error_median,
-        number(&expected["twist_error_median"]),
-        1e-9,
-    );
-
-    near(
-        &format!("{what} metres"),
-        scores.translation_m_median,
-        number(&expected["median_t_m"]),
-        1e-9,
-    );
-
-    near(
-        &format!("{what} radians"),
-        scores.rotation_rad_median,
-        number(&expected["median_R_rad"]),
-        1e-9,
-    );
 
     for recall in &scores.pose_recalls {
         let key = format!("{}m_{}deg", recall.translation_m, recall.rotation_deg);
-        near(
-            &format!("{what} {key}"),
-            recall.rate.rate,
-            number(&expected["recall_t_R"][&key]),
-            1e-12,
+        near_each(
+            what,
+            &expected["recall_t_R"],
+            &[(&key, recall.rate.rate, 1e-12)],
         );
     }
 }
@@ -157,54 +97,50 @@ fn compare_retrieval(what: &str, scores: &RetrievalScores, expected: &serde_json
 /// index gives.
 fn compare_identity(row: &Row, navigator: &Navigator, expected: &serde_json::Value) {
     let count = navigator.room().frame_count();
-    let pairs = Split::Time
-        .test_pairs(&Timeline::unbroken(count), STRIDE)
-        .unwrap();
-
-    let index = ExactIndex::new(
-        navigator.latents(),
-        &Split::Time.candidates(&Timeline::unbroken(count)),
-    );
+    let timeline = Timeline::unbroken(count);
+    let pairs = Split::Time.test_pairs(&timeline, STRIDE).unwrap();
+    let index = ExactIndex::new(navigator.latents(), &Split::Time.candidates(&timeline));
 
     let first = |pair: &Pair| {
-        index.nearest(
-            &navigator.latents().row(pair.source.row()).to_vec(),
-            1,
-            None,
-        )[0]
-        .frame
+        let source = navigator.latents().row(pair.source.row()).to_vec();
+        index.nearest(&source, 1, None)[0].frame
     };
-
     let retrieved: Vec<_> = pairs.iter().map(first).collect();
 
-    let thresholds: Vec<f64> = row
-        .retrieval
-        .hits
-        .iter()
-        .map(|(epsilon, _)| *epsilon)
-        .collect();
+    let hits = &row.retrieval.hits;
+    let thresholds: Vec<f64> = hits.iter().map(|(epsilon, _)| *epsilon).collect();
     let scores = RetrievalScores::of(&pairs, &retrieved, navigator.room().poses(), &thresholds);
 
     compare_retrieval("identity", &scores, &expected["source_included"]);
 
-    assert_eq!(
-        (&row.retrieval.hits, row.retrieval.top1),
-        (&scores.hits, scores.top1)
-    );
+    assert_eq!((hits, row.retrieval.top1), (&scores.hits, scores.top1));
 
-    near(
-        "identity mse",
-        row.latent.unwrap().mse,
-        number(&expected["mse"]),
-        1e-9,
-    );
+    let latent = row.latent.unwrap();
+    let numbers = [
+        ("mse", latent.mse, 1e-9),
+        ("r2_variance_weighted", latent.r2, 1e-8),
+    ];
+    near_each("identity", expected, &numbers);
+}
 
-    near(
-        "identity r2",
-        row.latent.unwrap().r2,
-        number(&expected["r2_variance_weighted"]),
-        1e-8,
+/// The rows of the paper's protocol with these navigators.
+fn rows_of(
+    navigator: &Navigator,
+    exclude_source: Option<u32>,
+    navigators: Vec<NavigatorKind>,
+) -> Vec<Row> {
+    let protocol = Protocol {
+        exclude_source,
+        navigators,
+        ..Protocol::paper(STRIDE)
+    };
+    let report = evaluate(
+        navigator,
+        &protocol,
+        &Cancellation::default(),
+        &mut |_, _| (),
     );
+    report.unwrap().rows
 }
 
 fn evaluated(navigator: &Navigator, exclude_source: Option<u32>) -> Vec<Row> {
@@ -218,20 +154,7 @@ fn evaluated(navigator: &Navigator, exclude_source: Option<u32>) -> Vec<Row> {
     };
 
     let navigators = NavigatorKind::all().into_iter().filter(can).collect();
-    let protocol = Protocol {
-        exclude_source,
-        navigators,
-        ..Protocol::paper(STRIDE)
-    };
-
-    evaluate(
-        navigator,
-        &protocol,
-        &Cancellation::default(),
-        &mut |_, _| (),
-    )
-    .unwrap()
-    .rows
+    rows_of(navigator, exclude_source, navigators)
 }
 
 /// Oracle: NumPy's pinv and brute force, scikit-learn's scores and Ridge, SciPy's Wilson intervals.
@@ -276,12 +199,8 @@ fn the_navigation_table_matches_the_oracle(room: &str, folder: PathBuf) {
                 continue;
             }
 
-            compare(
-                &format!("{room} {ours}"),
-                row,
-                &expected["navigators"][theirs],
-                side,
-            );
+            let expected = &expected["navigators"][theirs];
+            compare(&format!("{room} {ours}"), row, expected, side);
         }
     }
 }
@@ -297,29 +216,10 @@ fn retrieval_in_the_row_space_matches_the_oracle(room: &str, folder: PathBuf) {
             (Reading::Affine, "inverse_affine"),
             (Reading::Homogeneous, "inverse_homogeneous"),
         ] {
-            let kind = NavigatorKind::Step(
-                StepKind::InversePoincare(reading),
-                RetrievalMetric::RowSpace,
-            );
-            let protocol = Protocol {
-                exclude_source,
-                navigators: vec![kind],
-                ..Protocol::paper(STRIDE)
-            };
-
-            let report = evaluate(
-                &navigator,
-                &protocol,
-                &Cancellation::default(),
-                &mut |_, _| (),
-            )
-            .unwrap();
-
-            compare_retrieval(
-                &kind.name(),
-                &report.rows[0].retrieval,
-                &expected[theirs][side],
-            );
+            let step = StepKind::InversePoincare(reading);
+            let kind = NavigatorKind::Step(step, RetrievalMetric::RowSpace);
+            let rows = rows_of(&navigator, exclude_source, vec![kind]);
+            compare_retrieval(&kind.name(), &rows[0].retrieval, &expected[theirs][side]);
         }
     }
 }
@@ -352,36 +252,23 @@ fn calibrated_retrieval_is_the_least_surprising_candidate() {
         let wanted = body_twist(&poses[pair.source.row()], &poses[pair.target.row()]);
         let here = latents.row(pair.source.row());
 
-        let surprise = |frame: &seese3_core::room::FrameId| {
+        let surprise = |frame: &FrameId| {
             let seen =
                 adapter.motion(here, latents.row(frame.row())).to_vector() - adapter.scale().mean;
             let left = wanted.to_vector() - seen;
             (left.transpose() * inverse * left)[(0, 0)]
         };
-        let best = candidates
-            .iter()
-            .min_by(|a, b| surprise(a).total_cmp(&surprise(b)))
-            .unwrap();
+        let least = |a: &&FrameId, b: &&FrameId| surprise(a).total_cmp(&surprise(b));
+        let best = candidates.iter().min_by(least).unwrap();
 
         let imagined = &here + &stepper.step(adapter, here, wanted, 1.0).unwrap();
-        assert_eq!(
-            search.nearest(imagined.view(), 1, None)[0].frame,
-            *best,
-            "source {}",
-            pair.source
-        );
+        let found = search.nearest(imagined.view(), 1, None)[0].frame;
+        assert_eq!(found, *best, "source {}", pair.source);
     }
 
     let uncalibrated = adapter_of(&folder, "synthetic", 1);
-    assert!(
-        Search::exact(
-            RetrievalMetric::Calibrated,
-            &uncalibrated,
-            latents,
-            &candidates
-        )
-        .is_err()
-    );
+    let metric = RetrievalMetric::Calibrated;
+    assert!(Search::exact(metric, &uncalibrated, latents, &candidates).is_err());
     assert!(uncalibrated.with_error_covariance(-covariance).is_err());
 }
 
@@ -408,7 +295,7 @@ fn a_corrector_walks_a_motion_in_parts() {
     let corrector = Corrector::from_tensors(CorrectorKind::Linear, 20, read).unwrap();
     let adapter = plain.with_correctors(vec![corrector]).unwrap();
 
-    let twist = seese3_core::geometry::Twist {
+    let twist = Twist {
         linear: [0.5, -0.2, 0.9].into(),
         angular: [0.1, 0.3, -0.2].into(),
     };
@@ -436,12 +323,11 @@ fn a_closed_loop_takes_the_mean_off_once() {
     let folder = seese3_testing::golden();
     let navigator = navigator(&folder, "synthetic", adapter(&folder, "synthetic"));
     let stepper = Stepper::InversePoincare(Reading::Affine);
-    let start = navigator
-        .start(&Source::Frame(seese3_core::room::FrameId(100)), None)
-        .unwrap();
+    let frame = FrameId(100);
+    let start = navigator.start(&Source::Frame(frame), None).unwrap();
 
     let adapter = navigator.adapter();
-    let still = seese3_core::geometry::Twist::default();
+    let still = Twist::default();
     let whole = adapter.inverse().step(still, Reading::Affine, 1.0);
 
     // Only the start can be retrieved, so every part begins there, with nothing left to walk.
@@ -449,10 +335,9 @@ fn a_closed_loop_takes_the_mean_off_once() {
         RetrievalMetric::Full,
         adapter,
         navigator.latents(),
-        &[seese3_core::room::FrameId(100)],
-    )
-    .unwrap();
-
+        &[frame],
+    );
+    let search = search.unwrap();
     let space = Space {
         search: &search,
         ..navigator.space(&stepper)
@@ -465,26 +350,14 @@ fn a_closed_loop_takes_the_mean_off_once() {
         exclude_source: None,
     };
 
-    let walked = walk(
-        space,
-        &start,
-        Leg {
-            motion: still,
-            goal: start.pose,
-        },
-        plan,
-        &Cancellation::default(),
-    )
-    .unwrap();
-
-    for step in walked {
+    let leg = Leg {
+        motion: still,
+        goal: start.pose,
+    };
+    for step in walk(space, &start, leg, plan, &Cancellation::default()).unwrap() {
         let moved = &step.latent - &start.latent;
-        assert!(
-            moved
-                .iter()
-                .zip(&whole)
-                .all(|(a, b)| (a - b / 4.0).abs() < 1e-12)
-        );
+        let mut parts = moved.iter().zip(&whole);
+        assert!(parts.all(|(a, b)| (a - b / 4.0).abs() < 1e-12));
     }
 }
 
@@ -494,45 +367,23 @@ fn a_mixture_navigates_as_the_oracle(room: &str, folder: PathBuf) {
     let expected = &json(&folder.join(format!("navigation/{room}_expected.json")))["mixture_k2_inverse_affine"];
     let tensors = Tensors::open(&folder.join(format!("navigation/{room}_expected.safetensors")));
     let navigator = navigator(&folder, room, Arc::new(adapter_of(&folder, room, 2)));
-    let pairs = Split::Time
-        .test_pairs(navigator.room().timeline(), STRIDE)
-        .unwrap();
+    let timeline = navigator.room().timeline();
+    let pairs = Split::Time.test_pairs(timeline, STRIDE).unwrap();
 
+    let latents = navigator.latents();
     let gates = tensors.rows("mixture_k2.alpha_source");
     for (pair, gate) in pairs.iter().zip(gates.outer_iter()) {
-        let found = navigator
-            .latents()
-            .row(pair.source.row())
-            .slice(ndarray::s![40..])
-            .to_owned();
-
-        assert!(
-            found.iter().zip(gate).all(|(a, b)| (a - b).abs() < 1e-9),
-            "{room}, source {}",
-            pair.source
-        );
+        let latent = latents.row(pair.source.row());
+        let mut found = latent.iter().skip(40).zip(gate);
+        let is_near = found.all(|(a, b)| (a - b).abs() < 1e-9);
+        assert!(is_near, "{room}, source {}", pair.source);
     }
 
-    let kind = NavigatorKind::Step(
-        StepKind::InversePoincare(Reading::Affine),
-        RetrievalMetric::Full,
-    );
+    let step = StepKind::InversePoincare(Reading::Affine);
+    let kind = NavigatorKind::Step(step, RetrievalMetric::Full);
     for (side, exclude_source) in [("source_included", None), ("source_excluded", Some(0))] {
-        let protocol = Protocol {
-            exclude_source,
-            navigators: vec![kind],
-            ..Protocol::paper(STRIDE)
-        };
-
-        let report = evaluate(
-            &navigator,
-            &protocol,
-            &Cancellation::default(),
-            &mut |_, _| (),
-        )
-        .unwrap();
-
-        compare("mixture", &report.rows[0], expected, side);
+        let rows = rows_of(&navigator, exclude_source, vec![kind]);
+        compare("mixture", &rows[0], expected, side);
     }
 }
 
@@ -542,10 +393,8 @@ seese3_testing::on_oracle_rooms!(a_mixture_navigates_as_the_oracle);
 fn identity_hits_exactly_when_the_motion_is_short(room: &str, folder: PathBuf) {
     let expected = json(&folder.join(format!("navigation/{room}_expected.json")));
     let rows = evaluated(&navigator(&folder, room, adapter(&folder, room)), None);
-    let identity = rows
-        .iter()
-        .find(|row| row.name == NavigatorKind::Identity.name())
-        .unwrap();
+    let identity = NavigatorKind::Identity.name();
+    let identity = rows.iter().find(|row| row.name == identity).unwrap();
 
     for (epsilon, rate) in &identity.retrieval.hits {
         let below = number(&expected["pair_displacement"]["fraction_below"][epsilon.to_string()]);
@@ -559,11 +408,8 @@ seese3_testing::on_oracle_rooms!(identity_hits_exactly_when_the_motion_is_short)
 fn the_pseudo_inverse_matches_numpy(room: &str, folder: PathBuf) {
     let tensors = Tensors::open(&folder.join(format!("navigation/{room}_expected.safetensors")));
     let adapter = adapter(&folder, room);
-    let off = worst(
-        &adapter.inverse().matrix().to_owned(),
-        &tensors.rows("W_dagger"),
-    );
-
+    let found = adapter.inverse().matrix().to_owned();
+    let off = worst(&found, &tensors.rows("W_dagger"));
     assert!(off < 1e-12, "{room}: off by {off}");
 
     let singular = &json(&folder.join(format!("navigation/{room}_expected.json")))["W_dagger"]["singular_values"];
@@ -577,56 +423,31 @@ seese3_testing::on_oracle_rooms!(the_pseudo_inverse_matches_numpy);
 /// Oracle: brute force in NumPy, every retrieved frame of every step of every mode; the open loop's
 /// end does not depend on the number of steps.
 fn every_step_of_every_mode_retrieves_the_oracles_frame(room: &str, folder: PathBuf) {
+    use Mode::{ClosedLoop, OpenLoop, Snap};
+    use Reading::{Affine, Homogeneous, Literal};
+
     let tensors = Tensors::open(&folder.join(format!("navigation/{room}_expected.safetensors")));
     let navigator = navigator(&folder, room, adapter(&folder, room));
-    let count = navigator.room().frame_count();
-    let candidates = Split::Time.candidates(&Timeline::unbroken(count));
+    let timeline = Timeline::unbroken(navigator.room().frame_count());
+    let candidates = Split::Time.candidates(&timeline);
+    let (adapter, latents) = (navigator.adapter(), navigator.latents());
+    let search = Search::exact(RetrievalMetric::Full, adapter, latents, &candidates).unwrap();
 
-    let search = Search::exact(
-        RetrievalMetric::Full,
-        navigator.adapter(),
-        navigator.latents(),
-        &candidates,
-    )
-    .unwrap();
-
-    let pairs = Split::Time
-        .test_pairs(&Timeline::unbroken(count), STRIDE)
-        .unwrap();
+    let pairs = Split::Time.test_pairs(&timeline, STRIDE).unwrap();
     for (name, mode, reading, exclude_source) in [
-        (
-            "open_loop_homogeneous",
-            Mode::OpenLoop,
-            Reading::Homogeneous,
-            None,
-        ),
-        (
-            "open_loop_affine_spread",
-            Mode::OpenLoop,
-            Reading::Affine,
-            None,
-        ),
-        ("open_loop_literal", Mode::OpenLoop, Reading::Literal, None),
-        ("snap_homogeneous", Mode::Snap, Reading::Homogeneous, None),
-        ("snap_affine_spread", Mode::Snap, Reading::Affine, None),
+        ("open_loop_homogeneous", OpenLoop, Homogeneous, None),
+        ("open_loop_affine_spread", OpenLoop, Affine, None),
+        ("open_loop_literal", OpenLoop, Literal, None),
+        ("snap_homogeneous", Snap, Homogeneous, None),
+        ("snap_affine_spread", Snap, Affine, None),
         (
             "snap_exclude_current_homogeneous",
-            Mode::Snap,
-            Reading::Homogeneous,
+            Snap,
+            Homogeneous,
             Some(0),
         ),
-        (
-            "snap_exclude_current_affine_spread",
-            Mode::Snap,
-            Reading::Affine,
-            Some(0),
-        ),
-        (
-            "closed_loop_homogeneous",
-            Mode::ClosedLoop,
-            Reading::Homogeneous,
-            None,
-        ),
+        ("snap_exclude_current_affine_spread", Snap, Affine, Some(0)),
+        ("closed_loop_homogeneous", ClosedLoop, Homogeneous, None),
     ] {
         let stepper = Stepper::InversePoincare(reading);
         let space = Space {
@@ -647,16 +468,15 @@ fn every_step_of_every_mode_retrieves_the_oracles_frame(room: &str, folder: Path
 
             for (pair, expected) in pairs.iter().zip(expected.outer_iter()) {
                 let found = walk_pair(space, &navigator, *pair, plan);
-                let frames: Vec<f64> = found
+                let frames = found
                     .iter()
-                    .map(|step| f64::from(step.neighbours[0].frame.0))
-                    .collect();
-
+                    .map(|step| f64::from(step.neighbours[0].frame.0));
+                let frames: Vec<f64> = frames.collect();
+                let source = pair.source;
                 assert_eq!(
                     frames,
                     expected.to_vec(),
-                    "{room} {name} in {steps}, source {}",
-                    pair.source
+                    "{room} {name} in {steps}, source {source}"
                 );
             }
         }
@@ -698,18 +518,9 @@ fn walk_pair(
     let poses = navigator.room().poses();
     let start = navigator.start(&Source::Frame(pair.source), None).unwrap();
     let motion = body_twist(&poses[pair.source.row()], &poses[pair.target.row()]);
-    let goal = start
-        .pose
-        .map(|pose| pose * seese3_core::geometry::exp(&motion));
-
-    walk(
-        space,
-        &start,
-        Leg { motion, goal },
-        plan,
-        &Cancellation::default(),
-    )
-    .unwrap()
+    let goal = start.pose.map(|pose| pose * exp(&motion));
+    let leg = Leg { motion, goal };
+    walk(space, &start, leg, plan, &Cancellation::default()).unwrap()
 }
 
 /// Oracle: as above, with φ and W frozen in a room they never saw.
@@ -727,12 +538,8 @@ fn an_adapter_in_another_room_matches_the_oracle() {
         ("inverse-poincare-homogeneous", "zero_shot_homogeneous"),
         ("ridge-refit", "refit_raw_no_intercept"),
     ] {
-        compare(
-            ours,
-            rows.iter().find(|row| row.name == ours).unwrap(),
-            &expected[theirs],
-            "source_included",
-        );
+        let row = rows.iter().find(|row| row.name == ours).unwrap();
+        compare(ours, row, &expected[theirs], "source_included");
     }
 }
 
@@ -742,17 +549,10 @@ fn an_adapter_in_another_room_matches_the_oracle() {
 fn zero_motion_stays_put_only_in_the_homogeneous_reading() {
     let folder = seese3_testing::golden();
     let adapter = adapter(&folder, "synthetic");
-    let still = seese3_core::geometry::Twist::default();
+    let step = |reading| adapter.inverse().step(Twist::default(), reading, 1.0);
+    assert!(step(Reading::Homogeneous).iter().all(|&x| x == 0.0));
 
-    assert!(
-        adapter
-            .inverse()
-            .step(still, Reading::Homogeneous, 1.0)
-            .iter()
-            .all(|&x| x == 0.0)
-    );
-
-    let shift = adapter.inverse().step(still, Reading::Affine, 1.0);
+    let shift = step(Reading::Affine);
     let expected = &json(&folder.join("navigation/synthetic_expected.json"))["W_dagger"]["zero_motion_shift_affine"];
     for (column, &value) in shift.iter().enumerate() {
         near("shift", value, number(&expected[column]), 1e-12);

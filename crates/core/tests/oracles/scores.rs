@@ -9,7 +9,7 @@ use seese3_core::ridge::{Intercept, Ridge};
 use seese3_core::room::Timeline;
 use seese3_core::splits::Split;
 
-use seese3_testing::{Tensors, features, golden, json, near, number, poses, worst};
+use seese3_testing::{Tensors, features, golden, json, near_each, number, poses, worst};
 
 fn twists(value: &serde_json::Value) -> Vec<Twist> {
     let row = |row: &serde_json::Value| {
@@ -19,47 +19,21 @@ fn twists(value: &serde_json::Value) -> Vec<Twist> {
 }
 
 fn compare(scores: &MotionScores, expected: &serde_json::Value) {
-    near(
-        "overall",
-        scores.overall,
-        number(&expected["overall"]),
-        1e-9,
-    );
+    let numbers = [
+        ("overall", scores.overall, 1e-9),
+        ("translation", scores.translation, 1e-9),
+        ("rotation", scores.rotation, 1e-9),
+        ("direction", scores.direction, 1e-9),
+        ("magnitude", scores.magnitude, 1e-9),
+    ];
+    near_each("scores", expected, &numbers);
 
-    near(
-        "translation",
-        scores.translation,
-        number(&expected["translation"]),
-        1e-9,
-    );
-
-    near(
-        "rotation",
-        scores.rotation,
-        number(&expected["rotation"]),
-        1e-9,
-    );
-
-    near(
-        "direction",
-        scores.direction,
-        number(&expected["direction"]),
-        1e-9,
-    );
-
-    near(
-        "magnitude",
-        scores.magnitude,
-        number(&expected["magnitude"]),
-        1e-9,
-    );
-
+    let count = |key: &str| expected[key].as_u64().unwrap();
     assert_eq!(
         scores.direction_pairs_dropped as u64,
-        expected["direction_pairs_dropped"].as_u64().unwrap()
+        count("direction_pairs_dropped")
     );
-
-    assert_eq!(scores.n as u64, expected["n_pairs"].as_u64().unwrap());
+    assert_eq!(scores.n as u64, count("n_pairs"));
 }
 
 /// Oracle: scikit-learn's `r2_score` on twelve pairs of which three hardly move.
@@ -117,17 +91,12 @@ fn ridge_and_its_scores_match_scikit_learn(room: &str, folder: PathBuf) {
             let row = |x| scale.twist(&nalgebra::Vector6::from_fn(|c, _| fit.predict(x)[c]));
             x.outer_iter().map(row).collect()
         };
-        compare(
-            &MotionScores::of(&test_y, &predict(test_x.view())),
-            &expected["test"],
-        );
+        let scores = MotionScores::of(&test_y, &predict(test_x.view()));
+        compare(&scores, &expected["test"]);
 
-        near(
-            "train mean",
-            constant_r2(&test_y, &scale.mean),
-            number(&expected["baseline_predict_train_mean_r2"]),
-            1e-9,
-        );
+        let baseline = constant_r2(&test_y, &scale.mean);
+        let numbers = [("baseline_predict_train_mean_r2", baseline, 1e-9)];
+        near_each("train mean", expected, &numbers);
     }
 }
 

@@ -20,24 +20,21 @@ fn network<T: Real>(path: &Path, prefix: &str, charts: usize) -> Mixture<T> {
     Mixture::from_tensors(charts, Mixing::Gate, read).unwrap()
 }
 
+/// PyTorch's initial weights.
+fn initial<T: Real>(folder: &Path, room: &str, charts: usize) -> Mixture<T> {
+    let file = folder.join(format!("m4_adapter/{room}_k{charts}_init.safetensors"));
+    network(&file, "", charts)
+}
+
 /// Batches as the oracle cut them: an epoch's order in pieces, the short last piece kept.
 fn batches(folder: &Path, room: &str, batch: usize) -> Vec<Vec<usize>> {
     let order = npy::<u16>(&folder.join(format!("m4_adapter/{room}_batch_order.npy")));
-    let epochs = order.outer_iter().map(|epoch| {
-        epoch
-            .iter()
-            .map(|&pair| usize::from(pair))
-            .collect::<Vec<_>>()
-    });
-
-    epochs
-        .flat_map(|epoch| {
-            epoch
-                .chunks(batch)
-                .map(<[usize]>::to_vec)
-                .collect::<Vec<_>>()
-        })
-        .collect()
+    let mut batches = Vec::new();
+    for epoch in order.outer_iter() {
+        let epoch: Vec<usize> = epoch.iter().map(|&pair| usize::from(pair)).collect();
+        batches.extend(epoch.chunks(batch).map(<[usize]>::to_vec));
+    }
+    batches
 }
 
 /// The worst difference of any tensor; the last bias has no gradient in mathematics and only noise
@@ -80,19 +77,9 @@ fn check<T: Real>(
     let samples = samples::<T>(folder, room);
 
     for component in 0..6 {
-        near(
-            "mu",
-            samples.scale().mean[component],
-            number(&expected["mu"][component]),
-            1e-12,
-        );
-
-        near(
-            "sd",
-            samples.scale().deviation[component],
-            number(&expected["sd"][component]),
-            1e-12,
-        );
+        let [mean, deviation] = ["mu", "sd"].map(|key| number(&expected[key][component]));
+        near("mu", samples.scale().mean[component], mean, 1e-12);
+        near("sd", samples.scale().deviation[component], deviation, 1e-12);
     }
 
     let expected_run = &expected[&name];
@@ -105,15 +92,7 @@ fn check<T: Real>(
         ..TrainConfig::default()
     };
 
-    let start = network::<T>(
-        &folder.join(format!(
-            "m4_adapter/{room}_k{}_init.safetensors",
-            run.charts
-        )),
-        "",
-        run.charts,
-    );
-
+    let start = initial::<T>(folder, room, run.charts);
     let mut trainer = Trainer::new(&samples, start, config);
     let is_f64 = std::mem::size_of::<T>() == 8;
     for (step, batch) in (1..=50).zip(batches(folder, room, batch)) {
@@ -128,29 +107,16 @@ fn check<T: Real>(
 
         let report = trainer.step(&batch);
         if is_f64 {
-            near(
-                "loss",
-                report.loss,
-                number(&expected_run["loss"][step - 1]),
-                1e-10,
-            );
-
-            near(
-                "gradient norm",
-                report.gradient_norm,
-                number(&expected_run["grad_norm"][step - 1]),
-                1e-10,
-            );
+            let keys = ["loss", "grad_norm"];
+            let [loss, norm] = keys.map(|key| number(&expected_run[key][step - 1]));
+            near("loss", report.loss, loss, 1e-10);
+            near("gradient norm", report.gradient_norm, norm, 1e-10);
         }
 
         if run.kept.contains(&step) {
             let kept = format!("after{step}");
-            let off = difference(
-                trainer.weights(),
-                &network(&reference, &format!("{kept}."), run.charts),
-                is_f64,
-            );
-
+            let expected = network(&reference, &format!("{kept}."), run.charts);
+            let off = difference(trainer.weights(), &expected, is_f64);
             assert!(
                 off <= tolerance(expected_run, &kept),
                 "{room} {name}: weights {kept} off by {off}"
@@ -178,16 +144,12 @@ seese3_testing::on_oracle_rooms!(fifty_steps_in_f32_stay_as_near_as_pytorch_does
 /// Oracle: as above, for the other losses.
 fn fifty_steps_of_the_other_losses_match_pytorch(room: &str, folder: PathBuf) {
     for loss in [Loss::Cosine, Loss::Rotation] {
-        check::<f64>(
-            &Run {
-                charts: 1,
-                loss,
-                kept: &[50],
-            },
-            room,
-            &folder,
-            |_, _| 1e-10,
-        );
+        let run = Run {
+            charts: 1,
+            loss,
+            kept: &[50],
+        };
+        check::<f64>(&run, room, &folder, |_, _| 1e-10);
     }
 }
 
@@ -205,12 +167,7 @@ seese3_testing::on_oracle_rooms!(fifty_steps_of_a_mixture_match_pytorch);
 /// Oracle: PyTorch's first batch through a mixture of two: the gate, both charts, and what they say
 /// together.
 fn a_mixtures_gate_and_charts_match_pytorch(room: &str, folder: PathBuf) {
-    let mixture = network::<f64>(
-        &folder.join(format!("m4_adapter/{room}_k2_init.safetensors")),
-        "",
-        2,
-    );
-
+    let mixture = initial::<f64>(&folder, room, 2);
     let expected = Tensors::open(&folder.join(format!("m4_adapter/{room}_k2_mse.safetensors")));
     let samples = samples::<f64>(&folder, room);
     let first: Vec<usize> = batches(&folder, room, 8)[0].clone();
@@ -220,11 +177,8 @@ fn a_mixtures_gate_and_charts_match_pytorch(room: &str, folder: PathBuf) {
         .unwrap();
 
     let latents = |end: fn(&Pair) -> usize| {
-        let rows = rows.select(
-            ndarray::Axis(0),
-            &first.iter().map(|&p| end(&pairs[p])).collect::<Vec<_>>(),
-        );
-        mixture.embed(rows)
+        let ends: Vec<usize> = first.iter().map(|&p| end(&pairs[p])).collect();
+        mixture.embed(rows.select(ndarray::Axis(0), &ends))
     };
 
     let from = latents(|p| p.source.row());
@@ -235,12 +189,8 @@ fn a_mixtures_gate_and_charts_match_pytorch(room: &str, folder: PathBuf) {
         assert!(worst(&g(&to), &expected.rows(&format!("first.g_j.{chart}"))) < 1e-12);
     }
 
-    assert!(
-        worst(
-            &from.slice(ndarray::s![.., 40..]).to_owned(),
-            &expected.rows("first.alpha")
-        ) < 1e-12
-    );
+    let gate = from.slice(ndarray::s![.., 40..]).to_owned();
+    assert!(worst(&gate, &expected.rows("first.alpha")) < 1e-12);
 
     let adapter = Adapter::new(
         FeatureSource::imported("oracle", rows.ncols()),
@@ -250,14 +200,10 @@ fn a_mixtures_gate_and_charts_match_pytorch(room: &str, folder: PathBuf) {
     let adapter = adapter.unwrap();
 
     for (row, y) in expected.rows("first.y").outer_iter().enumerate() {
-        let seen = samples
-            .scale()
-            .normalised(adapter.motion(from.row(row), to.row(row)));
-
-        assert!(
-            seen.iter().zip(y).all(|(a, b)| (a - b).abs() < 1e-12),
-            "{room}, pair {row}"
-        );
+        let motion = adapter.motion(from.row(row), to.row(row));
+        let seen = samples.scale().normalised(motion);
+        let is_near = seen.iter().zip(y).all(|(a, b)| (a - b).abs() < 1e-12);
+        assert!(is_near, "{room}, pair {row}");
     }
 }
 
@@ -267,8 +213,7 @@ seese3_testing::on_oracle_rooms!(a_mixtures_gate_and_charts_match_pytorch);
 /// of the sine.
 fn a_seed_gives_pytorchs_initial_weights(room: &str, folder: PathBuf) {
     for charts in [1, 2, 4] {
-        let file = folder.join(format!("m4_adapter/{room}_k{charts}_init.safetensors"));
-        let expected = network::<f32>(&file, "", charts);
+        let expected = initial::<f32>(&folder, room, charts);
         let widths = Widths {
             feature: expected.feature_dim(),
             hidden: 64,
@@ -282,23 +227,14 @@ fn a_seed_gives_pytorchs_initial_weights(room: &str, folder: PathBuf) {
             .zip(expected.parameters())
             .zip(found.parameters())
         {
-            let off = a
-                .iter()
-                .zip(b)
-                .map(|(a, b)| (a - b).abs())
-                .fold(0.0, f32::max);
-
-            assert!(
-                off <= if name == "prototypes" { 1e-6 } else { 0.0 },
-                "{room} {name} off by {off}"
-            );
+            let off = a.iter().zip(b).map(|(a, b)| (a - b).abs());
+            let off = off.fold(0.0, f32::max);
+            let bound = if name == "prototypes" { 1e-6 } else { 0.0 };
+            assert!(off <= bound, "{room} {name} off by {off}");
         }
 
-        assert_ne!(
-            Mixture::<f32>::initial(widths, charts, 1),
-            expected,
-            "{room}"
-        );
+        let other = Mixture::<f32>::initial(widths, charts, 1);
+        assert_ne!(other, expected, "{room}");
     }
 }
 
@@ -386,21 +322,15 @@ fn weights_learned_on_z_scored_features_are_folded() {
         train(&samples, config, &mut |_| ()).unwrap()
     };
 
-    let expected = learned(&scored, &config)
-        .embed(scored.clone())
-        .mapv(f64::from);
+    let expected = learned(&scored, &config).embed(scored.clone());
 
-    let folded = learned(
-        &rows,
-        &TrainConfig {
-            standardise: true,
-            ..config
-        },
-    )
-    .embed(rows)
-    .mapv(f64::from);
+    let standardised = TrainConfig {
+        standardise: true,
+        ..config
+    };
+    let folded = learned(&rows, &standardised).embed(rows);
 
-    let off = worst(&folded, &expected);
+    let off = worst(&folded.mapv(f64::from), &expected.mapv(f64::from));
     assert!(off < 2e-3, "off by {off}");
 }
 
@@ -417,15 +347,11 @@ fn averaged_weights_lie_between_start_and_end() {
     };
     let last = train(&samples, &one_step, &mut |_| ()).unwrap();
 
-    let averaged = train(
-        &samples,
-        &TrainConfig {
-            average: 0.9,
-            ..one_step
-        },
-        &mut |_| (),
-    )
-    .unwrap();
+    let averaging = TrainConfig {
+        average: 0.9,
+        ..one_step
+    };
+    let averaged = train(&samples, &averaging, &mut |_| ()).unwrap();
 
     let widths = Widths {
         feature: samples.feature_dim(),
@@ -442,12 +368,8 @@ fn averaged_weights_lie_between_start_and_end() {
         .zip(averaged.parameters())
     {
         let expected = *start + (last - *start) * share as f32;
-        assert!(
-            averaged
-                .iter()
-                .zip(&expected)
-                .all(|(a, b)| (a - b).abs() < 1e-6)
-        );
+        let mut pairs = averaged.iter().zip(&expected);
+        assert!(pairs.all(|(a, b)| (a - b).abs() < 1e-6));
     }
 }
 
@@ -465,12 +387,7 @@ fn the_gradient_is_the_slope_of_the_loss() {
         (2, Loss::Cosine),
         (4, Loss::MeanSquaredError),
     ] {
-        let start = network::<f64>(
-            &folder.join(format!("m4_adapter/synthetic_k{charts}_init.safetensors")),
-            "",
-            charts,
-        );
-
+        let start = initial::<f64>(&folder, "synthetic", charts);
         let config = TrainConfig {
             loss,
             charts,
