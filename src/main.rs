@@ -2,11 +2,11 @@
 //! calls the crates and prints the results.
 
 mod camera;
-mod encoder;
 mod examples;
 mod log;
 mod named;
 mod output;
+mod encoder;
 mod pose_options;
 mod store_option;
 #[cfg(feature = "lab")]

@@ -154,7 +154,7 @@ impl Store {
                     ..body.clone()
                 };
 
-                if same == newest {
+                if as_json(&same)? == as_json(&newest)? {
                     let manifest = revision_path(&folder, newest.revision).to_string();
                     return Ok(Published {
                         revision: newest.revision,
@@ -279,4 +279,12 @@ impl Store {
 
         Ok(body)
     }
+}
+
+/// A body as it is stored. Undefined scores are NaN in memory and null here, where they are equal.
+fn as_json(body: &AdapterBody) -> Result<serde_json::Value, Error> {
+    serde_json::to_value(body).map_err(|error| Error::Damaged {
+        file: body.adapter.clone(),
+        problem: error.into(),
+    })
 }

@@ -49,7 +49,7 @@ pub struct FeaturesEntry {
 }
 
 /// The body of an adapter's manifest.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct AdapterBody {
     pub schema: u64,
     pub adapter: String,
@@ -91,7 +91,7 @@ pub struct FittedEntry {
 }
 
 /// A [`TrainingRecord`] with the names of the adapter's correctors.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TrainingEntry {
     preset: String,
     split: Split,

@@ -351,7 +351,10 @@ async fn stopping_answers_what_is_in_flight_within_a_bound() {
     };
     let in_flight = tokio::spawn(async move { client.navigate(slow).await });
 
-    until("it is in flight", in_flight_now, |count| *count == Some(1.0)).await;
+    until("it is in flight", in_flight_now, |count| {
+        *count == Some(1.0)
+    })
+    .await;
     server.stop.send(()).unwrap();
     assert_eq!(in_flight.await.unwrap().unwrap().steps.len(), 30_000);
 
@@ -373,7 +376,10 @@ async fn stopping_answers_what_is_in_flight_within_a_bound() {
     };
     let in_flight = tokio::spawn(async move { client.navigate(endless).await });
 
-    until("it is in flight", in_flight_now, |count| *count == Some(1.0)).await;
+    until("it is in flight", in_flight_now, |count| {
+        *count == Some(1.0)
+    })
+    .await;
     stuck.stop.send(()).unwrap();
     soon("the bound holds", stuck.ended).await.unwrap().unwrap();
 
@@ -415,7 +421,10 @@ async fn a_lame_duck_still_answers() {
     let late = Client::connect(&server.address, PATIENCE).await.unwrap();
     assert!(late.navigate(question()).await.is_ok());
     clock.advance(Duration::from_millis(200)).await;
-    soon("the server ends", server.ended).await.unwrap().unwrap();
+    soon("the server ends", server.ended)
+        .await
+        .unwrap()
+        .unwrap();
 }
 
 /// Oracle: the meaning of the flag: a store without a room is of use where rooms can be added.

@@ -195,7 +195,10 @@ async fn a_stream_holds_its_own_room_alone() {
     std::fs::remove_dir_all(server.folder.path().join("rooms/attic")).unwrap();
     asked.notify_one();
     let in_memory = async || metric(&config, "seese3_rooms_in_memory");
-    until("the removed room is dropped", in_memory, |rooms| *rooms <= 1.0).await;
+    until("the removed room is dropped", in_memory, |rooms| {
+        *rooms <= 1.0
+    })
+    .await;
 
     sender.send(seen(0)).await.unwrap();
     assert!(stream.message().await.unwrap().is_some());

@@ -119,11 +119,15 @@ async fn every_kind_of_adapter_comes_back_as_it_was() {
         let covariance = Matrix6::from_diagonal(&Vector6::new(1.0, 2.0, 3.0, 0.1, 0.2, 0.3));
         let adapter = adapter.with_error_covariance(covariance).unwrap();
         record.calibrated_on = vec![(RoomId::new("b").unwrap(), 3)];
-
-        store
-            .publish_adapter(name, &adapter, &record, features.rows())
-            .await
-            .unwrap();
+        // An undefined score, as under `Split::Whole`, does not make the content new.
+        record.test.direction = f64::NAN;
+        for is_new in [true, false] {
+            let published = store
+                .publish_adapter(name, &adapter, &record, features.rows())
+                .await
+                .unwrap();
+            assert_eq!(published.is_new, is_new, "{name}");
+        }
 
         let back = store.load_adapter(name, None).await.unwrap();
         assert_eq!(back.adapter.network(), adapter.network(), "{name}");
