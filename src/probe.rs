@@ -96,10 +96,6 @@ enum CountedName {
 type Loaded = (StoredRoom, Features);
 
 impl Probe {
-    #[expect(
-        clippy::too_many_lines,
-        reason = "one command, from its arguments to what it prints"
-    )]
     pub async fn run(self) -> anyhow::Result<()> {
         let store = self.common.open()?;
         let rooms = load_rooms(&store, &self.rooms, self.features.as_deref()).await?;

@@ -20,10 +20,13 @@ const FOCAL_FACTOR: f64 = 1.4;
 /// Largest relative difference between the aspect ratios of the stated camera and of an image.
 const ASPECT_TOLERANCE: f64 = 0.02;
 
+/// Returns the width and height of an image, pixels, or the reason why it cannot be read.
+type SizeOf<'a> = dyn Fn(&str) -> Result<(u32, u32), String> + 'a;
+
 /// Access to the images of a room, which this crate does not decode itself.
 pub struct RoomImages<'a> {
-    /// Width and height of an image, pixels, from its header; the error is the reason as text.
-    pub size: &'a dyn Fn(&str) -> Result<(u32, u32), String>,
+    /// Reads the size of an image from its header.
+    pub size: &'a SizeOf<'a>,
     /// Decodes an image; `None` if it cannot be read.
     pub read: &'a dyn Fn(&str) -> Option<RgbImage>,
     /// The room's poses as the recording states them, before `read_as` was applied; one per frame.

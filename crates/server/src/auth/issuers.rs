@@ -190,7 +190,8 @@ impl RoomScope {
     }
 }
 
-#[cfg(all(test, feature = "jwt"))]
+#[cfg(test)]
+#[cfg(feature = "jwt")]
 mod tests {
     use super::super::credentials::Credentials;
     use super::*;

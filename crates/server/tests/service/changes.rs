@@ -13,8 +13,8 @@ use sha2::{Digest, Sha256};
 use tonic::Code;
 
 use crate::harness::{
-    TestServer, code_of, feature, features_of, filled_store, publish_oracle, question, refused,
-    room_of, start_on,
+    TestServer, Unfit, code_of, feature, features_of, filled_store, publish_oracle, question,
+    refused, room_of, start_on,
 };
 use crate::security::{client_with, principal};
 use seese3_testing::world;
@@ -160,7 +160,7 @@ async fn unfit_uploads_are_refused_and_leave_nothing() {
     let (server, store) = start_writable().await;
     let good = Upload::synthetic("rooms/bad");
 
-    let cases: [(fn(&mut Upload), &str); 26] = [
+    let cases: [Unfit<Upload>; 26] = [
         (|u| u.spec.name = "bad".into(), "room.name"),
         (|u| u.spec.name = "rooms/../x".into(), "room.name"),
         (

@@ -24,6 +24,9 @@ use tonic::Code;
 
 use seese3_testing::{Tensors, features, golden, poses};
 
+/// A change that makes a valid message unfit, and the field that the refusal names.
+pub type Unfit<M> = (fn(&mut M), &'static str);
+
 /// How long an event may take on a busy machine. A test that passes does not wait for it.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 

@@ -12,7 +12,7 @@ use seese3_server::{Config, TokenKey};
 use seese3_store::Store;
 use tonic::Code;
 
-use crate::harness::{TestServer, feature, frame, start_on};
+use crate::harness::{TestServer, Unfit, feature, frame, start_on};
 use seese3_testing::world::{FRAMES, calibrated, place, served};
 
 /// Two places, and an adapter that can be followed with; `key` seals tokens.
@@ -474,7 +474,7 @@ async fn a_stream_is_configured_once_and_first() {
             frames,
         })
     }
-    let cases: [(fn(&mut pb::TrackConfig), &str); 8] = [
+    let cases: [Unfit<pb::TrackConfig>; 8] = [
         (|c| c.room = "nowhere".into(), "config.room"),
         (|c| c.rooms = vec!["hall".into()], "config.rooms"),
         (|c| c.fusion = 9, "config.fusion"),
@@ -711,7 +711,7 @@ async fn a_view_is_found_among_rooms_or_called_ambiguous() {
     let after = server.client.rooms().await.unwrap();
     assert_eq!(after, before, "nothing changes");
 
-    let cases: [(fn(&mut pb::RelocalizeRequest), &str); 4] = [
+    let cases: [Unfit<pb::RelocalizeRequest>; 4] = [
         (|_| (), "views"),
         (|r| r.views.push(frame(1).unwrap()), "views[0].frame_id"),
         (|r| r.views.push(pb::View::default()), "views[0]"),
@@ -798,7 +798,7 @@ async fn odometry_that_is_none_is_refused() {
         pose: Some(convert::pose_to_wire(&Pose::identity(), "wheels", "")),
         ..Default::default()
     };
-    let cases: [(fn(&mut pb::MeasuredOdometry), &str); 4] = [
+    let cases: [Unfit<pb::MeasuredOdometry>; 4] = [
         (|o| o.pose = None, "odometry.pose"),
         (|o| o.pose = Some(pb::Pose::default()), "odometry.pose"),
         (
